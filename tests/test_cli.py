@@ -169,6 +169,15 @@ def test_the_axis_that_points_up_can_be_said(cone, tmp_path):
     assert np.abs(one - other).max() > 0.1
 
 
+def test_the_camera_and_the_light_of_a_mesh_can_be_turned(cone, tmp_path):
+    options = "--direction", -1, 0.5, 0, "--light-rotation", 90, "--method", "none", "--size", 16, 16
+    result = run("render", cone, "-o", tmp_path / "x.exr", "--up", "z", *options)
+    assert result.exit_code == 0, result.output
+    scene = ws.default_scene(cone, up="z", size=(16, 16), direction=(-1, 0.5, 0))
+    turned = dataclasses.replace(scene, light=scene.light.rotated(90), visibility=ws.Visibility("none"))
+    np.testing.assert_array_equal(ws.read_image(tmp_path / "x.exr"), ws.render(turned))
+
+
 def test_a_mesh_is_shown_in_place_of_a_scene(cone, monkeypatch):
     served = []
 
@@ -202,6 +211,10 @@ def test_files_that_are_neither_scenes_nor_meshes_are_refused(cone, scene, tmp_p
     parts = ("cut.stl", "the file is cut off: got 144 bytes", "9 triangles, which are 534")
     fails("render", tmp_path / "cut.stl", "-o", tmp_path / "x.png", parts=parts)
     fails("render", scene, "-o", tmp_path / "x.png", "--up", "z", parts=("--up: got z with", "expected a mesh"))
+    options = "--direction", 1, 0, 0
+    fails("render", scene, "-o", tmp_path / "x.png", *options, parts=("--direction: got 1.0 0.0 0.0 with", "[camera]"))
+    options = "--light-rotation", 30
+    fails("render", scene, "-o", tmp_path / "x.png", *options, parts=("--light-rotation: got 30", "[light] rotation"))
     fails("render", cone, "-o", tmp_path / "x.png", "--up", "x", parts=("--up",), status=2)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal, Optional
+from typing import Annotated, Any, Literal, NamedTuple, Optional
 
 import numpy as np
 import typer
@@ -18,7 +18,7 @@ import warp as wp
 
 from warpshadow import Tuning, __version__, quiet
 from warpshadow.assets import files
-from warpshadow.assets.camera import Camera
+from warpshadow.assets.camera import DIRECTION, Camera
 from warpshadow.assets.picture import SUFFIXES, Picture
 from warpshadow.assets.video import VIDEO_SUFFIXES, check_video, write_video
 from warpshadow.scene.scene import Scene
@@ -70,6 +70,20 @@ Size = Annotated[
 
 Light = Annotated[
     Optional[Path], typer.Option(help="Of a mesh: file of an environment map, .exr or .hdr, in place of a sky.")
+]
+
+Direction = Annotated[
+    Optional[tuple[float, float, float]],
+    typer.Option(
+        help="Of a mesh: where the camera stands, seen from the mesh's middle, y up; without it 0.3 0.4 0.9; from "
+        "behind it is 0.3 0.4 -0.9.",
+        metavar="X Y Z",
+    ),
+]
+
+LightRotation = Annotated[
+    Optional[float],
+    typer.Option(help="Of a mesh: turn the light, counterclockwise seen from above, in degrees.", metavar="DEGREES"),
 ]
 
 Device = Annotated[str, typer.Option(help="Where to compute: cpu, cuda:0, …")]
@@ -168,6 +182,8 @@ def render(
     up: Up = None,
     size: Size = None,
     light: Light = None,
+    direction: Direction = None,
+    light_rotation: LightRotation = None,
     png: Annotated[Optional[Path], typer.Option(help="Beside an .exr, also write a picture: .png, or .jpg.")] = None,
     exposure: Annotated[
         Optional[float],
@@ -274,7 +290,7 @@ def render(
             raise ValueError(f"--{error}{others}") from error
         arguments: dict[str, Any] = {"method": method, "samples": samples, "bounces": bounces}
         arguments = {name: value for name, value in arguments.items() if value is not None}
-        parsed = _load(scene, up, size, light, is_quiet, **arguments)
+        parsed = _load(scene, is_quiet, _OfMesh(up, size, light, direction, light_rotation), **arguments)
         where = _device(device)
         loaded = parsed
         if parsed.visibility.method == AUTO:
@@ -301,12 +317,30 @@ def render(
             _note(f"{file}: {f'{messages}, ' * (file == output)}exposure {picture.exposure:+.2f} stops", is_quiet)
 
 
-def _load(
-    file: Path, up: str | None, size: tuple[str, str] | None, light: Path | None, is_quiet: bool, **settings: Any
-) -> Scene:
+class _OfMesh(NamedTuple):
+    """Options of the default scene of a mesh; None as it is without."""
+
+    up: str | None
+    size: tuple[str, str] | None
+    light: Path | None
+    direction: tuple[float, float, float] | None
+    light_rotation: float | None
+
+
+_KEYS_OF_SCENES = {
+    "--up": "[[body]] rotation",
+    "--size": "[camera] size",
+    "--light": "[light]",
+    "--direction": '[camera] direction, beside framing = "auto", or eye and target',
+    "--light-rotation": "[light] rotation",
+}
+"""Keys that scene files have in place of the options of meshes, in the order of these."""
+
+
+def _load(file: Path, is_quiet: bool, options: _OfMesh, **settings: Any) -> Scene:
     """The scene of a file, or the default one of a mesh's file; of that a note says which way is up."""
     from warpshadow.assets.mesh_files import MESH_SUFFIXES
-    from warpshadow.scene.files import load_scene
+    from warpshadow.scene.files import load_scene, turned_light
     from warpshadow.scene.mesh_scene import default_scene, guess_up
     from warpshadow.scene.scene import Body, Visibility
 
@@ -314,21 +348,23 @@ def _load(
         expected = f".toml for a scene file, or a mesh's: {', '.join(MESH_SUFFIXES)}"
         raise ValueError(f"{file}: got extension {file.suffix!r}, expected {expected}")
     if file.suffix.lower() not in MESH_SUFFIXES:
-        of_mesh = {"--up": (up, "[[body]] rotation"), "--size": (size, "[camera] size"), "--light": (light, "[light]")}
-        for option, (value, key) in of_mesh.items():
+        for (option, key), value in zip(_KEYS_OF_SCENES.items(), options, strict=True):
             if value is not None:
-                shown = " ".join(value) if isinstance(value, tuple) else value
+                shown = " ".join(map(str, value)) if isinstance(value, tuple) else value
                 raise ValueError(f"{option}: got {shown} with {file}, expected a mesh; scene files have {key}")
         return load_scene(file, **settings)
     body = Body(file)
+    up = options.up
     if up is None:
         guess = guess_up(body.mesh, file.suffix.lower())
         up = guess.axis
         _note(f"{file}: {up} is taken to be up ({guess.reason}); --up {'zy'['yz'.index(up)]} says otherwise", is_quiet)
-    width, height = map(int, size or ("512", "512"))
-    scene = default_scene(body, up=up, size=(width, height), light=light)
+    width, height = map(int, options.size or ("512", "512"))
+    direction = options.direction or DIRECTION
+    scene = default_scene(body, up=up, size=(width, height), light=options.light, direction=direction)
+    light = turned_light(scene.light, options.light_rotation or 0.0, 1.0)
     bounces = settings.pop("bounces", scene.bounces)
-    return replace(scene, visibility=Visibility.of(settings), bounces=bounces)
+    return replace(scene, light=light, visibility=Visibility.of(settings), bounces=bounces)
 
 
 def _behind(scene: Scene, background: str) -> str | np.ndarray | None:
@@ -365,6 +401,8 @@ def scene(
     up: Up = None,
     size: Size = None,
     light: Light = None,
+    direction: Direction = None,
+    light_rotation: LightRotation = None,
     is_quiet: Quiet = False,
 ) -> None:
     """Write a scene file of a mesh on a ground under a sky, to be edited, rendered and viewed.
@@ -378,7 +416,9 @@ def scene(
         if mesh is None:
             mesh = write_bunny(output.parent)
             _note(f"{mesh}: Warp's bunny", is_quiet)
-        write_starter(output, mesh, _load(mesh, up, size, light, is_quiet), light=light)
+        loaded = _load(mesh, is_quiet, _OfMesh(up, size, light, direction, light_rotation))
+        placed = {"direction": direction or DIRECTION, "rotation": light_rotation or 0.0}
+        write_starter(output, mesh, loaded, light=light, **placed)
         _note(f"{output}: warpshadow view {output} shows it", is_quiet)
 
 
@@ -420,6 +460,8 @@ def view(
     scene: SceneOrMesh,
     up: Up = None,
     light: Light = None,
+    direction: Direction = None,
+    light_rotation: LightRotation = None,
     host: Annotated[
         str, typer.Option(help="Address to serve at; by default for this machine alone, 0.0.0.0 is for everybody.")
     ] = HOST,
@@ -430,7 +472,7 @@ def view(
 ) -> None:
     """Show a scene, or a mesh on a ground under a sky, in the browser, to be turned with the mouse, until Ctrl+C."""
     with _clear_errors():
-        loaded = _load(scene, up, None, light, is_quiet)
+        loaded = _load(scene, is_quiet, _OfMesh(up, None, light, direction, light_rotation))
         file = scene if scene.suffix.lower() == ".toml" else None
         viewer = serve(loaded, host=host, port=port, device=_device(device), path=file)
         typer.echo(f"{viewer.url}   (Ctrl+C ends it)")
@@ -462,6 +504,8 @@ def tune(
     up: Up = None,
     size: Size = None,
     light: Light = None,
+    direction: Direction = None,
+    light_rotation: LightRotation = None,
     device: Device = "cpu",
     is_quiet: Quiet = False,
 ) -> None:
@@ -476,7 +520,7 @@ def tune(
     with _clear_errors():
         if (error is None) == (ms is None):
             raise ValueError(f"--error, --ms: got {'neither' if error is None else 'both'}, expected one of them")
-        loaded = _load(scene, up, size, light, is_quiet)
+        loaded = _load(scene, is_quiet, _OfMesh(up, size, light, direction, light_rotation))
         where = _device(device)
         tuning = tune_scene(
             loaded, error=error, milliseconds=ms, bounces=bounces, fits=fit, device=where, progress=True

@@ -51,6 +51,18 @@ def test_the_command_writes_it_and_says_how_to_go_on(tmp_path, monkeypatch):
     assert again.exit_code == 1 and ws.load_scene("a.toml").camera.width == 20
 
 
+def test_the_camera_stands_elsewhere_and_the_light_is_turned(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ws.icosphere(0.5, 1).write("a.obj")
+    result = CliRunner().invoke(app, ["scene", "a.obj", "--direction", "-1", "0.5", "0", "--light-rotation", "30"])
+    assert result.exit_code == 0, result.output
+    scene = ws.load_scene("scene.toml")
+    expected = ws.default_scene("a.obj", direction=(-1, 0.5, 0), size=(512, 512))
+    np.testing.assert_allclose(scene.camera.eye, expected.camera.eye, atol=1e-9)
+    assert scene.camera.eye[0] < -2
+    np.testing.assert_array_equal(scene.light.radiance, expected.light.rotated(30).radiance)
+
+
 def test_without_a_mesh_there_is_a_bunny(tmp_path, monkeypatch):
     pytest.importorskip("pxr")
     monkeypatch.chdir(tmp_path)

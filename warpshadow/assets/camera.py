@@ -34,6 +34,9 @@ _NARROW = 1.6
 # Part of the image that stays free in turntables for which a camera has to go back.
 _AROUND = 0.05
 
+# From the framed bodies to a framing camera: it looks down from the front.
+DIRECTION = (0.3, 0.4, 0.9)
+
 # Near plane of a framing camera, as a fraction of the distance to the nearest point.
 _NEAR = 0.01
 
@@ -150,7 +153,7 @@ class Camera:
         cls,
         shown: Placed | Iterable[Placed] | HasBodies,
         *,
-        direction: npt.ArrayLike = (0.3, 0.4, 0.9),
+        direction: npt.ArrayLike = DIRECTION,
         up: npt.ArrayLike = (0.0, 1.0, 0.0),
         fov_y: float = 40.0,
         size: tuple[int, int] = (256, 256),

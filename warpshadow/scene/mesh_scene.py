@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from warpshadow import check
-from warpshadow.assets.camera import Camera
+from warpshadow.assets.camera import DIRECTION, Camera
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.mesh_files import MeshSource
@@ -81,6 +82,7 @@ def default_scene(
     up: str = "y",
     size: tuple[int, int] = (256, 256),
     light: EnvironmentMap | AnyPath | None = None,
+    direction: npt.ArrayLike = DIRECTION,
 ) -> Scene:
     """Put a mesh on a ground without end, under a sky with a sun, before a camera that frames it.
 
@@ -91,6 +93,7 @@ def default_scene(
         up: Axis of the mesh that points up, "y" or "z", or "guess", which :func:`guess_up` finds by its shape.
         size: Width and height of the image [pixels].
         light: In place of the sky: an environment map, or the file of one.
+        direction: From the body's middle to the camera, in the world, whose y is up, shape [3], any length.
     """
     check.choice("up", up, (*_AXES, GUESS))
     suffix = Path(body).suffix.lower() if check.is_path(body) else ""
@@ -99,7 +102,8 @@ def default_scene(
     body = body.creased() if body.mesh.rounds_edges else body
     body = replace(body, rotation=np.array([-90.0 if axis == "z" else 0.0, 0.0, 0.0])).on_ground(size=2)
     ground = Body(infinite_ground(GROUND_SIZE), albedo=(0.4, 0.4, 0.4))
-    camera, sky = Camera.framing(body, size=size), synthetic_sky() if light is None else light
+    camera = Camera.framing(body, direction=direction, size=size)
+    sky = synthetic_sky() if light is None else light
     return Scene([body, ground], sky, camera, bounces=int(body.metallic is not None and body.metallic.any()))
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from warpshadow.assets import files
+from warpshadow.assets.camera import DIRECTION
 from warpshadow.assets.mesh_files import load_mesh
 from warpshadow.assets.topology import CREASE
 from warpshadow.scene.mesh_scene import GROUND_SIZE
@@ -19,10 +21,12 @@ _SCENE = """\
 
 [camera]
 framing = "auto"             # as near as the bodies are in view
+direction = {direction}  # from the bodies to the camera; y is up
 size = [{width}, {height}]            # width, height
 
 [light]
 {light}
+rotation = {rotation}               # degrees about the vertical
 bounces = {bounces}                  # how often light bounces between bodies, or "all"
 
 [[body]]
@@ -38,7 +42,15 @@ albedo = {albedo}
 _SKY = "sky = {}                     # clear, with a sun"
 
 
-def write_starter(path: Path, mesh: Path, scene: Scene, *, light: Path | None = None) -> None:
+def write_starter(
+    path: Path,
+    mesh: Path,
+    scene: Scene,
+    *,
+    light: Path | None = None,
+    direction: Sequence[float] = DIRECTION,
+    rotation: float = 0.0,
+) -> None:
     """Write the default scene of a mesh; its file names the mesh's, and is short.
 
     Args:
@@ -46,6 +58,8 @@ def write_starter(path: Path, mesh: Path, scene: Scene, *, light: Path | None = 
         mesh: File of the mesh.
         scene: Its :func:`warpshadow.default_scene`.
         light: File of the environment map that lights it, if not the sky.
+        direction: From the mesh's middle to the camera.
+        rotation: By what the light is turned [degrees about +y].
     Raises:
         FileExistsError: where the file is there, and differs: it may have been edited.
     """
@@ -57,6 +71,8 @@ def write_starter(path: Path, mesh: Path, scene: Scene, *, light: Path | None = 
         options.append(f"creased = {CREASE:g}                 # edges stay sharp where faces bend by more degrees")
     lines = _SCENE.format(
         name=path.name,
+        direction=[float(number) for number in direction],
+        rotation=float(rotation),
         width=scene.camera.width,
         height=scene.camera.height,
         light=_SKY if light is None else f"envmap = {_from(path, light)}",
