@@ -71,6 +71,16 @@ def test_waits_that_take_no_second_say_nothing_however_many(lines, monkeypatch):
     assert not lines()
 
 
+def test_a_loop_of_calls_says_nothing_and_one_long_call_does(lines):
+    for _ in range(12):
+        with waiting("rendering"), progress_bar(3, "shading", "receiver"):
+            time.sleep(0.06)
+    assert not lines()
+    with waiting("rendering"):
+        time.sleep(0.4)
+    assert re.fullmatch(r"rendering: \d s", lines()[0])
+
+
 def test_lines_are_hidden_as_bars_are(lines):
     with progress_bar(3, "counting", "thing", shows=False):
         time.sleep(0.3)

@@ -1,6 +1,7 @@
 """Progress: bars in terminals and notebooks, from a second on; elsewhere a line every ten seconds.
 
-One wait has one bar or line. Work within it, such as the compilation of kernels, is named there, too.
+One wait has one bar or line. Work within it, such as the compilation of kernels, is named there, too. Lines tell of a
+call of a renderer that lasts ten seconds by itself: those of a loop of shorter calls would say nothing.
 """
 
 from __future__ import annotations
@@ -91,10 +92,11 @@ class Wait:
         total: Number of units; None where it is not known.
         unit: Unit of the count, such as "receiver"; empty where nothing is counted.
         done: Units that were done before.
+        patience: Time before lines tell of it, and of work within it [s].
     """
 
-    def __init__(self, what: str = "", total: int | None = None, unit: str = "", done: int = 0):
-        self.what, self.total, self.unit, self.done = what, total, unit, done
+    def __init__(self, what: str = "", total: int | None = None, unit: str = "", done: int = 0, patience: float = 0.0):
+        self.what, self.total, self.unit, self.done, self.patience = what, total, unit, done, patience
         self.remark = ""
         self.bar: Any = None  # tqdm's, where it shows one
         self.outer_bar: Any = None  # or that in which its words show
@@ -196,9 +198,11 @@ class _Reporter:
                 if _can_be_seen():
                     for waits in shown_waits:
                         _refresh(waits)
-                elif any(shown_waits) and time.monotonic() - self._reported >= _EVERY:
+                    continue
+                told_waits = [waits for waits in shown_waits if waits and waits[0].age >= waits[0].patience]
+                if told_waits and time.monotonic() - self._reported >= _EVERY:
                     self._reported = time.monotonic()
-                    for waits in filter(None, shown_waits):
+                    for waits in told_waits:
                         say("; ".join(wait.line() for wait in waits))
 
 
@@ -218,7 +222,7 @@ if hasattr(os, "register_at_fork"):  # a child has its lock, but not its thread
 
 @contextlib.contextmanager
 def waiting(what: str, *, shows: bool = True) -> Iterator[None]:
-    """Say in files every ten seconds that a block runs; bars within it show as without.
+    """Say in files every ten seconds that a block runs, if it lasts as long; bars within it show as without.
 
     Args:
         what: Label of the work, such as "rendering".
@@ -229,7 +233,7 @@ def waiting(what: str, *, shows: bool = True) -> Iterator[None]:
         return
     _this_thread.is_hidden = not shows
     try:
-        with _within(Wait(what), shows=shows):
+        with _within(Wait(what, patience=_EVERY), shows=shows):
             yield
     finally:
         _this_thread.is_hidden = False
