@@ -257,6 +257,7 @@ def render(
     from warpshadow.scene.camera_path import CameraPath
     from warpshadow.scene.scene import AUTO
     from warpshadow.tuning.tune import describe, resolved
+    from warpshadow.tuning.video_time import remark_on_stills
 
     with _clear_errors():
         video = "--turntable" if turntable is not None else "--camera-path" if camera_path is not None else None
@@ -300,6 +301,8 @@ def render(
         start = time.perf_counter()
         if video is not None:
             cameras = path.cameras(loaded.camera) if path is not None else loaded.camera.around(loaded, turntable or 1)
+            if not stills and (remark := remark_on_stills(parsed, len(cameras), device=where)):
+                _note(remark, is_quiet)
             frames = _frames(loaded, cameras, where, exposure, tone, background)
             write_video(output, frames, fps=rate)
             _note(f"{output}: {len(cameras)} frames, rendered in {time.perf_counter() - start:.2f} s", is_quiet)
@@ -382,13 +385,17 @@ def _frames(
     from warpshadow.pipeline.renderer import SceneRenderer
 
     renderer = SceneRenderer(scene, device=device, progress=True)
-    with progress_bar(len(cameras), "rendering", "frame") as bar:
-        for camera in cameras:
-            image = renderer.with_cameras([camera]).render()[0]
-            behind = _behind(replace(scene, camera=camera), background)
-            picture = Picture(image, exposure=exposure, tone=tone, background=behind)
-            exposure = picture.exposure
-            yield picture
+
+    def picture(camera: Camera, exposure: float | None) -> Picture:
+        image = renderer.with_cameras([camera]).render()[0]
+        behind = _behind(replace(scene, camera=camera), background)
+        return Picture(image, exposure=exposure, tone=tone, background=behind)
+
+    first = picture(cameras[0], exposure)  # its set-up, fits and tracing, has bars of its own
+    with progress_bar(len(cameras), "rendering", "frame", done=1) as bar:
+        yield first
+        for camera in cameras[1:]:
+            yield picture(camera, first.exposure)
             bar.update()
 
 
