@@ -66,8 +66,8 @@ class Target:
         outlines: Mapping[BodyLike, npt.ArrayLike | AnyPath] | None = None,
         distortion: npt.ArrayLike | None = None,
     ):
-        told = None if encoding is None else checked_encoding(encoding)
-        vars(self).update(image=image, mask=mask, camera=camera, encoding=told or "linear")
+        checked = None if encoding is None else checked_encoding(encoding)
+        vars(self).update(image=image, mask=mask, camera=camera, encoding=checked or "linear")
         stops, tone = 0.0 if exposure is None else check.number("exposure", exposure), "clip"
         if check.is_path(image):
             path = check.file("image", image)
@@ -77,10 +77,10 @@ class Target:
                 stops = developed.exposure if exposure is None else stops
                 saturation = 1.0 if saturation is None else saturation
             with check.located("image"):
-                object.__setattr__(self, "encoding", told or guess_encoding(path))
+                object.__setattr__(self, "encoding", checked or guess_encoding(path))
                 object.__setattr__(self, "image", read_linear(path, self.encoding, tone))
-        elif told not in (None, "linear"):
-            raise ValueError(f"encoding: got {told!r} for an array, expected a file, or linear values")
+        elif checked not in (None, "linear"):
+            raise ValueError(f"encoding: got {checked!r} for an array, expected a file, or linear values")
         if check.is_path(mask):
             path = check.file("mask", mask)
             with check.located("mask"):

@@ -158,15 +158,15 @@ def with_planes_last(free: Sequence[Free]) -> tuple[Free, ...]:
     """Free parameters of bodies' numbers in the order in which they move bodies; planes carry those that stand on them.
 
     Raises:
-        ValueError: for a prior of a pose in the world whose plane moves, and for a plane whose pose is free, too.
+        ValueError: for a prior of the distance of a body whose plane moves, and for a plane whose pose is free, too.
     """
     planes = []
     for plane in (item for item in free if isinstance(item, Plane)):
         standing = [pose for pose in free if isinstance(pose, Pose) and pose.stands_on == plane.number]
         for pose in standing:
-            if pose.distance is not None or pose.covariance is not None:
+            if pose.distance is not None:
                 raise ValueError(
-                    f"{pose.name}: got a prior in the world, expected one of the {plane.name} it stands on"
+                    f"{pose.name}: got a distance beside a free {plane.name}, expected priors of the plane"
                 )
         if any(isinstance(pose, Pose) and pose.number == plane.number for pose in free):
             raise ValueError(f"{plane.name}: got a free pose of the same body, expected one of them")

@@ -47,10 +47,10 @@ class Pose(FreeOfBody):
         fixed: Coordinates of its middle that stay: "x", "y", "z". Beside ``stands_on`` the others must be able to move
             it onto the plane: "y" is never fixed above one that is horizontal.
         distance: Prior of the distance of its middle from the first view's eye, and its standard deviation [scene
-            units].
+            units]; not beside a free plane that it stands on.
         size: Prior of the diagonal of its bounding box, and its standard deviation [scene units], of a free scale.
         covariance: Prior of turn [radians] and shift [scene units] from where the scene has it, shape [6, 6]; or their
-            six standard deviations.
+            six standard deviations. Where a free plane moves it along, from there.
     """
 
     key: ClassVar[str] = "pose"
