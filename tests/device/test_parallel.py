@@ -100,6 +100,18 @@ def test_short_launches_are_not_divided():
     assert set(spread(np.ones(100), cost=1.0)[1]) == {0}
 
 
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_threads_have_as_many_slices_each(count, monkeypatch):
+    counts = []
+    share = parallel._share
+    monkeypatch.setattr(parallel, "_share", lambda *arguments: (counts.append(arguments[1]), share(*arguments)))
+    parallel.set_thread_count(count)
+    for rows in (100, 400, 1000):
+        spread(np.ones(rows), wants_total=False, cost=2e3)  # work for 2, 8 and 20 slices
+    assert all(number % count == 0 or number < count for number in counts)
+    assert len(counts) == (3 if count > 1 else 0)
+
+
 def test_nothing_is_launched_over_no_rows():
     parallel.set_thread_count(4)
     assert spread(np.ones(0))[2] == 3

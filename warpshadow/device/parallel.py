@@ -209,6 +209,8 @@ def _launch_slices(
     is_divisible = device.is_cpu and not device.is_capturing
     slice_count = min(dim[0], maximum, int(math.prod(dim) * cost / least_work)) if is_divisible else 1
     launch = functools.partial(warp_internals.bound_kernel, kernel, device=device)
+    if not summed and slice_count > workers:
+        slice_count -= slice_count % workers  # as many for each thread
     if slice_count <= 1 or (not summed and workers == 1):
         launch(arguments, gradients=gradients)(dim)
         return

@@ -25,7 +25,7 @@ from warpshadow.stages.self_visibility.trace import RUN
 
 _LEAST_REACH = 2.2  # least h, in radii of the coarse cells
 _MOST_RAYS = 32  # rays that a cell looks up on average at most; a wider one looks up coarse cells
-_CELL_COST = 1500.0  # nanoseconds that a cell takes
+_CELL_COST = 1600.0  # nanoseconds that a cell takes
 
 
 class ResamplingKernels(NamedTuple):

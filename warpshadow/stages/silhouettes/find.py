@@ -51,7 +51,7 @@ LEAST_OPENING = 1e-4
 # Rasterization moves vertices by up to 1/8192 sample: an edge may be this far on the wrong side of a center [samples].
 _SNAP = 1.0 / 2048.0
 
-_FACE_COST, _SAMPLE_COST, _ENTRY_COST = 50.0, 4.0, 2.0
+_FACE_COST, _SAMPLE_COST, _ENTRY_COST = 50.0, 4.0, 3.2
 """Nanoseconds that a face takes, if it is small, a sample that is looked at for an intersection, and for an entry."""
 
 # In place of the edge between two samples: it was not looked for yet, or there is none.

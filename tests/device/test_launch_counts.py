@@ -1,0 +1,52 @@
+"""How many kernels and memory sets an image and an iteration of a pose fit take: on a GPU these are what one costs."""
+
+import pytest
+import warp as wp
+
+import warpshadow as ws
+from warpshadow.device import warp_internals
+from warpshadow.torch import TorchRenderer
+from warpshadow.tuning.timing import whole_image
+
+# Kernels and memory sets; they may fall. A pose iteration is to have at most 40 and 5.
+MOST = {"image": (48, 8), "pose iteration": (73, 32)}
+
+
+@pytest.fixture(scope="module")
+def calls():
+    """A ball on a ground, so small that no launch is cut; each of its calls is warm."""
+    ball = ws.Body(ws.icosphere(1.0, 1), blockers=8, translation=(0, 1, 0))
+    ground = ws.Body(ws.plane(6.0, 4), blockers=0)
+    camera = ws.Camera.look_at((1.6, 2.6, 4.6), (0, 0.75, 0), fov_y=36, size=(16, 16))
+    visibility = ws.Visibility(directions=16)
+    scene = ws.Scene((ball, ground), ws.synthetic_sky(), camera, visibility=visibility, supersampling=1)
+    renderer = TorchRenderer(scene, device="cpu")
+    rotations, translations, scales = renderer.scene_poses()
+    translations.requires_grad_()
+
+    def fit_pose():
+        renderer(geometry=renderer.placed(rotations, translations, scales)).square().sum().backward()
+
+    result = {"image": whole_image(renderer.warp), "pose iteration": fit_pose}
+    for call in result.values():
+        for _ in range(3):
+            call()
+    return result
+
+
+@pytest.mark.parametrize("name", list(MOST))
+def test_launches_and_memory_sets_do_not_grow(name, calls, monkeypatch):
+    kernels, sets = [], []
+    bound_kernel, zero, fill = warp_internals.bound_kernel, wp.array.zero_, wp.array.fill_
+
+    def counted(kernel, *arguments, **options):
+        kernels.append(kernel.key)
+        return bound_kernel(kernel, *arguments, **options)
+
+    monkeypatch.setattr(warp_internals, "bound_kernel", counted)
+    monkeypatch.setattr(wp.array, "zero_", lambda array: (sets.append(array.shape), zero(array))[1])
+    monkeypatch.setattr(wp.array, "fill_", lambda array, value: (sets.append(array.shape), fill(array, value))[1])
+    calls[name]()
+    found = len(kernels), len(sets)
+    print(f"{name}: {found[0]} kernels and {found[1]} memory sets, at most {MOST[name]}")
+    assert all(count <= most for count, most in zip(found, MOST[name], strict=True)), sorted(kernels)
