@@ -493,8 +493,8 @@ def find_silhouettes(
     if sample_count > MOST_SAMPLES:
         raise ValueError(f"fragments: got {sample_count} samples in all, expected at most {MOST_SAMPLES}")
     seen, strips = make_fragment_arrays(fragments, faces, clip_positions), strip_count(device)
-    found = wp.full((4, sample_count), NOTHING, dtype=wp.int32, device=device)
-    between, crossings = found[:2], found[2:]  # in the latter 3 face + corner of an edge, or INTERSECTION
+    numbers = wp.full((4, sample_count), NOTHING, dtype=wp.int32, device=device)
+    between, crossings = numbers[:2], numbers[2:]  # in the latter 3 face + corner of an edge, or INTERSECTION
     if creases is not None:
         check.shape("creases", creases.shape, faces.shape)
     launch(
