@@ -3,12 +3,14 @@
 import dataclasses
 
 import pytest
+import torch
 
 import warpshadow as ws
+from warpshadow.torch import TorchRenderer
 
 BALL = ws.Body(ws.icosphere(1.0, 0))
 SKY = ws.EnvironmentMap.constant(1.0)
-SCENE = ws.Scene([BALL], SKY)
+SCENE = ws.Scene([BALL], SKY, ws.Camera.framing(BALL, size=(8, 8)), ws.Visibility("none"))
 
 
 @pytest.mark.parametrize(
@@ -24,12 +26,35 @@ SCENE = ws.Scene([BALL], SKY)
             lambda: ws.synthetic_sky((0, 1, 0), 3.0),
             "too many positional arguments; .* are sun_direction, sun_strength",
         ),
+        (
+            lambda: ws.Renderer(SCENE).render(cameras=[SCENE.camera]),
+            r"unknown argument 'cameras' \(write renderer.with_cameras\(",
+        ),
+        (
+            lambda: TorchRenderer(SCENE)(cameras=[SCENE.camera]),
+            r"\(write TorchRenderer\(.*clip_matrices=",
+        ),
+        (lambda: TorchRenderer(SCENE)(vertices=None), r"\(write geometry=renderer.placed\(.*renderer.deformed\("),
         (lambda: ws.Body(), "Body: missing a required argument: 'mesh'"),
     ],
 )
 def test_arguments_that_do_not_fit_are_told_with_those_that_do(call, message):
     with pytest.raises(TypeError, match=message):
         call()
+
+
+def test_cameras_go_to_the_renderer():
+    with pytest.raises(ValueError, match="light: got a Camera, .*cameras go to the renderer: renderer.with_cameras"):
+        ws.Renderer(SCENE).render(SCENE.camera)
+
+
+def test_a_map_in_place_of_coefficients_gets_the_way_to_them():
+    renderer = TorchRenderer(SCENE)
+    with pytest.raises(ValueError, match=r"light: .* light=EnvironmentMap\(map.numpy\(\)\); its coefficients are"):
+        renderer(torch.ones(4, 8, 3))
+    map = torch.ones(4, 8, 3)
+    coefficients = renderer.basis.coefficients(ws.EnvironmentMap(map.numpy()))
+    renderer(torch.as_tensor(coefficients, dtype=torch.float32))
 
 
 @pytest.mark.parametrize(

@@ -424,8 +424,8 @@ def scene(
             mesh = write_bunny(output.parent)
             _note(f"{mesh}: Warp's bunny", is_quiet)
         loaded = _load(mesh, is_quiet, _OfMesh(up, size, light, direction, light_rotation))
-        placed = {"direction": direction or DIRECTION, "rotation": light_rotation or 0.0}
-        write_starter(output, mesh, loaded, light=light, **placed)
+        seen_from, turned_by = direction or DIRECTION, light_rotation or 0.0
+        write_starter(output, mesh, loaded, light=light, direction=seen_from, rotation=turned_by)
         _note(f"{output}: warpshadow view {output} shows it", is_quiet)
 
 

@@ -374,6 +374,7 @@ class SceneRenderer:
         view = self._checked(view)
         return view.image(light, self._reflecting(albedo, textures, gloss)).value(self._views.call(view))
 
+    @check.keywords(**dict.fromkeys(("camera", "cameras"), "renderer.with_cameras([camera]).render()"))
     def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:
         """Render the image of the scene.
 
@@ -383,6 +384,11 @@ class SceneRenderer:
             Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4], or
             [camera, height, width, 4] where cameras were given; the background is 0.
         """
+        if isinstance(light, Camera):
+            raise ValueError(
+                "light: got a Camera, expected a light, or none for the scene's; cameras go to the renderer: "
+                "renderer.with_cameras([camera]).render(), or Renderer(scene, cameras=[camera])"
+            )
         with unrecorded():
             images = (self._in_photograph(None, light) if self.scene.catchers else self.draw(light)).numpy().copy()
         return images if self.has_camera_batch else images[0]

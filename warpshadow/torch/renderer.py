@@ -24,6 +24,20 @@ from warpshadow.torch.arguments import Arguments, Slot
 from warpshadow.torch.autograd import uncompiled
 from warpshadow.tuning.renderer import Renderer
 
+_ELSEWHERE = {
+    **dict.fromkeys(
+        ("camera", "cameras"),
+        "TorchRenderer(scene, cameras=[…]), or for free cameras clip_matrices=renderer.clip_matrices(R, t, K)",
+    ),
+    **dict.fromkeys(
+        ("vertices", "positions"),
+        "geometry=renderer.placed(R, t, rest=renderer.deformed(body, vertices)), R and t of renderer.scene_poses()",
+    ),
+    **dict.fromkeys(("poses", "rotations", "translations"), "geometry=renderer.placed(rotations, translations)"),
+    "envmap": "light=",
+}
+"""What to write in place of keywords that a call does not have."""
+
 REFLECTANCE = ("albedo", "textures", *GLOSS)
 """Arguments that bodies have, each its own."""
 
@@ -135,6 +149,7 @@ class TorchRenderer(torch.nn.Module):
             raise ValueError(f"state_dict: got that of a TorchRenderer with {stored}, expected {own}")
 
     @uncompiled
+    @check.keywords(**_ELSEWHERE)
     @one_at_a_time
     def forward(
         self,
@@ -276,6 +291,11 @@ class TorchRenderer(torch.nn.Module):
         inputs: dict[str, Any] = {"light": light, "geometry": None, "clip_matrices": None}
         if isinstance(light, torch.Tensor):
             what = describe_coefficients(self.basis, light.shape[-2] if light.ndim > 1 else 0)
+            if light.ndim == 3 and light.shape[1] == 2 * light.shape[0]:
+                what += (
+                    "; of a map [height, width, 3] that is known, light=EnvironmentMap(map.numpy()); its coefficients "
+                    "are torch.as_tensor(renderer.basis.coefficients(EnvironmentMap(map.numpy())), dtype=torch.float32)"
+                )
             inputs["light"] = stored.add("light", light, wp.vec3, (self.basis.size,), what)
         elif isinstance(light, np.ndarray):  # which a renderer takes for known light
             raise ValueError("light: got ndarray, expected a tensor of torch.float32: torch.as_tensor makes one")
