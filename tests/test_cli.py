@@ -738,7 +738,9 @@ def test_another_fit_is_not_gone_on_with(fit_file, tmp_path):
     fit_file.write_text(FIT.replace("0.05", "0.04"))
     result = run("fit", fit_file, "-o", tmp_path / "out")
     assert result.exit_code == 1
-    assert "checkpoint: got one of another problem" in result.stderr and "another folder by -o" in result.stderr
+    assert (
+        "checkpoint: got one of another fit (other stages" in result.stderr and "another folder by -o" in result.stderr
+    )
 
 
 def test_a_folder_that_another_fit_writes_is_left_to_it(fit_file, tmp_path):

@@ -592,7 +592,8 @@ def test_a_checkpoint_of_another_fit_is_refused_and_stays(problem, tmp_path):
         "seed": 1,
     }
     for name, other in others.items():
-        with pytest.raises(CheckpointError, match="checkpoint: got one of another problem"):
+        words = "free" if name == "problem" else name
+        with pytest.raises(CheckpointError, match=rf"checkpoint: got one of another fit \(other {words}\), expected"):
             fit(**own | {name: other}, checkpoint=path)
     assert path.read_bytes() == content
     # the same optimizer by another name is the same
@@ -607,7 +608,7 @@ def test_what_is_no_checkpoint_is_refused_and_stays(problem, tmp_path):
         fit(problem, STAGES, checkpoint=path)
     assert path.read_text() == "[camera]\n"
     checkpoint.save(tmp_path / "epochs", {"epoch": 3})
-    with pytest.raises(CheckpointError, match="checkpoint: got one of another problem"):
+    with pytest.raises(CheckpointError, match="checkpoint: got one of no fit of this version"):
         fit(problem, STAGES, checkpoint=tmp_path / "epochs")
 
 

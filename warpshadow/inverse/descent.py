@@ -94,8 +94,15 @@ class _Descent:
         self.reason: str | None = None
         self._begin_run(self.candidates[0])
         # The optimizer is identified by an instance of it: a partial or a lambda has no name that tells all of it.
-        made = f"{type(self.optimizer).__qualname__} {self.optimizer.state_dict()!r}"
-        self.fingerprint = f"{problem.fingerprint()} {stages!r} {tolerance!r} {seed} {made}"
+        state = self.optimizer.state_dict()
+        groups = [{key: value for key, value in group.items() if key != "params"} for group in state["param_groups"]]
+        made = f"{type(self.optimizer).__qualname__} {groups!r} {state['state']!r}"
+        self.fingerprints = problem.fingerprints() | {
+            "stages": repr(stages),
+            "tolerance": repr(tolerance),
+            "seed": repr(seed),
+            "optimizer": made,
+        }
 
     def _widened(self, best: list[_Candidate]) -> list[_Candidate]:
         """The candidates of a stage: the best so far, and others scattered around the first where it wants more."""
@@ -137,7 +144,7 @@ class _Descent:
     def state(self) -> dict[str, Any]:
         """State from which a descent is resumed."""
         return {
-            "fingerprint": self.fingerprint,
+            "fingerprints": self.fingerprints,
             "stage": self.stage,
             "candidates": [tuple(candidate) for candidate in self.candidates],
             "is_found": self.is_found,
@@ -153,10 +160,12 @@ class _Descent:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state."""
-        if state.get("fingerprint") != self.fingerprint:
+        others = state.get("fingerprints")
+        changed = [name for name, own in self.fingerprints.items() if others is not None and others.get(name) != own]
+        if others is None or changed:
+            of_other = f"of another fit (other {', '.join(changed)})" if changed else "of no fit of this version"
             raise checkpoints.CheckpointError(
-                "checkpoint: got one of another problem, other stages, another optimizer, tolerance or seed, "
-                f"expected one of this fit; {checkpoints.OTHERWISE}, or remove it"
+                f"checkpoint: got one {of_other}, expected one of this fit; {checkpoints.OTHERWISE}, or remove it"
             )
         device = self.setting.device
         self.stage = state["stage"]
