@@ -153,6 +153,16 @@ def test_the_unit_is_the_root_mean_square_of_what_counts():
     assert Problem(scene, Target(np.zeros((24, 24, 3))), Exposure()).setting(CPU).unit == 1
 
 
+def test_arrays_are_targets_as_they_are():
+    scene = small_scene()
+    image = np.full((24, 24, 3), 0.5, np.float32)
+    for targets in (image, [image], [Target(image)]):
+        (target,) = Problem(scene, targets, Exposure()).targets
+        np.testing.assert_array_equal(target.image, image)
+    with pytest.raises(ValueError, match=r"^targets\[0\]: image: got shape"):
+        Problem(scene, [image[..., 0]], Exposure())
+
+
 # ---------------------------------------------------------------------------------------------- losses
 
 
@@ -309,7 +319,7 @@ def test_spheres_that_the_method_does_not_use_cannot_be_free():
         ({"free": [Light(), "pose"]}, r"free\[1\]: got 'pose', expected what is free"),
         ({"free": Light}, r"free\[0\]: got the class Light, expected what is free, such as Pose\(0\) or Light\(\)"),
         ({"free": [Light(), Albedo(1), Texture(1)]}, r"free: got Albedo\(1\) and Texture\(1\), expected one"),
-        ({"targets": [noise(2, 2, 3)]}, r"targets\[0\]: got ndarray of .*, expected a Target, as Target\(image\)"),
+        ({"targets": [3.0]}, r"targets\[0\]: got 3.0, expected a Target, as Target\(image\) makes it, or an image"),
         ({"free": [Pose(0), Light(), Pose(0, "6d")]}, r"free: got pose\[0\] twice"),
         ({"free": [Light(), Light(None, 64)]}, "free: got light twice"),
         ({"targets": [Target(noise(24, 24, 3)), Target(noise(24, 24, 4))]}, "targets: got images of shapes"),

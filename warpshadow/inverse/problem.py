@@ -13,6 +13,7 @@ import torch
 from warpshadow import check
 from warpshadow.assets.basis import Basis
 from warpshadow.assets.camera import Camera
+from warpshadow.check import AnyPath
 from warpshadow.inverse.free.base import Free, Values
 from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.free.plane import with_planes_last
@@ -34,7 +35,8 @@ class Problem:
 
     Args:
         scene: Start of the fit: free parameters begin with its values, all else stays as it is.
-        targets: The images to explain, of one size; one, or several views.
+        targets: The images to explain, of one size; one, or several views. Arrays and files are taken as
+            :class:`Target` takes them.
         free: The free parameters.
         loss: The loss.
         still: How visibility is computed where no geometry and no camera moves: rays by default, since then they are
@@ -50,7 +52,7 @@ class Problem:
     def __init__(
         self,
         scene: Scene,
-        targets: Target | Sequence[Target],
+        targets: Target | np.ndarray | AnyPath | Sequence[Target | np.ndarray | AnyPath],
         free: Free | Sequence[Free],
         loss: Loss = _SQUARES,
         still: Visibility | None = _RAYS,
@@ -66,8 +68,9 @@ class Problem:
             if not items:
                 raise ValueError(f"{name}: got none, expected one or more")
             object.__setattr__(self, name, items)
+        object.__setattr__(self, "targets", tuple(self._of_images()))
         for number, target in enumerate(self.targets):
-            check.instance(f"targets[{number}]", target, Target, "a Target, as Target(image) makes it")
+            check.instance(f"targets[{number}]", target, Target, "a Target, as Target(image) makes it, or an image")
         for number, item in enumerate(self.free):
             check.instance(f"free[{number}]", item, Free, "what is free, such as Pose(0) or Light()")
         object.__setattr__(self, "free", with_planes_last(tuple(self._numbered())))
@@ -102,6 +105,11 @@ class Problem:
         free = ", ".join(free.name for free in self.free)
         height, width, _ = self.targets[0].image.shape
         return f"Problem({self.scene!r}, {len(self.targets)} targets of {width} × {height}, free: {free})"
+
+    def _of_images(self) -> Iterator[Target]:
+        for number, item in enumerate(self.targets):
+            with check.located(f"targets[{number}]"):
+                yield Target(item) if isinstance(item, np.ndarray) or check.is_path(item) else item
 
     def _numbered(self) -> Iterator[Free]:
         for number, item in enumerate(self.free):
@@ -166,9 +174,11 @@ class Problem:
 
     def fingerprint(self) -> str:
         """A digest of all that the result depends on, in hexadecimal."""
-        digest = hashlib.sha256()
-        _digest(self, digest)
-        return digest.hexdigest()
+        return _fingerprint(self)
+
+    def fingerprints(self) -> dict[str, str]:
+        """Digests of its arguments, by their names, in hexadecimal."""
+        return {entry.name: _fingerprint(getattr(self, entry.name)) for entry in dataclasses.fields(self)}
 
 
 def _fitted(camera: Camera, width: int, height: int) -> Camera:
@@ -181,6 +191,12 @@ def _fitted(camera: Camera, width: int, height: int) -> Camera:
             f"{camera.width} × {camera.height}, or a camera of its own"
         )
     return camera.stretched(width, height)
+
+
+def _fingerprint(value: object) -> str:
+    digest = hashlib.sha256()
+    _digest(value, digest)
+    return digest.hexdigest()
 
 
 def _digest(value: object, digest: hashlib._Hash) -> None:
