@@ -173,10 +173,12 @@ def path(name: str, value: object) -> Path:
     return Path(value)
 
 
-def index(name: str, value: object, count: int, what: str) -> None:
+def index(name: str, value: object, count: int, what: str, alternative: str = "") -> None:
     """Raise ValueError unless a value is the number of one of ``count`` things, from 0; the message calls one that."""
     if not is_integer(value) or value not in range(count):
-        raise ValueError(f"{name}: got {described(value)}, expected the number of a {what}, from 0 to {count - 1}")
+        raise ValueError(
+            f"{name}: got {described(value)}, expected the number of a {what}, from 0 to {count - 1}{alternative}"
+        )
 
 
 def instance(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:

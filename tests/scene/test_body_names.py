@@ -45,7 +45,7 @@ def test_a_number_and_a_name_are_the_same_body(scene, body):
 
 @pytest.mark.parametrize("body", [-1, 2, True, 1.0, None, np.float64(0), b"ground", ("ground",)])
 def test_what_is_neither_a_number_nor_a_name_is_refused(scene, body):
-    with pytest.raises(ValueError, match="^body: got .*, expected the number of a body, from 0 to 1"):
+    with pytest.raises(ValueError, match="^body: got .*, expected the number of a body, from 0 to 1, or its name"):
         scene.body_number(body)
 
 

@@ -654,7 +654,8 @@ class Scene:
             ValueError: for a body that there is not, and for a name that two bodies have from their meshes.
         """
         if not isinstance(body, str):
-            check.index(argument, body, len(self.bodies), "body")
+            by_name = f", or its name, such as {self.bodies[-1].called!r}"
+            check.index(argument, body, len(self.bodies), "body", by_name)
             return int(body)
         names = [item.called for item in self.bodies]
         check.choice(argument, body, names)
