@@ -201,6 +201,13 @@ def test_a_mesh_is_shown_in_place_of_a_scene(cone, monkeypatch):
     assert path is None and [body.called for body in scene.bodies] == ["cone", "infinite_ground"]
 
 
+def test_a_picture_without_its_option_gets_the_option(cone, tmp_path):
+    """But not another option's value."""
+    fails("render", cone, "a.png", parts=("a.png", "expected -o a.png"), status=2)
+    fails("render", cone, "--size", 8, 8, "a.gif", parts=("expected -o a.gif",), status=2)
+    fails("render", cone, "--light", "a.exr", parts=("Missing option", "--output"), status=2)
+
+
 def test_files_that_are_neither_scenes_nor_meshes_are_refused(cone, scene, tmp_path):
     (tmp_path / "a.fbx").write_bytes(b"Kaydara")
     fails(

@@ -1,6 +1,7 @@
 """The command line: render and view scenes, explain images, fit spheres to a mesh, look into a light, compile ahead."""
 
 import contextlib
+import itertools
 import math
 import os
 import sys
@@ -14,6 +15,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Optional
 
 import numpy as np
 import typer
+import typer.core
 import warp as wp
 
 from warpshadow import Tuning, __version__, quiet
@@ -167,7 +169,20 @@ def _check_output(path: Path, *suffixes: str, instead: str = "") -> None:
     files.check_file(path)
 
 
-@app.command()
+class _Render(typer.core.TyperCommand):
+    """The command that renders; a picture that is named without its option gets an answer that says it."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read the command line."""
+        if not any(text.startswith("-o") or text.partition("=")[0] == "--output" for text in args):
+            alone = [text for before, text in itertools.pairwise(args) if not before.startswith("-")]
+            for text in alone:
+                if Path(text).suffix.lower() in (".exr", *SUFFIXES, *VIDEO_SUFFIXES):
+                    raise typer.BadParameter(f"expected -o {text}", ctx, param_hint=text)
+        return super().parse_args(ctx, args)
+
+
+@app.command(cls=_Render)
 def render(
     scene: SceneOrMesh,
     output: Annotated[
