@@ -22,7 +22,7 @@ from warpshadow.inverse import (
     Texture,
     fit,
 )
-from warpshadow.inverse.report import Report, write_result
+from warpshadow.inverse.report import Report, _stems, write_result
 from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import parse_camera
@@ -87,6 +87,16 @@ def test_what_is_written_of_a_fit_renders_as_its_result(tmp_path, free, toleranc
     got = rendered_again(tmp_path / "out", result)
     error, change, size = (np.linalg.norm(image) for image in (got - expected, expected - before, expected))
     assert error < tolerance * size < change  # so that what was not written would show
+
+
+def test_files_are_called_as_the_bodies_where_nothing_else_is():
+    def stems(*names):
+        bodies = [ws.Body(ws.icosphere(1.0, 0), name=name) for name in names]
+        return _stems(ws.Scene(bodies, ws.EnvironmentMap.constant(1.0)))
+
+    assert stems("spot", "the-ground") == ["spot", "the-ground"]
+    assert stems("Spot", "spot", "ball") == ["body_0", "body_1", "ball"]
+    assert stems("light", "body_0", "a/b", "a.b", "a_roughness") == [f"body_{number}" for number in range(5)]
 
 
 def test_all_values_are_in_an_archive_by_their_names(tmp_path):

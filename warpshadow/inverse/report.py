@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from warpshadow.inverse.uncertainty import FLAT
 from warpshadow.pipeline.lighting import map_of
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import camera_table, write_scene
+from warpshadow.scene.scene import GLOSS, Scene
 
 SUMMARY = "summary.toml"  # the file of a folder of results that is written last: where it is, the others are
 
@@ -58,16 +60,17 @@ class Report:
 
         Args:
             folder: Made if it is not there. It gets the scene as :func:`warpshadow.write_scene` writes it, to be
-                rendered again; light.exr of light in spherical harmonics, too; summary.toml (how the fit ended, and of
-                each view the camera and the exposure, which a scene does not have); light.png of free light, striped
-                where the images did not determine it; parameters.npz (all values, as the fit holds them); before.png
-                and after.png beside target.png; and loss.png where matplotlib is installed.
+                rendered again, with files named by the bodies where each has a name of its own; light.exr of light in
+                spherical harmonics, too; summary.toml (how the fit ended, and of each view the camera and the exposure,
+                which a scene does not have); light.png of free light, striped where the images did not determine it;
+                parameters.npz (all values, as the fit holds them); before.png and after.png beside target.png; and
+                loss.png where matplotlib is installed.
         Returns:
             The files.
         """
         folder, result = Path(folder), self.result
         scene = result.scene
-        written = write_scene(scene, folder)
+        written = write_scene(scene, folder, stems=_stems(scene))
         if not isinstance(scene.light, EnvironmentMap):
             write_image(folder / "light.exr", map_of(scene.light).astype(np.float32))
             written.append(folder / "light.exr")
@@ -139,6 +142,26 @@ class Report:
             self.result.light.picture().write(folder / "light.png")
             written.append(folder / "light.png")
         return written
+
+
+_OTHER_FILES = ("light", "target", "before", "after", "loss", "preview", "parameters")
+"""Files of a fit whose suffixes bodies' files have, too."""
+
+
+def _stems(scene: Scene) -> list[str]:
+    """Names of the bodies' files: the bodies' own, or body_0 and so on where other files have them."""
+    names = [body.called for body in scene.bodies]
+    lower = [name.lower() for name in names]
+    return [
+        name
+        if re.fullmatch(r"[\w-]+", name)
+        and lower.count(name.lower()) == 1
+        and name.lower() not in _OTHER_FILES
+        and not name.startswith("body_")
+        and not name.endswith(GLOSS)
+        else f"body_{number}"
+        for number, name in enumerate(names)
+    ]
 
 
 def found_values(result: Result) -> list[str]:

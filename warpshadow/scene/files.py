@@ -245,7 +245,7 @@ def _body(table: Table, folder: Path) -> Body:
 # ---------------------------------------------------------------------------------------------- writing
 
 
-def write_scene(scene: Scene, folder: AnyPath) -> list[Path]:
+def write_scene(scene: Scene, folder: AnyPath, *, stems: Sequence[str] | None = None) -> list[Path]:
     """Write a scene file and all that it names; :func:`load_scene` reads back the same scene, bit for bit.
 
     Args:
@@ -253,6 +253,7 @@ def write_scene(scene: Scene, folder: AnyPath) -> list[Path]:
             body_N.obj, body_N.npz where it has spheres of its own, body_N.npy where it has a color for each vertex,
             body_N_roughness.npy and the like where it has one for each vertex, and where it has a texture body_N.exr,
             with body_N.png and body_N.mtl for programs that draw OBJ files.
+        stems: In place of body_0, body_1, …: names of the bodies' files, without suffixes.
     Returns:
         The files.
     """
@@ -262,8 +263,9 @@ def write_scene(scene: Scene, folder: AnyPath) -> list[Path]:
     written: list[Path] = []
     bodies = []
     names = [body.called for body in scene.bodies]
-    for number, body in enumerate(scene.bodies):
-        table, files = _write_body(body, folder / f"body_{number}")
+    stems = [f"body_{number}" for number in range(len(names))] if stems is None else stems
+    for body, stem in zip(scene.bodies, stems, strict=True):
+        table, files = _write_body(body, folder / stem)
         if body.name is not None or names.count(body.called) == 1:
             table["name"] = body.called
         bodies.append(table)
