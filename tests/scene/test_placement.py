@@ -5,6 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import warpshadow as ws
 from warpshadow.scene.placement import enclosures, misplacements
@@ -138,3 +139,13 @@ def test_a_body_that_was_put_on_the_ground_and_framed_gives_no_warning(kind):
         warnings.simplefilter("error")
         image = ws.render(ws.Scene(bodies, LIGHT, visibility=ws.Visibility("none")))
     assert image[128, 128, 3] == 1
+
+
+def test_a_ceiling_as_broad_as_its_floor_is_not_remarked_on():
+    """Turned, their bounds differ by rounding."""
+    turn = Rotation.from_euler("y", np.arange(0, 45, 3), degrees=True)
+    over = turn * Rotation.from_euler("x", 180, degrees=True)
+    for rotation, rotation_over in zip(turn.as_matrix(), over.as_matrix(), strict=True):
+        floor = ws.Body(ws.plane((3.0, 4.0)), rotation=rotation)
+        ceiling = ws.Body(ws.plane((3.0, 4.0)), rotation=rotation_over, translation=(0, 3, 0))
+        assert not misplacements(ws.Scene([floor, ceiling], ws.synthetic_sky(height=8)))

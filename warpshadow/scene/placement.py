@@ -12,6 +12,7 @@ from warpshadow.maths.solid_angle import solid_angles
 from warpshadow.scene.scene import Body, Scene
 
 _LEVEL = 0.99  # cosine of the angle to +y up to which a flat body is a ground
+_BROADER = 1.01  # ratio of breadths up to which a body is as broad as its ground, such as a ceiling
 
 
 class _Box(NamedTuple):
@@ -49,7 +50,7 @@ def misplacements(scene: Scene) -> list[str]:
         if number in grounds or not below:
             continue
         broadest = max(below, key=lambda other: boxes[other].breadth)
-        if box.breadth > boxes[broadest].breadth:
+        if box.breadth > _BROADER * boxes[broadest].breadth:
             remarks.append(
                 f"body {number} ({body.called!r}) is {box.breadth:.3g} broad, and body {broadest} "
                 f"({scene.bodies[broadest].called!r}) below it {boxes[broadest].breadth:.3g}; on_ground(size=…) makes "
