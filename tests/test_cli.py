@@ -676,7 +676,7 @@ def test_an_interrupted_fit_says_how_to_go_on_and_ends_where_it_would_have(fit_f
 
 
 def test_a_fit_that_is_interrupted_as_it_writes_its_results_writes_them_the_next_time(fit_file, tmp_path, monkeypatch):
-    def interrupt(*args):
+    def interrupt(*args, **options):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
