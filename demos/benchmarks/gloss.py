@@ -1,10 +1,12 @@
 """Images of bodies that shine against Mitsuba's, by roughness, of metal and plastic.
 
     python demos/benchmarks/gloss.py [--data FOLDER] [--size 96] [--bounces 0|1|…] [--picture gloss.png]
+    python demos/benchmarks/gloss.py --loops [--data FOLDER] [--size 96] [--bounces 0|1|…]
 
 FOLDER has meshes/ and envmaps/, as for demos/benchmarks/accuracy.py. Mitsuba renders the same surface
 (demos/mitsuba_gloss.py), so that nothing is due to another one. Errors are of the whole image, and of the body that
-shines alone, relative L2, noise of the reference taken off.
+shines alone, relative L2, noise of the reference taken off. With --loops it prints the CPU time of an iteration of
+a torch loop in which the body moves, image and gradient, of the diffuse body and of those that shine, without Mitsuba.
 """
 
 import argparse
@@ -15,11 +17,13 @@ import time
 from pathlib import Path
 
 import numpy as np
+import torch
 
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.references import Reference, Request
 from demos.scenes import shipped_mesh
+from warpshadow.torch import TorchRenderer
 
 ROUGHNESS = (0.2, 0.35, 0.6)
 KINDS = {"metal": {"albedo": (0.9, 0.65, 0.35), "metallic": 1.0}, "plastic": {"albedo": (0.15, 0.35, 0.6)}}
@@ -79,6 +83,34 @@ def body_error(reference: Reference, shown: np.ndarray) -> float:
     return float(np.sqrt(max(error**2 - noise**2, 0)) / np.linalg.norm(truth))
 
 
+def iteration_seconds(scene: ws.Scene, count: int = 5) -> float:
+    """CPU time of an image of a moved body and its gradient, the median of some, after one that prepares."""
+    renderer = TorchRenderer(scene, progress=False)
+    rotations, translations, scales = renderer.scene_poses()
+    seconds = []
+    for number in range(count + 1):
+        shift = torch.tensor([0.01 * number, 0.0, 0.0]) * torch.tensor([[1.0], [0.0]])
+        moved = (translations + shift).requires_grad_()
+        start = time.process_time()
+        renderer(geometry=renderer.placed(rotations, moved, scales, moving=[0])).square().sum().backward()
+        seconds.append(time.process_time() - start)
+        assert moved.grad is not None and moved.grad[0].any()
+    return float(np.median(seconds[1:]))
+
+
+def print_loops(of_bodies: dict[str, ws.Scene], bounces: int) -> None:
+    """Print times of iterations, of diffuse bodies and of the same that shine."""
+    print(f"{'body':16}{'diffuse':>10}" + "".join(f"{kind:>18}" for kind in KINDS))
+    for name, plain in of_bodies.items():
+        plain = dataclasses.replace(plain, bounces=bounces)
+        diffuse = iteration_seconds(plain)
+        line = f"{name:16}{diffuse:8.3f} s"
+        for kind in KINDS:
+            seconds = iteration_seconds(glossy(plain, ROUGHNESS[1], kind))
+            line += f"{seconds:8.3f} s ({seconds / diffuse:.1f} x)"
+        print(line, flush=True)
+
+
 def main() -> None:
     """Print the tables, and write a contact sheet."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -90,8 +122,12 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
     parser.add_argument("--references", type=Path, default=Path("out/references"), help="where references stay")
     parser.add_argument("--picture", type=Path, help="contact sheet: reference, then each method")
+    parser.add_argument("--loops", action="store_true", help="times of iterations of a torch loop, and no images")
     arguments = parser.parse_args()
     ws.quiet()
+    if arguments.loops:
+        print_loops(scenes(arguments.data, arguments.size, arguments.bodies), arguments.bounces)
+        return
     errors: dict[str, list[float]] = {method: [] for method in arguments.methods}
     sheet = []
     print(f"{'body':16}{'roughness':10}{'kind':9}" + "".join(f"{name:>8} body    time" for name in arguments.methods))
