@@ -16,12 +16,15 @@ import warp as wp
 
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow
+from warpshadow import stages
 
 
 def main(output: Path) -> None:
     for value in list(vars(wp).values()):
         if isinstance(value, type) and value.__module__.startswith("warp."):
             value.__module__ = "warp"  # where users find it, in place of where it is defined
+    for package in (warpshadow, stages):  # pdoc does not ask for names that are imported when they are asked for
+        vars(package).update({name: getattr(package, name) for name in package.__all__})
     names = [module.name for module in pkgutil.walk_packages(warpshadow.__path__, "warpshadow.")]
     # pdoc shows an annotation that it cannot evaluate as it is written, which is fine
     warnings.filterwarnings("ignore", message="Error parsing type annotation")
