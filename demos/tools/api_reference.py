@@ -28,6 +28,7 @@ def main(output: Path) -> None:
     names = [module.name for module in pkgutil.walk_packages(warpshadow.__path__, "warpshadow.")]
     # pdoc shows an annotation that it cannot evaluate as it is written, which is fine
     warnings.filterwarnings("ignore", message="Error parsing type annotation")
+    warnings.filterwarnings("error", message="Found .* in .*__all__")  # names without documentation
     pdoc.render.configure(docformat="google", show_source=False)
     pdoc.pdoc("warpshadow", *names, output_directory=output)
     print(f"wrote {output / 'index.html'}")
