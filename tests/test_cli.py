@@ -192,8 +192,8 @@ def test_a_mesh_is_shown_in_place_of_a_scene(cone, monkeypatch):
         served.append((scene, options["path"]))
         return Served()
 
-    monkeypatch.setattr("warpshadow.cli.serve", serve)
-    monkeypatch.setattr("warpshadow.cli.os._exit", lambda status: None)
+    monkeypatch.setattr("warpshadow.cli.scenes.serve", serve)
+    monkeypatch.setattr("warpshadow.cli.scenes.os._exit", lambda status: None)
     result = run("view", cone, "--no-browser")
     assert result.exit_code == 0, result.output
     assert "z is taken to be up" in result.stdout
@@ -265,7 +265,7 @@ def test_a_turntable_goes_around_at_one_exposure(scene, tmp_path):
 def test_frames_of_a_video_are_stills_where_that_is_asked_for(scene, tmp_path, monkeypatch, options):
     scene.write_text(SCENE.replace("directions = 32\n", ""))
     frames = []
-    monkeypatch.setattr("warpshadow.cli.write_video", lambda path, pictures, fps: frames.extend(pictures))
+    monkeypatch.setattr("warpshadow.cli.rendering.write_video", lambda path, pictures, fps: frames.extend(pictures))
     assert run("render", scene, "-o", tmp_path / "turn.gif", "--turntable", 4, *options).exit_code == 0
     loaded = ws.load_scene(scene)
     assert loaded.visibility.method is None

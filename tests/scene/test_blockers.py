@@ -203,7 +203,7 @@ def test_fits_that_take_long_are_announced_with_the_way_around_them(tmp_path, mo
 @pytest.mark.parametrize(
     ("method", "body_options", "expected"),
     [
-        ("directional", {}, blockers.STAND_INS),
+        ("directional", {}, blockers.SPHERES_BESIDE_PARTS),
         ("directional", {"blockers": 24}, 24),
         ("directional", {"self_shadows": "spheres"}, "auto"),
         ("log-sh", {}, "auto"),

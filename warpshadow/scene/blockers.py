@@ -11,7 +11,7 @@ from warpshadow.scene.scene import SPHERE_METHODS, Body, Scene
 from warpshadow.spheres import Spheres, fit_spheres
 from warpshadow.spheres.fit import fit_seconds, is_fitted
 
-STAND_INS = 64
+SPHERES_BESIDE_PARTS = 64
 """Spheres of a body that blocks as convex parts: they send the light that it reflects, and block while it is deformed.
 
 Images of the table and the shelf of demos/kinds.py with all bounces are 2.3 and 4.8% off with 32, 2.3 and 4.9% with
@@ -65,7 +65,7 @@ def fitted_counts(scene: Scene) -> dict[int, int | str]:
         if (count := _wanted(body)) and grounds[number] is None:
             takes_parts = visibility.method == "directional" and body.blocks_as_parts
             traced = (body.self_shadows or visibility.self_shadows) != "spheres"
-            result[number] = STAND_INS if takes_parts and traced else count
+            result[number] = SPHERES_BESIDE_PARTS if takes_parts and traced else count
     return result
 
 

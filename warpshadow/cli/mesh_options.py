@@ -1,0 +1,121 @@
+"""Options of meshes that are given in place of scene files: their default scene."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, Optional
+
+import typer
+
+from warpshadow.assets.camera import DIRECTION
+from warpshadow.cli.console import note
+from warpshadow.scene.scene import Scene
+
+SceneOrMesh = Annotated[
+    Path,
+    typer.Argument(
+        help="Scene file, TOML, whose keys warpshadow/scene/README.md lists; or a mesh: .obj, .ply, .stl, .glb, .usd."
+    ),
+]
+
+Up = Annotated[
+    Optional[Literal["y", "z"]],
+    typer.Option(help="Of a mesh: the axis that points up; without it, it is guessed by how the mesh stands."),
+]
+
+
+def _two_numbers(size: tuple[str, str] | None) -> tuple[str, str] | None:
+    """Refuse a size that is not two numbers, such as one number and the next option."""
+    if size is not None and not all(text.isdecimal() for text in size):
+        square = f", such as {size[0]} {size[0]}" if size[0].isdecimal() else ", such as 512 512"
+        raise typer.BadParameter(f"got {' '.join(size)}, expected width and height{square}")
+    return size
+
+
+Size = Annotated[
+    Optional[tuple[str, str]],
+    typer.Option(
+        help="Of a mesh: width and height of the image, in pixels; without it 512 512.",
+        metavar="WIDTH HEIGHT",
+        callback=_two_numbers,
+    ),
+]
+
+Light = Annotated[
+    Optional[Path], typer.Option(help="Of a mesh: file of an environment map, .exr or .hdr, in place of a sky.")
+]
+
+Direction = Annotated[
+    Optional[tuple[float, float, float]],
+    typer.Option(
+        help="Of a mesh: where the camera stands, seen from the mesh's middle, y up; without it 0.3 0.4 0.9; from "
+        "behind it is 0.3 0.4 -0.9.",
+        metavar="X Y Z",
+    ),
+]
+
+LightRotation = Annotated[
+    Optional[float],
+    typer.Option(help="Of a mesh: turn the light, counterclockwise seen from above, in degrees.", metavar="DEGREES"),
+]
+
+
+class MeshOptions(NamedTuple):
+    """Options of the default scene of a mesh; None as it is without."""
+
+    up: str | None
+    size: tuple[str, str] | None
+    light: Path | None
+    direction: tuple[float, float, float] | None
+    light_rotation: float | None
+
+
+_KEYS_OF_SCENES = {
+    "--up": "[[body]] rotation",
+    "--size": "[camera] size",
+    "--light": "[light]",
+    "--direction": '[camera] direction, beside framing = "auto", or eye and target',
+    "--light-rotation": "[light] rotation",
+}
+"""Keys that scene files have in place of the options of meshes, in the order of these."""
+
+
+def load(file: Path, is_quiet: bool, options: MeshOptions, **settings: Any) -> Scene:
+    """The scene of a file, or the default one of a mesh's file; of that a note says which way is up."""
+    from warpshadow.assets.mesh_files import MESH_SUFFIXES
+    from warpshadow.scene.files import load_scene, turned_light
+    from warpshadow.scene.mesh_scene import default_scene, guess_up
+    from warpshadow.scene.scene import Body, Visibility
+
+    if file.suffix.lower() not in (*MESH_SUFFIXES, ".toml") and file.is_file():
+        expected = f".toml for a scene file, or a mesh's: {', '.join(MESH_SUFFIXES)}"
+        raise ValueError(f"{file}: got extension {file.suffix!r}, expected {expected}")
+    if file.suffix.lower() not in MESH_SUFFIXES:
+        for (option, key), value in zip(_KEYS_OF_SCENES.items(), options, strict=True):
+            if value is not None:
+                shown = " ".join(map(str, value)) if isinstance(value, tuple) else value
+                raise ValueError(f"{option}: got {shown} with {file}, expected a mesh; scene files have {key}")
+        return load_scene(file, **settings)
+    body = Body(file)
+    up = options.up
+    if up is None:
+        guess = guess_up(body.mesh, file.suffix.lower())
+        up = guess.axis
+        note(f"{file}: {up} is taken to be up ({guess.reason}); --up {'zy'['yz'.index(up)]} says otherwise", is_quiet)
+    width, height = map(int, options.size or ("512", "512"))
+    direction = options.direction or DIRECTION
+    scene = default_scene(body, up=up, size=(width, height), light=options.light, direction=direction)
+    light = turned_light(scene.light, options.light_rotation or 0.0, 1.0)
+    bounces = settings.pop("bounces", scene.bounces)
+    return replace(scene, light=light, visibility=Visibility.of(settings), bounces=bounces)
+
+
+def count_of_bounces(text: str) -> Any:
+    """A number of bounces, or "all"; others are refused as everywhere else."""
+    from warpshadow.scene.scene import check_bounces
+
+    count = int(text) if text.lstrip("-").isdecimal() else text
+    try:
+        check_bounces(count)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
+    return count

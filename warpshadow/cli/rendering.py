@@ -1,0 +1,227 @@
+"""Images and videos: render."""
+
+import itertools
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, Optional
+
+import numpy as np
+import typer
+import typer.core
+import warp as wp
+
+from warpshadow.assets.camera import Camera
+from warpshadow.assets.picture import SUFFIXES, Picture
+from warpshadow.assets.video import VIDEO_SUFFIXES, check_video, write_video
+from warpshadow.cli.console import Device, Quiet, app, check_output, clear_errors, device_of, note
+from warpshadow.cli.mesh_options import (
+    Direction,
+    Light,
+    LightRotation,
+    MeshOptions,
+    SceneOrMesh,
+    Size,
+    Up,
+    count_of_bounces,
+    load,
+)
+from warpshadow.scene.scene import Scene
+
+_BACKGROUNDS = ("transparent", "environment")  # beside colors
+
+
+class _Render(typer.core.TyperCommand):
+    """The command that renders; a picture that is named without its option gets an answer that says it."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read the command line."""
+        if not any(text.startswith("-o") or text.partition("=")[0] == "--output" for text in args):
+            alone = [text for before, text in itertools.pairwise(args) if not before.startswith("-")]
+            for text in alone:
+                if Path(text).suffix.lower() in (".exr", *SUFFIXES, *VIDEO_SUFFIXES):
+                    raise typer.BadParameter(f"expected -o {text}", ctx, param_hint=text)
+        return super().parse_args(ctx, args)
+
+
+@app.command(cls=_Render)
+def render(
+    scene: SceneOrMesh,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o",
+            "--output",
+            help="Image to write: .png or .jpg, in sRGB, or .exr, linear float32 RGBA, alpha = coverage; with "
+            "--turntable or --camera-path a video: .mp4, .gif, .webp.",
+        ),
+    ],
+    up: Up = None,
+    size: Size = None,
+    light: Light = None,
+    direction: Direction = None,
+    light_rotation: LightRotation = None,
+    png: Annotated[Optional[Path], typer.Option(help="Beside an .exr, also write a picture: .png, or .jpg.")] = None,
+    exposure: Annotated[
+        Optional[float],
+        typer.Option(help="Exposure of the picture in stops; without it the brightest 1% just saturate."),
+    ] = None,
+    tone: Annotated[
+        Literal["clip", "filmic"], typer.Option(help="What becomes of bright color in the picture: cut off, or bent.")
+    ] = "clip",
+    background: Annotated[
+        str,
+        typer.Option(
+            help="Background of the picture or video: environment, a color (white, #ffcc00), or transparent, which "
+            ".jpg files and videos show as white."
+        ),
+    ] = "transparent",
+    turntable: Annotated[
+        Optional[int], typer.Option(help="Write a video of so many frames in which the camera goes around.", min=1)
+    ] = None,
+    fps: Annotated[
+        Optional[float],
+        typer.Option(help="Frames a second of a turntable, 24 by default; 0.1 to 1000, of .webp 90, of .gif 50."),
+    ] = None,
+    camera_path: Annotated[
+        Optional[Path],
+        typer.Option(
+            help="Write a video along the keyframes of a TOML file, whose keys warpshadow/scene/README.md lists."
+        ),
+    ] = None,
+    stills: Annotated[
+        bool,
+        typer.Option(
+            "--stills",
+            help="Render each frame of a video as an image alone: by rays, if the scene names no method. Shadows are "
+            "better, and nothing is prepared, but each frame takes two to three times as long.",
+        ),
+    ] = False,
+    layers: Annotated[
+        bool,
+        typer.Option(
+            "--layers",
+            help="Also write depth (Z), normals (N.X, N.Y, N.Z), numbers of bodies (body) and their masks (mask.0, …) "
+            "as channels of the image.",
+        ),
+    ] = False,
+    method: Annotated[
+        Optional[Literal["directional", "log-sh", "none", "ray-traced", "auto"]],
+        typer.Option(
+            help="How visibility is computed, in place of the scene's; ray-traced, the reference, is a path tracer "
+            "where light bounces."
+        ),
+    ] = None,
+    samples: Annotated[
+        Optional[int],
+        typer.Option(help="Of the ray-traced method: rays of a pixel, and with bounces half as many paths.", min=1),
+    ] = None,
+    bounces: Annotated[
+        Any,
+        typer.Option(
+            help="How often light bounces, 0 to 16 or all, in place of the scene's.",
+            parser=count_of_bounces,
+            metavar="INTEGER|all",
+        ),
+    ] = None,
+    device: Device = "cpu",
+    is_quiet: Quiet = False,
+) -> None:
+    """Render a scene file, or a mesh on a ground under a sky, to an image with soft shadows."""
+    from warpshadow.assets.image import write_image
+    from warpshadow.pipeline.choice_of_receivers import for_picture
+    from warpshadow.pipeline.renderer import SceneRenderer
+    from warpshadow.scene.camera_path import CameraPath
+    from warpshadow.scene.scene import AUTO
+    from warpshadow.tuning.tune import describe, resolved
+    from warpshadow.tuning.video_time import remark_on_stills
+
+    with clear_errors():
+        video = "--turntable" if turntable is not None else "--camera-path" if camera_path is not None else None
+        path = None if camera_path is None else CameraPath.read(camera_path)
+        if video is None:
+            if stills:
+                raise ValueError("--stills: got it for an image, expected --turntable FRAMES or --camera-path FILE")
+            is_video = output.suffix.lower() in VIDEO_SUFFIXES
+            remedy = "; videos take --turntable FRAMES or --camera-path FILE" if is_video else ""
+            check_output(output, ".exr", *SUFFIXES, instead=remedy)
+            if layers and output.suffix.lower() in SUFFIXES:
+                raise ValueError(f"--layers: got it with {output}, expected an .exr file, which has channels for them")
+        else:
+            check_output(output, *VIDEO_SUFFIXES)
+            for option, value in (("--png", png), ("--layers", layers or None), ("--camera-path", camera_path)):
+                if value is not None and option != video:
+                    raise ValueError(f"{option}: got it beside {video}, expected one of them")
+        if fps is not None and turntable is None:
+            expected = "fps in the file" if path is not None else "--turntable FRAMES with it"
+            raise ValueError(f"--fps: got {fps:g} without --turntable, expected {expected}")
+        rate = path.fps if path is not None else 24.0 if fps is None else fps
+        if video is not None:
+            check_video(output, rate)
+        if png is not None:
+            check_output(png, *SUFFIXES)
+        plain = None if background in _BACKGROUNDS else background
+        try:
+            Picture(np.zeros((1, 1, 4)), exposure=exposure, background=plain)  # refused before the work
+        except ValueError as error:
+            others = f", or one of {', '.join(_BACKGROUNDS)}" if str(error).startswith("background") else ""
+            raise ValueError(f"--{error}{others}") from error
+        arguments: dict[str, Any] = {"method": method, "samples": samples, "bounces": bounces}
+        arguments = {name: value for name, value in arguments.items() if value is not None}
+        parsed = load(scene, is_quiet, MeshOptions(up, size, light, direction, light_rotation), **arguments)
+        where = device_of(device)
+        loaded = parsed
+        if parsed.visibility.method == AUTO:
+            loaded = resolved(parsed, device=where, progress=True)
+            note(f"auto: {describe(loaded)}", is_quiet)
+        loaded = for_picture(loaded if video is None or stills else loaded.with_method())
+        start = time.perf_counter()
+        if video is not None:
+            cameras = path.cameras(loaded.camera) if path is not None else loaded.camera.around(loaded, turntable or 1)
+            if not stills and (remark := remark_on_stills(parsed, len(cameras), device=where)):
+                note(remark, is_quiet)
+            frames = _frames(loaded, cameras, where, exposure, tone, background)
+            write_video(output, frames, fps=rate)
+            note(f"{output}: {len(cameras)} frames, rendered in {time.perf_counter() - start:.2f} s", is_quiet)
+            return
+        renderer = SceneRenderer(loaded, device=where, progress=True)
+        image = renderer.render()
+        seconds = time.perf_counter() - start
+        messages = f"{loaded.visibility.method}, {image.shape[1]} × {image.shape[0]}, {seconds:.2f} s"
+        if output.suffix.lower() == ".exr":
+            write_image(output, image, layers=renderer.layers().channels() if layers else None)
+            note(f"{output}: {messages}", is_quiet)
+        for file in (item for item in (output, png) if item is not None and item.suffix.lower() != ".exr"):
+            picture = Picture(image, exposure=exposure, tone=tone, background=_behind(loaded, background))
+            write_image(file, picture)
+            note(f"{file}: {f'{messages}, ' * (file == output)}exposure {picture.exposure:+.2f} stops", is_quiet)
+
+
+def _behind(scene: Scene, background: str) -> str | np.ndarray | None:
+    """The background of a picture, by its option."""
+    if background == "environment":
+        return scene.background()
+    return None if background == "transparent" else background
+
+
+def _frames(
+    scene: Scene, cameras: list[Camera], device: wp.Device, exposure: float | None, tone: str, background: str
+) -> Iterator[Picture]:
+    """Pictures from cameras, by default at the exposure of the first."""
+    from warpshadow.device.progress import progress_bar
+    from warpshadow.pipeline.renderer import SceneRenderer
+
+    renderer = SceneRenderer(scene, device=device, progress=True)
+
+    def picture(camera: Camera, exposure: float | None) -> Picture:
+        image = renderer.with_cameras([camera]).render()[0]
+        behind = _behind(replace(scene, camera=camera), background)
+        return Picture(image, exposure=exposure, tone=tone, background=behind)
+
+    first = picture(cameras[0], exposure)  # its set-up, fits and tracing, has bars of its own
+    with progress_bar(len(cameras), "rendering", "frame", done=1) as bar:
+        yield first
+        for camera in cameras[1:]:
+            yield picture(camera, first.exposure)
+            bar.update()
