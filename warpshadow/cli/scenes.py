@@ -171,7 +171,7 @@ def tune(
         typer.echo(tuning.toml(), nl=False)
 
 
-def _next_attempt(tuning: Tuning, is_inaccurate: bool) -> str:
+def _next_attempt(tuning: "Tuning", is_inaccurate: bool) -> str:
     """Suggestions for reaching an error that no setting reached."""
     if not is_inaccurate:
         return "try a smaller image or fewer samples a pixel (supersampling = 1)"
