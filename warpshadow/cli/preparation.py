@@ -1,4 +1,4 @@
-"""What scenes are prepared from: spheres, maps, caches, kernels."""
+"""Spheres, maps, caches and kernels, which scenes are prepared from."""
 
 import time
 from pathlib import Path

@@ -36,7 +36,7 @@ _ELSEWHERE = {
     **dict.fromkeys(("poses", "rotations", "translations"), "geometry=renderer.placed(rotations, translations)"),
     "envmap": "light=",
 }
-"""What to write in place of keywords that a call does not have."""
+"""Remedies for keywords that a call does not have."""
 
 REFLECTANCE = ("albedo", "textures", *GLOSS)
 """Arguments that bodies have, each its own."""
