@@ -143,7 +143,7 @@ def test_a_body_that_was_put_on_the_ground_and_framed_gives_no_warning(kind):
 
 def test_a_ceiling_as_broad_as_its_floor_is_not_remarked_on():
     """Turned, their bounds differ by rounding."""
-    turn = Rotation.from_euler("y", np.arange(0, 45, 3), degrees=True)
+    turn = Rotation.from_euler("y", np.arange(0, 45, 3)[:, None], degrees=True)
     over = turn * Rotation.from_euler("x", 180, degrees=True)
     for rotation, rotation_over in zip(turn.as_matrix(), over.as_matrix(), strict=True):
         floor = ws.Body(ws.plane((3.0, 4.0)), rotation=rotation)

@@ -199,8 +199,8 @@ def test_a_missing_table_is_named(load, name):
     [
         (MINIMAL.replace("eye = [0, 1, 4]", ""), ["[camera]", "eye: missing", "expected 3 finite numbers"]),
         (MINIMAL.replace("target = [0, 0, 0]", ""), ["[camera]", "target: missing", "expected 3 finite numbers"]),
-        (CAMERA + "[light]\n" + BODY, ["[light]", "either envmap", "or sh"]),
-        (CAMERA + LIGHT + 'envmap = "x.exr"\n' + BODY, ["[light]", "either envmap", "or sh"]),
+        (CAMERA + "[light]\n" + BODY, ["[light]", "one of envmap", "sky", "and sh"]),
+        (CAMERA + LIGHT + 'envmap = "x.exr"\n' + BODY, ["[light]", "one of envmap", "sky", "and sh"]),
         (CAMERA + LIGHT + "[[body]]\n", ["1st [[body]]", "either mesh", "or primitive"]),
         (MINIMAL + 'mesh = "x.obj"\n', ["1st [[body]]", "either mesh", "'plane', 'icosphere'"]),
         (MINIMAL + 'albedo = [1, 1, 1]\ntexture = "x.png"\n', ["1st [[body]]", "either albedo or texture"]),

@@ -100,6 +100,7 @@ def prepare() -> None:
     warnings.simplefilter("ignore")  # the viewer warns of the same
     start_quietly()
     scene, device = pickle.load(sys.stdin.buffer)
+    sys.unraisablehook = _interrupt_again
     threading.Thread(target=_end_with_viewer, daemon=True).start()
     if hasattr(os, "nice"):
         os.nice(5)
@@ -109,6 +110,14 @@ def prepare() -> None:
         page = own_page(scene, painter.page_scale)
         for quality in _QUALITIES:
             painter.image(viewer_state, page, quality)
+
+
+def _interrupt_again(unraisable: sys.UnraisableHookArgs) -> None:
+    """Interrupt once more where Python dropped an interrupt, since it came while an array was freed."""
+    if isinstance(unraisable.exc_value, KeyboardInterrupt):
+        _thread.interrupt_main()
+    else:
+        sys.__unraisablehook__(unraisable)
 
 
 def _end_with_viewer() -> None:
