@@ -23,10 +23,6 @@ app = typer.Typer(
 DIVERGED = 3
 INTERRUPTED = 130
 
-# Exit statuses beside 0, 1 (a mistake in a file or value) and 2 (a mistake in the command line).
-DIVERGED = 3
-INTERRUPTED = 130
-
 Device = Annotated[str, typer.Option(help="Where to compute: cpu, cuda:0, …")]
 
 
