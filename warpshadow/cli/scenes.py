@@ -1,5 +1,6 @@
 """Scenes: write one to begin with, put it into a photograph, view it, tune its settings."""
 
+import contextlib
 import os
 import sys
 import time
@@ -111,9 +112,10 @@ def view(
         loaded = load(scene, is_quiet, MeshOptions(up, None, light, direction, light_rotation))
         file = scene if scene.suffix.lower() == ".toml" else None
         viewer = serve(loaded, host=host, port=port, device=device_of(device), path=file)
-        typer.echo(f"{viewer.url}   (Ctrl+C ends it)")
-        viewer.open(browser)
-        viewer.wait()
+        with contextlib.suppress(KeyboardInterrupt):  # from the first moment that a page can be seen
+            typer.echo(f"{viewer.url}   (Ctrl+C ends it)")
+            viewer.open(browser)
+            viewer.wait()
     sys.stdout.flush()
     os._exit(0)  # exit at once: Python's own exit waits for compiling and painting threads, and unloads all kernels
 
