@@ -15,7 +15,7 @@ import numpy as np
 import warpshadow as ws
 from warpshadow.scene.scene import GLOSS
 
-LEAST_PIXELS = 16  # of a body, to be measured
+MIN_PIXELS = 16  # of a body, to be measured
 BLOCK = 8  # pixels across
 _ACROSS = 2
 """Samples across a pixel. Rays go in sixteen sets of directions, so few rays of many samples err all in the same way:
@@ -64,14 +64,14 @@ class Reference:
         """Pixels of a body, [height, width]: those that show nothing else, or for thin bodies little else."""
         shown = self.covered & (self.body == number)
         whole = shown & self.is_whole
-        return whole if whole.sum() >= LEAST_PIXELS else shown
+        return whole if whole.sum() >= MIN_PIXELS else shown
 
     def body_errors(self, image: np.ndarray, count: int) -> list[float | None]:
         """How much brighter each body is on average, relative; None for those that are hardly seen."""
         errors: list[float | None] = []
         for number in range(count):
             pixels = self.pixels(number)
-            truth = self.mean[pixels, :3].mean() if pixels.sum() >= LEAST_PIXELS else 0.0
+            truth = self.mean[pixels, :3].mean() if pixels.sum() >= MIN_PIXELS else 0.0
             errors.append(float(image[pixels, :3].mean() / truth - 1) if truth > 0 else None)
         return errors
 

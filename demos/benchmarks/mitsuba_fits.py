@@ -35,7 +35,7 @@ from warpshadow import inverse
 from warpshadow.inverse.target import stacked
 
 SAMPLES = 64  # a pixel, for the image and again for its gradient
-LEAST_LLVM = (17,)  # before, x86 has no minimum and maximum that pass NaN on
+MIN_LLVM = (17,)  # before, x86 has no minimum and maximum that pass NaN on
 LIGHT_HEIGHT = 64  # rows of the map that stands for light in spherical harmonics
 
 Tensors = dict[str, torch.Tensor]
@@ -212,9 +212,9 @@ def _check_compiler() -> None:
     import drjit as dr
 
     version = dr.detail.llvm_version() if dr.has_backend(dr.JitBackend.LLVM) else ()
-    if version < LEAST_LLVM:
+    if version < MIN_LLVM:
         got = ".".join(map(str, version)) or "none"
-        raise ValueError(f"Mitsuba: got LLVM {got}, expected {LEAST_LLVM[0]} or newer, named by DRJIT_LIBLLVM_PATH")
+        raise ValueError(f"Mitsuba: got LLVM {got}, expected {MIN_LLVM[0]} or newer, named by DRJIT_LIBLLVM_PATH")
 
 
 def _mesh(body: ws.Body, number: int) -> Any:

@@ -52,7 +52,7 @@ SETTINGS = ("still-direct", "kept-direct", "still-full", "kept-full")
 ALL_BOUNCES = 16
 FULL_COLOR = 0.5  # difference, over the mean of the image, that is as red or blue as can be
 MOVED_RUNS = 3
-LEAST_TILE = 256  # pixels across a picture of the contact sheet
+MIN_TILE = 256  # pixels across a picture of the contact sheet
 SEEN = 0.95  # share of pixels of the reference that the contact sheet does not clip
 
 
@@ -221,7 +221,7 @@ def draw_sheet(
             color = 1 - red * (0, 1, 1) - blue * (1, 1, 0)
             tiles.append((f"{setting}, difference", np.uint8(255 * color)))
         rows.append(tiles)
-    label, times = 16, max(1, LEAST_TILE // len(next(iter(images.values()))))
+    label, times = 16, max(1, MIN_TILE // len(next(iter(images.values()))))
     height, width = (times * length for length in next(iter(images.values())).shape[:2])
     sheet = Image.new("RGB", (max(map(len, rows)) * width, len(rows) * (height + label)), "white")
     for row, tiles in enumerate(rows):

@@ -13,14 +13,14 @@ import nbformat
 from nbclient import NotebookClient
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
-MOST_SECONDS = 600  # of a cell: the first one of a new machine compiles kernels and fits spheres
+MAX_SECONDS = 600  # of a cell: the first one of a new machine compiles kernels and fits spheres
 
 
 def executed(path: Path, *more: str) -> nbformat.NotebookNode:
     """A notebook as it is after it has run from its own folder, with further cells behind its own."""
     notebook = nbformat.read(path, as_version=4)
     notebook.cells += [nbformat.v4.new_code_cell(source) for source in more]
-    NotebookClient(notebook, timeout=MOST_SECONDS, resources={"metadata": {"path": str(path.parent)}}).execute()
+    NotebookClient(notebook, timeout=MAX_SECONDS, resources={"metadata": {"path": str(path.parent)}}).execute()
     return notebook
 
 

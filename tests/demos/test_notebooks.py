@@ -12,7 +12,7 @@ from demos.tools.run_notebooks import NOTEBOOKS, executed, lasting_outputs, tidi
 
 SCRIPTS = Path(__file__).parents[2] / "demos" / "scripts"
 
-MOST_BYTES = 1e6
+MAX_BYTES = 1e6
 
 FOUND = {
     "first_picture": "assert error(image) < 0.07 < 0.2 < error(unshadowed)",
@@ -40,7 +40,7 @@ def test_a_notebook_finds_what_it_says(path):
 @each_notebook
 def test_a_notebook_is_small_and_has_its_pictures(path):
     text = path.read_text("utf-8")
-    assert len(text) < MOST_BYTES
+    assert len(text) < MAX_BYTES
     outputs = [output for cell in json.loads(text)["cells"] for output in cell.get("outputs", [])]
     assert any("image/png" in output.get("data", {}) for output in outputs)
     assert not any(output["output_type"] == "error" for output in outputs)

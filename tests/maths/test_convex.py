@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from warpshadow.maths.convex import MOST_FACES, find_convex_parts
+from warpshadow.maths.convex import MAX_FACES, find_convex_parts
 
 
 def parts_of(mesh):
@@ -67,8 +67,8 @@ def test_bodies_that_are_not_all_convex_have_no_parts():
     assert parts_of(dented) is None
     assert parts_of(together(box(), trimesh.creation.torus(1.0, 0.3))) is None
     assert parts_of(trimesh.creation.icosphere(2)) is None  # more than 64 faces
-    assert parts_of(trimesh.creation.cylinder(1, 1, sections=MOST_FACES - 1)) is None
-    assert len(parts_of(trimesh.creation.cylinder(1, 1, sections=MOST_FACES - 2))) == 1
+    assert parts_of(trimesh.creation.cylinder(1, 1, sections=MAX_FACES - 1)) is None
+    assert len(parts_of(trimesh.creation.cylinder(1, 1, sections=MAX_FACES - 2))) == 1
     assert find_convex_parts(np.zeros((3, 3)), np.array([[0, 1, 2]])) is None
 
 

@@ -414,7 +414,7 @@ def test_a_body_has_as_many_spheres_as_it_needs(monkeypatch):
     """A ball few, and a slab, whose shadow has holes as long as they are few, as many as there may be."""
     monkeypatch.setattr(enough, "TRIED", (8, 32))
     meshes = (normalized(mesh, "cpu") for mesh in (icosphere(1.0, 3), box((1.0, 0.05, 0.8), 2)))
-    for mesh, expected in zip(meshes, ((8, 16), (32, enough.MOST_SPHERES)), strict=True):
+    for mesh, expected in zip(meshes, ((8, 16), (32, enough.MAX_SPHERES)), strict=True):
         receivers = FitReceivers(mesh, 2048, np.random.default_rng(SEED))
         assert enough.enough_spheres(mesh, receivers, seed=0) in expected
 

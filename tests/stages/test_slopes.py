@@ -12,7 +12,7 @@ from warpshadow.stages.project import to_clip
 from warpshadow.stages.rasterization import rasterize
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
 from warpshadow.stages.silhouettes.find import find_silhouettes
-from warpshadow.stages.slopes import LEAST_DISTANCE, moving_radiance
+from warpshadow.stages.slopes import MIN_DISTANCE, moving_radiance
 
 # float32 kernels against float64; measured 2e-6.
 FLOAT32 = 2e-5
@@ -108,7 +108,7 @@ def twin(drawn):
                         is_own = np.linalg.det(
                             np.stack([*clip[edge][:, [0, 1, 3]], [*(2 * here / [width, height] - 1), 1]])
                         )
-                        if is_own > 0 and t > LEAST_DISTANCE:
+                        if is_own > 0 and t > MIN_DISTANCE:
                             rises += (
                                 sign * min(t, 0.5) / t * (edge_colors[batch, entries[sample], side] - color[sample])
                             )

@@ -17,7 +17,7 @@ from warpshadow.check import AnyPath
 
 SUFFIXES = (".png", ".jpg", ".jpeg")  # suffixes of picture files
 
-MOST_STOPS = 100  # 2 to it is a float32
+MAX_STOPS = 100  # 2 to it is a float32
 
 TONES: dict[str, Callable[[np.ndarray], np.ndarray]] = {"clip": lambda color: color, "filmic": filmic}
 """Tone curves of exposed color before it is clipped at 1."""
@@ -58,9 +58,9 @@ class Picture:
     ):
         linear = _checked("image", image)
         check.choice("tone", tone, TONES)
-        if exposure is not None and not (check.is_number(exposure) and abs(exposure) <= MOST_STOPS):
+        if exposure is not None and not (check.is_number(exposure) and abs(exposure) <= MAX_STOPS):
             raise ValueError(
-                f"exposure: got {check.described(exposure)}, expected {-MOST_STOPS} to {MOST_STOPS} stops, or None"
+                f"exposure: got {check.described(exposure)}, expected {-MAX_STOPS} to {MAX_STOPS} stops, or None"
             )
         self.exposure = auto_exposure(linear) if exposure is None else float(exposure)
         self.tone = tone

@@ -67,12 +67,12 @@ def spheres(
 
 def _judgement(report: FitReport) -> str:
     """The meaning of a fit's errors for images."""
-    from warpshadow.spheres.enough import MOST_SPHERES, RAGGED
+    from warpshadow.spheres.enough import MAX_SPHERES, RAGGED
 
     own = "the error on the surface counts where the body deforms, else it traces its shadow on itself"
     if report.shadow_error <= RAGGED:
         return f"the shadow on the ground is whole, as its error is below {RAGGED:.0%}; {own}"
-    more = f"--count {2 * report.sphere_count}" if report.sphere_count < MOST_SPHERES else 'method = "ray-traced"'
+    more = f"--count {2 * report.sphere_count}" if report.sphere_count < MAX_SPHERES else 'method = "ray-traced"'
     return f"the shadow on the ground has holes, as its error is above {RAGGED:.0%}; {more} may mend them; {own}"
 
 

@@ -11,7 +11,7 @@ import warp as wp
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_MOST_RESULTS = 256
+_MAX_RESULTS = 256
 """Results of a function that are cached; the oldest go first."""
 
 _collections: dict[int, list[wp.array]] = {}  # by their identity
@@ -43,7 +43,7 @@ def cached_by_values(function: Callable[P, R]) -> Callable[P, R]:
         if result is None:
             with collected() as arrays:
                 result = function(*args), arrays  # type: ignore[call-arg]
-            while len(results) >= _MOST_RESULTS:
+            while len(results) >= _MAX_RESULTS:
                 results.pop(next(iter(results)), None)
             results[key] = result
         elif _collections:

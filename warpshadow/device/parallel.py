@@ -30,8 +30,8 @@ from warpshadow.device.tape import gradients_of
 
 ENVIRONMENT_VARIABLE = "WARPSHADOW_NUM_THREADS"
 
-_LEAST_WORK = 1.0e5  # minimum work of a slice [ns]: waking a thread and fetching its inputs take a third of that
-_LEAST_SUMMED_WORK = 3.0e5  # the same where a slice has sums of its own, which are zeroed and added up
+_MIN_WORK = 1.0e5  # minimum work of a slice [ns]: waking a thread and fetching its inputs take a third of that
+_MIN_SUMMED_WORK = 3.0e5  # the same where a slice has sums of its own, which are zeroed and added up
 _SLICES_PER_THREAD = 4  # rows differ in cost; threads that finish early take the remaining slices
 _SUMMED_SLICES = 16  # most slices of a launch whose sums are its slices' own
 _SUMMED_SIZE = 100_000  # items that the sums of all slices have at most, beyond two slices: they are to be added up
@@ -202,9 +202,9 @@ def _launch_slices(
     dim, workers = _shape(dim), thread_count()
     arguments = [0, 0 if device.is_cpu else -1, *arguments]
     gradients = None if gradients is None else [None, None, *gradients]
-    maximum, least_work = _SLICES_PER_THREAD * workers, _LEAST_WORK
+    maximum, least_work = _SLICES_PER_THREAD * workers, _MIN_WORK
     if summed:  # as many for any number of threads
-        least_work = _LEAST_SUMMED_WORK
+        least_work = _MIN_SUMMED_WORK
         maximum = min(_SUMMED_SLICES, max(2, _SUMMED_SIZE // max(1, *(array.size for array in summed.values()))))
     is_divisible = device.is_cpu and not device.is_capturing
     slice_count = min(dim[0], maximum, int(math.prod(dim) * cost / least_work)) if is_divisible else 1

@@ -22,7 +22,7 @@ from warpshadow.scene.scene import Body
 AXES = {"x": 0, "y": 1, "z": 2}
 UP = (0.0, 1.0, 0.0)
 RESTING = ("stable", "given", "free")
-_LEAST_SLOPE = 0.01  # of a plane along the coordinates that are not fixed
+_MIN_SLOPE = 0.01  # of a plane along the coordinates that are not fixed
 _INSIDE = 1e-6  # how far outside a triangle its centroid may project, in barycentric coordinates
 
 
@@ -102,7 +102,7 @@ def onto_plane(normal: np.ndarray, fixed: Sequence[str]) -> np.ndarray:
         ValueError: for fixed coordinates beside which nothing, or hardly anything, of the normal is left.
     """
     onto = np.where([axis in fixed for axis in AXES], 0.0, normal)
-    if np.linalg.norm(onto) < _LEAST_SLOPE:
+    if np.linalg.norm(onto) < _MIN_SLOPE:
         raise ValueError(
             f"fixed: got {list(fixed)} beside stands_on a plane of normal {np.round(normal, 3).tolist()}, expected a "
             "coordinate that is free to move the body onto the plane"

@@ -9,10 +9,10 @@ import numpy as np
 from warpshadow.maths.components import connected_components
 from warpshadow.maths.panels import MOST_PANELS, TOLERANCE, find_panels
 
-MOST_FACES = 64
+MAX_FACES = 64
 """Faces of a part at most; a cylinder of 48 sides has 50."""
 
-_MOST_TRIANGLES = 16 * MOST_FACES
+_MAX_TRIANGLES = 16 * MAX_FACES
 """Triangles of a solid at most: its faces may be divided."""
 
 _FLATNESS = 1e-4
@@ -100,7 +100,7 @@ def _panel(corners: np.ndarray) -> ConvexPart:
 
 def _solid(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
     """The convex solid that triangles enclose; None where they enclose none."""
-    if len(triangles) > _MOST_TRIANGLES:
+    if len(triangles) > _MAX_TRIANGLES:
         return None
     edges, count = _edges(triangles), len(triangles)
     triangle_at = {(a, b): number % count for number, (a, b) in enumerate(edges.tolist())}
@@ -125,7 +125,7 @@ def _solid(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
     pairs = np.stack([left, right])[:, is_flat]
     face = connected_components(pairs[0], pairs[1], count)
     face_count = face.max() + 1
-    if face_count > MOST_FACES:
+    if face_count > MAX_FACES:
         return None
     largest = [np.flatnonzero(face == number)[lengths[face == number].argmax()] for number in range(face_count)]
     from_plane = points[triangles] - points[triangles[largest, 0]][face][:, None]

@@ -12,7 +12,7 @@ CHUNK = 16  # directions that fill a vector register; their number is a multiple
 BUNDLE = 4  # directions that are culled together
 
 
-LEAST_WIDTH = 2e-3  # half-width of a falloff [rad] below which float32 has no digits left for it
+MIN_WIDTH = 2e-3  # half-width of a falloff [rad] below which float32 has no digits left for it
 
 
 def check_count(name: str, count: int) -> None:
@@ -59,13 +59,13 @@ def falloff_width(softness: float, count: int) -> float:
     """Half-width w = κ·ρ of the falloff of a blocked cone towards ``count`` cells [rad].
 
     Raises:
-        ValueError: for a width of π/4 or more, where the falloff is as wide as cones, and below :data:`LEAST_WIDTH`.
+        ValueError: for a width of π/4 or more, where the falloff is as wide as cones, and below :data:`MIN_WIDTH`.
     """
     width = softness * cell_radius(count) if check.is_number(softness) else -1.0
-    if not LEAST_WIDTH <= width < np.pi / 4:
+    if not MIN_WIDTH <= width < np.pi / 4:
         raise ValueError(
-            f"softness: got {softness!r} for {count} directions, expected {LEAST_WIDTH / cell_radius(count):.3g} to "
-            f"{np.pi / 4 / cell_radius(count):.3g} (a half-width softness·2/√directions from {LEAST_WIDTH} to π/4)"
+            f"softness: got {softness!r} for {count} directions, expected {MIN_WIDTH / cell_radius(count):.3g} to "
+            f"{np.pi / 4 / cell_radius(count):.3g} (a half-width softness·2/√directions from {MIN_WIDTH} to π/4)"
         )
     return width
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from warpshadow.pipeline.static import StaticBodies
     from warpshadow.stages.photograph import RatioImage
 
-MOST_SHARED = 2
+MAX_SHARED = 2
 """Samples of a pixel across in stills up to which those on a smooth surface share a receiver: whoever asks for more
 wants edges and bumps within pixels resolved."""
 
@@ -156,7 +156,7 @@ class View(LitPoints):
             wants_samples[merged_scene.body_of_face],
         )
         shares_surfaces, supersampling = method.shares_directions, self._supersampling
-        if shares_surfaces and supersampling > MOST_SHARED:
+        if shares_surfaces and supersampling > MAX_SHARED:
             shares_surfaces, supersampling = False, 1  # each sample is a receiver
         return find_receivers(
             *arguments,

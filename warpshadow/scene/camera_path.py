@@ -32,7 +32,7 @@ from warpshadow.scene import toml_tables
 
 _KEYS = ("fps", "loop", "keyframe")
 
-MOST_FRAMES = 100_000  # frames beyond which a path is taken for a mistake, such as times in milliseconds
+MAX_FRAMES = 100_000  # frames beyond which a path is taken for a mistake, such as times in milliseconds
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -90,10 +90,10 @@ class CameraPath:
                 raise ValueError(
                     f"keyframes[{number}]: time: got {after.time:g} after {before.time:g}, expected rising times"
                 )
-        if self.frame_count > MOST_FRAMES:
+        if self.frame_count > MAX_FRAMES:
             raise ValueError(
                 f"keyframes: got {self.seconds:g} seconds at {self.fps:g} frames a second, expected at most "
-                f"{MOST_FRAMES} frames; times are in seconds"
+                f"{MAX_FRAMES} frames; times are in seconds"
             )
 
     def __repr__(self) -> str:

@@ -51,7 +51,7 @@ _NAMING = {name for name, methods in READ_BY.items() if DEFAULT_METHOD in method
 
 BOUNCING = (*SPHERE_METHODS, "ray-traced", AUTO)  # the methods that find light that bounces
 
-MOST_BOUNCES = 16
+MAX_BOUNCES = 16
 
 Bounces = int | Literal["all"]  # how often light bounces
 
@@ -516,8 +516,8 @@ def check_supersampling(count: object) -> None:
 def check_bounces(count: object) -> None:
     """Raise ValueError unless it is a number of bounces, 0 to 16, or "all"."""
     is_all = isinstance(count, str) and count == "all"
-    if not is_all and (not check.is_integer(count) or count not in range(MOST_BOUNCES + 1)):
-        expected = f'a whole number from 0 to {MOST_BOUNCES}, or "all"'
+    if not is_all and (not check.is_integer(count) or count not in range(MAX_BOUNCES + 1)):
+        expected = f'a whole number from 0 to {MAX_BOUNCES}, or "all"'
         raise ValueError(f"bounces: got {check.described(count)}, expected {expected}")
 
 

@@ -14,7 +14,7 @@ from warpshadow.spheres.refine import Refinement
 AUTO = "auto"
 
 TRIED = (8, 32, 128, 512)
-MOST_SPHERES = 2 * TRIED[-1]
+MAX_SPHERES = 2 * TRIED[-1]
 
 _STEPS, _STEPS_MORE = 40, 1 / 8
 """Steps of a short fit, and how many more a sphere. With 40 for all, 512 spheres of a table were no better than 256."""
@@ -68,7 +68,7 @@ def enough_spheres(
         if stalls and before[1] <= RAGGED:
             return count // 2
         before = error, shadow_error
-    return TRIED[-1] if stalls and before[1] <= RAGGED else MOST_SPHERES
+    return TRIED[-1] if stalls and before[1] <= RAGGED else MAX_SPHERES
 
 
 def _errors(judge: Refinement, spheres: np.ndarray) -> tuple[float, float]:

@@ -24,7 +24,7 @@ from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.maths.spatial_sort import compact_order
 from warpshadow.spheres.cover import descend_cover, greedy_cover
-from warpshadow.spheres.enough import AUTO, MOST_SPHERES, enough_spheres
+from warpshadow.spheres.enough import AUTO, MAX_SPHERES, enough_spheres
 from warpshadow.spheres.measure import FitReport, measure
 from warpshadow.spheres.normalized_mesh import NormalizedMesh, normalize
 from warpshadow.spheres.receivers import FitReceivers
@@ -48,7 +48,7 @@ BAD_SHADOW = 0.18
 """Error of a shadow above which it is ragged. With 64 spheres a chair, a fence and a table with thin legs have 0.21 to
 0.27; a ring and rocks, whose shadows are small but whole, 0.16; man, monkey, cow, teapot and bunny 0.02 to 0.07."""
 
-LEAST_GROUND_ERROR = 0.01
+MIN_GROUND_ERROR = 0.01
 """Error of a ground below which nobody sees how ragged a shadow is: of a slab that lies on it, 0.004. Chair, fence and
 table have 0.02 to 0.05."""
 
@@ -138,7 +138,7 @@ def fit_spheres(
 
 def _warn_of_holes(mesh: Mesh, count: int | str, report: FitReport) -> None:
     """Warn once of a mesh too thin for spheres that are many; whoever asks for few knows; flats need none."""
-    is_ragged = report.shadow_error > BAD_SHADOW and report.ground_error > LEAST_GROUND_ERROR
+    is_ragged = report.shadow_error > BAD_SHADOW and report.ground_error > MIN_GROUND_ERROR
     is_filled = report.nearby_error > BAD_AIR
     number = report.sphere_count if isinstance(count, str) else count
     if not (is_ragged or is_filled) or number < MANY or mesh in _warned or mesh.is_flat:
@@ -182,7 +182,7 @@ def _search(fit: Callable[[int], tuple[np.ndarray, FitReport]], error: float) ->
     """Find the least number of spheres, within an eighth, whose error is met."""
     failed, count = 0, 16
     best = fit(count)
-    while best[1].visibility_error > error and count < MOST_SPHERES:
+    while best[1].visibility_error > error and count < MAX_SPHERES:
         failed, count = count, 2 * count
         best = fit(count)
     if best[1].visibility_error > error:

@@ -20,7 +20,7 @@ _UNIFORM_SHARE = 0.1  # of the samples of a map: light too dim to be drawn still
 _SUN = 30.0  # times as bright as all on average is a sun …
 _SUN_SHARE = 0.35  # … and suns get so much of shared directions at most
 _UNSEEN_SHARE = 0.3  # of the importance of light, which stays where receivers do not see it
-_LEAST_ROWS, _MOST_ROWS = 64, 512  # of a map that is cut
+_MIN_ROWS, _MAX_ROWS = 64, 512  # of a map that is cut
 
 
 class LightSamples(NamedTuple):
@@ -130,12 +130,12 @@ def cut_map(
 
 
 def _of_size(radiance: np.ndarray) -> np.ndarray:
-    """The map with :data:`_LEAST_ROWS` or more: pixels are cut; and with not many more, where they are averaged."""
+    """The map with :data:`_MIN_ROWS` or more: pixels are cut; and with not many more, where they are averaged."""
     height = len(radiance)
-    if height < _LEAST_ROWS:
-        times = -(-_LEAST_ROWS // height)
+    if height < _MIN_ROWS:
+        times = -(-_MIN_ROWS // height)
         return radiance.repeat(times, axis=0).repeat(times, axis=1)
-    step = height // _MOST_ROWS
+    step = height // _MAX_ROWS
     if step < 2:
         return radiance
     rows = height // step

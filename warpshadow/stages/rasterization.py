@@ -37,7 +37,7 @@ _VERTEX_COST, _FACE_COST, _SAMPLE_COST = 15.0, 70.0, 1.6
 """Nanoseconds that a vertex and a face take, if faces are small, and a sample of one layer. Vertices of an image are
 not shared by threads."""
 
-_LEAST_FACES_COST = 4.0  # of a layer, for one of its samples: less than that is not worth another layer
+_MIN_FACES_COST = 4.0  # of a layer, for one of its samples: less than that is not worth another layer
 
 _INT32_MASK = (1 << 32) - 1
 _DEPTH_ONE = 0x3F800000
@@ -410,7 +410,7 @@ def _visible_faces(clip_positions: wp.array, faces: wp.array, width: int, height
     batch_count, vertex_count = clip_positions.shape
     layers, strips, run = 1, strip_count(device), run_length(device, width)
     if device.is_cpu and batch_count:  # layers for threads that have no image of their own
-        worth = _FACE_COST * faces.shape[0] / (_LEAST_FACES_COST * width * height)
+        worth = _FACE_COST * faces.shape[0] / (_MIN_FACES_COST * width * height)
         layers = max(1, min(thread_count() // batch_count, int(worth)))
     corners = empty((batch_count, vertex_count), dtype=wp.vec2i, device=device)
     depths = empty((batch_count, vertex_count), dtype=float, device=device)

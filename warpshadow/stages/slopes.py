@@ -38,7 +38,7 @@ from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
 from warpshadow.stages.silhouettes.find import Silhouettes
 from warpshadow.stages.silhouettes.lines import NOTHING, FragmentArrays, edge_line, make_fragment_arrays
 
-LEAST_DISTANCE = 0.02  # distance of an edge [samples] below which rounding outweighs how color changes on the way to it
+MIN_DISTANCE = 0.02  # distance of an edge [samples] below which rounding outweighs how color changes on the way to it
 
 _COST = 20.0  # nanoseconds that a sample takes
 
@@ -121,7 +121,7 @@ def _pull(
                         if edge[0] >= 0:
                             line = edge_line(edge, center, clip)
                             t = distance(line, way, half)
-                            if ends_before(line, way) and t > LEAST_DISTANCE and t <= 1.0:
+                            if ends_before(line, way) and t > MIN_DISTANCE and t <= 1.0:
                                 # entries are of all views; where one view serves all images, each has its own colors
                                 rise = edge_colors[batch - view, entry, way] - color
                                 span = wp.min(t, 0.5)

@@ -9,7 +9,7 @@ COLORS = ("#4dabf7", "#ffa94d", "#69db7c", "#f783ac", "#b197fc", "#ffe066")
 """Colors of the stages; further stages begin again."""
 
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM = 360, 220, 44, 18
-_MOST_POINTS = 600  # of all lines: a page is sent all of them each time
+_MAX_POINTS = 600  # of all lines: a page is sent all of them each time
 
 
 def loss_plot(stages: Sequence[Sequence[Sequence[float]]]) -> str:
@@ -40,7 +40,7 @@ def loss_plot(stages: Sequence[Sequence[Sequence[float]]]) -> str:
         y = to_y(log)
         parts.append(f'<line x1="{_LEFT}" x2="{_WIDTH}" y1="{y:.1f}" y2="{y:.1f}" stroke="#444"/>')
         parts.append(f'<text x="{_LEFT - 4}" y="{y + 4:.1f}" text-anchor="end">{10**log:.2g}</text>')
-    first, step = 0, math.ceil(count / _MOST_POINTS)
+    first, step = 0, math.ceil(count / _MAX_POINTS)
     for stage, run in runs:
         shown_iterations = sorted({*range(0, len(run), step), len(run) - 1}) if run else []
         points = [(to_x(first + n), to_y(math.log10(run[n]))) for n in shown_iterations if 0 < run[n] < math.inf]

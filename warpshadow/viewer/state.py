@@ -26,7 +26,7 @@ from warpshadow.scene.scene import (
 )
 from warpshadow.viewer.quality import Quality
 
-MOST_CELLS, MOST_SPHERES, MOST_BOUNCES, MOST_STOPS = 1024, 512, 8, 20.0  # more than these a page may not ask for
+MAX_CELLS, MAX_SPHERES, MAX_BOUNCES, MAX_STOPS = 1024, 512, 8, 20.0  # more than these a page may not ask for
 AS_GIVEN = "as given"  # receivers, and numbers of spheres, as the scene has them
 
 PICTURE, ERROR = "picture", "error against rays"
@@ -91,20 +91,20 @@ class ViewerState:
         """Check it."""
         within("turn", self.turn, -360, 360)
         within("scale", self.scale, 0, 1000)
-        within("stops", self.stops, -MOST_STOPS, MOST_STOPS)
+        within("stops", self.stops, -MAX_STOPS, MAX_STOPS)
         check.choice("method", self.method, METHODS)
         check.choice("sampling", self.sampling, SAMPLINGS)
         check_count("directions", self.directions)
-        if self.directions > MOST_CELLS:
-            raise ValueError(f"directions: got {self.directions}, expected at most {MOST_CELLS}")
+        if self.directions > MAX_CELLS:
+            raise ValueError(f"directions: got {self.directions}, expected at most {MAX_CELLS}")
         within("softness", self.softness, 0.05, 1.5)
         if self.spheres is not None:
             check.whole("spheres", self.spheres, what="spheres")
-            within("spheres", self.spheres, 1, MOST_SPHERES)
+            within("spheres", self.spheres, 1, MAX_SPHERES)
         check.choice("receivers", self.receivers, (AS_GIVEN, *RECEIVERS))
         check_bounces(self.bounces)
         if self.bounces != "all":
-            within("bounces", self.bounces, 0, MOST_BOUNCES)
+            within("bounces", self.bounces, 0, MAX_BOUNCES)
         check.choice("shows", self.shows, (PICTURE, ERROR))
         check.flag("shows_light", self.shows_light)
         for pose in self.poses:
@@ -119,11 +119,11 @@ class ViewerState:
             stops=stops,
             method=scene.visibility.method or DEFAULT_METHOD,
             sampling=scene.visibility.sampling,
-            directions=min(scene.visibility.directions, MOST_CELLS),
+            directions=min(scene.visibility.directions, MAX_CELLS),
             softness=scene.visibility.softness,
             spheres=None,
             receivers=AS_GIVEN,
-            bounces=scene.bounces if scene.bounces == "all" else min(scene.bounces, MOST_BOUNCES),
+            bounces=scene.bounces if scene.bounces == "all" else min(scene.bounces, MAX_BOUNCES),
             shows=PICTURE,
             shows_light=False,
             poses=tuple(BodyPose(tuple(body.rotation), tuple(body.translation)) for body in scene.bodies),

@@ -13,7 +13,7 @@ from warpshadow.inverse.free.base import FreeOfBody, Values
 from warpshadow.inverse.world import FittedScene, Setting, World
 from warpshadow.pipeline.reflectance import GLOSS_DEFAULTS
 from warpshadow.scene.scene import Scene
-from warpshadow.stages.gloss.lobes import LEAST_ROUGHNESS
+from warpshadow.stages.gloss.lobes import MIN_ROUGHNESS
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class _Gloss(FreeOfBody):
 
     def project(self, values: Values) -> None:
         """Numbers are in [0, 1]; roughness is at least what is shown."""
-        values["value"].clamp_(LEAST_ROUGHNESS if self.key == "roughness" else 0, 1)
+        values["value"].clamp_(MIN_ROUGHNESS if self.key == "roughness" else 0, 1)
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
         """Make the body shine so."""

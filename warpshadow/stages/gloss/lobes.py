@@ -24,10 +24,10 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.parallel import split_row
 
-LEAST_ROUGHNESS = 0.1
+MIN_ROUGHNESS = 0.1
 """Roughness of the smoothest surface; maps of 128 rows have nothing sharper."""
 
-_LEAST_COSINE = 0.02
+_MIN_COSINE = 0.02
 """Cosine between a receiver's normal and its viewer, of those whose interpolated normal turns away."""
 
 _COST = 60.0
@@ -98,9 +98,9 @@ def _sample_lobes(
     normal = normals[located, receiver]
     eye = eye_of(clip_matrices[instance_in(batch, clip_matrices.shape[0])])
     view = wp.normalize(eye - points[located, receiver])
-    rough = wp.max(roughness[instance_in(batch, roughness.shape[0]), receiver], LEAST_ROUGHNESS)
+    rough = wp.max(roughness[instance_in(batch, roughness.shape[0]), receiver], MIN_ROUGHNESS)
     width = rough * rough
-    cosine = wp.clamp(wp.dot(normal, view), _LEAST_COSINE, 0.99999)
+    cosine = wp.clamp(wp.dot(normal, view), _MIN_COSINE, 0.99999)
     sine = wp.sqrt(1.0 - cosine * cosine)
     across_view = view - wp.dot(normal, view) * normal
     if wp.length_sq(across_view) < 1.0e-10:

@@ -20,7 +20,7 @@ from warpshadow.maths import sh
 ROWS = 128
 """Most rows of level 0."""
 
-_LEAST_ROWS = 16
+_MIN_ROWS = 16
 _LEVELS = 7
 
 _COST = 60.0
@@ -31,7 +31,7 @@ wp.set_module_options({"max_unroll": 1})
 
 def level_rows(rows: int) -> list[int]:
     """Rows of each level of a map of a number of rows."""
-    return [rows] + [max(rows >> level, _LEAST_ROWS) for level in range(_LEVELS - 1)]
+    return [rows] + [max(rows >> level, _MIN_ROWS) for level in range(_LEVELS - 1)]
 
 
 def with_rows(radiance: np.ndarray, rows: int) -> np.ndarray:

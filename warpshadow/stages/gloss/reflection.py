@@ -24,7 +24,7 @@ from warpshadow.device.parallel import split_row
 STRAIGHT = 0.04
 """F₀ of all that is not metal: an index of refraction of 1.5."""
 
-LEAST_SHARE = 0.02
+MIN_SHARE = 0.02
 """Part of the hemisphere below which it says little of blockers' radiance how much light they send."""
 
 _COST = 10.0
@@ -110,7 +110,7 @@ def _find_blocked(
     light = bounced[instance_in(batch, bounced.shape[0]), receiver]
     rest = light - direct[instance_in(batch, direct.shape[0]), receiver]
     share = 1.0 - openness[instance_in(batch, openness.shape[0]), receiver][0]
-    blocked[batch, receiver] = wp.max(rest, wp.vec3()) / wp.max(share, LEAST_SHARE)
+    blocked[batch, receiver] = wp.max(rest, wp.vec3()) / wp.max(share, MIN_SHARE)
 
 
 def blocked_radiance(bounced: wp.array, direct: wp.array, openness: wp.array) -> wp.array:

@@ -47,8 +47,8 @@ THRESHOLDS = {
 3-fold at twice its limit and 200-fold at four times. At the defaults irradiance is within 0.1% (`quadratic`), 0.7%
 (`linear`) and 4% (`optimal_linear`, whose table of single caps fits a sum of many spheres badly) of the converged."""
 
-LEAST_THRESHOLD = 0.01  # squarings amplify float32 rounding 2^p times; below this they cost more digits than they give
-MOST_SQUARINGS = 20  # limit of the squarings; a log that asks for more is cut down to it
+MIN_THRESHOLD = 0.01  # squarings amplify float32 rounding 2^p times; below this they cost more digits than they give
+MAX_SQUARINGS = 20  # limit of the squarings; a log that asks for more is cut down to it
 
 BLENDED = 0.7
 """|f̂| / 2^p, in thresholds, from which on the base approximation is wholly the square of that of half the log."""
@@ -110,7 +110,7 @@ def _make_measure(order: int, lanes: int) -> wp.Function:
             while s * depth[lane] > threshold:
                 s = 0.5 * s
                 p = p + 1
-            p = wp.min(p, MOST_SQUARINGS)
+            p = wp.min(p, MAX_SQUARINGS)
             count[lane] = float(p)
             scale[lane] = s
             maximum = wp.max(maximum, p)
@@ -388,9 +388,9 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
     check.choice("base", base, THRESHOLDS)
     default, limit = THRESHOLDS[base]
     threshold = default if threshold is None else threshold
-    if not LEAST_THRESHOLD <= threshold <= limit:
+    if not MIN_THRESHOLD <= threshold <= limit:
         raise ValueError(
-            f"threshold: got {threshold!r} for base {base!r}, expected {LEAST_THRESHOLD} to {limit}: beyond it "
+            f"threshold: got {threshold!r} for base {base!r}, expected {MIN_THRESHOLD} to {limit}: beyond it "
             "repeated squaring is unstable, below it drowns in rounding"
         )
     check.shape("log_sh", log_sh.shape, ("batch", "vertex", "order²"))
@@ -404,7 +404,7 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
     row_count = batch_count * groups
     scratch = [Scratch((4, order**2), lane_type(lanes))]
     # memory that no squaring reaches is never touched
-    powers_shape = batch_count, groups, MOST_SQUARINGS + 1, order**2
+    powers_shape = batch_count, groups, MAX_SQUARINGS + 1, order**2
     powers = empty(powers_shape, dtype=lane_type(lanes), device=device) if log_sh.requires_grad else None
     optimal = _optimal_table(order, str(device)) if base == "optimal_linear" else None
     faults = zeros(2, dtype=wp.int32, device=device)

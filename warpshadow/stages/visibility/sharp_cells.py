@@ -14,17 +14,17 @@ import warp as wp
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import split_row
-from warpshadow.maths.directions import CHUNK, LEAST_WIDTH, cell_radius
+from warpshadow.maths.directions import CHUNK, MIN_WIDTH, cell_radius
 from warpshadow.stages.visibility.directional import SOFTNESS
 
 _RADII = 2.4  # radius of the cell whose soft edge is like a spot's penumbra, in half-angles of the spot
-_LEAST_SHARE = 0.1  # share of all light that sharp cells have at least: less is not worth their time
+_MIN_SHARE = 0.1  # share of all light that sharp cells have at least: less is not worth their time
 
 WIDEST_PAST_PLANES = 1.7
 """Radius up to which cells are sharp where planes block them, in radii of all cells: their edges are 0.6 times as wide
 at κ = 0.35."""
 
-_LEAST_RADIUS = cell_radius(2048)
+_MIN_RADIUS = cell_radius(2048)
 """Radius [rad] down to which cells are sharp: an edge of ±0.9° at κ = 0.35, sharper than shadows of spheres are."""
 
 _CELL_COST = 5.0  # nanoseconds that a sharp cell takes
@@ -60,10 +60,10 @@ def find_sharp_cells(
         softness: κ, by which edges become no narrower than a falloff may be.
         widest: Radius up to which cells are sharp, in radii of all cells.
     """
-    radii = np.maximum(_RADII * spreads, max(_LEAST_RADIUS, 1.001 * LEAST_WIDTH / softness))
+    radii = np.maximum(_RADII * spreads, max(_MIN_RADIUS, 1.001 * MIN_WIDTH / softness))
     result = np.flatnonzero((radii < widest * cell_radius(len(power))) & (power > 0))
     result = np.sort(result[np.argsort(-power[result], kind="stable")[:CHUNK]])
-    if power[result].sum() <= _LEAST_SHARE * power.sum():
+    if power[result].sum() <= _MIN_SHARE * power.sum():
         return None
     repeated = np.arange(CHUNK) * len(result) // CHUNK
     places = np.full(len(power), -1, np.int32)
