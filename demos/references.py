@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import warpshadow as ws
-from warpshadow.scene.scene import GLOSS
+from warpshadow.scene.scene import GLOSS_ARGUMENTS
 
 MIN_PIXELS = 16  # of a body, to be measured
 BLOCK = 8  # pixels across
@@ -118,7 +118,7 @@ class Request:
             digest.update(f"{body.mesh.content_hash} {body.casts_shadow} {body.scale}".encode())
             texture = np.zeros(0) if body.texture is None else body.texture
             arrays += [body.albedo, texture, body.rotation, body.translation]
-            arrays += [value for name in GLOSS if (value := getattr(body, name)) is not None]
+            arrays += [value for name in GLOSS_ARGUMENTS if (value := getattr(body, name)) is not None]
         for array in arrays:
             digest.update(f"{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
         digest.update(f"{camera.width} {camera.height} {camera.near} {_ACROSS}".encode())

@@ -29,7 +29,7 @@ _OWN_FOLDER = str(Path(__file__).parent) + os.sep
 
 _PASSED_OVER = ("contextlib", "dataclasses", "functools", "torch")  # modules between a user's line and ours
 
-_LONGEST = 60  # characters of a value that messages quote
+_MAX_QUOTED_LENGTH = 60  # characters of a value that messages quote
 
 
 class _Nothing:
@@ -347,9 +347,9 @@ def described(value: object) -> str:
         return f"{type(value).__name__} of {dtype} and shape {tuple(value.shape)}"
     text = repr(value)
     if value is None or isinstance(value, (str, bytes, int, float, complex, np.number, _Nothing)):
-        return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+        return text if len(text) <= _MAX_QUOTED_LENGTH else f"{text[:_MAX_QUOTED_LENGTH]}…"
     if isinstance(value, (list, tuple, dict)):
-        return text if len(text) <= _LONGEST else f"{type(value).__name__} of {len(value)} items"
+        return text if len(text) <= _MAX_QUOTED_LENGTH else f"{type(value).__name__} of {len(value)} items"
     return type(value).__name__
 
 

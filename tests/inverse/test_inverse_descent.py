@@ -34,7 +34,7 @@ from warpshadow.inverse import (
     fit,
     short_adam,
 )
-from warpshadow.inverse.descent import WINDOW
+from warpshadow.inverse.descent import CONVERGENCE_WINDOW
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.schedule import check_stages, deformation_stages, pose_stages
 from warpshadow.torch import rotation_matrices
@@ -382,7 +382,7 @@ def test_a_fit_does_not_depend_on_exposure():
 def test_a_fit_at_its_goal_has_converged_as_soon_as_that_can_be_said():
     scene = small_scene()
     problem = Problem(scene, Target(ws.Renderer(scene).render()), Pose(0), still=None)
-    for optimizer, count in ((QuasiNewton, 2), (short_adam, 2 * WINDOW)):
+    for optimizer, count in ((QuasiNewton, 2), (short_adam, 2 * CONVERGENCE_WINDOW)):
         result = fit(problem, [Stage(500)], tolerance=1e-3, optimizer=optimizer)
         assert result.reason == "converged"
         assert len(result.losses[0]) == count
@@ -392,7 +392,7 @@ def test_a_loss_of_zero_has_converged():
     scene = small_scene()
     black = dataclasses.replace(scene, light=np.zeros((4, 3)))
     problem = Problem(black, Target(np.zeros((24, 24, 3))), Albedo(0), still=None)
-    for optimizer, count in ((QuasiNewton, 2), (short_adam, 2 * WINDOW)):
+    for optimizer, count in ((QuasiNewton, 2), (short_adam, 2 * CONVERGENCE_WINDOW)):
         result = fit(problem, [Stage(500)], optimizer=optimizer)
         assert result.losses[0] == [0.0] * count and result.reason == "converged"
 
@@ -419,9 +419,9 @@ def test_a_stage_that_has_converged_makes_way_for_the_next():
     scene = small_scene()
     problem = Problem(scene, Target(ws.Renderer(scene).render()), Pose(0), still=None)
     result = fit(problem, [Stage(500), Stage(3)], tolerance=1e-3, optimizer=short_adam)
-    assert [len(losses) for losses in result.losses] == [2 * WINDOW, 3] and result.reason == "finished"
+    assert [len(losses) for losses in result.losses] == [2 * CONVERGENCE_WINDOW, 3] and result.reason == "finished"
     result = fit(problem, [Stage(500, tolerance=0.5), Stage(3)], tolerance=0.0, optimizer=short_adam)
-    assert [len(losses) for losses in result.losses] == [2 * WINDOW, 3]  # by its own tolerance
+    assert [len(losses) for losses in result.losses] == [2 * CONVERGENCE_WINDOW, 3]  # by its own tolerance
 
 
 def test_a_swing_through_a_low_loss_is_not_convergence():

@@ -23,7 +23,7 @@ from warpshadow.inverse import (
 )
 from warpshadow.inverse.diagnostics import small_stage
 from warpshadow.inverse.model import Model
-from warpshadow.inverse.uncertainty import SPREAD, NormalMatrix, along_flat
+from warpshadow.inverse.uncertainty import CANDIDATE_SPACING, NormalMatrix, along_flat
 
 NOISE = 0.05
 DIFFERENCE = 0.03  # central differences of a loss that bends where edges pass the centers of pixels
@@ -110,8 +110,8 @@ def test_starts_lie_along_the_direction_that_is_known_least(outline, pose, rotat
         turned, middle, _ = free.moved(start[free.name], setting)
         turn = Rotation.from_matrix((turned @ first.T).numpy()).as_rotvec()
         moves.append(np.concatenate([turn, (middle - origin).numpy() / setting.extent(0)]))
-    np.testing.assert_allclose(np.linalg.norm(moves, axis=1), SPREAD * np.array([1, 1, 2, 2]), rtol=1e-2)
-    np.testing.assert_allclose(moves[0], -moves[1], atol=1e-2 * SPREAD)
+    np.testing.assert_allclose(np.linalg.norm(moves, axis=1), CANDIDATE_SPACING * np.array([1, 1, 2, 2]), rtol=1e-2)
+    np.testing.assert_allclose(moves[0], -moves[1], atol=1e-2 * CANDIDATE_SPACING)
 
 
 @pytest.mark.parametrize("rotation", ["quaternion", "6d"])

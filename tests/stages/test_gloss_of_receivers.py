@@ -114,7 +114,7 @@ def test_transmittance_of_samples_is_the_mean_of_the_cells_around(device):
         *(wp.array(value, dtype=wp.vec3, device=device) for value in (normals, directions)),
     ]
     got = transmittance.transmittance_towards(*inputs, cells).numpy()
-    expected = twins.transmittance_near(through, normals, directions, cells, transmittance.REACH)
+    expected = twins.transmittance_near(through, normals, directions, cells, transmittance.KERNEL_RADIUS)
     assert np.abs(got - expected).max() < 20 * FLOAT32
 
 

@@ -1,21 +1,28 @@
 """How good an image is made follows from what images took."""
 
-from warpshadow.viewer.quality import FEWEST, FULL, LONGEST, MOST, SECONDS, FrameRate
+from warpshadow.viewer.quality import (
+    FULL,
+    MAX_MOVING_PIXELS,
+    MIN_MOVING_PIXELS,
+    MOVING_SECONDS,
+    STILL_SECONDS,
+    FrameRate,
+)
 
 
 def test_a_slow_motion_gets_fewer_pixels_down_to_a_least_and_a_quick_one_more_up_to_a_most():
     frame_rate = FrameRate()
     first = frame_rate.moving().pixels
-    frame_rate.took(SECONDS)
+    frame_rate.took(MOVING_SECONDS)
     assert frame_rate.moving().pixels == first
-    frame_rate.took(2 * SECONDS)
+    frame_rate.took(2 * MOVING_SECONDS)
     assert frame_rate.moving().pixels == first // 2
     for _ in range(20):
         frame_rate.took(10.0)
-    assert frame_rate.moving().pixels == FEWEST
+    assert frame_rate.moving().pixels == MIN_MOVING_PIXELS
     for _ in range(20):
         frame_rate.took(0.0)
-    assert frame_rate.moving().pixels == MOST
+    assert frame_rate.moving().pixels == MAX_MOVING_PIXELS
 
 
 def chain(seconds_a_pixel, canvas):
@@ -38,5 +45,5 @@ def test_at_rest_images_grow_to_the_canvas_and_no_further():
 
 def test_no_image_is_begun_that_would_take_too_long():
     pixels, times = chain(2e-6, 4000 * 3000)
-    assert times[-1] <= LONGEST and pixels[-1] > 4e5
+    assert times[-1] <= STILL_SECONDS and pixels[-1] > 4e5
     assert chain(1e-4, 4000 * 3000)[0] == [256**2]

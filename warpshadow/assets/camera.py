@@ -29,10 +29,10 @@ from warpshadow.maths.plane import is_flat
 _ROTATION_TOLERANCE = 1e-4
 
 # Fields of view below this [degrees] are rather π/2 radians or less.
-_NARROW = 1.6
+_RADIANS_LIMIT = 1.6
 
 # Part of the image that stays free in turntables for which a camera has to go back.
-_AROUND = 0.05
+_TURNTABLE_MARGIN = 0.05
 
 # From the framed bodies to a framing camera: it looks down from the front.
 DIRECTION = (0.3, 0.4, 0.9)
@@ -359,7 +359,9 @@ class Camera:
         cameras = [self.turned(angle, middle) for angle in angles]
         if self._missing_distance(points) > 1e-6 * np.ptp(points, axis=0).max():
             return cameras
-        back = np.array([0.0, 0.0, max(0.0, *(camera._missing_distance(points, margin=_AROUND) for camera in cameras))])
+        back = np.array(
+            [0.0, 0.0, max(0.0, *(camera._missing_distance(points, margin=_TURNTABLE_MARGIN) for camera in cameras))]
+        )
         return [
             Camera(self.intrinsics, camera.rotation, camera.translation + back, self.width, self.height, self.near)
             for camera in cameras
@@ -457,7 +459,7 @@ def _is_parallel(one: np.ndarray, other: np.ndarray) -> bool:
 def _centered_intrinsics(fov_y: float, width: int, height: int) -> np.ndarray:
     if not (check.is_number(fov_y) and 0.0 < fov_y < 180.0):
         raise ValueError(f"fov_y: got {check.described(fov_y)}, expected degrees between 0 and 180")
-    if fov_y < _NARROW:
+    if fov_y < _RADIANS_LIMIT:
         check.warn(
             f"fov_y: got {fov_y:g} degrees, which is as narrow as a telescope's; if these are radians, they are "
             f"{np.degrees(fov_y):.4g} degrees",

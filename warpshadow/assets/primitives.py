@@ -37,7 +37,7 @@ def plane(size: float | tuple[float, float] = 2.0, segments: int | tuple[int, in
     return Mesh(positions, faces, uvs, faces, "plane")
 
 
-_REACH = 1e4
+_INFINITE_EXTENT = 1e4
 """How far an infinite ground goes, in sizes: seen from one size above, it ends 0.006 degrees below the horizon."""
 
 
@@ -51,13 +51,13 @@ def infinite_ground(size: float = 2.0, segments: int = 64) -> Mesh:
         size: Diameter of the disc [scene units], such as the extent of the bodies on it with their shadows.
         segments: Faces around the origin, 8 to 4096: in the disc they are π size / segments long.
     """
-    if not (check.is_number(size) and 0 < size <= check.LARGEST / _REACH):
+    if not (check.is_number(size) and 0 < size <= check.LARGEST / _INFINITE_EXTENT):
         raise MeshError(f"size: got {check.described(size)}, expected a positive number of scene units")
     if not check.is_integer(segments) or not 8 <= segments <= 4096:
         raise MeshError(f"segments: got {check.described(segments)}, expected a whole number from 8 to 4096")
     step = 2 * np.pi / segments
     inner = np.linspace(0, 0.5, round(1 / step) + 1)[1:]
-    outer = np.geomspace(0.5, _REACH, int(np.ceil(np.log(2 * _REACH) / np.log1p(step))) + 1)[1:]
+    outer = np.geomspace(0.5, _INFINITE_EXTENT, int(np.ceil(np.log(2 * _INFINITE_EXTENT) / np.log1p(step))) + 1)[1:]
     radii = size * np.concatenate([inner, outer])
     angles = step * np.arange(segments)
     rim = np.stack([np.cos(angles), np.zeros(segments), -np.sin(angles)], axis=-1)

@@ -59,7 +59,7 @@ def _to_unit_edges(mesh: Mesh) -> np.ndarray:
 
 
 # Cosines: of the angle between faces that may count as flat (2.6°; xatlas takes 0.8°), and of that within a flat part.
-_FLAT = 0.999
+_FLAT_COSINE = 0.999
 _SAME_SIDE = 0.5
 
 
@@ -77,7 +77,7 @@ def _pieces(corners: np.ndarray, neighbors: np.ndarray) -> list[np.ndarray]:
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     face, edge = np.nonzero(neighbors >= 0)
     other = neighbors[face, edge]
-    is_flat = np.sum(normals[face] * normals[other], axis=1) > _FLAT
+    is_flat = np.sum(normals[face] * normals[other], axis=1) > _FLAT_COSINE
     links = coo_array((is_flat[is_flat], (face[is_flat], other[is_flat])), shape=(len(normals), len(normals)))
     count, part = connected_components(links, directed=False)
     means = np.zeros((count, 3))

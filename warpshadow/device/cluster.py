@@ -16,7 +16,7 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 _NO_TOKEN = "it asks for a token: set RAY_AUTH_MODE=token here, too, and have the same ~/.ray/auth_token as there"
-_PATIENCE = 20.0  # how long the head of a cluster may be away [s]; after 60 Ray ends this process, at once
+_HEAD_TIMEOUT = 20.0  # how long the head of a cluster may be away [s]; after 60 Ray ends this process, at once
 
 
 def run_on_ray(
@@ -69,7 +69,7 @@ def run_on_ray(
                     yield TaskResult(task, None, error)
             if not pending:
                 return
-            for reference in ray.wait([*pending], timeout=_PATIENCE / 2)[0]:
+            for reference in ray.wait([*pending], timeout=_HEAD_TIMEOUT / 2)[0]:
                 task = pending.pop(reference)
                 try:
                     ended = TaskResult(task, *unpack(ray.get(reference)))
@@ -88,10 +88,10 @@ def run_on_ray(
 def _await(head: str) -> None:
     """Return once a cluster's head, "HOST:PORT", can be reached."""
     host, _, port = head.rpartition(":")
-    deadline = time.monotonic() + _PATIENCE
+    deadline = time.monotonic() + _HEAD_TIMEOUT
     while True:
         try:
-            socket.create_connection((host.strip("[]"), int(port)), timeout=_PATIENCE).close()
+            socket.create_connection((host.strip("[]"), int(port)), timeout=_HEAD_TIMEOUT).close()
             return
         except OSError as error:
             if time.monotonic() > deadline:

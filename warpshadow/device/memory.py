@@ -17,7 +17,7 @@ import warp as wp
 from warpshadow.device.warp_internals import contiguous_view, item_shape, new_array, scalar_type, set_gradient
 
 _HUGE = 2**21  # bytes of a huge page
-_LEAST = 2 * _HUGE  # bytes of an array that is worth asking
+_MIN_BYTES = 2 * _HUGE  # bytes of an array that is worth asking
 
 
 @functools.cache
@@ -36,7 +36,7 @@ def in_huge_pages(array: wp.array) -> wp.array:
     It is a request: where the system refuses, memory comes in small pages as before.
     """
     size = array.size * wp.types.type_size_in_bytes(array.dtype)
-    if size >= _LEAST and array.device.is_cpu and (advise := _advise()) is not None:
+    if size >= _MIN_BYTES and array.device.is_cpu and (advise := _advise()) is not None:
         first, end = -(-array.ptr // _HUGE) * _HUGE, (array.ptr + size) // _HUGE * _HUGE
         advise(first, end - first, mmap.MADV_HUGEPAGE)
     return array

@@ -21,9 +21,9 @@ from warpshadow.device.parallel import thread_count
 from warpshadow.device.warp_internals import around_compilation
 
 _DELAY = 1.0  # time before a bar shows, and between its states where nothing is done [s]
-_EVERY = 10.0  # time between lines [s]
+_LINE_INTERVAL = 10.0  # time between lines [s]
 
-LONG = 30.0  # time of work that is announced, with the way around it [s]
+ANNOUNCED_SECONDS = 30.0  # time of work that is announced, with the way around it [s]
 
 
 _bars_show = True
@@ -38,8 +38,8 @@ def show_bars(shows: bool) -> None:
 
 def report_every(seconds: float) -> None:
     """Set the time between progress lines where no bar can show; ten seconds without."""
-    global _EVERY
-    _EVERY = seconds
+    global _LINE_INTERVAL
+    _LINE_INTERVAL = seconds
 
 
 def in_ipython() -> bool:
@@ -73,7 +73,7 @@ def announce(work: str, seconds: float, alternative: str, *, shows: bool = True)
         shows: Whether to say it.
     """
     seconds /= thread_count()
-    if shows and _bars_show and seconds > LONG:
+    if shows and _bars_show and seconds > ANNOUNCED_SECONDS:
         say(f"{work} takes about {show_time(seconds)}, {alternative}")
 
 
@@ -165,13 +165,13 @@ class _Reporter:
         self._lock = threading.Lock()
         self._waits_of_threads: list[list[Wait]] = []
         self._thread: threading.Thread | None = None
-        self._reported = self._ended = -_EVERY
+        self._reported = self._ended = -_LINE_INTERVAL
 
     def begin(self, waits: list[Wait]) -> None:
         """Report the waits of a thread from now on."""
         with self._lock:
             now = time.monotonic()
-            if not self._waits_of_threads and now - self._ended >= _EVERY:
+            if not self._waits_of_threads and now - self._ended >= _LINE_INTERVAL:
                 self._reported = now
             self._waits_of_threads.append(waits)
             if self._thread is None:
@@ -189,7 +189,7 @@ class _Reporter:
 
     def _run(self) -> None:
         while True:
-            time.sleep(min(_DELAY, _EVERY) / 2)
+            time.sleep(min(_DELAY, _LINE_INTERVAL) / 2)
             with self._lock:
                 if not self._waits_of_threads:
                     self._thread = None
@@ -200,7 +200,7 @@ class _Reporter:
                         _refresh(waits)
                     continue
                 told_waits = [waits for waits in shown_waits if waits and waits[0].age >= waits[0].patience]
-                if told_waits and time.monotonic() - self._reported >= _EVERY:
+                if told_waits and time.monotonic() - self._reported >= _LINE_INTERVAL:
                     self._reported = time.monotonic()
                     for waits in told_waits:
                         say("; ".join(wait.line() for wait in waits))
@@ -233,7 +233,7 @@ def waiting(what: str, *, shows: bool = True) -> Iterator[None]:
         return
     _this_thread.is_hidden = not shows
     try:
-        with _within(Wait(what, patience=_EVERY), shows=shows):
+        with _within(Wait(what, patience=_LINE_INTERVAL), shows=shows):
             yield
     finally:
         _this_thread.is_hidden = False

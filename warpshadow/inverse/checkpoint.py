@@ -18,10 +18,10 @@ from warpshadow import check
 from warpshadow.assets import files
 from warpshadow.check import AnyPath
 
-OTHERWISE = "choose another file, which on the command line is another folder by -o"
+OTHER_FILE_REMEDY = "choose another file, which on the command line is another folder by -o"
 """Remedy for messages about an unusable checkpoint."""
 
-_MARK = b"warpshadow checkpoint 1\n"
+_FILE_HEADER = b"warpshadow checkpoint 1\n"
 
 
 class CheckpointError(ValueError):
@@ -45,7 +45,7 @@ def alone(path: AnyPath | None) -> Iterator[None]:
         with files.locked(path, timeout=0):
             yield
     except Timeout as error:
-        raise CheckpointError(f"{path}: another fit is writing it; wait for its end, or {OTHERWISE}") from error
+        raise CheckpointError(f"{path}: another fit is writing it; wait for its end, or {OTHER_FILE_REMEDY}") from error
 
 
 def save(path: AnyPath, state: Mapping[str, object]) -> None:
@@ -61,7 +61,7 @@ def save(path: AnyPath, state: Mapping[str, object]) -> None:
     payload = buffer.getvalue()
     with files.whole(path) as unfinished:
         with unfinished.open("wb") as file:
-            file.write(_MARK + hashlib.sha256(payload).digest() + payload)
+            file.write(_FILE_HEADER + hashlib.sha256(payload).digest() + payload)
             file.flush()
             os.fsync(file.fileno())
         if _payload(path) is not None:  # a damaged one does not take the place of the whole one before it
@@ -101,9 +101,9 @@ def _payload(path: Path) -> bytes | None:
     if not path.exists():
         return None
     content = path.read_bytes()
-    start = len(_MARK) + hashlib.sha256().digest_size
+    start = len(_FILE_HEADER) + hashlib.sha256().digest_size
     payload = content[start:]
-    return payload if content[:start] == _MARK + hashlib.sha256(payload).digest() else None
+    return payload if content[:start] == _FILE_HEADER + hashlib.sha256(payload).digest() else None
 
 
 def _state(path: Path, payload: bytes) -> dict[str, Any]:
@@ -114,10 +114,12 @@ def _state(path: Path, payload: bytes) -> dict[str, Any]:
         reason = str(error).partition("\n")[0]
         raise CheckpointError(
             f"{path}: got more than data ({type(error).__name__}: {reason}), expected tensors, numbers, strings, and "
-            f"lists and dictionaries of them; remove it, or {OTHERWISE}"
+            f"lists and dictionaries of them; remove it, or {OTHER_FILE_REMEDY}"
         ) from error
     if not isinstance(state, dict):
-        raise CheckpointError(f"{path}: got {check.described(state)}, expected a dictionary; remove it, or {OTHERWISE}")
+        raise CheckpointError(
+            f"{path}: got {check.described(state)}, expected a dictionary; remove it, or {OTHER_FILE_REMEDY}"
+        )
     return state
 
 

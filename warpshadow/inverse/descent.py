@@ -32,10 +32,10 @@ from warpshadow.inverse.variable_projection import make_model
 from warpshadow.inverse.watch import Watch, watching
 from warpshadow.viewer import FitViewer
 
-FEW = 100  # up to how many values are found by quasi-Newton steps unless an optimizer is named
-WINDOW = 25  # iterations over which a loss must fall for its stage to go on
+MAX_QUASI_NEWTON_VALUES = 100  # up to how many values are found by quasi-Newton steps unless an optimizer is named
+CONVERGENCE_WINDOW = 25  # iterations over which a loss must fall for its stage to go on
 
-AROUND = 6
+PERTURBED_STARTS = 6
 """To how many scattered values a result is compared that may stand out: a pose turned about each axis, either way."""
 
 
@@ -165,7 +165,8 @@ class _Descent:
         if others is None or changed:
             of_other = f"of another fit (other {', '.join(changed)})" if changed else "of no fit of this version"
             raise checkpoints.CheckpointError(
-                f"checkpoint: got one {of_other}, expected one of this fit; {checkpoints.OTHERWISE}, or remove it"
+                f"checkpoint: got one {of_other}, expected one of this fit; "
+                f"{checkpoints.OTHER_FILE_REMEDY}, or remove it"
             )
         device = self.setting.device
         self.stage = state["stage"]
@@ -242,8 +243,8 @@ class _Descent:
         if losses and isinstance(self.optimizer, QuasiNewton):
             return self.optimizer.has_converged(tolerance)
         # means, as the least loss may be the luck of a passing iterate
-        last, before = losses[-WINDOW:], losses[-2 * WINDOW : -WINDOW]
-        return len(before) == WINDOW and sum(last) >= (1 - tolerance) * sum(before)
+        last, before = losses[-CONVERGENCE_WINDOW:], losses[-2 * CONVERGENCE_WINDOW : -CONVERGENCE_WINDOW]
+        return len(before) == CONVERGENCE_WINDOW and sum(last) >= (1 - tolerance) * sum(before)
 
     def _stands_out(self, run: _Run) -> bool:
         """Whether the loss of a run is far below that of values scattered around its best."""
@@ -251,7 +252,7 @@ class _Descent:
         if part == 0 or run.failure is not None:
             return False
         losses = []
-        for values in self._scattered(run.best, AROUND):
+        for values in self._scattered(run.best, PERTURBED_STARTS):
             with torch.no_grad(), contextlib.suppress(ValueError):  # one that cannot be drawn
                 losses.append(float(self.model.loss(values)[0]))
         return run.loss < part * min(filter(math.isfinite, losses), default=0.0)
@@ -337,7 +338,7 @@ def short_adam(parameters: list[torch.Tensor], lr: float) -> torch.optim.Optimiz
 
 def default_optimizer(parameters: list[torch.Tensor], lr: float) -> torch.optim.Optimizer:
     """Quasi-Newton steps for up to 100 values, such as poses and colors; :func:`short_adam` for more."""
-    few = sum(tensor.numel() for tensor in parameters) <= FEW
+    few = sum(tensor.numel() for tensor in parameters) <= MAX_QUASI_NEWTON_VALUES
     return QuasiNewton(parameters, lr) if few else short_adam(parameters, lr)
 
 

@@ -15,16 +15,16 @@ from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
 from warpshadow.inverse.world import Setting
 
-UNSEEN = 0.01
+MAX_UNSEEN_SHARE = 0.01
 """Share of the counted pixels that may see no body without a warning."""
 
-FALLING = 0.01
+MAX_LAST_GAIN = 0.01
 """Part of its loss that a fit may still gain over a window of iterations without a warning."""
 
-EXPLAINED = 0.5
+MAX_EXPLAINED_SHARE = 0.5
 """Part of the residual's squares that a factor of an image may explain without a warning."""
 
-STOPS = 0.2
+MIN_EXPOSURE_GAP = 0.2
 """Logarithm to the base 2 of the factor from which that is of interest; a wrong pose has one, too."""
 
 _WINDOW = 20  # iterations, of which the second half is compared with the first
@@ -58,7 +58,7 @@ def exposure_gaps(model: Model, images: torch.Tensor) -> dict[int, float]:
         image, target = image[..., :3], target[..., :3]
         factor = float((weight * image * target).sum() / (weight * image.square()).sum().clamp_min(1e-30))
         residual, left = ((weight * (gain * image - target).square()).sum() for gain in (1.0, factor))
-        if factor > 0 and abs(math.log2(factor)) > STOPS and left < (1 - EXPLAINED) * residual:
+        if factor > 0 and abs(math.log2(factor)) > MIN_EXPOSURE_GAP and left < (1 - MAX_EXPLAINED_SHARE) * residual:
             gaps[view] = math.log2(factor)
     return gaps
 
@@ -93,7 +93,7 @@ def warn_of(
         if is_exposure_known:
             _warn_of_exposures(model, images)
     gain = gain_of_last(losses)
-    if end == "finished" and problem.basis is not None and gain > FALLING:
+    if end == "finished" and problem.basis is not None and gain > MAX_LAST_GAIN:
         check.warn(
             f"light has not converged: the loss still fell by {gain:.1%} over the last {_WINDOW // 2} iterations; "
             'give the last stage more iterations, or stages = "photograph", which solves for the light',
@@ -103,7 +103,7 @@ def warn_of(
 
 def _warn_of_unseen(model: Model, images: torch.Tensor) -> None:
     share = unseen_share(model, images)
-    if share > UNSEEN:
+    if share > MAX_UNSEEN_SHARE:
         check.warn(
             f"{share:.0%} of the counted pixels see no body, and are explained as black; mask them out, or make the "
             "ground larger",

@@ -31,13 +31,13 @@ from warpshadow.maths.directions import fibonacci
 from warpshadow.maths.sh import equirectangular_directions, pixel_solid_angles
 from warpshadow.pipeline.lighting import map_of
 
-FAINTEST = 0.05
+MIN_INFLUENCE = 0.05
 """Influence below which a direction is not determined, as a fraction of the mean over all directions: noise in the
 images disturbs it twenty times as much as on average.
 """
 
 _CELLS = 512  # that directions are told apart by
-_ENLARGED, _STRIPE = 4, 6  # of its picture: pixels across one of the map; width of a stripe [pixels]
+_MAGNIFICATION, _STRIPE_WIDTH = 4, 6  # of its picture: pixels across one of the map; width of a stripe [pixels]
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class FoundLight:
     @property
     def determined(self) -> np.ndarray:
         """Which directions the images determined, bool of shape [height, 2·height]."""
-        return self.influence >= FAINTEST
+        return self.influence >= MIN_INFLUENCE
 
     @property
     def undetermined_share(self) -> float:
@@ -69,9 +69,9 @@ class FoundLight:
         bright = np.maximum(self.radiance, 0)
         shown = bright[self.determined] if self.determined.any() else bright
         linear = np.clip(bright * 2 ** auto_exposure(shown), 0, 1)
-        large, known = (item.repeat(_ENLARGED, 0).repeat(_ENLARGED, 1) for item in (linear, self.determined))
+        large, known = (item.repeat(_MAGNIFICATION, 0).repeat(_MAGNIFICATION, 1) for item in (linear, self.determined))
         rows, columns = np.indices(known.shape)
-        is_stripe = ~known & ((rows + columns) // _STRIPE % 2 == 0)
+        is_stripe = ~known & ((rows + columns) // _STRIPE_WIDTH % 2 == 0)
         return Picture(np.where(is_stripe[..., None], 0.2, large), exposure=0.0)
 
     def _repr_png_(self) -> bytes:

@@ -46,7 +46,9 @@ TABLE = "table.csv"  # the file, in the folder of all results, that says how eac
 _FIT_FILE = "fit.toml"  # pattern of fit files in a folder
 _RECORD = "ending.json"
 _ATTEMPTS = 4  # begins of a fit whose workers are killed
-_PATIENCE = 60.0  # how long a worker waits for another that is at the same fit, such as one that Ray believed dead [s]
+_LOCK_TIMEOUT = (
+    60.0  # how long a worker waits for another that is at the same fit, such as one that Ray believed dead [s]
+)
 
 
 @dataclass(frozen=True)
@@ -284,7 +286,7 @@ def _ended(job: _FitJob) -> Ending:
     check_folder(job.folder)
     job.folder.mkdir(exist_ok=True)
     try:
-        with files.locked(job.folder / _RECORD, timeout=_PATIENCE):
+        with files.locked(job.folder / _RECORD, timeout=_LOCK_TIMEOUT):
             result = loaded.run(
                 device=job.device,
                 checkpoint=job.folder / CHECKPOINT,

@@ -23,7 +23,7 @@ from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.target import Target
 from warpshadow.inverse.world import FittedScene, Setting
 from warpshadow.scene.blockers import blocking_planes, scene_blockers
-from warpshadow.scene.scene import METHODS, SCENE, SPHERE_METHODS, Scene, Visibility
+from warpshadow.scene.scene import METHODS, SCENE_TYPES, SPHERE_METHODS, Scene, Visibility
 from warpshadow.tuning.tune import resolved
 
 _SQUARES, _RAYS = Loss(), Visibility("ray-traced")
@@ -58,7 +58,7 @@ class Problem:
         still: Visibility | None = _RAYS,
     ):
         vars(self).update(scene=scene, targets=targets, free=free, loss=loss, still=still)
-        check.instance("scene", self.scene, Scene, SCENE)
+        check.instance("scene", self.scene, Scene, SCENE_TYPES)
         check.instance("loss", self.loss, Loss, "a Loss, such as Loss('huber')")
         rays = "a Visibility, such as Visibility('ray-traced'), or None for the scene's"
         check.instance("still", self.still, (Visibility, type(None)), rays)

@@ -17,10 +17,10 @@ Curvature = tuple[list[torch.Tensor], list[torch.Tensor]]
 HISTORY = 12
 """How many steps are kept: of six values, their curvature wholly."""
 
-_GROWTH = 2.0  # of the bound, where a step that reached it was kept
-_SHORTEST, _LONGEST = 0.1, 0.5  # factors of the bound after a rejected step, relative to the step
-_REACH = 5.0  # the bound at most, in learning rates
-_CURVED = 1e-3  # least cosine of a step and the change of the gradient that tell the curvature
+_BOUND_GROWTH = 2.0  # of the bound, where a step that reached it was kept
+_MIN_BOUND_FACTOR, _MAX_BOUND_FACTOR = 0.1, 0.5  # factors of the bound after a rejected step, relative to the step
+_MAX_BOUND = 5.0  # the bound at most, in learning rates
+_MIN_CURVATURE_COSINE = 1e-3  # least cosine of a step and the change of the gradient that tell the curvature
 
 
 class QuasiNewton(torch.optim.Optimizer):
@@ -120,11 +120,13 @@ class QuasiNewton(torch.optim.Optimizer):
             self._remember(step, change)
         rise = loss - memory["loss"]
         if rise >= 0 and length > 0:
-            lowest = -slope / (2 * (rise - slope)) if rise > slope else _LONGEST  # of the parabola through both
-            memory["bound"] = length * min(max(lowest, _SHORTEST), _LONGEST)
+            lowest = (
+                -slope / (2 * (rise - slope)) if rise > slope else _MAX_BOUND_FACTOR
+            )  # of the parabola through both
+            memory["bound"] = length * min(max(lowest, _MIN_BOUND_FACTOR), _MAX_BOUND_FACTOR)
             return
         if length > 0.8 * memory["bound"]:
-            memory["bound"] = min(_GROWTH * memory["bound"], _REACH * self._rate)
+            memory["bound"] = min(_BOUND_GROWTH * memory["bound"], _MAX_BOUND * self._rate)
         memory["gained"] = -rise
         self._keep(loss, place, gradient, self._sides(place))
 
@@ -170,7 +172,7 @@ def _products(step: T, change: T) -> tuple[tuple[T, T], ...]:
 
 def _curves(mixed: float, step: float, change: float) -> bool:
     """Whether the loss curves upwards over a step, by its :func:`_products` with how the gradient changed."""
-    return mixed > _CURVED * math.sqrt(step * change)
+    return mixed > _MIN_CURVATURE_COSINE * math.sqrt(step * change)
 
 
 def _dot(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:

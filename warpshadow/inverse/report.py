@@ -24,11 +24,11 @@ from warpshadow.inverse.model import Model
 from warpshadow.inverse.one_thread import torch_on_one_thread
 from warpshadow.inverse.result import Result
 from warpshadow.inverse.schedule import Stage
-from warpshadow.inverse.uncertainty import FLAT
+from warpshadow.inverse.uncertainty import MAX_POSE_UNCERTAINTY
 from warpshadow.pipeline.lighting import map_of
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import camera_table, write_scene
-from warpshadow.scene.scene import GLOSS, Scene
+from warpshadow.scene.scene import GLOSS_ARGUMENTS, Scene
 
 SUMMARY = "summary.toml"  # the file of a folder of results that is written last: where it is, the others are
 
@@ -119,7 +119,8 @@ class Report:
             table[name] = {"shift": pose.shift.tolist(), "turn": pose.turn, "least": str(pose)}
             if pose.is_flat:
                 check.warn(
-                    f"{name} is uncertain by more than {FLAT:.0%} of its size; {pose}. A plane that it stands on "
+                    f"{name} is uncertain by more than {MAX_POSE_UNCERTAINTY:.0%} of its size; {pose}. "
+                    "A plane that it stands on "
                     "(stands_on), a prior or another view would tell more",
                     DiagnosticWarning,
                 )
@@ -158,7 +159,7 @@ def _stems(scene: Scene) -> list[str]:
         and lower.count(name.lower()) == 1
         and name.lower() not in _OTHER_FILES
         and not name.startswith("body_")
-        and not name.endswith(GLOSS)
+        and not name.endswith(GLOSS_ARGUMENTS)
         else f"body_{number}"
         for number, name in enumerate(names)
     ]

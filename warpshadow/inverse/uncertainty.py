@@ -30,13 +30,13 @@ from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.variable_projection import ProjectedModel
 from warpshadow.inverse.world import FittedScene, Setting
 
-FEW = 32
+MAX_UNCERTAIN_NUMBERS = 32
 """Numbers that a parameter has at most to be among the uncertain ones; textures are taken as they are."""
 
-FLAT = 0.02
+MAX_POSE_UNCERTAINTY = 0.02
 """Part of its diagonal by which a body may be uncertain without a warning."""
 
-SPREAD = 0.06
+CANDIDATE_SPACING = 0.06
 """Distance between candidates along a flat direction [half diagonals of the body]."""
 
 _STEP = 0.01  # of differences: half a pixel or less of the small images
@@ -68,7 +68,7 @@ class PoseUncertainty:
     def is_flat(self) -> bool:
         """Whether the body is uncertain by more than 2% of its diagonal."""
         turned = np.radians(self.least_turn) * self.diagonal / 2
-        return float(np.hypot(np.linalg.norm(self.least), turned)) > FLAT * self.diagonal
+        return float(np.hypot(np.linalg.norm(self.least), turned)) > MAX_POSE_UNCERTAINTY * self.diagonal
 
     def __str__(self) -> str:
         length = np.linalg.norm(self.least)
@@ -334,7 +334,7 @@ def along_flat(problem: Problem, setting: Setting, values: Mapping[str, Values],
         moving = normal.directions[poses].any(axis=0)
         spread = np.linalg.inv(normal.form)[np.ix_(moving, moving)]
         weakest = normal.directions[:, moving] @ np.linalg.eigh(spread)[1][:, -1]
-    return [normal.moved(SPREAD * (number // 2 + 1) * (-1) ** number * weakest) for number in range(count)]
+    return [normal.moved(CANDIDATE_SPACING * (number // 2 + 1) * (-1) ** number * weakest) for number in range(count)]
 
 
 def _places(values: Mapping[str, Values]) -> list[tuple[str, str, int]]:
@@ -343,6 +343,6 @@ def _places(values: Mapping[str, Values]) -> list[tuple[str, str, int]]:
         (name, key, number)
         for name, own in values.items()
         for key, tensor in own.items()
-        if name != Light.key and tensor.numel() <= FEW
+        if name != Light.key and tensor.numel() <= MAX_UNCERTAIN_NUMBERS
         for number in range(tensor.numel())
     ]

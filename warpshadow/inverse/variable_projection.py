@@ -30,7 +30,7 @@ from warpshadow.maths.directions import fibonacci
 
 _REWEIGHTINGS = 6  # of losses that are not squares
 _RIDGE = 1e-6  # least eigenvalue of a form, as a share of the mean of its diagonal
-_DARKEST = 1e-6  # radiance of a cell whose logarithm is stored, where the solution is 0 [radiance of the targets]
+_MIN_RADIANCE = 1e-6  # radiance of a cell whose logarithm is stored, where the solution is 0 [radiance of the targets]
 _LIGHTS_AT_ONCE = 32
 _ATOMS = 192  # cells of which light in spherical harmonics is made
 
@@ -103,7 +103,7 @@ class ProjectedModel(Model):
     def _store(self, radiance: np.ndarray, values: Values) -> None:
         """Write radiance of atoms, [atom, 3], into the light's values."""
         if isinstance(self.light.basis, CellBasis):
-            stored = {"log_radiance": np.log(np.maximum(radiance, _DARKEST))}
+            stored = {"log_radiance": np.log(np.maximum(radiance, _MIN_RADIANCE))}
         else:
             stored = {"coefficients": self.atoms.T @ radiance / np.sqrt(4 * np.pi)}
         for key, numbers in stored.items():

@@ -24,9 +24,9 @@ from warpshadow.inverse.schedule import Stage
 from warpshadow.viewer import FitViewer
 from warpshadow.viewer.painter import picture
 
-_SECONDS = 0.5  # between two pictures, at least
-_SHARE = 0.02  # of the fit's time that pictures may take; encoding and sending in other threads come on top
-_ACROSS = 768  # pixels of a picture, about
+_MIN_INTERVAL = 0.5  # between two pictures, at least
+_MAX_TIME_SHARE = 0.02  # of the fit's time that pictures may take; encoding and sending in other threads come on top
+_PICTURE_WIDTH = 768  # pixels of a picture, about
 
 
 class Watched(Protocol):
@@ -67,7 +67,7 @@ class Watch:
             while page.pauses:
                 page.wait(0.5)
         if time.perf_counter() >= self._next:
-            self._next = time.perf_counter() + _SECONDS
+            self._next = time.perf_counter() + _MIN_INTERVAL
             if page.is_watched:
                 self._show(fit, "runs")
         return not page.stops
@@ -89,7 +89,7 @@ class Watch:
             self._page.show_pictures(pictures(fit))
             self._page.fail(None)
         now = time.perf_counter()
-        self._next = now + max(_SECONDS, (now - start) / _SHARE)
+        self._next = now + max(_MIN_INTERVAL, (now - start) / _MAX_TIME_SHARE)
 
     @contextlib.contextmanager
     def _kept_from_the_fit(self) -> Iterator[None]:
@@ -118,7 +118,7 @@ def pictures(fit: Watched) -> np.ndarray:
         with torch.no_grad():
             images = fit.model.images(fit.values)
     width = 3 * images.shape[2]
-    step, factor = max(1, width // _ACROSS), max(1, _ACROSS // width)
+    step, factor = max(1, width // _PICTURE_WIDTH), max(1, _PICTURE_WIDTH // width)
     shown = side_by_side(fit.model.targets[:, ::step, ::step], images[:, ::step, ::step])
     shown = shown.repeat(factor, axis=0).repeat(factor, axis=1).astype(np.float32)
     opaque = np.ones((*shown.shape[:2], 1), np.float32)

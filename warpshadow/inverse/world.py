@@ -13,7 +13,7 @@ import torch
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.geometry import Geometry
 from warpshadow.scene.blockers import scene_blockers
-from warpshadow.scene.scene import GLOSS, SPHERE_METHODS, Scene, Visibility
+from warpshadow.scene.scene import GLOSS_ARGUMENTS, SPHERE_METHODS, Scene, Visibility
 from warpshadow.spheres import Spheres
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.torch import TorchRenderer
@@ -121,7 +121,7 @@ class World:
         self.light: torch.Tensor | None = None
         self.albedo: list[torch.Tensor | None] = [None] * count
         self.textures: list[torch.Tensor | None] = [None] * count
-        self.gloss: dict[str, list[torch.Tensor | None]] = {name: [None] * count for name in GLOSS}
+        self.gloss: dict[str, list[torch.Tensor | None]] = {name: [None] * count for name in GLOSS_ARGUMENTS}
         self.rotations, self.translations, self.scales = (list(poses.unbind()) for poses in renderer.scene_poses())
         self.rest: Geometry | None = None
         self.moving: set[int] = set()

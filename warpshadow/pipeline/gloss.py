@@ -17,7 +17,7 @@ from warpshadow.device.constants import constant
 from warpshadow.pipeline.lighting import KnownLight, Light, LitPoints, change_basis, map_of, receiver_words
 from warpshadow.pipeline.node import Input, Node, detached
 from warpshadow.pipeline.reflectance import Materials
-from warpshadow.scene.scene import GLOSS
+from warpshadow.scene.scene import GLOSS_ARGUMENTS
 from warpshadow.stages.gloss.lobes import sample_lobes
 from warpshadow.stages.gloss.prefilter import look_up_light, prefilter
 from warpshadow.stages.gloss.reflection import mix_reflection, sum_lobes
@@ -56,7 +56,7 @@ class GlossyPoints(LitPoints):
             materials: Of the bodies.
         """
         words = functools.partial(receiver_words, self)
-        roughness, metallic, specular = (self._values(materials, name) for name in GLOSS)
+        roughness, metallic, specular = (self._values(materials, name) for name in GLOSS_ARGUMENTS)
         key = materials.roughness
 
         def lobes() -> Node:

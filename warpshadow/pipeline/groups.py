@@ -24,7 +24,7 @@ from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 
-PART = 1 << 13  # receivers of each instance that are lit at once where no gradient is asked for
+PART_SIZE = 1 << 13  # receivers of each instance that are lit at once where no gradient is asked for
 
 
 def solid_bodies(merged_scene: MergedScene) -> list[int]:
@@ -58,7 +58,7 @@ class Group(NamedTuple):
         return lifted_points(self.points, fronts, frames, planes, skip), fronts
 
     def parts(self) -> Iterator[Group]:
-        """Parts of at most PART receivers, with as many instances in all arrays where there are spheres.
+        """Parts of at most PART_SIZE receivers, with as many instances in all arrays where there are spheres.
 
         For a gradient all of them come at once, and so do receivers with cached rows.
         """
@@ -73,11 +73,15 @@ class Group(NamedTuple):
             points, normals, centers, radii = [expand(array, count) for array in arguments]
             clusters = clusters if radii is self.radii and centers is self.centers else None
         size = points.shape[1]
-        if self.cached_rows is not None or size <= PART or varies([*arguments, turns, frames, solids, self.corners]):
+        if (
+            self.cached_rows is not None
+            or size <= PART_SIZE
+            or varies([*arguments, turns, frames, solids, self.corners])
+        ):
             yield self._replace(points=points, normals=normals, centers=centers, radii=radii, clusters=clusters)
             return
-        for start in range(0, size, PART):
-            part = slice(start, min(start + PART, size))
+        for start in range(0, size, PART_SIZE):
+            part = slice(start, min(start + PART_SIZE, size))
             yield self._replace(
                 points=points[:, part].contiguous(),
                 normals=normals[:, part].contiguous(),

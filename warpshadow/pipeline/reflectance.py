@@ -14,7 +14,7 @@ from warpshadow.device.constants import constant
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node, detached
-from warpshadow.scene.scene import GLOSS
+from warpshadow.scene.scene import GLOSS_ARGUMENTS
 from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.textures.footprint import find_footprints
 from warpshadow.stages.textures.pyramid import mip_pyramids
@@ -43,8 +43,8 @@ class Materials:
     Args:
         merged_scene: The bodies.
         inputs: Arrays of each body, by name: "albedo", vec3 of shape [batch, 1] or [batch, vertex]; "textures", vec3 of
-            shape [batch, height, width], None without one; and where a body shines, those of GLOSS, float32 of shape
-            [batch, 1] or [batch, vertex].
+            shape [batch, height, width], None without one; and where a body shines, those of GLOSS_ARGUMENTS, float32
+            of shape [batch, 1] or [batch, vertex].
     Attributes:
         albedo, textures, roughness: These inputs; None where no body shines.
         images: The textures that there are.
@@ -82,7 +82,7 @@ class Materials:
             "textures": [None if body.texture is None else array(body.texture) for body in bodies],
         }
         if merged_scene.is_glossy.any():
-            arrays |= {name: _of_bodies(merged_scene, name) for name in GLOSS}
+            arrays |= {name: _of_bodies(merged_scene, name) for name in GLOSS_ARGUMENTS}
         return cls(merged_scene, {name: Input(name, values) for name, values in arrays.items()})
 
     def is_black(self, number: int) -> bool:
@@ -122,7 +122,7 @@ class Materials:
     def _check(self, name: str, number: int, array: wp.array) -> None:
         """Raise ValueError for an array that is not one of a body."""
         body, where = self.merged_scene.scene.bodies[number], f"{name}[{number}]"
-        if name in GLOSS and not body.is_glossy:
+        if name in GLOSS_ARGUMENTS and not body.is_glossy:
             expected = "one for bodies that have roughness in the scene"
             raise ValueError(f"{where}: got some for {body.called!r}, expected {expected}")
         if name == "textures":
@@ -134,7 +134,7 @@ class Materials:
         else:
             check.shape(where, array.shape, ("batch", 1 if array.shape[1:] == (1,) else body.mesh.vertex_count))
         check.finite_arrays({where: array})
-        if name not in GLOSS:
+        if name not in GLOSS_ARGUMENTS:
             self._warn_of_growth(where, array)
 
     def _warn_of_growth(self, name: str, values: wp.array) -> None:

@@ -39,7 +39,7 @@ from warpshadow.pipeline.scene_views import SceneViews, camera_batch
 from warpshadow.pipeline.view import View
 from warpshadow.scene.creases import rounded_edges
 from warpshadow.scene.placement import enclosures, misplacements
-from warpshadow.scene.scene import GLOSS, METHODS, SCENE, BodyLike, PerBody, Scene
+from warpshadow.scene.scene import GLOSS_ARGUMENTS, METHODS, SCENE_TYPES, BodyLike, PerBody, Scene
 from warpshadow.stages.receivers import Receivers
 
 RendererType = TypeVar("RendererType", bound="SceneRenderer")
@@ -104,7 +104,7 @@ class SceneRenderer:
         basis: Basis | None = None,
         progress: bool = False,
     ):
-        check.instance("scene", scene, Scene, SCENE)
+        check.instance("scene", scene, Scene, SCENE_TYPES)
         check_basis(basis)
         where, scene = check.device("device", device), scene.with_method()
         check.choice("scene.visibility.method", scene.visibility.method, METHODS)
@@ -339,7 +339,7 @@ class SceneRenderer:
         gloss: Mapping[str, PerBody[wp.array]] | None = None,
     ) -> Materials:
         """The scene's materials with others in their place, checked."""
-        check.known_keys("gloss", gloss or {}, GLOSS)
+        check.known_keys("gloss", gloss or {}, GLOSS_ARGUMENTS)
         replacements = {"albedo": albedo, "textures": textures, **(gloss or {})}
         return self._materials.replaced(
             {name: self.scene.per_body(values, name) for name, values in replacements.items()}

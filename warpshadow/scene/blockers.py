@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.mesh import Mesh
-from warpshadow.device.progress import LONG, announce
+from warpshadow.device.progress import ANNOUNCED_SECONDS, announce
 from warpshadow.maths.plane import plane_normal
 from warpshadow.maths.solid_angle import solid_angles
 from warpshadow.scene.scene import SPHERE_METHODS, Body, Scene
@@ -72,7 +72,7 @@ def fitted_counts(scene: Scene) -> dict[int, int | str]:
 def _announce(scene: Scene, counts: dict[int, int | str], device: wp.DeviceLike, progress: bool) -> None:
     """Say how long fits that are to be made take, if that is long."""
     requested = {(scene.bodies[body].mesh, count) for body, count in counts.items()}
-    if sum(fit_seconds(count) for _, count in requested) <= LONG:
+    if sum(fit_seconds(count) for _, count in requested) <= ANNOUNCED_SECONDS:
         return
     missing = [count for mesh, count in requested if not is_fitted(mesh, count, device=device)]
     announce(

@@ -24,12 +24,12 @@ from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
 from warpshadow.scene.scene import (
-    COLORS,
-    GLOSS,
-    MEANT,
-    READ_BY,
-    SCENE,
-    VALUES,
+    COLORS_SUFFIX,
+    GLOSS_ARGUMENTS,
+    LIKELY_MISTAKES,
+    METHODS_OF_SETTING,
+    SCENE_TYPES,
+    VALUES_SUFFIX,
     Body,
     Bounces,
     Scene,
@@ -56,7 +56,7 @@ _SHAPE_KEYS = {name: tuple(inspect.signature(make).parameters) for name, make in
 _KEYS = {
     "[camera]": (*_CAMERA_KEYS, *_FRAMING_KEYS, "supersampling"),
     "[light]": _LIGHT_KEYS,
-    "[visibility]": ("method", *READ_BY),
+    "[visibility]": ("method", *METHODS_OF_SETTING),
     "[[body]]": ("mesh", "primitive", *(key for keys in _SHAPE_KEYS.values() for key in keys), *_PLACE_KEYS),
 }
 """Keys that each table of a scene file may have."""
@@ -136,8 +136,8 @@ def _check_keys(name: str, table: Table, known: Iterable[str] = (), *, what: str
         others = [] if is_typo else [other for other, keys in _KEYS.items() if key in keys]
         if key not in known and others and name not in others:
             raise ValueError(f"got {key}, expected it in {' or '.join(others)}")
-        if key not in known and MEANT.get(key) in known:
-            raise ValueError(f"{what}: unknown key {key!r} (did you mean {MEANT[key]!r}?)")
+        if key not in known and LIKELY_MISTAKES.get(key) in known:
+            raise ValueError(f"{what}: unknown key {key!r} (did you mean {LIKELY_MISTAKES[key]!r}?)")
     check.known_keys(what, table, known)
 
 
@@ -216,10 +216,10 @@ def _body(table: Table, folder: Path) -> Body:
     place: Table = {"mesh": mesh} | {key: table[key] for key in _PLACE_KEYS if key in table}
     if "texture" in place:
         place["texture"] = toml_tables.file(table, "texture", folder)
-    if isinstance(place.get("albedo"), str) and place["albedo"].endswith(COLORS):
+    if isinstance(place.get("albedo"), str) and place["albedo"].endswith(COLORS_SUFFIX):
         place["albedo"] = toml_tables.file(table, "albedo", folder)
-    for name in GLOSS:
-        if isinstance(place.get(name), str) and place[name].endswith(VALUES):
+    for name in GLOSS_ARGUMENTS:
+        if isinstance(place.get(name), str) and place[name].endswith(VALUES_SUFFIX):
             place[name] = toml_tables.file(table, name, folder)
     if "spheres" in place:
         path = toml_tables.file(place, "spheres", folder)
@@ -257,7 +257,7 @@ def write_scene(scene: Scene, folder: AnyPath, *, stems: Sequence[str] | None = 
     Returns:
         The files.
     """
-    check.instance("scene", scene, Scene, SCENE)
+    check.instance("scene", scene, Scene, SCENE_TYPES)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
@@ -321,13 +321,13 @@ def _write_body(body: Body, stem: Path) -> tuple[Table, list[Path]]:
         table["spheres"] = arrays.name
         written.append(arrays)
     place: Table = {"rotation": list(body.rotation), "translation": list(body.translation), "scale": float(body.scale)}
-    for name in GLOSS:
+    for name in GLOSS_ARGUMENTS:
         values = getattr(body, name)
         if values is None:
             continue
         place[name] = _numbers(values)[0]
         if values.size > 1:
-            path = stem.with_name(f"{stem.name}_{name}{VALUES}")
+            path = stem.with_name(f"{stem.name}_{name}{VALUES_SUFFIX}")
             with files.whole(path) as unfinished:
                 np.save(unfinished, values)
             place[name] = path.name

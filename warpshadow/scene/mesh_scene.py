@@ -21,15 +21,15 @@ from warpshadow.scene.scene import Body, Scene
 
 GROUND_SIZE = 6.0  # within which the ground's faces are small, as infinite_ground has it [scene units]
 
-GUESS = "guess"  # ways to point up: the one that :func:`guess_up` finds
+GUESSED_AXIS = "guess"  # ways to point up: the one that :func:`guess_up` finds
 
 _AXES = {"y": 1, "z": 2}
 _Y_UP_FORMATS = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz")  # glTF says so, and USD is turned as it is read
 _Z_UP_FORMATS = (".stl",)  # as programs for printing and construction have it
 
-_FOOT = 0.02  # height of the part that touches the ground, as a part of the size
-_FIRMER = 0.2  # difference of footings that decides
-_THIN = 0.3  # extent of plates and doors along their normal, as a part of the next
+_FOOT_HEIGHT = 0.02  # height of the part that touches the ground, as a part of the size
+_MIN_FOOTING_DIFFERENCE = 0.2  # difference of footings that decides
+_PLATE_THINNESS = 0.3  # extent of plates and doors along their normal, as a part of the next
 _SAMPLES = 4000
 _HULL_DIRECTIONS = 64
 _SYMMETRIC, _ASYMMETRIC = 1.1, 2.0  # distances to the mirrored surface, in distances between samples
@@ -69,8 +69,8 @@ def guess_up(mesh: Mesh, suffix: str = "") -> UpGuess:
     footing = {axis: _footing(points, samples[0].mean(axis=0), number) for axis, number in _AXES.items()}
     axis, other = sorted(footing, key=lambda item: -footing[item])
     extents = np.ptp(points, axis=0)
-    is_thin = extents[_AXES[axis]] < _THIN * np.delete(extents, _AXES[axis]).min()
-    if footing[axis] < footing[other] + _FIRMER or is_thin:
+    is_thin = extents[_AXES[axis]] < _PLATE_THINNESS * np.delete(extents, _AXES[axis]).min()
+    if footing[axis] < footing[other] + _MIN_FOOTING_DIFFERENCE or is_thin:
         is_z = suffix in _Z_UP_FORMATS
         return UpGuess("z" if is_z else "y", f"as {suffix} files often have it" if is_z else "its shape does not say")
     return UpGuess(axis, f"it stands firmer than on {other}")
@@ -95,10 +95,10 @@ def default_scene(
         light: In place of the sky: an environment map, or the file of one.
         direction: From the body's middle to the camera, in the world, whose y is up, shape [3], any length.
     """
-    check.choice("up", up, (*_AXES, GUESS))
+    check.choice("up", up, (*_AXES, GUESSED_AXIS))
     suffix = Path(body).suffix.lower() if check.is_path(body) else ""
     body = body if isinstance(body, Body) else Body(body)
-    axis = guess_up(body.mesh, suffix).axis if up == GUESS else up
+    axis = guess_up(body.mesh, suffix).axis if up == GUESSED_AXIS else up
     body = body.creased() if body.mesh.rounds_edges else body
     body = replace(body, rotation=np.array([-90.0 if axis == "z" else 0.0, 0.0, 0.0])).on_ground(size=2)
     ground = Body(infinite_ground(GROUND_SIZE), albedo=(0.4, 0.4, 0.4))
@@ -111,7 +111,7 @@ def _footing(points: np.ndarray, middle: np.ndarray, axis: int) -> float:
     """Area on which points stand, as a part of that of their shadow from above; 0 where they would fall over."""
     level = np.delete(points, axis, axis=1)
     height = points[:, axis] - points[:, axis].min()
-    base, shadow = _hull(level[height < _FOOT * np.ptp(points, axis=0).max()]), _hull(level)
+    base, shadow = _hull(level[height < _FOOT_HEIGHT * np.ptp(points, axis=0).max()]), _hull(level)
     if _area(base) <= 1e-9 * np.ptp(points, axis=0).max() ** 2:
         return 0.0
     ends = np.roll(base, -1, axis=0)

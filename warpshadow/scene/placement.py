@@ -11,8 +11,8 @@ from warpshadow.maths.plane import plane_normal
 from warpshadow.maths.solid_angle import solid_angles
 from warpshadow.scene.scene import Body, Scene
 
-_LEVEL = 0.99  # cosine of the angle to +y up to which a flat body is a ground
-_BROADER = 1.01  # ratio of breadths up to which a body is as broad as its ground, such as a ceiling
+_GROUND_COSINE = 0.99  # cosine of the angle to +y up to which a flat body is a ground
+_CEILING_RATIO = 1.01  # ratio of breadths up to which a body is as broad as its ground, such as a ceiling
 
 
 class _Box(NamedTuple):
@@ -50,7 +50,7 @@ def misplacements(scene: Scene) -> list[str]:
         if number in grounds or not below:
             continue
         broadest = max(below, key=lambda other: boxes[other].breadth)
-        if box.breadth > _BROADER * boxes[broadest].breadth:
+        if box.breadth > _CEILING_RATIO * boxes[broadest].breadth:
             remarks.append(
                 f"body {number} ({body.called!r}) is {box.breadth:.3g} broad, and body {broadest} "
                 f"({scene.bodies[broadest].called!r}) below it {boxes[broadest].breadth:.3g}; on_ground(size=…) makes "
@@ -100,4 +100,4 @@ def _is_ground(body: Body, box: _Box) -> bool:
     if size[1] > 0.2 * size.max():  # at once: most bodies are not flat
         return False
     normal = plane_normal(mesh.positions[mesh.faces].astype(np.float64))
-    return normal is not None and bool((body.rotation_matrix() @ normal)[1] > _LEVEL)
+    return normal is not None and bool((body.rotation_matrix() @ normal)[1] > _GROUND_COSINE)

@@ -32,7 +32,7 @@ SPHERE_METHODS = ("directional", "log-sh")
 METHODS = (*SPHERE_METHODS, "none", "ray-traced")
 DEFAULT_METHOD = "directional"  # method of renderers that are kept, where none is named
 AUTO = "auto"
-READ_BY = {
+METHODS_OF_SETTING = {
     "directions": ("directional",),
     "softness": ("directional", AUTO),
     "merging": (*SPHERE_METHODS, AUTO),
@@ -46,10 +46,12 @@ READ_BY = {
 }
 """The methods that read each setting of a :class:`Visibility`; "auto" leaves some to the chosen method."""
 
-_NAMING = {name for name, methods in READ_BY.items() if DEFAULT_METHOD in methods and "ray-traced" not in methods}
+_DIRECTIONAL_SETTINGS = {
+    name for name, methods in METHODS_OF_SETTING.items() if DEFAULT_METHOD in methods and "ray-traced" not in methods
+}
 """Settings that name :data:`DEFAULT_METHOD` where they are not the default."""
 
-BOUNCING = (*SPHERE_METHODS, "ray-traced", AUTO)  # the methods that find light that bounces
+BOUNCE_METHODS = (*SPHERE_METHODS, "ray-traced", AUTO)  # the methods that find light that bounces
 
 MAX_BOUNCES = 16
 
@@ -66,22 +68,22 @@ SHARED_DIRECTIONS = 512
 direct light) stills have a mean error of 1.7%, at worst 3.5%, in a cage. With 256 edges of dim shadows show as streaks.
 """
 
-_RAYS = 1024  # rays unless ``samples`` says how many, where each receiver has its own
-SCENE = "a Scene; load_scene(path) reads one"  # the types of scenes that functions accept, for messages
-COLORS = ".npy"  # suffixes of files with a color for each vertex; other text is no albedo
+_INDEPENDENT_RAYS = 1024  # rays unless ``samples`` says how many, where each receiver has its own
+SCENE_TYPES = "a Scene; load_scene(path) reads one"  # the types of scenes that functions accept, for messages
+COLORS_SUFFIX = ".npy"  # suffixes of files with a color for each vertex; other text is no albedo
 
-VALUES = ".npy"
+VALUES_SUFFIX = ".npy"
 """Suffix of files with a number for each vertex."""
 
-_SPHERES = ".npz"
+_SPHERES_SUFFIX = ".npz"
 
-GLOSS = ("roughness", "metallic", "specular")
+GLOSS_ARGUMENTS = ("roughness", "metallic", "specular")
 """Arguments of a body that say how it shines."""
 
-GLOSSY = ("directional", "none", "ray-traced", AUTO)
+GLOSS_METHODS = ("directional", "none", "ray-traced", AUTO)
 """The methods that show it."""
 
-MEANT = {"color": "albedo", "colour": "albedo", "position": "translation"}
+LIKELY_MISTAKES = {"color": "albedo", "colour": "albedo", "position": "translation"}
 """Replacements for likely mistakes in a body's arguments, and keys."""
 
 BodyLike = int | str  # a body of a scene: its number, from 0, or its name
@@ -139,16 +141,16 @@ class Visibility:
     def __post_init__(self) -> None:
         self._check_values()
         reader = self.method or DEFAULT_METHOD
-        changed = [name for name in READ_BY if getattr(self, name) != getattr(Visibility, name)]
+        changed = [name for name in METHODS_OF_SETTING if getattr(self, name) != getattr(Visibility, name)]
         for name in changed:
-            if reader not in READ_BY[name]:
-                readers = " or ".join(map(repr, READ_BY[name]))
+            if reader not in METHODS_OF_SETTING[name]:
+                readers = " or ".join(map(repr, METHODS_OF_SETTING[name]))
                 raise ValueError(
                     f"{name}: got {getattr(self, name)!r}, which {reader!r} does not read, expected the default, "
                     f"{getattr(Visibility, name)!r}, or method = {readers}; visibility.by({reader!r}) leaves behind "
                     "what a method does not read"
                 )
-        if self.method is None and set(changed) & _NAMING:
+        if self.method is None and set(changed) & _DIRECTIONAL_SETTINGS:
             object.__setattr__(self, "method", DEFAULT_METHOD)
 
     def _check_values(self) -> None:
@@ -172,17 +174,20 @@ class Visibility:
         """Number of rays: ``samples``, or as many as the method has by default."""
         if self.samples is not None:
             return self.samples
-        return SHARED_DIRECTIONS if self.sampling == "shared" else _RAYS
+        return SHARED_DIRECTIONS if self.sampling == "shared" else _INDEPENDENT_RAYS
 
     @classmethod
     def of(cls, settings: Mapping[str, object]) -> Visibility:
         """Make one from settings for any methods, by their names: all are checked, and the method's own are used."""
-        check.known_keys("key", settings, ("method", *READ_BY))
+        check.known_keys("key", settings, ("method", *METHODS_OF_SETTING))
         every = object.__new__(cls)
         vars(every).update(settings)
         every._check_values()
         reader = every.method or DEFAULT_METHOD
-        return cls(every.method, **{name: getattr(every, name) for name in READ_BY if reader in READ_BY[name]})
+        return cls(
+            every.method,
+            **{name: getattr(every, name) for name in METHODS_OF_SETTING if reader in METHODS_OF_SETTING[name]},
+        )
 
     def with_method(self) -> Visibility:
         """The same by "directional" where no method is named, as renderers that are kept have it."""
@@ -264,7 +269,7 @@ class Body:
     metallic: np.ndarray | None
     specular: np.ndarray | None
 
-    @check.keywords(**MEANT, spheres="blockers", path="mesh")
+    @check.keywords(**LIKELY_MISTAKES, spheres="blockers", path="mesh")
     def __init__(
         self,
         mesh: Mesh | MeshSource,
@@ -351,16 +356,16 @@ class Body:
             texture=material.texture if self.texture is None else self.texture,
         )
         is_diffuse = self.shadow_catcher or self.receivers in ("vertex", "adaptive")
-        if all(getattr(self, name) is None for name in GLOSS) and not is_diffuse:
+        if all(getattr(self, name) is None for name in GLOSS_ARGUMENTS) and not is_diffuse:
             vars(self).update(roughness=material.roughness, metallic=material.metallic)
 
     def _read_files(self) -> None:
         """Replace paths by the content of their files."""
         readers: tuple[tuple[str, Callable[[Path], Any], str, type[ValueError]], ...] = (
             ("texture", read_rgb, "", ImageError),
-            ("albedo", _read_colors, COLORS, ValueError),
-            ("blockers", Spheres.read, _SPHERES, ValueError),
-            *((name, _read_values, VALUES, ValueError) for name in GLOSS),
+            ("albedo", _read_colors, COLORS_SUFFIX, ValueError),
+            ("blockers", Spheres.read, _SPHERES_SUFFIX, ValueError),
+            *((name, _read_values, VALUES_SUFFIX, ValueError) for name in GLOSS_ARGUMENTS),
         )
         for name, read, suffix, error in readers:
             value = getattr(self, name)
@@ -399,8 +404,8 @@ class Body:
 
     def _check_gloss(self) -> None:
         """Hold roughness and its like as float32, [1] or [vertex]; without roughness there is none of them."""
-        expected = f"a number from 0 to 1, one for each vertex, [vertex], or an {VALUES} file of them"
-        for name in GLOSS:
+        expected = f"a number from 0 to 1, one for each vertex, [vertex], or an {VALUES_SUFFIX} file of them"
+        for name in GLOSS_ARGUMENTS:
             value = getattr(self, name)
             if value is None:
                 continue
@@ -435,7 +440,7 @@ class Body:
             angle: Edges are sharp where their faces bend by more [degrees], 0 to 180.
         """
         mesh = self.mesh.creased(angle)
-        values: dict[str, Any] = {name: getattr(self, name) for name in GLOSS}
+        values: dict[str, Any] = {name: getattr(self, name) for name in GLOSS_ARGUMENTS}
         of_vertices = {name: array[mesh.origins] for name, array in values.items() if np.size(array) > 1}
         colors = self.albedo if self.albedo.ndim == 1 else self.albedo[mesh.origins]
         return replace(self, mesh=mesh, albedo=colors, **of_vertices)
@@ -608,13 +613,13 @@ class Scene:
         check_supersampling(self.supersampling)
         check_bounces(self.bounces)
         glossy = next((body for body in self.bodies if body.is_glossy), None)
-        if glossy is not None and self.visibility.method not in (*GLOSSY, None):
+        if glossy is not None and self.visibility.method not in (*GLOSS_METHODS, None):
             raise ValueError(
                 f"roughness: got some for body {glossy.called!r}, which {self.visibility.method!r} does not show, "
-                f"expected None, or method = one of {', '.join(map(repr, GLOSSY))}"
+                f"expected None, or method = one of {', '.join(map(repr, GLOSS_METHODS))}"
             )
-        if self.bounces and self.visibility.method not in (*BOUNCING, None):
-            finders = ", ".join(map(repr, BOUNCING))
+        if self.bounces and self.visibility.method not in (*BOUNCE_METHODS, None):
+            finders = ", ".join(map(repr, BOUNCE_METHODS))
             raise ValueError(
                 f"bounces: got {self.bounces}, which {self.visibility.method!r} does not find, expected 0, or "
                 f"method = one of {finders}"

@@ -13,21 +13,21 @@ from warpshadow.spheres.refine import Refinement
 
 AUTO = "auto"
 
-TRIED = (8, 32, 128, 512)
-MAX_SPHERES = 2 * TRIED[-1]
+TRIED_COUNTS = (8, 32, 128, 512)
+MAX_SPHERES = 2 * TRIED_COUNTS[-1]
 
 _STEPS, _STEPS_MORE = 40, 1 / 8
 """Steps of a short fit, and how many more a sphere. With 40 for all, 512 spheres of a table were no better than 256."""
 
-_JUDGES = 1024
+_TEST_RECEIVERS = 1024
 
-_WANTED = 0.04
+_MAX_ERROR = 0.04
 """Error of a short fit that is small enough: relative to the light at receivers on grounds and in the air around."""
 
-_STALLED = 0.72
+_MIN_ERROR_RATIO = 0.72
 """Ratio of the errors of a count and of four times as many above which more are not worth it: 15% a doubling."""
 
-RAGGED = 0.2
+RAGGED_ERROR = 0.2
 """Error relative to the light that is missing above which a shadow has holes, and more spheres are tried all the same.
 
 Measured with 32 spheres, cow 0.11, box 0.19, bunny 0.19, bowl 0.32, table 0.37, chair 0.39, slab 0.46; with 512, bunny
@@ -51,10 +51,10 @@ def enough_spheres(
         known: Errors of the first short fits, where an interrupted call found them.
         keep: Gets the known fits, after each short fit.
     """
-    judges = FitReceivers(mesh, _JUDGES, np.random.default_rng(seed + 1), sharpness=0.0)
+    judges = FitReceivers(mesh, _TEST_RECEIVERS, np.random.default_rng(seed + 1), sharpness=0.0)
     before = np.inf, np.inf
     errors = list(known)
-    for number, count in enumerate(TRIED):
+    for number, count in enumerate(TRIED_COUNTS):
         if number == len(errors):
             rng = np.random.default_rng(seed)
             start = greedy_cover(mesh, count, rng)
@@ -62,13 +62,13 @@ def enough_spheres(
             errors.append(_errors(Refinement(mesh, judges, rng), last.spheres))
             keep(errors)
         error, shadow_error = errors[number]
-        if error <= _WANTED:
+        if error <= _MAX_ERROR:
             return _where(count, before[0], error)
-        stalls = error > _STALLED * before[0]
-        if stalls and before[1] <= RAGGED:
+        stalls = error > _MIN_ERROR_RATIO * before[0]
+        if stalls and before[1] <= RAGGED_ERROR:
             return count // 2
         before = error, shadow_error
-    return TRIED[-1] if stalls and before[1] <= RAGGED else MAX_SPHERES
+    return TRIED_COUNTS[-1] if stalls and before[1] <= RAGGED_ERROR else MAX_SPHERES
 
 
 def _errors(judge: Refinement, spheres: np.ndarray) -> tuple[float, float]:
@@ -86,7 +86,7 @@ def _errors(judge: Refinement, spheres: np.ndarray) -> tuple[float, float]:
 
 def _where(count: int, before: float, error: float) -> int:
     """Where, from a quarter of the count on, the error becomes small enough; it falls with a power of the count."""
-    if count == TRIED[0]:
+    if count == TRIED_COUNTS[0]:
         return count
-    part = np.log(before / _WANTED) / max(np.log(before / error), 1e-6)
+    part = np.log(before / _MAX_ERROR) / max(np.log(before / error), 1e-6)
     return count // 4 * 2 ** int(np.clip(np.ceil(2 * part - 0.25), 1, 2))

@@ -21,10 +21,10 @@ from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 
-_REACH = 2.0  # a sphere follows vertices within so many radii, or distances of the nearest one if that is more
-_LEAST = 12  # and this many at least, or all
+_BINDING_RADIUS = 2.0  # a sphere follows vertices within so many radii, or distances of the nearest one if that is more
+_MIN_VERTICES = 12  # and this many at least, or all
 _RIDGE = 1e-3  # of the spread of its vertices: where they lie in a plane, weights stay small
-_SOFT = 1e-6  # squares of radii by which spreads differ from 0, where a root has no derivative
+_SPREAD_SOFTENING = 1e-6  # squares of radii by which spreads differ from 0, where a root has no derivative
 
 
 @wp.kernel
@@ -121,8 +121,8 @@ class SphereBinding:
 
         places = points[vertices].astype(np.float64)
         tree = cKDTree(places)
-        distances = tree.query(centers, k=min(_LEAST, len(places)))[0].reshape(len(centers), -1)
-        reaches = np.maximum(_REACH * np.maximum(distances[:, 0], radii), 1.1 * distances[:, -1])
+        distances = tree.query(centers, k=min(_MIN_VERTICES, len(places)))[0].reshape(len(centers), -1)
+        reaches = np.maximum(_BINDING_RADIUS * np.maximum(distances[:, 0], radii), 1.1 * distances[:, -1])
         near = tree.query_ball_point(centers, reaches, return_sorted=True)
         rows = [_weights(places[own], *sphere) for own, *sphere in zip(near, centers, reaches, strict=True)]
         weights, shares = (np.concatenate(column) for column in zip(*rows, strict=True))
@@ -157,7 +157,7 @@ class SphereBinding:
         launch(_move_centers, shape, inputs=inputs, outputs=[centers])
         rest_spreads = self._spreads(rest_positions, rest_centers)
         radii = empty(shape, dtype=wp.float32, device=device)
-        inputs = [rest_radii, rest_spreads, self._spreads(positions, centers), _SOFT]
+        inputs = [rest_radii, rest_spreads, self._spreads(positions, centers), _SPREAD_SOFTENING]
         launch(_grow_radii, shape, inputs=inputs, outputs=[radii])
         return centers, radii
 

@@ -11,7 +11,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
 from warpshadow.device.threads import one_at_a_time
 
-_SHARED = 0.02  # points that two neighboring nodes carry together, as a fraction of a node's points
+_SHARED_POINTS_RATIO = 0.02  # points that two neighboring nodes carry together, as a fraction of a node's points
 
 
 @wp.kernel
@@ -132,7 +132,7 @@ class DeformationGraph:
         shared = np.zeros((len(nodes), len(nodes)))
         for i, j in itertools.product(range(count), repeat=2):
             np.add.at(shared, (nearest[:, i], nearest[:, j]), np.sqrt(weights[:, i] * weights[:, j]))
-        are_neighbors = shared > _SHARED * len(points) / len(nodes)
+        are_neighbors = shared > _SHARED_POINTS_RATIO * len(points) / len(nodes)
         _, others = tree.query(nodes, k=count + 1)
         are_neighbors[np.arange(len(nodes))[:, None], others] = True
         are_neighbors |= are_neighbors.T

@@ -17,7 +17,7 @@ SET_COUNT = 16
 
 _UNIFORM_SHARE = 0.1  # of the samples of a map: light too dim to be drawn still is
 
-_SUN = 30.0  # times as bright as all on average is a sun …
+_SUN_BRIGHTNESS = 30.0  # times as bright as all on average is a sun …
 _SUN_SHARE = 0.35  # … and suns get so much of shared directions at most
 _UNSEEN_SHARE = 0.3  # of the importance of light, which stays where receivers do not see it
 _MIN_ROWS, _MAX_ROWS = 64, 512  # of a map that is cut
@@ -88,8 +88,8 @@ def cut_map(
     receivers that see a whole rectangle get exactly its light, whatever their normal, and those on whose horizon it
     lies get it little by little.
 
-    Importance is luminance, to which even light adds a tenth. But suns, what is :data:`_SUN` times as bright as all is
-    on average, have :data:`_SUN_SHARE` of it at most: their many directions would be close to each other.
+    Importance is luminance, to which even light adds a tenth. But suns, what is :data:`_SUN_BRIGHTNESS` times as bright
+    as all is on average, have :data:`_SUN_SHARE` of it at most: their many directions would be close to each other.
 
     Args:
         radiance: Linear RGB, shape [height, 2·height, 3]; negative lobes of a band-limited map are welcome.
@@ -104,7 +104,7 @@ def cut_map(
     power = brightness * solid_angle
     importance = _UNIFORM_SHARE * solid_angle / (4 * np.pi)
     total = power.sum()
-    is_sun = brightness > _SUN * total / (4 * np.pi)
+    is_sun = brightness > _SUN_BRIGHTNESS * total / (4 * np.pi)
     if brightness.any():
         power /= total
         share = power[is_sun].sum()

@@ -8,8 +8,8 @@ from warpshadow import check
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty, zeros
 
-_THINNEST = 1.0e-12  # faces of a smaller height, in their length, have no area: there gradients could overflow
-_SHORTEST = 1.0e-20  # so have faces of shorter edges [scene units]
+_MIN_HEIGHT = 1.0e-12  # faces of a smaller height, in their length, have no area: there gradients could overflow
+_MIN_EDGE = 1.0e-20  # so have faces of shorter edges [scene units]
 
 _FACE_COST, _VERTEX_COST = 15.0, 6.0  # nanoseconds that a face and a vertex take. Instances are shared by threads
 
@@ -24,8 +24,8 @@ def _edges(positions: wp.array(dtype=wp.vec3), corners: wp.vec3i):
 @wp.func
 def _has_area(along_j: wp.vec3d, along_k: wp.vec3d, normal: wp.vec3d):
     longest2 = wp.max(wp.dot(along_j, along_j), wp.dot(along_k, along_k))
-    is_long = longest2 > wp.float64(_SHORTEST * _SHORTEST)
-    return is_long and wp.length(normal) > wp.float64(_THINNEST) * longest2
+    is_long = longest2 > wp.float64(_MIN_EDGE * _MIN_EDGE)
+    return is_long and wp.length(normal) > wp.float64(_MIN_HEIGHT) * longest2
 
 
 @wp.kernel(enable_backward=False)

@@ -22,8 +22,8 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, from_numpy
 from warpshadow.device.parallel import split_row
 
-LARGEST = 4  # pixels of the side of the largest squares
-PROBE = 2  # pixels between probes
+MAX_SIDE = 4  # pixels of the side of the largest squares
+PROBE_SPACING = 2  # pixels between probes
 _SQUARE_COST = 50.0  # nanoseconds that one of the largest squares takes
 TOLERANCE = 0.02  # error of interpolation at which a square is cut, as a part of the light where nothing blocks any
 
@@ -50,9 +50,9 @@ def probe_grid(size: tuple[int, int], supersampling: int) -> tuple[np.ndarray, n
         size: Height and width of the image [samples].
         supersampling: Samples of a pixel across and down.
     """
-    counts = (PROBE * -(-length // (supersampling * LARGEST)) + 1 for length in size)
+    counts = (PROBE_SPACING * -(-length // (supersampling * MAX_SIDE)) + 1 for length in size)
     rows_, columns = (
-        np.minimum(PROBE * supersampling * np.arange(count), length - 1)
+        np.minimum(PROBE_SPACING * supersampling * np.arange(count), length - 1)
         for count, length in zip(counts, size, strict=True)
     )
     return rows_, columns
@@ -211,7 +211,7 @@ def find_quadtree(
     result = sizes.numpy()
     row, column = np.arange(shape[1])[:, None], np.arange(shape[2])
     is_first = result == 1
-    for size in (2, LARGEST):
+    for size in (2, MAX_SIDE):
         is_first |= (result == size) & (row % size == 0) & (column % size == 0)
     view, row, column = np.nonzero(is_first)
     numbers = np.zeros(shape, np.int32)

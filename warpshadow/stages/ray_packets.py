@@ -16,7 +16,7 @@ import warp as wp
 
 from warpshadow.device.lanes import vectors_type
 from warpshadow.maths.directions import CHUNK
-from warpshadow.stages.ray_tracing import RAISE, ROUNDING, UPRIGHT
+from warpshadow.stages.ray_tracing import MIN_HIT_HEIGHT, ROUNDING, WALL_COSINE
 
 PACKET = CHUNK  # rays of a packet
 
@@ -128,7 +128,7 @@ def make_find_open() -> wp.Function:
         if (wp::abs(drop) <= {ROUNDING} * size) {{
             const double length = wp::length(across);
             const double upward = across[0] * normal[0] + across[1] * normal[1] + across[2] * normal[2];
-            const double height = upward < -{UPRIGHT} * length ? -{RAISE} : {RAISE};
+            const double height = upward < -{WALL_COSINE} * length ? -{MIN_HIT_HEIGHT} : {MIN_HIT_HEIGHT};
             const wp::vec3d move = wp::mul(across, (drop / length + height * wp::sqrt(length)) / length);
             p -= move;
             q -= move;

@@ -18,12 +18,14 @@ RAY_COST = 200.0  # nanoseconds that a ray takes
 ROUNDING = 2.0**-21
 """How far a point interpolated in float32 may lie off its face: a part of the face's largest coordinate, by axis."""
 
-UPRIGHT = 1.0e-3
+WALL_COSINE = 1.0e-3
 """Cosine between a face's normal and a receiver's below which the face is a wall at whose foot the receiver lies: it is
 in front of it then, against rounding.
 """
 
-RAISE = 1.0e-4  # height above a face, as a part of its size, from which rays of receivers on it start to meet it
+MIN_HIT_HEIGHT = (
+    1.0e-4  # height above a face, as a part of its size, from which rays of receivers on it start to meet it
+)
 
 
 @wp.func
@@ -50,8 +52,8 @@ def _seen_from(mesh: wp.uint64, face: int, point: wp.vec3, normal: wp.vec3):
     if wp.abs(drop) <= wp.float64(ROUNDING) * wp.dot(wp.abs(face_normal), wp.vec3d(largest)):
         length = wp.length(face_normal)
         upward = wp.dot(face_normal, wp.vec3d(normal))
-        lies_on = wp.abs(upward) >= wp.float64(UPRIGHT) * length
-        height = wp.where(upward < wp.float64(-UPRIGHT) * length, -RAISE, RAISE)
+        lies_on = wp.abs(upward) >= wp.float64(WALL_COSINE) * length
+        height = wp.where(upward < wp.float64(-WALL_COSINE) * length, -MIN_HIT_HEIGHT, MIN_HIT_HEIGHT)
         move = (drop / length + wp.float64(height) * wp.sqrt(length)) / length * face_normal
         a -= move
         b -= move

@@ -11,8 +11,8 @@ from warpshadow.stages.nearest_rotation import nearest_rotations
 
 Vec6 = wp.types.vector(length=6, dtype=wp.float32)
 
-SHORTEST = 1.0e-18  # shorter quaternions and columns have no direction: its gradient would be out of float32's range
-PARALLEL = 1.0e-6  # columns at a smaller angle [radians] are parallel: the angle is rounding
+MIN_LENGTH = 1.0e-18  # shorter quaternions and columns have no direction: its gradient would be out of float32's range
+MIN_ANGLE = 1.0e-6  # columns at a smaller angle [radians] are parallel: the angle is rounding
 
 NOT_ORTHONORMAL = 0.05
 """Largest entry of |RᵀR − I| of a matrix that counts as a rotation: a step of 0.01 in all nine numbers stays below."""
@@ -126,19 +126,19 @@ def _check_rotations(parameters: wp.array) -> None:
         return
     values = parameters.numpy().astype(np.float64)
     if parameters.dtype is wp.vec4:
-        _refuse(np.linalg.norm(values, axis=-1) < SHORTEST, f"quaternions shorter than {SHORTEST:g}")
+        _refuse(np.linalg.norm(values, axis=-1) < MIN_LENGTH, f"quaternions shorter than {MIN_LENGTH:g}")
         return
     if parameters.dtype is wp.mat33:
         largest, middle, minimum = np.moveaxis(np.linalg.svd(values, compute_uv=False), -1, 0)
-        _refuse(largest < SHORTEST, f"matrices smaller than {SHORTEST:g}")
+        _refuse(largest < MIN_LENGTH, f"matrices smaller than {MIN_LENGTH:g}")
         gaps = middle + np.sign(np.linalg.det(values / largest[..., None, None])) * minimum
-        _refuse(gaps < PARALLEL * largest, "matrices as near to several rotations, as mirrored ones are,")
+        _refuse(gaps < MIN_ANGLE * largest, "matrices as near to several rotations, as mirrored ones are,")
         return
     x, y = values[..., :3], values[..., 3:]
     lengths = np.linalg.norm(x, axis=-1), np.linalg.norm(y, axis=-1)
-    _refuse(np.minimum(*lengths) < SHORTEST, f"columns shorter than {SHORTEST:g}")
+    _refuse(np.minimum(*lengths) < MIN_LENGTH, f"columns shorter than {MIN_LENGTH:g}")
     areas = np.linalg.norm(np.cross(x, y), axis=-1)
-    _refuse(areas < PARALLEL * lengths[0] * lengths[1], "pairs of parallel columns")
+    _refuse(areas < MIN_ANGLE * lengths[0] * lengths[1], "pairs of parallel columns")
 
 
 def _refuse(faults: np.ndarray, what: str) -> None:

@@ -30,7 +30,7 @@ from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sample_receivers import ALIKE, LEVEL
 
 _PACKET_COST = 2000.0  # nanoseconds that a packet takes
-_PILOTS = 256  # receivers that stand for all, where directions are chosen
+_PILOT_RECEIVERS = 256  # receivers that stand for all, where directions are chosen
 
 SQUARES = 128
 """Squares at whose corners all rays are traced, across the shorter side of an image, or more: their side in pixels is a
@@ -172,7 +172,7 @@ def find_shares(tree: FaceTree, points: wp.array, normals: wp.array, samples: Li
     Differentiable: no.
     """
     count = points.shape[0]
-    chosen = np.arange(min(count, _PILOTS)) * count // max(min(count, _PILOTS), 1)
+    chosen = np.arange(min(count, _PILOT_RECEIVERS)) * count // max(min(count, _PILOT_RECEIVERS), 1)
     at, facing = (wp.array(rows.numpy()[chosen], dtype=wp.vec3, device=points.device) for rows in (points, normals))
     shape = len(chosen), samples.directions.shape[1] // PACKET, PACKET
     received = zeros(shape, dtype=wp.float32, device=at.device)

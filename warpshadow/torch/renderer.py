@@ -16,7 +16,7 @@ from warpshadow.device.threads import one_at_a_time
 from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.explain import Explanation
 from warpshadow.pipeline.geometry import GEOMETRY_DTYPES, Geometry
-from warpshadow.scene.scene import GLOSS, BodyLike, PerBody, Scene
+from warpshadow.scene.scene import GLOSS_ARGUMENTS, BodyLike, PerBody, Scene
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.poses import Poses
 from warpshadow.stages.project import compose_clip_matrices
@@ -38,7 +38,7 @@ _ELSEWHERE = {
 }
 """Remedies for keywords that a call does not have."""
 
-REFLECTANCE = ("albedo", "textures", *GLOSS)
+REFLECTANCE = ("albedo", "textures", *GLOSS_ARGUMENTS)
 """Arguments that bodies have, each its own."""
 
 
@@ -310,7 +310,7 @@ class TorchRenderer(torch.nn.Module):
                     messages = self._said(name, values, number)
                     of_body = self._of_body(name, number, tensor)
                     slots[number] = stored.add(f"{name}[{number}]", *of_body, messages=messages)
-            (inputs.setdefault("gloss", {}) if name in GLOSS else inputs)[name] = slots
+            (inputs.setdefault("gloss", {}) if name in GLOSS_ARGUMENTS else inputs)[name] = slots
         return stored, inputs
 
     def _of_body(

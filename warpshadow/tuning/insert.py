@@ -13,12 +13,12 @@ from warpshadow.assets.image import ImageError, read_rgb
 from warpshadow.check import AnyPath
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.choice_of_receivers import for_picture
-from warpshadow.scene.scene import SCENE, Scene
+from warpshadow.scene.scene import SCENE_TYPES, Scene
 from warpshadow.tuning.renderer import Renderer
 
-_MOSTLY = 0.5  # part of a pixel that bodies cover, above which it is theirs
+_COVERED_SHARE = 0.5  # part of a pixel that bodies cover, above which it is theirs
 
-_TENTH = 0.1
+_MAX_WHITE_SHARE = 0.1
 """Share of white pixels, more among the inserted bodies than in the photograph, above which a remark is made."""
 
 
@@ -49,7 +49,7 @@ def insert(
     Raises:
         ValueError: for a photograph of other proportions than the camera's, and a scene without a catcher.
     """
-    check.instance("scene", scene, Scene, SCENE)
+    check.instance("scene", scene, Scene, SCENE_TYPES)
     pixels = linear_photograph(photograph)
     height, width, _ = pixels.shape
     camera, gain = fitting_camera(scene.camera, width, height), 2.0 ** check.number("exposure", exposure)
@@ -72,11 +72,11 @@ def _overexposure(image: np.ndarray, photograph: np.ndarray, covered: np.ndarray
         covered: Part of each pixel that the bodies cover.
         exposure: Theirs [stops].
     """
-    bright = image.max(axis=2)[covered > _MOSTLY]
+    bright = image.max(axis=2)[covered > _COVERED_SHARE]
     if not len(bright) or photograph.max() > 1:
         return None
     share, usual = float((bright > 1).mean()), float((photograph >= 1).any(axis=2).mean())
-    if share <= usual + _TENTH:
+    if share <= usual + _MAX_WHITE_SHARE:
         return None
     stops = math.floor(10 * (exposure - math.log2(np.percentile(bright, 99)))) / 10
     return (

@@ -10,7 +10,7 @@ from warpshadow.assets.basis import Basis, check_basis
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline import renderer
 from warpshadow.pipeline.choice_of_receivers import for_picture
-from warpshadow.scene.scene import SCENE, Scene
+from warpshadow.scene.scene import SCENE_TYPES, Scene
 from warpshadow.tuning import tune
 
 
@@ -34,7 +34,7 @@ class Renderer(renderer.SceneRenderer):
         basis: Basis | None = None,
         progress: bool = True,
     ):
-        check.instance("scene", scene, Scene, SCENE)
+        check.instance("scene", scene, Scene, SCENE_TYPES)
         check_basis(basis)
         scene = tune.resolved(scene, device=check.device("device", device), progress=progress)
         super().__init__(scene, cameras=cameras, device=device, basis=basis, progress=progress)
@@ -67,5 +67,5 @@ def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = True
     Returns:
         Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4]; the background is 0.
     """
-    check.instance("scene", scene, Scene, SCENE)
+    check.instance("scene", scene, Scene, SCENE_TYPES)
     return Renderer(for_picture(scene), device=device, progress=progress).render()

@@ -23,7 +23,7 @@ from warpshadow.device.progress import progress_bar
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.scene import toml_tables
 from warpshadow.scene.blockers import fitted_counts
-from warpshadow.scene.scene import AUTO, SCENE, SPHERE_METHODS, Bounces, Scene, Visibility, check_bounces
+from warpshadow.scene.scene import AUTO, SCENE_TYPES, SPHERE_METHODS, Bounces, Scene, Visibility, check_bounces
 from warpshadow.spheres import Spheres, fit_spheres, is_fitted
 from warpshadow.stages.visibility.zonal_logs import LOGS
 from warpshadow.tuning.point_sample import PointSample
@@ -34,14 +34,16 @@ ORDERS = (4, 6, 8)
 BOUNCE_COUNTS = (0, 1, 2, 4)
 SPHERE_COUNTS = (16, 32, 64, 128, 256, 512)
 
-EQUAL = 0.1
+EQUAL_TIME_SHARE = 0.1
 """Settings whose times differ by less than this share count as equally fast; then the more accurate is better.
 
 Where none is accurate enough, the same holds of their errors; then the faster is better.
 """
 
 ERROR_STEP = 0.003  # errors that differ by less than this count as equal, too: nobody sees it
-COARSE = 0.005  # error of interpolation between a body's vertices from which on its pixels are tried as receivers
+COARSE_FACES_ERROR = (
+    0.005  # error of interpolation between a body's vertices from which on its pixels are tried as receivers
+)
 
 
 class Trial(NamedTuple):
@@ -218,7 +220,7 @@ def tune(
     Warns:
         Where the machine is busy already: its load average is above its number of cores.
     """
-    check.instance("scene", scene, Scene, SCENE)
+    check.instance("scene", scene, Scene, SCENE_TYPES)
     device = check.device("device", device)
     arguments = {"error": error, "milliseconds": milliseconds}
     requested = next((value for value in arguments.values() if value is not None), None)
@@ -232,7 +234,7 @@ def tune(
     _warn_if_busy()
     scene = scene.with_method()
     sample = PointSample(scene, bounces=bounces, device=device, progress=progress)
-    is_coarse = sample.interpolation_errors() > COARSE
+    is_coarse = sample.interpolation_errors() > COARSE_FACES_ERROR
     fine = [
         body.receivers if receivers == own.receivers else receivers
         for body, own, receivers in zip(
@@ -277,14 +279,14 @@ def _warn_if_busy() -> None:
 
 def _cheapest(trials: Sequence[Trial]) -> Trial:
     """The fastest trial, or the most accurate of trials that are about as fast."""
-    longest = (1 + EQUAL) * min(trial.milliseconds for trial in trials)
+    longest = (1 + EQUAL_TIME_SHARE) * min(trial.milliseconds for trial in trials)
     return min((trial for trial in trials if trial.milliseconds <= longest), key=lambda trial: trial.error)
 
 
 def _nearest(trials: Sequence[Trial]) -> Trial:
     """The most accurate trial, or the fastest of trials that are about as accurate."""
     minimum = min(trial.error for trial in trials)
-    maximum = minimum + max(EQUAL * minimum, ERROR_STEP)
+    maximum = minimum + max(EQUAL_TIME_SHARE * minimum, ERROR_STEP)
     return min((trial for trial in trials if trial.error <= maximum), key=lambda trial: trial.milliseconds)
 
 

@@ -13,7 +13,7 @@ from warpshadow.spheres.fit import fit_seconds, is_fitted
 from warpshadow.stages.self_visibility.trace import trace_seconds
 
 _BUNNY_FACES = 12_200
-_STILL = 2.8e-5
+_STILL_PIXEL_SECONDS = 2.8e-5
 """Time of a pixel of a still on one thread [s]: 48 stills of that bunny on a ground, 256 × 256, took 88 s of CPU time
 (two cores of an AMD EPYC, Zen 5). It grows with faces as that of other rays."""
 
@@ -35,7 +35,7 @@ def still_seconds(scene: Scene) -> float:
     faces = sum(body.mesh.face_count for body in scene.bodies if not body.mesh.is_flat)
     pixels = scene.camera.width * scene.camera.height
     rays = for_picture(scene).visibility.ray_count / SHARED_DIRECTIONS
-    return _STILL * (max(faces, 1) / _BUNNY_FACES) ** 0.27 * pixels * rays
+    return _STILL_PIXEL_SECONDS * (max(faces, 1) / _BUNNY_FACES) ** 0.27 * pixels * rays
 
 
 def remark_on_stills(scene: Scene, frame_count: int, *, device: wp.DeviceLike = "cpu") -> str:

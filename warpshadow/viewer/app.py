@@ -24,7 +24,7 @@ from warpshadow.viewer.quality import Quality
 from warpshadow.viewer.server import Server, check_address
 from warpshadow.viewer.state import ViewerState
 
-_PATIENCE = 2.0  # seconds that a page has to take a picture before it is sent the next
+_PICTURE_TIMEOUT = 2.0  # seconds that a page has to take a picture before it is sent the next
 _STATUS_SECONDS = 0.25  # between two notes of how long pictures take
 _CORNER = (  # of the page: below the picture on the left, out of the mouse's way
     "position:fixed;left:0.8em;bottom:0.8em;padding:0.2em 0.6em;font-size:12px;line-height:1.4;color:#ddd;"
@@ -189,7 +189,7 @@ class _ViserPage:
 
     def _ask(self, frame: Frame, requested: float) -> None:
         with contextlib.suppress(RuntimeError, TimeoutError):  # RuntimeError: gone, or its storage is blocked
-            self._client.local_storage.get_item("taken", timeout=_PATIENCE)
+            self._client.local_storage.get_item("taken", timeout=_PICTURE_TIMEOUT)
         now = time.monotonic()
         if not self._message and (now - self._last_status > _STATUS_SECONDS or not frame.quality.is_moving):
             self._last_status = now

@@ -30,9 +30,9 @@ from warpshadow.viewer.painter import Painter, own_page
 from warpshadow.viewer.quality import FrameRate, Quality
 from warpshadow.viewer.state import ViewerState
 
-_SECONDS = 1.0  # time between two notes of how far it is
+_NOTE_INTERVAL = 1.0  # time between two notes of how far it is
 _PIXELS = 128**2  # of the images that the process renders, for all that they need
-_PATIENCE = 40.0  # time that the process has to write what it has, after this one ended [s]
+_STOP_TIMEOUT = 40.0  # time that the process has to write what it has, after this one ended [s]
 
 
 _QUALITIES = (
@@ -104,7 +104,7 @@ def prepare() -> None:
     threading.Thread(target=_end_with_viewer, daemon=True).start()
     if hasattr(os, "nice"):
         os.nice(5)
-    report_every(_SECONDS)
+    report_every(_NOTE_INTERVAL)
     with contextlib.suppress(KeyboardInterrupt):
         painter, viewer_state = Painter(scene, device=device, progress=True), ViewerState.of(scene)
         page = own_page(scene, painter.page_scale)
@@ -124,5 +124,5 @@ def _end_with_viewer() -> None:
     while os.read(0, 1):  # not by sys.stdin, whose lock a process cannot end without
         pass
     _thread.interrupt_main()
-    time.sleep(_PATIENCE)
+    time.sleep(_STOP_TIMEOUT)
     os._exit(1)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-SECONDS = 1 / 24  # time budget of an image while something moves; encoding and sending come on top
-LONGEST = 1.0  # time budget of an image while nothing moves [s]: a page waits at most so long when it moves again
-FEWEST, MOST = 160**2, 512**2  # pixels of an image while something moves
+MOVING_SECONDS = 1 / 24  # time budget of an image while something moves; encoding and sending come on top
+STILL_SECONDS = 1.0  # time budget of an image while nothing moves [s]: a page waits at most so long when it moves again
+MIN_MOVING_PIXELS, MAX_MOVING_PIXELS = 160**2, 512**2  # pixels of an image while something moves
 FULL = 1 << 20  # pixels of an image while all rests
 
 _STEP = 1.3  # of pixels, that is worth another image
@@ -43,10 +43,10 @@ class FrameRate:
 
     def took(self, seconds: float) -> None:
         """Learn from the time of an image in a motion; only a time far from the budget changes anything."""
-        if seconds > 1.6 * SECONDS:
-            self.pixels = max(FEWEST, self.pixels // 2)
-        elif seconds < 0.3 * SECONDS:
-            self.pixels = min(MOST, self.pixels * 2)
+        if seconds > 1.6 * MOVING_SECONDS:
+            self.pixels = max(MIN_MOVING_PIXELS, self.pixels // 2)
+        elif seconds < 0.3 * MOVING_SECONDS:
+            self.pixels = min(MAX_MOVING_PIXELS, self.pixels * 2)
 
     def better(self, last: Quality, seconds: float, canvas: int) -> Quality | None:
         """The next quality while all rests.
@@ -61,7 +61,7 @@ class FrameRate:
         goal = min(FULL, canvas)
         if last.is_moving:
             return Quality(min(goal, 256**2), cells=1 << 16, rays=1 << 16, supersampling=16, is_moving=False)
-        pixels = min(goal, 4 * last.pixels, int(last.pixels * LONGEST / max(seconds, 1e-3)))
+        pixels = min(goal, 4 * last.pixels, int(last.pixels * STILL_SECONDS / max(seconds, 1e-3)))
         if last.pixels >= goal or pixels < min(goal, _STEP * last.pixels):
             return None
         return Quality(pixels, last.cells, last.rays, last.supersampling, is_moving=False)

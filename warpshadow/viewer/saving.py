@@ -11,7 +11,7 @@ from pathlib import Path
 from warpshadow.assets.camera import Camera
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import camera_table, write_scene
-from warpshadow.scene.scene import READ_BY, Scene
+from warpshadow.scene.scene import METHODS_OF_SETTING, Scene
 from warpshadow.viewer.page_camera import PageCamera
 from warpshadow.viewer.state import AS_GIVEN, ViewerState
 
@@ -40,7 +40,7 @@ def as_toml(path: Path, scene: Scene, viewer_state: ViewerState, camera: Camera)
     settings = viewer_state.settings(scene)
     light["bounces"] = settings.bounces
     visibility, arguments = tables.setdefault("visibility", {}), scene.visibility.with_method()
-    for name in ("method", *READ_BY):
+    for name in ("method", *METHODS_OF_SETTING):
         value = getattr(settings.visibility, name)
         if value != getattr(arguments, name):
             visibility[name] = value

@@ -12,10 +12,10 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths.directions import check_count
 from warpshadow.scene.files import turned_light
 from warpshadow.scene.scene import (
-    BOUNCING,
+    BOUNCE_METHODS,
     DEFAULT_METHOD,
     METHODS,
-    READ_BY,
+    METHODS_OF_SETTING,
     RECEIVERS,
     SAMPLINGS,
     Body,
@@ -132,7 +132,7 @@ class ViewerState:
     def visibility(self, arguments: Visibility, quality: Quality | None = None) -> Visibility:
         """The settings of a scene, as they are changed; no better than a quality asks for."""
         names = "method", "sampling", "directions", "softness"
-        settings = {name: getattr(arguments, name) for name in READ_BY}
+        settings = {name: getattr(arguments, name) for name in METHODS_OF_SETTING}
         requested = Visibility.of(settings | {name: getattr(self, name) for name in names})
         if quality is None:
             return requested
@@ -160,7 +160,7 @@ class ViewerState:
             scene,
             bodies=self.bodies(scene.bodies),
             visibility=visibility,
-            bounces=self.bounces if visibility.method in BOUNCING else 0,
+            bounces=self.bounces if visibility.method in BOUNCE_METHODS else 0,
             supersampling=min(scene.supersampling, quality.supersampling if quality else scene.supersampling),
         )
 

@@ -16,7 +16,9 @@ from warpshadow.inverse.world import FittedScene, Setting, World
 from warpshadow.maths.directions import check_count, fibonacci
 from warpshadow.maths.sh import check_order
 
-_DARKEST = 1e-3  # light of cells starts no lower [radiance of the targets]: a logarithm has to come back from there
+_MIN_RADIANCE = (
+    1e-3  # light of cells starts no lower [radiance of the targets]: a logarithm has to come back from there
+)
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class Light(Free):
         """The scene's light."""
         radiance = self.basis.coefficients(setting.scene.light) / setting.unit
         if isinstance(self.basis, CellBasis):
-            return {"log_radiance": setting.tensor(np.log(np.maximum(radiance, _DARKEST)))}
+            return {"log_radiance": setting.tensor(np.log(np.maximum(radiance, _MIN_RADIANCE)))}
         return {"coefficients": setting.tensor(radiance / np.sqrt(4 * np.pi))}
 
     def coefficients(self, values: Values, setting: Setting) -> torch.Tensor:

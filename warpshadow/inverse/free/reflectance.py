@@ -17,9 +17,9 @@ from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.scene.scene import Body, Scene, Visibility
 from warpshadow.stages.textures.seen import fill_unseen
 
-_SHORT = 1e-3
+_SMOOTHING_LENGTH = 1e-3
 """Length of a difference of reflectances below which its variation is smooth: lengths have no derivative at 0."""
-_PLAIN = 1e-3  # deviation below which texels are of one color
+_MAX_PLAIN_DEVIATION = 1e-3  # deviation below which texels are of one color
 
 
 def _one_color(body: Body) -> np.ndarray:
@@ -131,7 +131,7 @@ class Texture(FreeOfBody):
         """Colors of a palette, [color, 3]: quantiles of the texels by brightness; grays if all texels are alike."""
         flat = texels.reshape(-1, 3)
         shares = (torch.arange(self.colors, device=texels.device) + 0.5) / self.colors
-        if flat.std(dim=0).max() < _PLAIN:
+        if flat.std(dim=0).max() < _MAX_PLAIN_DEVIATION:
             return shares[:, None].expand(-1, 3).contiguous()
         ranked = flat[flat.sum(dim=1).argsort()]
         return ranked[(shares * len(flat)).long()]
@@ -149,7 +149,7 @@ class Texture(FreeOfBody):
         if self.smoothness:  # sums: a single row has no mean down
             energies.append(self.smoothness * (squares[0].sum() + squares[1].sum()) / texels.numel())
         if self.total_variation:
-            lengths = [(square.sum(dim=-1) + _SHORT**2).sqrt() - _SHORT for square in squares]
+            lengths = [(square.sum(dim=-1) + _SMOOTHING_LENGTH**2).sqrt() - _SMOOTHING_LENGTH for square in squares]
             energies.append(self.total_variation * (lengths[0].sum() + lengths[1].sum()) / texels[..., 0].numel())
         if self.palette:
             gaps = (texels[:, :, None] - values["palette"]).square().sum(dim=-1)

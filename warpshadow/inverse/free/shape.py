@@ -16,7 +16,7 @@ from warpshadow.scene.scene import SPHERE_METHODS, Body, Scene
 from warpshadow.spheres import Spheres, fit_spheres
 from warpshadow.torch import apply, rotation_matrices
 
-_STRETCH = 0.4  # a unit of stretch: nodes stretch less than they turn
+_STRETCH_UNIT = 0.4  # a unit of stretch: nodes stretch less than they turn
 
 
 def _sphere_count(body: Body) -> int:
@@ -73,7 +73,7 @@ class Deformation(FreeOfBody):
         """Matrices [node, 3, 3] and translations [node, 3] in the body's own space, and stretches [node, 3, 3]."""
         smoothing = setting.smoothing(self.number, self.count, self.smoothness)
         turns, shifts, entries = (smoothing @ values[key] for key in ("turns", "shifts", "stretches"))
-        stretches = (_STRETCH * entries[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]]).reshape(-1, 3, 3)
+        stretches = (_STRETCH_UNIT * entries[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]]).reshape(-1, 3, 3)
         rotations = rotation_matrices(turns)
         return rotations + rotations @ stretches, setting.extent(self.number) * shifts, stretches
 

@@ -36,7 +36,7 @@ from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.visibility.directional import transmittance
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 
-CELLS = fibonacci(64)  # where receivers look for bounced light if direct light is found in harmonics
+HARMONIC_GATHER_CELLS = fibonacci(64)  # where receivers look for bounced light if direct light is found in harmonics
 ALL_FLAT = "all that reflects is flat"  # why no body sends light to itself, in words
 
 _SOFTNESS_OF_PARTS = 1.0
@@ -75,7 +75,7 @@ def see_cells(
             seen.transmittance_total if seen.transmittance_spheres is None else seen.transmittance_spheres
         )
     else:
-        directions, transmittance_self = CELLS, None
+        directions, transmittance_self = HARMONIC_GATHER_CELLS, None
         transmittance_spheres = _transmittance(method, group, solid_bodies(merged_scene), spheres, directions)
     if transmittance_self is None and group.body is not None and not merged_scene.is_flat[group.body]:
         transmittance_self = _transmittance(method, group, [group.body], spheres, directions)

@@ -29,8 +29,8 @@ from warpshadow.stages.bounces.radiosity import mean_over_sources
 from warpshadow.stages.receivers import Receivers, receivers_on_faces
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
-_SCENE_PATCHES = 2048  # patches of a scene of more than 8 bodies, but no fewer than _FEWEST of each
-_FEWEST = 32  # patches of each of many bodies, at least: a side of a box has some
+_SCENE_PATCHES = 2048  # patches of a scene of more than 8 bodies, but no fewer than _MIN_BODY_PATCHES of each
+_MIN_BODY_PATCHES = 32  # patches of each of many bodies, at least: a side of a box has some
 _SCENE_SOURCES = 4096  # sources of the patches of a scene, but at least one of each
 
 
@@ -90,11 +90,11 @@ class ScenePatches:
         areas = {n: body.scale**2 * _area(body.mesh) for n, body in enumerate(bodies) if n not in self.planes}
         total, counts = sum(areas.values()), {}
         for number, area in areas.items():
-            share = _SCENE_PATCHES * area / total if total > 0 else _FEWEST
+            share = _SCENE_PATCHES * area / total if total > 0 else _MIN_BODY_PATCHES
             minimum = max(LEAST_PATCHES, len(bodies[number].mesh.surface.faces) // PIECES)
             maximum = MOST_PATCHES
             if len(areas) * MOST_PATCHES > _SCENE_PATCHES:
-                maximum = min(maximum, int(2 ** np.floor(np.log2(max(share, _FEWEST)))))
+                maximum = min(maximum, int(2 ** np.floor(np.log2(max(share, _MIN_BODY_PATCHES)))))
             counts[number] = min(minimum, maximum)
         return counts
 

@@ -17,7 +17,9 @@ from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.textures.pyramid import Textures
 
 _LIGHT_SAMPLES = 1024  # directions of each set from which hits draw light
-_ALL = 64  # most bounces of a path where it may have any number: in a closed room of albedo 0.9 one in 800 ends there
+_MAX_PATH_BOUNCES = (
+    64  # most bounces of a path where it may have any number: in a closed room of albedo 0.9 one in 800 ends there
+)
 
 _RAYS_OF_PATH = 2
 """Rays of direct light for each path, which varies about as much and takes 2.4 times as long with two bounces."""
@@ -38,7 +40,7 @@ def path_traced(
     """
     merged_scene = points.merged_scene
     maximum, paths = merged_scene.scene.bounces, -(-samples // _RAYS_OF_PATH)
-    bounces = _ALL if maximum == "all" else maximum
+    bounces = _MAX_PATH_BOUNCES if maximum == "all" else maximum
 
     def trace(
         shading: wp.array,

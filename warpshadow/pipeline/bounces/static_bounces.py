@@ -32,7 +32,7 @@ from warpshadow.pipeline.reflectance import Materials
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.colored import ColoredTransfer, colored_light
 from warpshadow.stages.bounces.factors import (
-    UNLIT,
+    BLACK_ENTRIES,
     PatchFormFactors,
     loose_mesh,
     mean_outside,
@@ -198,9 +198,11 @@ class StaticBounces:
 
             def trace(points: np.ndarray, normals: np.ndarray, sky: np.ndarray | None) -> PatchFormFactors:
                 count = len(senders.areas)
-                arguments = mesh, of_faces, count + len(UNLIT), points, normals
+                arguments = mesh, of_faces, count + len(BLACK_ENTRIES), points, normals
                 form_factors = trace_factors(*arguments, rays=self._rays, progress=self._progress)
-                return scaled_to_sky(form_factors, np.append(casts[senders.body_of_patch], [True] * len(UNLIT)), sky)
+                return scaled_to_sky(
+                    form_factors, np.append(casts[senders.body_of_patch], [True] * len(BLACK_ENTRIES)), sky
+                )
 
             def at_view(
                 points: np.ndarray, normals: np.ndarray, sky: np.ndarray | None
@@ -258,7 +260,7 @@ class StaticBounces:
     def _mesh(self, positions: np.ndarray, senders: Senders) -> tuple[wp.Mesh, np.ndarray]:
         """The mesh that rays meet, of the pieces of all bodies, and the patches of the sides of its faces.
 
-        After all patches follow the entries UNLIT, for surfaces that send nothing.
+        After all patches follow the entries BLACK_ENTRIES, for surfaces that send nothing.
         """
         merged_scene = self._patches.merged_scene
         corners, owners, count = [], [], len(senders.areas)

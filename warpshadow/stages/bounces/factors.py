@@ -16,15 +16,15 @@ from warpshadow.stages.ray_tracing import RAY_COST, nearest, parts
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-_COUNTED = 1 << 22  # counts that are held at once [receivers × patches]
+_MAX_COUNTS = 1 << 22  # counts that are held at once [receivers × patches]
 
 GOLDEN = (5**0.5 - 1) / 2  # turn from ray to ray, as a part of a full turn
 
 
-UNLIT = ("black surfaces", "insides of closed bodies")
+BLACK_ENTRIES = ("black surfaces", "insides of closed bodies")
 """Places for rays that meet surfaces which send nothing, told apart from the sky: after all patches."""
 
-_BURIED = 0.5
+_BURIED_SHARE = 0.5
 """Part of its hemisphere from which a point that sees insides of closed bodies counts as inside one itself."""
 
 
@@ -120,7 +120,7 @@ def trace_factors(
     device = mesh.device
     owners = wp.array(of_faces, dtype=wp.int32, device=device)
     factors = []
-    for part in parts(len(points), _COUNTED // max(count, 1), progress):
+    for part in parts(len(points), _MAX_COUNTS // max(count, 1), progress):
         counts = zeros((part.stop - part.start, count), dtype=wp.int32, device=device)
         at = [wp.array(values[part], dtype=wp.vec3, device=device) for values in (points, normals)]
         inputs = [mesh.id, owners, *at, part.start, rays]
@@ -145,17 +145,17 @@ def scaled_to_sky(factors: csr_matrix, casts: np.ndarray, sky: np.ndarray | None
     """Scale form factors so that they and the sky of direct light fill the hemisphere: by (1 − s) / f.
 
     Args:
-        factors: f by rays, of patches and of UNLIT, shape [point, patch + 2].
+        factors: f by rays, of patches and of BLACK_ENTRIES, shape [point, patch + 2].
         casts: Which of these cast shadows, bool of shape [patch + 2]; the others take nothing of the sky.
         sky: s, part of the hemisphere that is open where direct light is found, shape [point]; None for rays, too.
     """
     from scipy.sparse import diags
 
-    is_buried = factors[:, [-1]].toarray().ravel() > _BURIED
+    is_buried = factors[:, [-1]].toarray().ravel() > _BURIED_SHARE
     if sky is not None:
         blocking = factors @ diags(casts.astype(np.float32))
         factors = (factors + scaled(blocking, ratios(1 - sky, np.asarray(blocking.sum(axis=1)).ravel()) - 1)).tocsr()
-    return PatchFormFactors(factors[:, : -len(UNLIT)], is_buried)
+    return PatchFormFactors(factors[:, : -len(BLACK_ENTRIES)], is_buried)
 
 
 def ratios(target: np.ndarray, current: np.ndarray) -> np.ndarray:

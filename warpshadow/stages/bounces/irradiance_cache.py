@@ -15,7 +15,7 @@ CACHE_POINT_COUNT = 2048  # cache points of an image: of 256 × 256 pixels one i
 
 _NEIGHBORS = 3
 
-_TURN = 0.1  # distance that a difference of normals by 1 counts as, in parts of the receivers' extent
+_NORMAL_DISTANCE = 0.1  # distance that a difference of normals by 1 counts as, in parts of the receivers' extent
 
 
 def choose_cache_points(points: np.ndarray, count: int = CACHE_POINT_COUNT) -> np.ndarray:
@@ -47,7 +47,7 @@ def interpolation(points: np.ndarray, normals: np.ndarray, cache_points: np.ndar
     from scipy.spatial import cKDTree
 
     extent = float(np.ptp(points, axis=0).max(initial=0.0)) or 1.0
-    features = np.concatenate([points / extent, _TURN * normals], axis=1).astype(np.float64)
+    features = np.concatenate([points / extent, _NORMAL_DISTANCE * normals], axis=1).astype(np.float64)
     reached = min(_NEIGHBORS + 1, len(cache_points))
     distances, neighbors = cKDTree(features[cache_points]).query(features, k=reached)
     distances, neighbors = distances.reshape(len(points), reached), neighbors.reshape(len(points), reached)

@@ -55,7 +55,7 @@ from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 from warpshadow.stages.sparse import multiply
 
 _CELL_COST = 15.0  # mean time of a cell of a receiver [ns], over cells that hit a plane and cells that do not
-_LEAST = wp.constant(1.0e-30)  # the least Σ s
+_MIN_WEIGHT_SUM = wp.constant(1.0e-30)  # the least Σ s
 
 # Scratch of a receiver, vec3. Its position relative to each plane f, whose gradients have the same places:
 #     4 f        where it is along both axes, and its height
@@ -302,7 +302,7 @@ def _mean_light(cells: int, side_count: int, own: wp.array(dtype=wp.vec3)):
             light += (own[cells + 4 * i + 2][0] * unhidden) * own[cells + 4 * i + 1]
             weights += coverage * unhidden
             covered += coverage
-    weights = wp.max(weights, _LEAST)
+    weights = wp.max(weights, _MIN_WEIGHT_SUM)
     return light / weights, weights, covered
 
 

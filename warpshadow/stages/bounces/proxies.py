@@ -20,7 +20,7 @@ from warpshadow.device.memory import empty
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
-_BELOW = wp.constant(0.5)  # how far below its patch a center is, in radii
+_CENTER_DEPTH = wp.constant(0.5)  # how far below its patch a center is, in radii
 
 
 @wp.kernel
@@ -42,7 +42,7 @@ def _place(
         radius = ratios[patch] * blocker_radii[instance_in(batch, blocker_radii.shape[0]), numbers[patch]]
     point = points[instance_in(batch, points.shape[0]), patch]
     normal = normals[instance_in(batch, normals.shape[0]), patch]
-    centers[batch, patch] = point - _BELOW * radius * normal
+    centers[batch, patch] = point - _CENTER_DEPTH * radius * normal
     radii[batch, patch] = radius
 
 

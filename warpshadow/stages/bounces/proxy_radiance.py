@@ -26,9 +26,9 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.stages.visibility.merging import MERGING, QUAD, merged_count
 
-_HIDDEN = wp.constant(0.01)  # part of its area that a patch counts for where it shows none
+_HIDDEN_WEIGHT = wp.constant(0.01)  # part of its area that a patch counts for where it shows none
 
-_SHOWN = 0.25
+_BLACK_SPHERE_WEIGHT = 0.25
 """Part of its area that a convex body shows on average: the weight of spheres without patches, which are black."""
 
 
@@ -75,7 +75,7 @@ def _tabulate(
     open = float(minimum[node])
     for k in range(starts[node], starts[node + 1]):
         patch = numbers[k]
-        part = shares[k] * (shows[patch, direction] + _HIDDEN)
+        part = shares[k] * (shows[patch, direction] + _HIDDEN_WEIGHT)
         light += part * sent[patch]
         open += part
     proxy_radiance[batch, node, direction] = wp.vec4(light[0], light[1], light[2], open)
@@ -116,7 +116,7 @@ def find_proxy_radiance(
     totals = np.bincount(nodes, areas[numbers], len(starts) - 1)
     shares = areas[numbers] / np.where(totals > 0, totals, 1)[nodes]
     integers = [constant(np.asarray(values, np.int32), wp.int32, device) for values in (starts, numbers)]
-    floats = [shares, np.where(totals > 0, 0.0, _SHOWN)]
+    floats = [shares, np.where(totals > 0, 0.0, _BLACK_SPHERE_WEIGHT)]
     tables = [*integers, *(constant(values.astype(np.float32), wp.float32, device) for values in floats)]
     proxy_radiance = empty((batch_count, len(starts) - 1, shown.shape[2]), dtype=wp.vec4, device=device)
     launch(_tabulate, proxy_radiance.shape, inputs=[radiosity, shown, *tables], outputs=[proxy_radiance])

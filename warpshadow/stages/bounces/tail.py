@@ -34,9 +34,9 @@ from warpshadow.device.memory import empty, zeros
 
 TERM_COUNT = 5  # radiosities from which the tail is found
 
-_MOST = wp.constant(wp.float64(50.0))  # length of R in that of D_1, at most
-_SMALL = wp.constant(wp.float64(1.0e-7))  # added to the diagonal of M
-_LEAST = wp.constant(wp.float64(1.0e-60))  # the least <D, D>: less is darkness
+_MAX_RESIDUAL = wp.constant(wp.float64(50.0))  # length of R in that of D_1, at most
+_RIDGE = wp.constant(wp.float64(1.0e-7))  # added to the diagonal of M
+_MIN_SQUARE = wp.constant(wp.float64(1.0e-60))  # the least <D, D>: less is darkness
 
 
 @wp.func
@@ -93,27 +93,27 @@ def _solve(
     s1 = sums[batch, color, 1]
     s2 = sums[batch, color, 2]
     one = wp.float64(1.0)
-    n0 = one / wp.sqrt(wp.max(s0[0], _LEAST))
-    n1 = one / wp.sqrt(wp.max(s1[1], _LEAST))
-    n2 = one / wp.sqrt(wp.max(s2[2], _LEAST))
+    n0 = one / wp.sqrt(wp.max(s0[0], _MIN_SQUARE))
+    n1 = one / wp.sqrt(wp.max(s1[1], _MIN_SQUARE))
+    n2 = one / wp.sqrt(wp.max(s2[2], _MIN_SQUARE))
     matrix = wp.mat33d(
-        n0 * n0 * (s0[0] - s0[1]) + _SMALL,
+        n0 * n0 * (s0[0] - s0[1]) + _RIDGE,
         n0 * n1 * (s0[1] - s0[2]),
         n0 * n2 * (s0[2] - s0[3]),
         n1 * n0 * (s1[0] - s1[1]),
-        n1 * n1 * (s1[1] - s1[2]) + _SMALL,
+        n1 * n1 * (s1[1] - s1[2]) + _RIDGE,
         n1 * n2 * (s1[2] - s1[3]),
         n2 * n0 * (s2[0] - s2[1]),
         n2 * n1 * (s2[1] - s2[2]),
-        n2 * n2 * (s2[2] - s2[3]) + _SMALL,
+        n2 * n2 * (s2[2] - s2[3]) + _RIDGE,
     )
     result = wp.inverse(matrix) * wp.vec3d(n0 * s0[0], n1 * s1[0], n2 * s2[0])
     result = wp.vec3d(n0 * result[0], n1 * result[1], n2 * result[2])
     row_dot = result[0] * s0[0] + result[1] * s0[1] + result[2] * s0[2]
-    if row_dot >= wp.float64(0.0) and row_dot <= _MOST * s0[0]:
+    if row_dot >= wp.float64(0.0) and row_dot <= _MAX_RESIDUAL * s0[0]:
         coefficients[batch, color] = result
     else:
-        coefficients[batch, color] = wp.vec3d(one, one, _MOST)
+        coefficients[batch, color] = wp.vec3d(one, one, _MAX_RESIDUAL)
 
 
 @wp.func

@@ -40,13 +40,13 @@ from warpshadow.stages.visibility.directional import SOFTNESS
 _PART_COST = 300.0
 """Mean time of a part of a receiver [ns]."""
 
-_UNKNOWN = wp.constant(-2)
+_UNKNOWN_COUNT = wp.constant(-2)
 """Number of edges of a silhouette that is not found yet."""
 
-_ROOM = wp.constant(1.001)
+_BOUND_MARGIN = wp.constant(1.001)
 """Bounds are so much larger, for rounding."""
 
-_TINY = wp.constant(1.0e-6)
+_MIN_EDGE_SINE = wp.constant(1.0e-6)
 """Sine of the least angle under which a receiver sees an edge."""
 
 # Scratch of a receiver, vec3, for each edge of a part's silhouette:
@@ -91,7 +91,7 @@ def _find_silhouette(
             b = corners[end] - point
             n = wp.cross(a, b)
             length2 = wp.length_sq(n)
-            if length2 > _TINY * _TINY * wp.length_sq(a) * wp.length_sq(b):
+            if length2 > _MIN_EDGE_SINE * _MIN_EDGE_SINE * wp.length_sq(a) * wp.length_sq(b):
                 length = wp.sqrt(length2)
                 silhouette[_ROWS * count] = (1.0 / length) * n
                 silhouette[_ROWS * count + 1] = a
@@ -222,7 +222,7 @@ def _find_bound(point: wp.vec3, normal: wp.vec3, bound: wp.vec4, radius: float):
     if distance2 > bound[3] * bound[3]:
         distance = wp.sqrt(distance2)
         result.axis = away / distance
-        sine = _ROOM * bound[3] / distance
+        sine = _BOUND_MARGIN * bound[3] / distance
         cosine = wp.sqrt(wp.max(0.0, 1.0 - sine * sine))
         scale = 1.0 / wp.sqrt(1.0 + radius * radius)
         result.cosine = (cosine - sine * radius) * scale
@@ -258,7 +258,7 @@ def _add_coverage(
     for part in range(parts.first_part[body], parts.first_part[body + 1]):
         bound = _find_bound(point, normal, bounds[part], radius)
         if bound.is_seen:
-            count = int(_UNKNOWN)
+            count = int(_UNKNOWN_COUNT)
             for bundle in range(cells.axes.shape[0]):
                 if _reaches(bound, cells.axes[bundle], cells.half_angles[bundle]):
                     for q in range(bundle * BUNDLE, (bundle + 1) * BUNDLE):
@@ -272,7 +272,7 @@ def _add_coverage(
                                 for k in range(cells.directions.shape[0]):
                                     coverage[k] = 0.0
                                 covers = True
-                            if count == _UNKNOWN:
+                            if count == _UNKNOWN_COUNT:
                                 count = _find_silhouette(point, corners, planes, parts, part, silhouette)
                             share = float(1.0)
                             if count >= 0:
@@ -391,14 +391,14 @@ def _pass_adjoint(
             for part in range(parts.first_part[body], parts.first_part[body + 1]):
                 bound = _find_bound(point, normal, bounds[instance, part], radius)
                 if bound.is_seen:
-                    count = int(_UNKNOWN)
+                    count = int(_UNKNOWN_COUNT)
                     for bundle in range(cells.axes.shape[0]):
                         if _reaches(bound, cells.axes[bundle], cells.half_angles[bundle]):
                             for q in range(bundle * BUNDLE, (bundle + 1) * BUNDLE):
                                 left = 1.0 - coverages[place, q]
                                 adj = adj_passing[batch, receiver, q] * passing[batch, receiver, q]
                                 if adj != 0.0 and left > 0.0 and left < 1.0:
-                                    if count == _UNKNOWN:
+                                    if count == _UNKNOWN_COUNT:
                                         count = _find_silhouette(
                                             point, corners[instance], planes[instance], parts, part, silhouettes[place]
                                         )

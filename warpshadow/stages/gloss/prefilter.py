@@ -17,7 +17,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.parallel import split_row
 from warpshadow.maths import sh
 
-ROWS = 128
+MAX_ROWS = 128
 """Most rows of level 0."""
 
 _MIN_ROWS = 16
@@ -79,7 +79,7 @@ def prefilter(radiance: np.ndarray) -> np.ndarray:
     Returns:
         Texels of all levels, one level and row after another, float32 of shape [texel, channel].
     """
-    rows = min(max(1 << (len(radiance) - 1).bit_length(), 64), ROWS)
+    rows = min(max(1 << (len(radiance) - 1).bit_length(), 64), MAX_ROWS)
     levels = [with_rows(radiance, rows)]
     for level, count in enumerate(level_rows(rows)[1:]):
         spectrum = np.fft.rfft(with_rows(levels[0], count), axis=1)
@@ -93,7 +93,7 @@ def prefilter(radiance: np.ndarray) -> np.ndarray:
 
 def _levels_of(texel_count: int) -> np.ndarray:
     """First texel and rows of each level, [level, 2], by the number of all texels."""
-    choices = (np.array(level_rows(rows)) for rows in (64, ROWS))
+    choices = (np.array(level_rows(rows)) for rows in (64, MAX_ROWS))
     rows = next(counts for counts in choices if (2 * counts**2).sum() == texel_count)
     return np.stack([np.cumsum(2 * rows**2) - 2 * rows**2, rows], axis=1)
 

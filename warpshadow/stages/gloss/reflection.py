@@ -21,10 +21,10 @@ from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.parallel import split_row
 
-STRAIGHT = 0.04
+DIELECTRIC_F0 = 0.04
 """F₀ of all that is not metal: an index of refraction of 1.5."""
 
-MIN_SHARE = 0.02
+MIN_BLOCKED_SHARE = 0.02
 """Part of the hemisphere below which it says little of blockers' radiance how much light they send."""
 
 _COST = 10.0
@@ -110,7 +110,7 @@ def _find_blocked(
     light = bounced[instance_in(batch, bounced.shape[0]), receiver]
     rest = light - direct[instance_in(batch, direct.shape[0]), receiver]
     share = 1.0 - openness[instance_in(batch, openness.shape[0]), receiver][0]
-    blocked[batch, receiver] = wp.max(rest, wp.vec3()) / wp.max(share, MIN_SHARE)
+    blocked[batch, receiver] = wp.max(rest, wp.vec3()) / wp.max(share, MIN_BLOCKED_SHARE)
 
 
 def blocked_radiance(bounced: wp.array, direct: wp.array, openness: wp.array) -> wp.array:
@@ -177,9 +177,9 @@ def _reflect(
         s = specular[instance_in(batch, specular.shape[0]), number]
         slant = 1.0 - cosines[instance_in(batch, cosines.shape[0]), number]
         slant = slant * slant
-        reflected = STRAIGHT + (1.0 - STRAIGHT) * (even[0] + slant * (even[1] + slant * even[2]))
+        reflected = DIELECTRIC_F0 + (1.0 - DIELECTRIC_F0) * (even[0] + slant * (even[1] + slant * even[2]))
         colored[batch, receiver] = (1.0 - m) * (1.0 - s * reflected) * light + m * (lobe - rest)
-        white[batch, receiver] = (1.0 - m) * s * (STRAIGHT * lobe + (1.0 - STRAIGHT) * rest) + m * rest
+        white[batch, receiver] = (1.0 - m) * s * (DIELECTRIC_F0 * lobe + (1.0 - DIELECTRIC_F0) * rest) + m * rest
 
 
 def mix_reflection(

@@ -18,10 +18,10 @@ from warpshadow.device.launch import launch
 from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import cell_radius
 
-REACH = 2.2
+KERNEL_RADIUS = 2.2
 """Distance of a cell from which it no longer counts, in cell radii."""
 
-_ROWS = 32
+_TABLE_ROWS = 32
 """Rows of the table of cells near directions, and its columns: an octahedron."""
 
 _COST = 60.0
@@ -38,13 +38,13 @@ def _neighbors(directions: bytes) -> np.ndarray:
     from scipy.spatial import cKDTree
 
     cells = np.frombuffer(directions).reshape(-1, 3)
-    place = (np.arange(_ROWS) + 0.5) / _ROWS * 2 - 1
+    place = (np.arange(_TABLE_ROWS) + 0.5) / _TABLE_ROWS * 2 - 1
     x, z = np.meshgrid(place, place)
     y = 1 - np.abs(x) - np.abs(z)
     below = np.maximum(-y, 0)
     texels = np.stack([x - np.sign(x) * below, y, z - np.sign(z) * below], axis=-1).reshape(-1, 3)
     texels /= np.linalg.norm(texels, axis=1, keepdims=True)
-    reach = 2 * np.sin(min(REACH * cell_radius(len(cells)) + 2.2 / _ROWS, np.pi) / 2)
+    reach = 2 * np.sin(min(KERNEL_RADIUS * cell_radius(len(cells)) + 2.2 / _TABLE_ROWS, np.pi) / 2)
     tree = cKDTree(cells)
     count = max(len(near) for near in tree.query_ball_point(texels, reach))
     return tree.query(texels, min(max(count, 3), len(cells)))[1].astype(np.int32)
@@ -60,9 +60,9 @@ def _texel(direction: wp.vec3):
         folded = wp.sign(x) * (1.0 - wp.abs(z))
         z = wp.sign(z) * (1.0 - wp.abs(x))
         x = folded
-    column = wp.clamp(int((x + 1.0) * 0.5 * float(_ROWS)), 0, _ROWS - 1)
-    row = wp.clamp(int((z + 1.0) * 0.5 * float(_ROWS)), 0, _ROWS - 1)
-    return row * _ROWS + column
+    column = wp.clamp(int((x + 1.0) * 0.5 * float(_TABLE_ROWS)), 0, _TABLE_ROWS - 1)
+    row = wp.clamp(int((z + 1.0) * 0.5 * float(_TABLE_ROWS)), 0, _TABLE_ROWS - 1)
+    return row * _TABLE_ROWS + column
 
 
 @wp.kernel
@@ -132,7 +132,7 @@ def transmittance_towards(
     count, device = common_batch(arrays), directions.device
     near = _neighbors(np.ascontiguousarray(cells, np.float64).tobytes())
     radius = float(cell_radius(len(cells)))
-    reach = float(np.cos(REACH * radius))
+    reach = float(np.cos(KERNEL_RADIUS * radius))
     sums = wp.empty((count, *directions.shape[1:]), dtype=wp.vec2, device=device)
     towards, neighbors = constant(cells, wp.vec3, device), constant(near, wp.int32, device)
     launch(

@@ -41,11 +41,11 @@ from warpshadow.device.launch import launch
 from warpshadow.stages.planes.cells import step
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 
-_ROOM = wp.constant(1.25)
+_FRONT_RADIUS_RATIO = wp.constant(1.25)
 """A source is wholly in front of a plane where its height and its sphere's add up to 1/1.25 of the sphere's radius."""
 
-_LIFT = wp.constant(5.0)  # how far receivers in a plane are lifted off it, in its margins
-_TINY = wp.constant(1.0e-18)  # radius up to which a sphere blocks nothing
+_LIFT_IN_MARGINS = wp.constant(5.0)  # how far receivers in a plane are lifted off it, in its margins
+_MIN_BLOCKER_RADIUS = wp.constant(1.0e-18)  # radius up to which a sphere blocks nothing
 
 
 class NearestBlockers(NamedTuple):
@@ -153,10 +153,10 @@ def _find_fronts(
         radius = float(0.0)
         if number >= 0:
             radius = radii[instance_in(batch, radii.shape[0]), number] / wp.length(axis_u)
-        if radius > _TINY:
+        if radius > _MIN_BLOCKER_RADIUS:
             middle = _height(centers[instance_in(batch, centers.shape[0]), number], frames, instance, f)
-            if _ROOM * wp.abs(height + middle) < radius:
-                front = step(_ROOM * (height + middle) / radius)
+            if _FRONT_RADIUS_RATIO * wp.abs(height + middle) < radius:
+                front = step(_FRONT_RADIUS_RATIO * (height + middle) / radius)
             else:
                 front = wp.where(height + middle > 0.0, 1.0, 0.0)
         elif wp.abs(height) < 2.0 * grids[f].margin:
@@ -237,12 +237,12 @@ def _lift(
     for f in range(grids.shape[0]):
         axis_u = frames[instance, 3 * f + 1]
         if f != skip and wp.length_sq(axis_u) > 0.0:
-            height = _height(point, frames, instance, f) / (2.0 * _LIFT * grids[f].margin)
+            height = _height(point, frames, instance, f) / (2.0 * _LIFT_IN_MARGINS * grids[f].margin)
             if wp.abs(height) < 1.0:
                 near = 1.0 - height * height
                 up = wp.normalize(wp.cross(axis_u, frames[instance, 3 * f + 2]))
                 side = 2.0 * fronts[batch, receiver, f] - 1.0
-                result += side * near * near * _LIFT * grids[f].margin * wp.length(axis_u) * up
+                result += side * near * near * _LIFT_IN_MARGINS * grids[f].margin * wp.length(axis_u) * up
     lifted[batch, receiver] = result
 
 

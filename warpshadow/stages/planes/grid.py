@@ -9,9 +9,11 @@ import numpy as np
 from warpshadow.maths.plane import plane_normal
 
 _GRID = 24  # texels along a grid's longer side
-_EVEN = 100.0  # spread of a grid that is even, in sizes of its body
+_EVEN_SPREAD = 100.0  # spread of a grid that is even, in sizes of its body
 _ROUNDING = 1e-6  # how far off a face a point may lie and still count as on it, as a part of the face or texel
-_TESTED = 3  # points along each side of a texel that are tested to lie on the mesh; odd, so that its middle is one
+_TESTS_PER_SIDE = (
+    3  # points along each side of a texel that are tested to lie on the mesh; odd, so that its middle is one
+)
 
 
 class PlaneTexture(NamedTuple):
@@ -107,7 +109,7 @@ def find_grid(
     frame = _smallest_rectangle(corners.reshape(-1, 3), normal)
     points = corners.reshape(-1, 3) @ frame.T
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
-    middle, spread = (low + high) / 2, _EVEN * (high - low).max()
+    middle, spread = (low + high) / 2, _EVEN_SPREAD * (high - low).max()
     if others is not None and len(others):
         near = others @ frame.T[:, :2]
         reach = np.ptp(near, axis=0).max() / 2
@@ -143,9 +145,9 @@ def _smallest_rectangle(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
 def _find_covered(grid: PlaneTexture, corners: np.ndarray) -> tuple[np.ndarray, CoveredPoints]:
     """Find which share of each texel the faces [face, 3, 2] cover, and a point in each that is not empty."""
     height, width = grid.covered.shape
-    points = grid.points(_TESTED)
-    shape = np.array([width, height]) * _TESTED
-    places = grid.in_texels(corners) * _TESTED - 0.5
+    points = grid.points(_TESTS_PER_SIDE)
+    shape = np.array([width, height]) * _TESTS_PER_SIDE
+    places = grid.in_texels(corners) * _TESTS_PER_SIDE - 0.5
     first = np.maximum(np.ceil(places.min(axis=1) - _ROUNDING), 0).astype(int)
     last = np.minimum(np.floor(places.max(axis=1) + _ROUNDING), shape - 1).astype(int)
     counts = np.maximum(last - first + 1, 0)
@@ -159,9 +161,9 @@ def _find_covered(grid: PlaneTexture, corners: np.ndarray) -> tuple[np.ndarray, 
     inside = (barycentrics > -_ROUNDING).all(axis=1)
     owner = np.full(points.shape[:2], -1)
     owner[row[inside], column[inside]] = np.flatnonzero(inside)
-    tested = owner.reshape(height, _TESTED, width, _TESTED).swapaxes(1, 2).reshape(height * width, -1)
+    tested = owner.reshape(height, _TESTS_PER_SIDE, width, _TESTS_PER_SIDE).swapaxes(1, 2).reshape(height * width, -1)
     covered = (tested >= 0).mean(axis=1)
-    from_middle = np.abs(np.arange(_TESTED**2) - _TESTED**2 // 2).argsort(kind="stable")
+    from_middle = np.abs(np.arange(_TESTS_PER_SIDE**2) - _TESTS_PER_SIDE**2 // 2).argsort(kind="stable")
     best = (tested[:, from_middle] >= 0).argmax(axis=1)
     chosen = tested[np.arange(len(tested)), from_middle[best]]
     texels = np.flatnonzero(chosen >= 0)

@@ -55,7 +55,7 @@ _FACE_COST, _SAMPLE_COST, _ENTRY_COST = 50.0, 4.0, 3.2
 """Nanoseconds that a face takes, if it is small, a sample that is looked at for an intersection, and for an entry."""
 
 # In place of the edge between two samples: it was not looked for yet, or there is none.
-_UNKNOWN, _NO_EDGE = NOTHING, -2
+_UNKNOWN_EDGE, _NO_EDGE = NOTHING, -2
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,7 +329,7 @@ def _find_edges(
                         sample += wp.where(axis == 0, row * seen.width + column, column * seen.width + row)
                         if seen.face_ids[sample] != seen.face_ids[neighbor(sample, 2 * axis, seen.width)]:
                             edge_found = between[axis, sample]
-                            if edge_found == _UNKNOWN:
+                            if edge_found == _UNKNOWN_EDGE:
                                 edge_found = _edge_between(seen, neighbors, creases, sample, 2 * axis)
                                 between[axis, sample] = wp.where(edge_found < 0, _NO_EDGE, edge_found)
                             if edge_found == 3 * face + k:

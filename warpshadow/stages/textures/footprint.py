@@ -19,7 +19,7 @@ from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.screen import center, relative, volumes
 from warpshadow.stages.textures.pyramid import Textures
 
-REACH = 0.25
+PROBE_LINE_EXCESS = 0.25
 """Widths that a line of probes is longer than they are wide together: a probe reaches beyond its width.
 
 Of 0 to 1, a quarter was nearest to the mean over the footprint, for noise, natural spectra and checkerboards.
@@ -107,8 +107,8 @@ def _probes(derivatives: wp.mat22, width: float, height: float):
         root = wp.sqrt(half * half + uv * uv + 1.0e-12 * (uu + vv) * (uu + vv))
         major = wp.sqrt(0.5 * (uu + vv) + root)
         minor = wp.abs(ux * vy - uy * vx) / major
-        probe_width = wp.max(wp.max(minor, major / wp.static(MAX_PROBES + REACH)), 1.0)
-        count = wp.max(major / probe_width - wp.static(REACH), 1.0)
+        probe_width = wp.max(wp.max(minor, major / wp.static(MAX_PROBES + PROBE_LINE_EXCESS)), 1.0)
+        count = wp.max(major / probe_width - wp.static(PROBE_LINE_EXCESS), 1.0)
         # eigenvector of the major axis, from the row in which nothing cancels
         along_u = wp.where(half > 0.0, root + half, uv)
         along_v = wp.where(half > 0.0, uv, root - half)

@@ -17,7 +17,7 @@ from warpshadow.maths.directions import bundle_cones, check_directions, falloff_
 from warpshadow.stages.visibility.cones import BLEND
 from warpshadow.stages.visibility.traversal import ALL, receiver_lanes_type
 
-REACH = 1.001 + BLEND
+BOUND_MARGIN = 1.001 + BLEND
 """Bounds are so much larger: cones of receivers as near as BLEND are wider than the sphere, and there is rounding."""
 
 
@@ -135,7 +135,7 @@ def make_cull(has_horizon: bool, Task: type, lanes: int) -> wp.Function:
         count = int(0)
         cells = task.cells
         if bound[3] > 0.0:
-            reach = REACH * bound[3]
+            reach = BOUND_MARGIN * bound[3]
             away = offset(wp.vec3(bound[0], bound[1], bound[2]), receivers.points)
             distance = sqrt(dot(away, away))
             is_within = is_any_above(-distance, -reach)

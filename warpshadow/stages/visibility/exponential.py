@@ -8,7 +8,7 @@ The number of squarings is *blended*. p, the least with |f̂| / 2^p ≤ T, jumps
 it, by some tenths of a percent, and finite differences of images would be wrong there. So from t = |f̂| / 2^p T = ½ on,
 where p squarings are just enough, the base approximation q of f / 2^p is blended with the square of q of f / 2^{p+1},
 
-    (1 − w) q(f / 2^p) + w q(f / 2^{p+1})²,    w = smoothstep((t − ½) / (BLENDED − ½))
+    (1 − w) q(f / 2^p) + w q(f / 2^{p+1})²,    w = smoothstep((t − ½) / (BLEND_START − ½))
 
 At t = 1, w = 1: there p + 1 squarings take over with the same value, and v has a continuous derivative. It costs one
 product more.
@@ -50,12 +50,12 @@ THRESHOLDS = {
 MIN_THRESHOLD = 0.01  # squarings amplify float32 rounding 2^p times; below this they cost more digits than they give
 MAX_SQUARINGS = 20  # limit of the squarings; a log that asks for more is cut down to it
 
-BLENDED = 0.7
+BLEND_START = 0.7
 """|f̂| / 2^p, in thresholds, from which on the base approximation is wholly the square of that of half the log."""
 
 _SQUARING_COST = 0.5  # nanoseconds that exponentiation takes for a receiver and a pair of coefficients
 
-_KNOTS = 2048
+_TABLE_KNOTS = 2048
 
 
 @functools.cache
@@ -70,7 +70,7 @@ def _optimal_table(order: int, device: str) -> wp.array:
     a = exponential[:, 0] / UNIT
     b = np.sum(exponential * log, axis=1) / norm**2
     rising = np.argmax(norm)
-    knots = np.linspace(0, THRESHOLDS["optimal_linear"].limit, _KNOTS + 1)
+    knots = np.linspace(0, THRESHOLDS["optimal_linear"].limit, _TABLE_KNOTS + 1)
     table = np.stack([np.interp(knots, np.r_[0, norm[:rising]], np.r_[1, v[:rising]]) for v in (a, b)], axis=-1)
     return wp.array(table.astype(np.float32), dtype=wp.vec2, device=device)
 
@@ -88,7 +88,7 @@ def _make_measure(order: int, lanes: int) -> wp.Function:
     """
     Lane = lane_type(lanes)
     sqrt = make_lane_functions(lanes).sqrt
-    PER_BLEND = wp.constant(1 / (BLENDED - 0.5))
+    PER_BLEND = wp.constant(1 / (BLEND_START - 0.5))
 
     @wp.func
     def measure(log: wp.array(dtype=Lane), threshold: float):
@@ -129,7 +129,7 @@ def _make_measure(order: int, lanes: int) -> wp.Function:
 def _make_factor(base: str, lanes: int) -> wp.Function:
     """Make the kernel function of the base's factors: |h| → a, b of a 1 + b h, and their derivatives."""
     Lane = lane_type(lanes)
-    STEP = wp.constant(THRESHOLDS["optimal_linear"].limit / _KNOTS)
+    STEP = wp.constant(THRESHOLDS["optimal_linear"].limit / _TABLE_KNOTS)
     is_optimal = base == "optimal_linear"
 
     @wp.func
@@ -141,7 +141,7 @@ def _make_factor(base: str, lanes: int) -> wp.Function:
         if wp.static(is_optimal):
             for lane in range(lanes):
                 position = length[lane] / STEP
-                interval = wp.min(int(position), _KNOTS - 1)
+                interval = wp.min(int(position), _TABLE_KNOTS - 1)
                 ab = wp.lerp(optimal[interval], optimal[interval + 1], position - float(interval))
                 change = (optimal[interval + 1] - optimal[interval]) / STEP
                 constant[lane] = ab[0]

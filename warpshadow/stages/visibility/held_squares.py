@@ -5,13 +5,14 @@ Where many spheres overlap, the truncated sum of their logs has lobes above 0, a
 directions is at most the mean of v. Truncation breaks that rule, and d = ⟨v²⟩ − ⟨v⟩, which is then above 0, measures by
 how much. Each squaring is
 
-    v ← v + w (v * v − v),    w = 1 − smoothstep(log(|f̂| d / QUIET) / log(LOUD / QUIET))
+    v ← v + w (v * v − v),    w = 1 − smoothstep(log(|f̂| d / SQUARED_BELOW) / log(HELD_ABOVE / SQUARED_BELOW))
 
-While |f̂| d ≤ QUIET, w = 1: v is squared. From LOUD on, w = 0: v stays as it is. If k squarings are left out, the
-result is the visibility of f / 2^k. The factor |f̂| grows with the number of spheres that overlap. It stops the
-squarings of such logs earlier; nothing is lost, since such receivers are dark before their last squarings. LOUD is four
-times QUIET: one squaring raises d by that factor or more, so w is between 0 and 1 for one squaring at a time, and v
-changes smoothly with f. The rule is cheap: the mean of v² is the first coefficient of the product v * v.
+While |f̂| d ≤ SQUARED_BELOW, w = 1: v is squared. From HELD_ABOVE on, w = 0: v stays as it is. If k squarings are left
+out, the result is the visibility of f / 2^k. The factor |f̂| grows with the number of spheres that overlap. It stops
+the squarings of such logs earlier; nothing is lost, since such receivers are dark before their last squarings.
+HELD_ABOVE is four times SQUARED_BELOW: one squaring raises d by that factor or more, so w is between 0 and 1 for one
+squaring at a time, and v changes smoothly with f. The rule is cheap: the mean of v² is the first coefficient of the
+product v * v.
 """
 
 import functools
@@ -22,10 +23,10 @@ import warp as wp
 from warpshadow.device.lanes import lane_type
 from warpshadow.stages.sh_kernels import ProductTable, make_multiply
 
-QUIET = 6.0
+SQUARED_BELOW = 6.0
 """|f̂|(⟨v²⟩ − ⟨v⟩) up to which squaring is exact; 64 spheres around a bunny reach 0.4 (`eigen`) and 5.1 (`cap`)."""
 
-LOUD = 24.0  # |f̂|(⟨v²⟩ − ⟨v⟩) from which on nothing is squared
+HELD_ABOVE = 24.0  # |f̂|(⟨v²⟩ − ⟨v⟩) from which on nothing is squared
 
 UNIT = float(np.sqrt(4 * np.pi))  # the coefficient of the constant function 1
 
@@ -34,16 +35,16 @@ UNIT = float(np.sqrt(4 * np.pi))  # the coefficient of the constant function 1
 def _make_hold(lanes: int) -> wp.Function:
     """Make the kernel function of holding squarings: |f̂| d → the share w of the square, and its derivative."""
     Lane = lane_type(lanes)
-    PER_OCTAVES = wp.constant(float(1 / np.log(LOUD / QUIET)))
+    PER_OCTAVES = wp.constant(float(1 / np.log(HELD_ABOVE / SQUARED_BELOW)))
 
     @wp.func
     def hold(loudness: Lane):
         share = Lane(1.0)
         slope = Lane(0.0)
-        if wp.max(loudness) > QUIET:
+        if wp.max(loudness) > SQUARED_BELOW:
             for lane in range(lanes):
-                if loudness[lane] > QUIET:
-                    t = wp.min(wp.log(loudness[lane] / QUIET) * PER_OCTAVES, 1.0)
+                if loudness[lane] > SQUARED_BELOW:
+                    t = wp.min(wp.log(loudness[lane] / SQUARED_BELOW) * PER_OCTAVES, 1.0)
                     share[lane] = 1.0 - t * t * (3.0 - 2.0 * t)
                     slope[lane] = -6.0 * PER_OCTAVES * t * (1.0 - t) / loudness[lane]
         return share, slope

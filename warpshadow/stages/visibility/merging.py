@@ -34,7 +34,7 @@ ITEMS = QUAD + 1  # spheres of a quad, its own included
 MERGING = 0.75  # τ: half-angle in cell radii under which four spheres are seen as one
 MERGED_FROM = 512  # fewer spheres do not merge: they are so large that hardly a receiver is far enough from them
 
-_BLEND = 0.7  # τ0 / τ
+_BLEND_ANGLE_RATIO = 0.7  # τ0 / τ
 
 _SHADOW = 5.4  # of an ellipsoid, from the moments of spheres
 
@@ -212,7 +212,7 @@ def _make_blend(lanes: int) -> wp.Function:
     """Make the kernel function of the share m of a quad's sphere: d/E, τ → m, and its derivative by (D/E)²."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
     dot = make_lane_functions(lanes).dot
-    BLEND2 = wp.constant(_BLEND**2)
+    BLEND2 = wp.constant(_BLEND_ANGLE_RATIO**2)
     FARTHEST2 = wp.constant(_FARTHEST2)
 
     @wp.func
