@@ -58,7 +58,7 @@ def note_of_tests(request, record_testsuite_property):
 @pytest.fixture(autouse=True)
 def no_lines(monkeypatch):
     """Tests that compile kernels take as long as they take: no line says how far they are."""
-    monkeypatch.setattr(progress, "_EVERY", 3600.0)
+    monkeypatch.setattr(progress, "_LINE_INTERVAL", 3600.0)
 
 
 @pytest.fixture(scope="session")

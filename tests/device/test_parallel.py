@@ -209,9 +209,9 @@ def image_with_gradients():
 
 def test_kernels_that_warp_differentiates_are_divided_both_ways(monkeypatch):
     parallel.set_thread_count(2)
-    monkeypatch.setattr(parallel, "_LEAST_SUMMED_WORK", 1e18)
+    monkeypatch.setattr(parallel, "_MIN_SUMMED_WORK", 1e18)
     whole = image_with_gradients()
-    monkeypatch.setattr(parallel, "_LEAST_SUMMED_WORK", 1e4)
+    monkeypatch.setattr(parallel, "_MIN_SUMMED_WORK", 1e4)
     results = []
     for count in (1, 2, 5):
         parallel.set_thread_count(count)
@@ -245,8 +245,8 @@ def moved_balls():
 
 def test_images_of_a_batch_that_threads_share_are_the_same(monkeypatch):
     whole = moved_balls()
-    monkeypatch.setattr(parallel, "_LEAST_WORK", 1e3)
-    monkeypatch.setattr(parallel, "_LEAST_SUMMED_WORK", 1e3)
+    monkeypatch.setattr(parallel, "_MIN_WORK", 1e3)
+    monkeypatch.setattr(parallel, "_MIN_SUMMED_WORK", 1e3)
     for count in (2, 5):
         parallel.set_thread_count(count)
         assert moved_balls() == whole

@@ -31,7 +31,7 @@ def lines(monkeypatch, capsys):
     """As if a second were 20 ms and stderr a file; what is written there, line by line."""
     monkeypatch.setattr(progress, "_can_be_seen", lambda: False)
     monkeypatch.setattr(progress, "_DELAY", 0.02)
-    monkeypatch.setattr(progress, "_EVERY", 0.2)
+    monkeypatch.setattr(progress, "_LINE_INTERVAL", 0.2)
     monkeypatch.setattr(progress, "_reporter", progress._Reporter())
     return lambda: capsys.readouterr().err.splitlines()
 
@@ -100,7 +100,7 @@ def test_compiled_kernels_are_counted(lines):
 
     with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
         patch.setattr(wp.config, "kernel_cache_dir", folder)
-        patch.setattr(progress, "_EVERY", 0.05)
+        patch.setattr(progress, "_LINE_INTERVAL", 0.05)
         wp.launch(name_that_no_other_kernel_has, dim=1, inputs=[wp.zeros(1, device="cpu"), 3], device="cpu")
         assert re.match(r"compiling kernels, module \d+: \d s", lines()[0])
         wp.launch(name_that_no_other_kernel_has, dim=1, inputs=[wp.zeros(1, device="cpu"), 3], device="cpu")

@@ -291,7 +291,7 @@ def test_who_has_no_token_for_a_ray_cluster_is_told_so(cluster, photos, tmp_path
 @pytest.mark.slow
 def test_the_death_of_the_head_of_a_ray_cluster_is_an_error(cluster, monkeypatch):
     """It comes last, as the cluster dies."""
-    monkeypatch.setattr("warpshadow.device.cluster._PATIENCE", 1.0)
+    monkeypatch.setattr("warpshadow.device.cluster._HEAD_TIMEOUT", 1.0)
     ended = run_on_ray(time.sleep, [0.0, TIME], cluster[0])
     assert next(ended).task == 0.0
     cluster[1].kill()

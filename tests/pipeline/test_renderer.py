@@ -683,7 +683,7 @@ def test_receivers_lit_in_parts_are_those_lit_at_once(method, monkeypatch):
     ball = ws.Body(ws.icosphere(1.0, 3), blockers=UNIT_SPHERE, translation=(0, 1, 0))
     scene = ws.Scene((ball, ws.Body(ws.plane(4, 16), blockers=0)), dome(), CAMERA, ws.Visibility(method))
     whole = SceneRenderer(scene).render()
-    monkeypatch.setattr(groups, "PART", 37)
+    monkeypatch.setattr(groups, "PART_SIZE", 37)
     renderer = SceneRenderer(scene)
     np.testing.assert_array_equal(renderer.render(), whole)
     assert "transfer" in str(renderer.explain())
@@ -691,7 +691,7 @@ def test_receivers_lit_in_parts_are_those_lit_at_once(method, monkeypatch):
 
 def test_parts_of_receivers_need_little_memory(monkeypatch):
     """What is shaded at once is told by the largest array of what is seen."""
-    monkeypatch.setattr(groups, "PART", 64)
+    monkeypatch.setattr(groups, "PART_SIZE", 64)
     sizes = []
     shade = directional.shade_cells
     monkeypatch.setattr(

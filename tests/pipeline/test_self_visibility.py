@@ -337,7 +337,7 @@ def test_a_damaged_file_of_an_interrupt_is_not_read(tmp_path, monkeypatch):
 
 def test_rows_that_take_long_to_trace_are_announced_with_the_way_around_them(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(progress, "LONG", 1.0)
+    monkeypatch.setattr(progress, "ANNOUNCED_SECONDS", 1.0)
     monkeypatch.setattr(self_visibility, "trace_seconds", lambda rows, faces: rows)
     monkeypatch.setenv("WARPSHADOW_NUM_THREADS", "2")
     SceneRenderer(scene_of(), progress=True).render()

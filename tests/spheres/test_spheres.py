@@ -412,7 +412,7 @@ def test_a_fit_that_fills_a_cavity_is_not_called_good():
 
 def test_a_body_has_as_many_spheres_as_it_needs(monkeypatch):
     """A ball few, and a slab, whose shadow has holes as long as they are few, as many as there may be."""
-    monkeypatch.setattr(enough, "TRIED", (8, 32))
+    monkeypatch.setattr(enough, "TRIED_COUNTS", (8, 32))
     meshes = (normalized(mesh, "cpu") for mesh in (icosphere(1.0, 3), box((1.0, 0.05, 0.8), 2)))
     for mesh, expected in zip(meshes, ((8, 16), (32, enough.MAX_SPHERES)), strict=True):
         receivers = FitReceivers(mesh, 2048, np.random.default_rng(SEED))
@@ -511,8 +511,8 @@ def test_a_fit_goes_on_where_an_interrupt_left_it_to_the_same_bits(tmp_path, mon
         return fit_spheres(bumpy(), **{**QUICK, "cache": True, "steps": 100})
 
     monkeypatch.setattr(stage_2.Refinement, "gradient", counted)
-    monkeypatch.setattr(enough, "TRIED", (2, 4))
-    monkeypatch.setattr(enough, "_WANTED", 0.0)
+    monkeypatch.setattr(enough, "TRIED_COUNTS", (2, 4))
+    monkeypatch.setattr(enough, "_MAX_ERROR", 0.0)
     monkeypatch.setattr(enough, "_STEPS", 10)
     whole = fit("whole").spheres
     assert len(steps) == 120  # of two short fits, and the descent

@@ -442,7 +442,7 @@ def test_without_reading_the_count_back_the_result_is_the_same(device, monkeypat
 
 
 def test_more_samples_than_int32_counts_are_refused(device, monkeypatch):
-    monkeypatch.setattr(find, "MOST_SAMPLES", 81 * 97 - 1)
+    monkeypatch.setattr(find, "MAX_SAMPLES", 81 * 97 - 1)
     mesh = ws.icosphere(1.0, 1)
     with pytest.raises(ValueError, match="fragments: got 7857 samples in all, expected at most 7856"):
         setup(mesh.positions, mesh.faces, device)

@@ -31,8 +31,8 @@ PROGRAM = [sys.executable, "-c", "from warpshadow.cli import app; app(prog_name=
 @pytest.fixture(autouse=True)
 def often(monkeypatch):
     """Show whatever happens at once."""
-    monkeypatch.setattr(watch, "_SECONDS", 0.02)
-    monkeypatch.setattr(watch, "_SHARE", 0.5)
+    monkeypatch.setattr(watch, "_MIN_INTERVAL", 0.02)
+    monkeypatch.setattr(watch, "_MAX_TIME_SHARE", 0.5)
 
 
 @pytest.fixture
