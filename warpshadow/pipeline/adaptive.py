@@ -49,7 +49,7 @@ def find_squares(
     shares = np.zeros(probe_keys.shape, np.float32)
     with unrecorded():
         bare = detached(spheres[0]), detached(spheres[1])
-        blockers = method.blockers(points.blocking, detached(positions), bare)
+        blockers = method.blockers(points.blocker_kinds, detached(positions), bare)
         for body in np.flatnonzero(is_adaptive).tolist():
             columns = _ragged(body_of_probe == body)
             if not columns.shape[1]:

@@ -15,9 +15,9 @@ from warpshadow.pipeline.convex import SceneParts
 from warpshadow.pipeline.geometry import Geometry
 from warpshadow.pipeline.groups import Blockers, Group, Transmittance, find_groups
 from warpshadow.pipeline.lighting import (
-    BY_SPHERES,
     LARGEST_COEFFICIENT,
-    Blocking,
+    ONLY_SPHERES,
+    BlockerKinds,
     KnownLight,
     LitPoints,
     Method,
@@ -70,8 +70,8 @@ class SphereMethod(Method):
         """The bodies' shadows on themselves, from rays."""
         return SelfVisibility(self.merged_scene, self.samples_receive, progress=self.progress)
 
-    def blocking(self, geometry: Geometry | None, rotations: Input | None) -> Blocking:
-        """How the bodies of a geometry, by default the scene's, block light.
+    def blocker_kinds(self, geometry: Geometry | None, rotations: Input | None) -> BlockerKinds:
+        """Choose the kind of blocker that each body of a geometry is; the scene's geometry by default.
 
         Bodies block as planes and convex parts where the method knows such; where light does not bounce, no deformed
         body is a plane.
@@ -79,22 +79,24 @@ class SphereMethod(Method):
         deformed = () if geometry is None or self.merged_scene.scene.bounces else geometry.deformed
         planes = tuple(body for body in self.plane_blockers if body not in deformed)
         if rotations is None or not self.traces_self_visibility:
-            return BY_SPHERES._replace(planes=planes)
+            return ONLY_SPHERES._replace(planes=planes)
         count = len(self.merged_scene.scene.bodies)
         why = tuple(self.self_visibility.why_spheres(body, geometry) for body in range(count))
         traced = tuple(body for body, reason in enumerate(why) if not reason)
-        return Blocking(traced, rotations, why, planes, self.convex_among(traced))
+        return BlockerKinds(traced, rotations, why, planes, self.convex_among(traced))
 
     def convex_among(self, traced: tuple[int, ...]) -> tuple[int, ...]:
         """Bodies that block the light of others as convex parts, of some that block their own light as rays found."""
         return ()
 
-    def blockers(self, blocking: Blocking, positions: wp.array, spheres: tuple[wp.array, wp.array]) -> Blockers:
+    def blockers(
+        self, blocker_kinds: BlockerKinds, positions: wp.array, spheres: tuple[wp.array, wp.array]
+    ) -> Blockers:
         """Place the blockers among bodies, by their vertices and spheres. Differentiable: these."""
         owners = self.planes, self.parts, self.self_visibility, self.visibility.merging
-        frames = self.planes.frames(blocking.planes, positions) if blocking.planes else None
-        placed = self.parts.placed(blocking.convex, positions) if blocking.convex else None
-        return Blockers(self.merged_scene, blocking, *owners, positions, spheres, frames, placed)
+        frames = self.planes.frames(blocker_kinds.planes, positions) if blocker_kinds.planes else None
+        placed = self.parts.placed(blocker_kinds.convex, positions) if blocker_kinds.convex else None
+        return Blockers(self.merged_scene, blocker_kinds, *owners, positions, spheres, frames, placed)
 
     def past_planes(self, group: Group, seen: Transmittance, projected_light: Any) -> Transmittance:
         """Visibility of a group past the flat bodies around it, given its visibility past all other blockers."""
@@ -136,7 +138,7 @@ class SphereMethod(Method):
         """
         return None
 
-    def cached_rows(self, static: StaticBodies, light: Input | None, blocking: Blocking) -> VertexRows:
+    def cached_rows(self, static: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """Rows of transmittance past static bodies, for known light or for any."""
         raise NotImplementedError
 
@@ -232,8 +234,8 @@ class InParts(Node):
             idle=lambda: _why_unblocked(method, points),
             caches=False,
         )
-        planes = points.blocking.planes
-        place = functools.partial(method.blockers, points.blocking)
+        planes = points.blocker_kinds.planes
+        place = functools.partial(method.blockers, points.blocker_kinds)
         blockers = points.cached("blockers", None, lambda: Node("", place, points.vertices, spheres))
         self._passing = Node(
             f"planes{where}",
@@ -308,14 +310,16 @@ def _sphere_counts(method: SphereMethod, points: LitPoints) -> np.ndarray:
     """Number of spheres by which each body blocks the light of others."""
     bodies = np.arange(len(method.merged_scene.scene.bodies))
     return np.where(
-        np.isin(bodies, (*points.blocking.planes, *points.blocking.convex)), 0, method.merged_scene.sphere_counts
+        np.isin(bodies, (*points.blocker_kinds.planes, *points.blocker_kinds.convex)),
+        0,
+        method.merged_scene.sphere_counts,
     )
 
 
 def _part_counts(method: SphereMethod, points: LitPoints) -> np.ndarray:
     """Number of convex parts by which each body blocks the light of others."""
     counts = np.zeros(len(method.merged_scene.scene.bodies), int)
-    for body in points.blocking.convex:
+    for body in points.blocker_kinds.convex:
         counts[body] = len(method.parts.parts[body])
     return counts
 
@@ -340,7 +344,7 @@ def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
     counts = _sphere_counts(method, points) + _part_counts(method, points)
     _, moving, static = points.counts()
     if method.why_no_shadows or not counts.sum():
-        rest = "but flat ones " if points.blocking.planes else ""
+        rest = "but flat ones " if points.blocker_kinds.planes else ""
         return method.why_no_shadows or f"no body {rest}has blockers"
     if moving or (points.static and static and (method.joins_cached or counts[list(points.static.moving)].sum())):
         return ""
@@ -349,7 +353,7 @@ def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
 
 def _self_visibility(method: SphereMethod, points: LitPoints, projected_light: Any) -> Node:
     """Node of the receivers' self-visibility lookups, by body."""
-    bodies, rotations = points.blocking.traced, points.blocking.rotations
+    bodies, rotations = points.blocker_kinds.traced, points.blocker_kinds.rotations
     named = [body for body in bodies if not method.merged_scene.is_flat[body]]
     if not named or rotations is None:
         return Node("self-shadows", None, idle=lambda: _why_no_self_visibility(method, points))
@@ -367,7 +371,7 @@ def _why_no_self_visibility(method: SphereMethod, points: LitPoints) -> str:
     if not method.traces_self_visibility:
         return "the method takes those of spheres"
     names = [body.called for body in method.merged_scene.scene.bodies]
-    whys = {name: why for name, why in zip(names, points.blocking.why_spheres, strict=False) if why}
+    whys = {name: why for name, why in zip(names, points.blocker_kinds.why_spheres, strict=False) if why}
     return "; ".join(f"{name}: {why}" for name, why in whys.items()) or "bodies are flat"
 
 
@@ -378,7 +382,7 @@ def _static_shadows(method: SphereMethod, points: LitPoints, light: Input | None
         bouncing = bool(method.merged_scene.scene.bounces)
         why = "light bounces: nothing of static bodies is kept" if bouncing else "no static body has blockers"
         return Node("static shadows", None, idle=why)
-    rows = method.cached_rows(static, light, points.blocking)
+    rows = method.cached_rows(static, light, points.blocker_kinds)
 
     def missing() -> int:
         receivers = points.receivers_node.known(points.call)

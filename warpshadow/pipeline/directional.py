@@ -18,7 +18,7 @@ from warpshadow.pipeline.convex import PartsOfGroup
 from warpshadow.pipeline.groups import Group, Transmittance
 from warpshadow.pipeline.lighting import (
     LARGEST_COEFFICIENT,
-    Blocking,
+    BlockerKinds,
     KnownLight,
     LitPoints,
     change_basis,
@@ -348,7 +348,7 @@ class Directional(SphereMethod):
 
         return points.cached("cells", None if is_free else light, in_cells), projected_light
 
-    def cached_rows(self, static: StaticBodies, light: Input | None, blocking: Blocking) -> VertexRows:
+    def cached_rows(self, static: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """The light S_q that static bodies let through, [row, 3, direction]; but for the scene's, of 1: [row, 1, …]."""
         is_scenes = light is self.light
         return static.rows("lit cells" if is_scenes else "cells", functools.partial(self._trace, is_scenes))

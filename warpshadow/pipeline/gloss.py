@@ -43,7 +43,7 @@ class GlossyPoints(LitPoints):
         self._all_receivers, self._cameras = view.receivers_node, cameras
         receivers = Node("", functools.partial(_glossy_receivers, glossy), view.receivers_node)
         arguments = view.method, view.materials, view.vertices, view.spheres, receivers, view.call
-        super().__init__(*arguments, normals=view.normals, blocking=view.blocking, is_static=view.is_static)
+        super().__init__(*arguments, normals=view.normals, blocker_kinds=view.blocker_kinds, is_static=view.is_static)
         self._numbers = Node("", functools.partial(_numbers, glossy), detached(view.receivers_node))
 
     def mixed(self, view: LitPoints, diffuse: Node, light: Light | None, materials: Materials) -> tuple[Node, Node]:

@@ -12,7 +12,7 @@ from warpshadow.device.batch import common_batch, cut, expand
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import varies
 from warpshadow.pipeline.convex import PartsOfGroup, SceneParts
-from warpshadow.pipeline.lighting import Blocking, LitPoints
+from warpshadow.pipeline.lighting import BlockerKinds, LitPoints
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.planes import PlanesOfGroup, ScenePlanes
 from warpshadow.pipeline.self_visibility import SelfVisibility, SelfVisibilityLobes, SelfVisibilityLookup
@@ -105,7 +105,7 @@ class Blockers(NamedTuple):
     """The blockers of a geometry, where they are in the world."""
 
     merged_scene: MergedScene
-    blocking: Blocking
+    blocker_kinds: BlockerKinds
     planes: ScenePlanes
     parts: SceneParts
     self_visibility: SelfVisibility
@@ -117,7 +117,9 @@ class Blockers(NamedTuple):
 
     def solid(self, bodies: Iterable[int]) -> list[int]:
         """Bodies among some that block light by their spheres."""
-        return [body for body in bodies if body not in self.blocking.planes and body not in self.blocking.convex]
+        return [
+            body for body in bodies if body not in self.blocker_kinds.planes and body not in self.blocker_kinds.convex
+        ]
 
     def spheres_of(self, bodies: Iterable[int]) -> tuple[wp.array, wp.array]:
         """Centers and radii of the spheres of bodies, of those that block by them."""
@@ -130,7 +132,7 @@ class Blockers(NamedTuple):
 
     def planes_around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> PlanesOfGroup | None:
         """Flat bodies around receivers of one body: all that block, or some."""
-        planes = self.blocking.planes
+        planes = self.blocker_kinds.planes
         named = planes if of_bodies is None else tuple(number for number in planes if number in of_bodies)
         if self.frames is None or not set(named) - {body}:
             return None
@@ -139,7 +141,7 @@ class Blockers(NamedTuple):
 
     def parts_around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> PartsOfGroup | None:
         """Convex parts of bodies around receivers of one body: all that block, or some."""
-        bodies = self.blocking.convex
+        bodies = self.blocker_kinds.convex
         named = bodies if of_bodies is None else tuple(number for number in bodies if number in of_bodies)
         if self.placed is None or not set(named) - {body}:
             return None
@@ -185,25 +187,25 @@ def _groups_that_move(
 ) -> Iterator[Group]:
     """Groups of receivers that may move."""
     solid = blockers.solid(blockers.bodies)
-    blocking, none = blockers.spheres_of(solid), blockers.spheres_of([])
+    spheres, none = blockers.spheres_of(solid), blockers.spheres_of([])
     corners = blockers.planes.corners(blockers.positions) if blockers.planes.numbers and receivers.spans else None
     clusters, nearest_blockers = None, _nearest_blockers(blocker_of_point, blockers)
     if not receivers.spans:
         facing = receivers.points, receivers.normals
-        yield Group(*facing, *blocking, planes=blockers.planes_around(), nearest_blockers=nearest_blockers)
+        yield Group(*facing, *spheres, planes=blockers.planes_around(), nearest_blockers=nearest_blockers)
     for span in receivers.spans:
         facing = receivers.points, receivers.normals
         assert receivers.vertices is not None
         if span.first < receivers.vertices.size and len(blockers.positions) == 1:  # all cameras see the same vertices
             facing = receivers.points[:1], receivers.normals[:1]
-        is_traced = span.body in blockers.blocking.traced
+        is_traced = span.body in blockers.blocker_kinds.traced
         skip = blockers.merged_scene.spheres_among(solid, span.body) if is_traced else (0, 0)
-        others = none if skip == (0, blocking[1].shape[1]) else blocking
+        others = none if skip == (0, spheres[1].shape[1]) else spheres
         points, normals = (cut(array, span.first, span.end) for array in facing)
         planes, parts = blockers.planes_around(span.body), blockers.parts_around(span.body)
         group = Group(points, normals, *others, planes=planes, parts_around=parts)
-        if others is blocking:
-            clusters = clusters or find_clusters(*blocking, blockers.merging)
+        if others is spheres:
+            clusters = clusters or find_clusters(*spheres, blockers.merging)
             group = group._replace(skip=skip, clusters=clusters)
         if span.body >= 0:
             weights = blockers.self_visibility.probe_weights(receivers, span)

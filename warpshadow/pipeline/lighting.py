@@ -38,8 +38,8 @@ LARGEST_COEFFICIENT = 1e3 * check.LARGEST
 """Light is larger in another basis than it was given in: 64 harmonics add up in a direction."""
 
 
-class Blocking(NamedTuple):
-    """How the bodies of a geometry block light: by their spheres, but for some."""
+class BlockerKinds(NamedTuple):
+    """Which bodies block light as planes, convex parts or by their traced self-visibility; spheres block all other light."""
 
     traced: tuple[int, ...] = ()  # bodies that block their own light as rays found, not by their spheres
     rotations: Input | None = None  # of all bodies, mat33 of shape [batch, body]; None where none is traced
@@ -48,7 +48,7 @@ class Blocking(NamedTuple):
     convex: tuple[int, ...] = ()  # traced ones that block the light of others by the convex parts that they consist of
 
 
-BY_SPHERES = Blocking()  # all bodies block by their spheres
+ONLY_SPHERES = BlockerKinds()  # all bodies block by their spheres
 
 
 class LitPoints:
@@ -63,7 +63,7 @@ class LitPoints:
         call: Holds values of the points that may not be cached.
         static: The static bodies among moving ones; None where any may move.
         normals: Node of the normals of all vertices, vec3 of shape [batch, vertex]; by default its own.
-        blocking: How the bodies block light.
+        blocker_kinds: Which bodies block light by something else than their spheres.
         is_static: Whether bodies and points are where the scene and its camera have them, for good.
         blocker_of_point: Of points that send light, the number of the blocker nearest to the patch of each, among the
             spheres of bodies that are not flat, −1 for none: NumPy of shape [receiver].
@@ -79,11 +79,11 @@ class LitPoints:
         call: Call,
         static: StaticBodies | None = None,
         normals: Node | None = None,
-        blocking: Blocking = BY_SPHERES,
+        blocker_kinds: BlockerKinds = ONLY_SPHERES,
         is_static: bool = False,
         blocker_of_point: np.ndarray | None = None,
     ):
-        self.blocking, self.is_static, self.blocker_of_point = blocking, is_static, blocker_of_point
+        self.blocker_kinds, self.is_static, self.blocker_of_point = blocker_kinds, is_static, blocker_of_point
         self.method, self.materials, self.merged_scene = method, materials, method.merged_scene
         self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
         self.call, self.static = call, static
@@ -199,14 +199,14 @@ class Method:
         self.light = Input("light", merged_scene.scene.light)
         self._numberings: dict[tuple[tuple[int, ...], ...], list[Numbering]] = {}
 
-    def blocking(self, geometry: Geometry | None, rotations: Input | None) -> Blocking:
-        """How the bodies of a geometry, by default the scene's, block light.
+    def blocker_kinds(self, geometry: Geometry | None, rotations: Input | None) -> BlockerKinds:
+        """Choose the kind of blocker that each body of a geometry is; the scene's geometry by default.
 
         Args:
             geometry: The geometry.
             rotations: Of its bodies; None where nobody knows on which body a receiver is.
         """
-        return BY_SPHERES
+        return ONLY_SPHERES
 
     @functools.cached_property
     def samples_receive(self) -> np.ndarray:
@@ -225,22 +225,22 @@ class Method:
         body_of_vertex, receives = self.merged_scene.body_of_vertex, ~self.samples_receive
         return np.stack([receives[body_of_vertex], (receives & self.merged_scene.is_two_sided)[body_of_vertex]])
 
-    def separate_bodies(self, blocking: Blocking) -> np.ndarray | None:
+    def separate_bodies(self, blocker_kinds: BlockerKinds) -> np.ndarray | None:
         """Bodies whose receivers are groups of their own, −1 for others, shape [body]; None where all share a group."""
         bodies = np.arange(len(self.merged_scene.scene.bodies))
         if self.merged_scene.scene.bounces:
             return bodies
-        named = (*blocking.traced, *blocking.planes, *np.flatnonzero(self.merged_scene.is_glossy))
+        named = (*blocker_kinds.traced, *blocker_kinds.planes, *np.flatnonzero(self.merged_scene.is_glossy))
         return np.where(np.isin(bodies, named), bodies, -1) if named else None
 
-    def numbering(self, blocking: Blocking, has_backs: bool) -> Numbering:
+    def numbering(self, blocker_kinds: BlockerKinds, has_backs: bool) -> Numbering:
         """Of all vertices, or of all with their backs; a first call makes both, so that a capture finds them."""
-        key = blocking.traced, blocking.planes
+        key = blocker_kinds.traced, blocker_kinds.planes
         if key not in self._numberings:
             faces, can_receive, separate_bodies = (
                 self.merged_scene.faces,
                 self.can_receive,
-                self.separate_bodies(blocking),
+                self.separate_bodies(blocker_kinds),
             )
             bodies = None if separate_bodies is None else separate_bodies[self.merged_scene.body_of_vertex]
             sides = can_receive[:1], can_receive

@@ -12,7 +12,7 @@ from warpshadow.device.batch import expand_rows
 from warpshadow.device.memory import zeros
 from warpshadow.pipeline.by_spheres import SphereMethod
 from warpshadow.pipeline.groups import Group, Transmittance
-from warpshadow.pipeline.lighting import Blocking, KnownLight
+from warpshadow.pipeline.lighting import BlockerKinds, KnownLight
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input
 from warpshadow.pipeline.self_visibility import SelfVisibilityLobes
@@ -109,11 +109,11 @@ class LogSH(SphereMethod):
             group.self_lookup.lobes, group.probe_weights, group.self_lookup.turn, order=self._order, bands=bands
         )
 
-    def cached_rows(self, static: StaticBodies, light: Input | None, blocking: Blocking) -> VertexRows:
+    def cached_rows(self, static: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """The log-visibility of the static spheres, for any light, [row, 1, order²]; and lobes, if one has its own."""
-        if any(body in blocking.traced for body in static.bodies):
-            find = functools.partial(self._accumulate_and_turn, blocking.traced)
-            return static.rows(("log sums and lobes", blocking.traced), find)
+        if any(body in blocker_kinds.traced for body in static.bodies):
+            find = functools.partial(self._accumulate_and_turn, blocker_kinds.traced)
+            return static.rows(("log sums and lobes", blocker_kinds.traced), find)
         return static.rows("log sums", self._accumulate)
 
     def _accumulate(self, static: StaticBodies, vertices: np.ndarray, normals: wp.array) -> wp.array:
@@ -133,8 +133,8 @@ class LogSH(SphereMethod):
         for body in np.unique(bodies).tolist():
             of_body = np.flatnonzero(bodies == body)
             arguments = static.gathered(vertices[of_body], normals)
-            blocking = [other for other in static.bodies if not (other == body and body in traced)]
-            rows[of_body, 0] = self._logs(*arguments, *static.spheres_of(blocking)).numpy()[0]
+            others = [other for other in static.bodies if not (other == body and body in traced)]
+            rows[of_body, 0] = self._logs(*arguments, *static.spheres_of(others)).numpy()[0]
             if body in turned:
                 lobes, turn = turned[body]
                 result = self_visibility_lobes(

@@ -11,7 +11,7 @@ from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.device.batch import common_batch
 from warpshadow.pipeline.geometry import PLACED, Geometry
-from warpshadow.pipeline.lighting import Blocking, LitPoints, Method
+from warpshadow.pipeline.lighting import BlockerKinds, LitPoints, Method
 from warpshadow.pipeline.node import Call, Clock, Input, Node
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.static import StaticBodies
@@ -93,7 +93,7 @@ class SceneViews:
             static = self._static.get(geometry.moving)
             if static is None or not static.are_those_of(geometry):
                 static = StaticBodies(self._merged_scene, geometry)
-        arguments = vertices, spheres, cameras, static, self._blocking(geometry, last)
+        arguments = vertices, spheres, cameras, static, self._blocker_kinds(geometry, last)
         for view in self.last:
             if view is not None and view.given == arguments:
                 return view
@@ -109,14 +109,14 @@ class SceneViews:
             is_static=geometry is None and clip_matrices is None and image_count == 1,
         )
 
-    def _blocking(self, geometry: Geometry | None, last: LitPoints | None = None) -> Blocking:
-        """How the bodies of a geometry, by default the scene's, block light."""
+    def _blocker_kinds(self, geometry: Geometry | None, last: LitPoints | None = None) -> BlockerKinds:
+        """The kind of blocker that each body of a geometry, by default the scene's, is."""
         rotations = self._rotations
         if geometry is not None and geometry.rotations is not None:
             count = len(self._merged_scene.scene.bodies)
             check.shape("geometry.rotations", geometry.rotations.shape, ("batch", count))
-            rotations = Input.renewed("rotations", geometry.rotations, last.blocking.rotations if last else None)
-        return self._method.blocking(geometry, rotations)
+            rotations = Input.renewed("rotations", geometry.rotations, last.blocker_kinds.rotations if last else None)
+        return self._method.blocker_kinds(geometry, rotations)
 
     def _bodies(self, geometry: Geometry | None) -> tuple[Input, Input]:
         """Vertices and spheres of a geometry, by default the scene's."""
@@ -138,8 +138,8 @@ class SceneViews:
         """
         receivers = Input("receivers", Receivers(points, normals, None, None, None))  # type: ignore[arg-type]
         node = Node("", lambda arguments: arguments, receivers)
-        bodies, blocking = self._bodies(geometry), self._method.blocking(geometry, None)
-        return LitPoints(self._method, self._materials, *bodies, node, self.call(), blocking=blocking)
+        bodies, blocker_kinds = self._bodies(geometry), self._method.blocker_kinds(geometry, None)
+        return LitPoints(self._method, self._materials, *bodies, node, self.call(), blocker_kinds=blocker_kinds)
 
     def on_faces(self, sides: np.ndarray, barycentrics: np.ndarray, geometry: Geometry | None = None) -> LitPoints:
         """Points on faces of bodies to be lit by :meth:`shade`, by whose own bodies it knows them.
@@ -151,14 +151,14 @@ class SceneViews:
             geometry: Where the bodies are, by default where the scene has them.
         Differentiable: geometry.
         """
-        scene, blocking, bodies = self._merged_scene, self._blocking(geometry), self._bodies(geometry)
-        owners = self._method.separate_bodies(blocking)
+        scene, blocker_kinds, bodies = self._merged_scene, self._blocker_kinds(geometry), self._bodies(geometry)
+        owners = self._method.separate_bodies(blocker_kinds)
         if owners is not None:
             owners = owners[scene.body_of_face[sides % len(scene.body_of_face)]]
         normals = Node("", vertex_normals, bodies[0], scene.faces)
         node = Node("", receivers_on_faces, bodies[0], normals, scene.faces, sides, barycentrics, owners)
         points = self._method, self._materials, *bodies, node, self.call()
-        return LitPoints(*points, normals=normals, blocking=blocking)
+        return LitPoints(*points, normals=normals, blocker_kinds=blocker_kinds)
 
 
 def camera_batch(cameras: Sequence[Camera]) -> tuple[Camera, ...]:

@@ -9,7 +9,7 @@ import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.pipeline.lighting import Blocking, Light, LitPoints, Method, receiver_words
+from warpshadow.pipeline.lighting import BlockerKinds, Light, LitPoints, Method, receiver_words
 from warpshadow.pipeline.node import Call, Input, Node, detached
 from warpshadow.pipeline.reflectance import Materials, Reflection
 from warpshadow.stages.film import average, sample_radiance, sum_radiance
@@ -44,7 +44,7 @@ class View(LitPoints):
         spheres: Centers and radii of the spheres.
         cameras: Clip matrices.
         static: The static bodies among moving ones; None where any may move.
-        blocking: How the bodies block light.
+        blocker_kinds: Which bodies block light by something else than their spheres.
         call: Holds its values that may not be cached.
         camera: Has the cameras' size and near plane.
         counts: Number of geometries, and of images.
@@ -62,21 +62,23 @@ class View(LitPoints):
         spheres: Input,
         cameras: Input,
         static: "StaticBodies | None",
-        blocking: Blocking,
+        blocker_kinds: BlockerKinds,
         *,
         call: Call,
         camera: Camera,
         counts: tuple[int, int],
         is_static: bool = False,
     ):
-        self.given = vertices, spheres, cameras, static, blocking
-        self._separate_bodies = method.separate_bodies(blocking)
+        self.given = vertices, spheres, cameras, static, blocker_kinds
+        self._separate_bodies = method.separate_bodies(blocker_kinds)
         self.cameras = cameras
         self._camera, self._supersampling, self._pose_count = camera, method.merged_scene.scene.supersampling, counts[0]
         self._size = self._supersampling * camera.width, self._supersampling * camera.height
         self._sample_count = counts[1] * self._size[0] * self._size[1]
         normals, receivers = self._wire(method, vertices, spheres, cameras, static)
-        super().__init__(method, materials, vertices, spheres, receivers, call, static, normals, blocking, is_static)
+        super().__init__(
+            method, materials, vertices, spheres, receivers, call, static, normals, blocker_kinds, is_static
+        )
 
     def _wire(
         self, method: Method, vertices: Input, spheres: Input, cameras: Input, static: "StaticBodies | None"
@@ -143,7 +145,7 @@ class View(LitPoints):
                 seen = positions, normals, fragments, spheres
                 quadtree = find_squares(self, *seen, is_adaptive, self._supersampling)
         elif on_static_body is None:
-            numbering = method.numbering(self.blocking, has_backs)
+            numbering = method.numbering(self.blocker_kinds, has_backs)
         else:
             numbering = number_receivers(merged_scene.faces, keeps_vertex, on_static_body, bodies=bodies)
         bodies = None if separate_bodies is None else separate_bodies[merged_scene.body_of_face]

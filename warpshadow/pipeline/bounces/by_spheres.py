@@ -351,5 +351,5 @@ class SphereBounces:
         """Sources, to be lit among the bodies among which points are; the blockers nearest to them, if any."""
         arguments = self._method, materials, points.vertices, points.spheres, sources, points.call
         return LitPoints(
-            *arguments, normals=points.normals, blocking=points.blocking, blocker_of_point=blocker_of_point
+            *arguments, normals=points.normals, blocker_kinds=points.blocker_kinds, blocker_of_point=blocker_of_point
         )

@@ -242,7 +242,7 @@ class StaticBounces:
         def make() -> Node:
             sources = self.sources(points, materials)
             arguments = points.method, materials, points.vertices, points.spheres, sources, points.call
-            at_sources = LitPoints(*arguments, normals=points.normals, blocking=points.blocking)
+            at_sources = LitPoints(*arguments, normals=points.normals, blocker_kinds=points.blocker_kinds)
             skies = [points.method.openness(item) for item in (at_sources, points)]
             return Node(
                 "form factors",
