@@ -13,7 +13,7 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.progress import progress_bar
 from warpshadow.pipeline.convex import SceneParts
 from warpshadow.pipeline.geometry import Geometry
-from warpshadow.pipeline.groups import Blockers, Group, Transmittance, find_groups
+from warpshadow.pipeline.groups import Blockers, Group, GroupVisibility, find_groups
 from warpshadow.pipeline.lighting import (
     LARGEST_COEFFICIENT,
     ONLY_SPHERES,
@@ -98,7 +98,9 @@ class SphereMethod(Method):
         placed = self.parts.placed(blocker_kinds.convex, positions) if blocker_kinds.convex else None
         return Blockers(self.merged_scene, blocker_kinds, *owners, positions, spheres, frames, placed)
 
-    def past_planes(self, group: Group, seen: Transmittance, projected_light: Any) -> Transmittance:
+    def find_visibility_past_planes(
+        self, group: Group, visibility: GroupVisibility, projected_light: Any
+    ) -> GroupVisibility:
         """Visibility of a group past the flat bodies around it, given its visibility past all other blockers."""
         raise NotImplementedError
 
@@ -114,11 +116,11 @@ class SphereMethod(Method):
         """Self-visibility of receivers of some bodies, :attr:`Group.self_lookup` by body. Differentiable: rotations."""
         raise NotImplementedError
 
-    def see(self, group: Group, projected_light: Any) -> Transmittance:
+    def find_visibility(self, group: Group, projected_light: Any) -> GroupVisibility:
         """Visibility, or transmittance, past a group's spheres and its own body."""
         raise NotImplementedError
 
-    def transfer(self, seen: Transmittance, group: Group, projected_light: Any) -> wp.array:
+    def transfer(self, visibility: GroupVisibility, group: Group, projected_light: Any) -> wp.array:
         """Transfer vectors of a group."""
         raise NotImplementedError
 
@@ -126,7 +128,7 @@ class SphereMethod(Method):
         """Shading of a group in known light."""
         return shade(transfer, projected_light.coefficients, maximum=LARGEST_COEFFICIENT)
 
-    def shade_transmittance(self, seen: Transmittance, group: Group, projected_light: Any) -> wp.array:
+    def shade_transmittance(self, visibility: GroupVisibility, group: Group, projected_light: Any) -> wp.array:
         """Shading of a group in known light."""
         raise NotImplementedError
 
@@ -225,7 +227,7 @@ class InParts(Node):
         self_visibility = _self_visibility(method, points, projected_light)
         self._visibility = Node(
             f"visibility{where}",
-            method.see,
+            method.find_visibility,
             receivers,
             spheres,
             projected_light,
@@ -237,9 +239,9 @@ class InParts(Node):
         planes = points.blocker_kinds.planes
         place = functools.partial(method.blockers, points.blocker_kinds)
         blockers = points.cached("blockers", None, lambda: Node("", place, points.vertices, spheres))
-        self._passing = Node(
+        self._visibility_past_planes = Node(
             f"planes{where}",
-            method.past_planes,
+            method.find_visibility_past_planes,
             receivers,
             self._visibility,
             projected_light,
@@ -253,7 +255,7 @@ class InParts(Node):
         self._transfer = result = Node(
             f"transfer{where}",
             method.transfer if self._is_transferred else None,
-            self._passing,
+            self._visibility_past_planes,
             projected_light,
             items=lambda: f"{words()} × {method.coefficient_count(light)} coefficients",
             idle="" if self._is_transferred else "known light is shaded without transfer vectors",
@@ -290,19 +292,23 @@ class InParts(Node):
 
     def find(self, call: Call, part: Group, projected_light: Any, spheres: tuple[wp.array, wp.array]) -> Any:
         """Compute a part's visibility, given the projected light and all spheres."""
-        return self.light(call, part, self.see(call, part, projected_light), projected_light)
+        return self.light(call, part, self.find_visibility(call, part, projected_light), projected_light)
 
-    def see(self, call: Call, part: Group, projected_light: Any) -> Transmittance:
+    def find_visibility(self, call: Call, part: Group, projected_light: Any) -> GroupVisibility:
         """Find the visibility of a part."""
-        seen = self._visibility.run(call, part, projected_light)
-        return seen if part.planes is None else self._passing.run(call, part, seen, projected_light)
+        visibility = self._visibility.run(call, part, projected_light)
+        return (
+            visibility
+            if part.planes is None
+            else self._visibility_past_planes.run(call, part, visibility, projected_light)
+        )
 
-    def light(self, call: Call, part: Group, seen: Transmittance, projected_light: Any) -> wp.array:
-        """Transfer vectors of a part that sees something, or its shading."""
+    def light(self, call: Call, part: Group, visibility: GroupVisibility, projected_light: Any) -> wp.array:
+        """Transfer vectors of a part, or its shading."""
         if not self._is_transferred:
             assert self._shading is not None
-            return self._shading.run(call, seen, part, projected_light)
-        transfer = self._transfer.run(call, seen, part, projected_light)
+            return self._shading.run(call, visibility, part, projected_light)
+        transfer = self._transfer.run(call, visibility, part, projected_light)
         return transfer if self._shading is None else self._shading.run(call, transfer, part, projected_light)
 
 

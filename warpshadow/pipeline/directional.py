@@ -15,7 +15,7 @@ from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.pipeline.by_spheres import InParts, SphereMethod
 from warpshadow.pipeline.convex import PartsOfGroup
-from warpshadow.pipeline.groups import Group, Transmittance
+from warpshadow.pipeline.groups import Group, GroupVisibility
 from warpshadow.pipeline.lighting import (
     LARGEST_COEFFICIENT,
     BlockerKinds,
@@ -119,7 +119,7 @@ class Directional(SphereMethod):
         )
         return self.self_visibility.lookups(bodies, rotations, towards, projected_light.spreads, has_sun=has_sun)
 
-    def see(self, group: Group, projected_light: ProjectedCells) -> Transmittance:
+    def find_visibility(self, group: Group, projected_light: ProjectedCells) -> GroupVisibility:
         """Transmittance, float32 of shape [batch, receiver, direction]."""
         points, normals, radii, cached_rows = group.points, group.normals, group.radii, group.cached_rows
         transmittance_self = self._transmittance_self(group, projected_light)
@@ -133,8 +133,8 @@ class Directional(SphereMethod):
         known = [factor for factor in factors if factor is not None]
         if not known:
             shape = *points.shape, len(projected_light.directions)
-            return Transmittance(wp.full(shape, 1.0, dtype=wp.float32, device=points.device))
-        return Transmittance(functools.reduce(multiply_transmittances, known), transmittance_self)
+            return GroupVisibility(wp.full(shape, 1.0, dtype=wp.float32, device=points.device))
+        return GroupVisibility(functools.reduce(multiply_transmittances, known), transmittance_self)
 
     def _past_parts(
         self, parts: PartsOfGroup, points: wp.array, facing: wp.array | None, projected_light: ProjectedCells
@@ -171,11 +171,13 @@ class Directional(SphereMethod):
         """Bodies that consist of convex parts."""
         return tuple(body for body in traced if body in self.parts.parts)
 
-    def past_planes(self, group: Group, seen: Transmittance, projected_light: ProjectedCells) -> Transmittance:
+    def find_visibility_past_planes(
+        self, group: Group, visibility: GroupVisibility, projected_light: ProjectedCells
+    ) -> GroupVisibility:
         """Transmittance past the flat bodies around a group, too."""
-        planes, transmittance_spheres = group.planes, seen.transmittance_total
+        planes, transmittance_spheres = group.planes, visibility.transmittance_total
         if planes is None or transmittance_spheres is None or not group.points.size:
-            return seen
+            return visibility
         facing = group.normals if group.cached_rows is None else None
         points, fronts = group.among(planes.frames, planes.planes, planes.skip)
         cover = functools.partial(
@@ -183,7 +185,7 @@ class Directional(SphereMethod):
         )
         covered = cover(projected_light.directions)
         if covered is None:
-            return seen
+            return visibility
         if projected_light.samples is not None and planes.planes.has_holes:
             covered = coverage_of_light(
                 points,
@@ -202,7 +204,7 @@ class Directional(SphereMethod):
             sharp_cells = cover(directions, radius=self.visibility.softness * scale * cell_radius(len(directions)))
             assert sharp_cells is not None
             covered = overwrite_sharp_cells(covered, sharp_cells, places)
-        return seen._replace(
+        return visibility._replace(
             transmittance_total=transmittance_past_planes(transmittance_spheres, covered),
             transmittance_spheres=transmittance_spheres,
         )
@@ -225,15 +227,15 @@ class Directional(SphereMethod):
         of_sun = trace_sun_cells(rays[0], group.probe_weights, rays[1], group.body, projected_light.sun)
         return overwrite_sharp_cells(transmittance_self, of_sun, projected_light.sun.places)
 
-    def transfer(self, seen: Transmittance, group: Group, projected_light: ProjectedCells) -> wp.array:
+    def transfer(self, visibility: GroupVisibility, group: Group, projected_light: ProjectedCells) -> wp.array:
         """Transfer vectors; the transmittance as it is where cached cells hold known light."""
-        assert seen.transmittance_total is not None
+        assert visibility.transmittance_total is not None
         if group.cached_rows is None:
-            return directional_transfer(seen.transmittance_total, group.normals, projected_light.directions)
+            return directional_transfer(visibility.transmittance_total, group.normals, projected_light.directions)
         return (
-            seen.transmittance_total
+            visibility.transmittance_total
             if _has_light(group.cached_rows)
-            else cell_transfer(seen.transmittance_total, group.cached_rows)
+            else cell_transfer(visibility.transmittance_total, group.cached_rows)
         )
 
     def shade_transfer(self, transfer: wp.array, group: Group, projected_light: ProjectedCells) -> wp.array:
@@ -242,12 +244,19 @@ class Directional(SphereMethod):
             return light_cells(transfer, group.cached_rows)
         return super().shade_transfer(transfer, group, projected_light)
 
-    def shade_transmittance(self, seen: Transmittance, group: Group, projected_light: ProjectedCells) -> wp.array:
+    def shade_transmittance(
+        self, visibility: GroupVisibility, group: Group, projected_light: ProjectedCells
+    ) -> wp.array:
         """Shading of a group in known light."""
         if group.cached_rows is not None:
-            return self.shade_transfer(self.transfer(seen, group, projected_light), group, projected_light)
-        assert seen.transmittance_total is not None and projected_light.coefficients is not None
-        arguments = seen.transmittance_total, group.normals, projected_light.directions, projected_light.coefficients
+            return self.shade_transfer(self.transfer(visibility, group, projected_light), group, projected_light)
+        assert visibility.transmittance_total is not None and projected_light.coefficients is not None
+        arguments = (
+            visibility.transmittance_total,
+            group.normals,
+            projected_light.directions,
+            projected_light.coefficients,
+        )
         return shade_cells(*arguments, maximum=LARGEST_COEFFICIENT)
 
     @functools.cached_property
@@ -377,7 +386,7 @@ class CellTransmittances(InParts):
         self, call: Call, part: Group, projected_light: ProjectedCells, spheres: tuple[wp.array, wp.array]
     ) -> wp.array:
         """Find that of a part."""
-        return self.see(call, part, projected_light).transmittance_total
+        return self.find_visibility(call, part, projected_light).transmittance_total
 
 
 def _towards(

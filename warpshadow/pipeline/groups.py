@@ -93,7 +93,7 @@ class Group(NamedTuple):
             )
 
 
-class Transmittance(NamedTuple):
+class GroupVisibility(NamedTuple):
     """Visibility of a group."""
 
     transmittance_total: wp.array | None  # visibility or transmittance past all bodies; None where nothing blocks

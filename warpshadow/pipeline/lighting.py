@@ -39,7 +39,7 @@ LARGEST_COEFFICIENT = 1e3 * check.LARGEST
 
 
 class BlockerKinds(NamedTuple):
-    """Which bodies block light as planes, convex parts or by their traced self-visibility; spheres block all other light."""
+    """Which bodies block light as planes, convex parts or by traced self-visibility; spheres block the rest."""
 
     traced: tuple[int, ...] = ()  # bodies that block their own light as rays found, not by their spheres
     rotations: Input | None = None  # of all bodies, mat33 of shape [batch, body]; None where none is traced

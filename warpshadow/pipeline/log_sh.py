@@ -11,7 +11,7 @@ from warpshadow.assets.harmonic_light import as_light
 from warpshadow.device.batch import expand_rows
 from warpshadow.device.memory import zeros
 from warpshadow.pipeline.by_spheres import SphereMethod
-from warpshadow.pipeline.groups import Group, Transmittance
+from warpshadow.pipeline.groups import Group, GroupVisibility
 from warpshadow.pipeline.lighting import BlockerKinds, KnownLight
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input
@@ -64,47 +64,51 @@ class LogSH(SphereMethod):
         """The lobes of some bodies, turned. Differentiable: rotations."""
         return self.self_visibility.turned_lobes(bodies, rotations, self._order)
 
-    def see(self, group: Group, projected_light: ProjectedBands) -> Transmittance:
+    def find_visibility(self, group: Group, projected_light: ProjectedBands) -> GroupVisibility:
         """Visibility, float32 of shape [batch, receiver, order²]; None where nothing blocks."""
         points, _, _, radii, cached_rows = group[:5]
         if not points.size or (cached_rows is None and not radii.shape[1]):
-            return Transmittance(None)
+            return GroupVisibility(None)
         if radii.shape[1]:
             log = self._logs(*group[:4], skip=group.skip, clusters=group.clusters)
         else:
             log = zeros((*points.shape, self._order**2), dtype=wp.float32, device=points.device)
         if cached_rows is not None:
             add_rows(cached_rows, log)
-        return Transmittance(exponential.exponentiate(log, base=self.visibility.base))
+        return GroupVisibility(exponential.exponentiate(log, base=self.visibility.base))
 
-    def transfer(self, seen: Transmittance, group: Group, projected_light: ProjectedBands) -> wp.array:
+    def transfer(self, visibility: GroupVisibility, group: Group, projected_light: ProjectedBands) -> wp.array:
         """Transfer vectors, float32 of shape [batch, receiver, bands²]."""
-        lobes = self._self_visibility_lobes(seen, group, projected_light)
+        lobes = self._self_visibility_lobes(visibility, group, projected_light)
         if lobes is None:
-            return sh_transfer(seen.transmittance_total, group.normals, order=self._order, bands=projected_light.bands)
-        if seen.transmittance_total is None:
+            return sh_transfer(
+                visibility.transmittance_total, group.normals, order=self._order, bands=projected_light.bands
+            )
+        if visibility.transmittance_total is None:
             return lobes
         lobes = expand_rows(
-            lobes, len(seen.transmittance_total)
+            lobes, len(visibility.transmittance_total)
         )  # where cameras share the rotations, but not the receivers
-        return sh_product(seen.transmittance_total, lobes, order=self._order, bands=projected_light.bands)
+        return sh_product(visibility.transmittance_total, lobes, order=self._order, bands=projected_light.bands)
 
     def _self_visibility_lobes(
-        self, seen: Transmittance, group: Group, projected_light: ProjectedBands
+        self, visibility: GroupVisibility, group: Group, projected_light: ProjectedBands
     ) -> wp.array | None:
         """Lobes that receivers' own bodies leave, [batch, receiver, order²]; only the light's bands if nothing blocks.
 
         None where they are clamped cosines.
         """
         if group.cached_rows is not None and group.cached_rows.rows.shape[1] == 2:
-            assert seen.transmittance_total is not None
-            lobes = zeros(seen.transmittance_total.shape, dtype=wp.float32, device=seen.transmittance_total.device)
+            assert visibility.transmittance_total is not None
+            lobes = zeros(
+                visibility.transmittance_total.shape, dtype=wp.float32, device=visibility.transmittance_total.device
+            )
             add_rows(group.cached_rows, lobes, channel=1)
             return lobes
         if group.self_lookup is None or not group.points.size:
             return None
         assert group.probe_weights is not None and isinstance(group.self_lookup, SelfVisibilityLobes)
-        bands = projected_light.bands if seen.transmittance_total is None else self._order
+        bands = projected_light.bands if visibility.transmittance_total is None else self._order
         return self_visibility_lobes(
             group.self_lookup.lobes, group.probe_weights, group.self_lookup.turn, order=self._order, bands=bands
         )

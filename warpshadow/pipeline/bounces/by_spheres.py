@@ -27,7 +27,7 @@ from warpshadow.pipeline.bounces.gathering import (
     OutgoingRadiance,
     ProjectedPatches,
     Proxies,
-    see_cells,
+    find_cell_transmittance,
 )
 from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
@@ -73,11 +73,11 @@ class PartVisibilities(InParts):
 
     def find(self, call: Call, part: Group, projected_light: Any, spheres: tuple[wp.array, wp.array]) -> PartVisibility:
         """Find the visibility of a part."""
-        seen = self.see(call, part, projected_light)
+        visibility = self.find_visibility(call, part, projected_light)
         return PartVisibility(
-            self.light(call, part, seen, projected_light),
+            self.light(call, part, visibility, projected_light),
             part,
-            see_cells(self.method, part, seen, projected_light, spheres),
+            find_cell_transmittance(self.method, part, visibility, projected_light, spheres),
         )
 
 
@@ -85,7 +85,7 @@ class LitParts(Node):
     """Direct light, in parts.
 
     Args:
-        seen: Visibility of the receivers.
+        visibility: Visibility of the receivers.
         projected_light: The light projected for the method.
         words: Number of receivers, in words.
         where: Put after the name of its stage.
@@ -95,38 +95,38 @@ class LitParts(Node):
 
     def __init__(
         self,
-        seen: PartVisibilities,
+        visibility: PartVisibilities,
         projected_light: Node,
         words: str | Callable[[], str],
         where: str = "",
         others: tuple[Node, ...] = (),
         extra_inputs: tuple[Node, ...] = (),
     ):
-        self._seen = seen
+        self._visibilities = visibility
         self._shade = Node(
-            f"shading{where}", seen.method.shade_transfer, seen, projected_light, items=words, caches=False
+            f"shading{where}", visibility.method.shade_transfer, visibility, projected_light, items=words, caches=False
         )
-        super().__init__("", None, projected_light, *others, extra_inputs=(seen, self._shade, *extra_inputs))
+        super().__init__("", None, projected_light, *others, extra_inputs=(visibility, self._shade, *extra_inputs))
 
     def compute(self, call: Call) -> Any:
         """Light all parts."""
         (projected_light,) = self.values(call)
-        return [self._light(call, part, projected_light) for part in self._seen.value(call)]
+        return [self._light(call, part, projected_light) for part in self._visibilities.value(call)]
 
     def _light(self, call: Call, part: PartVisibility, projected_light: Any) -> LitPart:
         return LitPart(self._shade.run(call, part.transfer, part.group, projected_light), part.group, part.cells)
 
 
-def _open_shares(senders: Senders, seen: list[PartVisibility]) -> wp.array:
+def _open_shares(senders: Senders, visibility: list[PartVisibility]) -> wp.array:
     """How much each source counts in its patch, vec3 of shape [batch, source]."""
-    parts = [find_openness(part.group.normals, *part.cells) for part in seen]
+    parts = [find_openness(part.group.normals, *part.cells) for part in visibility]
     return open_shares(joined(parts), senders.mean, senders.patch_of_source)
 
 
 class PatchSampleNodes(NamedTuple):
     """Nodes of the points at which patches are lit."""
 
-    seen: PartVisibilities  # visibility
+    visibility: PartVisibilities  # visibility
     frames: Node  # of flat bodies
     shown: Node  # patches as receivers see them
     shares: Node  # how much each counts in its patch, vec3 of shape [batch, source]
@@ -197,7 +197,7 @@ class BouncedShading(LitParts):
     """Shading of receivers, direct and bounced.
 
     Args:
-        seen: Visibility; one part after another where none of it is cached.
+        visibility: Visibility; one part after another where none of it is cached.
         projected_light: The light projected for the method.
         words: Number of receivers, in words.
         radiosity: Radiosity of the patches.
@@ -206,19 +206,19 @@ class BouncedShading(LitParts):
 
     def __init__(
         self,
-        seen: PartVisibilities,
+        visibility: PartVisibilities,
         projected_light: Node,
         words: Callable[[], str],
         radiosity: Radiosity,
         gathering: Gathering,
     ):
         self._gathering = gathering
-        super().__init__(seen, projected_light, words, others=(radiosity,), extra_inputs=gathering.stages)
+        super().__init__(visibility, projected_light, words, others=(radiosity,), extra_inputs=gathering.stages)
 
     def compute(self, call: Call) -> wp.array:
         """Light all parts, directly and by the patches' radiosity."""
         projected_light, outgoing = self.values(call)
-        parts = self._seen.value(call) if self._seen.caches else self._seen.parts(call)
+        parts = self._visibilities.value(call) if self._visibilities.caches else self._visibilities.parts(call)
         return joined([self._bounced(call, self._light(call, part, projected_light), outgoing) for part in parts])
 
     def _bounced(self, call: Call, part: LitPart, outgoing: OutgoingRadiance) -> wp.array:
@@ -259,7 +259,7 @@ class SphereBounces:
         self,
         points: LitPoints,
         projected_light: Node,
-        seen_in: Any,
+        visibility_light: Any,
         light: Input,
         materials: Materials,
         *,
@@ -271,37 +271,45 @@ class SphereBounces:
             idle = Node("bounces", None, idle="every body is black")
             return InParts(method, points, projected_light, light, joined, extra_inputs=(idle,))
         proxies = self._proxies.setdefault(senders, Proxies(senders, method.visibility.merging))
-        see = functools.partial(
-            PartVisibilities, method, projected_light=seen_in, light=light, finish=list, is_shaded=False
+        make_visibility = functools.partial(
+            PartVisibilities, method, projected_light=visibility_light, light=light, finish=list, is_shaded=False
         )
         key, is_cached = None if is_free else light, is_free or materials is not points.materials
-        seen = points.cached("seen", (key, is_cached), lambda: see(points, caches=is_cached))
-        of_sources = points.cached("of sources", (key, senders), lambda: self._sources(see, proxies, points))
+        visibility = points.cached("visibility", (key, is_cached), lambda: make_visibility(points, caches=is_cached))
+        of_sources = points.cached(
+            "of sources", (key, senders), lambda: self._sources(make_visibility, proxies, points)
+        )
         radiosity = self._radiosity(of_sources, projected_light, proxies, materials)
         words = functools.partial(receiver_words, points)
         at_points = self._gathering(senders, (points.receivers_node, radiosity), words)
-        return BouncedShading(seen, projected_light, words, radiosity, at_points)
+        return BouncedShading(visibility, projected_light, words, radiosity, at_points)
 
-    def _sources(self, see: Callable[..., PartVisibilities], proxies: Proxies, points: LitPoints) -> PatchSampleNodes:
+    def _sources(
+        self, make_visibility: Callable[..., PartVisibilities], proxies: Proxies, points: LitPoints
+    ) -> PatchSampleNodes:
         """Sources among the bodies among which points are."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
 
-        def show(sources: Receivers, seen: list[PartVisibility], *arguments: Any) -> ProjectedPatches:
-            return proxies.shown(sources, [part.cells for part in seen], *arguments)
+        def show(sources: Receivers, visibility: list[PartVisibility], *arguments: Any) -> ProjectedPatches:
+            return proxies.shown(sources, [part.cells for part in visibility], *arguments)
 
         make = functools.partial(Node, "sources", senders.sources, points.vertices, points.normals)
         sources = points.cached("sources", senders, lambda: make(items=_words(senders)))
-        seen = see(self._at(sources, points, points.materials, proxies.blocker_of_source), where=_OF_SOURCES)
+        visibility = make_visibility(
+            self._at(sources, points, points.materials, proxies.blocker_of_source), where=_OF_SOURCES
+        )
         frames = Node("", planes.all.frames if planes else lambda _: None, points.vertices)
-        shown = Node("", show, sources, seen, spheres, frames)
-        return PatchSampleNodes(seen, frames, shown, Node("", functools.partial(_open_shares, senders), seen))
+        shown = Node("", show, sources, visibility, spheres, frames)
+        return PatchSampleNodes(
+            visibility, frames, shown, Node("", functools.partial(_open_shares, senders), visibility)
+        )
 
     def _radiosity(
         self, sources: PatchSampleNodes, projected_light: Node, proxies: Proxies, materials: Materials
     ) -> Radiosity:
         """Radiosity of the patches, given the light at their sources."""
         senders, why_not = proxies.senders, "light bounces once" if self._count == 1 else ""
-        lit = LitParts(sources.seen, projected_light, _words(senders), _OF_SOURCES)
+        lit = LitParts(sources.visibility, projected_light, _words(senders), _OF_SOURCES)
         albedo = self._patches.albedo(materials, senders.bodies)
         arguments = lit, albedo, sources.frames
         among_senders = self._gathering(senders, arguments, _words(senders), _OF_SOURCES, why_not, only_others=True)

@@ -20,7 +20,7 @@ from warpshadow.pipeline.bounces.patches import Senders
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.by_spheres import SphereMethod
 from warpshadow.pipeline.directional import ProjectedCells
-from warpshadow.pipeline.groups import Group, Transmittance, solid_bodies
+from warpshadow.pipeline.groups import Group, GroupVisibility, solid_bodies
 from warpshadow.pipeline.lighting import joined
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.scene.scene import Visibility
@@ -56,23 +56,29 @@ class CellTransmittance(NamedTuple):
     directions: np.ndarray  # [cell, 3]
 
 
-def see_cells(
-    method: SphereMethod, group: Group, seen: Transmittance, projected_light: Any, spheres: tuple[wp.array, wp.array]
+def find_cell_transmittance(
+    method: SphereMethod,
+    group: Group,
+    visibility: GroupVisibility,
+    projected_light: Any,
+    spheres: tuple[wp.array, wp.array],
 ) -> CellTransmittance:
     """Transmittance of a group in cells of directions.
 
     Args:
         method: How light is blocked.
         group: The receivers.
-        seen: Visibility of direct light.
+        visibility: Visibility of direct light.
         projected_light: Projected direct light.
         spheres: Centers and radii of all spheres.
     """
     merged_scene = method.merged_scene
     if isinstance(projected_light, ProjectedCells):
-        directions, transmittance_self = projected_light.directions, seen.transmittance_self
+        directions, transmittance_self = projected_light.directions, visibility.transmittance_self
         transmittance_spheres = (
-            seen.transmittance_total if seen.transmittance_spheres is None else seen.transmittance_spheres
+            visibility.transmittance_total
+            if visibility.transmittance_spheres is None
+            else visibility.transmittance_spheres
         )
     else:
         directions, transmittance_self = HARMONIC_GATHER_CELLS, None

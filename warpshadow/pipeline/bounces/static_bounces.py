@@ -209,13 +209,13 @@ class StaticBounces:
             ) -> tuple[csr_matrix, csr_matrix]:
                 """Means over nodes, [receiver, node], and the nodes' form factors, of the receivers of a view."""
                 nodes = choose_cache_points(points)
-                seen = trace(points[nodes], normals[nodes], None if sky is None else sky[nodes])
-                is_node = ~seen.is_buried | seen.is_buried.all()
+                form_factors = trace(points[nodes], normals[nodes], None if sky is None else sky[nodes])
+                is_node = ~form_factors.is_buried | form_factors.is_buried.all()
                 nodes = nodes[is_node]
                 means = interpolation(points, normals, nodes)
                 if sky is not None:
                     means = scaled(means, ratios(1 - sky, means @ (1 - sky[nodes])))
-                return means, seen.factors[is_node]
+                return means, form_factors.factors[is_node]
 
             at, facing, device = receivers.points.numpy(), receivers.normals.numpy(), positions.device
             skies = [None if sky is None else sky.numpy()[..., 0] for sky in (sky_at_sources, sky_at_receivers)]
