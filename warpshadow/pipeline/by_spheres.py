@@ -160,7 +160,7 @@ class SphereMethod(Method):
             return (self.bounces.cached_shading if is_cached else self.bounces.shading)(
                 points, projected_light, light, materials
             )
-        return InParts(self, points, projected_light, light, joined)
+        return PartwiseShading(self, points, projected_light, light, joined)
 
     def free_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
         """Shading of points in free light; where it bounces between moving bodies, computed as for known light."""
@@ -172,7 +172,7 @@ class SphereMethod(Method):
     def openness(self, points: LitPoints) -> Node:
         """Light that points reflect as white surfaces under an even sky of 1, vec3 of shape [batch, receiver]."""
         sky = Input("light", EnvironmentMap.constant(1.0))
-        return InParts(self, points, Node("", self.project_light, sky), sky, joined, where=" in an even sky")
+        return PartwiseShading(self, points, Node("", self.project_light, sky), sky, joined, where=" in an even sky")
 
     def _projected_if_given(self, light: wp.array) -> Any:
         """Project given free light for the method. Differentiable: light."""
@@ -181,7 +181,7 @@ class SphereMethod(Method):
     def transfers(self, points: LitPoints, where: str = "") -> Node:
         """Transfer vectors of points to :attr:`basis`; where they vary, to the method's native basis."""
         matrix = self.native_from_basis
-        transfers = InParts(self, points, self.free_projection, None, list, caches=matrix is None, where=where)
+        transfers = PartwiseShading(self, points, self.free_projection, None, list, caches=matrix is None, where=where)
         if matrix is None or transfers.requires_grad:
             return transfers
 
@@ -191,7 +191,7 @@ class SphereMethod(Method):
         return Node("", to_basis, transfers)
 
 
-class InParts(Node):
+class PartwiseShading(Node):
     """Shading or transfer vectors of receivers, found group by group and part by part.
 
     So without a gradient transfer vectors of all receivers are in memory at once only where light is free.

@@ -13,7 +13,7 @@ from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.harmonic_light import as_light
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
-from warpshadow.pipeline.by_spheres import InParts, SphereMethod
+from warpshadow.pipeline.by_spheres import PartwiseShading, SphereMethod
 from warpshadow.pipeline.convex import PartsOfGroup
 from warpshadow.pipeline.groups import Group, GroupVisibility
 from warpshadow.pipeline.lighting import (
@@ -353,7 +353,9 @@ class Directional(SphereMethod):
         projected_light = self.free_projection if is_free else points.cached("projected", light, make)
 
         def in_cells() -> Node:
-            return CellTransmittances(self, points, projected_light, None, list, where=" of gloss", is_shaded=False)
+            return PartwiseCellTransmittance(
+                self, points, projected_light, None, list, where=" of gloss", is_shaded=False
+            )
 
         return points.cached("cells", None if is_free else light, in_cells), projected_light
 
@@ -379,7 +381,7 @@ class Directional(SphereMethod):
         return cell_samples(samples, self._directions, device=self.merged_scene.device)
 
 
-class CellTransmittances(InParts):
+class PartwiseCellTransmittance(PartwiseShading):
     """Transmittance of receivers past all bodies, in parts, float32 of shape [batch, receiver, direction]."""
 
     def find(

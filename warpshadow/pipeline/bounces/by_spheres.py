@@ -33,7 +33,7 @@ from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.bounces.static_bounces import StaticBounces
-from warpshadow.pipeline.by_spheres import InParts, SphereMethod
+from warpshadow.pipeline.by_spheres import PartwiseShading, SphereMethod
 from warpshadow.pipeline.groups import Group
 from warpshadow.pipeline.lighting import LitPoints, joined, receiver_words
 from warpshadow.pipeline.node import Call, Input, Node
@@ -60,7 +60,7 @@ class PartVisibility(NamedTuple):
     cells: CellTransmittance
 
 
-class LitPart(NamedTuple):
+class DirectLightPart(NamedTuple):
     """Some receivers in direct light, and their visibility of bounced light."""
 
     direct: wp.array  # vec3 of shape [batch, receiver]
@@ -68,7 +68,7 @@ class LitPart(NamedTuple):
     cells: CellTransmittance
 
 
-class PartVisibilities(InParts):
+class PartwiseVisibility(PartwiseShading):
     """Visibility of receivers for direct and bounced light, in parts."""
 
     def find(self, call: Call, part: Group, projected_light: Any, spheres: tuple[wp.array, wp.array]) -> PartVisibility:
@@ -81,7 +81,7 @@ class PartVisibilities(InParts):
         )
 
 
-class LitParts(Node):
+class PartwiseDirectLight(Node):
     """Direct light, in parts.
 
     Args:
@@ -95,7 +95,7 @@ class LitParts(Node):
 
     def __init__(
         self,
-        visibility: PartVisibilities,
+        visibility: PartwiseVisibility,
         projected_light: Node,
         words: str | Callable[[], str],
         where: str = "",
@@ -113,8 +113,10 @@ class LitParts(Node):
         (projected_light,) = self.values(call)
         return [self._light(call, part, projected_light) for part in self._visibilities.value(call)]
 
-    def _light(self, call: Call, part: PartVisibility, projected_light: Any) -> LitPart:
-        return LitPart(self._shade.run(call, part.transfer, part.group, projected_light), part.group, part.cells)
+    def _light(self, call: Call, part: PartVisibility, projected_light: Any) -> DirectLightPart:
+        return DirectLightPart(
+            self._shade.run(call, part.transfer, part.group, projected_light), part.group, part.cells
+        )
 
 
 def _open_shares(senders: Senders, visibility: list[PartVisibility]) -> wp.array:
@@ -126,7 +128,7 @@ def _open_shares(senders: Senders, visibility: list[PartVisibility]) -> wp.array
 class PatchSampleNodes(NamedTuple):
     """Nodes of the points at which patches are lit."""
 
-    visibility: PartVisibilities  # visibility
+    visibility: PartwiseVisibility  # visibility
     frames: Node  # of flat bodies
     shown: Node  # patches as receivers see them
     shares: Node  # how much each counts in its patch, vec3 of shape [batch, source]
@@ -188,12 +190,12 @@ class Radiosity(Node):
         self_bounces = 0 if between is None else SELF_BOUNCES
         return sent(after_bounces(count, others_light_of, with_self_light, senders.areas, self_bounces=self_bounces))
 
-    def _light(self, call: Call, part: LitPart, outgoing: OutgoingRadiance) -> wp.array:
+    def _light(self, call: Call, part: DirectLightPart, outgoing: OutgoingRadiance) -> wp.array:
         """Light of a part of the sources past its own body, from the sky and from others."""
         return total_light([part.direct, *self._gathering.run(call, part.group, part.cells, outgoing)])
 
 
-class BouncedShading(LitParts):
+class BouncedShading(PartwiseDirectLight):
     """Shading of receivers, direct and bounced.
 
     Args:
@@ -206,7 +208,7 @@ class BouncedShading(LitParts):
 
     def __init__(
         self,
-        visibility: PartVisibilities,
+        visibility: PartwiseVisibility,
         projected_light: Node,
         words: Callable[[], str],
         radiosity: Radiosity,
@@ -221,7 +223,7 @@ class BouncedShading(LitParts):
         parts = self._visibilities.value(call) if self._visibilities.caches else self._visibilities.parts(call)
         return joined([self._bounced(call, self._light(call, part, projected_light), outgoing) for part in parts])
 
-    def _bounced(self, call: Call, part: LitPart, outgoing: OutgoingRadiance) -> wp.array:
+    def _bounced(self, call: Call, part: DirectLightPart, outgoing: OutgoingRadiance) -> wp.array:
         return total_light([part.direct, *self._gathering.run(call, part.group, part.cells, outgoing)])
 
 
@@ -269,10 +271,10 @@ class SphereBounces:
         method, senders = self._method, self._patches.senders(materials)
         if not senders.bodies:
             idle = Node("bounces", None, idle="every body is black")
-            return InParts(method, points, projected_light, light, joined, extra_inputs=(idle,))
+            return PartwiseShading(method, points, projected_light, light, joined, extra_inputs=(idle,))
         proxies = self._proxies.setdefault(senders, Proxies(senders, method.visibility.merging))
         make_visibility = functools.partial(
-            PartVisibilities, method, projected_light=visibility_light, light=light, finish=list, is_shaded=False
+            PartwiseVisibility, method, projected_light=visibility_light, light=light, finish=list, is_shaded=False
         )
         key, is_cached = None if is_free else light, is_free or materials is not points.materials
         visibility = points.cached("visibility", (key, is_cached), lambda: make_visibility(points, caches=is_cached))
@@ -285,7 +287,7 @@ class SphereBounces:
         return BouncedShading(visibility, projected_light, words, radiosity, at_points)
 
     def _sources(
-        self, make_visibility: Callable[..., PartVisibilities], proxies: Proxies, points: LitPoints
+        self, make_visibility: Callable[..., PartwiseVisibility], proxies: Proxies, points: LitPoints
     ) -> PatchSampleNodes:
         """Sources among the bodies among which points are."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
@@ -309,7 +311,7 @@ class SphereBounces:
     ) -> Radiosity:
         """Radiosity of the patches, given the light at their sources."""
         senders, why_not = proxies.senders, "light bounces once" if self._count == 1 else ""
-        lit = LitParts(sources.visibility, projected_light, _words(senders), _OF_SOURCES)
+        lit = PartwiseDirectLight(sources.visibility, projected_light, _words(senders), _OF_SOURCES)
         albedo = self._patches.albedo(materials, senders.bodies)
         arguments = lit, albedo, sources.frames
         among_senders = self._gathering(senders, arguments, _words(senders), _OF_SOURCES, why_not, only_others=True)
@@ -328,8 +330,12 @@ class SphereBounces:
             materials: Reflectance of the bodies.
         """
         sources, at_sources = self._cached_sources(points, materials)
-        direct = points.cached("direct", light, lambda: InParts(self._method, points, projected_light, light, joined))
-        make = functools.partial(InParts, self._method, at_sources, projected_light, light, joined, where=_OF_SOURCES)
+        direct = points.cached(
+            "direct", light, lambda: PartwiseShading(self._method, points, projected_light, light, joined)
+        )
+        make = functools.partial(
+            PartwiseShading, self._method, at_sources, projected_light, light, joined, where=_OF_SOURCES
+        )
         lit = points.cached("direct at sources", (light, sources), make)
         return self._still.in_known_light(direct, lit, points, materials)
 
