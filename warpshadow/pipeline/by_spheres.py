@@ -23,7 +23,7 @@ from warpshadow.pipeline.lighting import (
     Method,
     change_basis,
     joined,
-    receiver_words,
+    receiver_text,
 )
 from warpshadow.pipeline.node import Call, Input, Node, detached
 from warpshadow.pipeline.planes import ScenePlanes
@@ -223,7 +223,7 @@ class PartwiseShading(Node):
     ):
         self.method, self._points = method, points
         self._finish, self._progress = finish, method.progress and light is not None
-        receivers, spheres, words = points.receivers_node, points.spheres, functools.partial(receiver_words, points)
+        receivers, spheres, item_text = points.receivers_node, points.spheres, functools.partial(receiver_text, points)
         self_visibility = _self_visibility(method, points, projected_light)
         self._visibility = Node(
             f"visibility{where}",
@@ -246,7 +246,7 @@ class PartwiseShading(Node):
             self._visibility,
             projected_light,
             blockers,
-            items=lambda: f"{words()} × {len(planes)} flat {'body' if len(planes) == 1 else 'bodies'}",
+            items=lambda: f"{item_text()} × {len(planes)} flat {'body' if len(planes) == 1 else 'bodies'}",
             idle="" if planes else "spheres stand in for what casts shadows",
             caches=False,
         )
@@ -257,7 +257,7 @@ class PartwiseShading(Node):
             method.transfer if self._is_transferred else None,
             self._visibility_past_planes,
             projected_light,
-            items=lambda: f"{words()} × {method.coefficient_count(light)} coefficients",
+            items=lambda: f"{item_text()} × {method.coefficient_count(light)} coefficients",
             idle="" if self._is_transferred else "known light is shaded without transfer vectors",
             caches=False,
         )
@@ -265,7 +265,7 @@ class PartwiseShading(Node):
         if is_lit:
             shade_part = method.shade_transfer if self._is_transferred else method.shade_transmittance
             arguments = self._transfer, projected_light
-            self._shading = result = Node(f"shading{where}", shade_part, *arguments, items=words, caches=False)
+            self._shading = result = Node(f"shading{where}", shade_part, *arguments, items=item_text, caches=False)
         shadows = _static_shadows(method, points, light)
         cached_rows = shadows if shadows.function else None
         looked_up: Node | dict = self_visibility if self_visibility.function else {}
@@ -338,11 +338,11 @@ def _pairs(method: SphereMethod, points: LitPoints) -> str:
         solids = f" and {parts[bodies].sum():,} convex parts" if parts[bodies].sum() else ""
         return f"{spheres[bodies].sum():,} spheres{solids}"
 
-    words = f"{receiver_words(points, static=False)} × {blockers(list(range(len(spheres))))}"
+    item_text = f"{receiver_text(points, static=False)} × {blockers(list(range(len(spheres))))}"
     if points.static is None:
-        return words
+        return item_text
     moving = list(points.static.moving)
-    return f"{words}, {receiver_words(points, moving=False)} on static bodies × {blockers(moving)}"
+    return f"{item_text}, {receiver_text(points, moving=False)} on static bodies × {blockers(moving)}"
 
 
 def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:

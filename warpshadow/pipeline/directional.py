@@ -24,7 +24,7 @@ from warpshadow.pipeline.lighting import (
     change_basis,
     joined,
     map_of,
-    receiver_words,
+    receiver_text,
 )
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Call, Input, Node
@@ -316,9 +316,9 @@ class Directional(SphereMethod):
     def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input) -> Node:
         """Transmittance towards the samples of lobes, between cells; of known light, to where it comes from in them."""
         cells, projected_light = self._lobe_cells(points, light)
-        words = functools.partial(receiver_words, points)
+        item_text = functools.partial(receiver_text, points)
         arguments = cells, points.receivers_node, directions, projected_light
-        return Node("transmittance of lobes", _towards, *arguments, items=words)
+        return Node("transmittance of lobes", _towards, *arguments, items=item_text)
 
     def blocked_radiance(
         self, points: LitPoints, diffuse: Node, light: Input, view: LitPoints, choose: Callable[[Node], Node]

@@ -127,7 +127,7 @@ def _decision(node: Node, call: Call, reason: Decision) -> Decision:
     """Whether a node runs, given why it is asked for, or why it is not."""
     if node.known(call) is not None:
         return Decision(False, f"cached: {_names(node.sources)} are the same")
-    if idle := _words(node.idle):
+    if idle := _text(node.idle):
         return Decision(False, idle)
     if not reason:
         return reason
@@ -147,20 +147,20 @@ def _stage(node: Node, forward: Decision) -> StageReport:
         backward = Decision(True, f"a gradient to {_names(node.differentiated_inputs)} is asked for")
     else:
         backward = Decision(False, "nothing before it requires a gradient")
-    return StageReport(node.name, forward, backward, _words(node.items) if forward else "")
+    return StageReport(node.name, forward, backward, _text(node.items) if forward else "")
 
 
 def _names(sources: Iterable[Input]) -> str:
     return _listed(dict.fromkeys(source.name for source in sources))
 
 
-def _words(words: str | Callable[[], str]) -> str:
-    return words() if callable(words) else words
+def _text(text: str | Callable[[], str]) -> str:
+    return text() if callable(text) else text
 
 
-def _listed(words: Iterable[str]) -> str:
+def _listed(items: Iterable[str]) -> str:
     """Words with commas and an "and"."""
-    *first, last = list(words) or ["all of it"]
+    *first, last = list(items) or ["all of it"]
     return f"{', '.join(first)} and {last}" if first else last
 
 

@@ -14,7 +14,7 @@ import warp as wp
 
 from warpshadow.device.batch import concatenate, cut
 from warpshadow.device.constants import constant
-from warpshadow.pipeline.lighting import KnownLight, Light, LitPoints, change_basis, map_of, receiver_words
+from warpshadow.pipeline.lighting import KnownLight, Light, LitPoints, change_basis, map_of, receiver_text
 from warpshadow.pipeline.node import Input, Node, detached
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.scene.scene import GLOSS_ARGUMENTS
@@ -55,27 +55,27 @@ class GlossyPoints(LitPoints):
             light: As for :meth:`LitPoints.shading`.
             materials: Of the bodies.
         """
-        words = functools.partial(receiver_words, self)
+        item_text = functools.partial(receiver_text, self)
         roughness, metallic, specular = (self._values(materials, name) for name in GLOSS_ARGUMENTS)
         key = materials.roughness
 
         def lobes() -> Node:
             inputs = self.receivers_node, roughness, self._cameras, self.method.lobe_samples
-            return Node("lobes", _sample, *inputs, items=words)
+            return Node("lobes", _sample, *inputs, items=item_text)
 
         sampled = self.cached("lobes", key, lobes)
         directions, filters, cosines = (Node("", operator.itemgetter(part), sampled) for part in range(3))
         source = self.light_input(light)
         texels = self.cached("prefiltered", source, lambda: self._prefiltered(source))
-        radiance = Node("prefiltered light", look_up_light, texels, directions, filters, items=words)
+        radiance = Node("prefiltered light", look_up_light, texels, directions, filters, items=item_text)
         through = self.method.lobe_transmittance(self, directions, source)
         blocked = None
         if self.merged_scene.scene.bounces:
             blocked = self.method.blocked_radiance(self, self.chosen(diffuse), source, view, self.chosen)
-        sums = Node("gloss", sum_lobes, filters, radiance, through, blocked, items=words)
+        sums = Node("gloss", sum_lobes, filters, radiance, through, blocked, items=item_text)
         straight, grazing = (Node("", operator.itemgetter(part), sums) for part in range(2))
         arguments = self._numbers, diffuse, straight, grazing, cosines, metallic, specular
-        mix = Node("reflection", mix_reflection, *arguments, items=words)
+        mix = Node("reflection", mix_reflection, *arguments, items=item_text)
         return Node("", operator.itemgetter(0), mix), Node("", operator.itemgetter(1), mix)
 
     def chosen(self, light: Node) -> Node:

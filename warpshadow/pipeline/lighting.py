@@ -254,7 +254,7 @@ class Method:
     def free_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
         """Shading of points in free light, which is converted where the transfer vectors are not."""
         matrix = self.native_from_basis if points.transfers.requires_grad else None
-        items = functools.partial(receiver_words, points)
+        items = functools.partial(receiver_text, points)
         return Node("shading", functools.partial(_shade, matrix=matrix), points.transfers, light, items=items)
 
     @functools.cached_property
@@ -312,7 +312,7 @@ def map_of(light: KnownLight) -> np.ndarray:
     return as_light(light).radiance
 
 
-def receiver_words(points: LitPoints, *, moving: bool = True, static: bool = True) -> str:
+def receiver_text(points: LitPoints, *, moving: bool = True, static: bool = True) -> str:
     """Number of receivers, in words."""
     up_to, moving_count, static_count = points.counts()
     return f"{up_to}{moving * moving_count + static * static_count:,} receivers"

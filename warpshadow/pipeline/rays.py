@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import Basis, HarmonicBasis
-from warpshadow.pipeline.lighting import KnownLight, LitPoints, Method, map_of, receiver_words
+from warpshadow.pipeline.lighting import KnownLight, LitPoints, Method, map_of, receiver_text
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node, detached
 from warpshadow.pipeline.reflectance import Materials
@@ -54,7 +54,7 @@ class Rays(Method):
                 meshes,
                 points.receivers_node,
                 light,
-                items=lambda: receiver_words(points),
+                items=lambda: receiver_text(points),
                 extra_inputs=(Node("transfer", None, idle="rays shade known light at once"),),
             )
 
@@ -99,14 +99,14 @@ class Rays(Method):
 
     def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input) -> Node:
         """Transmittance towards the samples of lobes: rays, each of its own."""
-        words = functools.partial(receiver_words, points)
+        item_text = functools.partial(receiver_text, points)
         return Node(
             "transmittance of lobes",
             _trace_lobes,
             self._trees_around(points),
             points.receivers_node,
             directions,
-            items=words,
+            items=item_text,
         )
 
     def blocked_radiance(
@@ -130,7 +130,7 @@ class Rays(Method):
             self._transfer,
             self._meshes(points),
             points.receivers_node,
-            items=lambda: f"{receiver_words(points)} × {self.basis.size} coefficients",
+            items=lambda: f"{receiver_text(points)} × {self.basis.size} coefficients",
         )
         if node.requires_grad:
             node.function = _refuse
@@ -144,7 +144,7 @@ class Rays(Method):
 
     def _trees_around(self, points: LitPoints, name: str = "") -> Node:
         """Node of the trees of all vertices around points."""
-        items = functools.partial(receiver_words, points)
+        items = functools.partial(receiver_text, points)
         return points.cached("trees", points.vertices, lambda: Node(name, self._trees, points.vertices, items=items))
 
     def _trees(self, positions: wp.array) -> list[FaceTree]:
@@ -161,7 +161,7 @@ class Rays(Method):
             self._casting_meshes,
             points.vertices,
             detached(points.receivers_node),
-            items=lambda: f"{receiver_words(points)} by rays",
+            items=lambda: f"{receiver_text(points)} by rays",
             idle="" if self.merged_scene.casting else "no body has blockers",
             caches=False,
             extra_inputs=(Node("static shadows", None, idle=alike),),

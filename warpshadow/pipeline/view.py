@@ -9,7 +9,7 @@ import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.pipeline.lighting import BlockerKinds, Light, LitPoints, Method, receiver_words
+from warpshadow.pipeline.lighting import BlockerKinds, Light, LitPoints, Method, receiver_text
 from warpshadow.pipeline.node import Call, Input, Node, detached
 from warpshadow.pipeline.reflectance import Materials, Reflection
 from warpshadow.stages.film import average, sample_radiance, sum_radiance
@@ -107,11 +107,11 @@ class View(LitPoints):
             normals = Node("normals", static.with_moving_normals, vertices, static.normals, items=corners)
         # receivers at vertices move with these alone; receivers at samples move with the samples' fragments, too
         seen = sides if method.samples_receive.any() else detached(sides)
-        words = functools.partial(receiver_words, self)
+        item_text = functools.partial(receiver_text, self)
         arguments = [vertices, normals, seen, detached(silhouettes)]
         if method.is_adaptive.any():
             arguments.append(detached(spheres))
-        receivers = Node("receivers", self._receive, *arguments, items=words)
+        receivers = Node("receivers", self._receive, *arguments, items=item_text)
         self.clip_positions, self.fragments_node, self.silhouettes = clip, sides, silhouettes
         return normals, receivers
 
@@ -180,7 +180,7 @@ class View(LitPoints):
 
     def image(self, light: Light | None, materials: Materials) -> Node:
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""
-        words, clip, fragments = self._samples, self.clip_positions, self.fragments_node
+        item_text, clip, fragments = self._samples, self.clip_positions, self.fragments_node
         lit, reflected = self.shading(light, materials), self.reflection(materials)
         if materials.roughness:
             samples = self._glossy(lit, light, materials, reflected.samples)
@@ -188,7 +188,9 @@ class View(LitPoints):
             result = (Node("reflectance", None, idle="found with the radiance"),)
             reflecting = reflected.vertex_albedo, reflected.pyramids, reflected.footprints
             arguments = fragments, self.merged_scene.faces, *reflecting, self._white_radiance_of(lit)
-            samples = Node("radiance", textured_radiance, *arguments, items=words, caches=False, extra_inputs=result)
+            samples = Node(
+                "radiance", textured_radiance, *arguments, items=item_text, caches=False, extra_inputs=result
+            )
         else:
             samples = self._radiance(lit, reflected.samples)
         averaged = self._averaged(samples, is_moving=self._is_moving)

@@ -35,7 +35,7 @@ from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.bounces.static_bounces import StaticBounces
 from warpshadow.pipeline.by_spheres import PartwiseShading, SphereMethod
 from warpshadow.pipeline.groups import Group
-from warpshadow.pipeline.lighting import LitPoints, joined, receiver_words
+from warpshadow.pipeline.lighting import LitPoints, joined, receiver_text
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.scene.scene import Bounces
@@ -47,7 +47,7 @@ from warpshadow.stages.receivers import Receivers
 _OF_SOURCES = " of sources"  # put after the names of stages
 
 
-def _words(senders: Senders) -> str:
+def _source_text(senders: Senders) -> str:
     """Number of sources, in words."""
     return f"{len(senders.sides):,} sources"
 
@@ -87,7 +87,7 @@ class PartwiseDirectLight(Node):
     Args:
         visibility: Visibility of the receivers.
         projected_light: The light projected for the method.
-        words: Number of receivers, in words.
+        item_text: Number of receivers, in words.
         where: Put after the name of its stage.
         others: More that it depends on.
         extra_inputs: As for :class:`Node`.
@@ -97,14 +97,19 @@ class PartwiseDirectLight(Node):
         self,
         visibility: PartwiseVisibility,
         projected_light: Node,
-        words: str | Callable[[], str],
+        item_text: str | Callable[[], str],
         where: str = "",
         others: tuple[Node, ...] = (),
         extra_inputs: tuple[Node, ...] = (),
     ):
         self._visibilities = visibility
         self._shade = Node(
-            f"shading{where}", visibility.method.shade_transfer, visibility, projected_light, items=words, caches=False
+            f"shading{where}",
+            visibility.method.shade_transfer,
+            visibility,
+            projected_light,
+            items=item_text,
+            caches=False,
         )
         super().__init__("", None, projected_light, *others, extra_inputs=(visibility, self._shade, *extra_inputs))
 
@@ -155,10 +160,12 @@ class Radiosity(Node):
             gathering,
         )
         senders = proxies.senders
-        words = f"{len(senders.areas):,} patches"
+        item_text = f"{len(senders.areas):,} patches"
         idle = ALL_FLAT if all(senders.merged_scene.is_flat[body] for body in senders.bodies) else ""
-        self._reflect = Node("radiosity", patch_radiosity, albedo, lit, items=words, caches=False)
-        self._own = Node("self light of patches", patch_radiosity, albedo, lit, items=words, idle=idle, caches=False)
+        self._reflect = Node("radiosity", patch_radiosity, albedo, lit, items=item_text, caches=False)
+        self._own = Node(
+            "self light of patches", patch_radiosity, albedo, lit, items=item_text, idle=idle, caches=False
+        )
         extra_inputs = self._reflect, self._own, *gathering.stages
         super().__init__("", None, lit, albedo, shown, frames, shares, extra_inputs=extra_inputs)
 
@@ -201,7 +208,7 @@ class BouncedShading(PartwiseDirectLight):
     Args:
         visibility: Visibility; one part after another where none of it is cached.
         projected_light: The light projected for the method.
-        words: Number of receivers, in words.
+        item_text: Number of receivers, in words.
         radiosity: Radiosity of the patches.
         gathering: Gathers it at receivers.
     """
@@ -210,12 +217,12 @@ class BouncedShading(PartwiseDirectLight):
         self,
         visibility: PartwiseVisibility,
         projected_light: Node,
-        words: Callable[[], str],
+        item_text: Callable[[], str],
         radiosity: Radiosity,
         gathering: Gathering,
     ):
         self._gathering = gathering
-        super().__init__(visibility, projected_light, words, others=(radiosity,), extra_inputs=gathering.stages)
+        super().__init__(visibility, projected_light, item_text, others=(radiosity,), extra_inputs=gathering.stages)
 
     def compute(self, call: Call) -> wp.array:
         """Light all parts, directly and by the patches' radiosity."""
@@ -282,9 +289,9 @@ class SphereBounces:
             "of sources", (key, senders), lambda: self._sources(make_visibility, proxies, points)
         )
         radiosity = self._radiosity(of_sources, projected_light, proxies, materials)
-        words = functools.partial(receiver_words, points)
-        at_points = self._gathering(senders, (points.receivers_node, radiosity), words)
-        return BouncedShading(visibility, projected_light, words, radiosity, at_points)
+        item_text = functools.partial(receiver_text, points)
+        at_points = self._gathering(senders, (points.receivers_node, radiosity), item_text)
+        return BouncedShading(visibility, projected_light, item_text, radiosity, at_points)
 
     def _sources(
         self, make_visibility: Callable[..., PartwiseVisibility], proxies: Proxies, points: LitPoints
@@ -296,7 +303,7 @@ class SphereBounces:
             return proxies.shown(sources, [part.cells for part in visibility], *arguments)
 
         make = functools.partial(Node, "sources", senders.sources, points.vertices, points.normals)
-        sources = points.cached("sources", senders, lambda: make(items=_words(senders)))
+        sources = points.cached("sources", senders, lambda: make(items=_source_text(senders)))
         visibility = make_visibility(
             self._at(sources, points, points.materials, proxies.blocker_of_source), where=_OF_SOURCES
         )
@@ -311,10 +318,12 @@ class SphereBounces:
     ) -> Radiosity:
         """Radiosity of the patches, given the light at their sources."""
         senders, why_not = proxies.senders, "light bounces once" if self._count == 1 else ""
-        lit = PartwiseDirectLight(sources.visibility, projected_light, _words(senders), _OF_SOURCES)
+        lit = PartwiseDirectLight(sources.visibility, projected_light, _source_text(senders), _OF_SOURCES)
         albedo = self._patches.albedo(materials, senders.bodies)
         arguments = lit, albedo, sources.frames
-        among_senders = self._gathering(senders, arguments, _words(senders), _OF_SOURCES, why_not, only_others=True)
+        among_senders = self._gathering(
+            senders, arguments, _source_text(senders), _OF_SOURCES, why_not, only_others=True
+        )
         return Radiosity(self._count, proxies, self._self_form_factors, among_senders, lit, albedo, sources)
 
     def _gathering(self, senders: Senders, *arguments: Any, **options: Any) -> Gathering:

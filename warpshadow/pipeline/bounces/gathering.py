@@ -277,7 +277,7 @@ class Gathering:
         senders: The bodies whose patches send light.
         self_form_factors: Form factors of bodies for themselves.
         given: Nodes that radiosity, receivers and spheres depend on.
-        words: Number of receivers, in words.
+        item_text: Number of receivers, in words.
         where: Put after the names of its stages.
         why_not: Why nobody asks for it, in words; empty if somebody does.
         only_others: Leave out light from a body to itself.
@@ -291,7 +291,7 @@ class Gathering:
         senders: Senders,
         self_form_factors: SelfFormFactors,
         arguments: tuple[Node | Input, ...],
-        words: str | Callable[[], str],
+        item_text: str | Callable[[], str],
         where: str = "",
         why_not: str = "",
         only_others: bool = False,
@@ -307,7 +307,7 @@ class Gathering:
         functions = self._from_itself, self._from_planes, self._from_spheres
         names = "self light", "plane light", "sphere light"
         stages = tuple(
-            Node(f"{name}{where}", function, *arguments, items=words, idle=why_not or why, caches=False)
+            Node(f"{name}{where}", function, *arguments, items=item_text, idle=why_not or why, caches=False)
             for name, function, why in zip(names, functions, idle, strict=True)
         )
         self.stages = stages[1:] if only_others else stages

@@ -6,7 +6,7 @@ import warp as wp
 
 from warpshadow.device.batch import common_batch
 from warpshadow.device.memory import empty
-from warpshadow.pipeline.lighting import KnownLight, LitPoints, map_of, receiver_words
+from warpshadow.pipeline.lighting import KnownLight, LitPoints, map_of, receiver_text
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.reflectance import Materials
@@ -88,7 +88,7 @@ def path_traced(
         light,
         materials.vertex_albedo,
         materials.pyramids if materials.images else None,
-        items=lambda: f"{receiver_words(points)} × {paths:,} paths of {maximum} bounces",
+        items=lambda: f"{receiver_text(points)} × {paths:,} paths of {maximum} bounces",
         has_adjoint=False,
     )
 

@@ -26,7 +26,7 @@ import warp as wp
 
 from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
-from warpshadow.pipeline.lighting import LitPoints, receiver_words
+from warpshadow.pipeline.lighting import LitPoints, receiver_text
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.scene.scene import Bounces
@@ -148,7 +148,7 @@ class StaticBounces:
             return factors.to_receivers(direct, colored_light(transfer, light))
 
         transfer, factors = points.cached("bounces", lit, bounced), self._factors(points, materials, senders)
-        return Node("bounces", shade, direct, transfer, light, factors, items=self._words(points, senders))
+        return Node("bounces", shade, direct, transfer, light, factors, items=self._item_text(points, senders))
 
     def _shading(self, direct: Node, at_patches: Node, points: LitPoints, materials: Materials) -> Node:
         """Shading with bounces, given the direct light on patches, vec3 of shape [batch, patch]."""
@@ -158,7 +158,7 @@ class StaticBounces:
             return factors.to_receivers(direct, self._at_cache_points(albedo, at_patches, factors, senders))
 
         albedo, factors = self._patches.albedo(materials, senders.bodies), self._factors(points, materials, senders)
-        return Node("bounces", bounce, direct, albedo, at_patches, factors, items=self._words(points, senders))
+        return Node("bounces", bounce, direct, albedo, at_patches, factors, items=self._item_text(points, senders))
 
     def _at_cache_points(self, albedo: wp.array, at_patches: wp.array, factors: _Factors, senders: Senders) -> wp.array:
         """Bounced light at nodes, vec3 of shape [batch, node]. Differentiable: albedo, at_patches."""
@@ -175,8 +175,8 @@ class StaticBounces:
         arguments = self._bounces, others_light_of, with_self_light, senders.areas
         return multiply(factors.of_nodes, after_bounces(*arguments, self_bounces=SELF_BOUNCES))
 
-    def _words(self, points: LitPoints, senders: Senders) -> Callable[[], str]:
-        return lambda: f"{receiver_words(points)}, {len(senders.areas):,} patches, {self._bounces} bounces"
+    def _item_text(self, points: LitPoints, senders: Senders) -> Callable[[], str]:
+        return lambda: f"{receiver_text(points)}, {len(senders.areas):,} patches, {self._bounces} bounces"
 
     def _factors(self, points: LitPoints, materials: Materials, senders: Senders) -> Node:
         def find(
