@@ -135,7 +135,7 @@ class PatchSampleNodes(NamedTuple):
 
     visibility: PartwiseVisibility  # visibility
     frames: Node  # of flat bodies
-    shown: Node  # patches as receivers see them
+    projected_patches: Node  # patches as receivers see them
     shares: Node  # how much each counts in its patch, vec3 of shape [batch, source]
 
 
@@ -152,7 +152,7 @@ class Radiosity(Node):
         albedo: Node,
         sources: PatchSampleNodes,
     ):
-        _, frames, shown, shares = sources
+        _, frames, projected_patches, shares = sources
         self._count, self._proxies, self._self_form_factors, self._gathering = (
             count,
             proxies,
@@ -167,18 +167,18 @@ class Radiosity(Node):
             "self light of patches", patch_radiosity, albedo, lit, items=item_text, idle=idle, caches=False
         )
         extra_inputs = self._reflect, self._own, *gathering.stages
-        super().__init__("", None, lit, albedo, shown, frames, shares, extra_inputs=extra_inputs)
+        super().__init__("", None, lit, albedo, projected_patches, frames, shares, extra_inputs=extra_inputs)
 
     def compute(self, call: Call) -> OutgoingRadiance:
         """Reflect direct light, then light that has bounced once, and so on; more often between patches of one body."""
-        lit, albedo, shown, frames, shares = self.values(call)
+        lit, albedo, projected_patches, frames, shares = self.values(call)
         senders, count = self._proxies.senders, self._count
         between = (
             None if self._own.idle else self._self_form_factors.between_patches(senders, [part.group for part in lit])
         )
 
         def sent(radiosity: wp.array) -> OutgoingRadiance:
-            return OutgoingRadiance(self._proxies, radiosity, shown, frames)
+            return OutgoingRadiance(self._proxies, radiosity, projected_patches, frames)
 
         def others_light_of(radiosity: wp.array | None) -> wp.array:
             """Radiosity of patches by light from the sky and from other bodies."""
@@ -299,8 +299,8 @@ class SphereBounces:
         """Sources among the bodies among which points are."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
 
-        def show(sources: Receivers, visibility: list[PartVisibility], *arguments: Any) -> ProjectedPatches:
-            return proxies.shown(sources, [part.cells for part in visibility], *arguments)
+        def project(sources: Receivers, visibility: list[PartVisibility], *arguments: Any) -> ProjectedPatches:
+            return proxies.projected_patches(sources, [part.cells for part in visibility], *arguments)
 
         make = functools.partial(Node, "sources", senders.sources, points.vertices, points.normals)
         sources = points.cached("sources", senders, lambda: make(items=_source_text(senders)))
@@ -308,9 +308,9 @@ class SphereBounces:
             self._at(sources, points, points.materials, proxies.blocker_of_source), where=_OF_SOURCES
         )
         frames = Node("", planes.all.frames if planes else lambda _: None, points.vertices)
-        shown = Node("", show, sources, visibility, spheres, frames)
+        projected_patches = Node("", project, sources, visibility, spheres, frames)
         return PatchSampleNodes(
-            visibility, frames, shown, Node("", functools.partial(_open_shares, senders), visibility)
+            visibility, frames, projected_patches, Node("", functools.partial(_open_shares, senders), visibility)
         )
 
     def _radiosity(

@@ -197,7 +197,7 @@ class Proxies:
         """The blocker nearest to the patch of each source, among spheres of bodies that are not flat; −1 for none."""
         return self._blockers[0][self.senders.patch_of_source]
 
-    def shown(
+    def projected_patches(
         self,
         sources: Receivers,
         cells: list[CellTransmittance],
@@ -243,7 +243,7 @@ class OutgoingRadiance:
     Args:
         proxies: Proxies of the bodies whose patches they are.
         radiosity: Of the patches, vec3 of shape [batch, patch].
-        shown: The patches as receivers see them.
+        projected_patches: The patches as receivers see them.
         frames: Where flat bodies are, vec3 of shape [batch, 3 · plane].
     """
 
@@ -251,11 +251,11 @@ class OutgoingRadiance:
         self,
         proxies: Proxies,
         radiosity: wp.array,
-        shown: ProjectedPatches,
+        projected_patches: ProjectedPatches,
         frames: wp.array,
     ):
         self.proxies, self.senders, self.radiosity = proxies, proxies.senders, radiosity
-        self.shown, self.frames = shown, frames
+        self.projected_patches, self.frames = projected_patches, frames
 
     def of_body(self, body: int) -> wp.array:
         """Radiosity of the patches of a body, vec3 of shape [batch, patch]."""
@@ -266,7 +266,9 @@ class OutgoingRadiance:
     def proxy_radiance(self) -> wp.array:
         """Light that proxies of patches send towards cells, vec4 of shape [batch, node, cell]."""
         proxies = self.proxies
-        return find_proxy_radiance(self.radiosity, self.shown.areas, self.senders.areas, *proxies.patches_of_clusters)
+        return find_proxy_radiance(
+            self.radiosity, self.projected_patches.areas, self.senders.areas, *proxies.patches_of_clusters
+        )
 
 
 class Gathering:
@@ -334,13 +336,13 @@ class Gathering:
     def _from_spheres(self, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
         if not any(body != group.body and not self._is_flat[body] for body in outgoing.senders.bodies):
             return None
-        shown, proxy_radiance = outgoing.shown, outgoing.proxy_radiance
+        projected_patches, proxy_radiance = outgoing.projected_patches, outgoing.proxy_radiance
         softness = self._visibility.softness
         if group.parts_around is not None:
             softness = max(softness, _SOFTNESS_OF_PARTS)
-        count = common_batch({"geometry": group.points, "light": proxy_radiance, "proxies": shown.radii})
+        count = common_batch({"geometry": group.points, "light": proxy_radiance, "proxies": projected_patches.radii})
         points, normals = expand(group.points, count), expand(group.normals, count)
-        centers, radii = expand(shown.centers, count), expand(shown.radii, count)
+        centers, radii = expand(projected_patches.centers, count), expand(projected_patches.radii, count)
         return sphere_light(
             points,
             normals,
@@ -353,5 +355,7 @@ class Gathering:
             softness=softness,
             merging=self._visibility.merging,
             skip=outgoing.proxies.span_of(group.body),
-            clusters=shown.clusters if radii is shown.radii and centers is shown.centers else None,
+            clusters=projected_patches.clusters
+            if radii is projected_patches.radii and centers is projected_patches.centers
+            else None,
         )

@@ -129,7 +129,7 @@ def turn_from_planes(
 
 
 @wp.kernel
-def _show(
+def _project(
     # in
     normals: wp.array2d(dtype=wp.vec3),
     transmittance: wp.array3d(dtype=wp.float32),
@@ -139,7 +139,7 @@ def _show(
     directions: wp.array(dtype=wp.vec3),
     opposite: wp.array(dtype=wp.int32),
     # out
-    shown: wp.array3d(dtype=wp.float32),
+    projected_areas: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a patch of an instance and a direction."""
     batch, patch, direction = wp.tid()
@@ -152,7 +152,7 @@ def _show(
             * cosine
             * transmittance[instance_in(batch, transmittance.shape[0]), sources[k], opposite[direction]]
         )
-    shown[batch, patch, direction] = total
+    projected_areas[batch, patch, direction] = total
 
 
 @cached_by_values
@@ -182,6 +182,8 @@ def find_projected_areas(
     check.shape("passing", transmittance.shape, ("batch", mean.shape[1], len(directions)))
     count = common_batch({"normals": normals, "passing": transmittance})
     device = normals.device
-    shown = empty((count, mean.shape[0], len(directions)), dtype=wp.float32, device=device)
-    launch(_show, shown.shape, inputs=[normals, transmittance, *mean.rows, *cells], outputs=[shown])
-    return shown
+    projected_areas = empty((count, mean.shape[0], len(directions)), dtype=wp.float32, device=device)
+    launch(
+        _project, projected_areas.shape, inputs=[normals, transmittance, *mean.rows, *cells], outputs=[projected_areas]
+    )
+    return projected_areas

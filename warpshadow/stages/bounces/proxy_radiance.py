@@ -59,7 +59,7 @@ def patches_of_clusters(
 def _tabulate(
     # in
     radiosity: wp.array2d(dtype=wp.vec3),
-    shown: wp.array3d(dtype=wp.float32),
+    projected_areas: wp.array3d(dtype=wp.float32),
     starts: wp.array(dtype=wp.int32),
     numbers: wp.array(dtype=wp.int32),
     shares: wp.array(dtype=wp.float32),
@@ -70,12 +70,12 @@ def _tabulate(
     """A thread owns a node and a direction; shares are A / Σ A, and so sums are linear, as Warp's adjoint needs it."""
     batch, node, direction = wp.tid()
     sent = radiosity[instance_in(batch, radiosity.shape[0])]
-    shows = shown[instance_in(batch, shown.shape[0])]
+    areas_of_instance = projected_areas[instance_in(batch, projected_areas.shape[0])]
     light = wp.vec3()
     open = float(minimum[node])
     for k in range(starts[node], starts[node + 1]):
         patch = numbers[k]
-        part = shares[k] * (shows[patch, direction] + _HIDDEN_WEIGHT)
+        part = shares[k] * (areas_of_instance[patch, direction] + _HIDDEN_WEIGHT)
         light += part * sent[patch]
         open += part
     proxy_radiance[batch, node, direction] = wp.vec4(light[0], light[1], light[2], open)
@@ -83,7 +83,7 @@ def _tabulate(
 
 def find_proxy_radiance(
     radiosity: wp.array,
-    shown: wp.array,
+    projected_areas: wp.array,
     areas: np.ndarray,
     starts: np.ndarray,
     numbers: np.ndarray,
@@ -100,12 +100,12 @@ def find_proxy_radiance(
         starts, numbers: Patches of each node, from :func:`patches_of_clusters`.
     Returns:
         Σ A (g + 0.01) B / Σ A and Σ A (g + 0.01) / Σ A, vec4 of shape [batch, node, direction].
-    Differentiable: radiosity, shown.
+    Differentiable: radiosity, projected_areas.
     """
-    batch_count = common_batch({"radiosity": radiosity, "shown": shown})
+    batch_count = common_batch({"radiosity": radiosity, "projected_areas": projected_areas})
     patch_count = len(areas)
     check.shape("radiosity", radiosity.shape, (radiosity.shape[0], patch_count))
-    check.shape("shown", shown.shape, (shown.shape[0], patch_count, "direction"))
+    check.shape("projected_areas", projected_areas.shape, (projected_areas.shape[0], patch_count, "direction"))
     check.finite("areas", np.asarray(areas), minimum=0.0)
     if starts[0] != 0 or (np.diff(starts) < 0).any() or starts[-1] != len(numbers):
         raise ValueError(f"starts: got {np.asarray(starts)!r}, expected 0 to the {len(numbers)} numbers, rising")
@@ -118,6 +118,6 @@ def find_proxy_radiance(
     integers = [constant(np.asarray(values, np.int32), wp.int32, device) for values in (starts, numbers)]
     floats = [shares, np.where(totals > 0, 0.0, _BLACK_SPHERE_WEIGHT)]
     tables = [*integers, *(constant(values.astype(np.float32), wp.float32, device) for values in floats)]
-    proxy_radiance = empty((batch_count, len(starts) - 1, shown.shape[2]), dtype=wp.vec4, device=device)
-    launch(_tabulate, proxy_radiance.shape, inputs=[radiosity, shown, *tables], outputs=[proxy_radiance])
+    proxy_radiance = empty((batch_count, len(starts) - 1, projected_areas.shape[2]), dtype=wp.vec4, device=device)
+    launch(_tabulate, proxy_radiance.shape, inputs=[radiosity, projected_areas, *tables], outputs=[proxy_radiance])
     return proxy_radiance
