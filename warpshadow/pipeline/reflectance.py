@@ -28,7 +28,7 @@ GLOSS_DEFAULTS = {"roughness": 1.0, "metallic": 0.0, "specular": 1.0}
 """Of bodies that do not say; their roughness does not count where they do not shine."""
 
 
-class Reflection(NamedTuple):
+class SampleReflectance(NamedTuple):
     """Nodes of the samples' reflectance."""
 
     samples: Node  # vec3 of shape [batch, height, width]
@@ -180,18 +180,20 @@ class Materials:
         arguments = fragments, merged_scene.faces, clip_positions, *maps, sizes
         return Node("footprints", find_footprints, *arguments, items=items)
 
-    def reflection(self, fragments: Node, pyramids: Node, footprints: Node, items: Callable[[], str]) -> Reflection:
+    def reflectance(
+        self, fragments: Node, pyramids: Node, footprints: Node, items: Callable[[], str]
+    ) -> SampleReflectance:
         """Nodes of the samples' reflectance by albedo and textures."""
         seen = fragments, self.merged_scene.faces, self.vertex_albedo
         samples = Node("reflectance", sample_albedo, *seen, pyramids, footprints, items=items)
-        return Reflection(samples, self.vertex_albedo, pyramids, footprints)
+        return SampleReflectance(samples, self.vertex_albedo, pyramids, footprints)
 
-    def plain_reflection(self, fragments: Node, items: Callable[[], str]) -> Reflection:
+    def untextured_reflectance(self, fragments: Node, items: Callable[[], str]) -> SampleReflectance:
         """The same where no body has a texture."""
         none = [Node(name, None, idle="no body has a texture") for name in ("mip pyramids", "footprints")]
         seen = fragments, self.merged_scene.faces, self.vertex_albedo
         samples = Node("reflectance", interpolate, *seen, items=items, extra_inputs=tuple(none))
-        return Reflection(samples, self.vertex_albedo, *none)
+        return SampleReflectance(samples, self.vertex_albedo, *none)
 
 
 def _arrays_of(replacements: Mapping[str, BodyArrays]) -> Iterator[tuple[str, int, wp.array]]:

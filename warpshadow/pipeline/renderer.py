@@ -316,7 +316,7 @@ class SceneRenderer:
         Differentiable: albedo, textures, view.
         """
         view = self._checked(view)
-        return view.reflection(self._reflecting(albedo, textures)).samples.value(self._views.call(view))
+        return view.reflectance(self._given_materials(albedo, textures)).samples.value(self._views.call(view))
 
     @one_at_a_time
     def seen_texels(self, body: BodyLike) -> np.ndarray:
@@ -332,7 +332,7 @@ class SceneRenderer:
         """
         return self._scene_view.seen_texels(self.scene.body_number(body))
 
-    def _reflecting(
+    def _given_materials(
         self,
         albedo: PerBody[wp.array] | None,
         textures: PerBody[wp.array] | None,
@@ -372,7 +372,7 @@ class SceneRenderer:
         Differentiable: light, albedo, textures, gloss, view.
         """
         view = self._checked(view)
-        return view.image(light, self._reflecting(albedo, textures, gloss)).value(self._views.call(view))
+        return view.image(light, self._given_materials(albedo, textures, gloss)).value(self._views.call(view))
 
     @check.keywords(**dict.fromkeys(("camera", "cameras"), "renderer.with_cameras([camera]).render()"))
     def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:
@@ -447,14 +447,16 @@ class SceneRenderer:
             if geometry.moving is None or set(geometry.moving) & set(catchers):
                 alone = self.merged_scene.part(geometry, catchers)
             geometry = replace(geometry, moving=None)  # else static catchers would be lit in another way than alone
-        materials, without = self._reflecting(albedo, textures, gloss), self._without_others
+        materials, without = self._given_materials(albedo, textures, gloss), self._without_others
         seen = without.view(alone, clip_matrices)
         colors, images = self.scene.per_body(albedo, "albedo"), self.scene.per_body(textures, "textures")
-        reflecting = without._reflecting([colors[body] for body in catchers], [images[body] for body in catchers])
+        catcher_materials = without._given_materials(
+            [colors[body] for body in catchers], [images[body] for body in catchers]
+        )
         view = self.view(geometry, clip_matrices)
         if self._method.lights_samples:  # rays are drawn by the number of a receiver, and so are the same for both
             seen = seen.at_receivers_of(view)
-        received = seen.white(light, reflecting).value(without._views.call(seen))
+        received = seen.white(light, catcher_materials).value(without._views.call(seen))
         photo_input = None if photograph is None else Input("photograph", photograph)
         arguments = photo_input, Input("light without the others", received), self._catches, light, materials
         return view.in_photograph(*arguments).value(self._views.call(view))
@@ -565,7 +567,7 @@ class SceneRenderer:
             hidden = {*decide(view.receivers_node, view.call), view.silhouettes}
         else:
             view = self._views.view(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
-        image = view.preview().image(light, self._reflecting(albedo, textures, gloss))
+        image = view.preview().image(light, self._given_materials(albedo, textures, gloss))
         is_host = self.device.is_cpu or self.clock.waits
         notes = [*receiver_notes(self._given_scene, self._choices), *bounce_notes(self.scene.bounces)]
         return Explanation(

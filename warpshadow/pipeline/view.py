@@ -11,7 +11,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.lighting import BlockerKinds, Light, LitPoints, Method, receiver_text
 from warpshadow.pipeline.node import Call, Input, Node, detached
-from warpshadow.pipeline.reflectance import Materials, Reflection
+from warpshadow.pipeline.reflectance import Materials, SampleReflectance
 from warpshadow.stages.film import average, sample_radiance, sum_radiance
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.project import to_clip
@@ -181,35 +181,35 @@ class View(LitPoints):
     def image(self, light: Light | None, materials: Materials) -> Node:
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""
         item_text, clip, fragments = self._samples, self.clip_positions, self.fragments_node
-        lit, reflected = self.shading(light, materials), self.reflection(materials)
+        shading, reflectance = self.shading(light, materials), self.reflectance(materials)
         if materials.roughness:
-            samples = self._glossy(lit, light, materials, reflected.samples)
-        elif reflected.pyramids.requires_grad and not (lit.requires_grad or clip.requires_grad):
+            samples = self._glossy(shading, light, materials, reflectance.samples)
+        elif reflectance.pyramids.requires_grad and not (shading.requires_grad or clip.requires_grad):
             result = (Node("reflectance", None, idle="found with the radiance"),)
-            reflecting = reflected.vertex_albedo, reflected.pyramids, reflected.footprints
-            arguments = fragments, self.merged_scene.faces, *reflecting, self._white_radiance_of(lit)
+            reflectance_inputs = reflectance.vertex_albedo, reflectance.pyramids, reflectance.footprints
+            arguments = fragments, self.merged_scene.faces, *reflectance_inputs, self._white_radiance_of(shading)
             samples = Node(
                 "radiance", textured_radiance, *arguments, items=item_text, caches=False, extra_inputs=result
             )
         else:
-            samples = self._radiance(lit, reflected.samples)
+            samples = self._radiance(shading, reflectance.samples)
         averaged = self._averaged(samples, is_moving=self._is_moving)
         return averaged
 
-    def reflection(self, materials: Materials) -> Reflection:
+    def reflectance(self, materials: Materials) -> SampleReflectance:
         """Nodes of the samples' reflectance; the scene's own are cached."""
-        wire = functools.partial(self._reflect, materials)
+        wire = functools.partial(self._find_reflectance, materials)
         return self.cached("reflection", None, wire) if materials is self.materials else wire()
 
-    def _reflect(self, materials: Materials) -> Reflection:
+    def _find_reflectance(self, materials: Materials) -> SampleReflectance:
         if not materials.images:
-            return materials.plain_reflection(self.fragments_node, self._samples)
+            return materials.untextured_reflectance(self.fragments_node, self._samples)
         pyramids = materials.pyramids
         if materials.textures is not self.materials.textures:
             pyramids = materials.pyramids_to(functools.partial(self.coarsest_level, materials.sizes))
         arguments = self.fragments_node, self.clip_positions, pyramids, self._samples
         footprints = self.cached("footprints", materials.sizes, functools.partial(materials.footprints, *arguments))
-        return materials.reflection(self.fragments_node, pyramids, footprints, self._samples)
+        return materials.reflectance(self.fragments_node, pyramids, footprints, self._samples)
 
     def coarsest_level(self, sizes: tuple) -> int | None:
         """Coarsest level that cached footprints in textures of some sizes take; on a GPU it waits for that, once."""
@@ -224,17 +224,17 @@ class View(LitPoints):
         has_texture = [size is not None for size in self.materials.sizes]
         if not has_texture[number]:
             raise ValueError(f"body: got {number}, a body without a texture, expected one that has one")
-        reflection = self.reflection(self.materials)
-        textures, footprints = (node.value(self.call) for node in (reflection.pyramids, reflection.footprints))
+        reflectance = self.reflectance(self.materials)
+        textures, footprints = (node.value(self.call) for node in (reflectance.pyramids, reflectance.footprints))
         return seen_texels(textures, footprints)[sum(has_texture[:number])].sum(axis=0)
 
-    def _glossy(self, lit: Node, light: Light | None, materials: Materials, reflected: Node) -> Node:
+    def _glossy(self, shading: Node, light: Light | None, materials: Materials, reflectance: Node) -> Node:
         """Node of the samples where bodies shine: of light in the surface's color, and of light that has its own."""
         from warpshadow.pipeline.gloss import GlossyPoints
 
         points = self.cached("gloss", None, lambda: GlossyPoints(self, self.cameras))
-        colored, white = points.mixed(self, lit, light, materials)
-        parts = self._radiance(colored, reflected), self._radiance(white, self._white_reflectance)
+        colored, white = points.mixed(self, shading, light, materials)
+        parts = self._radiance(colored, reflectance), self._radiance(white, self._white_reflectance)
         return Node("radiance", _sum_moving if self._is_moving else sum_radiance, *parts, caches=False)
 
     @property
@@ -265,17 +265,19 @@ class View(LitPoints):
         """
         from warpshadow.stages.photograph import compose, find_ratio_image, over_nothing
 
-        lit, reflected = self.shading(light, materials), self.reflection(materials)
+        shading, reflectance = self.shading(light, materials), self.reflectance(materials)
 
         def divide(fragments: Fragments, *arguments: wp.array) -> "RatioImage":
             return find_ratio_image(fragments.face_ids, catches, *arguments)
 
-        seen = detached(self.fragments_node), reflected.samples, unshadowed
+        seen = detached(self.fragments_node), reflectance.samples, unshadowed
         division = Node("ratio", divide, *seen, items=self._samples, caches=False)
         drawn, inverse, rest = (Node("", operator.itemgetter(part), division, caches=False) for part in range(3))
         is_moving = self.clip_positions.requires_grad
-        parts = self._glossy(lit, light, materials, drawn) if materials.roughness else self._radiance(lit, drawn)
-        films = [self._averaged(item, is_moving=is_moving) for item in (parts, self._radiance(lit, inverse))]
+        parts = (
+            self._glossy(shading, light, materials, drawn) if materials.roughness else self._radiance(shading, drawn)
+        )
+        films = [self._averaged(item, is_moving=is_moving) for item in (parts, self._radiance(shading, inverse))]
         films.append(self._averaged(rest))
         if photograph is None:
             return Node("photograph", over_nothing, *films, caches=False)
@@ -288,21 +290,21 @@ class View(LitPoints):
         """
         return self._white_radiance_of(self.shading(light, materials))
 
-    def white_image(self, lit: Node) -> Node:
+    def white_image(self, shading: Node) -> Node:
         """The image if every surface were white, of light on the receivers; vec4 of shape [batch, height, width]."""
-        return self._averaged(self._white_radiance_of(lit))
+        return self._averaged(self._white_radiance_of(shading))
 
     def at_receivers_of(self, other: "View") -> "View":
         """The view with the receivers of another view by the same cameras, among this view's blockers."""
         return other.cached("in another scene", self, lambda: self.with_receivers(other.receivers_node))
 
-    def _radiance(self, lit: Node, reflected: Node) -> Node:
+    def _radiance(self, shading: Node, reflectance: Node) -> Node:
         """Node of the samples."""
         samples_of = functools.partial(Node, "radiance", items=self._samples, caches=False)
         if self.clip_positions.requires_grad:
             moving = self.silhouettes, self.clip_positions
-            return samples_of(_moving_radiance, self.receivers_node, lit, reflected, *moving)
-        return samples_of(_radiance, self.receivers_node, lit, reflected)
+            return samples_of(_moving_radiance, self.receivers_node, shading, reflectance, *moving)
+        return samples_of(_radiance, self.receivers_node, shading, reflectance)
 
     def _averaged(self, samples: Node, *, is_moving: bool = False) -> Node:
         """Node of the pixels, from samples, or from samples and edge colors of moving surfaces."""
@@ -313,9 +315,9 @@ class View(LitPoints):
             return Node("averaging", _same, smoothed, idle="a pixel has one sample", caches=False)
         return samples_of("averaging", average, smoothed, self._supersampling)
 
-    def _white_radiance_of(self, lit: Node) -> Node:
+    def _white_radiance_of(self, shading: Node) -> Node:
         """Node of the samples if every surface were white; cached with the last shading."""
-        return self.cached("white", lit, lambda: Node("", _white_radiance, self.receivers_node, lit))
+        return self.cached("white", shading, lambda: Node("", _white_radiance, self.receivers_node, shading))
 
     # ------------------------------------------------------------------------------------------ in words
 
@@ -368,16 +370,16 @@ def _same(value: object) -> object:
     return value
 
 
-def _radiance(receivers: Receivers, lit: wp.array, reflected: wp.array) -> wp.array:
-    return sample_radiance(receivers.fragments, receivers.faces, lit, reflected)
+def _radiance(receivers: Receivers, shading: wp.array, reflectance: wp.array) -> wp.array:
+    return sample_radiance(receivers.fragments, receivers.faces, shading, reflectance)
 
 
 def _moving_radiance(
-    receivers: Receivers, lit: wp.array, reflected: wp.array, silhouettes: Silhouettes, clip_positions: wp.array
+    receivers: Receivers, shading: wp.array, reflectance: wp.array, silhouettes: Silhouettes, clip_positions: wp.array
 ) -> tuple[wp.array, wp.array]:
     """Samples, and the colors at edges."""
-    seen = receivers.fragments, receivers.faces, lit, reflected
-    return moving_radiance(*seen, silhouettes, clip_positions, receivers.of_vertices)
+    samples = receivers.fragments, receivers.faces, shading, reflectance
+    return moving_radiance(*samples, silhouettes, clip_positions, receivers.of_vertices)
 
 
 def _sum_moving(first: tuple[wp.array, wp.array], second: tuple[wp.array, wp.array]) -> tuple[wp.array, wp.array]:
@@ -391,7 +393,7 @@ def _smooth_moving(radiance: tuple[wp.array, wp.array], silhouettes: Silhouettes
     return smooth_silhouettes(samples, silhouettes, clip_positions, edge_colors)
 
 
-def _white_radiance(receivers: Receivers, lit: wp.array) -> wp.array:
+def _white_radiance(receivers: Receivers, shading: wp.array) -> wp.array:
     _, height, width = receivers.fragments.face_ids.shape
-    white = wp.full((1, height, width), wp.vec3(1.0), dtype=wp.vec3, device=lit.device)
-    return sample_radiance(receivers.fragments, receivers.faces, lit, white)
+    white = wp.full((1, height, width), wp.vec3(1.0), dtype=wp.vec3, device=shading.device)
+    return sample_radiance(receivers.fragments, receivers.faces, shading, white)

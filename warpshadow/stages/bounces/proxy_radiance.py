@@ -93,8 +93,8 @@ def find_proxy_radiance(
     It costs nodes × directions × patches of a node, for any number of receivers.
 
     Args:
-        radiosity: Of patches: white under a radiance of 1 has 1, vec3 of shape [batch, patch]. shown: g, projected area
-            of each patch towards each cell, float32 of shape [batch, patch, direction], from
+        radiosity: Of patches: white under a radiance of 1 has 1, vec3 of shape [batch, patch].
+        projected_areas: g of each patch towards each cell, float32 of shape [batch, patch, direction], from
             :func:`.projected_areas.find_projected_areas`.
         areas: Of patches [scene units²], not negative, float32 of shape [patch].
         starts, numbers: Patches of each node, from :func:`patches_of_clusters`.
