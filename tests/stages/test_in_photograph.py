@@ -103,7 +103,7 @@ def test_the_ratio_is_that_of_the_light_where_there_is_light_and_1_where_there_i
     unshadowed = np.stack([light] * 3 + [np.ones_like(light)], axis=-1)
     _, parts = divided(np.ones((1, 2, 4), int), [np.zeros((1, 2, 4, 3)), unshadowed], device)
     shadowed = 0.25 * light
-    ratio = (parts.inverse.numpy()[..., 0] * shadowed + parts.rest.numpy()[..., 0]).ravel()
+    ratio = (parts.inverse_light.numpy()[..., 0] * shadowed + parts.base_factor.numpy()[..., 0]).ravel()
     assert ratio[:4] == pytest.approx(0.25, rel=0.005)
     assert (np.diff(ratio[2:7]) > 0).all() and ratio[5:7] == pytest.approx(1, abs=1e-3)
     assert ratio[7] == pytest.approx(1)  # bands of light ring below 0
@@ -112,7 +112,7 @@ def test_the_ratio_is_that_of_the_light_where_there_is_light_and_1_where_there_i
 def test_without_light_the_photograph_stays(device):
     dark = np.concatenate([np.zeros((1, 4, 6, 3)), np.ones((1, 4, 6, 1))], axis=-1)
     _, parts = divided(np.ones((1, 4, 6), int), [np.zeros((1, 4, 6, 3)), dark], device)
-    assert not parts.inverse.numpy().any() and (parts.rest.numpy()[..., :3] == 1).all()
+    assert not parts.inverse_light.numpy().any() and (parts.base_factor.numpy()[..., :3] == 1).all()
 
 
 def test_a_photograph_is_multiplied_and_covered(device):

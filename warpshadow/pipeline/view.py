@@ -270,15 +270,19 @@ class View(LitPoints):
         def divide(fragments: Fragments, *arguments: wp.array) -> "RatioImage":
             return find_ratio_image(fragments.face_ids, catches, *arguments)
 
-        seen = detached(self.fragments_node), reflectance.samples, unshadowed
-        division = Node("ratio", divide, *seen, items=self._samples, caches=False)
-        drawn, inverse, rest = (Node("", operator.itemgetter(part), division, caches=False) for part in range(3))
+        inputs = detached(self.fragments_node), reflectance.samples, unshadowed
+        ratio = Node("ratio", divide, *inputs, items=self._samples, caches=False)
+        body_light, inverse_light, base_factor = (
+            Node("", operator.itemgetter(part), ratio, caches=False) for part in range(3)
+        )
         is_moving = self.clip_positions.requires_grad
         parts = (
-            self._glossy(shading, light, materials, drawn) if materials.roughness else self._radiance(shading, drawn)
+            self._glossy(shading, light, materials, body_light)
+            if materials.roughness
+            else self._radiance(shading, body_light)
         )
-        films = [self._averaged(item, is_moving=is_moving) for item in (parts, self._radiance(shading, inverse))]
-        films.append(self._averaged(rest))
+        films = [self._averaged(item, is_moving=is_moving) for item in (parts, self._radiance(shading, inverse_light))]
+        films.append(self._averaged(base_factor))
         if photograph is None:
             return Node("photograph", over_nothing, *films, caches=False)
         return Node("photograph", compose, photograph, *films, caches=False)

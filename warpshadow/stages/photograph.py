@@ -26,7 +26,7 @@ _FLOOR = 1.0 / 256.0
 
 
 @wp.func
-def _inverse(light: float, floor: float):
+def _regularized_inverse(light: float, floor: float):
     """r, from S₀ and ε."""
     if floor <= 0.0:
         return 0.0
@@ -43,38 +43,38 @@ def _divide(
     unshadowed: wp.array2d(dtype=wp.vec4),
     floors: wp.array(dtype=float),
     # out
-    drawn: wp.array2d(dtype=wp.vec3),
-    inverse: wp.array2d(dtype=wp.vec3),
-    rest: wp.array2d(dtype=wp.vec4),
+    body_light: wp.array2d(dtype=wp.vec3),
+    inverse_light: wp.array2d(dtype=wp.vec3),
+    base_factor: wp.array2d(dtype=wp.vec4),
 ):
     """A thread owns a sample."""
     batch, sample = wp.tid()
     face = face_ids[instance_in(batch, face_ids.shape[0]), sample]
     if face < 0:
-        drawn[batch, sample] = wp.vec3()
-        inverse[batch, sample] = wp.vec3()
-        rest[batch, sample] = wp.vec4(1.0, 1.0, 1.0, 1.0)
+        body_light[batch, sample] = wp.vec3()
+        inverse_light[batch, sample] = wp.vec3()
+        base_factor[batch, sample] = wp.vec4(1.0, 1.0, 1.0, 1.0)
     elif catches[face]:
         light = unshadowed[instance_in(batch, unshadowed.shape[0]), sample]
         floor = floors[instance_in(batch, floors.shape[0])]
-        a = _inverse(light[0], floor)
-        b = _inverse(light[1], floor)
-        c = _inverse(light[2], floor)
-        drawn[batch, sample] = wp.vec3()
-        inverse[batch, sample] = wp.vec3(a, b, c)
-        rest[batch, sample] = wp.vec4(1.0 - light[0] * a, 1.0 - light[1] * b, 1.0 - light[2] * c, 0.0)
+        a = _regularized_inverse(light[0], floor)
+        b = _regularized_inverse(light[1], floor)
+        c = _regularized_inverse(light[2], floor)
+        body_light[batch, sample] = wp.vec3()
+        inverse_light[batch, sample] = wp.vec3(a, b, c)
+        base_factor[batch, sample] = wp.vec4(1.0 - light[0] * a, 1.0 - light[1] * b, 1.0 - light[2] * c, 0.0)
     else:
-        drawn[batch, sample] = reflected[instance_in(batch, reflected.shape[0]), sample]
-        inverse[batch, sample] = wp.vec3()
-        rest[batch, sample] = wp.vec4()
+        body_light[batch, sample] = reflected[instance_in(batch, reflected.shape[0]), sample]
+        inverse_light[batch, sample] = wp.vec3()
+        base_factor[batch, sample] = wp.vec4()
 
 
 class RatioImage(NamedTuple):
     """Light that samples reflect, vec3 of shape [batch, height, width], and the photograph beside that."""
 
-    drawn: wp.array  # where they see a body that is drawn
-    inverse: wp.array  # r where they see a catcher, 0 elsewhere
-    rest: wp.array  # 1 − S₀ r where they see a catcher, 1 where there is nothing; vec4
+    body_light: wp.array  # where they see a body that is drawn
+    inverse_light: wp.array  # r where they see a catcher, 0 elsewhere
+    base_factor: wp.array  # 1 − S₀ r where they see a catcher, 1 where there is nothing; vec4
 
 
 def find_ratio_image(face_ids: wp.array, catches: wp.array, reflected: wp.array, unshadowed: wp.array) -> RatioImage:
@@ -106,18 +106,18 @@ def find_ratio_image(face_ids: wp.array, catches: wp.array, reflected: wp.array,
 def _compose(
     # in
     photograph: wp.array3d(dtype=wp.vec3),
-    drawn: wp.array3d(dtype=wp.vec4),
-    caught: wp.array3d(dtype=wp.vec4),
-    rest: wp.array3d(dtype=wp.vec4),
+    body_light: wp.array3d(dtype=wp.vec4),
+    relit_factor: wp.array3d(dtype=wp.vec4),
+    base_factor: wp.array3d(dtype=wp.vec4),
     # out
     composed: wp.array3d(dtype=wp.vec3),
 ):
     """A thread owns a pixel."""
     batch, row, column = wp.tid()
     consumed = photograph[instance_in(batch, photograph.shape[0]), row, column]
-    color = drawn[instance_in(batch, drawn.shape[0]), row, column]
-    a = caught[instance_in(batch, caught.shape[0]), row, column]
-    b = rest[instance_in(batch, rest.shape[0]), row, column]
+    color = body_light[instance_in(batch, body_light.shape[0]), row, column]
+    a = relit_factor[instance_in(batch, relit_factor.shape[0]), row, column]
+    b = base_factor[instance_in(batch, base_factor.shape[0]), row, column]
     factor = wp.vec3(a[0] + b[0], a[1] + b[1], a[2] + b[2])
     composed[batch, row, column] = wp.vec3(color[0], color[1], color[2]) + wp.cw_mul(consumed, factor)
 
@@ -125,49 +125,51 @@ def _compose(
 @wp.kernel(enable_backward=False)
 def _cover(
     # in
-    drawn: wp.array3d(dtype=wp.vec4),
-    caught: wp.array3d(dtype=wp.vec4),
-    rest: wp.array3d(dtype=wp.vec4),
+    body_light: wp.array3d(dtype=wp.vec4),
+    relit_factor: wp.array3d(dtype=wp.vec4),
+    base_factor: wp.array3d(dtype=wp.vec4),
     # out
     covered: wp.array3d(dtype=wp.vec4),
 ):
     """A thread owns a pixel."""
     batch, row, column = wp.tid()
-    color = drawn[instance_in(batch, drawn.shape[0]), row, column]
-    a = caught[instance_in(batch, caught.shape[0]), row, column]
-    b = rest[instance_in(batch, rest.shape[0]), row, column]
+    color = body_light[instance_in(batch, body_light.shape[0]), row, column]
+    a = relit_factor[instance_in(batch, relit_factor.shape[0]), row, column]
+    b = base_factor[instance_in(batch, base_factor.shape[0]), row, column]
     factor = (a[0] + b[0] + a[1] + b[1] + a[2] + b[2]) / 3.0
     covered[batch, row, column] = wp.vec4(color[0], color[1], color[2], wp.clamp(1.0 - factor, 0.0, 1.0))
 
 
-def over_nothing(drawn: wp.array, caught: wp.array, rest: wp.array) -> wp.array:
+def over_nothing(body_light: wp.array, relit_factor: wp.array, base_factor: wp.array) -> wp.array:
     """Draw bodies over nothing; their shadows are coverage, the mean of the share they take of a white photograph.
 
     Args:
-        drawn, caught, rest: As for :func:`compose`.
+        body_light, relit_factor, base_factor: As for :func:`compose`.
     Returns:
         Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]. Not differentiable.
     """
-    count = common_batch({"drawn": drawn, "caught": caught, "rest": rest})
-    covered = empty((count, *drawn.shape[1:]), dtype=wp.vec4, device=drawn.device)
-    launch(_cover, covered.shape, inputs=[drawn, caught, rest], outputs=[covered])
+    count = common_batch({"body_light": body_light, "relit_factor": relit_factor, "base_factor": base_factor})
+    covered = empty((count, *body_light.shape[1:]), dtype=wp.vec4, device=body_light.device)
+    launch(_cover, covered.shape, inputs=[body_light, relit_factor, base_factor], outputs=[covered])
     return covered
 
 
-def compose(photograph: wp.array, drawn: wp.array, caught: wp.array, rest: wp.array) -> wp.array:
+def compose(photograph: wp.array, body_light: wp.array, relit_factor: wp.array, base_factor: wp.array) -> wp.array:
     """Multiply a photograph by its ratio of light, and put bodies into it.
 
     Args:
         photograph: Linear RGB, vec3 of shape [batch, height, width].
-        drawn: The film of the reflected light, vec4 of shape [batch, height, width].
-        caught: The film of ``inverse`` times the light at the samples, likewise.
-        rest: That of ``rest``, likewise. Any batch may be 1 and then serves every instance.
+        body_light: The film of the reflected light, vec4 of shape [batch, height, width].
+        relit_factor: The film of ``inverse_light`` times the light at the samples, likewise.
+        base_factor: That of ``base_factor``, likewise. Any batch may be 1 and then serves every instance.
     Returns:
         Linear RGB, vec3 of shape [batch, height, width].
     Differentiable: all.
     """
-    count = common_batch({"photograph": photograph, "drawn": drawn, "caught": caught, "rest": rest})
-    check.shape("photograph", photograph.shape, ("batch", *drawn.shape[1:]))
-    composed = empty((count, *drawn.shape[1:]), dtype=wp.vec3, device=drawn.device)
-    launch(_compose, composed.shape, inputs=[photograph, drawn, caught, rest], outputs=[composed])
+    count = common_batch(
+        {"photograph": photograph, "body_light": body_light, "relit_factor": relit_factor, "base_factor": base_factor}
+    )
+    check.shape("photograph", photograph.shape, ("batch", *body_light.shape[1:]))
+    composed = empty((count, *body_light.shape[1:]), dtype=wp.vec3, device=body_light.device)
+    launch(_compose, composed.shape, inputs=[photograph, body_light, relit_factor, base_factor], outputs=[composed])
     return composed
