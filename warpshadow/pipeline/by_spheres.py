@@ -11,7 +11,7 @@ import warp as wp
 
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.progress import progress_bar
-from warpshadow.pipeline.convex import SceneParts
+from warpshadow.pipeline.convex import SceneConvexParts
 from warpshadow.pipeline.geometry import Geometry
 from warpshadow.pipeline.groups import Blockers, Group, GroupVisibility, find_groups
 from warpshadow.pipeline.lighting import (
@@ -61,9 +61,9 @@ class SphereMethod(Method):
         return ScenePlanes(self.merged_scene)
 
     @functools.cached_property
-    def parts(self) -> SceneParts:
+    def parts(self) -> SceneConvexParts:
         """The bodies that consist of convex parts."""
-        return SceneParts(self.merged_scene)
+        return SceneConvexParts(self.merged_scene)
 
     @functools.cached_property
     def self_visibility(self) -> SelfVisibility:
@@ -83,9 +83,9 @@ class SphereMethod(Method):
         count = len(self.merged_scene.scene.bodies)
         why = tuple(self.self_visibility.why_spheres(body, geometry) for body in range(count))
         traced = tuple(body for body, reason in enumerate(why) if not reason)
-        return BlockerKinds(traced, rotations, why, planes, self.convex_among(traced))
+        return BlockerKinds(traced, rotations, why, planes, self.convex_blockers(traced))
 
-    def convex_among(self, traced: tuple[int, ...]) -> tuple[int, ...]:
+    def convex_blockers(self, traced: tuple[int, ...]) -> tuple[int, ...]:
         """Bodies that block the light of others as convex parts, of some that block their own light as rays found."""
         return ()
 
@@ -360,14 +360,14 @@ def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
 def _self_visibility(method: SphereMethod, points: LitPoints, projected_light: Any) -> Node:
     """Node of the receivers' self-visibility lookups, by body."""
     bodies, rotations = points.blocker_kinds.traced, points.blocker_kinds.rotations
-    named = [body for body in bodies if not method.merged_scene.is_flat[body]]
-    if not named or rotations is None:
+    curved_bodies = [body for body in bodies if not method.merged_scene.is_flat[body]]
+    if not curved_bodies or rotations is None:
         return Node("self-shadows", None, idle=lambda: _why_no_self_visibility(method, points))
 
     def state() -> str:
         missing = method.self_visibility.missing(bodies)
         known = f"{missing} to be traced, or read from the cache" if missing else "traced once, cached"
-        return f"{len(named)} {'body' if len(named) == 1 else 'bodies'}: {known}"
+        return f"{len(curved_bodies)} {'body' if len(curved_bodies) == 1 else 'bodies'}: {known}"
 
     return Node("self-shadows", functools.partial(method.self_lookups, bodies), rotations, projected_light, items=state)
 

@@ -18,7 +18,7 @@ from warpshadow.stages.convex.prepared import ConvexBlockers, ConvexBody, Placed
 from warpshadow.stages.convex.transmittance import transmittance_past_parts
 
 
-class PartsOfGroup(NamedTuple):
+class GroupConvexParts(NamedTuple):
     """Convex parts around some receivers."""
 
     blockers: ConvexBlockers
@@ -34,7 +34,7 @@ class PartsOfGroup(NamedTuple):
         )
 
 
-class SceneParts:
+class SceneConvexParts:
     """The bodies of a scene that consist of convex parts.
 
     Args:
@@ -43,7 +43,7 @@ class SceneParts:
 
     def __init__(self, merged_scene: MergedScene):
         self._merged_scene = merged_scene
-        self._among: dict[tuple[tuple[int, ...], tuple[int, ...]], ConvexBlockers] = {}
+        self._blockers: dict[tuple[tuple[int, ...], tuple[int, ...]], ConvexBlockers] = {}
 
     @functools.cached_property
     def parts(self) -> dict[int, list[ConvexPart]]:
@@ -54,15 +54,17 @@ class SceneParts:
             if body.blocks_as_parts and not self._merged_scene.is_flat[number]
         }
 
-    def among(self, bodies: tuple[int, ...], blocking: tuple[int, ...]) -> ConvexBlockers:
-        """Some of these bodies, of which some block light."""
-        key = bodies, blocking
-        if key not in self._among:
+    def blockers(self, bodies: tuple[int, ...], blocking_bodies: tuple[int, ...]) -> ConvexBlockers:
+        """Convex blockers of some of these bodies; ``blocking_bodies`` cast shadows."""
+        key = bodies, blocking_bodies
+        if key not in self._blockers:
             starts, device = self._merged_scene.first_vertex, self._merged_scene.device
-            chosen = [ConvexBody(self.parts[number], int(starts[number]), number in blocking) for number in bodies]
-            self._among[key] = ConvexBlockers.of(chosen, int(starts[-1]), device=device)
-        return self._among[key]
+            chosen = [
+                ConvexBody(self.parts[number], int(starts[number]), number in blocking_bodies) for number in bodies
+            ]
+            self._blockers[key] = ConvexBlockers.of(chosen, int(starts[-1]), device=device)
+        return self._blockers[key]
 
     def placed(self, bodies: tuple[int, ...], positions: wp.array) -> PlacedParts:
         """Where parts of some bodies are, of vertices [batch, vertex]. Differentiable in them."""
-        return self.among(bodies, bodies).placed(positions)
+        return self.blockers(bodies, bodies).placed(positions)

@@ -14,7 +14,7 @@ from warpshadow.assets.harmonic_light import as_light
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.pipeline.by_spheres import PartwiseShading, SphereMethod
-from warpshadow.pipeline.convex import PartsOfGroup
+from warpshadow.pipeline.convex import GroupConvexParts
 from warpshadow.pipeline.groups import Group, GroupVisibility
 from warpshadow.pipeline.lighting import (
     LARGEST_COEFFICIENT,
@@ -126,8 +126,8 @@ class Directional(SphereMethod):
         # cached cells have light although their middles are below the horizon
         facing = normals if cached_rows is None else None
         factors = [transmittance_self]
-        if points.size and group.parts_around is not None:
-            factors.append(self._past_parts(group.parts_around, points, facing, projected_light))
+        if points.size and group.convex_parts_around is not None:
+            factors.append(self._past_parts(group.convex_parts_around, points, facing, projected_light))
         if points.size and radii.shape[1]:
             factors.append(self._past_spheres(group, facing, projected_light))
         known = [factor for factor in factors if factor is not None]
@@ -137,7 +137,7 @@ class Directional(SphereMethod):
         return GroupVisibility(functools.reduce(multiply_transmittances, known), transmittance_self)
 
     def _past_parts(
-        self, parts: PartsOfGroup, points: wp.array, facing: wp.array | None, projected_light: ProjectedCells
+        self, parts: GroupConvexParts, points: wp.array, facing: wp.array | None, projected_light: ProjectedCells
     ) -> wp.array:
         """Transmittance past convex parts."""
         transmittance = parts.transmittance(points, facing, projected_light.directions)
@@ -167,7 +167,7 @@ class Directional(SphereMethod):
         """Bodies of the scene that block light as planes."""
         return blocking_planes(self.merged_scene.scene)
 
-    def convex_among(self, traced: tuple[int, ...]) -> tuple[int, ...]:
+    def convex_blockers(self, traced: tuple[int, ...]) -> tuple[int, ...]:
         """Bodies that consist of convex parts."""
         return tuple(body for body in traced if body in self.parts.parts)
 
@@ -179,7 +179,7 @@ class Directional(SphereMethod):
         if planes is None or transmittance_spheres is None or not group.points.size:
             return visibility
         facing = group.normals if group.cached_rows is None else None
-        points, fronts = group.among(planes.frames, planes.planes, planes.skip)
+        points, fronts = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
         cover = functools.partial(
             plane_coverage, points, planes.frames, planes.planes, facing=facing, fronts=fronts, skip=planes.skip
         )
@@ -286,7 +286,7 @@ class Directional(SphereMethod):
         """Light of the sharpest cells, over all light if nothing blocked any."""
         directions, light, scale, power = self._sharpest
         points, normals, centers, radii = group[:4]
-        if not radii.shape[1] and group.planes is None and group.parts_around is None:
+        if not radii.shape[1] and group.planes is None and group.convex_parts_around is None:
             return None
         if radii.shape[1]:
             transmittance = directional.transmittance(
@@ -295,12 +295,12 @@ class Directional(SphereMethod):
         else:
             transmittance = wp.full((*points.shape, CHUNK), 1.0, dtype=wp.float32, device=points.device)
         radius = scale * cell_radius(CHUNK)
-        if group.parts_around is not None:
-            past_parts = group.parts_around.transmittance(points, normals, directions, radius)
+        if group.convex_parts_around is not None:
+            past_parts = group.convex_parts_around.transmittance(points, normals, directions, radius)
             transmittance = multiply_transmittances(transmittance, past_parts)
         if group.planes is not None:
             planes = group.planes
-            lifted, fronts = group.among(planes.frames, planes.planes, planes.skip)
+            lifted, fronts = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
             arguments = lifted, planes.frames, planes.planes, directions
             covered = plane_coverage(*arguments, radius=radius, facing=normals, fronts=fronts, skip=planes.skip)
             transmittance = transmittance if covered is None else transmittance_past_planes(transmittance, covered)

@@ -11,10 +11,10 @@ import warp as wp
 from warpshadow.device.batch import common_batch, cut, expand
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import varies
-from warpshadow.pipeline.convex import PartsOfGroup, SceneParts
+from warpshadow.pipeline.convex import GroupConvexParts, SceneConvexParts
 from warpshadow.pipeline.lighting import BlockerKinds, LitPoints
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.planes import PlanesOfGroup, ScenePlanes
+from warpshadow.pipeline.planes import GroupPlanes, ScenePlanes
 from warpshadow.pipeline.self_visibility import SelfVisibility, SelfVisibilityLobes, SelfVisibilityLookup
 from warpshadow.stages.cached_cells import CachedRows
 from warpshadow.stages.convex.prepared import PlacedParts
@@ -27,7 +27,7 @@ from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 PART_SIZE = 1 << 13  # receivers of each instance that are lit at once where no gradient is asked for
 
 
-def solid_bodies(merged_scene: MergedScene) -> list[int]:
+def nonplanar_bodies(merged_scene: MergedScene) -> list[int]:
     """Bodies that spheres represent in bounced light: all that are not flat."""
     return [body for body in range(len(merged_scene.scene.bodies)) if not merged_scene.is_flat[body]]
 
@@ -45,15 +45,17 @@ class Group(NamedTuple):
     self_lookup: SelfVisibilityLookup | SelfVisibilityLobes | None = (
         None  # by rays; None where there is none, or its spheres block
     )
-    planes: PlanesOfGroup | None = None  # bodies that block as planes; None without any
-    parts_around: PartsOfGroup | None = None  # bodies that block as convex parts; None without any
+    planes: GroupPlanes | None = None  # bodies that block as planes; None without any
+    convex_parts_around: GroupConvexParts | None = None  # bodies that block as convex parts; None without any
     nearest_blockers: NearestBlockers | None = None  # None where they are not sources of light
     corners: wp.array | None = None  # of the body, vec3 of shape [batch, corner]; None where it is not known
     skip: tuple[int, int] = (0, 0)  # spheres that do not block: the first, and the one after the last
     clusters: ClusterTree | None = None  # of the spheres, where they are found already
 
-    def among(self, frames: wp.array, planes: PlaneBlockers, skip: int | None) -> tuple[wp.array, wp.array]:
-        """Where they are lit among planes, off the planes they lie in, and the part of each front that they see."""
+    def lifted_points_and_fronts(
+        self, frames: wp.array, planes: PlaneBlockers, skip: int | None
+    ) -> tuple[wp.array, wp.array]:
+        """Positions, lifted off planes that they lie in, and the part of each front that the receivers see."""
         fronts = find_fronts(self.points, self.normals, self.corners, self.nearest_blockers, frames, planes)
         return lifted_points(self.points, fronts, frames, planes, skip), fronts
 
@@ -65,7 +67,7 @@ class Group(NamedTuple):
         self_lookup, planes, clusters = self.self_lookup, self.planes, self.clusters
         turns = None if self_lookup is None else self_lookup.turned
         frames = None if planes is None else planes.frames
-        solids = None if self.parts_around is None else self.parts_around.placed.corners
+        solids = None if self.convex_parts_around is None else self.convex_parts_around.placed.corners
         arguments = points, normals, centers, radii = self[:4]
         if radii.shape[1] or any(array is not None for array in (turns, frames, solids)):
             arrays = {"points": points, "centers": centers, "radii": radii, "rotations": turns, "planes": frames}
@@ -107,7 +109,7 @@ class Blockers(NamedTuple):
     merged_scene: MergedScene
     blocker_kinds: BlockerKinds
     planes: ScenePlanes
-    parts: SceneParts
+    parts: SceneConvexParts
     self_visibility: SelfVisibility
     merging: float
     positions: wp.array  # of all vertices, vec3 [batch, vertex]
@@ -115,7 +117,7 @@ class Blockers(NamedTuple):
     frames: wp.array | None  # where bodies are that block as planes, vec3 [batch, 3 · plane]; None without any
     placed: PlacedParts | None  # where convex parts are; None without any
 
-    def solid(self, bodies: Iterable[int]) -> list[int]:
+    def sphere_blockers(self, bodies: Iterable[int]) -> list[int]:
         """Bodies among some that block light by their spheres."""
         return [
             body for body in bodies if body not in self.blocker_kinds.planes and body not in self.blocker_kinds.convex
@@ -123,35 +125,35 @@ class Blockers(NamedTuple):
 
     def spheres_of(self, bodies: Iterable[int]) -> tuple[wp.array, wp.array]:
         """Centers and radii of the spheres of bodies, of those that block by them."""
-        return self.merged_scene.spheres_of(self.solid(bodies), self.spheres)
+        return self.merged_scene.spheres_of(self.sphere_blockers(bodies), self.spheres)
 
     @property
     def bodies(self) -> range:
         """All bodies."""
         return range(len(self.merged_scene.scene.bodies))
 
-    def planes_around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> PlanesOfGroup | None:
+    def planes_around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> GroupPlanes | None:
         """Flat bodies around receivers of one body: all that block, or some."""
         planes = self.blocker_kinds.planes
-        named = planes if of_bodies is None else tuple(number for number in planes if number in of_bodies)
-        if self.frames is None or not set(named) - {body}:
+        chosen = planes if of_bodies is None else tuple(number for number in planes if number in of_bodies)
+        if self.frames is None or not set(chosen) - {body}:
             return None
         skip = planes.index(body) if body in planes else None
-        return PlanesOfGroup(self.planes.among(planes, named), self.frames, skip)
+        return GroupPlanes(self.planes.blockers(planes, chosen), self.frames, skip)
 
-    def parts_around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> PartsOfGroup | None:
+    def convex_parts_around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> GroupConvexParts | None:
         """Convex parts of bodies around receivers of one body: all that block, or some."""
         bodies = self.blocker_kinds.convex
-        named = bodies if of_bodies is None else tuple(number for number in bodies if number in of_bodies)
-        if self.placed is None or not set(named) - {body}:
+        chosen = bodies if of_bodies is None else tuple(number for number in bodies if number in of_bodies)
+        if self.placed is None or not set(chosen) - {body}:
             return None
         skip = bodies.index(body) if body in bodies else None
-        return PartsOfGroup(self.parts.among(bodies, named), self.placed, skip)
+        return GroupConvexParts(self.parts.blockers(bodies, chosen), self.placed, skip)
 
     def around_plane(self, points: wp.array, normals: wp.array, body: int) -> Group:
         """The group of points of a flat body."""
-        planes, parts = self.planes_around(body), self.parts_around()
-        return Group(points, normals, *self.spheres_of(self.bodies), planes=planes, parts_around=parts)
+        planes, parts = self.planes_around(body), self.convex_parts_around()
+        return Group(points, normals, *self.spheres_of(self.bodies), planes=planes, convex_parts_around=parts)
 
 
 def find_groups(
@@ -177,8 +179,8 @@ def find_groups(
         return groups
     assert static_normals is not None
     moving, facing = points.static.moving, points.static.receivers(receivers.on_static, static_normals)
-    planes, parts = blockers.planes_around(of_bodies=moving), blockers.parts_around(of_bodies=moving)
-    group = Group(*facing, *blockers.spheres_of(moving), cached_rows, planes=planes, parts_around=parts)
+    planes, parts = blockers.planes_around(of_bodies=moving), blockers.convex_parts_around(of_bodies=moving)
+    group = Group(*facing, *blockers.spheres_of(moving), cached_rows, planes=planes, convex_parts_around=parts)
     return [group, *groups] if receivers.points.shape[1] else [group]
 
 
@@ -186,8 +188,8 @@ def _groups_that_move(
     receivers: Receivers, blockers: Blockers, self_lookups: dict[int, Any], blocker_of_point: np.ndarray | None
 ) -> Iterator[Group]:
     """Groups of receivers that may move."""
-    solid = blockers.solid(blockers.bodies)
-    spheres, none = blockers.spheres_of(solid), blockers.spheres_of([])
+    sphere_bodies = blockers.sphere_blockers(blockers.bodies)
+    spheres, none = blockers.spheres_of(sphere_bodies), blockers.spheres_of([])
     corners = blockers.planes.corners(blockers.positions) if blockers.planes.numbers and receivers.spans else None
     clusters, nearest_blockers = None, _nearest_blockers(blocker_of_point, blockers)
     if not receivers.spans:
@@ -199,11 +201,11 @@ def _groups_that_move(
         if span.first < receivers.vertices.size and len(blockers.positions) == 1:  # all cameras see the same vertices
             facing = receivers.points[:1], receivers.normals[:1]
         is_traced = span.body in blockers.blocker_kinds.traced
-        skip = blockers.merged_scene.spheres_among(solid, span.body) if is_traced else (0, 0)
+        skip = blockers.merged_scene.spheres_among(sphere_bodies, span.body) if is_traced else (0, 0)
         others = none if skip == (0, spheres[1].shape[1]) else spheres
         points, normals = (cut(array, span.first, span.end) for array in facing)
-        planes, parts = blockers.planes_around(span.body), blockers.parts_around(span.body)
-        group = Group(points, normals, *others, planes=planes, parts_around=parts)
+        planes, parts = blockers.planes_around(span.body), blockers.convex_parts_around(span.body)
+        group = Group(points, normals, *others, planes=planes, convex_parts_around=parts)
         if others is spheres:
             clusters = clusters or find_clusters(*spheres, blockers.merging)
             group = group._replace(skip=skip, clusters=clusters)
@@ -223,5 +225,5 @@ def _nearest_blockers(numbers: np.ndarray | None, blockers: Blockers) -> Nearest
     if numbers is None:
         return None
     merged_scene = blockers.merged_scene
-    own = merged_scene.spheres_of(solid_bodies(merged_scene), blockers.spheres)
+    own = merged_scene.spheres_of(nonplanar_bodies(merged_scene), blockers.spheres)
     return NearestBlockers(*own, constant(numbers, wp.int32, merged_scene.device))

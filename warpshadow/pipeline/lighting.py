@@ -230,8 +230,8 @@ class Method:
         bodies = np.arange(len(self.merged_scene.scene.bodies))
         if self.merged_scene.scene.bounces:
             return bodies
-        named = (*blocker_kinds.traced, *blocker_kinds.planes, *np.flatnonzero(self.merged_scene.is_glossy))
-        return np.where(np.isin(bodies, named), bodies, -1) if named else None
+        separate = (*blocker_kinds.traced, *blocker_kinds.planes, *np.flatnonzero(self.merged_scene.is_glossy))
+        return np.where(np.isin(bodies, separate), bodies, -1) if separate else None
 
     def numbering(self, blocker_kinds: BlockerKinds, has_backs: bool) -> Numbering:
         """Of all vertices, or of all with their backs; a first call makes both, so that a capture finds them."""

@@ -132,8 +132,8 @@ class LogSH(SphereMethod):
         body_of_vertex, device = self.merged_scene.body_of_vertex, self.merged_scene.device
         rows = np.empty((len(vertices), 2, self._order**2), np.float32)
         bodies = body_of_vertex[vertices % len(body_of_vertex)]
-        named = tuple(np.intersect1d(traced, bodies).tolist())
-        turned = self.self_visibility.turned_lobes(named, static.rotations, self._order)
+        traced_bodies = tuple(np.intersect1d(traced, bodies).tolist())
+        turned = self.self_visibility.turned_lobes(traced_bodies, static.rotations, self._order)
         for body in np.unique(bodies).tolist():
             of_body = np.flatnonzero(bodies == body)
             arguments = static.gathered(vertices[of_body], normals)

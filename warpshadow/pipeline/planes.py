@@ -21,7 +21,7 @@ from warpshadow.stages.sparse import SparseMatrix, multiply
 _CORNERS = 64  # directions in which the vertices of a body are sought that are farthest out
 
 
-class PlanesOfGroup(NamedTuple):
+class GroupPlanes(NamedTuple):
     """Flat bodies around some receivers."""
 
     planes: PlaneBlockers
@@ -39,7 +39,7 @@ class ScenePlanes:
     def __init__(self, merged_scene: MergedScene):
         self._merged_scene = merged_scene
         self._bodies: dict[int, PlaneBody] = {}
-        self._among: dict[tuple[tuple[int, ...], tuple[int, ...]], PlaneBlockers] = {}
+        self._blockers: dict[tuple[tuple[int, ...], tuple[int, ...]], PlaneBlockers] = {}
 
     @functools.cached_property
     def numbers(self) -> tuple[int, ...]:
@@ -56,20 +56,20 @@ class ScenePlanes:
             if other != number
         ]
 
-    def among(self, bodies: tuple[int, ...], blocking: tuple[int, ...]) -> PlaneBlockers:
-        """Some flat bodies, of which some block light; they send none."""
-        key = bodies, blocking
-        if key not in self._among:
-            chosen = [self._body(number)._replace(blocks=number in blocking) for number in bodies]
+    def blockers(self, bodies: tuple[int, ...], blocking_bodies: tuple[int, ...]) -> PlaneBlockers:
+        """Plane blockers of some flat bodies, which send no light; ``blocking_bodies`` cast shadows."""
+        key = bodies, blocking_bodies
+        if key not in self._blockers:
+            chosen = [self._body(number)._replace(blocks=number in blocking_bodies) for number in bodies]
             vertex_count = int(self._merged_scene.first_vertex[-1])
-            self._among[key] = PlaneBlockers.of(chosen, 0, vertex_count, device=self._merged_scene.device)
-        return self._among[key]
+            self._blockers[key] = PlaneBlockers.of(chosen, 0, vertex_count, device=self._merged_scene.device)
+        return self._blockers[key]
 
     def frames(self, bodies: tuple[int, ...], positions: wp.array) -> wp.array:
         """Where some flat bodies are, of vertices [batch, vertex]; see :meth:`PlaneBlockers.frames`.
         Differentiable in them.
         """
-        return self.among(bodies, bodies).frames(positions)
+        return self.blockers(bodies, bodies).frames(positions)
 
     @functools.cached_property
     def first_corner(self) -> np.ndarray:

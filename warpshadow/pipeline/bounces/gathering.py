@@ -20,7 +20,7 @@ from warpshadow.pipeline.bounces.patches import Senders
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.by_spheres import SphereMethod
 from warpshadow.pipeline.directional import ProjectedCells
-from warpshadow.pipeline.groups import Group, GroupVisibility, solid_bodies
+from warpshadow.pipeline.groups import Group, GroupVisibility, nonplanar_bodies
 from warpshadow.pipeline.lighting import joined
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.scene.scene import Visibility
@@ -82,7 +82,7 @@ def find_cell_transmittance(
         )
     else:
         directions, transmittance_self = HARMONIC_GATHER_CELLS, None
-        transmittance_spheres = _transmittance(method, group, solid_bodies(merged_scene), spheres, directions)
+        transmittance_spheres = _transmittance(method, group, nonplanar_bodies(merged_scene), spheres, directions)
     if transmittance_self is None and group.body is not None and not merged_scene.is_flat[group.body]:
         transmittance_self = _transmittance(method, group, [group.body], spheres, directions)
     if transmittance_spheres is None:
@@ -149,14 +149,14 @@ class Proxies:
         return SenderPlanes(form_factors, {number: k for k, number in enumerate(numbers)})
 
     @functools.cached_property
-    def solid(self) -> list[int]:
+    def nonplanar_bodies(self) -> list[int]:
         """The bodies for which spheres stand in."""
-        return solid_bodies(self.merged_scene)
+        return nonplanar_bodies(self.merged_scene)
 
     @functools.cached_property
-    def dark(self) -> list[int]:
+    def black_bodies(self) -> list[int]:
         """Bodies that are not flat and send nothing: the spheres by which they block stand in for them."""
-        return [body for body in self.solid if body not in self.senders.bodies]
+        return [body for body in self.nonplanar_bodies if body not in self.senders.bodies]
 
     def span_of(self, body: int | None) -> tuple[int, int]:
         """Where the proxies of a body begin and end."""
@@ -164,13 +164,13 @@ class Proxies:
         if body in self.senders.bodies:
             place = self.senders.bodies.index(body)
             return int(first[place]), int(first[place + 1])
-        begin, end = self.merged_scene.spheres_among(self.dark, body)
+        begin, end = self.merged_scene.spheres_among(self.black_bodies, body)
         return (int(first[-1]) + begin, int(first[-1]) + end) if end else (0, 0)
 
     @functools.cached_property
     def patches_of_clusters(self) -> tuple[np.ndarray, np.ndarray]:
         """The patches of each proxy, and of the clusters that they merge into: where they begin, and numbers."""
-        count = int(self.merged_scene.sphere_counts[self.dark].sum())
+        count = int(self.merged_scene.sphere_counts[self.black_bodies].sum())
         numbers = np.arange(len(self.senders.areas))
         return patches_of_clusters(numbers, np.full(len(numbers) + count, -1), merging=self.merging)
 
@@ -181,7 +181,7 @@ class Proxies:
         centers, radii = rest.centers.numpy()[0], rest.radii.numpy()[0]
         numbers, ratios = np.full(len(senders.areas), -1, np.int32), np.zeros(len(senders.areas), np.float32)
         start = 0
-        for body in self.solid:
+        for body in self.nonplanar_bodies:
             of_body = slice(*first_sphere[body : body + 2])
             if len(radii[of_body]) and body in senders.bodies:
                 place = senders.bodies.index(body)
@@ -213,7 +213,7 @@ class Proxies:
             frames: Where flat bodies are.
         """
         normals, planes, senders = sources.normals, self.planes, self.senders
-        centers, radii = self.merged_scene.spheres_of(self.solid, spheres)
+        centers, radii = self.merged_scene.spheres_of(self.nonplanar_bodies, spheres)
         if planes is not None:
             numbers, points, device = self.blocker_of_source, sources.points, normals.device
             of_sources = NearestBlockers(centers, radii, constant(numbers, wp.int32, device))
@@ -229,8 +229,8 @@ class Proxies:
         directions = cells[0].directions
         transmittance = transmittance.reshape((len(transmittance), len(senders.sides), len(directions)))
         placed = place_proxies(sources, senders.mean, radii, *self._blockers)
-        if self.dark:
-            others = self.merged_scene.spheres_of(self.dark, spheres)
+        if self.black_bodies:
+            others = self.merged_scene.spheres_of(self.black_bodies, spheres)
             counts = [len(senders.areas), others[1].shape[1]]
             placed = tuple(concatenate(pair, counts) for pair in zip(placed, others, strict=True))
         areas = find_projected_areas(normals, transmittance, senders.mean, directions)
@@ -300,11 +300,11 @@ class Gathering:
     ):
         self._visibility, self._self_form_factors = visibility, self_form_factors
         self._is_flat, sphere_counts = senders.merged_scene.is_flat, senders.merged_scene.sphere_counts
-        solid = [body for body in senders.bodies if not self._is_flat[body]]
+        nonplanar_bodies = [body for body in senders.bodies if not self._is_flat[body]]
         idle = (
-            "" if solid else ALL_FLAT,
-            "" if len(solid) < len(senders.bodies) else "nothing flat reflects",
-            "" if any(sphere_counts[body] for body in solid) else "nothing that reflects has spheres",
+            "" if nonplanar_bodies else ALL_FLAT,
+            "" if len(nonplanar_bodies) < len(senders.bodies) else "nothing flat reflects",
+            "" if any(sphere_counts[body] for body in nonplanar_bodies) else "nothing that reflects has spheres",
         )
         functions = self._from_itself, self._from_planes, self._from_spheres
         names = "self light", "plane light", "sphere light"
@@ -329,7 +329,7 @@ class Gathering:
         planes = outgoing.proxies.planes
         assert planes is not None
         skip = planes.number.get(group.body)
-        points, fronts = group.among(outgoing.frames, planes.all, skip)
+        points, fronts = group.lifted_points_and_fronts(outgoing.frames, planes.all, skip)
         arguments = points, group.normals, cells.transmittance_spheres, outgoing.frames, outgoing.radiosity, planes.all
         return plane_light(*arguments, cells.directions, fronts=fronts, skip=skip)
 
@@ -338,7 +338,7 @@ class Gathering:
             return None
         projected_patches, proxy_radiance = outgoing.projected_patches, outgoing.proxy_radiance
         softness = self._visibility.softness
-        if group.parts_around is not None:
+        if group.convex_parts_around is not None:
             softness = max(softness, _SOFTNESS_OF_PARTS)
         count = common_batch({"geometry": group.points, "light": proxy_radiance, "proxies": projected_patches.radii})
         points, normals = expand(group.points, count), expand(group.normals, count)
