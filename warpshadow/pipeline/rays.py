@@ -73,7 +73,7 @@ class Rays(Method):
             return Node("", shade, self._blockers(points, sources), sources, light)
 
         at_sources = points.cached("direct at sources", (light, sources), shaded_sources)
-        return self._bounces.in_known_light(direct, at_sources, points, materials)
+        return self._bounces.shading(direct, at_sources, points, materials)
 
     def free_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
         """Shading of points in free light."""
@@ -86,7 +86,7 @@ class Rays(Method):
             return Node("", self._transfer, self._meshes_for(points, sources), sources)
 
         at_sources = points.cached("transfer of sources", sources, transfers)
-        return self._bounces.in_free_light(direct, at_sources, light, points, materials)
+        return self._bounces.free_shading(direct, at_sources, light, points, materials)
 
     @functools.cached_property
     def _bounces(self) -> "StaticBounces":

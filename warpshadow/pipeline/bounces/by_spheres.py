@@ -346,7 +346,7 @@ class SphereBounces:
             PartwiseShading, self._method, at_sources, projected_light, light, joined, where=_OF_SOURCES
         )
         lit = points.cached("direct at sources", (light, sources), make)
-        return self._still.in_known_light(direct, lit, points, materials)
+        return self._still.shading(direct, lit, points, materials)
 
     def cached_free_shading(self, direct: Node, points: LitPoints, light: Input, materials: Materials) -> Node:
         """The same in free light.
@@ -357,7 +357,7 @@ class SphereBounces:
         """
         sources, at_sources = self._cached_sources(points, materials)
         transfers = points.cached("transfer", sources, lambda: self._method.transfers(at_sources, _OF_SOURCES))
-        return self._still.in_free_light(direct, transfers, light, points, materials)
+        return self._still.free_shading(direct, transfers, light, points, materials)
 
     def _cached_sources(self, points: LitPoints, materials: Materials) -> tuple[Node, LitPoints]:
         """Node of the sources of bodies that do not move, and these as points that are lit."""

@@ -11,8 +11,8 @@ Receivers of an image are many: F is found at some of them, and interpolated.
 Direct light and form factors must agree on how much of a hemisphere is open: where spheres block a part 1 − s of an
 even sky, and rays hit bodies in a part f, F is scaled by (1 − s) / f. Otherwise light is gained and lost: eighteen
 white balls in a white furnace were 0.91 to 1.06 bright. Points inside another body see its inside; they count neither
-in means over the sources of a patch nor as nodes. The radiosity is linear in light: of free light among bodies whose
-colors are known all of it is one matrix, which is cached. Differentiable in light and albedo.
+in means over the sources of a patch nor as cache points. The radiosity is linear in light: of free light among bodies
+whose colors are known all of it is one matrix, which is cached. Differentiable in light and albedo.
 """
 
 from __future__ import annotations
@@ -50,34 +50,34 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 
-RAYS = 1024  # rays of a node or source, which find its form factors …
+RAYS = 1024  # rays of a cache point or source, which find its form factors …
 
 STILL_RAYS = 256
 """… and those of a still, which has no time to spare: of the table of demos/kinds.py (128²) it has an error of 1.95%
 against paths with these, and of 1.93% with 1024, in 3.1 and 7.1 s of CPU time."""
 
 
-class _Factors(NamedTuple):
+class _GeometryFactors(NamedTuple):
     """Cached results of a geometry."""
 
-    of_sources: SparseMatrix  # [patch, source], means over the sources that lie in no other body
-    of_itself: SparseMatrix  # [patch, patch] of the same body, means over the sources of the first
-    of_others: SparseMatrix  # [patch, patch] of different ones, likewise
-    of_nodes: SparseMatrix  # [node, patch], nodes of each view after one another
-    of_receivers: SparseMatrix  # [receiver, node]
+    source_means: SparseMatrix  # [patch, source], means over the sources that lie in no other body
+    within_bodies: SparseMatrix  # [patch, patch] of the same body, means over the sources of the first
+    between_bodies: SparseMatrix  # [patch, patch] of different ones, likewise
+    to_cache_points: SparseMatrix  # [cache point, patch], those of each view after one another
+    receiver_weights: SparseMatrix  # [receiver, cache point]
     shape: tuple[int, int]  # views, receivers of each
 
     def to_receivers(self, direct: wp.array, bounced: wp.array) -> wp.array:
-        """Add the bounced light of nodes to direct shading, vec3 of shape [batch, receiver]. Differentiable: both."""
+        """Add the bounced light of cache points to direct shading, vec3 of shape [batch, receiver]. Differentiable: both."""
         if self.shape[0] == 1:
-            return multiply(self.of_receivers, bounced, plus=direct)
+            return multiply(self.receiver_weights, bounced, plus=direct)
         if len(bounced) > 1:
             raise ValueError(
                 f"light, albedo, textures: got a batch of {len(bounced)} for {self.shape[0]} views by "
                 'method "ray-traced" with bounces, expected one for them all; method = "directional" takes '
                 "batches"
             )
-        return multiply(self.of_receivers, bounced, plus=direct.reshape((1, -1))).reshape(self.shape)
+        return multiply(self.receiver_weights, bounced, plus=direct.reshape((1, -1))).reshape(self.shape)
 
 
 class StaticBounces:
@@ -86,7 +86,7 @@ class StaticBounces:
     Args:
         patches: Of the scene.
         bounces: How often, 1 or more; "all" until nothing is left.
-        rays: Of a node or source.
+        rays: Of a cache point or source.
     """
 
     def __init__(self, patches: ScenePatches, bounces: Bounces, *, rays: int = RAYS, progress: bool = False):
@@ -97,7 +97,7 @@ class StaticBounces:
         senders = self._patches.senders(materials)
         return points.cached("sources", senders, lambda: Node("", senders.sources, points.vertices, points.normals))
 
-    def in_known_light(self, direct: Node, at_sources: Node, points: LitPoints, materials: Materials) -> Node:
+    def shading(self, direct: Node, at_sources: Node, points: LitPoints, materials: Materials) -> Node:
         """Shading with bounces.
 
         Args:
@@ -109,10 +109,10 @@ class StaticBounces:
         senders = self._patches.senders(materials)
         if not senders.bodies:
             return direct
-        make = functools.partial(Node, "", _mean, at_sources, self._factors(points, materials, senders))
+        make = functools.partial(Node, "", _light_on_patches, at_sources, self._factors(points, materials, senders))
         return self._shading(direct, points.cached("light of patches", at_sources, make), points, materials)
 
-    def in_free_light(
+    def free_shading(
         self, direct: Node, transfers: Node, light: Input, points: LitPoints, materials: Materials
     ) -> Node:
         """The same in free light; its transfer among the colors of the scene is cached.
@@ -128,52 +128,57 @@ class StaticBounces:
         if not senders.bodies:
             return direct
 
-        def spread(parts: list[wp.array], factors: _Factors) -> wp.array:
+        def light_on_patches(parts: list[wp.array], factors: _GeometryFactors) -> wp.array:
             """Light on patches by each coefficient of white light, vec3 of shape [coefficient, patch]."""
-            grey = np.concatenate([part.numpy()[0] for part in parts]).T[..., None]
-            return _mean(wp.array(np.repeat(grey, 3, axis=2), dtype=wp.vec3, device=parts[0].device), factors)
+            white_light = np.concatenate([part.numpy()[0] for part in parts]).T[..., None]
+            return _light_on_patches(
+                wp.array(np.repeat(white_light, 3, axis=2), dtype=wp.vec3, device=parts[0].device), factors
+            )
 
         arguments = transfers, self._factors(points, materials, senders)
-        lit = points.cached("patches in each coefficient", transfers, lambda: Node("", spread, *arguments))
+        lit = points.cached("patches in each coefficient", transfers, lambda: Node("", light_on_patches, *arguments))
         if materials is not points.materials:
             transfer = points.cached("transfer of patches", lit, lambda: Node("", _as_transfer, lit))
             return self._shading(direct, Node("", colored_light, transfer, light), points, materials)
 
         def bounced() -> Node:
             arguments = self._patches.albedo(materials, senders.bodies), lit, self._factors(points, materials, senders)
-            find = functools.partial(self._at_cache_points, senders=senders)
+            find = functools.partial(self._light_at_cache_points, senders=senders)
             return Node("transfer of bounces", lambda *arguments: _as_transfer(find(*arguments)), *arguments)
 
-        def shade(direct: wp.array, transfer: ColoredTransfer, light: wp.array, factors: _Factors) -> wp.array:
+        def shade(direct: wp.array, transfer: ColoredTransfer, light: wp.array, factors: _GeometryFactors) -> wp.array:
             return factors.to_receivers(direct, colored_light(transfer, light))
 
         transfer, factors = points.cached("bounces", lit, bounced), self._factors(points, materials, senders)
         return Node("bounces", shade, direct, transfer, light, factors, items=self._item_text(points, senders))
 
-    def _shading(self, direct: Node, at_patches: Node, points: LitPoints, materials: Materials) -> Node:
+    def _shading(self, direct: Node, patch_light: Node, points: LitPoints, materials: Materials) -> Node:
         """Shading with bounces, given the direct light on patches, vec3 of shape [batch, patch]."""
         senders = self._patches.senders(materials)
 
-        def bounce(direct: wp.array, albedo: wp.array, at_patches: wp.array, factors: _Factors) -> wp.array:
-            return factors.to_receivers(direct, self._at_cache_points(albedo, at_patches, factors, senders))
+        def bounce(direct: wp.array, albedo: wp.array, patch_light: wp.array, factors: _GeometryFactors) -> wp.array:
+            return factors.to_receivers(direct, self._light_at_cache_points(albedo, patch_light, factors, senders))
 
         albedo, factors = self._patches.albedo(materials, senders.bodies), self._factors(points, materials, senders)
-        return Node("bounces", bounce, direct, albedo, at_patches, factors, items=self._item_text(points, senders))
+        return Node("bounces", bounce, direct, albedo, patch_light, factors, items=self._item_text(points, senders))
 
-    def _at_cache_points(self, albedo: wp.array, at_patches: wp.array, factors: _Factors, senders: Senders) -> wp.array:
-        """Bounced light at nodes, vec3 of shape [batch, node]. Differentiable: albedo, at_patches."""
+    def _light_at_cache_points(
+        self, albedo: wp.array, patch_light: wp.array, factors: _GeometryFactors, senders: Senders
+    ) -> wp.array:
+        """Bounced light at cache points, vec3 of shape [batch, cache point]. Differentiable: albedo, patch_light."""
 
         def others_light_of(radiosity: wp.array | None) -> wp.array:
             """Light on patches from the sky and from other bodies."""
-            return at_patches if radiosity is None else multiply(factors.of_others, radiosity, plus=at_patches)
+            return patch_light if radiosity is None else multiply(factors.between_bodies, radiosity, plus=patch_light)
 
         def with_self_light(others_light: wp.array, radiosity: wp.array | None) -> wp.array:
             return reflect(
-                albedo, others_light if radiosity is None else multiply(factors.of_itself, radiosity, plus=others_light)
+                albedo,
+                others_light if radiosity is None else multiply(factors.within_bodies, radiosity, plus=others_light),
             )
 
         arguments = self._bounces, others_light_of, with_self_light, senders.areas
-        return multiply(factors.of_nodes, after_bounces(*arguments, self_bounces=SELF_BOUNCES))
+        return multiply(factors.to_cache_points, after_bounces(*arguments, self_bounces=SELF_BOUNCES))
 
     def _item_text(self, points: LitPoints, senders: Senders) -> Callable[[], str]:
         return lambda: f"{receiver_text(points)}, {len(senders.areas):,} patches, {self._bounces} bounces"
@@ -185,7 +190,7 @@ class StaticBounces:
             receivers: Receivers,
             sky_at_sources: wp.array | None,
             sky_at_receivers: wp.array | None,
-        ) -> _Factors:
+        ) -> _GeometryFactors:
             from scipy.sparse import block_diag, coo_matrix, vstack
 
             if len(positions) > 1:
@@ -204,38 +209,40 @@ class StaticBounces:
                     form_factors, np.append(casts[senders.body_of_patch], [True] * len(BLACK_ENTRIES)), sky
                 )
 
-            def at_view(
+            def find_cache_points(
                 points: np.ndarray, normals: np.ndarray, sky: np.ndarray | None
             ) -> tuple[csr_matrix, csr_matrix]:
-                """Means over nodes, [receiver, node], and the nodes' form factors, of the receivers of a view."""
-                nodes = choose_cache_points(points)
-                form_factors = trace(points[nodes], normals[nodes], None if sky is None else sky[nodes])
-                is_node = ~form_factors.is_buried | form_factors.is_buried.all()
-                nodes = nodes[is_node]
-                means = interpolation(points, normals, nodes)
+                """Weights of cache points at the receivers of a view, [receiver, cache point], and their form factors."""
+                cache_points = choose_cache_points(points)
+                form_factors = trace(
+                    points[cache_points], normals[cache_points], None if sky is None else sky[cache_points]
+                )
+                is_cache_point = ~form_factors.is_buried | form_factors.is_buried.all()
+                cache_points = cache_points[is_cache_point]
+                means = interpolation(points, normals, cache_points)
                 if sky is not None:
-                    means = scaled(means, ratios(1 - sky, means @ (1 - sky[nodes])))
-                return means, form_factors.factors[is_node]
+                    means = scaled(means, ratios(1 - sky, means @ (1 - sky[cache_points])))
+                return means, form_factors.factors[is_cache_point]
 
             at, facing, device = receivers.points.numpy(), receivers.normals.numpy(), positions.device
             skies = [None if sky is None else sky.numpy()[..., 0] for sky in (sky_at_sources, sky_at_receivers)]
             at_source = None if skies[0] is None else skies[0][0]
             at_receivers = [None] * len(at) if skies[1] is None else np.broadcast_to(skies[1], at.shape[:2])
             seen_by_sources = trace(sources.points.numpy()[0], sources.normals.numpy()[0], at_source)
-            of_receivers, of_nodes = zip(*map(at_view, at, facing, at_receivers), strict=True)
+            receiver_weights, to_cache_points = zip(*map(find_cache_points, at, facing, at_receivers), strict=True)
             mean = mean_outside(senders.mean.on_host(), seen_by_sources.is_buried)
             between = (mean @ seen_by_sources.factors).tocoo()
-            is_own = np.equal(*(senders.body_of_patch[patches] for patches in between.coords))
-            of_itself, of_others = (
+            is_same_body = np.equal(*(senders.body_of_patch[patches] for patches in between.coords))
+            within_bodies, between_bodies = (
                 coo_matrix((between.data[which], (between.row[which], between.col[which])), between.shape)
-                for which in (is_own, ~is_own)
+                for which in (is_same_body, ~is_same_body)
             )
-            return _Factors(
+            return _GeometryFactors(
                 SparseMatrix.of(mean, device=device),
-                SparseMatrix.of(of_itself, device=device),
-                SparseMatrix.of(of_others, device=device),
-                SparseMatrix.of(vstack(of_nodes), device=device),
-                SparseMatrix.of(block_diag(of_receivers), device=device),
+                SparseMatrix.of(within_bodies, device=device),
+                SparseMatrix.of(between_bodies, device=device),
+                SparseMatrix.of(vstack(to_cache_points), device=device),
+                SparseMatrix.of(block_diag(receiver_weights), device=device),
                 at.shape[:2],
             )
 
@@ -280,9 +287,9 @@ class StaticBounces:
         return loose_mesh(np.concatenate(corners), device=merged_scene.device), np.concatenate(owners, axis=1)
 
 
-def _mean(at_sources: wp.array, factors: _Factors) -> wp.array:
+def _light_on_patches(at_sources: wp.array, factors: _GeometryFactors) -> wp.array:
     """Mean light on patches, given that at their sources: vec3 of shape [batch, patch]. Differentiable: light."""
-    return multiply(factors.of_sources, at_sources)
+    return multiply(factors.source_means, at_sources)
 
 
 def _as_transfer(lit: wp.array) -> ColoredTransfer:
