@@ -124,9 +124,9 @@ def test_bodies_that_cast_no_shadow_block_nothing(device):
 def test_nothing_below_the_horizon_is_blocked(device):
     normals = np.random.default_rng(0).normal(size=POINTS.shape)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    facing = wp.array(normals[None], dtype=wp.vec3, device=device)
+    horizon_normals = wp.array(normals[None], dtype=wp.vec3, device=device)
     expected = np.where(normals @ DIRECTIONS.T > 0, of_kernel(POINTS, device), 1)
-    np.testing.assert_array_equal(of_kernel(POINTS, device, facing=facing), expected)
+    np.testing.assert_array_equal(of_kernel(POINTS, device, horizon_normals=horizon_normals), expected)
 
 
 def test_instances_have_parts_of_their_own(device):

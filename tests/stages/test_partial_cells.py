@@ -34,7 +34,7 @@ def test_coverage_is_moved_by_where_light_is_in_cells_that_are_covered_in_part(n
     points, normals, _, vertices, _ = setting.arrays()
     frames, samples = setting.planes.frames(vertices), samples_of_cells()
     assert setting.planes.has_holes == (names == ("l",))
-    options = {"facing": normals if is_facing else None, "skip": skip}
+    options = {"horizon_normals": normals if is_facing else None, "skip": skip}
     covered = plane_coverage(points, frames, setting.planes, DIRECTIONS, **options)
     found = coverage_of_light(points, covered, frames, setting.planes, DIRECTIONS, samples, **options).numpy()
     coverage, means = covered.numpy(), []

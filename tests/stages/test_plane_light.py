@@ -91,9 +91,9 @@ def met_sides(point, omega, radius, frames, grids, radiosity, skip, fronts=None)
         edges = [np.sign(e) * np.expm1(np.abs(e)) * grid.spread for e in (grid.low, grid.high)]
         margin = margin_of(grid)
         front = ramp(1 + 2 * height / margin) if fronts is None else fronts[f]
-        for side, presence in ((1, front), (-1, 1 - front)):
+        for side, side_weight in ((1, front), (-1, 1 - front)):
             cosine = -side * (normal @ omega)
-            if f == skip or presence <= 0 or cosine <= -radius:
+            if f == skip or side_weight <= 0 or cosine <= -radius:
                 continue
             ratio = cosine / radius
             mean = cosine if ratio >= 1 else radius * (1 / 3 + 2 / 3 * ((ratio + 1) / 2) ** 3)
@@ -102,7 +102,7 @@ def met_sides(point, omega, radius, frames, grids, radiosity, skip, fronts=None)
             y = place + t * (axes @ omega)
             extents = t * radius * np.sqrt(1 + (axes @ omega / mean) ** 2)
             inside = ramp((edges[1] - y) / extents) - ramp((edges[0] - y) / extents)
-            share = presence * ramp(ratio) * inside.prod()
+            share = side_weight * ramp(ratio) * inside.prod()
             covered = fetched(grid.covered[..., None].astype(float), grid, y, mean, t, radius)[0]
             light = np.zeros(3)
             if side == 1 or grid.sides == 2:

@@ -26,11 +26,17 @@ class GroupConvexParts(NamedTuple):
     skip: int | None = None  # index, among the bodies of blockers, of the body that the receivers are part of
 
     def transmittance(
-        self, points: wp.array, facing: wp.array | None, directions: np.ndarray, radius: float | None = None
+        self, points: wp.array, horizon_normals: wp.array | None, directions: np.ndarray, radius: float | None = None
     ) -> wp.array:
         """Transmittance past them, see :func:`.transmittance_past_parts`. Differentiable: points."""
         return transmittance_past_parts(
-            points, self.placed, self.blockers, directions, radius=radius, facing=facing, skip=self.skip
+            points,
+            self.placed,
+            self.blockers,
+            directions,
+            radius=radius,
+            horizon_normals=horizon_normals,
+            skip=self.skip,
         )
 
 

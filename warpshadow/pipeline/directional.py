@@ -124,12 +124,12 @@ class Directional(SphereMethod):
         points, normals, radii, cached_rows = group.points, group.normals, group.radii, group.cached_rows
         transmittance_self = self._transmittance_self(group, projected_light)
         # cached cells have light although their middles are below the horizon
-        facing = normals if cached_rows is None else None
+        horizon_normals = normals if cached_rows is None else None
         factors = [transmittance_self]
         if points.size and group.convex_parts_around is not None:
-            factors.append(self._past_parts(group.convex_parts_around, points, facing, projected_light))
+            factors.append(self._past_parts(group.convex_parts_around, points, horizon_normals, projected_light))
         if points.size and radii.shape[1]:
-            factors.append(self._past_spheres(group, facing, projected_light))
+            factors.append(self._past_spheres(group, horizon_normals, projected_light))
         known = [factor for factor in factors if factor is not None]
         if not known:
             shape = *points.shape, len(projected_light.directions)
@@ -137,20 +137,28 @@ class Directional(SphereMethod):
         return GroupVisibility(functools.reduce(multiply_transmittances, known), transmittance_self)
 
     def _past_parts(
-        self, parts: GroupConvexParts, points: wp.array, facing: wp.array | None, projected_light: ProjectedCells
+        self,
+        parts: GroupConvexParts,
+        points: wp.array,
+        horizon_normals: wp.array | None,
+        projected_light: ProjectedCells,
     ) -> wp.array:
         """Transmittance past convex parts."""
-        transmittance = parts.transmittance(points, facing, projected_light.directions)
+        transmittance = parts.transmittance(points, horizon_normals, projected_light.directions)
         if projected_light.sharp_cells_past_planes is None:
             return transmittance
         directions, places, scale = projected_light.sharp_cells_past_planes
         # a part has its own edges: they need no room for the rest of a cell, as spheres do not
         radius = self.visibility.softness * scale * cell_radius(len(directions))
-        return overwrite_sharp_cells(transmittance, parts.transmittance(points, facing, directions, radius), places)
+        return overwrite_sharp_cells(
+            transmittance, parts.transmittance(points, horizon_normals, directions, radius), places
+        )
 
-    def _past_spheres(self, group: Group, facing: wp.array | None, projected_light: ProjectedCells) -> wp.array:
+    def _past_spheres(
+        self, group: Group, horizon_normals: wp.array | None, projected_light: ProjectedCells
+    ) -> wp.array:
         """Transmittance past spheres."""
-        arguments, scales = (group.points, facing, group.centers, group.radii), self._scales
+        arguments, scales = (group.points, horizon_normals, group.centers, group.radii), self._scales
         block = functools.partial(directional.transmittance, *arguments, skip=group.skip, clusters=group.clusters)
         transmittance = block(projected_light.directions, **scales(1.0))
         if projected_light.sharp_cells is None:
@@ -178,10 +186,16 @@ class Directional(SphereMethod):
         planes, transmittance_spheres = group.planes, visibility.transmittance_total
         if planes is None or transmittance_spheres is None or not group.points.size:
             return visibility
-        facing = group.normals if group.cached_rows is None else None
+        horizon_normals = group.normals if group.cached_rows is None else None
         points, fronts = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
         cover = functools.partial(
-            plane_coverage, points, planes.frames, planes.planes, facing=facing, fronts=fronts, skip=planes.skip
+            plane_coverage,
+            points,
+            planes.frames,
+            planes.planes,
+            horizon_normals=horizon_normals,
+            fronts=fronts,
+            skip=planes.skip,
         )
         covered = cover(projected_light.directions)
         if covered is None:
@@ -194,7 +208,7 @@ class Directional(SphereMethod):
                 planes.planes,
                 projected_light.directions,
                 projected_light.samples,
-                facing=facing,
+                horizon_normals=horizon_normals,
                 fronts=fronts,
                 skip=planes.skip,
             )
@@ -302,15 +316,17 @@ class Directional(SphereMethod):
             planes = group.planes
             lifted, fronts = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
             arguments = lifted, planes.frames, planes.planes, directions
-            covered = plane_coverage(*arguments, radius=radius, facing=normals, fronts=fronts, skip=planes.skip)
+            covered = plane_coverage(
+                *arguments, radius=radius, horizon_normals=normals, fronts=fronts, skip=planes.skip
+            )
             transmittance = transmittance if covered is None else transmittance_past_planes(transmittance, covered)
         lit = shade_cells(transmittance, normals, directions, light, maximum=LARGEST_COEFFICIENT).numpy()[..., 0]
-        facing, towards = normals.numpy(), self.free_projection.directions
-        plane_normals = facing[:, :1]  # of all points of a plane, or the opposite
+        receiver_normals, towards = normals.numpy(), self.free_projection.directions
+        plane_normals = receiver_normals[:, :1]  # of all points of a plane, or the opposite
         whole = [
             4 / len(power) * np.maximum(sign * plane_normals @ towards.T, 0) @ power for sign in (1, -1)
         ]  # [batch, 1]
-        unblocked = np.where((facing * plane_normals).sum(axis=2) > 0, *whole)
+        unblocked = np.where((receiver_normals * plane_normals).sum(axis=2) > 0, *whole)
         return np.divide(lit, unblocked, out=np.zeros_like(lit), where=unblocked > 0)
 
     def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input) -> Node:
@@ -365,10 +381,10 @@ class Directional(SphereMethod):
         return static.rows("lit cells" if is_scenes else "cells", functools.partial(self._trace, is_scenes))
 
     def _trace(self, is_scenes: bool, static: StaticBodies, vertices: np.ndarray, normals: wp.array) -> wp.array:
-        points, facing = static.gathered(vertices, normals)
+        points, normals = static.gathered(vertices, normals)
         numbers = wp.array(split_sides(vertices, len(static.has_vertex))[0], dtype=wp.int32, device=points.device)
         samples = self._lit_samples if is_scenes else self._even_samples
-        return trace_cells(static.mesh, points[0], facing[0], numbers, samples, progress=self.progress)
+        return trace_cells(static.mesh, points[0], normals[0], numbers, samples, progress=self.progress)
 
     @functools.cached_property
     def _lit_samples(self) -> CellSamples:

@@ -68,7 +68,7 @@ class _GeometryFactors(NamedTuple):
     shape: tuple[int, int]  # views, receivers of each
 
     def to_receivers(self, direct: wp.array, bounced: wp.array) -> wp.array:
-        """Add the bounced light of cache points to direct shading, vec3 of shape [batch, receiver]. Differentiable: both."""
+        """Add bounced light of cache points to direct shading, vec3 of shape [batch, receiver]. Differentiable: both."""
         if self.shape[0] == 1:
             return multiply(self.receiver_weights, bounced, plus=direct)
         if len(bounced) > 1:
@@ -212,7 +212,7 @@ class StaticBounces:
             def find_cache_points(
                 points: np.ndarray, normals: np.ndarray, sky: np.ndarray | None
             ) -> tuple[csr_matrix, csr_matrix]:
-                """Weights of cache points at the receivers of a view, [receiver, cache point], and their form factors."""
+                """Weights of cache points at receivers of a view, [receiver, cache point], and their form factors."""
                 cache_points = choose_cache_points(points)
                 form_factors = trace(
                     points[cache_points], normals[cache_points], None if sky is None else sky[cache_points]

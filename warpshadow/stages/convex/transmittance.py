@@ -34,6 +34,7 @@ from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import Scratch, scratch_place, split_row
 from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.convex.prepared import ConvexArrays, ConvexBlockers, PlacedParts
+from warpshadow.stages.planes.transmittance import horizon_normal, is_above_horizon
 from warpshadow.stages.visibility.culling import DirectionCells, make_cells
 from warpshadow.stages.visibility.directional import SOFTNESS
 
@@ -71,18 +72,18 @@ def _find_silhouette(
     Returns how many edges it has, 0 for a tiny one or a polygon from the side, −1 for a receiver inside the part.
     """
     first_face = parts.first_face[part]
-    facing = wp.uint64(0)
+    facing_bits = wp.uint64(0)
     for face in range(first_face, parts.first_face[part + 1]):
         plane = planes[face]
         if plane[0] * point[0] + plane[1] * point[1] + plane[2] * point[2] > plane[3]:
-            facing = facing | (wp.uint64(1) << wp.uint64(face - first_face))
-    if facing == wp.uint64(0):
+            facing_bits = facing_bits | (wp.uint64(1) << wp.uint64(face - first_face))
+    if facing_bits == wp.uint64(0):
         return wp.where(parts.first_face[part + 1] - first_face > 2, -1, 0)
     count = int(0)
     for e in range(parts.first_edge[part], parts.first_edge[part + 1]):
         edge = parts.edges[e]
-        is_left = ((facing >> wp.uint64(edge[2])) & wp.uint64(1)) == wp.uint64(1)
-        is_right = ((facing >> wp.uint64(edge[3])) & wp.uint64(1)) == wp.uint64(1)
+        is_left = ((facing_bits >> wp.uint64(edge[2])) & wp.uint64(1)) == wp.uint64(1)
+        is_right = ((facing_bits >> wp.uint64(edge[3])) & wp.uint64(1)) == wp.uint64(1)
         if is_left != is_right:
             # the part is to the left of its faces' edges as they are seen
             begin = wp.where(is_left, edge[1], edge[0])
@@ -266,7 +267,7 @@ def _add_coverage(
                         if (
                             wp.dot(bound.axis, direction) > bound.cosine
                             and (not covers or coverage[q] < 1.0)
-                            and (wp.dot(normal, direction) > 0.0 or wp.length_sq(normal) == 0.0)
+                            and is_above_horizon(normal, direction)
                         ):
                             if not covers:
                                 for k in range(cells.directions.shape[0]):
@@ -281,21 +282,13 @@ def _add_coverage(
     return covers
 
 
-@wp.func
-def _facing(facing: wp.array2d(dtype=wp.vec3), batch: int, receiver: int):
-    """Where a receiver looks; 0 for one that looks everywhere."""
-    if facing:
-        return facing[instance_in(batch, facing.shape[0]), receiver]
-    return wp.vec3()
-
-
 @wp.kernel(enable_backward=False)
 def _pass(
     first_row: int,
     worker: int,
     # in
     points: wp.array2d(dtype=wp.vec3),
-    facing: wp.array2d(dtype=wp.vec3),
+    horizon_normals: wp.array2d(dtype=wp.vec3),
     corners: wp.array2d(dtype=wp.vec3),
     planes: wp.array2d(dtype=wp.vec4),
     bounds: wp.array2d(dtype=wp.vec4),
@@ -314,7 +307,7 @@ def _pass(
     batch, receiver = split_row(row, points.shape[1])
     place = scratch_place(worker, row)
     instance = instance_in(batch, corners.shape[0])
-    normal = _facing(facing, batch, receiver)
+    normal = horizon_normal(horizon_normals, batch, receiver)
     for q in range(cells.directions.shape[0]):
         passing[batch, receiver, q] = 1.0
     for body in range(parts.first_part.shape[0] - 1):
@@ -345,7 +338,7 @@ def _pass_adjoint(
     worker: int,
     # in
     points: wp.array2d(dtype=wp.vec3),
-    facing: wp.array2d(dtype=wp.vec3),
+    horizon_normals: wp.array2d(dtype=wp.vec3),
     corners: wp.array2d(dtype=wp.vec3),
     planes: wp.array2d(dtype=wp.vec4),
     bounds: wp.array2d(dtype=wp.vec4),
@@ -368,7 +361,7 @@ def _pass_adjoint(
     batch, receiver = split_row(row, points.shape[1])
     place = scratch_place(worker, row)
     instance = instance_in(batch, corners.shape[0])
-    point, normal = points[batch, receiver], _facing(facing, batch, receiver)
+    point, normal = points[batch, receiver], horizon_normal(horizon_normals, batch, receiver)
     adj_point = wp.vec3()
     for body in range(parts.first_part.shape[0] - 1):
         if (
@@ -416,7 +409,7 @@ def transmittance_past_parts(
     directions: np.ndarray,
     *,
     radius: float | None = None,
-    facing: wp.array | None = None,
+    horizon_normals: wp.array | None = None,
     skip: int | None = None,
 ) -> wp.array:
     """Transmittance of cells past the convex parts of bodies.
@@ -427,13 +420,13 @@ def transmittance_past_parts(
         blockers: The bodies.
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
         radius: Of cells that do not tile the sphere [rad]; by default that of so many even ones, which do.
-        facing: Normals, vec3 of shape [batch, receiver]: nothing blocks cells below the horizon.
+        horizon_normals: Normals, vec3 of shape [batch, receiver]: nothing blocks cells below the horizon.
         skip: Number of the body that the receivers are part of, which blocks none of their light; None for none.
 
     Returns:
         Float32 of shape [batch, receiver, direction].
 
-    Differentiable: points, placed. Not: facing, which decides by steps.
+    Differentiable: points, placed. Not: horizon_normals, which decides by steps.
     """
     check.shape("points", points.shape, ("batch", "receiver"))
     check.shape("directions", directions.shape, ("direction", 3))
@@ -442,7 +435,7 @@ def transmittance_past_parts(
     points = expand(points, common_batch({"points": points, "corners": placed.corners}))
     own_radius = cell_radius(len(directions)) if radius is None else radius
     cells = make_cells(directions, SOFTNESS, points.device)
-    inputs = [points, facing, *placed, blockers.arrays, cells, own_radius, -1 if skip is None else skip]
+    inputs = [points, horizon_normals, *placed, blockers.arrays, cells, own_radius, -1 if skip is None else skip]
     scratch = [Scratch((_ROWS * blockers.edge_count,), wp.vec3), Scratch((len(directions),), wp.float32)]
     cost = _PART_COST * placed.bounds.shape[1]
     passing = wp.empty((*points.shape, len(directions)), dtype=wp.float32, device=points.device)

@@ -255,7 +255,7 @@ def _is_amid(grid: PlaneGrid, footprint: PlaneFootprint, radius: float):
 
 
 @wp.func
-def find_footprint(grid: PlaneGrid, scene: PlaneArrays, at: wp.vec3, toward: wp.vec3, presence: float):
+def find_footprint(grid: PlaneGrid, scene: PlaneArrays, at: wp.vec3, toward: wp.vec3, side_weight: float):
     """Find the footprint of a cell on a side.
 
     Args:
@@ -263,10 +263,10 @@ def find_footprint(grid: PlaneGrid, scene: PlaneArrays, at: wp.vec3, toward: wp.
         scene: Has the radius of cells.
         at: Where the receiver is: along both axes, and its height above the side.
         toward: Direction of the cell along both axes, and its cosine, above −ρ.
-        presence: Part of the side that is there.
+        side_weight: Part of the side that is there.
     """
     footprint = PlaneFootprint()
-    footprint.share = presence
+    footprint.share = side_weight
     cosine = toward[2]
     if cosine < scene.radius:
         ratio = cosine * scene.per_radius
@@ -291,14 +291,14 @@ def find_footprint_adjoint(
     grid: PlaneGrid,
     scene: PlaneArrays,
     toward: wp.vec3,
-    presence: float,
+    side_weight: float,
     footprint: PlaneFootprint,
     adj_share: float,
     adj_distance: float,
     adj_cosine: float,
     adj_center: wp.vec2,
 ):
-    """Gradients of ``at``, ``toward`` and ``presence``, given the footprint's and the mean cosine's, c′."""
+    """Gradients of ``at``, ``toward`` and ``side_weight``, given the footprint's and the mean cosine's, c′."""
     radius = scene.radius
     horizon = step(toward[2] * scene.per_radius)
     inside_x = float(1.0)
@@ -316,7 +316,7 @@ def find_footprint_adjoint(
         before = wp.cw_div(grid.least - footprint.center, extent)
         inside_x = step(upper_bound[0]) - step(before[0])
         inside_y = step(upper_bound[1]) - step(before[1])
-        adj_inside = adj_share * presence * horizon * wp.vec2(inside_y, inside_x)
+        adj_inside = adj_share * side_weight * horizon * wp.vec2(inside_y, inside_x)
         at_most = wp.cw_div(
             wp.cw_mul(adj_inside, wp.vec2(step_slope(upper_bound[0]), step_slope(upper_bound[1]))), extent
         )
@@ -333,7 +333,7 @@ def find_footprint_adjoint(
     adj_c -= adj_t * footprint.distance * footprint.per_cosine
     if toward[2] < radius:
         u = 0.5 * toward[2] * scene.per_radius + 0.5
-        adj_c = adj_c * u * u + adj_inside_share * presence * step_slope(2.0 * u - 1.0) * scene.per_radius
+        adj_c = adj_c * u * u + adj_inside_share * side_weight * step_slope(2.0 * u - 1.0) * scene.per_radius
     adj_toward += wp.vec3(adj_x * footprint.distance, adj_y * footprint.distance, adj_c)
     return wp.vec3(adj_x, adj_y, adj_t * footprint.per_cosine), adj_toward, adj_inside_share * horizon
 

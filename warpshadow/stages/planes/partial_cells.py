@@ -36,7 +36,7 @@ from warpshadow.stages.planes.cells import (
     plane_arrays,
 )
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
-from warpshadow.stages.planes.transmittance import PlaneCover, cover, cover_adjoint, looks, normal_of
+from warpshadow.stages.planes.transmittance import PlaneCover, cover, cover_adjoint, horizon_normal, is_above_horizon
 
 SAMPLES = wp.constant(4)
 """Directions of a cell. With 16 in place of 4 an image of that room had an error of 7.2 in place of 7.5%, and took 2.3
@@ -80,22 +80,22 @@ def _cover_by(
     q: int,
     s: int,
     normal: wp.vec3,
-    presence: float,
+    side_weight: float,
 ):
     """Coverage of direction s of cell q; of the even ones by the whole cell where the plane has holes."""
     result = PlaneCover()
     if s >= SAMPLES and grid.is_whole == 0:
-        if looks(normal, views.directions[q]):
-            result = cover(views.coarse, grid, place, is_back, views.directions[q], presence)
-    elif looks(normal, views.samples[q, s]):
-        result = cover(views.fine, grid, place, is_back, views.samples[q, s], presence)
+        if is_above_horizon(normal, views.directions[q]):
+            result = cover(views.coarse, grid, place, is_back, views.directions[q], side_weight)
+    elif is_above_horizon(normal, views.samples[q, s]):
+        result = cover(views.fine, grid, place, is_back, views.samples[q, s], side_weight)
     return result
 
 
 @wp.func
 def _sums(
     points: wp.array2d(dtype=wp.vec3),
-    facing: wp.array2d(dtype=wp.vec3),
+    horizon_normals: wp.array2d(dtype=wp.vec3),
     frames: wp.array(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
     views: CellViews,
@@ -105,7 +105,7 @@ def _sums(
     receiver: int,
 ):
     """Σ_k h_k of four of the directions drawn from a cell."""
-    normal = normal_of(facing, batch, receiver)
+    normal = horizon_normal(horizon_normals, batch, receiver)
     sums = wp.vec4()
     for f in range(views.fine.grids.shape[0]):
         grid = views.fine.grids[f]
@@ -131,7 +131,7 @@ def _look_again(
     worker: int,
     # in
     points: wp.array2d(dtype=wp.vec3),
-    facing: wp.array2d(dtype=wp.vec3),
+    horizon_normals: wp.array2d(dtype=wp.vec3),
     covered: wp.array3d(dtype=wp.float32),
     frames: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
@@ -146,8 +146,8 @@ def _look_again(
         coverage = covered[batch, receiver, q]
         gate = _gate(coverage)
         if gate > 0.0:
-            of_light = _sums(points, facing, placed, fronts, views, q, 0, batch, receiver)
-            of_cell = _sums(points, facing, placed, fronts, views, q, SAMPLES, batch, receiver)
+            of_light = _sums(points, horizon_normals, placed, fronts, views, q, 0, batch, receiver)
+            of_cell = _sums(points, horizon_normals, placed, fronts, views, q, SAMPLES, batch, receiver)
             coverage = wp.clamp(coverage + gate * _difference(of_light, of_cell), 0.0, 1.0)
         result[batch, receiver, q] = coverage
 
@@ -158,7 +158,7 @@ def _look_again_adjoint(
     worker: int,
     # in
     points: wp.array2d(dtype=wp.vec3),
-    facing: wp.array2d(dtype=wp.vec3),
+    horizon_normals: wp.array2d(dtype=wp.vec3),
     covered: wp.array3d(dtype=wp.float32),
     frames: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
@@ -178,7 +178,7 @@ def _look_again_adjoint(
     batch, receiver = split_row(row, points.shape[1])
     instance = instance_in(batch, frames.shape[0])
     own = pulls[scratch_place(worker, row)]
-    normal = normal_of(facing, batch, receiver)
+    normal = horizon_normal(horizon_normals, batch, receiver)
     point = points[batch, receiver]
     for q in range(views.directions.shape[0]):
         coverage = covered[batch, receiver, q]
@@ -188,8 +188,8 @@ def _look_again_adjoint(
         own[2 * q + 1] = wp.vec4()
         slope = float(1.0)
         if adj != 0.0 and gate > 0.0:
-            of_light = _sums(points, facing, frames[instance], fronts, views, q, 0, batch, receiver)
-            of_cell = _sums(points, facing, frames[instance], fronts, views, q, SAMPLES, batch, receiver)
+            of_light = _sums(points, horizon_normals, frames[instance], fronts, views, q, 0, batch, receiver)
+            of_cell = _sums(points, horizon_normals, frames[instance], fronts, views, q, SAMPLES, batch, receiver)
             difference = _difference(of_light, of_cell)
             total = coverage + gate * difference
             slope = wp.where(total > 0.0 and total < 1.0, 1.0, 0.0)
@@ -212,29 +212,37 @@ def _look_again_adjoint(
                     adj_part = own[2 * q + s // SAMPLES][s % SAMPLES]
                     if adj_part != 0.0:
                         for side in range(2):
-                            is_back, presence = side == 1, wp.where(side == 1, 1.0 - front, front)
-                            part = _cover_by(views, grid, place, is_back, q, s, normal, presence)
+                            is_back, side_weight = side == 1, wp.where(side == 1, 1.0 - front, front)
+                            part = _cover_by(views, grid, place, is_back, q, s, normal, side_weight)
                             if part.coverage > 0.0:
-                                adj_presence = float(0.0)
+                                adj_side_weight = float(0.0)
                                 if s >= SAMPLES and grid.is_whole == 0:
                                     direction = views.directions[q]
-                                    adj_place, adj_presence = cover_adjoint(
+                                    adj_place, adj_side_weight = cover_adjoint(
                                         views.coarse,
                                         grid,
                                         place,
                                         is_back,
                                         direction,
-                                        presence,
+                                        side_weight,
                                         part,
                                         adj_part,
                                         adj_place,
                                     )
                                 else:
                                     direction = views.samples[q, s]
-                                    adj_place, adj_presence = cover_adjoint(
-                                        views.fine, grid, place, is_back, direction, presence, part, adj_part, adj_place
+                                    adj_place, adj_side_weight = cover_adjoint(
+                                        views.fine,
+                                        grid,
+                                        place,
+                                        is_back,
+                                        direction,
+                                        side_weight,
+                                        part,
+                                        adj_part,
+                                        adj_place,
                                     )
-                                adj_front += wp.where(is_back, -adj_presence, adj_presence)
+                                adj_front += wp.where(is_back, -adj_side_weight, adj_side_weight)
             adj_height = front_of_adjoint(fronts, grid, place.at[2], adj_front, batch, receiver, f, adj_fronts)
             adj_place.at = adj_place.at + wp.vec3(0.0, 0.0, adj_height)
             adj_point += find_in_plane_adjoint(point, frames[instance], f, place, adj_place, instance, adj_frames)
@@ -250,14 +258,14 @@ def coverage_of_light(
     directions: np.ndarray,
     samples: np.ndarray,
     *,
-    facing: wp.array | None = None,
+    horizon_normals: wp.array | None = None,
     fronts: wp.array | None = None,
     skip: int | None = None,
 ) -> wp.array:
     """Coverage of the light of cells, C′: more exact than that of cells where planes cover them in part.
 
     Args:
-        points, frames, planes, directions, facing, fronts, skip: As for :func:`.transmittance.plane_coverage`.
+        points, frames, planes, directions, horizon_normals, fronts, skip: As for :func:`.transmittance.plane_coverage`.
         covered: C, its result, float32 of shape [batch, receiver, direction].
         samples: Four directions drawn from the light of each cell, and four that are even in it, NumPy of shape
             [direction, 8, 3].
@@ -276,7 +284,7 @@ def coverage_of_light(
     views.fine = plane_arrays(planes, cell_radius(SAMPLES * len(directions)), skip, tiles=False)
     views.directions = constant(directions, wp.vec3, points.device)
     views.samples = constant(np.asarray(samples, np.float32), wp.vec3, points.device)
-    inputs, cost = [points, facing, covered, frames, fronts, views], _CELL_COST * len(directions)
+    inputs, cost = [points, horizon_normals, covered, frames, fronts, views], _CELL_COST * len(directions)
     return differentiable(
         lambda result: launch(_look_again, points.size, inputs=inputs, outputs=[result], cost=cost),
         lambda adj_result: launch(

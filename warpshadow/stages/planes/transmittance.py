@@ -54,14 +54,14 @@ class PlaneCover:
 
 @wp.func
 def cover(
-    scene: PlaneArrays, grid: PlaneGrid, place: ReceiverInPlane, is_back: bool, direction: wp.vec3, presence: float
+    scene: PlaneArrays, grid: PlaneGrid, place: ReceiverInPlane, is_back: bool, direction: wp.vec3, side_weight: float
 ):
     """Coverage of a cell by a side of a plane, for the visible part of the cell."""
     covered = PlaneCover()
     cosine = wp.dot(direction, place.normal)
-    if presence > 0.0 and wp.where(is_back, cosine, -cosine) > -scene.radius:
+    if side_weight > 0.0 and wp.where(is_back, cosine, -cosine) > -scene.radius:
         covered.footprint = find_footprint(
-            grid, scene, on_side(grid, place, is_back), toward_side(place, is_back, direction), presence
+            grid, scene, on_side(grid, place, is_back), toward_side(place, is_back, direction), side_weight
         )
         covered.part = 1.0
         if grid.is_whole == 0 and covered.footprint.share > 0.0:
@@ -78,7 +78,7 @@ def cover_adjoint(
     place: ReceiverInPlane,
     is_back: bool,
     direction: wp.vec3,
-    presence: float,
+    side_weight: float,
     covered: PlaneCover,
     adj: float,
     adj_place: ReceiverInPlane,
@@ -93,31 +93,31 @@ def cover_adjoint(
     adj_distance = float(0.0)
     if adj_spot[2] != 0.0:  # a footprint is as wide as t / √c′
         adj_distance = adj_spot[2] / footprint.distance
-    adj_at, adj_toward, adj_presence = find_footprint_adjoint(
+    adj_at, adj_toward, adj_side_weight = find_footprint_adjoint(
         grid,
         scene,
         toward_side(place, is_back, direction),
-        presence,
+        side_weight,
         footprint,
         adj * covered.part,
         adj_distance,
         -0.5 * footprint.per_cosine * adj_spot[2],
         wp.vec2(adj_spot[0], adj_spot[1]),
     )
-    return side_adjoint(grid, place, is_back, direction, adj_at, adj_toward, adj_place), adj_presence
+    return side_adjoint(grid, place, is_back, direction, adj_at, adj_toward, adj_place), adj_side_weight
 
 
 @wp.func
-def normal_of(facing: wp.array2d(dtype=wp.vec3), batch: int, receiver: int):
-    """Where a receiver looks; 0 for one that looks everywhere."""
-    if facing:
-        return facing[instance_in(batch, facing.shape[0]), receiver]
+def horizon_normal(horizon_normals: wp.array2d(dtype=wp.vec3), batch: int, receiver: int):
+    """Receiver normal, or 0 to skip the horizon test."""
+    if horizon_normals:
+        return horizon_normals[instance_in(batch, horizon_normals.shape[0]), receiver]
     return wp.vec3()
 
 
 @wp.func
-def looks(normal: wp.vec3, direction: wp.vec3):
-    """Whether it looks towards a direction."""
+def is_above_horizon(normal: wp.vec3, direction: wp.vec3):
+    """Whether a direction is above the horizon of a normal; it is for the normal 0."""
     return wp.dot(normal, direction) > 0.0 or wp.length_sq(normal) == 0.0
 
 
@@ -127,7 +127,7 @@ def _add_coverage(
     worker: int,
     # in
     points: wp.array2d(dtype=wp.vec3),
-    facing: wp.array2d(dtype=wp.vec3),
+    horizon_normals: wp.array2d(dtype=wp.vec3),
     covered: wp.array3d(dtype=wp.float32),
     frames: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
@@ -143,13 +143,13 @@ def _add_coverage(
     exists = wp.length_sq(place.normal) > 0.0
     grid = scene.grids[f]
     front = front_of(fronts, grid, place.at[2], batch, receiver, f)
-    normal = normal_of(facing, batch, receiver)
+    normal = horizon_normal(horizon_normals, batch, receiver)
     for q in range(directions.shape[0]):
         direction = directions[q]
         part = float(0.0)
         if covered:
             part = covered[batch, receiver, q]
-        if exists and part < 1.0 and looks(normal, direction):
+        if exists and part < 1.0 and is_above_horizon(normal, direction):
             part += cover(scene, grid, place, False, direction, front).coverage
             part += cover(scene, grid, place, True, direction, 1.0 - front).coverage
         result[batch, receiver, q] = part
@@ -161,7 +161,7 @@ def _add_coverage_adjoint(
     worker: int,
     # in
     points: wp.array2d(dtype=wp.vec3),
-    facing: wp.array2d(dtype=wp.vec3),
+    horizon_normals: wp.array2d(dtype=wp.vec3),
     covered: wp.array3d(dtype=wp.float32),
     frames: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
@@ -184,7 +184,7 @@ def _add_coverage_adjoint(
     exists = wp.length_sq(place.normal) > 0.0
     grid = scene.grids[f]
     front = front_of(fronts, grid, place.at[2], batch, receiver, f)
-    normal = normal_of(facing, batch, receiver)
+    normal = horizon_normal(horizon_normals, batch, receiver)
     adj_place = ReceiverInPlane()
     adj_front = float(0.0)
     for q in range(directions.shape[0]):
@@ -193,15 +193,15 @@ def _add_coverage_adjoint(
         part = float(0.0)
         if covered:
             part = covered[batch, receiver, q]
-        if exists and adj != 0.0 and part < 1.0 and looks(normal, direction):
+        if exists and adj != 0.0 and part < 1.0 and is_above_horizon(normal, direction):
             for side in range(2):
-                is_back, presence = side == 1, wp.where(side == 1, 1.0 - front, front)
-                result = cover(scene, grid, place, is_back, direction, presence)
+                is_back, side_weight = side == 1, wp.where(side == 1, 1.0 - front, front)
+                result = cover(scene, grid, place, is_back, direction, side_weight)
                 if result.coverage > 0.0 and result.coverage < 1.0:  # a cell that is covered wholly stays so
-                    adj_place, adj_presence = cover_adjoint(
-                        scene, grid, place, is_back, direction, presence, result, adj, adj_place
+                    adj_place, adj_side_weight = cover_adjoint(
+                        scene, grid, place, is_back, direction, side_weight, result, adj, adj_place
                     )
-                    adj_front += wp.where(is_back, -adj_presence, adj_presence)
+                    adj_front += wp.where(is_back, -adj_side_weight, adj_side_weight)
         if adj_covered:
             adj_covered[batch, receiver, q] = adj_covered[batch, receiver, q] + adj
     adj_height = front_of_adjoint(fronts, grid, place.at[2], adj_front, batch, receiver, f, adj_fronts)
@@ -258,7 +258,7 @@ def plane_coverage(
     directions: np.ndarray,
     *,
     radius: float | None = None,
-    facing: wp.array | None = None,
+    horizon_normals: wp.array | None = None,
     fronts: wp.array | None = None,
     skip: int | None = None,
 ) -> wp.array | None:
@@ -271,7 +271,7 @@ def plane_coverage(
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
         radius: Of cells that do not tile the sphere [rad], how soft edges and horizons are; by default that of so many
             even ones, which do.
-        facing: Normals, vec3 of shape [batch, receiver]: nothing covers cells below the horizon.
+        horizon_normals: Normals, vec3 of shape [batch, receiver]: nothing covers cells below the horizon.
         fronts: Part of the front of each plane that receivers see, from :func:`.fronts.find_fronts`, float32 of shape
             [batch, receiver, plane]; by default their heights decide.
         skip: Number of the plane that the receivers are part of, which blocks none of their light; None for none.
@@ -288,13 +288,13 @@ def plane_coverage(
     cells, covered = constant(directions, wp.vec3, points.device), None
     for f in planes.blocking:
         if f != skip:
-            covered = _add(points, facing, covered, frames, fronts, scene, f, cells)
+            covered = _add(points, horizon_normals, covered, frames, fronts, scene, f, cells)
     return covered
 
 
 def _add(
     points: wp.array,
-    facing: wp.array | None,
+    horizon_normals: wp.array | None,
     covered: wp.array | None,
     frames: wp.array,
     fronts: wp.array | None,
@@ -303,7 +303,7 @@ def _add(
     directions: wp.array,
 ) -> wp.array:
     """Coverage by one flat more. Differentiable: points, covered, frames, fronts."""
-    inputs = [points, facing, covered, frames, fronts, scene, f, directions]
+    inputs = [points, horizon_normals, covered, frames, fronts, scene, f, directions]
     cost = _CELL_COST * directions.size
     return differentiable(
         lambda result: launch(_add_coverage, points.size, inputs=inputs, outputs=[result], cost=cost),
