@@ -68,7 +68,7 @@ class _GeometryFactors(NamedTuple):
     shape: tuple[int, int]  # views, receivers of each
 
     def to_receivers(self, direct: wp.array, bounced: wp.array) -> wp.array:
-        """Add bounced light of cache points to direct shading, vec3 of shape [batch, receiver]. Differentiable: both."""
+        """Add bounced light of cache points to direct shading, vec3 [batch, receiver]. Differentiable: both."""
         if self.shape[0] == 1:
             return multiply(self.receiver_weights, bounced, plus=direct)
         if len(bounced) > 1:

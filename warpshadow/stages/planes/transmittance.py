@@ -108,6 +108,39 @@ def cover_adjoint(
 
 
 @wp.func
+def add_sides(
+    part: float, scene: PlaneArrays, grid: PlaneGrid, place: ReceiverInPlane, direction: wp.vec3, front: float
+):
+    """Add the coverage of a cell by both sides of a plane, given the weight of its front."""
+    front_part = part + cover(scene, grid, place, False, direction, front).coverage
+    return front_part + cover(scene, grid, place, True, direction, 1.0 - front).coverage
+
+
+@wp.func
+def add_sides_adjoint(
+    scene: PlaneArrays,
+    grid: PlaneGrid,
+    place: ReceiverInPlane,
+    direction: wp.vec3,
+    front: float,
+    adj: float,
+    adj_place: ReceiverInPlane,
+    adj_front: float,
+):
+    """Add to the gradients of the place, and of the front weight."""
+    adj_weights = float(adj_front)
+    for side in range(2):
+        is_back, side_weight = side == 1, wp.where(side == 1, 1.0 - front, front)
+        covered = cover(scene, grid, place, is_back, direction, side_weight)
+        if covered.coverage > 0.0 and covered.coverage < 1.0:  # a cell that is covered wholly stays so
+            adj_place, adj_weight = cover_adjoint(
+                scene, grid, place, is_back, direction, side_weight, covered, adj, adj_place
+            )
+            adj_weights += wp.where(is_back, -adj_weight, adj_weight)
+    return adj_place, adj_weights
+
+
+@wp.func
 def horizon_normal(horizon_normals: wp.array2d(dtype=wp.vec3), batch: int, receiver: int):
     """Receiver normal, or 0 to skip the horizon test."""
     if horizon_normals:
@@ -150,8 +183,7 @@ def _add_coverage(
         if covered:
             part = covered[batch, receiver, q]
         if exists and part < 1.0 and is_above_horizon(normal, direction):
-            part += cover(scene, grid, place, False, direction, front).coverage
-            part += cover(scene, grid, place, True, direction, 1.0 - front).coverage
+            part = add_sides(part, scene, grid, place, direction, front)
         result[batch, receiver, q] = part
 
 
@@ -194,14 +226,7 @@ def _add_coverage_adjoint(
         if covered:
             part = covered[batch, receiver, q]
         if exists and adj != 0.0 and part < 1.0 and is_above_horizon(normal, direction):
-            for side in range(2):
-                is_back, side_weight = side == 1, wp.where(side == 1, 1.0 - front, front)
-                result = cover(scene, grid, place, is_back, direction, side_weight)
-                if result.coverage > 0.0 and result.coverage < 1.0:  # a cell that is covered wholly stays so
-                    adj_place, adj_side_weight = cover_adjoint(
-                        scene, grid, place, is_back, direction, side_weight, result, adj, adj_place
-                    )
-                    adj_front += wp.where(is_back, -adj_side_weight, adj_side_weight)
+            adj_place, adj_front = add_sides_adjoint(scene, grid, place, direction, front, adj, adj_place, adj_front)
         if adj_covered:
             adj_covered[batch, receiver, q] = adj_covered[batch, receiver, q] + adj
     adj_height = front_of_adjoint(fronts, grid, place.at[2], adj_front, batch, receiver, f, adj_fronts)
