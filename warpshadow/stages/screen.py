@@ -10,8 +10,8 @@ stages that ask where something lies in an image agree on this:
     relative      (x − w x₀, y − w y₀, w), relative to the ray through a position (x₀, y₀): nothing cancels near the ray
     line          ℓ with ℓ·(x, y, 1) = 0; a × b is the line through vertices a and b
     plane         n with n·(x, y, w) = 1; relative to a ray, n_w is the 1/w at which the ray meets it
-    way           from a sample's center to that of a neighbor: 0 right, 1 left, 2 below, 3 above. Its axis is way/2
-    distance      from a sample's center along a way, 1 at the neighbor's center [samples]
+    direction     from a sample's center to that of a neighbor: 0 right, 1 left, 2 below, 3 above. Its axis is direction
+    / 2 distance      from a sample's center along a direction, 1 at the neighbor's center [samples]
 """
 
 import warp as wp
@@ -41,31 +41,31 @@ def half_size(width: int, height: int):
 
 
 @wp.func
-def neighbor(sample: int, way: int, width: int):
-    """The next sample on a way."""
-    step = wp.where(way < 2, 1, width)
-    return sample + wp.where(way % 2 == 0, step, -step)
+def neighbor(sample: int, direction: int, width: int):
+    """The next sample in a direction."""
+    step = wp.where(direction < 2, 1, width)
+    return sample + wp.where(direction % 2 == 0, step, -step)
 
 
 @wp.func
-def has_neighbor(sample: int, way: int, width: int, height: int):
-    """Whether the image goes on that way."""
+def has_neighbor(sample: int, direction: int, width: int, height: int):
+    """Whether the image goes on in that direction."""
     row = sample / width
-    place = wp.where(way < 2, sample - row * width, row % height)
-    last = wp.where(way < 2, width, height) - 1
-    return wp.where(way % 2 == 0, place < last, place > 0)
+    place = wp.where(direction < 2, sample - row * width, row % height)
+    last = wp.where(direction < 2, width, height) - 1
+    return wp.where(direction % 2 == 0, place < last, place > 0)
 
 
 @wp.func
-def opposite(way: int):
-    """The way back."""
-    return wp.where(way % 2 == 0, way + 1, way - 1)
+def opposite(direction: int):
+    """The opposite direction."""
+    return wp.where(direction % 2 == 0, direction + 1, direction - 1)
 
 
 @wp.func
-def sense(way: int):
-    """1 where a way leads to larger positions, else −1."""
-    return 1.0 - 2.0 * float(way % 2)
+def sense(direction: int):
+    """1 where a direction leads to larger positions, else −1."""
+    return 1.0 - 2.0 * float(direction % 2)
 
 
 # ---------------------------------------------------------------------------------------------------- faces
@@ -115,20 +115,20 @@ def plane(corners: wp.vec3i, position: wp.vec2, clip_positions: wp.array(dtype=w
 
 
 @wp.func
-def distance(line: wp.vec3, way: int, half: wp.vec2):
-    """Distance at which a line, relative to a sample's center, crosses a way from there; ``half`` is `half_size`."""
-    axis = way / 2
-    return -sense(way) * half[axis] * line[2] / line[axis]
+def distance(line: wp.vec3, direction: int, half: wp.vec2):
+    """Distance at which a line, relative to a sample's center, crosses a direction; ``half`` is `half_size`."""
+    axis = direction / 2
+    return -sense(direction) * half[axis] * line[2] / line[axis]
 
 
 @wp.func
-def lean(line: wp.vec3, way: int, half: wp.vec2):
-    """How far along a way a line moves from one row (or column) of samples to the next [samples]."""
-    axis = way / 2
+def lean(line: wp.vec3, direction: int, half: wp.vec2):
+    """How far along a direction a line moves from one row (or column) of samples to the next [samples]."""
+    axis = direction / 2
     return wp.abs(line[1 - axis] / line[axis]) * half[axis] / half[1 - axis]
 
 
 @wp.func
-def ends_before(line: wp.vec3, way: int):
+def ends_before(line: wp.vec3, direction: int):
     """Whether a line, positive on the surface that ends there, bounds the surface of the sample, not its neighbor."""
-    return -sense(way) * line[way / 2] > 0.0
+    return -sense(direction) * line[direction / 2] > 0.0

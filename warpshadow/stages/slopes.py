@@ -72,7 +72,7 @@ def _pull(
     receiver_faces: wp.array(dtype=wp.vec3i),
     shading: wp.array2d(dtype=wp.vec3),
     albedo: wp.array2d(dtype=wp.vec3),
-    seen: FragmentArrays,
+    fragments: FragmentArrays,
     entries: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
     edge_colors: wp.array3d(dtype=wp.vec4),
@@ -84,17 +84,17 @@ def _pull(
 ):
     """A thread owns a run of samples of all instances; ``at`` is a sample's number in the flat images that are seen."""
     first = (first_row + wp.tid()) * run
-    width = seen.width
-    half = half_size(width, seen.height)
+    width = fragments.width
+    half = half_size(width, fragments.height)
     for batch in range(adj_samples.shape[0]):
         view = instance_in(batch, receiver_face_ids.shape[0])
         reflecting = instance_in(batch, albedo.shape[0])
         of_receivers = shading[instance_in(batch, shading.shape[0])]
         lit = instance_in(batch, light.shape[0])
-        clip = seen.clip_positions[view]
+        clip = fragments.clip_positions[view]
         for sample in range(first, first + run):
             at = view * adj_samples.shape[1] + sample
-            face = seen.face_ids[at]
+            face = fragments.face_ids[at]
             adj_sample = adj_samples[batch, sample]
             adj_color = wp.vec3(adj_sample[0], adj_sample[1], adj_sample[2])
             receivers = wp.vec3i()
@@ -105,43 +105,43 @@ def _pull(
                 adj_light = wp.cw_mul(adj_color, albedo[reflecting, sample])
                 here = light[lit, sample]
                 color = samples[batch, sample]
-                center = sample_center(at, width, seen.height)
+                center = sample_center(at, width, fragments.height)
                 entry = entries[at]
                 is_flat = entry < 0
-                for way in range(4):
-                    if has_neighbor(at, way, width, seen.height):
-                        is_flat = is_flat and seen.face_ids[neighbor(at, way, width)] == face
+                for direction in range(4):
+                    if has_neighbor(at, direction, width, fragments.height):
+                        is_flat = is_flat and fragments.face_ids[neighbor(at, direction, width)] == face
                 rises = wp.vec2()
                 spans = wp.vec2()  # lengths over which the differences were measured [samples]
                 if not is_flat:
-                    for way in range(4):
+                    for direction in range(4):
                         edge = wp.vec2i(NOTHING, NOTHING)
                         if entry >= 0:
-                            edge = edges[entry, way]
+                            edge = edges[entry, direction]
                         if edge[0] >= 0:
                             line = edge_line(edge, center, clip)
-                            t = distance(line, way, half)
-                            if ends_before(line, way) and t > MIN_DISTANCE and t <= 1.0:
+                            t = distance(line, direction, half)
+                            if ends_before(line, direction) and t > MIN_DISTANCE and t <= 1.0:
                                 # entries are of all views; where one view serves all images, each has its own colors
-                                rise = edge_colors[batch - view, entry, way] - color
+                                rise = edge_colors[batch - view, entry, direction] - color
                                 span = wp.min(t, 0.5)
                                 total = wp.dot(adj_color, wp.vec3(rise[0], rise[1], rise[2]))
-                                rises[way / 2] += sense(way) * span / t * total
-                                spans[way / 2] += span
-                        elif edge[0] == NOTHING and has_neighbor(at, way, width, seen.height):
-                            other = neighbor(sample, way, width)
+                                rises[direction / 2] += sense(direction) * span / t * total
+                                spans[direction / 2] += span
+                        elif edge[0] == NOTHING and has_neighbor(at, direction, width, fragments.height):
+                            other = neighbor(sample, direction, width)
                             if receiver_face_ids[view, other] >= 0:
                                 rise_of_light = wp.dot(adj_light, light[lit, other] - here)
-                                rises[way / 2] += sense(way) * 0.5 * rise_of_light
-                                spans[way / 2] += 0.5
+                                rises[direction / 2] += sense(direction) * 0.5 * rise_of_light
+                                spans[direction / 2] += 0.5
                 slope = wp.cw_mul(wp.cw_div(rises, spans), half)
-                corners = seen.faces[face]
+                corners = fragments.faces[face]
                 if wp.min(spans) == 0.0:
                     own = _slope_of_face(adj_weights(of_receivers, receivers, adj_light), corners, center, clip)
                     slope = wp.vec2(
                         wp.where(spans[0] == 0.0, own[0], slope[0]), wp.where(spans[1] == 0.0, own[1], slope[1])
                     )
-                weights = seen.barycentrics[at]
+                weights = fragments.barycentrics[at]
                 depth = wp.dot(weights, wp.vec3(clip[corners[0]][3], clip[corners[1]][3], clip[corners[2]][3]))
                 pull = relative_adjoint(center, wp.vec3(-slope[0], -slope[1], 0.0)) / depth
                 if wp.isfinite(pull):

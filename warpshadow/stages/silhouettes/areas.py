@@ -1,7 +1,7 @@
 """Areas: how much of a sample lies beyond the lines around it, and how that changes with the vertices.
 
-A line crosses the way to a neighbor at distance t, and leans by m samples a sample (at most 1). Of the sample lies
-beyond it
+A line crosses the direction to a neighbor at distance t, and leans by m samples a sample (at most 1). Of the sample
+lies beyond it
 
     e = ½ − t                     t ≤ (1 − m)/2
         ((1 + m)/2 − t)² / 2m     between
@@ -44,19 +44,19 @@ def _measure(
     samples: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
     entries: wp.array(dtype=wp.int32),
-    seen: FragmentArrays,
+    fragments: FragmentArrays,
     # out
     shares: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a way of an entry: the area e beyond the line there, its weight ω, and the kind of its end."""
-    entry, way = wp.tid()
-    edge = edges[entry, way]
+    """A thread owns a direction of an entry: area e beyond the line there, its weight ω, and the kind of its end."""
+    entry, direction = wp.tid()
+    edge = edges[entry, direction]
     share = wp.vec3()
     if edge[0] != NOTHING:
-        half = half_size(seen.width, seen.height)
-        line = line_between(seen, samples[entry], way, edge)
-        t = wp.clamp(distance(line, way, half), 0.0, 1.0)
-        steepness = lean(line, way, half)
+        half = half_size(fragments.width, fragments.height)
+        line = line_between(fragments, samples[entry], direction, edge)
+        t = wp.clamp(distance(line, direction, half), 0.0, 1.0)
+        steepness = lean(line, direction, half)
         m = wp.min(steepness, 1.0)
         area = float(0.0)
         if t <= 0.5 * (1.0 - m):
@@ -64,12 +64,12 @@ def _measure(
         elif t < 0.5 * (1.0 + m):
             rest = 0.5 * (1.0 + m) - t
             area = 0.5 * rest * rest / m
-        if wp.isfinite(line / line[way / 2]):  # else vertices are so far away that products overflow
-            its_edge = edges[entries[neighbor(samples[entry], way, seen.width)], opposite(way)]
+        if wp.isfinite(line / line[direction / 2]):  # else vertices are so far away that products overflow
+            its_edge = edges[entries[neighbor(samples[entry], direction, fragments.width)], opposite(direction)]
             is_end = edge[0] == its_edge[0] and edge[1] == its_edge[1]
             counts = 1.0 / (1.0 + steepness * steepness * steepness * steepness)
             share = wp.vec3(area, counts, wp.where(is_end, 1.0, 0.0))
-    shares[entry, way] = share
+    shares[entry, direction] = share
 
 
 @wp.kernel(enable_backward=False)
@@ -77,31 +77,31 @@ def _measure_adjoint(
     # in
     samples: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
-    seen: FragmentArrays,
+    fragments: FragmentArrays,
     adj_areas: wp.array2d(dtype=wp.float32),
     # out
     adj_clip_positions: wp.array2d(dtype=wp.vec4),
 ):
-    """A thread owns a way of an entry: it pulls at the vertices of the line there."""
-    entry, way = wp.tid()
-    edge = edges[entry, way]
-    adj_area = adj_areas[entry, way]
+    """A thread owns a direction of an entry: it adds to the gradients of the line's vertices."""
+    entry, direction = wp.tid()
+    edge = edges[entry, direction]
+    adj_area = adj_areas[entry, direction]
     if edge[0] != NOTHING and adj_area != 0.0:
-        axis = way / 2
+        axis = direction / 2
         sample = samples[entry]
-        batch = image_of(seen, sample)
-        clip = seen.clip_positions[batch]
-        half = half_size(seen.width, seen.height)
-        center = sample_center(sample, seen.width, seen.height)
-        line = line_between(seen, sample, way, edge)
-        t = wp.clamp(distance(line, way, half), 0.0, 1.0)
-        m = wp.min(lean(line, way, half), 1.0)
+        batch = image_of(fragments, sample)
+        clip = fragments.clip_positions[batch]
+        half = half_size(fragments.width, fragments.height)
+        center = sample_center(sample, fragments.width, fragments.height)
+        line = line_between(fragments, sample, direction, edge)
+        t = wp.clamp(distance(line, direction, half), 0.0, 1.0)
+        m = wp.min(lean(line, direction, half), 1.0)
         decline = float(0.0)  # of e with t
         if t <= 0.5 * (1.0 - m):
             decline = 1.0
         elif t < 0.5 * (1.0 + m):
             decline = (0.5 * (1.0 + m) - t) / m
-        adj_place = -sense(way) * adj_area * decline * half[axis]  # by the line's x in a row, or y in a column
+        adj_place = -sense(direction) * adj_area * decline * half[axis]  # by the line's x in a row, or y in a column
         if edge[0] >= 0:
             across_a = relative(clip[edge[0]], center)[1 - axis]
             across_b = relative(clip[edge[1]], center)[1 - axis]
@@ -114,34 +114,34 @@ def _measure_adjoint(
                 at = sample
                 sign = float(1.0)
                 if end == 1:
-                    at = neighbor(sample, way, seen.width)
+                    at = neighbor(sample, direction, fragments.width)
                     sign = -1.0
-                corners = seen.faces[seen.face_ids[at]]
-                ray = sample_center(at, seen.width, seen.height)
+                corners = fragments.faces[fragments.face_ids[at]]
+                ray = sample_center(at, fragments.width, fragments.height)
                 normal = plane(corners, ray, clip)
                 pull = sign * adj_place * (normal[2] / line[axis]) * relative_adjoint(ray, normal)
                 for k in range(3):
-                    wp.atomic_add(adj_clip_positions, batch, corners[k], seen.barycentrics[at][k] * pull)
+                    wp.atomic_add(adj_clip_positions, batch, corners[k], fragments.barycentrics[at][k] * pull)
 
 
-def measure_areas(samples: wp.array, edges: wp.array, entries: wp.array, seen: FragmentArrays) -> wp.array:
+def measure_areas(samples: wp.array, edges: wp.array, entries: wp.array, arrays: FragmentArrays) -> wp.array:
     """Measure the areas beyond the lines beside samples.
 
     Args:
         samples: Of each entry, int32 of shape [entry].
-        edges: Vertices of the line on each way, vec2i of shape [entry, 4].
+        edges: Vertices of the line in each direction, vec2i of shape [entry, 4].
         entries: Of each sample, int32 of shape [sample].
-        seen: The fragments.
+        arrays: The fragments as kernels take them.
     Returns:
         The area e beyond each line, how much it counts, ω, and whether a surface ends there, 1, or has a crease, 0;
         vec3 of shape [entry, 4], zero where there is no line.
     """
     shares = empty(edges.shape, dtype=wp.vec3, device=edges.device)
-    launch(_measure, edges.shape, inputs=[samples, edges, entries, seen], outputs=[shares])
+    launch(_measure, edges.shape, inputs=[samples, edges, entries, arrays], outputs=[shares])
     return shares
 
 
-def add_to_vertices(samples: wp.array, edges: wp.array, seen: FragmentArrays, adj_areas: wp.array) -> None:
+def add_to_vertices(samples: wp.array, edges: wp.array, arrays: FragmentArrays, adj_areas: wp.array) -> None:
     """The adjoint of the areas e, float32 of shape [entry, 4]: add to the gradient of the clip positions."""
-    adj_clip_positions = seen.clip_positions.grad
-    launch(_measure_adjoint, edges.shape, inputs=[samples, edges, seen, adj_areas], outputs=[adj_clip_positions])
+    adj_clip_positions = arrays.clip_positions.grad
+    launch(_measure_adjoint, edges.shape, inputs=[samples, edges, arrays, adj_areas], outputs=[adj_clip_positions])

@@ -28,7 +28,7 @@ def _find_edge_colors(
     image: wp.array2d(dtype=wp.vec4),
     samples: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
-    seen: FragmentArrays,
+    fragments: FragmentArrays,
     sides: wp.array(dtype=wp.int32),
     shading: wp.array2d(dtype=wp.vec3),
     receivers: wp.array(dtype=wp.int32),
@@ -40,37 +40,37 @@ def _find_edge_colors(
     instance, entry = wp.tid()
     sample = samples[entry]
     if sample >= 0:
-        batch = image_of(seen, sample)
+        batch = image_of(fragments, sample)
         of_receivers = shading[instance_in(instance + batch, shading.shape[0])]
         of_samples = albedo[instance_in(instance + batch, albedo.shape[0])]
-        center = sample_center(sample, seen.width, seen.height)
-        half = half_size(seen.width, seen.height)
-        clip = seen.clip_positions[batch]
+        center = sample_center(sample, fragments.width, fragments.height)
+        half = half_size(fragments.width, fragments.height)
+        clip = fragments.clip_positions[batch]
         here = image[instance, sample]
-        for way in range(4):
-            edge = edges[entry, way]
+        for direction in range(4):
+            edge = edges[entry, direction]
             if edge[0] != NOTHING:
-                line = line_between(seen, sample, way, edge)
+                line = line_between(fragments, sample, direction, edge)
                 color = here
-                back = opposite(way)
-                if edges[entry, back][0] == NOTHING and has_neighbor(sample, back, seen.width, seen.height):
-                    rise = here - image[instance, neighbor(sample, back, seen.width)]
+                back = opposite(direction)
+                if edges[entry, back][0] == NOTHING and has_neighbor(sample, back, fragments.width, fragments.height):
+                    rise = here - image[instance, neighbor(sample, back, fragments.width)]
                     if rise[3] == 0.0:
-                        color += wp.clamp(distance(line, way, half), 0.0, 1.0) * rise
-                if edge[0] >= 0 and ends_before(line, way):
+                        color += wp.clamp(distance(line, direction, half), 0.0, 1.0) * rise
+                if edge[0] >= 0 and ends_before(line, direction):
                     is_back = bool(False)
                     if sides:
-                        _, is_back = split_side(sides[sample], seen.faces.shape[0])
+                        _, is_back = split_side(sides[sample], fragments.faces.shape[0])
                     first = receivers[join_side(edge[0], is_back, clip.shape[0])]
                     second = receivers[join_side(edge[1], is_back, clip.shape[0])]
                     if wp.min(first, second) >= 0:
-                        across_a = relative(clip[edge[0]], center)[1 - way / 2]
-                        across_b = relative(clip[edge[1]], center)[1 - way / 2]
+                        across_a = relative(clip[edge[0]], center)[1 - direction / 2]
+                        across_b = relative(clip[edge[1]], center)[1 - direction / 2]
                         place = wp.clamp(across_a / (across_a - across_b), 0.0, 1.0)
                         received = wp.lerp(of_receivers[first], of_receivers[second], place)
-                        received = wp.cw_mul(received, of_samples[sample % (seen.width * seen.height)])
+                        received = wp.cw_mul(received, of_samples[sample % (fragments.width * fragments.height)])
                         color = wp.vec4(received[0], received[1], received[2], 1.0)
-                edge_colors[instance, entry, way] = wp.where(wp.isfinite(color), color, here)
+                edge_colors[instance, entry, direction] = wp.where(wp.isfinite(color), color, here)
 
 
 def find_edge_colors(
@@ -97,8 +97,8 @@ def find_edge_colors(
             sides, the backs' receivers follow.
         albedo: Of the samples, vec3 of shape [batch, height, width].
     Returns:
-        For each way of each entry, the color of its sample's surface at the edge, vec4 of shape [instance, entry, 4],
-        for :func:`warpshadow.stages.silhouettes.smooth.smooth_silhouettes`.
+        For each direction of each entry, the color of its sample's surface at the edge, vec4 of shape [instance, entry,
+        4], for :func:`warpshadow.stages.silhouettes.smooth.smooth_silhouettes`.
 
     Not differentiable.
     """

@@ -91,14 +91,14 @@ class Silhouettes:
 
 
 @wp.func
-def _depth(seen: FragmentArrays, sample: int):
+def _depth(fragments: FragmentArrays, sample: int):
     """Distance of a sample's point along the view, infinite for the background."""
     depth = float(wp.inf)
-    face = seen.face_ids[sample]
+    face = fragments.face_ids[sample]
     if face >= 0:
-        weights = seen.barycentrics[sample]
-        clip = seen.clip_positions[image_of(seen, sample)]
-        corners = seen.faces[face]
+        weights = fragments.barycentrics[sample]
+        clip = fragments.clip_positions[image_of(fragments, sample)]
+        corners = fragments.faces[face]
         depth = weights[0] * clip[corners[0]][3] + weights[1] * clip[corners[1]][3] + weights[2] * clip[corners[2]][3]
     return depth
 
@@ -185,21 +185,25 @@ def _end_of_surface(
 
 @wp.func
 def _edge_between(
-    seen: FragmentArrays, neighbors: wp.array(dtype=wp.vec3i), creases: wp.array(dtype=wp.int32), sample: int, way: int
+    fragments: FragmentArrays,
+    neighbors: wp.array(dtype=wp.vec3i),
+    creases: wp.array(dtype=wp.int32),
+    sample: int,
+    direction: int,
 ):
-    """The one edge between a sample and its neighbor on a way, as 3 face + corner, or −1.
+    """The one edge between a sample and its neighbor in a direction, as 3 face + corner, or −1.
 
     It is where the surface of the nearer sample ends before the other's center. If that surface goes on, hidden behind
     the other's, it is where the other's ends instead. If they are one surface, it is its first crease.
     """
-    other = neighbor(sample, way, seen.width)
-    here = seen.face_ids[sample]
-    there = seen.face_ids[other]
-    is_nearer = _depth(seen, sample) <= _depth(seen, other)
-    first = sample_center(sample, seen.width, seen.height)
-    last = sample_center(other, seen.width, seen.height)
+    other = neighbor(sample, direction, fragments.width)
+    here = fragments.face_ids[sample]
+    there = fragments.face_ids[other]
+    is_nearer = _depth(fragments, sample) <= _depth(fragments, other)
+    first = sample_center(sample, fragments.width, fragments.height)
+    last = sample_center(other, fragments.width, fragments.height)
     margin = _SNAP * (last - first)
-    clip = seen.clip_positions[image_of(seen, sample)]
+    clip = fragments.clip_positions[image_of(fragments, sample)]
     edge_found = int(-1)
     crease = int(-1)
     for attempt in range(2):
@@ -208,7 +212,9 @@ def _edge_between(
             start = wp.where(from_here, here, there)
             goal = wp.where(from_here, there, here)
             end = wp.where(from_here, last + margin, first - margin)
-            edge_found, crease = _end_of_surface(start, goal, end, way / 2, seen.faces, neighbors, creases, clip)
+            edge_found, crease = _end_of_surface(
+                start, goal, end, direction / 2, fragments.faces, neighbors, creases, clip
+            )
     return wp.where(edge_found >= 0, edge_found, crease)
 
 
@@ -230,32 +236,32 @@ def _edge_of(
 
 @wp.func
 def _edge_at(
-    seen: FragmentArrays,
+    fragments: FragmentArrays,
     neighbors: wp.array(dtype=wp.vec3i),
     creases: wp.array(dtype=wp.int32),
     crossings: wp.array2d(dtype=wp.int32),
     sample: int,
-    way: int,
+    direction: int,
     is_neighbor: bool,
 ):
     """The edge between a sample and its neighbor, if there is any, as the one or the other has it."""
-    crossing = crossings[way / 2, sample]
+    crossing = crossings[direction / 2, sample]
     if crossing < 0:
         return wp.vec2i(crossing, crossing)  # nothing, or where faces intersect
     face = crossing / 3
     corner = crossing - 3 * face
-    clip = seen.clip_positions[image_of(seen, sample)]
-    edge = _edge_of(face, corner, seen.faces, clip)
+    clip = fragments.clip_positions[image_of(fragments, sample)]
+    edge = _edge_of(face, corner, fragments.faces, clip)
     if creases:
         other = neighbors[face][corner]
-        corners = seen.faces[face]
+        corners = fragments.faces[face]
         a = clip[corners[(corner + 1) % 3]]
         b = clip[corners[(corner + 2) % 3]]
         volume = orientation(clip[corners[0]], clip[corners[1]], clip[corners[2]])
-        is_crease = not _is_silhouette(face, other, a, b, volume, seen.faces, neighbors, clip)
+        is_crease = not _is_silhouette(face, other, a, b, volume, fragments.faces, neighbors, clip)
         # of the two samples that which the edge's line does not bound has the edge of the face beyond
-        if is_crease and ends_before(line_between(seen, sample, way, edge), way) == is_neighbor:
-            edge = _edge_of(other, _corner_before(face, other, neighbors), seen.faces, clip)
+        if is_crease and ends_before(line_between(fragments, sample, direction, edge), direction) == is_neighbor:
+            edge = _edge_of(other, _corner_before(face, other, neighbors), fragments.faces, clip)
     return edge
 
 
@@ -280,7 +286,7 @@ def _find_edges(
     first_row: int,
     worker: int,
     # in
-    seen: FragmentArrays,
+    fragments: FragmentArrays,
     neighbors: wp.array(dtype=wp.vec3i),
     creases: wp.array(dtype=wp.int32),
     strips: int,
@@ -295,17 +301,17 @@ def _find_edges(
     same.
     """
     row_of_faces, strip = wp.tid()
-    batch, face = split_row(first_row + row_of_faces, seen.faces.shape[0])
-    clip = seen.clip_positions[batch]
-    corners = seen.faces[face]
+    batch, face = split_row(first_row + row_of_faces, fragments.faces.shape[0])
+    clip = fragments.clip_positions[batch]
+    corners = fragments.faces[face]
     surrounding = neighbors[face]
-    half = half_size(seen.width, seen.height)
+    half = half_size(fragments.width, fragments.height)
     volume = orientation(clip[corners[0]], clip[corners[1]], clip[corners[2]])
     for k in range(3):
         a = clip[corners[(k + 1) % 3]]
         b = clip[corners[(k + 2) % 3]]
         is_line = a[3] > a[2] or b[3] > b[2]  # else it lies behind the near plane
-        if is_line and not _is_silhouette(face, surrounding[k], a, b, volume, seen.faces, neighbors, clip):
+        if is_line and not _is_silhouette(face, surrounding[k], a, b, volume, fragments.faces, neighbors, clip):
             is_line = _is_crease(face, k, creases)
         if is_line:
             p = _end_on_screen(a, b, half)
@@ -316,8 +322,8 @@ def _find_edges(
                 high = wp.where(p[1 - axis] < q[1 - axis], q, p)
                 extent = high[1 - axis] - low[1 - axis]
                 slope = (high[axis] - low[axis]) / wp.max(extent, 1.0e-30)
-                row_count = wp.where(axis == 0, seen.height, seen.width)
-                column_count = wp.where(axis == 0, seen.width, seen.height)
+                row_count = wp.where(axis == 0, fragments.height, fragments.width)
+                column_count = wp.where(axis == 0, fragments.width, fragments.height)
                 row = _centers_before(low[1 - axis] - _SNAP, row_count) + strip
                 row_end = _centers_before(high[1 - axis] + _SNAP, row_count)
                 while row < row_end:
@@ -325,12 +331,15 @@ def _find_edges(
                     column = wp.max(_centers_before(x - _SNAP, column_count) - 1, 0)
                     column_end = wp.min(_centers_before(x + _SNAP, column_count), column_count - 1)
                     while column < column_end:
-                        sample = batch * seen.width * seen.height
-                        sample += wp.where(axis == 0, row * seen.width + column, column * seen.width + row)
-                        if seen.face_ids[sample] != seen.face_ids[neighbor(sample, 2 * axis, seen.width)]:
+                        sample = batch * fragments.width * fragments.height
+                        sample += wp.where(axis == 0, row * fragments.width + column, column * fragments.width + row)
+                        if (
+                            fragments.face_ids[sample]
+                            != fragments.face_ids[neighbor(sample, 2 * axis, fragments.width)]
+                        ):
                             edge_found = between[axis, sample]
                             if edge_found == _UNKNOWN_EDGE:
-                                edge_found = _edge_between(seen, neighbors, creases, sample, 2 * axis)
+                                edge_found = _edge_between(fragments, neighbors, creases, sample, 2 * axis)
                                 between[axis, sample] = wp.where(edge_found < 0, _NO_EDGE, edge_found)
                             if edge_found == 3 * face + k:
                                 crossings[axis, sample] = edge_found
@@ -342,14 +351,14 @@ def _find_edges(
 
 
 @wp.func
-def _approach(seen: FragmentArrays, sample: int, way: int):
+def _approach(fragments: FragmentArrays, sample: int, direction: int):
     """Whether the face of a sample's neighbor gets clearly nearer than the sample's from one to the other."""
-    axis = way / 2
-    clip = seen.clip_positions[image_of(seen, sample)]
-    line = line_between(seen, sample, way, wp.vec2i(INTERSECTION, INTERSECTION))
-    center = sample_center(sample, seen.width, seen.height)
-    inverse_depth = plane(seen.faces[seen.face_ids[sample]], center, clip)[2]
-    opening = -sense(way) * line[axis] / half_size(seen.width, seen.height)[axis]
+    axis = direction / 2
+    clip = fragments.clip_positions[image_of(fragments, sample)]
+    line = line_between(fragments, sample, direction, wp.vec2i(INTERSECTION, INTERSECTION))
+    center = sample_center(sample, fragments.width, fragments.height)
+    inverse_depth = plane(fragments.faces[fragments.face_ids[sample]], center, clip)[2]
+    opening = -sense(direction) * line[axis] / half_size(fragments.width, fragments.height)[axis]
     return opening > MIN_OPENING * inverse_depth
 
 
@@ -358,7 +367,7 @@ def _find_intersections(
     first_row: int,
     worker: int,
     # in
-    seen: FragmentArrays,
+    fragments: FragmentArrays,
     neighbors: wp.array(dtype=wp.vec3i),
     bodies: wp.array(dtype=wp.int32),
     creases: wp.array(dtype=wp.int32),
@@ -368,22 +377,22 @@ def _find_intersections(
 ):
     """A thread owns ``run`` samples after one another: the crossings to their right and their lower neighbors."""
     first = (first_row + wp.tid()) * run
-    count = seen.face_ids.shape[0]
+    count = fragments.face_ids.shape[0]
     for sample in range(first, wp.min(first + run, count)):
-        here = seen.face_ids[sample]
+        here = fragments.face_ids[sample]
         if here >= 0:
             # Nearly all samples end here, so this comes first, and without branches.
             body = bodies[here]
-            right = bodies[wp.max(seen.face_ids[wp.min(sample + 1, count - 1)], 0)]
-            below = bodies[wp.max(seen.face_ids[wp.min(sample + seen.width, count - 1)], 0)]
+            right = bodies[wp.max(fragments.face_ids[wp.min(sample + 1, count - 1)], 0)]
+            below = bodies[wp.max(fragments.face_ids[wp.min(sample + fragments.width, count - 1)], 0)]
             if right != body or below != body:
                 for axis in range(2):
-                    way = 2 * axis
+                    direction = 2 * axis
                     differs = wp.where(axis == 0, right, below) != body
-                    if differs and has_neighbor(sample, way, seen.width, seen.height):
-                        is_face = seen.face_ids[neighbor(sample, way, seen.width)] >= 0
-                        if is_face and _approach(seen, sample, way):
-                            edge_found = _edge_between(seen, neighbors, creases, sample, way)
+                    if differs and has_neighbor(sample, direction, fragments.width, fragments.height):
+                        is_face = fragments.face_ids[neighbor(sample, direction, fragments.width)] >= 0
+                        if is_face and _approach(fragments, sample, direction):
+                            edge_found = _edge_between(fragments, neighbors, creases, sample, direction)
                             if edge_found < 0:
                                 crossings[axis, sample] = INTERSECTION
 
@@ -429,7 +438,7 @@ def _make_entries(
     worker: int,
     # in
     crossings: wp.array2d(dtype=wp.int32),
-    seen: FragmentArrays,
+    fragments: FragmentArrays,
     neighbors: wp.array(dtype=wp.vec3i),
     creases: wp.array(dtype=wp.int32),
     ends: wp.array(dtype=wp.int32),
@@ -454,12 +463,14 @@ def _make_entries(
             if not ends:
                 entry = sample
             samples[entry] = wp.where(number >= 0, sample, -1)
-            for way in range(4):
+            for direction in range(4):
                 edge = wp.vec2i(NOTHING, NOTHING)
-                first = wp.where(way % 2 == 0, sample, neighbor(sample, way, seen.width))
+                first = wp.where(direction % 2 == 0, sample, neighbor(sample, direction, fragments.width))
                 if number >= 0 and first >= 0:
-                    edge = _edge_at(seen, neighbors, creases, crossings, first, way - way % 2, way % 2 == 1)
-                edges[entry, way] = edge
+                    edge = _edge_at(
+                        fragments, neighbors, creases, crossings, first, direction - direction % 2, direction % 2 == 1
+                    )
+                edges[entry, direction] = edge
             entries[sample] = wp.where(number >= 0, entry, -1)
 
 
@@ -492,7 +503,7 @@ def find_silhouettes(
     device, sample_count = faces.device, fragments.face_ids.size
     if sample_count > MAX_SAMPLES:
         raise ValueError(f"fragments: got {sample_count} samples in all, expected at most {MAX_SAMPLES}")
-    seen, strips = make_fragment_arrays(fragments, faces, clip_positions), strip_count(device)
+    arrays, strips = make_fragment_arrays(fragments, faces, clip_positions), strip_count(device)
     numbers = wp.full((4, sample_count), NOTHING, dtype=wp.int32, device=device)
     between, crossings = numbers[:2], numbers[2:]  # in the latter 3 face + corner of an edge, or INTERSECTION
     if creases is not None:
@@ -501,23 +512,23 @@ def find_silhouettes(
         _find_edges,
         (len(clip_positions) * faces.shape[0], strips),
         cost=_FACE_COST,
-        inputs=[seen, neighbors, creases, strips],
+        inputs=[arrays, neighbors, creases, strips],
         outputs=[between, crossings],
     )
-    run = run_length(device, seen.width)
+    run = run_length(device, arrays.width)
     dim = -(-sample_count // run)
     if bodies is not None:
         check.shape("bodies", bodies.shape, faces.shape)
-        inputs = [seen, neighbors, bodies, creases, run]
+        inputs = [arrays, neighbors, bodies, creases, run]
         launch(_find_intersections, dim, cost=_SAMPLE_COST * run, inputs=inputs, outputs=[crossings])
     entries, ends = empty(sample_count, wp.int32, device), None if device.is_capturing else empty(dim, wp.int32, device)
-    inputs = [crossings, seen.width, run]
+    inputs = [crossings, arrays.width, run]
     launch(_count_entries, dim, cost=_ENTRY_COST * run, inputs=inputs, outputs=[entries, ends])
     entry_count = sample_count
     if ends is not None:
         wp.utils.array_scan(ends, ends)
         entry_count = int(ends[-1:].numpy()[0]) if dim else 0
     samples, edges = empty(entry_count, wp.int32, device), empty((entry_count, 4), wp.vec2i, device)
-    inputs = [crossings, seen, neighbors, creases, ends, run]
+    inputs = [crossings, arrays, neighbors, creases, ends, run]
     launch(_make_entries, dim, cost=_ENTRY_COST * run, inputs=inputs, outputs=[samples, edges, entries])
-    return Silhouettes(samples, edges, measure_areas(samples, edges, entries, seen), entries, fragments, faces)
+    return Silhouettes(samples, edges, measure_areas(samples, edges, entries, arrays), entries, fragments, faces)

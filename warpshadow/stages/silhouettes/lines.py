@@ -23,17 +23,17 @@ class FragmentArrays:
 
 def make_fragment_arrays(fragments: Fragments, faces: wp.array, clip_positions: wp.array) -> FragmentArrays:
     """Fragments of rasterized faces of vertices in clip space."""
-    seen = FragmentArrays()
-    seen.face_ids, seen.barycentrics = fragments.flat
-    seen.faces, seen.clip_positions = faces, clip_positions
-    _, seen.height, seen.width = fragments.face_ids.shape
-    return seen
+    arrays = FragmentArrays()
+    arrays.face_ids, arrays.barycentrics = fragments.flat
+    arrays.faces, arrays.clip_positions = faces, clip_positions
+    _, arrays.height, arrays.width = fragments.face_ids.shape
+    return arrays
 
 
 @wp.func
-def image_of(seen: FragmentArrays, sample: int):
+def image_of(fragments: FragmentArrays, sample: int):
     """Number of the image that has a sample of flat images."""
-    return sample / (seen.width * seen.height)
+    return sample / (fragments.width * fragments.height)
 
 
 @wp.func
@@ -43,12 +43,12 @@ def edge_line(edge: wp.vec2i, position: wp.vec2, clip_positions: wp.array(dtype=
 
 
 @wp.func
-def line_between(seen: FragmentArrays, sample: int, way: int, edge: wp.vec2i):
-    """The line ℓ between a sample and its neighbor on a way, relative to the sample's center."""
-    position = sample_center(sample, seen.width, seen.height)
-    clip = seen.clip_positions[image_of(seen, sample)]
+def line_between(fragments: FragmentArrays, sample: int, direction: int, edge: wp.vec2i):
+    """The line ℓ between a sample and its neighbor in a direction, relative to the sample's center."""
+    position = sample_center(sample, fragments.width, fragments.height)
+    clip = fragments.clip_positions[image_of(fragments, sample)]
     if edge[0] >= 0:
         return edge_line(edge, position, clip)
-    here = seen.faces[seen.face_ids[sample]]
-    there = seen.faces[seen.face_ids[neighbor(sample, way, seen.width)]]
+    here = fragments.faces[fragments.face_ids[sample]]
+    there = fragments.faces[fragments.face_ids[neighbor(sample, direction, fragments.width)]]
     return plane(here, position, clip) - plane(there, position, clip)

@@ -5,7 +5,7 @@ the other's color as much as its own area beyond the line (:mod:`warpshadow.stag
 al. 2020, section 3.5, who take edges as upright). A sample of color c, with neighbors of colors c_k, areas e_k beyond
 the lines and weights ω_k of the lines (:mod:`warpshadow.stages.silhouettes.find`), becomes
 
-    c + Σ_k e_k (ω_k − Σ_l π_kl max(ω_k + ω_l − 1, 0) e_l) (c_k − c)          l: the two ways across k
+    c + Σ_k e_k (ω_k − Σ_l π_kl max(ω_k + ω_l − 1, 0) e_l) (c_k − c)          l: the two directions across k
 
 which is a mean: the weights are positive, and at most 1 in all. The inner sum is the overlap of two areas: nothing if
 they lie beyond one line, their product if they lie beyond two upright ones. Of that each loses half, π = ½; but where
@@ -36,11 +36,11 @@ def _loss(share: wp.vec3, neighbor_share: wp.vec3):
 
 
 @wp.func
-def _counts(shares: wp.array(dtype=wp.vec3), way: int):
-    """Weight of the area on a way: ω, less its loss to the areas on both ways across."""
-    perpendicular = wp.where(way < 2, 2, 0)
-    counts = shares[way][1] - _loss(shares[way], shares[perpendicular]) * shares[perpendicular][0]
-    return counts - _loss(shares[way], shares[perpendicular + 1]) * shares[perpendicular + 1][0]
+def _counts(shares: wp.array(dtype=wp.vec3), direction: int):
+    """Weight of the area in a direction: ω, less its loss to the areas in both directions across."""
+    perpendicular = wp.where(direction < 2, 2, 0)
+    counts = shares[direction][1] - _loss(shares[direction], shares[perpendicular]) * shares[perpendicular][0]
+    return counts - _loss(shares[direction], shares[perpendicular + 1]) * shares[perpendicular + 1][0]
 
 
 @functools.cache
@@ -64,11 +64,11 @@ def _make_blend(dtype: type) -> wp.Kernel:
             own_shares = shares[entry]
             here = image[instance, sample]
             total = here
-            for way in range(4):
-                area = own_shares[way][0]
+            for direction in range(4):
+                area = own_shares[direction][0]
                 if area > 0.0:
-                    contrast = image[instance, neighbor(sample, way, width)] - here
-                    total += area * _counts(own_shares, way) * contrast
+                    contrast = image[instance, neighbor(sample, direction, width)] - here
+                    total += area * _counts(own_shares, direction) * contrast
             smoothed[instance, sample] = total
 
     return blend
@@ -101,22 +101,22 @@ def _make_blend_adjoint(dtype: type) -> wp.Kernel:
         if sample >= 0:
             own_shares = shares[entry]
             adj = adj_smoothed[instance, sample]
-            for way in range(4):
-                share = own_shares[way]
+            for direction in range(4):
+                share = own_shares[direction]
                 if share[0] > 0.0:
-                    other = neighbor(sample, way, width)
-                    counts = _counts(own_shares, way)
+                    other = neighbor(sample, direction, width)
+                    counts = _counts(own_shares, direction)
                     if adj_image:
                         wp.atomic_add(adj_image, instance, other, share[0] * counts * adj)
                         wp.atomic_sub(adj_image, instance, sample, share[0] * counts * adj)
                     if adj_areas:
                         contrast = image[instance, other] - image[instance, sample]
                         if edge_colors:
-                            upper_bound = edge_colors[instance, entries[other], opposite(way)]
-                            contrast = upper_bound - edge_colors[instance, entry, way]
+                            upper_bound = edge_colors[instance, entries[other], opposite(direction)]
+                            contrast = upper_bound - edge_colors[instance, entry, direction]
                         change = inner(adj, contrast)
-                        wp.atomic_add(adj_areas, entry, way, counts * change)
-                        perpendicular = wp.where(way < 2, 2, 0)
+                        wp.atomic_add(adj_areas, entry, direction, counts * change)
+                        perpendicular = wp.where(direction < 2, 2, 0)
                         for k in range(2):
                             loss = _loss(share, own_shares[perpendicular + k]) * share[0]
                             wp.atomic_sub(adj_areas, entry, perpendicular + k, loss * change)
@@ -171,7 +171,7 @@ def smooth_silhouettes(
             outputs=[adj_image, adj_areas],
         )
         if adj_areas is not None:
-            seen = make_fragment_arrays(fragments, silhouettes.faces, clip_positions)
-            add_to_vertices(samples, silhouettes.edges, seen, adj_areas)
+            arrays = make_fragment_arrays(fragments, silhouettes.faces, clip_positions)
+            add_to_vertices(samples, silhouettes.edges, arrays, adj_areas)
 
     return differentiable(blend, adjoint, wp.clone(image, requires_grad=False), [image, clip_positions])
