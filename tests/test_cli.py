@@ -754,7 +754,7 @@ def test_a_folder_that_another_fit_writes_is_left_to_it(fit_file, tmp_path):
     from warpshadow.inverse import checkpoint
 
     (tmp_path / "out").mkdir()
-    with checkpoint.alone(tmp_path / "out" / "checkpoint"):
+    with checkpoint.exclusive(tmp_path / "out" / "checkpoint"):
         result = run("fit", fit_file, "-o", tmp_path / "out")
     assert result.exit_code == 1 and result.stdout == ""
     assert "out/checkpoint: another fit is writing it" in result.stderr and "another folder by -o" in result.stderr

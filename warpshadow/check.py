@@ -81,7 +81,7 @@ def keywords(**instead: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
             try:
                 signature.bind(*args, **arguments)
             except TypeError as error:
-                key = _unbound(signature, args, error)
+                key = _unmatched_argument(signature, args, error)
                 hint = f" (write {instead[key]})" if key in instead else ""
                 raise TypeError(f"{name}: {error}{hint}; its arguments are {_listed(signature)}") from None
             return function(*args, **arguments)
@@ -91,7 +91,7 @@ def keywords(**instead: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
     return decorate
 
 
-def _unbound(signature: inspect.Signature, args: tuple[object, ...], error: TypeError) -> str:
+def _unmatched_argument(signature: inspect.Signature, args: tuple[object, ...], error: TypeError) -> str:
     """Name of the argument that is missing; or of the class of the first value that is superfluous."""
     names = re.findall(r"missing a required argument: '(\w+)'", str(error))
     by_position = [one for one in signature.parameters.values() if one.kind is one.POSITIONAL_OR_KEYWORD]
@@ -239,15 +239,15 @@ def numbers(
         raise error(f"{name}: got {described(values)}, expected {expected}") from cause
     except TypeError as cause:  # a tensor on a GPU, or of a type that NumPy has not
         raise error(f"{name}: got {described(values)}, expected {expected} ({cause})") from cause
-    if result.dtype.kind not in "iuf" or _holds_truth(values):
+    if result.dtype.kind not in "iuf" or _holds_booleans(values):
         raise error(f"{name}: got {described(values)}, expected {expected}")
     with np.errstate(over="ignore"):
         return np.array(result, dtype, order="C")
 
 
-def _holds_truth(values: object) -> bool:
+def _holds_booleans(values: object) -> bool:
     """Whether True or False is among numbers, which NumPy would take for 1 and 0."""
-    return isinstance(values, (list, tuple)) and any(isinstance(v, bool) or _holds_truth(v) for v in values)
+    return isinstance(values, (list, tuple)) and any(isinstance(v, bool) or _holds_booleans(v) for v in values)
 
 
 def number(name: str, value: object) -> float:
@@ -283,7 +283,7 @@ def nonnegative(name: str, value: object) -> float:
     return float(value)
 
 
-def whole(name: str, value: object, *, minimum: int = 1, what: str = "") -> int:
+def integer(name: str, value: object, *, minimum: int = 1, what: str = "") -> int:
     """Return a whole number, maybe of something, as an int, or raise ValueError."""
     if not is_integer(value) or value < minimum:
         of = f"{what}, " if what else ""
@@ -302,7 +302,7 @@ def image_size(size: object) -> tuple[int, int]:
     """Return width and height [pixels], or raise ValueError."""
     if not isinstance(size, (Sequence, np.ndarray)) or isinstance(size, str) or len(size) != 2:
         raise ValueError(f"size: got {described(size)}, expected width and height [pixels], such as (640, 480)")
-    return whole("size (width)", size[0], what="pixels"), whole("size (height)", size[1], what="pixels")
+    return integer("size (width)", size[0], what="pixels"), integer("size (height)", size[1], what="pixels")
 
 
 def pixels(name: str, values: object, *, expected: str, error: type[ValueError] = ValueError) -> np.ndarray:

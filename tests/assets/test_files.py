@@ -60,14 +60,14 @@ def test_what_was_there_stays_where_writing_fails(tmp_path, monkeypatch, name):
 
 
 def test_a_block_that_fails_leaves_nothing(tmp_path):
-    with pytest.raises(KeyboardInterrupt), files.whole(tmp_path / "a.txt") as unfinished:
+    with pytest.raises(KeyboardInterrupt), files.atomic_write(tmp_path / "a.txt") as unfinished:
         unfinished.write_text("half")
         raise KeyboardInterrupt
     assert not list(tmp_path.iterdir())
 
 
 def test_a_missing_folder_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="/no: no such folder$"), files.whole(tmp_path / "no" / "a.txt"):
+    with pytest.raises(FileNotFoundError, match="/no: no such folder$"), files.atomic_write(tmp_path / "no" / "a.txt"):
         pytest.fail("there is nothing to write to")
 
 
@@ -106,7 +106,7 @@ def test_a_link_stays_and_what_it_names_is_written_with_its_permissions(tmp_path
     target.write_text("before")
     target.chmod(0o640)
     link.symlink_to(target)
-    with files.whole(link) as unfinished:
+    with files.atomic_write(link) as unfinished:
         unfinished.write_text("after")
     assert link.is_symlink()
     assert target.read_text() == "after"

@@ -10,7 +10,7 @@ from PIL import Image, ImageCms, PngImagePlugin
 import warpshadow as ws
 from warpshadow.assets.lens import distorted, undistorted
 from warpshadow.inverse import Exposure, Problem, Target, load_fit
-from warpshadow.inverse.encoding import guess_encoding, noted
+from warpshadow.inverse.encoding import guess_encoding, toml_value
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.schedule import Stage
 from warpshadow.scene.files import parse_camera
@@ -243,7 +243,7 @@ def test_a_fit_file_names_a_response_curve(tmp_path):
     (tmp_path / "curve.csv").write_text("# of the camera\nradiance,value\n0,0\n0.2,0.5\n1,1\n")
     (target,) = load_fit(tmp_path / "fit.toml").problem.targets
     np.testing.assert_allclose(target.image, np.interp(codes / 255, (0, 0.5, 1), (0, 0.2, 1)), atol=1e-5)
-    assert noted(target.encoding) == "curve.csv"
+    assert toml_value(target.encoding) == "curve.csv"
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])

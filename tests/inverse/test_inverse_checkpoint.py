@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from warpshadow.inverse import CheckpointError
-from warpshadow.inverse.checkpoint import alone, load, previous_path, save
+from warpshadow.inverse.checkpoint import exclusive, load, previous_path, save
 
 
 class PowerCut(BaseException):
@@ -204,8 +204,8 @@ def test_a_folder_that_is_not_there_is_an_error(tmp_path):
 # ---------------------------------------------------------------------------------------------- two at once
 
 HOLD = """import sys
-from warpshadow.inverse.checkpoint import alone
-with alone(sys.argv[1]):
+from warpshadow.inverse.checkpoint import exclusive
+with exclusive(sys.argv[1]):
     print("held", flush=True)
     input()
 """
@@ -218,17 +218,17 @@ def test_a_file_that_another_process_fits_to_is_refused_until_that_ends(path, en
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout.readline() == "held\n"
         with pytest.raises(CheckpointError, match=r"fit\.checkpoint: another fit is writing it; .*folder by -o"):
-            alone(path).__enter__()
-        with alone(path.with_name("another")):
+            exclusive(path).__enter__()
+        with exclusive(path.with_name("another")):
             pass
         other.kill() if ending == "killed" else other.communicate("\n")
-    with alone(path):
+    with exclusive(path):
         save(path, state(1))
     assert number_in(path) == 1
 
 
 def test_two_fits_of_one_process_do_not_share_a_file(path):
-    with alone(path), pytest.raises(CheckpointError, match="another fit is writing it"), alone(path):
+    with exclusive(path), pytest.raises(CheckpointError, match="another fit is writing it"), exclusive(path):
         pass
-    with alone(None), alone(None):
+    with exclusive(None), exclusive(None):
         pass

@@ -167,7 +167,7 @@ def test_the_table_has_a_row_for_each(results):
 @pytest.mark.slow
 def test_what_has_ended_is_not_done_again(results, photos, monkeypatch):
     endings, folder = results
-    monkeypatch.setattr(many, "_do", None)  # what a worker would do
+    monkeypatch.setattr(many, "_run_job", None)  # what a worker would do
     good = {name: photos / name / "fit.toml" for name in GOOD} | {"killed": killed(photos, photos / "mark")}
     assert inverse.fit_many(good, folder, progress=False) == [each for each in endings if each.is_good]
 
@@ -310,7 +310,7 @@ def test_the_death_of_the_head_of_a_ray_cluster_is_an_error(cluster, monkeypatch
 def test_others_do_not_write_into_the_folder_meanwhile(photos, tmp_path):
     (tmp_path / "results").mkdir()
     with (
-        checkpoint.alone(tmp_path / "results" / many.TABLE),
+        checkpoint.exclusive(tmp_path / "results" / many.TABLE),
         pytest.raises(inverse.CheckpointError, match="table"),
     ):
         inverse.fit_many([photos / "a" / "fit.toml"], tmp_path / "results", progress=False)

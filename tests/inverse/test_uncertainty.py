@@ -23,7 +23,7 @@ from warpshadow.inverse import (
 )
 from warpshadow.inverse.diagnostics import small_stage
 from warpshadow.inverse.model import Model
-from warpshadow.inverse.uncertainty import CANDIDATE_SPACING, NormalMatrix, along_flat
+from warpshadow.inverse.uncertainty import CANDIDATE_SPACING, NormalMatrix, candidates_along_flat_direction
 
 NOISE = 0.05
 DIFFERENCE = 0.03  # central differences of a loss that bends where edges pass the centers of pixels
@@ -103,7 +103,7 @@ def test_a_free_light_leaves_less_curvature_to_a_pose():
 def test_starts_lie_along_the_direction_that_is_known_least(outline, pose, rotation):
     pose = dataclasses.replace(pose, rotation=rotation)
     result = result_of([pose, OutlineOffset()], outlines={"egg": outline}, mask=np.eye(48, 64))
-    starts = along_flat(result.problem, result.setting, result.values, 4)
+    starts = candidates_along_flat_direction(result.problem, result.setting, result.values, 4)
     (free, _), setting, moves = result.problem.free, result.setting, []
     first, origin, _ = free.moved(result.values[free.name], setting)
     for start in starts:

@@ -92,7 +92,7 @@ class Unfinished:
 
 def _write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    with files.whole(path) as unfinished:
+    with files.atomic_write(path) as unfinished:
         np.savez(unfinished, allow_pickle=False, **arrays)
 
 

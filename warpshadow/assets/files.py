@@ -12,7 +12,7 @@ from warpshadow.check import AnyPath
 
 
 @contextlib.contextmanager
-def whole(path: AnyPath) -> Iterator[Path]:
+def atomic_write(path: AnyPath) -> Iterator[Path]:
     """Give a new empty file beside ``path`` to write to, which takes its place if the block ends without an error.
 
     On an error the new file is removed and the old file at ``path`` stays. The temporary file has the suffix of
@@ -43,7 +43,7 @@ def whole(path: AnyPath) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def locked(path: Path, *, timeout: float = -1) -> Iterator[None]:
-    """Hold a file against others that want to hold it, in this process or another; the lock ends with the process.
+    """Lock a file against others that want to hold it, in this process or another; the lock ends with the process.
 
     Raises:
         filelock.Timeout: after this time [s]; by default it is waited for.

@@ -133,7 +133,7 @@ def write_image(path: AnyPath, pixels: np.ndarray | Picture, *, layers: Mapping[
         return
     channels = _checked_layers(layers or {}, pixels)
     try:
-        with files.whole(path) as unfinished:
+        with files.atomic_write(path) as unfinished:
             _write_exr(unfinished, pixels, channels)
     except RuntimeError as error:  # OpenEXR's, of a disk that is full
         raise OSError(f"{path}: {error}") from error

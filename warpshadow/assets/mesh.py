@@ -237,7 +237,7 @@ class Mesh:
             lines += ["vt {:.9g} {:.9g}".format(*uv) for uv in self.uvs.tolist()]
             corners = np.stack([self.faces, self.uv_faces], axis=-1).reshape(-1, 6) + 1
             lines += ["f {}/{} {}/{} {}/{}".format(*corner) for corner in corners.tolist()]
-        with files.whole(path) as unfinished:
+        with files.atomic_write(path) as unfinished:
             unfinished.write_text("\n".join(lines) + "\n")
 
 

@@ -106,7 +106,7 @@ class Picture:
         path = check.path("path", path)
         if path.suffix.lower() not in SUFFIXES:
             raise ValueError(f"{path}: got extension {path.suffix!r}, expected one of {', '.join(SUFFIXES)}")
-        with files.whole(path) as unfinished:
+        with files.atomic_write(path) as unfinished:
             comment = f"warpshadow: exposure {self.exposure:+.6f} stops, tone {self.tone}"
             if path.suffix.lower() == ".png":
                 _pillow(self.pixels).save(unfinished, pnginfo=_chunk(comment))

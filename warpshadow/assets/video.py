@@ -45,7 +45,7 @@ def write_video(path: AnyPath, frames: Iterable[Picture | np.ndarray], *, fps: f
     first = next(shown, None)
     if first is None:
         raise ValueError("frames: got none, expected at least one picture")
-    with files.whole(path) as unfinished:
+    with files.atomic_write(path) as unfinished:
         if path.suffix.lower() == ".mp4":
             _write_mp4(unfinished, first, shown, fps)
         else:

@@ -18,7 +18,7 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.mesh_files import MESH_SUFFIXES
 from warpshadow.dataset.recipe import Recipe, RecipeError
 from warpshadow.device.progress import progress_bar
-from warpshadow.scene.random_scenes import Drawn, RandomScenes, primitives
+from warpshadow.scene.random_scenes import DrawnScene, RandomScenes, primitives
 from warpshadow.scene.scene import AUTO, SPHERE_METHODS, Body
 from warpshadow.spheres import Spheres, fit_spheres
 
@@ -31,7 +31,7 @@ _KEPT_MAPS = 16  # how many files a process keeps in memory; it reads others aga
 _SAID_FAULTS = 10  # files that an error names at most
 
 
-class Stock(NamedTuple):
+class SplitAssets(NamedTuple):
     """Assets that a split draws from."""
 
     meshes: tuple[str, ...]  # names of files in the folder of meshes, or of simple shapes
@@ -79,13 +79,13 @@ class DataSet:
             self.hashes["maps"] = _hashes(
                 recipe.maps, "maps", _MAP_SUFFIXES, lambda path: _read_map(path).content_hash, progress
             )
-        self.stocks = {split: self._stock(split) for split in recipe.splits}
+        self.stocks = {split: self._split_assets(split) for split in recipe.splits}
 
     def __repr__(self) -> str:
         splits = ", ".join(f"{split} {len(self.numbers(split))}" for split in self.recipe.splits)
         return f"DataSet({splits} images of {self.recipe.size[0]} × {self.recipe.size[1]})"
 
-    def _stock(self, split: str) -> Stock:
+    def _split_assets(self, split: str) -> SplitAssets:
         """The assets of a split; RecipeError if there are none."""
         names = {}
         for kind, hashes in self.hashes.items():
@@ -97,7 +97,7 @@ class DataSet:
                     f"[splits]: {split} got none of the {len(hashes)} {kind} ({counts}), expected one or more: try "
                     "another seed, a larger part, or more files"
                 )
-        return Stock(names["meshes"], names.get("maps"))
+        return SplitAssets(names["meshes"], names.get("maps"))
 
     def numbers(self, split: str) -> range:
         """Numbers of the images of a split; splits follow one another."""
@@ -118,12 +118,12 @@ class DataSet:
         if recipe.meshes is None:
             bodies = [body for body in self._primitives if body.called in stock.meshes]
         else:
-            bodies = _ReadWhenAsked(recipe.meshes, stock.meshes, lambda path: self._read_mesh(path).body)
-        maps = None if recipe.maps is None else _ReadWhenAsked(recipe.maps, stock.maps or (), _read_map)
+            bodies = _LazyFiles(recipe.meshes, stock.meshes, lambda path: self._read_mesh(path).body)
+        maps = None if recipe.maps is None else _LazyFiles(recipe.maps, stock.maps or (), _read_map)
         arguments = recipe.visibility, recipe.supersampling, maps, recipe.ranges, recipe.bounces
         return RandomScenes(recipe.seed, recipe.images, recipe.size, bodies, *arguments)
 
-    def draw(self, number: int) -> Drawn:
+    def draw(self, number: int) -> DrawnScene:
         """Draw the scene of an image."""
         return self.scenes(self.split_of(number)).draw(number)
 
@@ -142,7 +142,7 @@ def _split_of(recipe: Recipe, content: str) -> str:
 # ---------------------------------------------------------------------------------------------- files
 
 
-class _ReadWhenAsked(Sequence[Item], Generic[Item]):
+class _LazyFiles(Sequence[Item], Generic[Item]):
     """Files of a folder, each read when it is asked for."""
 
     def __init__(self, folder: Path, names: Sequence[str], read: Callable[[Path], Item]):
@@ -157,7 +157,7 @@ class _ReadWhenAsked(Sequence[Item], Generic[Item]):
             return self._read(self._folder / self._names[place])
 
 
-class _Read(NamedTuple):
+class _ReadMesh(NamedTuple):
     """A mesh as it was read."""
 
     body: Body  # with its spheres, creased if that is wanted
@@ -165,14 +165,14 @@ class _Read(NamedTuple):
 
 
 @functools.lru_cache(_KEPT_BODIES)
-def _read_body(path: Path, blockers: int | str, creased: float | None, fits: bool, device: str) -> _Read:
+def _read_body(path: Path, blockers: int | str, creased: float | None, fits: bool, device: str) -> _ReadMesh:
     body = Body(path, blockers=blockers)
     content_hash = body.mesh.content_hash
     colors = body.albedo if body.texture is None else body.texture
     if body.texture is not None or body.mesh.colors is not None:
         content_hash = hashlib.sha256(content_hash.encode() + colors.tobytes()).hexdigest()
     body = body if creased is None else body.creased(creased)
-    return _Read(_fitted(body, device) if fits else body, content_hash)
+    return _ReadMesh(_fitted(body, device) if fits else body, content_hash)
 
 
 def _fitted(body: Body, device: str) -> Body:

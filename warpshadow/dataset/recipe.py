@@ -76,9 +76,9 @@ class Recipe:
     bounces: Bounces = 0
 
     def __post_init__(self) -> None:
-        check.whole("images", self.images)
-        check.whole("seed", self.seed, minimum=0)
-        check.whole("shard", self.shard, what="images")
+        check.integer("images", self.images)
+        check.integer("seed", self.seed, minimum=0)
+        check.integer("shard", self.shard, what="images")
         check.instance("layers", self.layers, (list, tuple), f"a list of some of {', '.join(map(repr, _LAYERS))}")
         for layer in self.layers:
             check.choice("layers", layer, _LAYERS)
@@ -88,7 +88,7 @@ class Recipe:
         check.choice("format", self.format, FORMATS)
         object.__setattr__(self, "splits", _checked_splits(self.splits))
         if self.blockers != AUTO:
-            check.whole("blockers", self.blockers, minimum=0)
+            check.integer("blockers", self.blockers, minimum=0)
         if self.creased is not None and not (check.is_number(self.creased) and 0 <= self.creased <= 180):
             raise ValueError(f"creased: got {check.described(self.creased)}, expected degrees from 0 to 180")
         object.__setattr__(self, "visibility", self.visibility.with_method())

@@ -27,7 +27,7 @@ from warpshadow.dataset.layers import LAYERS, LazyLayers
 from warpshadow.dataset.png import Channels, as_png, from_png
 from warpshadow.dataset.recipe import Plain
 from warpshadow.scene.files import camera_table
-from warpshadow.scene.random_scenes import Drawn
+from warpshadow.scene.random_scenes import DrawnScene
 from warpshadow.scene.scene import Body, Scene
 from warpshadow.spheres import Spheres
 
@@ -105,7 +105,7 @@ def _spheres(scene: Scene) -> np.ndarray:
     return np.concatenate(rows).astype(np.float32)
 
 
-def _about(data_set: DataSet, number: int, drawn: Drawn) -> dict[str, Plain]:
+def _about(data_set: DataSet, number: int, drawn: DrawnScene) -> dict[str, Plain]:
     """How a scene was drawn."""
     scene, recipe, split = drawn.scene, data_set.recipe, data_set.split_of(number)
     stock = data_set.stocks[split]

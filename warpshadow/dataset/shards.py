@@ -71,17 +71,17 @@ def write_shards(
     folder = check.path("folder", folder)
     folder.mkdir(parents=True, exist_ok=True)
     shards = shards_of(data_set)
-    with _held(folder):
-        _begin(folder, describe(data_set))
+    with _locked_folder(folder):
+        _prepare_folder(folder, describe(data_set))
         missing = [shard for shard in shards if not (folder / shard.name).exists()]
         numbers = [number for shard in missing for number in shard.numbers]
-        rendered, messages = _rendered(data_set, numbers, _worker_count(data_set, workers)), set[str]()
+        rendered, messages = _render_all(data_set, numbers, _worker_count(data_set, workers)), set[str]()
         with contextlib.closing(rendered), progress_bar(len(numbers), "rendering", "image", shows=progress) as bar:
             for shard in missing:
                 with _new_archive(folder / shard.name) as archive:
                     for number in shard.numbers:
                         sample, remarks = next(rendered)
-                        _say(remarks, number, messages)
+                        _warn_once(remarks, number, messages)
                         _add(archive, number, sample)
                         bar.update()
     return [folder / shard.name for shard in shards]
@@ -89,7 +89,7 @@ def write_shards(
 
 def _worker_count(data_set: DataSet, workers: int | None) -> int:
     if workers is not None:
-        return check.whole("workers", workers, what="processes")
+        return check.integer("workers", workers, what="processes")
     return thread_count() if data_set.device == "cpu" else 1
 
 
@@ -110,7 +110,7 @@ def _render(data_set: DataSet, number: int) -> _Rendered:
     return _Rendered(files, [str(item.message) for item in caught])
 
 
-def _say(remarks: list[str], number: int, messages: set[str]) -> None:
+def _warn_once(remarks: list[str], number: int, messages: set[str]) -> None:
     """Give each warning once for all images, ignoring names and numbers."""
     for remark in remarks:
         kinds = {re.sub(r"'[^']*'|[\d.]+", "", part) for part in remark.split("; ")}
@@ -119,7 +119,7 @@ def _say(remarks: list[str], number: int, messages: set[str]) -> None:
         messages.update(kinds)
 
 
-def _rendered(data_set: DataSet, numbers: Sequence[int], workers: int) -> Generator[_Rendered, None, None]:
+def _render_all(data_set: DataSet, numbers: Sequence[int], workers: int) -> Generator[_Rendered, None, None]:
     """Render images, in the order of the numbers."""
     render = functools.partial(_render, data_set)
     if workers == 1:
@@ -141,7 +141,7 @@ def _rendered(data_set: DataSet, numbers: Sequence[int], workers: int) -> Genera
 
 @contextlib.contextmanager
 def _new_archive(path: Path) -> Iterator[tarfile.TarFile]:
-    with files.whole(path) as unfinished, tarfile.open(unfinished, "w", format=tarfile.USTAR_FORMAT) as archive:
+    with files.atomic_write(path) as unfinished, tarfile.open(unfinished, "w", format=tarfile.USTAR_FORMAT) as archive:
         yield archive
 
 
@@ -176,7 +176,7 @@ def describe(data_set: DataSet) -> dict[str, Plain]:
 
 
 @contextlib.contextmanager
-def _held(folder: Path) -> Iterator[None]:
+def _locked_folder(folder: Path) -> Iterator[None]:
     """Hold a folder against other processes."""
     from filelock import Timeout
 
@@ -188,7 +188,7 @@ def _held(folder: Path) -> Iterator[None]:
         yield
 
 
-def _begin(folder: Path, about: dict[str, Plain]) -> None:
+def _prepare_folder(folder: Path, about: dict[str, Plain]) -> None:
     """Write the index, or compare it; remove partial files of an interrupted run."""
     path = folder / INDEX
     if path.exists():
@@ -201,7 +201,7 @@ def _begin(folder: Path, about: dict[str, Plain]) -> None:
     else:
         if others := sorted(item.name for item in folder.iterdir() if not item.name.startswith(".")):
             raise FileExistsError(f"{folder}: got a folder with {others[0]} in it, expected a new one or one of shards")
-        with files.whole(path) as unfinished:
+        with files.atomic_write(path) as unfinished:
             unfinished.write_text(json.dumps(about, indent=1, ensure_ascii=False), encoding="utf-8")
     for unfinished in folder.glob(".*.unfinished.tar"):
         unfinished.unlink(missing_ok=True)

@@ -29,7 +29,7 @@ class CheckpointError(ValueError):
 
 
 @contextlib.contextmanager
-def alone(path: AnyPath | None) -> Iterator[None]:
+def exclusive(path: AnyPath | None) -> Iterator[None]:
     """Refuse a second fit that would write the same file; without a file nothing is refused.
 
     Raises:
@@ -59,7 +59,7 @@ def save(path: AnyPath, state: Mapping[str, object]) -> None:
     buffer = io.BytesIO()
     torch.save(state, buffer)
     payload = buffer.getvalue()
-    with files.whole(path) as unfinished:
+    with files.atomic_write(path) as unfinished:
         with unfinished.open("wb") as file:
             file.write(_FILE_HEADER + hashlib.sha256(payload).digest() + payload)
             file.flush()

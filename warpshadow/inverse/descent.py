@@ -27,7 +27,7 @@ from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import Curvature, QuasiNewton
 from warpshadow.inverse.result import Result
 from warpshadow.inverse.schedule import Stage, check_part, stages_for
-from warpshadow.inverse.uncertainty import along_flat
+from warpshadow.inverse.uncertainty import candidates_along_flat_direction
 from warpshadow.inverse.variable_projection import make_model
 from warpshadow.inverse.watch import Watch, watching
 from warpshadow.viewer import FitViewer
@@ -57,7 +57,7 @@ class _Candidate(NamedTuple):
     curvature: Curvature | None  # that a QuasiNewton found in the stage before
 
 
-class _Run(NamedTuple):
+class _FinishedRun(NamedTuple):
     """A candidate's descent that has ended."""
 
     loss: float
@@ -87,8 +87,8 @@ class _Descent:
         self.setting = problem.setting(device, progress=progress)
         self.stage = 0
         self.is_found = False
-        self.candidates = self._widened([_Candidate(problem.start(self.setting), None)])
-        self.ended: list[_Run] = []
+        self.candidates = self._candidates_of_stage([_Candidate(problem.start(self.setting), None)])
+        self.ended: list[_FinishedRun] = []
         self.losses: list[list[float]] = []
         self.descents: list[int] = []
         self.reason: str | None = None
@@ -104,15 +104,15 @@ class _Descent:
             "optimizer": made,
         }
 
-    def _widened(self, best: list[_Candidate]) -> list[_Candidate]:
+    def _candidates_of_stage(self, best: list[_Candidate]) -> list[_Candidate]:
         """The candidates of a stage: the best so far, and others scattered around the first where it wants more."""
         count = 1 if self.is_found else self.stages[self.stage].candidates
-        scattered = self._scattered(best[0].values, count - len(best))
+        scattered = self._perturbed_candidates(best[0].values, count - len(best))
         return [*best[:count], *(_Candidate(values, None) for values in scattered)]
 
-    def _scattered(self, values: Mapping[str, Values], count: int) -> list[dict[str, Values]]:
+    def _perturbed_candidates(self, values: Mapping[str, Values], count: int) -> list[dict[str, Values]]:
         if count > 0 and self.stages[self.stage].scatter == "flat":
-            return along_flat(self.problem, self.setting, values, count)
+            return candidates_along_flat_direction(self.problem, self.setting, values, count)
         generator = torch.Generator().manual_seed(self.seed)
         return [
             {free.name: free.scattered(values[free.name], number, generator) for free in self.problem.free}
@@ -175,7 +175,7 @@ class _Descent:
         self.begin_stage()
         self._begin_run(_Candidate(_copied(state["values"], device), None))
         self.optimizer.load_state_dict(state["optimizer"])
-        self.ended = [_Run(loss, _copied(best, device), *rest) for loss, best, *rest in state["ended"]]
+        self.ended = [_FinishedRun(loss, _copied(best, device), *rest) for loss, best, *rest in state["ended"]]
         self.best, self.failure = _copied(state["best"], device), state["failure"]
         self.losses, self.descents, self.reason = state["losses"], state["descents"], state["reason"]
 
@@ -183,7 +183,7 @@ class _Descent:
 
     def run(self) -> Iterator[None]:
         """Descend, step by step."""
-        while self._goes_on():
+        while self._advance():
             try:
                 self._step()
             except _Diverged as error:
@@ -191,7 +191,7 @@ class _Descent:
             else:
                 yield
 
-    def _goes_on(self) -> bool:
+    def _advance(self) -> bool:
         """Whether there is a step to take; begins the next run or stage where one has ended.
 
         It asks the state alone, so that a state saved after any step goes on as the descent itself does.
@@ -204,7 +204,7 @@ class _Descent:
         if not is_over:
             return True
         self.ended.append(self._ended_run())
-        self.is_found = self.is_found or (len(self.candidates) > 1 and self._stands_out(self.ended[-1]))
+        self.is_found = self.is_found or (len(self.candidates) > 1 and self._is_clearly_best(self.ended[-1]))
         if len(self.ended) < len(self.candidates) and not self.is_found:
             self._begin_run(self.candidates[len(self.ended)])
             self.losses.append([])
@@ -223,7 +223,7 @@ class _Descent:
         if len({tuple(free.name for free in self.problem.free if _descends(free, item)) for item in stages}) > 1:
             ranked = [candidate._replace(curvature=None) for candidate in ranked]  # of other parameters
         self.stage += 1
-        self.candidates, self.ended = self._widened(ranked), []
+        self.candidates, self.ended = self._candidates_of_stage(ranked), []
         self.begin_stage()
         return True
 
@@ -246,21 +246,21 @@ class _Descent:
         last, before = losses[-CONVERGENCE_WINDOW:], losses[-2 * CONVERGENCE_WINDOW : -CONVERGENCE_WINDOW]
         return len(before) == CONVERGENCE_WINDOW and sum(last) >= (1 - tolerance) * sum(before)
 
-    def _stands_out(self, run: _Run) -> bool:
+    def _is_clearly_best(self, run: _FinishedRun) -> bool:
         """Whether the loss of a run is far below that of values scattered around its best."""
         part = self.stages[self.stage].standout
         if part == 0 or run.failure is not None:
             return False
         losses = []
-        for values in self._scattered(run.best, PERTURBED_STARTS):
+        for values in self._perturbed_candidates(run.best, PERTURBED_STARTS):
             with torch.no_grad(), contextlib.suppress(ValueError):  # one that cannot be drawn
                 losses.append(float(self.model.loss(values)[0]))
         return run.loss < part * min(filter(math.isfinite, losses), default=0.0)
 
-    def _ended_run(self) -> _Run:
+    def _ended_run(self) -> _FinishedRun:
         """The best values of a run; its last step may have led to them."""
         curvature = self.optimizer.curvature if isinstance(self.optimizer, QuasiNewton) else None
-        best = _Run(min(self.losses[-1], default=math.inf), self.best, self.failure, curvature)
+        best = _FinishedRun(min(self.losses[-1], default=math.inf), self.best, self.failure, curvature)
         if self.failure is not None:
             return best
         try:
@@ -398,7 +398,7 @@ def fit(
     for name, file in (("checkpoint", checkpoint), ("preview", preview)):
         if file is not None and not Path(file).parent.is_dir():
             raise ValueError(f"{name}: got {str(file)!r}, expected a file in a folder that is there")
-    with checkpoints.alone(checkpoint), watching(view, progress=progress) as watch:
+    with checkpoints.exclusive(checkpoint), watching(view, progress=progress) as watch:
         descent = _Descent(problem, stages, optimizer, tolerance, seed, where, progress)
         durations = _descend(descent, checkpoint, checkpoint_seconds, preview, preview_seconds, progress, watch)
         reason = descent.reason or "stopped"
@@ -455,7 +455,7 @@ def _descend(
             bar.describe("fitting", f"stage {descent.stage + 1}, loss {descent.losses[-1][-1]:.3e}")
             bar.update()
             bar.expect(descent.iterations_left())
-            if watch is not None and not watch.goes_on(descent, save):
+            if watch is not None and not watch.update(descent, save):
                 break
             start = time.perf_counter()
         bar.expect(descent.iterations_left())

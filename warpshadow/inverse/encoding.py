@@ -109,7 +109,7 @@ def is_curve_file(value: object) -> TypeGuard[AnyPath]:
     return check.is_path(value) and Path(value).suffix.lower() == ".csv"
 
 
-def noted(encoding: Encoding) -> str | float:
+def toml_value(encoding: Encoding) -> str | float:
     """An encoding as a TOML file has it."""
     return encoding.name if isinstance(encoding, ResponseCurve) else encoding
 

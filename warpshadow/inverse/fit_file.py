@@ -56,7 +56,7 @@ _OPTIMIZERS: dict[str, tuple[Callable[..., torch.optim.Optimizer], dict[str, Cal
     "rmsprop": (torch.optim.RMSprop, {"alpha": check.number, "eps": check.number, "momentum": check.number}),
     "lbfgs": (
         functools.partial(torch.optim.LBFGS, line_search_fn="strong_wolfe"),
-        {"max_iter": check.whole, "history_size": check.whole},
+        {"max_iter": check.integer, "history_size": check.integer},
     ),
 }
 """Optimizers by name, and the checks of their options."""
@@ -112,7 +112,7 @@ def _fit(table: Table, folder: Path) -> Fit:
         if name not in table:
             raise ValueError(f'{name} is missing; a fit has scene = "FILE", at least one [[target]], and [free]')
     tolerance = check.number("tolerance", table.get("tolerance", 1e-4))
-    seed = check.whole("seed", table.get("seed", 0), minimum=0)
+    seed = check.integer("seed", table.get("seed", 0), minimum=0)
     scene = load_scene(toml_tables.file(table, "scene", folder)).with_method()
     targets = []
     for where, target in toml_tables.numbered(table, "target"):

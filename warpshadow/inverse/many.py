@@ -121,7 +121,7 @@ def fit_many(
         ConnectionError: where the Ray cluster cannot be reached.
     """
     if workers is not None:
-        check.whole("workers", workers)
+        check.integer("workers", workers)
     is_on_gpu = check.device("device", device).is_cuda
     check.nonnegative("checkpoint_seconds", checkpoint_seconds)
     folder = Path(folder).absolute()
@@ -137,7 +137,7 @@ def fit_many(
     total = len(fits) if isinstance(fits, Sized) else None
 
     with (
-        checkpoints.alone(folder / TABLE),
+        checkpoints.exclusive(folder / TABLE),
         progress_bar(total, "fitting", "fit", shows=progress, stays=True) as bar,
     ):
 
@@ -158,7 +158,7 @@ def fit_many(
                 try:
                     job = _FitJob(name, folder, item, _digest(item), device, checkpoint_seconds)
                 except Exception as error:  # such as that of an optimizer that cannot be pickled
-                    note(_failed(name, error))
+                    note(_failed_ending(name, error))
                     continue
                 ending = job.recorded()
                 if ending is None:
@@ -168,10 +168,10 @@ def fit_many(
 
         try:
             if ray is not None:
-                ended = run_on_ray(_do, jobs(), ray, workers=workers, attempts=_ATTEMPTS, is_on_gpu=is_on_gpu)
+                ended = run_on_ray(_run_job, jobs(), ray, workers=workers, attempts=_ATTEMPTS, is_on_gpu=is_on_gpu)
             else:
                 few = min(workers or (1 if is_on_gpu else thread_count()), total or math.inf)
-                ended = run_tasks(_do, jobs(), workers=int(few), attempts=_ATTEMPTS)
+                ended = run_tasks(_run_job, jobs(), workers=int(few), attempts=_ATTEMPTS)
             with contextlib.closing(ended):
                 for job, ending, error in ended:
                     note(ending or Ending(job.name, "failed", str(error)))
@@ -212,7 +212,7 @@ class _FitJob:
 
     def record(self, ending: Ending) -> None:
         """Note how it ended."""
-        with files.whole(self.folder / _RECORD) as unfinished:
+        with files.atomic_write(self.folder / _RECORD) as unfinished:
             record = {"of": self.digest, "ending": dataclasses.asdict(ending)}
             unfinished.write_text(json.dumps(record, indent=1), encoding="utf-8")
 
@@ -220,12 +220,12 @@ class _FitJob:
 def _digest(fit: Fit | Path) -> str:
     """A digest of a fit, or of a fit file's text and its files' modification times, empty if one is missing."""
     if isinstance(fit, Path):
-        return hashlib.sha256("\n".join(_marks(fit)).encode()).hexdigest() if fit.is_file() else ""
+        return hashlib.sha256("\n".join(_file_stamps(fit)).encode()).hexdigest() if fit.is_file() else ""
     decides = f"{fit.problem.fingerprint()} {fit.stages!r} {fit.tolerance!r} {fit.seed}".encode()
     return hashlib.sha256(decides + pickle.dumps(fit.optimizer)).hexdigest()
 
 
-def _marks(file: Path) -> Iterator[str]:
+def _file_stamps(file: Path) -> Iterator[str]:
     """The text of a TOML file, and size and time of all files that it names; of TOML files among them the same."""
     text = file.read_text(encoding="utf-8", errors="replace")
     yield text
@@ -233,34 +233,34 @@ def _marks(file: Path) -> Iterator[str]:
         table = toml_tables.read(file, "file")
     except ValueError:  # which the fit says, too
         return
-    for name in sorted(set(_texts(table))):
+    for name in sorted(set(_strings_in(table))):
         named = file.parent / name
         with contextlib.suppress(OSError, ValueError):  # a text that is no name of a file
             if named.is_file():
                 status = named.stat()
                 yield f"{name} {status.st_size} {status.st_mtime_ns}"
                 if named.suffix == ".toml" and named != file:
-                    yield from _marks(named)
+                    yield from _file_stamps(named)
 
 
-def _texts(value: object) -> Iterator[str]:
+def _strings_in(value: object) -> Iterator[str]:
     """All strings in a parsed TOML file."""
     if isinstance(value, str):
         yield value
     elif isinstance(value, (dict, list)):
         for item in value.values() if isinstance(value, dict) else value:
-            yield from _texts(item)
+            yield from _strings_in(item)
 
 
-def _do(job: _FitJob) -> Ending:
+def _run_job(job: _FitJob) -> Ending:
     """Run a fit and record its ending, even if it fails."""
     start = time.perf_counter()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")
         try:
-            ending = _ended(job)
+            ending = _run_fit(job)
         except Exception as error:
-            ending = _failed(job.name, error)
+            ending = _failed_ending(job.name, error)
     messages = dict.fromkeys(str(item.message) for item in caught if not issubclass(item.category, FitWarning))
     ending = replace(ending, seconds=round(time.perf_counter() - start, 3), warnings=[*messages])
     if ending.reason != "failed":
@@ -268,7 +268,7 @@ def _do(job: _FitJob) -> Ending:
     return ending
 
 
-def _failed(name: str, error: Exception) -> Ending:
+def _failed_ending(name: str, error: Exception) -> Ending:
     """An ending with the error, and with its place unless it is a mistake in the input."""
     message = str(error) if error.args else type(error).__name__
     if not isinstance(error, (ValueError, OSError, ImportError)):
@@ -277,7 +277,7 @@ def _failed(name: str, error: Exception) -> Ending:
     return Ending(name, "failed", message)
 
 
-def _ended(job: _FitJob) -> Ending:
+def _run_fit(job: _FitJob) -> Ending:
     """Do a fit, in its folder."""
     from filelock import Timeout
 
@@ -322,7 +322,7 @@ def write_table(endings: Sequence[Ending], path: AnyPath) -> None:
             row |= {f"{name}[{k}]" if len(numbers) > 1 else name: number for k, number in enumerate(numbers)}
         rows.append(row | {"warnings": "; ".join(messages)})
     columns = [column for column in dict.fromkeys(itertools.chain.from_iterable(rows)) if column != "warnings"]
-    with files.whole(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
+    with files.atomic_write(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, [*columns, "warnings"])
         writer.writeheader()
         writer.writerows(rows)
@@ -355,7 +355,7 @@ def find_fits(where: AnyPath | Sequence[AnyPath]) -> dict[str, Path]:
     """
     if not isinstance(where, (str, os.PathLike)):
         fitted = [check.file("file", item).absolute() for item in where]
-        return _named(fitted, Path(os.path.commonpath([file.parent for file in fitted])), _FIT_FILE)
+        return _names_of_files(fitted, Path(os.path.commonpath([file.parent for file in fitted])), _FIT_FILE)
     path, text = Path(where), os.fspath(where)
     if path.is_dir():
         start, fitted, last = path, sorted(path.rglob(_FIT_FILE)), _FIT_FILE
@@ -368,10 +368,10 @@ def find_fits(where: AnyPath | Sequence[AnyPath]) -> dict[str, Path]:
         last = path.name
     if not fitted:
         raise FileNotFoundError(f"{where}: no fit file, expected some")
-    return _named(fitted, start, last)
+    return _names_of_files(fitted, start, last)
 
 
-def _named(files: Iterable[Path], start: Path, last: str) -> dict[str, Path]:
+def _names_of_files(files: Iterable[Path], start: Path, last: str) -> dict[str, Path]:
     """Files by their paths from a folder, but for a last part."""
     named: dict[str, Path] = {}
     for file in files:

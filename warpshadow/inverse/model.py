@@ -67,13 +67,13 @@ class Model:
 
     def loss(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor | None]:
         """The loss with its regularizers, and the images, if it took any. Differentiable: values."""
-        total, images = self._unlikeness(values)
+        total, images = self._data_loss(values)
         for free in self.problem.free:
             regularizer = free.regularizer(values[free.name], self.setting)
             total = total if regularizer is None else total + self.regularization * regularizer
         return total, images
 
-    def _unlikeness(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor | None]:
+    def _data_loss(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Return (loss of images and outlines, images)."""
         world = self.world(values)
         total, images = torch.zeros((), device=self.setting.device), None
@@ -126,7 +126,7 @@ class LightModel(Model):
             return [self.renderer(unit) for unit in units]
         return [image[None] for part in units.split(_LIGHTS_AT_ONCE) for image in self.renderer(part)]
 
-    def _unlikeness(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor | None]:
+    def _data_loss(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor | None]:
         light = self.light.coefficients(values[self.light.name], self.setting).double().T[..., None]
         form = (light * (self._form @ light - 2 * self._slope)).sum()
         return (form + self._constant).float(), None

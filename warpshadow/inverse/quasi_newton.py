@@ -74,7 +74,7 @@ class QuasiNewton(torch.optim.Optimizer):
             memory["bound"] = self._rate
             self._keep(loss, place, gradient, torch.zeros_like(place))
         else:
-            self._judge(loss, place, gradient)
+            self._accept_or_reject(loss, place, gradient)
         direction, bound = self._direction(), memory["bound"]
         longest, slope = _read(direction.abs().max(), _dot(memory["gradient"], direction))
         if longest > bound or not self.curvature[0]:  # a gradient alone does not tell how far
@@ -110,14 +110,14 @@ class QuasiNewton(torch.optim.Optimizer):
         stays = torch.where(place == memory["place"], memory["sides"], 0.0)
         return torch.where(place == memory["aim"], stays, torch.sign(memory["aim"] - place))
 
-    def _judge(self, loss: float, place: torch.Tensor, gradient: torch.Tensor) -> None:
+    def _accept_or_reject(self, loss: float, place: torch.Tensor, gradient: torch.Tensor) -> None:
         """Keep the last step or take it back, and bound the next."""
         memory = self._memory
         step, change = place - memory["place"], gradient - memory["gradient"]  # maybe clamped
         numbers = _dot(memory["gradient"], step), step.abs().max(), *(_dot(*pair) for pair in _products(step, change))
         slope, length, *products = _read(*numbers)
-        if _curves(*products):
-            self._remember(step, change)
+        if _has_positive_curvature(*products):
+            self._add_curvature_pair(step, change)
         rise = loss - memory["loss"]
         if rise >= 0 and length > 0:
             lowest = (
@@ -130,7 +130,7 @@ class QuasiNewton(torch.optim.Optimizer):
         memory["gained"] = -rise
         self._keep(loss, place, gradient, self._sides(place))
 
-    def _remember(self, step: torch.Tensor, change: torch.Tensor) -> None:
+    def _add_curvature_pair(self, step: torch.Tensor, change: torch.Tensor) -> None:
         """Add a step and how the gradient changed over it."""
         memory = self._memory
         steps, changes = self.curvature
@@ -151,7 +151,7 @@ class QuasiNewton(torch.optim.Optimizer):
         products = np.array(_read(*(vectors @ vectors.T)))
         count = len(steps)
         pairs = [(k, count + k) for k in range(count)]
-        pairs = [(k, j) for k, j in pairs if _curves(*(products[pair] for pair in _products(k, j)))]
+        pairs = [(k, j) for k, j in pairs if _has_positive_curvature(*(products[pair] for pair in _products(k, j)))]
         factors, parts = np.zeros(2 * count + 1), []
         factors[-1] = 1.0
         for step, change in reversed(pairs):
@@ -170,7 +170,7 @@ def _products(step: T, change: T) -> tuple[tuple[T, T], ...]:
     return (step, change), (step, step), (change, change)
 
 
-def _curves(mixed: float, step: float, change: float) -> bool:
+def _has_positive_curvature(mixed: float, step: float, change: float) -> bool:
     """Whether the loss curves upwards over a step, by its :func:`_products` with how the gradient changed."""
     return mixed > _MIN_CURVATURE_COSINE * math.sqrt(step * change)
 

@@ -18,7 +18,7 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.picture import Picture
 from warpshadow.check import AnyPath
 from warpshadow.inverse.diagnostics import DiagnosticWarning
-from warpshadow.inverse.encoding import noted
+from warpshadow.inverse.encoding import toml_value
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.one_thread import torch_on_one_thread
@@ -77,7 +77,7 @@ class Report:
         values: dict[str, Any] = {
             f"{name}.{key}": item.cpu().numpy() for name, own in result.values.items() for key, item in own.items()
         }
-        with files.whole(folder / "parameters.npz") as unfinished:
+        with files.atomic_write(folder / "parameters.npz") as unfinished:
             np.savez(unfinished, **values)
         written.append(folder / "parameters.npz")
         written += [*self._write_pictures(folder), *plot_losses(result, folder / "loss.png")]
@@ -99,17 +99,17 @@ class Report:
             for camera, factor in zip(fitted.cameras, fitted.exposures, strict=True)
         ]
         images: list[toml_tables.Table] = [
-            {"encoding": noted(target.encoding), "stops": math.log2(factor)}
+            {"encoding": toml_value(target.encoding), "stops": math.log2(factor)}
             for target, factor in zip(self.result.problem.targets, fitted.exposures, strict=True)
         ]
         for image, gains in zip(images, fitted.white_balances, strict=False):  # none unless they were free
             image["white_balance"] = list(gains)
         light = self.result.light
         known = {} if light is None else {"light": {"undetermined": round(light.undetermined_share, 4)}}
-        unsure = self._uncertain()
+        unsure = self._uncertainty_table()
         return {"fit": fit, **known, **unsure, "view": views, "image": images}
 
-    def _uncertain(self) -> toml_tables.Table:
+    def _uncertainty_table(self) -> toml_tables.Table:
         """Standard deviations of poses, light and exposures; a warning for each body that hardly is where it is."""
         known = self.result.uncertainty
         if known is None:
@@ -207,7 +207,7 @@ def plot_losses(result: Result, path: AnyPath) -> list[Path]:
         first += len(losses)
     axes.set_xlabel("iteration (a color for each candidate of each stage)")
     axes.set_ylabel(f"loss ({result.problem.loss.kind})")
-    with files.whole(path) as unfinished:
+    with files.atomic_write(path) as unfinished:
         figure.savefig(unfinished, dpi=120)
     pyplot.close(figure)
     return [Path(path)]

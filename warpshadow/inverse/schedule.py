@@ -54,8 +54,8 @@ class Stage:
     scatter: str = "turned"
 
     def __post_init__(self) -> None:
-        check.whole("iterations", self.iterations)
-        check.whole("candidates", self.candidates)
+        check.integer("iterations", self.iterations)
+        check.integer("candidates", self.candidates)
         check.choice("compares", self.compares, ("all", "outlines"))
         check.choice("scatter", self.scatter, ("turned", "flat"))
         check.flag("solves_light", self.solves_light)

@@ -114,7 +114,11 @@ class Target:
                 f"image: got {size[0]} × {size[1]} pixels, expected the camera's "
                 f"{self.camera.width} × {self.camera.height}"
             )
-        saturated = None if saturation is None else image[..., :3] >= decoded(_share(saturation), self.encoding, tone)
+        saturated = (
+            None
+            if saturation is None
+            else image[..., :3] >= decoded(_saturation_share(saturation), self.encoding, tone)
+        )
         object.__setattr__(self, "saturated", saturated if saturated is not None and saturated.any() else None)
         gains = 2.0**stops * _gains(white_balance)
         image[..., :3] = image[..., :3] / gains.astype(np.float32)
@@ -165,7 +169,7 @@ def _gains(white_balance: npt.ArrayLike | None) -> np.ndarray:
     return gains
 
 
-def _share(saturation: float) -> np.ndarray:
+def _saturation_share(saturation: float) -> np.ndarray:
     if not (check.is_number(saturation) and 0 < saturation <= 1):
         raise ValueError(f"saturation: got {check.described(saturation)}, expected above 0 and up to 1, such as 0.98")
     return np.asarray(saturation - 1e-6)

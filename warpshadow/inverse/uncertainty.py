@@ -112,7 +112,7 @@ class NormalMatrix:
         stage = small_stage(problem)
         has_light = any(isinstance(free, Light) for free in problem.free)
         self.model = (ProjectedModel if has_light else Model)(problem, setting, stage)
-        self.places = _places(self.values)
+        self.places = _few_number_entries(self.values)
         self.directions = self._directions()
         self.roots: list[torch.Tensor] = []  # of the weights of colors, and of coverage
         with torch.no_grad():
@@ -283,7 +283,7 @@ def uncertainty(
         problem, setting, values: Of the result.
         fitted: The scene that was found.
     """
-    if not _places(values):
+    if not _few_number_entries(values):
         return None
     normal = NormalMatrix(problem, setting, values)
     inverse = normal.directions @ np.linalg.inv(normal.form)
@@ -323,7 +323,9 @@ def _pose_uncertainty(free: Pose, normal: NormalMatrix, covariance: np.ndarray) 
     )
 
 
-def along_flat(problem: Problem, setting: Setting, values: Mapping[str, Values], count: int) -> list[dict[str, Values]]:
+def candidates_along_flat_direction(
+    problem: Problem, setting: Setting, values: Mapping[str, Values], count: int
+) -> list[dict[str, Values]]:
     """Values beside some, along the direction of the poses that the images tell least of, either way, farther and
     farther; the light is solved for anew.
     """
@@ -337,7 +339,7 @@ def along_flat(problem: Problem, setting: Setting, values: Mapping[str, Values],
     return [normal.moved(CANDIDATE_SPACING * (number // 2 + 1) * (-1) ** number * weakest) for number in range(count)]
 
 
-def _places(values: Mapping[str, Values]) -> list[tuple[str, str, int]]:
+def _few_number_entries(values: Mapping[str, Values]) -> list[tuple[str, str, int]]:
     """Name, key and index of the numbers of parameters that have few."""
     return [
         (name, key, number)

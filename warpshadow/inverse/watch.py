@@ -53,7 +53,7 @@ class Watch:
         self._next = 0.0  # time of the next picture
         self._has_failed = False
 
-    def goes_on(self, fit: Watched, save: Callable[[], None]) -> bool:
+    def update(self, fit: Watched, save: Callable[[], None]) -> bool:
         """Show how far a fit is, wait while it is to pause, and say whether it goes on.
 
         Args:
@@ -75,16 +75,16 @@ class Watch:
     def end(self, fit: Watched, reason: str) -> None:
         """Show how a fit ended."""
         self._show(fit, reason)
-        with self._kept_from_the_fit():
+        with self._report_page_errors():
             self._page.end(f"{reason} after {sum(map(len, fit.losses))} iterations")
 
     def _show(self, fit: Watched, note: str) -> None:
         start = time.perf_counter()
-        with self._kept_from_the_fit():
+        with self._report_page_errors():
             words = [note, f"stage {fit.stage + 1} of {len(fit.stages)}", f"iteration {sum(map(len, fit.losses))}"]
             last = next((run[-1] for run in reversed(fit.losses) if run), None)
             words += [] if last is None else [f"loss {last:.3e}"]
-            losses = by_stage(fit.losses, fit.descents)
+            losses = losses_by_stage(fit.losses, fit.descents)
             self._page.show(" · ".join(words), losses, fit.stage, fit.stages[fit.stage].candidates)
             self._page.show_pictures(pictures(fit))
             self._page.fail(None)
@@ -92,7 +92,7 @@ class Watch:
         self._next = now + max(_MIN_INTERVAL, (now - start) / _MAX_TIME_SHARE)
 
     @contextlib.contextmanager
-    def _kept_from_the_fit(self) -> Iterator[None]:
+    def _report_page_errors(self) -> Iterator[None]:
         """Report an error of the page on the page, and once in a warning, and leave the fit alone."""
         try:
             yield
@@ -105,7 +105,7 @@ class Watch:
                 self._page.fail(message)
 
 
-def by_stage(losses: Sequence[list[float]], descents: Sequence[int]) -> list[list[list[float]]]:
+def losses_by_stage(losses: Sequence[list[float]], descents: Sequence[int]) -> list[list[list[float]]]:
     """Losses of a fit's descents, which stand one after another, for each stage, of which the numbers are given."""
     runs = iter(losses)
     return [list(islice(runs, count)) for count in descents]

@@ -391,7 +391,7 @@ def _static_shadows(method: SphereMethod, points: LitPoints, light: Input | None
     rows = method.cached_rows(static, light, points.blocker_kinds)
 
     def missing() -> int:
-        receivers = points.receivers_node.known(points.call)
+        receivers = points.receivers_node.value_if_known(points.call)
         return rows.missing(None if receivers is None else receivers.on_static)
 
     return Node(

@@ -94,7 +94,7 @@ class FaceSize(NamedTuple):
         return f"its faces have {self.area:.2g} pixels each, and the long ones are {self.length:.2g} pixels long"
 
 
-class Choice(NamedTuple):
+class ReceiverChoice(NamedTuple):
     """Where light is evaluated on a body."""
 
     receivers: str  # at every "vertex", at every "pixel" that shows the body, or "adaptive"
@@ -103,7 +103,7 @@ class Choice(NamedTuple):
 
 def choose_receivers(
     merged_scene: MergedScene, cameras: Sequence[Camera], *, is_light_free: bool = False
-) -> list[Choice]:
+) -> list[ReceiverChoice]:
     """Choose the receivers of the bodies that leave it open, as cameras see the scene.
 
     The same scene and cameras make the same choice, and later motion does not change it.
@@ -114,10 +114,10 @@ def choose_receivers(
         is_light_free: Whether light is given as coefficients, so that nobody knows where shadows will have edges.
     """
     if merged_scene.scene.visibility.method == "ray-traced":  # every sample is a receiver, overriding the bodies
-        return [Choice(body.receivers, None) for body in merged_scene.scene.bodies]
+        return [ReceiverChoice(body.receivers, None) for body in merged_scene.scene.bodies]
     requested = ["pixel" if body.is_glossy else body.receivers for body in merged_scene.scene.bodies]
     if AUTO not in requested:
-        return [Choice(receivers, None) for receivers in requested]
+        return [ReceiverChoice(receivers, None) for receivers in requested]
     sizes = face_sizes((_seen_faces(merged_scene, camera) for camera in cameras), merged_scene, cameras[0])
     share = LARGE_SHARE * cameras[0].width * cameras[0].height
     largest = min(max(LARGE_FACE, share), COARSE_FACE)
@@ -130,12 +130,12 @@ def choose_receivers(
     is_seen_large = np.array([size.area > SMALL_FACE for size in sizes])
     chosen = np.where(merged_scene.is_flat & is_sharp & is_seen_large, "adaptive", chosen).tolist()
     return [
-        Choice(own if receivers == AUTO else receivers, size)
+        ReceiverChoice(own if receivers == AUTO else receivers, size)
         for own, receivers, size in zip(chosen, requested, sizes, strict=True)
     ]
 
 
-def with_receivers(scene: Scene, choices: Sequence[Choice]) -> Scene:
+def with_receivers(scene: Scene, choices: Sequence[ReceiverChoice]) -> Scene:
     """The scene with a choice for each body in place of "auto"."""
     if all(body.receivers == choice.receivers for body, choice in zip(scene.bodies, choices, strict=True)):
         return scene
@@ -192,7 +192,7 @@ def _has_sun(scene: Scene) -> bool:
     return find_sharp_cells(cells.radiance @ LUMINANCE, cells.spots, cells.spreads) is not None
 
 
-def receiver_notes(scene: Scene, choices: Sequence[Choice]) -> list[str]:
+def receiver_notes(scene: Scene, choices: Sequence[ReceiverChoice]) -> list[str]:
     """Describe the choice for each body that leaves it open, a line each."""
     return [
         f"Body {number} ({body.called!r}) has receivers at {_WHERE[choice.receivers]}: {choice.size}."

@@ -114,7 +114,7 @@ def decide(image: Node, call: Call) -> dict[Node, Decision]:
         if reason:
             requested.add(node)
         own = _decision(node, call, reason)
-        is_idle = not own and node.known(call) is None  # an idle node passes the question on to its inputs
+        is_idle = not own and node.value_if_known(call) is None  # an idle node passes the question on to its inputs
         for item in node.before:
             visit(item, reason if is_idle else own)
         decisions[node] = own
@@ -125,7 +125,7 @@ def decide(image: Node, call: Call) -> dict[Node, Decision]:
 
 def _decision(node: Node, call: Call, reason: Decision) -> Decision:
     """Whether a node runs, given why it is asked for, or why it is not."""
-    if node.known(call) is not None:
+    if node.value_if_known(call) is not None:
         return Decision(False, f"cached: {_names(node.sources)} are the same")
     if idle := _text(node.idle):
         return Decision(False, idle)

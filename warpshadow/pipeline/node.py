@@ -170,7 +170,7 @@ class Node:
         end()
         return value
 
-    def known(self, call: "Call") -> Any:
+    def value_if_known(self, call: "Call") -> Any:
         """The value if it needs no computation, else None."""
         return self._cached if self.is_cached else call.get(self)
 

@@ -91,7 +91,7 @@ class SceneViews:
         caches_rows = not (self._method.lights_samples or self._merged_scene.scene.bounces)
         if geometry is not None and geometry.moving is not None and caches_rows:
             static = self._static.get(geometry.moving)
-            if static is None or not static.are_those_of(geometry):
+            if static is None or not static.matches(geometry):
                 static = StaticBodies(self._merged_scene, geometry)
         arguments = vertices, spheres, cameras, static, self._blocker_kinds(geometry, last)
         for view in self.last:

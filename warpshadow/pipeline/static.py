@@ -48,7 +48,7 @@ class StaticBodies:
         self.has_vertex = np.isin(merged_scene.body_of_vertex, self.bodies)
         self._merged_scene = merged_scene
         self._geometry = geometry.map(_first_instance)
-        if not self.are_those_of(geometry):
+        if not self.matches(geometry):
             raise ValueError(
                 f"geometry: got instances that differ in more than the bodies {self.moving}, expected their moving to "
                 "name all that do"
@@ -59,7 +59,7 @@ class StaticBodies:
         self._gathered: tuple = (None,)  # vertices, and points and normals of them
         self._rows: dict[Hashable, VertexRows] = {}
 
-    def are_those_of(self, geometry: Geometry) -> bool:
+    def matches(self, geometry: Geometry) -> bool:
         """Whether the static bodies of another geometry are these; on a GPU that is taken on trust."""
         if geometry.moving != self.moving:
             return False

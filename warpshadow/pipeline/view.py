@@ -332,7 +332,7 @@ class View(LitPoints):
 
     def counts(self) -> tuple[str, int, int]:
         """How many receivers may move and how many are static; "up to " where they are not found yet."""
-        if self.receivers_node.known(self.call) is not None:
+        if self.receivers_node.value_if_known(self.call) is not None:
             return super().counts()
         can_receive, static = self.method.can_receive, 0
         if self.static is not None:

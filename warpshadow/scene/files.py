@@ -308,7 +308,7 @@ def _write_body(body: Body, stem: Path) -> tuple[Table, list[Path]]:
     elif np.ndim(body.albedo) == 1:
         table["albedo"] = _numbers(body.albedo)
     else:
-        with files.whole(colors) as unfinished:
+        with files.atomic_write(colors) as unfinished:
             np.save(unfinished, body.albedo)
         table["albedo"] = colors.name
         written.append(colors)
@@ -328,7 +328,7 @@ def _write_body(body: Body, stem: Path) -> tuple[Table, list[Path]]:
         place[name] = _numbers(values)[0]
         if values.size > 1:
             path = stem.with_name(f"{stem.name}_{name}{VALUES_SUFFIX}")
-            with files.whole(path) as unfinished:
+            with files.atomic_write(path) as unfinished:
                 np.save(unfinished, values)
             place[name] = path.name
             written.append(path)
@@ -343,9 +343,9 @@ def _write_material(mesh: Path, texture: np.ndarray) -> list[Path]:
     """Let an OBJ file name its texture, as a PNG, which other programs draw."""
     picture, material = mesh.with_suffix(".png"), mesh.with_suffix(".mtl")
     write_image(picture, texture)
-    with files.whole(material) as unfinished:
+    with files.atomic_write(material) as unfinished:
         unfinished.write_text(f"newmtl textured\nKd 1 1 1\nmap_Kd {picture.name}\n")
-    with files.whole(mesh) as unfinished:
+    with files.atomic_write(mesh) as unfinished:
         unfinished.write_text(f"mtllib {material.name}\nusemtl textured\n{mesh.read_text()}")
     return [picture, material]
 

@@ -135,7 +135,7 @@ class DrawnLight(NamedTuple):
     """Factor of its radiance."""
 
 
-class Drawn(NamedTuple):
+class DrawnScene(NamedTuple):
     """A scene, and the random choices in it."""
 
     scene: Scene
@@ -175,8 +175,8 @@ class RandomScenes:
     bounces: Bounces = 0
 
     def __post_init__(self) -> None:
-        check.whole("seed", self.seed, minimum=0)
-        check.whole("count", self.count, minimum=0)
+        check.integer("seed", self.seed, minimum=0)
+        check.integer("count", self.count, minimum=0)
         for name, value in (("bodies", self.bodies), ("maps", self.maps)):
             if value is not None and not len(value):
                 raise ValueError(f"{name}: got none, expected one or more to draw from")
@@ -195,7 +195,7 @@ class RandomScenes:
         """
         return self.draw(index).scene
 
-    def draw(self, index: int) -> Drawn:
+    def draw(self, index: int) -> DrawnScene:
         """Draw a scene, as indexing does, and return the random choices with it."""
         if not -self.count <= index < self.count:
             raise IndexError(f"index: got {index}, expected a scene from 0 to {self.count - 1}")
@@ -210,7 +210,7 @@ class RandomScenes:
             light, drawn = _turned_map(rng, self.maps, ranges)
         camera = _random_camera(rng, bodies, self.size, ranges)
         scene = Scene((*bodies, ground), light, camera, self.visibility, self.supersampling, self.bounces)
-        return Drawn(scene, prototypes, drawn)
+        return DrawnScene(scene, prototypes, drawn)
 
 
 def _ground_size(bodies: Sequence[Body]) -> float:

@@ -163,7 +163,7 @@ class Visibility:
         check.choice("self_shadows", self.self_shadows, SELF_SHADOWS)
         check.choice("sampling", self.sampling, SAMPLINGS)
         if self.samples is not None:
-            check.whole("samples", self.samples, what="directions")
+            check.integer("samples", self.samples, what="directions")
         if not (check.is_number(self.error) and self.error > 0):
             raise ValueError(f"error: got {self.error!r}, expected a positive number such as 0.05, which is 5%")
         falloff_width(self.softness, self.directions)
@@ -378,7 +378,7 @@ class Body:
         count = self.mesh.vertex_count
         expected = "a linear color such as (0.8, 0.1, 0.1), one for each vertex, [vertex, 3], or an .npy file of them"
         if isinstance(self.albedo, str):
-            raise ValueError(f"albedo: got {self.albedo!r}, expected {expected}{_meant(self.albedo)}")
+            raise ValueError(f"albedo: got {self.albedo!r}, expected {expected}{_css_color_hint(self.albedo)}")
         albedo = check.numbers("albedo", self.albedo, expected=expected)
         if albedo.shape not in ((3,), (count, 3)):
             raise ValueError(f"albedo: got shape {albedo.shape}, expected [3] or [{count}, 3] (one for each vertex)")
@@ -501,7 +501,7 @@ def _read_values(path: Path) -> np.ndarray:
     return _read_colors(path, "[vertex]")
 
 
-def _meant(color: str) -> str:
+def _css_color_hint(color: str) -> str:
     """The linear RGB of a color of CSS, for messages; nothing for other text."""
     from PIL import ImageColor
 
@@ -528,12 +528,16 @@ def check_bounces(count: object) -> None:
 
 def _check_order(settings: Mapping[str, object]) -> None:
     """Raise ValueError where a scene's arguments stand in each other's places."""
-    swapped = [f"{role} in place of {name}" for name, value in settings.items() if (role := _role(value, name)) != name]
+    swapped = [
+        f"{role} in place of {name}"
+        for name, value in settings.items()
+        if (role := _argument_role(value, name)) != name
+    ]
     if swapped:
         raise ValueError(f"Scene: got {' and '.join(swapped)}, expected Scene(bodies, light, camera, visibility)")
 
 
-def _role(value: object, name: str) -> str:
+def _argument_role(value: object, name: str) -> str:
     """The argument of a scene that a value is meant for; that of the name where it is of no such class."""
     items = value if isinstance(value, (list, tuple)) else [value]
     if any(isinstance(item, Body) for item in items):

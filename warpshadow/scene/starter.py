@@ -75,16 +75,16 @@ def write_starter(
         rotation=float(rotation),
         width=scene.camera.width,
         height=scene.camera.height,
-        light=_SKY if light is None else f"envmap = {_from(path, light)}",
+        light=_SKY if light is None else f"envmap = {_relative_path(path, light)}",
         bounces=scene.bounces,
-        mesh=_from(path, mesh),
+        mesh=_relative_path(path, mesh),
         options="".join(f"{option}\n" for option in options),
         ground_size=GROUND_SIZE,
         albedo=[round(float(value), 4) for value in ground.albedo],
     )
     if path.exists() and path.read_text(encoding="utf-8") != lines:
         raise FileExistsError(f"{path}: got a file that is there and may have been edited, expected none; remove it")
-    with files.whole(path) as unfinished:
+    with files.atomic_write(path) as unfinished:
         unfinished.write_text(lines, encoding="utf-8")
 
 
@@ -105,6 +105,6 @@ def write_bunny(folder: Path) -> Path:
     return path
 
 
-def _from(path: Path, file: Path) -> str:
+def _relative_path(path: Path, file: Path) -> str:
     """A file as a scene file names it, from its folder, in quotes."""
     return json.dumps(Path(os.path.relpath(file, path.parent)).as_posix(), ensure_ascii=False)

@@ -78,7 +78,7 @@ def file(table: Table, key: str, folder: Path) -> Path:
 
 def write(path: Path, tables: Mapping[str, object]) -> None:
     """Write a TOML file of tables, as :func:`text` has them."""
-    with files.whole(path) as unfinished:
+    with files.atomic_write(path) as unfinished:
         unfinished.write_text(text(tables), encoding="utf-8")
 
 

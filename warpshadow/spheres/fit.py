@@ -111,10 +111,10 @@ def fit_spheres(
     if isinstance(count, str):
         check.choice("count", count, (AUTO,))
     else:
-        check.whole("count", count, minimum=0)
+        check.integer("count", count, minimum=0)
         count = int(count)
     for name, value, minimum in (("seed", seed, 0), ("steps", steps, 1)):
-        check.whole(name, value, minimum=minimum)
+        check.integer(name, value, minimum=minimum)
     if count == AUTO and mesh.is_flat:
         count = MANY
     if error is not None:

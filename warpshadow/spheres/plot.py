@@ -51,5 +51,5 @@ def plot_spheres(mesh: Mesh, spheres: Spheres, path: AnyPath) -> None:
         axes.view_init(elev=15, azim=turn)
         axes.set_axis_off()
     figure.suptitle(f"{mesh.name}: {len(spheres)} spheres")
-    with files.whole(path) as unfinished:
+    with files.atomic_write(path) as unfinished:
         figure.savefig(unfinished, dpi=110)

@@ -57,7 +57,7 @@ class Spheres:
 
     def write(self, path: AnyPath) -> None:
         """Write an .npz file of ``centers`` and ``radii``, which a scene file's ``spheres`` reads."""
-        with files.whole(path) as unfinished:
+        with files.atomic_write(path) as unfinished:
             np.savez(unfinished, centers=self.centers, radii=self.radii)
 
     def __len__(self) -> int:

@@ -156,7 +156,7 @@ class MixedRenderer(torch.nn.Module):
         poses = [
             batch.split(name, self._checked_poses(name, *entry), 1 + len(entry[1])) for name, entry in arguments.items()
         ]
-        bodies = None if moving is None else self._known("moving", moving)
+        bodies = None if moving is None else self._check_bodies("moving", moving)
         geometries = _Placed([None] * len(self.renderers))
         if any(
             tensor is not None and tensor.ndim > 1 + len(item) and len(tensor) > 1
@@ -212,7 +212,7 @@ class MixedRenderer(torch.nn.Module):
     def _renderer(self, scene: int) -> TorchRenderer:
         return cast(TorchRenderer, self.renderers[scene])
 
-    def _known(self, argument: str, bodies: Iterable[BodyLike]) -> list[BodyLike]:
+    def _check_bodies(self, argument: str, bodies: Iterable[BodyLike]) -> list[BodyLike]:
         """Numbers and names of bodies, checked: some scene has each."""
         if not isinstance(bodies, Iterable) or isinstance(bodies, str):
             raise ValueError(f"{argument}: got {check.described(bodies)}, expected a list of bodies, such as [0]")
@@ -226,7 +226,7 @@ class MixedRenderer(torch.nn.Module):
         if arguments is None:
             return {}
         if isinstance(arguments, Mapping):
-            self._known(argument, arguments)
+            self._check_bodies(argument, arguments)
             pairs = arguments.items()
         else:
             check.instance(
@@ -352,13 +352,13 @@ def _as_batch(renderers: Iterable[TorchRenderer]) -> list[TorchRenderer]:
         check.instance(name, renderer, TorchRenderer, "a TorchRenderer")
         if renderer.warp.has_camera_batch:
             raise ValueError(f"{name}: got one with cameras of its own, expected one that has its scene's camera")
-        got, expected = _described(renderer), _described(arguments[0])
+        got, expected = _batch_description(renderer), _batch_description(arguments[0])
         if got != expected or not _is_same_basis(renderer.basis, arguments[0].basis):
             raise ValueError(f"{name}: got {got}, expected {expected}, as the first has")
     return arguments
 
 
-def _described(renderer: TorchRenderer) -> str:
+def _batch_description(renderer: TorchRenderer) -> str:
     """Shared by renderers whose images are a batch."""
     camera, basis = renderer.cameras[0], renderer.basis
     return (

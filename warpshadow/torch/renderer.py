@@ -188,7 +188,9 @@ class TorchRenderer(torch.nn.Module):
             and where no light bounces to albedo and textures, may be differentiated again, in all of these;
             others raise NotImplementedError then.
         """
-        stored, inputs = self._given(light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular))
+        stored, inputs = self._checked_inputs(
+            light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular)
+        )
 
         def draw(inputs: dict[str, Any]) -> wp.array:
             seen = inputs.pop("geometry"), inputs.pop("clip_matrices")
@@ -211,7 +213,7 @@ class TorchRenderer(torch.nn.Module):
             have no gradient for another that comes in front of it; masks and coverage have that of silhouettes, as
             images have.
         """
-        stored, inputs = self._given(None, geometry, clip_matrices)
+        stored, inputs = self._checked_inputs(None, geometry, clip_matrices)
 
         def find(inputs: dict[str, Any]) -> tuple[wp.array, ...]:
             view = self.warp.view(inputs["geometry"], inputs["clip_matrices"])
@@ -249,7 +251,9 @@ class TorchRenderer(torch.nn.Module):
             ValueError: where no body of the scene is a catcher.
         Differentiable: all, as :meth:`forward` is; both the light with and that without the other bodies are.
         """
-        stored, inputs = self._given(light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular))
+        stored, inputs = self._checked_inputs(
+            light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular)
+        )
         camera = self.cameras[0]
         size = camera.height, camera.width
         inputs["photograph"] = stored.add("photograph", photograph, wp.vec3, size, "linear RGB")
@@ -270,10 +274,12 @@ class TorchRenderer(torch.nn.Module):
         specular: PerBody[torch.Tensor] | None = None,
     ) -> Explanation:
         """List the stages that a call with the same arguments computes and skips, as :meth:`Renderer.explain` does."""
-        stored, inputs = self._given(light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular))
+        stored, inputs = self._checked_inputs(
+            light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular)
+        )
         return self.warp.explain(**stored.filled(inputs))
 
-    def _given(
+    def _checked_inputs(
         self,
         light: torch.Tensor | EnvironmentMap | None = None,
         geometry: Geometry[torch.Tensor] | None = None,
@@ -307,13 +313,13 @@ class TorchRenderer(torch.nn.Module):
             slots: list[Slot | None] = [None] * len(self.scene.bodies)
             for number, tensor in enumerate(self.scene.per_body(values, name)):
                 if tensor is not None:
-                    messages = self._said(name, values, number)
-                    of_body = self._of_body(name, number, tensor)
+                    messages = self._item_name(name, values, number)
+                    of_body = self._body_rows(name, number, tensor)
                     slots[number] = stored.add(f"{name}[{number}]", *of_body, messages=messages)
             (inputs.setdefault("gloss", {}) if name in GLOSS_ARGUMENTS else inputs)[name] = slots
         return stored, inputs
 
-    def _of_body(
+    def _body_rows(
         self, name: str, number: int, tensor: torch.Tensor
     ) -> tuple[torch.Tensor, type, tuple[int | str, ...], str]:
         """A tensor of a body as rows of items, their dtype, the shape to expect, and a remedy."""
@@ -327,7 +333,7 @@ class TorchRenderer(torch.nn.Module):
         counts = shape[: len(shape) - len(item)][-1:]
         return tensor, dtype, counts if counts in ((), (1,)) else (self.scene.bodies[number].mesh.vertex_count,), ""
 
-    def _said(self, argument: str, stored: PerBody[torch.Tensor] | None, number: int) -> str:
+    def _item_name(self, argument: str, stored: PerBody[torch.Tensor] | None, number: int) -> str:
         """Name of an item for a body in messages: by the name of the body where that was given."""
         keys = stored if isinstance(stored, Mapping) else ()
         return f"{argument}[{next((repr(key) for key in keys if self.scene.body_number(key) == number), number)}]"

@@ -107,7 +107,7 @@ def is_own(origin: str | None, host: str, *, is_local: bool) -> bool:
 
 def check_address(host: object, port: object) -> None:
     """Raise ValueError unless one can serve there; warn where others can come in."""
-    if check.whole("port", port, minimum=0) > 65535:
+    if check.integer("port", port, minimum=0) > 65535:
         raise ValueError(f"port: got {port}, expected at most 65535")
     expected = "an address or a name of this machine, such as '127.0.0.1', or '0.0.0.0' for all that it has"
     check.instance("host", host, str, expected)

@@ -107,7 +107,7 @@ class Texture(FreeOfBody):
             object.__setattr__(self, "size", tuple(self.size))
         for name in ("smoothness", "total_variation", "palette"):
             check.nonnegative(name, getattr(self, name))
-        check.whole("colors", self.colors, minimum=2)
+        check.integer("colors", self.colors, minimum=2)
 
     def check_scene(self, scene: Scene) -> None:
         """Raise ValueError for a body that cannot have a texture."""
