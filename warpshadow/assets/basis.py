@@ -159,11 +159,11 @@ def conversion(basis: Basis, other: Basis) -> np.ndarray | None:
         return basis.functions(other.directions).astype(np.float32)
     # to cells: the mean of the harmonics over a cell, or how cells overlap, from many directions
     fine = fibonacci(64 * max(basis.size, other.size))
-    own = other.functions(fine)
-    weights = 1 / own.sum(axis=0)[:, None] if isinstance(other, CellBasis) else 4 * np.pi / len(fine)
+    values = other.functions(fine)
+    weights = 1 / values.sum(axis=0)[:, None] if isinstance(other, CellBasis) else 4 * np.pi / len(fine)
     if not isinstance(basis, CellBasis):
-        return (weights * (own.T @ basis.functions(fine))).astype(np.float32)
+        return (weights * (values.T @ basis.functions(fine))).astype(np.float32)
     from scipy.sparse import csr_matrix
 
     in_cells = csr_matrix((np.ones(len(fine)), (basis.cells(fine), np.arange(len(fine)))), (basis.size, len(fine)))
-    return (weights * (in_cells @ own).T).astype(np.float32)
+    return (weights * (in_cells @ values).T).astype(np.float32)

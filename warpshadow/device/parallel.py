@@ -214,12 +214,14 @@ def _launch_slices(
     if slice_count <= 1 or (not summed and workers == 1):
         launch(arguments, gradients=gradients)(dim)
         return
-    own = {place: zeros((slice_count, *array.shape), array.dtype, device=device) for place, array in summed.items()}
+    slice_sums = {
+        place: zeros((slice_count, *array.shape), array.dtype, device=device) for place, array in summed.items()
+    }
     kernel.module.load(device, 1)  # compiled here, not by each thread
-    launches = [] if own else [launch(arguments, gradients=gradients)] * slice_count
+    launches = [] if slice_sums else [launch(arguments, gradients=gradients)] * slice_count
     for number in range(len(launches), slice_count):
         values, adjoints = list(arguments), None if gradients is None else list(gradients)
-        for place, parts in own.items():
+        for place, parts in slice_sums.items():
             if adjoints is None:
                 values[place] = parts[number]
             else:
@@ -231,7 +233,7 @@ def _launch_slices(
         launches[number]((starts[number + 1] - starts[number], *dim[1:]), starts[number], worker)
 
     _share(run, slice_count, workers)
-    for place, parts in own.items():
+    for place, parts in slice_sums.items():
         summed[place].numpy()[...] += parts.numpy().sum(axis=0)
 
 

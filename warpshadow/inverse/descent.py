@@ -161,7 +161,11 @@ class _Descent:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state."""
         others = state.get("fingerprints")
-        changed = [name for name, own in self.fingerprints.items() if others is not None and others.get(name) != own]
+        changed = [
+            name
+            for name, stage_tolerance in self.fingerprints.items()
+            if others is not None and others.get(name) != stage_tolerance
+        ]
         if others is None or changed:
             of_other = f"of another fit (other {', '.join(changed)})" if changed else "of no fit of this version"
             raise checkpoints.CheckpointError(
@@ -237,8 +241,8 @@ class _Descent:
 
     def _has_converged(self) -> bool:
         """Whether the run gains no more than a part of its loss, by the optimizer's word where it has one."""
-        own = self.stages[self.stage].tolerance
-        tolerance = self.tolerance if own is None else own
+        stage_tolerance = self.stages[self.stage].tolerance
+        tolerance = self.tolerance if stage_tolerance is None else stage_tolerance
         losses = self.losses[-1]
         if losses and isinstance(self.optimizer, QuasiNewton):
             return self.optimizer.has_converged(tolerance)
@@ -320,8 +324,8 @@ def _descends(free: Free, stage: Stage) -> bool:
 def _copied(values: Mapping[str, Values], device: torch.device | None = None) -> dict[str, Values]:
     """A copy, on another device if one is given."""
     return {
-        name: {key: tensor.detach().to(device, copy=True) for key, tensor in own.items()}
-        for name, own in values.items()
+        name: {key: tensor.detach().to(device, copy=True) for key, tensor in stage_tolerance.items()}
+        for name, stage_tolerance in values.items()
     }
 
 

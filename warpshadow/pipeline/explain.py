@@ -113,11 +113,13 @@ def decide(image: Node, call: Call) -> dict[Node, Decision]:
             return
         if reason:
             requested.add(node)
-        own = _decision(node, call, reason)
-        is_idle = not own and node.value_if_known(call) is None  # an idle node passes the question on to its inputs
+        node_decision = _decision(node, call, reason)
+        is_idle = (
+            not node_decision and node.value_if_known(call) is None
+        )  # an idle node passes the question on to its inputs
         for item in node.before:
-            visit(item, reason if is_idle else own)
-        decisions[node] = own
+            visit(item, reason if is_idle else node_decision)
+        decisions[node] = node_decision
 
     visit(image, Decision(True, "an image is asked for"))
     return decisions

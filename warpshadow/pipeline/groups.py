@@ -225,5 +225,5 @@ def _nearest_blockers(numbers: np.ndarray | None, blockers: Blockers) -> Nearest
     if numbers is None:
         return None
     merged_scene = blockers.merged_scene
-    own = merged_scene.spheres_of(nonplanar_bodies(merged_scene), blockers.spheres)
-    return NearestBlockers(*own, constant(numbers, wp.int32, merged_scene.device))
+    sphere_arrays = merged_scene.spheres_of(nonplanar_bodies(merged_scene), blockers.spheres)
+    return NearestBlockers(*sphere_arrays, constant(numbers, wp.int32, merged_scene.device))

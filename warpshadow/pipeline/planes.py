@@ -49,9 +49,9 @@ class ScenePlanes:
     def others(self, number: int) -> list[np.ndarray]:
         """Vertices of each other body where the scene has it, in a body's frame."""
         bodies = self._merged_scene.scene.bodies
-        own = bodies[number]
+        plane_body = bodies[number]
         return [
-            (body.world_points() - own.translation) @ own.rotation_matrix() / own.scale
+            (body.world_points() - plane_body.translation) @ plane_body.rotation_matrix() / plane_body.scale
             for other, body in enumerate(bodies)
             if other != number
         ]
@@ -95,7 +95,9 @@ class ScenePlanes:
         from scipy.sparse import csr_matrix
 
         starts = self._merged_scene.first_vertex
-        columns = np.concatenate([first + own for first, own in zip(starts[:-1], self._corners, strict=True)])
+        columns = np.concatenate(
+            [first + plane_body for first, plane_body in zip(starts[:-1], self._corners, strict=True)]
+        )
         entries = np.ones(len(columns)), (np.arange(len(columns)), columns)
         matrix = csr_matrix(entries, shape=(len(columns), int(starts[-1])))
         return SparseMatrix.of(matrix, device=self._merged_scene.device)

@@ -124,7 +124,10 @@ class SphereBinding:
         distances = tree.query(centers, k=min(_MIN_VERTICES, len(places)))[0].reshape(len(centers), -1)
         reaches = np.maximum(_BINDING_RADIUS * np.maximum(distances[:, 0], radii), 1.1 * distances[:, -1])
         near = tree.query_ball_point(centers, reaches, return_sorted=True)
-        rows = [_weights(places[own], *sphere) for own, *sphere in zip(near, centers, reaches, strict=True)]
+        rows = [
+            _weights(places[bound_vertices], *sphere)
+            for bound_vertices, *sphere in zip(near, centers, reaches, strict=True)
+        ]
         weights, shares = (np.concatenate(column) for column in zip(*rows, strict=True))
         return SphereBinding(
             wp.array(np.cumsum([0, *map(len, near)]), dtype=wp.int32, device=device),

@@ -167,14 +167,14 @@ def _cut_squares(
                 y = 2 * top + pixel / 2
                 x = 2 * left + pixel % 2
                 if y < sizes.shape[1] and x < sizes.shape[2]:
-                    own = size
+                    pixel_size = size
                     if size == 1:
                         key = _key_at(seen, keys, sample_at(y, x, supersampling, height, width))
                         for corner in range(1, 4):
                             other = sample_at(y + corner / 2, x + corner % 2, supersampling, height, width)
                             if key < 0 or _key_at(seen, keys, other) != key:
-                                own = 0
-                    sizes[view, y, x] = own
+                                pixel_size = 0
+                    sizes[view, y, x] = pixel_size
 
 
 def find_quadtree(

@@ -368,12 +368,12 @@ def _resolve(
     """One thread owns a run of samples: the face in the largest key of all layers, and -1 for the key zero."""
     instance, thread = split_row(first_row + wp.tid(), keys.shape[2] // run)
     first_layer = keys[instance, 0]
-    own = face_ids[instance]
+    instance_faces = face_ids[instance]
     for sample in range(thread * run, (thread + 1) * run):
         key = first_layer[sample]
         for layer in range(1, keys.shape[1]):
             key = wp.max(key, keys[instance, layer, sample])
-        own[sample] = ~wp.int32(key)
+        instance_faces[sample] = ~wp.int32(key)
 
 
 def rasterize(clip_positions: wp.array, faces: wp.array, width: int, height: int) -> Fragments:

@@ -64,15 +64,15 @@ def _gather(
     """A thread owns a receiver: a vertex, or a fragment, −1 for nothing."""
     batch, receiver = wp.tid()
     instance = instance_in(batch, positions.shape[0])
-    own = receiver - vertices.shape[0]
-    if own < 0:
+    fragment = receiver - vertices.shape[0]
+    if fragment < 0:
         vertex, is_back = split_side(vertices[receiver], positions.shape[1])
         points[batch, receiver] = positions[instance, vertex]
         point_normals[batch, receiver] = wp.where(is_back, -1.0, 1.0) * normals[instance, vertex]
     else:
         view = instance_in(batch, seen_sides.shape[0])
-        weights = seen_barycentrics[view, own]
-        face, is_back = split_side(wp.max(seen_sides[view, own], 0), faces.shape[0])
+        weights = seen_barycentrics[view, fragment]
+        face, is_back = split_side(wp.max(seen_sides[view, fragment], 0), faces.shape[0])
         points[batch, receiver] = at_point(positions[instance], faces[face], weights)
         normal = wp.normalize(at_point(normals[instance], faces[face], weights))
         point_normals[batch, receiver] = wp.where(is_back, -1.0, 1.0) * normal
@@ -88,9 +88,9 @@ def _add_faces(
 ):
     """A thread owns a face: of the mesh, or of an own receiver."""
     face = wp.tid()  # with_self_light may have more
-    own = receiver_count + face - faces.shape[0]
-    corners = wp.vec3i(own, own, own)
-    if own < receiver_count:
+    receiver = receiver_count + face - faces.shape[0]
+    corners = wp.vec3i(receiver, receiver, receiver)
+    if receiver < receiver_count:
         corners = faces[face]
     with_self_light[face] = corners
 
@@ -207,15 +207,20 @@ def find_receivers(
             seen_points = points_seen(positions, normals, faces, Fragments(*receiver_fragments.rows))
             surface = SeenSurface(*seen_points, positions[0], faces)
         arguments = receiver_fragments, side_count, wants_samples, keys, supersampling, quadtree, surface
-        own = find_sample_receivers(*arguments)
-        receiver_fragments, seen = own.fragments, own.seen
+        sample_receivers = find_sample_receivers(*arguments)
+        receiver_fragments, seen = sample_receivers.fragments, sample_receivers.seen
         moving_count = numbering.moving_count
-        spans += tuple(Span(body, moving_count + first, moving_count + end) for body, first, end in own.spans)
+        spans += tuple(
+            Span(body, moving_count + first, moving_count + end) for body, first, end in sample_receivers.spans
+        )
         count = side_count + seen.face_ids.shape[1]
-        all_faces = empty(count + len(own.triangles), dtype=wp.vec3i, device=device)
+        all_faces = empty(count + len(sample_receivers.triangles), dtype=wp.vec3i, device=device)
         launch(_add_faces, count, inputs=[receiver_faces, receiver_count], outputs=[all_faces])
-        if len(own.triangles):
-            wp.copy(all_faces[count:], from_numpy(receiver_count + own.triangles, dtype=wp.vec3i, device=device))
+        if len(sample_receivers.triangles):
+            wp.copy(
+                all_faces[count:],
+                from_numpy(receiver_count + sample_receivers.triangles, dtype=wp.vec3i, device=device),
+            )
         receiver_faces = all_faces
     elif vertices is None:
         return Receivers(positions, normals, receiver_faces, of_vertices, receiver_fragments)

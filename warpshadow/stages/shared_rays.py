@@ -256,14 +256,16 @@ def find_corners(receivers: Receivers, instance: int, supersampling: int) -> Cor
     result = Corners.none(count)
     triangles, face_ids = receivers.faces.numpy(), receivers.fragments.face_ids.numpy()
     face_ids = face_ids[min(instance, len(face_ids) - 1)]
-    own = triangles[face_ids]
-    own = np.where((face_ids >= 0) & (own == own[..., :1]).all(axis=-1), own[..., 0], -1)
-    of_pixel = own[::supersampling, ::supersampling]
+    pixel_faces = triangles[face_ids]
+    pixel_faces = np.where(
+        (face_ids >= 0) & (pixel_faces == pixel_faces[..., :1]).all(axis=-1), pixel_faces[..., 0], -1
+    )
+    of_pixel = pixel_faces[::supersampling, ::supersampling]
     square = 1 << max(min(of_pixel.shape) // SQUARES, 1).bit_length() - 1
     if square == 1:
         return result
     places = np.full((count + 1, 2), -1)
-    places[own] = np.moveaxis(np.indices(own.shape), 0, -1) // supersampling
+    places[pixel_faces] = np.moveaxis(np.indices(pixel_faces.shape), 0, -1) // supersampling
     places = places[:-1]  # the last item was for samples without a receiver
     inside = np.flatnonzero(places[:, 0] >= 0)
     first = places[inside] // square * square

@@ -122,7 +122,8 @@ def _pull(
                             line = edge_line(edge, center, clip)
                             t = distance(line, direction, half)
                             if ends_before(line, direction) and t > MIN_DISTANCE and t <= 1.0:
-                                # entries are of all views; where one view serves all images, each has its own colors
+                                # entries are of all views; where one view serves all images, each has its
+                                # receiver_slope colors
                                 rise = edge_colors[batch - view, entry, direction] - color
                                 span = wp.min(t, 0.5)
                                 total = wp.dot(adj_color, wp.vec3(rise[0], rise[1], rise[2]))
@@ -137,9 +138,12 @@ def _pull(
                 slope = wp.cw_mul(wp.cw_div(rises, spans), half)
                 corners = fragments.faces[face]
                 if wp.min(spans) == 0.0:
-                    own = _slope_of_face(adj_weights(of_receivers, receivers, adj_light), corners, center, clip)
+                    receiver_slope = _slope_of_face(
+                        adj_weights(of_receivers, receivers, adj_light), corners, center, clip
+                    )
                     slope = wp.vec2(
-                        wp.where(spans[0] == 0.0, own[0], slope[0]), wp.where(spans[1] == 0.0, own[1], slope[1])
+                        wp.where(spans[0] == 0.0, receiver_slope[0], slope[0]),
+                        wp.where(spans[1] == 0.0, receiver_slope[1], slope[1]),
                     )
                 weights = fragments.barycentrics[at]
                 depth = wp.dot(weights, wp.vec3(clip[corners[0]][3], clip[corners[1]][3], clip[corners[2]][3]))

@@ -30,7 +30,7 @@ class Arguments:
 
     def __init__(self, device: torch.device, *, cameras: Sequence[Camera] | None = None):
         self.device = device
-        self._cameras = cameras  # a batch beside the tensors' own
+        self._cameras = cameras  # a batch beside the tensors' like_arrays
         self._has_batch = cameras is not None  # of results
         self.names: list[str] = []
         self.tensors: list[torch.Tensor] = []
@@ -66,9 +66,9 @@ class Arguments:
 
     def add_geometry(self, name: str, geometry: Geometry[torch.Tensor], like: Geometry[wp.array]) -> Geometry[Slot]:
         """Add the tensors of a geometry, of which arrays there are as many items as of another."""
-        geometry, own = as_geometry(name, geometry), like.arrays()
+        geometry, like_arrays = as_geometry(name, geometry), like.arrays()
         slots = {
-            part: self.add(f"{name}.{part}", tensor, GEOMETRY_DTYPES[part], own[part].shape[1:], PLACED)
+            part: self.add(f"{name}.{part}", tensor, GEOMETRY_DTYPES[part], like_arrays[part].shape[1:], PLACED)
             for part, tensor in geometry.arrays().items()
         }
         rotations = None

@@ -185,8 +185,8 @@ class MixedRenderer(torch.nn.Module):
         translations = torch.zeros(scene_count, body_count, 3, device=self.device)
         scales = torch.ones(scene_count, body_count, device=self.device)
         for scene in range(scene_count):
-            own = self._renderer(scene).scene_poses(pivot=pivot)
-            for all_poses, poses in zip((rotations, translations, scales), own, strict=True):
+            own_poses = self._renderer(scene).scene_poses(pivot=pivot)
+            for all_poses, poses in zip((rotations, translations, scales), own_poses, strict=True):
                 all_poses[scene, : len(poses)] = poses
         return rotations, translations, scales
 

@@ -144,9 +144,9 @@ class TorchRenderer(torch.nn.Module):
 
     def set_extra_state(self, state: torch.Tensor) -> None:
         """Raise ValueError unless a ``state_dict`` is of a renderer whose tensors mean the same."""
-        stored, own = (bytes(item.tolist()).decode() for item in (state, self.get_extra_state()))
-        if stored != own:
-            raise ValueError(f"state_dict: got that of a TorchRenderer with {stored}, expected {own}")
+        stored, expected_state = (bytes(item.tolist()).decode() for item in (state, self.get_extra_state()))
+        if stored != expected_state:
+            raise ValueError(f"state_dict: got that of a TorchRenderer with {stored}, expected {expected_state}")
 
     @uncompiled
     @check.keywords(**_ELSEWHERE)

@@ -106,8 +106,8 @@ class FreeOfBody(Free):
     def called(self, fitted: FittedScene) -> str:
         """The name of its body, or its number if the name is not unique."""
         names = [body.called for body in fitted.scene.bodies]
-        own = names[self.number]
-        return own if names.count(own) == 1 else f"body_{self.number}"
+        body_name = names[self.number]
+        return body_name if names.count(body_name) == 1 else f"body_{self.number}"
 
     def numbered(self, scene: Scene) -> FreeOfBody:
         """The same of the body's number."""

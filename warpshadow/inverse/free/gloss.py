@@ -39,8 +39,8 @@ class _Gloss(FreeOfBody):
     def start(self, setting: Setting) -> Values:
         """The body's numbers; their mean, where one is free."""
         body = setting.scene.bodies[self.number]
-        own = getattr(body, self.key)
-        numbers = np.full(1, GLOSS_DEFAULTS[self.key]) if own is None else own
+        body_value = getattr(body, self.key)
+        numbers = np.full(1, GLOSS_DEFAULTS[self.key]) if body_value is None else body_value
         numbers = (
             np.broadcast_to(numbers, (body.mesh.vertex_count,)) if self.per_vertex else numbers.mean(keepdims=True)
         )

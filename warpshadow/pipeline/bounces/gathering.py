@@ -185,10 +185,10 @@ class Proxies:
             of_body = slice(*first_sphere[body : body + 2])
             if len(radii[of_body]) and body in senders.bodies:
                 place = senders.bodies.index(body)
-                patches, own = senders.patches[place], slice(*senders.first[place : place + 2])
+                patches, patch_range = senders.patches[place], slice(*senders.first[place : place + 2])
                 nearest = patches.nearest_spheres(centers[of_body], radii[of_body])
-                numbers[own] = start + nearest
-                ratios[own] = np.sqrt(patches.areas / 2) / np.maximum(radii[of_body][nearest], 1e-30)
+                numbers[patch_range] = start + nearest
+                ratios[patch_range] = np.sqrt(patches.areas / 2) / np.maximum(radii[of_body][nearest], 1e-30)
             start += len(radii[of_body])
         return numbers, ratios
 

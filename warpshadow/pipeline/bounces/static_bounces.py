@@ -272,18 +272,18 @@ class StaticBounces:
         merged_scene = self._patches.merged_scene
         corners, owners, count = [], [], len(senders.areas)
         for number, body in enumerate(merged_scene.scene.bodies):
-            own = positions[merged_scene.first_vertex[number] : merged_scene.first_vertex[number + 1]]
+            body_positions = positions[merged_scene.first_vertex[number] : merged_scene.first_vertex[number + 1]]
             faces = body.mesh.surface.faces
             if number in senders.bodies:
                 place = senders.bodies.index(number)
                 patches = senders.patches[place]
-                corners.append(patches.pieces.positions(own, faces))
-                owned = np.where(patches.of_pieces < 0, -1, patches.of_pieces + senders.first[place])
+                corners.append(patches.pieces.positions(body_positions, faces))
+                patch_of_side = np.where(patches.of_pieces < 0, -1, patches.of_pieces + senders.first[place])
             else:
-                corners.append(own[faces])
-                owned = np.full((2, len(faces)), -1)
-            unlit = np.array([0, 0 if merged_scene.is_two_sided[number] else 1])
-            owners.append(np.where(owned < 0, count + unlit[:, None], owned))
+                corners.append(body_positions[faces])
+                patch_of_side = np.full((2, len(faces)), -1)
+            black_entry = np.array([0, 0 if merged_scene.is_two_sided[number] else 1])
+            owners.append(np.where(patch_of_side < 0, count + black_entry[:, None], patch_of_side))
         return loose_mesh(np.concatenate(corners), device=merged_scene.device), np.concatenate(owners, axis=1)
 
 

@@ -78,37 +78,37 @@ def _place_receiver(
     scene: PlaneArrays,
     batch: int,
     receiver: int,
-    own: wp.array(dtype=wp.vec3),
+    store: wp.array(dtype=wp.vec3),
 ):
     """Store a receiver's position relative to each plane; return how many sides it may hit."""
     plane_count = scene.grids.shape[0]
     side_count = int(0)
     for f in range(plane_count):
         place = find_in_plane(point, frames, f)
-        own[4 * f] = place.at
-        own[4 * f + 1] = place.along_u
-        own[4 * f + 2] = place.along_v
-        own[4 * f + 3] = place.normal
+        store[4 * f] = place.at
+        store[4 * f + 1] = place.along_u
+        store[4 * f + 2] = place.along_v
+        store[4 * f + 3] = place.normal
         # below the plane the front fades, and the back takes over
         front = front_of(fronts, scene.grids[f], place.at[2], batch, receiver, f)
         if f != scene.skip and wp.length_sq(place.normal) > 0.0:
             if front > 0.0:
-                own[4 * plane_count + side_count] = wp.vec3(float(f), 0.0, front)
+                store[4 * plane_count + side_count] = wp.vec3(float(f), 0.0, front)
                 side_count += 1
             if front < 1.0:
-                own[4 * plane_count + side_count] = wp.vec3(float(f), 1.0, 1.0 - front)
+                store[4 * plane_count + side_count] = wp.vec3(float(f), 1.0, 1.0 - front)
                 side_count += 1
     return side_count
 
 
 @wp.func
-def _stored_place(own: wp.array(dtype=wp.vec3), f: int):
+def _load_place(store: wp.array(dtype=wp.vec3), f: int):
     """Words stored for a plane."""
     place = ReceiverInPlane()
-    place.at = own[4 * f]
-    place.along_u = own[4 * f + 1]
-    place.along_v = own[4 * f + 2]
-    place.normal = own[4 * f + 3]
+    place.at = store[4 * f]
+    place.along_u = store[4 * f + 1]
+    place.along_v = store[4 * f + 2]
+    place.normal = store[4 * f + 3]
     return place
 
 
@@ -121,8 +121,8 @@ def _place_receiver_adjoint(
     batch: int,
     receiver: int,
     side_count: int,
-    own: wp.array(dtype=wp.vec3),
-    adj_own: wp.array(dtype=wp.vec3),
+    store: wp.array(dtype=wp.vec3),
+    adj_store: wp.array(dtype=wp.vec3),
     instance: int,
     adj_frames: wp.array2d(dtype=wp.vec3),
     adj_fronts: wp.array3d(dtype=wp.float32),
@@ -130,15 +130,15 @@ def _place_receiver_adjoint(
     """Add to the gradients of the frames of an instance, and of fronts; returns that of the point."""
     sides = 4 * scene.grids.shape[0]
     for i in range(side_count):
-        side = own[sides + i]
+        side = store[sides + i]
         f = int(side[0])
-        adj_front = wp.where(side[1] > 0.0, -1.0, 1.0) * adj_own[sides + i][2]
-        height = own[4 * f][2]
+        adj_front = wp.where(side[1] > 0.0, -1.0, 1.0) * adj_store[sides + i][2]
+        height = store[4 * f][2]
         adj_height = front_of_adjoint(fronts, scene.grids[f], height, adj_front, batch, receiver, f, adj_fronts)
-        adj_own[4 * f] = adj_own[4 * f] + wp.vec3(0.0, 0.0, adj_height)
+        adj_store[4 * f] = adj_store[4 * f] + wp.vec3(0.0, 0.0, adj_height)
     adj_point = wp.vec3()
     for f in range(scene.grids.shape[0]):
-        place, adj = _stored_place(own, f), _stored_place(adj_own, f)
+        place, adj = _load_place(store, f), _load_place(adj_store, f)
         adj_point += find_in_plane_adjoint(point, frames, f, place, adj, instance, adj_frames)
     return adj_point
 
@@ -150,13 +150,13 @@ def _levels_of(grid: PlaneGrid, is_back: bool):
 
 
 @wp.func
-def _meet_sides(
+def _hit_sides(
     scene: PlaneArrays,
     direction: wp.vec3,
     texels: wp.array(dtype=wp.vec3),
     part: float,
     side_count: int,
-    own: wp.array(dtype=wp.vec3),
+    store: wp.array(dtype=wp.vec3),
 ):
     """Store which plane sides this cell hits; return whether any. No part meets nothing."""
     if part <= 0.0:
@@ -165,12 +165,12 @@ def _meet_sides(
     cells = 6 * scene.grids.shape[0]
     meets = bool(False)
     for i in range(side_count):
-        side = own[sides + i]
+        side = store[sides + i]
         f = int(side[0])
         is_back = side[1] > 0.0
-        place = _stored_place(own, f)
+        place = _load_place(store, f)
         toward = toward_side(place, is_back, direction)
-        own[cells + 4 * i] = wp.vec3()
+        store[cells + 4 * i] = wp.vec3()
         if toward[2] > -scene.radius:
             grid = scene.grids[f]
             footprint = find_footprint(grid, scene, on_side(grid, place, is_back), toward, side[2])
@@ -186,25 +186,25 @@ def _meet_sides(
                     if sends:
                         radiosity = fetch(texels, scene, first_level, spot)
                 meets = True
-                own[cells + 4 * i] = wp.vec3(
+                store[cells + 4 * i] = wp.vec3(
                     footprint.share * covered,
                     footprint.distance,
                     footprint.distance * scene.radius * footprint.per_cosine,
                 )
-                own[cells + 4 * i + 1] = radiosity
-                own[cells + 4 * i + 2] = wp.vec3(footprint.share, covered, footprint.per_cosine)
-                own[cells + 4 * i + 3] = wp.vec3(footprint.center[0], footprint.center[1], 0.0)
+                store[cells + 4 * i + 1] = radiosity
+                store[cells + 4 * i + 2] = wp.vec3(footprint.share, covered, footprint.per_cosine)
+                store[cells + 4 * i + 3] = wp.vec3(footprint.center[0], footprint.center[1], 0.0)
     return meets
 
 
 @wp.func
-def _meet_sides_adjoint(
+def _hit_sides_adjoint(
     scene: PlaneArrays,
     direction: wp.vec3,
     texels: wp.array(dtype=wp.vec3),
     side_count: int,
-    own: wp.array(dtype=wp.vec3),
-    adj_own: wp.array(dtype=wp.vec3),
+    store: wp.array(dtype=wp.vec3),
+    adj_store: wp.array(dtype=wp.vec3),
     instance: int,
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
@@ -212,20 +212,20 @@ def _meet_sides_adjoint(
     sides = 4 * scene.grids.shape[0]
     cells = 6 * scene.grids.shape[0]
     for i in range(side_count):
-        if own[cells + 4 * i][0] > 0.0:
-            side = own[sides + i]
+        if store[cells + 4 * i][0] > 0.0:
+            side = store[sides + i]
             f = int(side[0])
             is_back = side[1] > 0.0
             grid = scene.grids[f]
-            stored = own[cells + 4 * i + 2]
-            spot_place = own[cells + 4 * i + 3]
+            stored = store[cells + 4 * i + 2]
+            spot_place = store[cells + 4 * i + 3]
             footprint = PlaneFootprint()
             footprint.share = stored[0]
-            footprint.distance = own[cells + 4 * i][1]
+            footprint.distance = store[cells + 4 * i][1]
             footprint.per_cosine = stored[2]
             footprint.center = wp.vec2(spot_place[0], spot_place[1])
-            adj_met = adj_own[cells + 4 * i]  # of coverage, distance, and t ρ / c′
-            adj_light = adj_own[cells + 4 * i + 1]  # of share × radiosity
+            adj_met = adj_store[cells + 4 * i]  # of coverage, distance, and t ρ / c′
+            adj_light = adj_store[cells + 4 * i + 1]  # of share × radiosity
             adj_share = adj_met[0] * stored[1]
             adj_spot = wp.vec3()
             sends = grid.sides == 2 or not is_back
@@ -236,7 +236,7 @@ def _meet_sides_adjoint(
                     adj_covered = wp.vec3(adj_met[0] * stored[0], 0.0, 0.0)
                     adj_spot += fetch_adjoint(scene.covered, grid, scene, first_level, footprint, spot, adj_covered)
                 if sends:
-                    adj_share += wp.dot(adj_light, own[cells + 4 * i + 1])
+                    adj_share += wp.dot(adj_light, store[cells + 4 * i + 1])
                     adj = stored[0] * adj_light
                     adj_spot += fetch_adjoint(texels, grid, scene, first_level, footprint, spot, adj)
                     if adj_texels:
@@ -248,7 +248,7 @@ def _meet_sides_adjoint(
             )
             if adj_spot[2] != 0.0:
                 adj_distance += adj_spot[2] / footprint.distance
-            place = _stored_place(own, f)
+            place = _load_place(store, f)
             toward = toward_side(place, is_back, direction)
             adj_at, adj_toward, adj_front = find_footprint_adjoint(
                 grid,
@@ -261,13 +261,13 @@ def _meet_sides_adjoint(
                 adj_cosine,
                 wp.vec2(adj_spot[0], adj_spot[1]),
             )
-            before = _stored_place(adj_own, f)
+            before = _load_place(adj_store, f)
             adj_place = side_adjoint(grid, place, is_back, direction, adj_at, adj_toward, before)
-            adj_own[sides + i] = adj_own[sides + i] + wp.vec3(0.0, 0.0, adj_front)
-            adj_own[4 * f] = adj_place.at
-            adj_own[4 * f + 1] = adj_place.along_u
-            adj_own[4 * f + 2] = adj_place.along_v
-            adj_own[4 * f + 3] = adj_place.normal
+            adj_store[sides + i] = adj_store[sides + i] + wp.vec3(0.0, 0.0, adj_front)
+            adj_store[4 * f] = adj_place.at
+            adj_store[4 * f + 1] = adj_place.along_u
+            adj_store[4 * f + 2] = adj_place.along_v
+            adj_store[4 * f + 3] = adj_place.normal
 
 
 @wp.func
@@ -277,50 +277,55 @@ def _nearness(footprint: wp.vec3, other: wp.vec3):
 
 
 @wp.func
-def _unhidden(i: int, but: int, cells: int, side_count: int, own: wp.array(dtype=wp.vec3)):
+def _side_transmittance(i: int, excluded: int, cells: int, side_count: int, store: wp.array(dtype=wp.vec3)):
     """Part of a side's light that passes the sides in front of it, but for one of them."""
-    footprint = own[cells + 4 * i]
+    footprint = store[cells + 4 * i]
     part = float(1.0)
     for j in range(side_count):
-        other = own[cells + 4 * j]
-        if j != i and j != but and other[0] > 0.0:
+        other = store[cells + 4 * j]
+        if j != i and j != excluded and other[0] > 0.0:
             part *= 1.0 - other[0] * step(_nearness(footprint, other))
     return part
 
 
 @wp.func
-def _mean_light(cells: int, side_count: int, own: wp.array(dtype=wp.vec3)):
+def _mean_light(cells: int, side_count: int, store: wp.array(dtype=wp.vec3)):
     """Find the mean radiosity of the sides that a cell hits, by its weights s; also their sum, and the coverages'."""
     light = wp.vec3()
     weights = float(0.0)
     covered = float(0.0)
     for i in range(side_count):
-        coverage = own[cells + 4 * i][0]
+        coverage = store[cells + 4 * i][0]
         if coverage > 0.0:
-            unhidden = _unhidden(i, i, cells, side_count, own)
-            own[cells + 4 * i + 3][2] = unhidden
-            light += (own[cells + 4 * i + 2][0] * unhidden) * own[cells + 4 * i + 1]
-            weights += coverage * unhidden
+            transmitted = _side_transmittance(i, i, cells, side_count, store)
+            store[cells + 4 * i + 3][2] = transmitted
+            light += (store[cells + 4 * i + 2][0] * transmitted) * store[cells + 4 * i + 1]
+            weights += coverage * transmitted
             covered += coverage
     weights = wp.max(weights, _MIN_WEIGHT_SUM)
     return light / weights, weights, covered
 
 
 @wp.func
-def _unhidden_adjoint(
-    i: int, adj_part: float, cells: int, side_count: int, own: wp.array(dtype=wp.vec3), adj_own: wp.array(dtype=wp.vec3)
+def _side_transmittance_adjoint(
+    i: int,
+    adj_part: float,
+    cells: int,
+    side_count: int,
+    store: wp.array(dtype=wp.vec3),
+    adj_store: wp.array(dtype=wp.vec3),
 ):
     """Add to the gradients of a cell's hits."""
-    footprint = own[cells + 4 * i]
+    footprint = store[cells + 4 * i]
     for j in range(side_count):
-        other = own[cells + 4 * j]
+        other = store[cells + 4 * j]
         if j != i and other[0] > 0.0:
-            adj_factor = adj_part * _unhidden(i, j, cells, side_count, own)
+            adj_factor = adj_part * _side_transmittance(i, j, cells, side_count, store)
             nearness = _nearness(footprint, other)
             adj_near = -adj_factor * other[0] * step_slope(nearness) / (footprint[2] + other[2] + 1.0e-20)
             adj_width = -adj_near * nearness
-            adj_own[cells + 4 * i] = adj_own[cells + 4 * i] + wp.vec3(0.0, adj_near, adj_width)
-            adj_own[cells + 4 * j] = adj_own[cells + 4 * j] + wp.vec3(
+            adj_store[cells + 4 * i] = adj_store[cells + 4 * i] + wp.vec3(0.0, adj_near, adj_width)
+            adj_store[cells + 4 * j] = adj_store[cells + 4 * j] + wp.vec3(
                 -adj_factor * step(nearness), -adj_near, adj_width
             )
 
@@ -346,17 +351,17 @@ def _light_receivers(
     """A thread owns a receiver."""
     row = first_row + wp.tid()
     batch, receiver = split_row(row, points.shape[1])
-    own = scratch[scratch_place(worker, row)]
+    store = scratch[scratch_place(worker, row)]
     sent = texels[instance_in(batch, texels.shape[0])]
     normal = normals[batch, receiver]
     cells = 6 * scene.grids.shape[0]
     placed = frames[instance_in(batch, frames.shape[0])]
-    side_count = _place_receiver(points[batch, receiver], placed, fronts, scene, batch, receiver, own)
+    side_count = _place_receiver(points[batch, receiver], placed, fronts, scene, batch, receiver, store)
     total = wp.vec3()
     for q in range(directions.shape[0]):
         weight = wp.dot(normal, directions[q]) * transmittance[batch, receiver, q]
-        if _meet_sides(scene, directions[q], sent, weight, side_count, own):
-            mean, _, covered = _mean_light(cells, side_count, own)
+        if _hit_sides(scene, directions[q], sent, weight, side_count, store):
+            mean, _, covered = _mean_light(cells, side_count, store)
             total += (weight * wp.min(covered, 1.0)) * mean
     light[batch, receiver] = (4.0 / float(directions.shape[0])) * total
 
@@ -391,16 +396,16 @@ def _light_receivers_adjoint(
     row = first_row + wp.tid()
     batch, receiver = split_row(row, points.shape[1])
     place = scratch_place(worker, row)
-    own = scratch[place]
-    adj_own = adj_scratch[place]
+    store = scratch[place]
+    adj_store = adj_scratch[place]
     seen_frames = instance_in(batch, frames.shape[0])
     seen_texels = instance_in(batch, texels.shape[0])
     sent = texels[seen_texels]
     normal = normals[batch, receiver]
     cells = 6 * scene.grids.shape[0]
-    side_count = _place_receiver(points[batch, receiver], frames[seen_frames], fronts, scene, batch, receiver, own)
+    side_count = _place_receiver(points[batch, receiver], frames[seen_frames], fronts, scene, batch, receiver, store)
     for k in range(cells):
-        adj_own[k] = wp.vec3()
+        adj_store[k] = wp.vec3()
     adj = (4.0 / float(directions.shape[0])) * adj_light[batch, receiver]
     adj_normal = wp.vec3()
     for q in range(directions.shape[0]):
@@ -408,27 +413,31 @@ def _light_receivers_adjoint(
         cosine = wp.dot(normal, direction)
         passing = transmittance[batch, receiver, q]
         weight = cosine * passing
-        if _meet_sides(scene, direction, sent, cosine, side_count, own):
-            mean, weights, covered = _mean_light(cells, side_count, own)
+        if _hit_sides(scene, direction, sent, cosine, side_count, store):
+            mean, weights, covered = _mean_light(cells, side_count, store)
             value = wp.dot(adj, mean)
             total = wp.min(covered, 1.0) * value
             factor = weight * wp.min(covered, 1.0) / weights
             adj_covered = wp.where(covered < 1.0, weight * value, 0.0)
             for i in range(side_count):
-                adj_own[cells + 4 * i] = wp.vec3(adj_covered, 0.0, 0.0)
+                adj_store[cells + 4 * i] = wp.vec3(adj_covered, 0.0, 0.0)
             for i in range(side_count):
-                coverage = own[cells + 4 * i][0]
+                coverage = store[cells + 4 * i][0]
                 if coverage > 0.0:
-                    unhidden = own[cells + 4 * i + 3][2]
-                    adj_unhidden = own[cells + 4 * i + 2][0] * wp.dot(adj, own[cells + 4 * i + 1]) - coverage * value
-                    adj_own[cells + 4 * i] = adj_own[cells + 4 * i] - wp.vec3(factor * unhidden * value, 0.0, 0.0)
-                    adj_own[cells + 4 * i + 1] = (factor * unhidden) * adj
-                    _unhidden_adjoint(i, factor * adj_unhidden, cells, side_count, own, adj_own)
+                    transmitted = store[cells + 4 * i + 3][2]
+                    adj_transmitted = (
+                        store[cells + 4 * i + 2][0] * wp.dot(adj, store[cells + 4 * i + 1]) - coverage * value
+                    )
+                    adj_store[cells + 4 * i] = adj_store[cells + 4 * i] - wp.vec3(
+                        factor * transmitted * value, 0.0, 0.0
+                    )
+                    adj_store[cells + 4 * i + 1] = (factor * transmitted) * adj
+                    _side_transmittance_adjoint(i, factor * adj_transmitted, cells, side_count, store, adj_store)
             adj_normal += (passing * total) * direction
             if adj_transmittance:
                 adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + cosine * total
             if passing > 0.0:
-                _meet_sides_adjoint(scene, direction, sent, side_count, own, adj_own, seen_texels, adj_texels)
+                _hit_sides_adjoint(scene, direction, sent, side_count, store, adj_store, seen_texels, adj_texels)
     if adj_normals:
         adj_normals[batch, receiver] = adj_normals[batch, receiver] + adj_normal
     adj_point = _place_receiver_adjoint(
@@ -439,8 +448,8 @@ def _light_receivers_adjoint(
         batch,
         receiver,
         side_count,
-        own,
-        adj_own,
+        store,
+        adj_store,
         seen_frames,
         adj_frames,
         adj_fronts,

@@ -48,7 +48,10 @@ def patches_of_clusters(
     permutation = np.argsort(spheres, kind="stable")
     ends = np.searchsorted(spheres[permutation], np.arange(len(nearest) + 1))
     lists = [permutation[first:end] for first, end in zip(ends[:-1], ends[1:], strict=True)]
-    lists = [own if len(own) or patch < 0 else np.array([patch]) for own, patch in zip(lists, nearest, strict=True)]
+    lists = [
+        patches_of_sphere if len(patches_of_sphere) or patch < 0 else np.array([patch])
+        for patches_of_sphere, patch in zip(lists, nearest, strict=True)
+    ]
     for quad in range(merged_count(len(nearest), merging)):
         lists.append(np.concatenate(lists[QUAD * quad : QUAD * (quad + 1)]))
     starts = np.cumsum([0, *map(len, lists)])

@@ -216,10 +216,10 @@ def _make_exponentiate(order: int, base: str, keeps_powers: bool, lanes: int) ->
         """
         thread = first_row + wp.tid()
         batch, group = find_block(thread, log_sh.shape[1])
-        own = scratch[scratch_place(worker, thread)]
-        row = own[0]
-        square = own[1]
-        half = own[2]
+        thread_scratch = scratch[scratch_place(worker, thread)]
+        row = thread_scratch[0]
+        square = thread_scratch[1]
+        half = thread_scratch[2]
         if wp.static(keeps_powers):
             half = powers[batch, group, 0]
         load_rows(log_sh[batch], group, row)
@@ -287,11 +287,11 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
         """
         thread = first_row + wp.tid()
         batch, group = find_block(thread, log_sh.shape[1])
-        own = scratch[scratch_place(worker, thread)]
-        log = own[0]
-        adj_row = own[1]
-        product = own[2]
-        bent = own[3]
+        thread_scratch = scratch[scratch_place(worker, thread)]
+        log = thread_scratch[0]
+        adj_row = thread_scratch[1]
+        product = thread_scratch[2]
+        bent = thread_scratch[3]
         load_rows(log_sh[batch], group, log)
         load_rows(adj_visibility[batch], group, adj_row)
         count, scale, norm, depth, maximum, root, blend, blend_slope = measure(log, threshold)
