@@ -123,7 +123,7 @@ def _pull(
                             t = distance(line, direction, half)
                             if ends_before(line, direction) and t > MIN_DISTANCE and t <= 1.0:
                                 # entries are of all views; where one view serves all images, each has its
-                                # receiver_slope colors
+                                # own colors
                                 rise = edge_colors[batch - view, entry, direction] - color
                                 span = wp.min(t, 0.5)
                                 total = wp.dot(adj_color, wp.vec3(rise[0], rise[1], rise[2]))

@@ -30,7 +30,7 @@ class Arguments:
 
     def __init__(self, device: torch.device, *, cameras: Sequence[Camera] | None = None):
         self.device = device
-        self._cameras = cameras  # a batch beside the tensors' like_arrays
+        self._cameras = cameras  # a batch beside the tensors' own
         self._has_batch = cameras is not None  # of results
         self.names: list[str] = []
         self.tensors: list[torch.Tensor] = []
