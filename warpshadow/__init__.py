@@ -27,10 +27,12 @@ from warpshadow.device.startup import start_quietly as _start_quietly
 from warpshadow.device.threads import one_call as _one_call
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.geometry import Geometry
+from warpshadow.scene.body import Body
 from warpshadow.scene.camera_path import CameraPath, Keyframe
 from warpshadow.scene.files import SceneError, load_scene, write_scene
 from warpshadow.scene.mesh_scene import default_scene
-from warpshadow.scene.scene import Body, Scene, Visibility
+from warpshadow.scene.scene import Scene
+from warpshadow.scene.visibility import Visibility
 from warpshadow.spheres import Spheres, fit_spheres
 
 if _TYPE_CHECKING:

@@ -43,7 +43,7 @@ sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.kinds import SCENES, Sources
 from demos.scenes import image_error, on_ground, shipped_mesh
-from warpshadow.scene.scene import AUTO
+from warpshadow.scene.visibility import AUTO
 from warpshadow.spheres import exact_occlusion
 from warpshadow.stages import accumulate, exponentiate, sample_map, sh_transfer, shade, trace_visibility
 from warpshadow.stages.visibility.merging import MERGED_FROM

@@ -9,7 +9,7 @@ import torch
 
 import warpshadow as ws
 from warpshadow.assets.topology import face_normals, welded
-from warpshadow.scene.scene import Body
+from warpshadow.scene.body import Body
 from warpshadow.torch import TorchRenderer
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)

@@ -8,7 +8,7 @@ import warp as wp
 
 import warpshadow as ws
 from warpshadow.pipeline.choice_of_receivers import for_picture
-from warpshadow.scene.scene import SHARED_DIRECTIONS
+from warpshadow.scene.visibility import SHARED_DIRECTIONS
 from warpshadow.spheres import Spheres
 from warpshadow.stages.light_samples import cut_map
 from warpshadow.stages.ray_packets import build_face_tree

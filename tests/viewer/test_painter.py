@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import warpshadow as ws
-from warpshadow.scene.scene import Visibility
+from warpshadow.scene.visibility import Visibility
 from warpshadow.viewer.page_camera import PageCamera
 from warpshadow.viewer.painter import (
     Painter,

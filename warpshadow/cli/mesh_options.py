@@ -82,9 +82,10 @@ _KEYS_OF_SCENES = {
 def load(file: Path, is_quiet: bool, options: MeshOptions, **settings: Any) -> Scene:
     """The scene of a file, or the default one of a mesh's file; of that a note says which way is up."""
     from warpshadow.assets.mesh_files import MESH_SUFFIXES
+    from warpshadow.scene.body import Body
     from warpshadow.scene.files import load_scene, turned_light
     from warpshadow.scene.mesh_scene import default_scene, guess_up
-    from warpshadow.scene.scene import Body, Visibility
+    from warpshadow.scene.visibility import Visibility
 
     if file.suffix.lower() not in (*MESH_SUFFIXES, ".toml") and file.is_file():
         expected = f".toml for a scene file, or a mesh's: {', '.join(MESH_SUFFIXES)}"

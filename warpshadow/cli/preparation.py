@@ -144,7 +144,9 @@ def warmup(device: Device = "cpu", is_quiet: Quiet = False) -> None:
     from warpshadow.assets.primitives import icosphere
     from warpshadow.device.progress import progress_bar
     from warpshadow.pipeline.renderer import SceneRenderer
-    from warpshadow.scene.scene import METHODS, Body, Scene, Visibility
+    from warpshadow.scene.body import Body
+    from warpshadow.scene.scene import Scene
+    from warpshadow.scene.visibility import METHODS, Visibility
     from warpshadow.spheres import fit_spheres
 
     with clear_errors():

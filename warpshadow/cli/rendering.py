@@ -133,7 +133,7 @@ def render(
     from warpshadow.pipeline.choice_of_receivers import for_picture
     from warpshadow.pipeline.renderer import SceneRenderer
     from warpshadow.scene.camera_path import CameraPath
-    from warpshadow.scene.scene import AUTO
+    from warpshadow.scene.visibility import AUTO
     from warpshadow.tuning.tune import describe, resolved
     from warpshadow.tuning.video_time import remark_on_stills
 

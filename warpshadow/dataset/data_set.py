@@ -18,8 +18,9 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.mesh_files import MESH_SUFFIXES
 from warpshadow.dataset.recipe import Recipe, RecipeError
 from warpshadow.device.progress import progress_bar
+from warpshadow.scene.body import Body
 from warpshadow.scene.random_scenes import DrawnScene, RandomScenes, primitives
-from warpshadow.scene.scene import AUTO, SPHERE_METHODS, Body
+from warpshadow.scene.visibility import AUTO, SPHERE_METHODS
 from warpshadow.spheres import Spheres, fit_spheres
 
 Item = TypeVar("Item")

@@ -14,8 +14,9 @@ from warpshadow.check import AnyPath
 from warpshadow.dataset.layers import LAYERS
 from warpshadow.scene import toml_tables
 from warpshadow.scene.random_scenes import Ranges
-from warpshadow.scene.scene import AUTO, Bounces, Scene, Visibility, check_bounces, check_supersampling
+from warpshadow.scene.scene import Bounces, Scene, check_bounces, check_supersampling
 from warpshadow.scene.toml_tables import Table
+from warpshadow.scene.visibility import AUTO, Visibility
 
 Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | int | float | None"  # values that JSON has
 

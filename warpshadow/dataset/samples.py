@@ -26,9 +26,10 @@ from warpshadow.dataset.data_set import DataSet
 from warpshadow.dataset.layers import LAYERS, LazyLayers
 from warpshadow.dataset.png import Channels, as_png, from_png
 from warpshadow.dataset.recipe import Plain
+from warpshadow.scene.body import Body
 from warpshadow.scene.files import camera_table
 from warpshadow.scene.random_scenes import DrawnScene
-from warpshadow.scene.scene import Body, Scene
+from warpshadow.scene.scene import Scene
 from warpshadow.spheres import Spheres
 
 LIGHT_ORDER = 4  # bands of the coefficients that a sample has of its light

@@ -17,7 +17,7 @@ import torch
 from warpshadow import check
 from warpshadow.assets.mesh import Mesh
 from warpshadow.maths.plane import plane_normal
-from warpshadow.scene.scene import Body
+from warpshadow.scene.body import Body
 
 AXES = {"x": 0, "y": 1, "z": 2}
 UP = (0.0, 1.0, 0.0)

@@ -33,8 +33,9 @@ from warpshadow.inverse.schedule import READY_STAGES, Stage, check_stages
 from warpshadow.inverse.target import Target
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import load_scene, parse_camera
-from warpshadow.scene.scene import BodyLike, Scene, Visibility
+from warpshadow.scene.scene import BodyLike, Scene
 from warpshadow.scene.toml_tables import Table
+from warpshadow.scene.visibility import Visibility
 
 _KEYS = ("scene", "tolerance", "seed", "stages", "target", "free", "loss", "still", "optimizer", "stage")
 _PHOTOGRAPH_KEYS = ("encoding", "exposure", "white_balance", "saturation", "distortion")

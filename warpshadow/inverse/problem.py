@@ -23,7 +23,8 @@ from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.target import Target
 from warpshadow.inverse.world import FittedScene, Setting
 from warpshadow.scene.blockers import blocking_planes, scene_blockers
-from warpshadow.scene.scene import METHODS, SCENE_TYPES, SPHERE_METHODS, Scene, Visibility
+from warpshadow.scene.scene import SCENE_TYPES, Scene
+from warpshadow.scene.visibility import METHODS, SPHERE_METHODS, Visibility
 from warpshadow.tuning.tune import resolved
 
 _SQUARES, _RAYS = Loss(), Visibility("ray-traced")

@@ -10,7 +10,8 @@ from typing import Any
 from warpshadow import check
 from warpshadow.inverse.problem import Problem
 from warpshadow.maths.directions import check_count
-from warpshadow.scene.scene import Visibility, check_supersampling
+from warpshadow.scene.scene import check_supersampling
+from warpshadow.scene.visibility import Visibility
 
 LAST_RATE = 0.1  # share of its learning rate that a stage ends with
 

@@ -13,7 +13,9 @@ import torch
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.geometry import Geometry
 from warpshadow.scene.blockers import scene_blockers
-from warpshadow.scene.scene import GLOSS_ARGUMENTS, SPHERE_METHODS, Scene, Visibility
+from warpshadow.scene.body import GLOSS_ARGUMENTS
+from warpshadow.scene.scene import Scene
+from warpshadow.scene.visibility import SPHERE_METHODS, Visibility
 from warpshadow.spheres import Spheres
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.torch import TorchRenderer

@@ -46,7 +46,9 @@ from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.harmonic_light import as_light
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.scene.scene import AUTO, Body, Scene, Visibility
+from warpshadow.scene.body import Body
+from warpshadow.scene.scene import Scene
+from warpshadow.scene.visibility import AUTO, Visibility
 from warpshadow.spheres import Spheres
 from warpshadow.stages.project import to_clip
 from warpshadow.stages.rasterization import rasterize

@@ -17,7 +17,7 @@ from warpshadow.device.constants import constant
 from warpshadow.pipeline.lighting import KnownLight, Light, LitPoints, change_basis, map_of, receiver_text
 from warpshadow.pipeline.node import Input, Node, detached
 from warpshadow.pipeline.reflectance import Materials
-from warpshadow.scene.scene import GLOSS_ARGUMENTS
+from warpshadow.scene.body import GLOSS_ARGUMENTS
 from warpshadow.stages.gloss.lobes import sample_lobes
 from warpshadow.stages.gloss.prefilter import look_up_light, prefilter
 from warpshadow.stages.gloss.reflection import mix_reflection, sum_lobes

@@ -15,7 +15,8 @@ from warpshadow.device.threads import one_at_a_time
 from warpshadow.maths.spatial_sort import z_order
 from warpshadow.pipeline.geometry import CENTER, Geometry, Pivot, as_geometry, splice
 from warpshadow.scene.blockers import scene_blockers
-from warpshadow.scene.scene import AUTO, SPHERE_METHODS, BodyLike, Scene
+from warpshadow.scene.scene import BodyLike, Scene
+from warpshadow.scene.visibility import AUTO, SPHERE_METHODS
 from warpshadow.spheres import MANY, Spheres
 from warpshadow.stages.bound_spheres import SphereBinding
 from warpshadow.stages.deform import DeformationGraph

@@ -37,9 +37,11 @@ from warpshadow.pipeline.node import Clock, Input, Node
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.scene_views import SceneViews, camera_batch
 from warpshadow.pipeline.view import View
+from warpshadow.scene.body import GLOSS_ARGUMENTS
 from warpshadow.scene.creases import rounded_edges
 from warpshadow.scene.placement import enclosures, misplacements
-from warpshadow.scene.scene import GLOSS_ARGUMENTS, METHODS, SCENE_TYPES, BodyLike, PerBody, Scene
+from warpshadow.scene.scene import SCENE_TYPES, BodyLike, PerBody, Scene
+from warpshadow.scene.visibility import METHODS
 from warpshadow.stages.receivers import Receivers
 
 RendererType = TypeVar("RendererType", bound="SceneRenderer")

@@ -7,7 +7,9 @@ from warpshadow.assets.mesh import Mesh
 from warpshadow.device.progress import ANNOUNCED_SECONDS, announce
 from warpshadow.maths.plane import plane_normal
 from warpshadow.maths.solid_angle import solid_angles
-from warpshadow.scene.scene import SPHERE_METHODS, Body, Scene
+from warpshadow.scene.body import Body
+from warpshadow.scene.scene import Scene
+from warpshadow.scene.visibility import SPHERE_METHODS
 from warpshadow.spheres import Spheres, fit_spheres
 from warpshadow.spheres.fit import fit_seconds, is_fitted
 

@@ -23,21 +23,10 @@ from warpshadow.assets.sky import synthetic_sky
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
-from warpshadow.scene.scene import (
-    COLORS_SUFFIX,
-    GLOSS_ARGUMENTS,
-    LIKELY_MISTAKES,
-    METHODS_OF_SETTING,
-    SCENE_TYPES,
-    VALUES_SUFFIX,
-    Body,
-    Bounces,
-    Scene,
-    Visibility,
-    check_bounces,
-    check_supersampling,
-)
+from warpshadow.scene.body import COLORS_SUFFIX, GLOSS_ARGUMENTS, LIKELY_MISTAKES, VALUES_SUFFIX, Body
+from warpshadow.scene.scene import SCENE_TYPES, Bounces, Scene, check_bounces, check_supersampling
 from warpshadow.scene.toml_tables import Table
+from warpshadow.scene.visibility import METHODS_OF_SETTING, Visibility
 from warpshadow.spheres import Spheres
 
 _VIEW_KEYS = ("eye", "target", "up", "fov_y")

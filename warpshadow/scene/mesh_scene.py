@@ -17,7 +17,8 @@ from warpshadow.assets.mesh_files import MeshSource
 from warpshadow.assets.primitives import infinite_ground
 from warpshadow.assets.sky import synthetic_sky
 from warpshadow.check import AnyPath
-from warpshadow.scene.scene import Body, Scene
+from warpshadow.scene.body import Body
+from warpshadow.scene.scene import Scene
 
 GROUND_SIZE = 6.0  # within which the ground's faces are small, as infinite_ground has it [scene units]
 

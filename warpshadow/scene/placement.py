@@ -9,7 +9,8 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.mesh import Mesh
 from warpshadow.maths.plane import plane_normal
 from warpshadow.maths.solid_angle import solid_angles
-from warpshadow.scene.scene import Body, Scene
+from warpshadow.scene.body import Body
+from warpshadow.scene.scene import Scene
 
 _GROUND_COSINE = 0.99  # cosine of the angle to +y up to which a flat body is a ground
 _CEILING_RATIO = 1.01  # ratio of breadths up to which a body is as broad as its ground, such as a ceiling

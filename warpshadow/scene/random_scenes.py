@@ -21,7 +21,9 @@ from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.primitives import icosphere, plane
 from warpshadow.assets.sky import synthetic_sky
 from warpshadow.maths import sh
-from warpshadow.scene.scene import Body, Bounces, Scene, Visibility
+from warpshadow.scene.body import Body
+from warpshadow.scene.scene import Bounces, Scene
+from warpshadow.scene.visibility import Visibility
 from warpshadow.spheres import Spheres
 
 GROUND_SIZE = 10.0  # scene units, or wider where bodies need it; a body is about one

@@ -16,7 +16,8 @@ from warpshadow.device.threads import one_at_a_time
 from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.explain import Explanation
 from warpshadow.pipeline.geometry import GEOMETRY_DTYPES, Geometry
-from warpshadow.scene.scene import GLOSS_ARGUMENTS, BodyLike, PerBody, Scene
+from warpshadow.scene.body import GLOSS_ARGUMENTS
+from warpshadow.scene.scene import BodyLike, PerBody, Scene
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.poses import Poses
 from warpshadow.stages.project import compose_clip_matrices

@@ -11,7 +11,8 @@ import warp as wp
 from warpshadow.maths.spatial_sort import z_order_of_cells
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.pipeline.view import View
-from warpshadow.scene.scene import AUTO, Bounces, Scene, Visibility
+from warpshadow.scene.scene import Bounces, Scene
+from warpshadow.scene.visibility import AUTO, Visibility
 from warpshadow.stages.normals import vertex_normals
 
 

@@ -23,7 +23,8 @@ from warpshadow.device.progress import progress_bar
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.scene import toml_tables
 from warpshadow.scene.blockers import fitted_counts
-from warpshadow.scene.scene import AUTO, SCENE_TYPES, SPHERE_METHODS, Bounces, Scene, Visibility, check_bounces
+from warpshadow.scene.scene import SCENE_TYPES, Bounces, Scene, check_bounces
+from warpshadow.scene.visibility import AUTO, SPHERE_METHODS, Visibility
 from warpshadow.spheres import Spheres, fit_spheres, is_fitted
 from warpshadow.stages.visibility.zonal_logs import LOGS
 from warpshadow.tuning.point_sample import PointSample

@@ -8,7 +8,8 @@ from warpshadow.device.parallel import thread_count
 from warpshadow.device.progress import show_time
 from warpshadow.pipeline.choice_of_receivers import for_picture
 from warpshadow.scene.blockers import fitted_counts
-from warpshadow.scene.scene import SHARED_DIRECTIONS, Scene
+from warpshadow.scene.scene import Scene
+from warpshadow.scene.visibility import SHARED_DIRECTIONS
 from warpshadow.spheres.fit import fit_seconds, is_fitted
 from warpshadow.stages.self_visibility.trace import trace_seconds
 

@@ -13,7 +13,8 @@ import numpy as np
 import viser
 import warp as wp
 
-from warpshadow.scene.scene import SPHERE_METHODS, Scene
+from warpshadow.scene.scene import Scene
+from warpshadow.scene.visibility import SPHERE_METHODS
 from warpshadow.tuning.tune import resolved
 from warpshadow.viewer.loop import Loop
 from warpshadow.viewer.page_camera import PageCamera, rotation, upward

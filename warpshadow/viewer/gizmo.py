@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from warpshadow.scene.scene import Body
+from warpshadow.scene.body import Body
 from warpshadow.viewer.page_camera import quaternion, rotation
 from warpshadow.viewer.state import BodyPose
 

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.primitives import icosphere
-from warpshadow.scene.scene import METHODS, RECEIVERS
+from warpshadow.scene.body import RECEIVERS
+from warpshadow.scene.visibility import METHODS
 from warpshadow.viewer import gizmo
 from warpshadow.viewer.loop import Loop
 from warpshadow.viewer.page_camera import PAGE_RADIUS, quaternion

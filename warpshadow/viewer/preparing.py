@@ -24,7 +24,8 @@ from warpshadow.device.parallel import ENVIRONMENT_VARIABLE, thread_count
 from warpshadow.device.progress import report_every
 from warpshadow.device.startup import start_quietly
 from warpshadow.scene.blockers import fitted_counts
-from warpshadow.scene.scene import SPHERE_METHODS, Scene
+from warpshadow.scene.scene import Scene
+from warpshadow.scene.visibility import SPHERE_METHODS
 from warpshadow.spheres import is_fitted
 from warpshadow.viewer.painter import Painter, own_page
 from warpshadow.viewer.quality import FrameRate, Quality

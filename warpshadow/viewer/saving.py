@@ -11,7 +11,8 @@ from pathlib import Path
 from warpshadow.assets.camera import Camera
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import camera_table, write_scene
-from warpshadow.scene.scene import METHODS_OF_SETTING, Scene
+from warpshadow.scene.scene import Scene
+from warpshadow.scene.visibility import METHODS_OF_SETTING
 from warpshadow.viewer.page_camera import PageCamera
 from warpshadow.viewer.state import AS_GIVEN, ViewerState
 

@@ -10,19 +10,16 @@ import numpy as np
 from warpshadow import check
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths.directions import check_count
+from warpshadow.scene.body import RECEIVERS, Body
 from warpshadow.scene.files import turned_light
-from warpshadow.scene.scene import (
+from warpshadow.scene.scene import Bounces, Scene, check_bounces
+from warpshadow.scene.visibility import (
     BOUNCE_METHODS,
     DEFAULT_METHOD,
     METHODS,
     METHODS_OF_SETTING,
-    RECEIVERS,
     SAMPLINGS,
-    Body,
-    Bounces,
-    Scene,
     Visibility,
-    check_bounces,
 )
 from warpshadow.viewer.quality import Quality
 

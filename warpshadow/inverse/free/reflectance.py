@@ -14,7 +14,9 @@ from warpshadow import check
 from warpshadow.inverse.free.base import FreeOfBody, Values
 from warpshadow.inverse.world import FittedScene, Setting, World
 from warpshadow.pipeline.renderer import SceneRenderer
-from warpshadow.scene.scene import Body, Scene, Visibility
+from warpshadow.scene.body import Body
+from warpshadow.scene.scene import Scene
+from warpshadow.scene.visibility import Visibility
 from warpshadow.stages.textures.seen import fill_unseen
 
 _SMOOTHING_LENGTH = 1e-3

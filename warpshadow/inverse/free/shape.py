@@ -12,7 +12,9 @@ import warp as wp
 from warpshadow import check
 from warpshadow.inverse.free.base import FreeOfBody, Values
 from warpshadow.inverse.world import FittedScene, Setting, World
-from warpshadow.scene.scene import SPHERE_METHODS, Body, Scene
+from warpshadow.scene.body import Body
+from warpshadow.scene.scene import Scene
+from warpshadow.scene.visibility import SPHERE_METHODS
 from warpshadow.spheres import Spheres, fit_spheres
 from warpshadow.torch import apply, rotation_matrices
 

@@ -23,7 +23,7 @@ from warpshadow.pipeline.directional import ProjectedCells
 from warpshadow.pipeline.groups import Group, GroupVisibility, nonplanar_bodies
 from warpshadow.pipeline.lighting import joined
 from warpshadow.pipeline.node import Call, Input, Node
-from warpshadow.scene.scene import Visibility
+from warpshadow.scene.visibility import Visibility
 from warpshadow.stages.bounces.plane_light import plane_light
 from warpshadow.stages.bounces.projected_areas import find_projected_areas, turn_from_planes
 from warpshadow.stages.bounces.proxies import place_proxies

@@ -1,0 +1,348 @@
+"""Bodies: meshes with reflectance and blockers, placed in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warpshadow import check
+from warpshadow.assets.color import GRAY, srgb_to_linear
+from warpshadow.assets.image import ImageError, read_rgb
+from warpshadow.assets.mesh import Mesh, MeshError
+from warpshadow.assets.mesh_files import Material, MeshSource, is_of_trimesh, load_material, load_shape
+from warpshadow.assets.topology import CREASE
+from warpshadow.check import AnyPath
+from warpshadow.scene.rotation import rotation_matrix, rotation_vector
+from warpshadow.scene.visibility import AUTO, SELF_SHADOWS
+from warpshadow.spheres import Spheres
+
+RECEIVERS = (AUTO, "vertex", "pixel", "adaptive")
+
+COLORS_SUFFIX = ".npy"  # suffixes of files with a color for each vertex; other text is no albedo
+
+VALUES_SUFFIX = ".npy"
+"""Suffix of files with a number for each vertex."""
+
+_SPHERES_SUFFIX = ".npz"
+
+GLOSS_ARGUMENTS = ("roughness", "metallic", "specular")
+"""Arguments of a body that say how it shines."""
+
+LIKELY_MISTAKES = {"color": "albedo", "colour": "albedo", "position": "translation"}
+"""Replacements for likely mistakes in a body's arguments, and keys."""
+
+
+@check.frozen
+@dataclass(frozen=True, eq=False, init=False)
+class Body:
+    """A mesh with its reflectance, placed in the world: scale first, then rotation, then translation.
+
+    A point p of the mesh is at R(s p) + t. The world is right-handed with y up; a rotation turns about the origin of
+    the mesh, counter-clockwise seen from the tip of its axis. Surfaces are diffuse, or shine
+    (``roughness``). Colors are linear RGB: ``srgb_to_linear`` converts those that color pickers show.
+
+    A path, relative to the current folder, stands for its file, as in scene files.
+
+    Args:
+        mesh: The mesh, or any source that :func:`warpshadow.load_mesh` reads: a file, or a mesh or a scene of trimesh.
+        albedo: Reflectance, linear RGB, for the body [3] or for each vertex [vertex, 3], or an .npy file of it. By
+            default the file's texture, if all its faces share one, or else the colors of the mesh, or gray, 0.8.
+        texture: Reflectance as an image in place of ``albedo``, which then does not count, linear RGB of shape
+            [height, width, 3], or a file that :func:`warpshadow.read_image` reads; needs uvs.
+        blockers: Number of spheres to fit to the mesh, or "auto" for as many as it needs, 8 to 1024
+            (:func:`warpshadow.fit_spheres`), or the spheres themselves, or an .npz file of them; 0 or none casts no
+            shadow, by rays neither. By method "directional" a flat body blocks light as the part of a plane that it is,
+            for any number, and with "auto" a body of closed convex pieces, such as boxes, or of at most 32 panels of
+            cloth, the light of others as these; by others a flat body with all else on one side is a ground, for which
+            any number means one sphere touching it from behind. Where light bounces, a body of 0 or none is lit and
+            reflects all the same, and takes its light from nobody. If it is not flat, other bodies get that light by
+            rays only: a sphere sends light in place of the light it blocks.
+        rotation: Axis-angle vector [degrees], shape [3]: (0, 90, 0) is a quarter turn about +y, through the origin of
+            the mesh's own space, wherever its vertices are; :meth:`on_ground` then stands the body where it is to
+            stand, and :meth:`Renderer.placed` can turn it about its middle. A matrix, shape [3, 3], becomes such a
+            vector. (In :mod:`warpshadow.torch` and :mod:`warpshadow.stages` axis-angle vectors are in radians.)
+        translation: Offset [scene units], shape [3].
+        scale: Factor, positive.
+        receivers: Where light is evaluated: at every "vertex", or at every "pixel" that shows the body, which a mesh
+            of few faces needs to receive a shadow; or "adaptive": on a flat body at some pixels, close to each other
+            where shadows have edges, between which it is interpolated (by pixel on other bodies, and on a GPU). "auto"
+            leaves it to each renderer: flat bodies of faces of more than 2 pixels are adaptive, with directional
+            visibility on a CPU. Else it is by pixel where its cameras see faces of more than 16 pixels on average, or
+            5% of the body's pixels show faces longer than 16 pixels (in images larger than 256 × 256, 1/4096 of the
+            pixels, at most 400, and four times the root of that). Pictures that are made once, as by
+            :func:`warpshadow.render`, show flat bodies by pixel, and under a sun all.
+        self_shadows: How it casts shadows on itself, "traced", by "rays" or by its "spheres", as for
+            :class:`Visibility`; None for the scene's setting.
+        name: Its name for lookups; None for that of its mesh, so of the mesh's file. :attr:`called` is the one that
+            counts.
+        shadow_catcher: Whether it models a surface in the photograph: :func:`warpshadow.insert` does not draw it, and
+            has it darken the photograph, or with bounces tint it, by the ratio of the light that it receives with the
+            other bodies to the light without them. In the image of :func:`warpshadow.render` its shadow is coverage
+            alone. ``draw``, torch's renderer, fits and the viewer show it as any other body.
+        roughness: glTF's, in [0, 1], one number or one for each vertex [vertex], or an .npy file of them: the surface
+            shines by a GGX lobe of width α = roughness². None, the default, is what the mesh's file says, if that is
+            glTF and neither ``albedo`` nor ``texture`` is given, and else a diffuse surface. Below 0.1 it is shown as
+            0.1. Such a body has receivers at pixels; all methods but "log-sh" show it. It reflects other bodies
+            where light bounces; with ``bounces=0`` they are black in it, so metals want bounces.
+        metallic: Likewise, how much of it is metal, which reflects its albedo and has no diffuse light; by default 0.
+        specular: Likewise, strength of the reflection of what is not metal, of which 1, the default, is 4% straight on.
+    """
+
+    mesh: Mesh
+    albedo: np.ndarray
+    texture: np.ndarray | None = field(repr=False)
+    blockers: int | str | Spheres
+    rotation: np.ndarray
+    translation: np.ndarray
+    scale: float
+    receivers: str
+    name: str | None
+    self_shadows: str | None
+    shadow_catcher: bool
+    roughness: np.ndarray | None
+    metallic: np.ndarray | None
+    specular: np.ndarray | None
+
+    @check.keywords(**LIKELY_MISTAKES, spheres="blockers", path="mesh")
+    def __init__(
+        self,
+        mesh: Mesh | MeshSource,
+        albedo: npt.ArrayLike | AnyPath | None = None,
+        texture: npt.ArrayLike | AnyPath | None = None,
+        blockers: int | str | Spheres | AnyPath = AUTO,
+        rotation: npt.ArrayLike = (0.0, 0.0, 0.0),
+        translation: npt.ArrayLike = (0.0, 0.0, 0.0),
+        scale: float = 1.0,
+        receivers: str = AUTO,
+        name: str | None = None,
+        self_shadows: str | None = None,
+        shadow_catcher: bool = False,
+        roughness: npt.ArrayLike | AnyPath | None = None,
+        metallic: npt.ArrayLike | AnyPath | None = None,
+        specular: npt.ArrayLike | AnyPath | None = None,
+    ):
+        vars(self).update(mesh=mesh, albedo=albedo, texture=texture, blockers=blockers)
+        vars(self).update(rotation=rotation, translation=translation, scale=scale, receivers=receivers, name=name)
+        vars(self).update(self_shadows=self_shadows, shadow_catcher=check.flag("shadow_catcher", shadow_catcher))
+        vars(self).update(roughness=roughness, metallic=metallic, specular=specular)
+        self._read_mesh()
+        self._read_files()
+        expected = "a Mesh or the path of a file, or a mesh of trimesh; Mesh(positions, faces) makes one of arrays"
+        check.instance("mesh", self.mesh, Mesh, expected)
+        object.__setattr__(self, "albedo", self._checked_albedo())
+        if self.texture is not None:
+            object.__setattr__(self, "texture", self._checked_texture(self.texture))
+        if not isinstance(self.blockers, Spheres) and not (isinstance(self.blockers, str) and self.blockers == AUTO):
+            if not check.is_integer(self.blockers) or self.blockers < 0:
+                raise ValueError(
+                    f"blockers: got {check.described(self.blockers)}, expected a number of spheres, 0 or more, or "
+                    "'auto', or Spheres, such as fit_spheres(mesh).spheres, or an .npz file of them"
+                )
+            object.__setattr__(self, "blockers", int(self.blockers))
+        object.__setattr__(self, "rotation", rotation_vector(self.rotation))
+        object.__setattr__(self, "translation", check.array("translation", self.translation, (3,)))
+        if not (check.is_number(self.scale) and 0 < self.scale <= check.LARGEST):
+            raise ValueError(
+                f"scale: got {check.described(self.scale)}, expected a positive number up to {check.LARGEST:g} for all "
+                "axes; mesh.transformed(scale=(x, y, z)) stretches a mesh"
+            )
+        check.choice("receivers", self.receivers, RECEIVERS)
+        self._check_gloss()
+        if self.self_shadows is not None:
+            check.choice("self_shadows", self.self_shadows, SELF_SHADOWS)
+        if self.name is not None and not (isinstance(self.name, str) and self.name):
+            raise ValueError(f"name: got {check.described(self.name)}, expected a name, or None for the mesh's")
+
+    def __repr__(self) -> str:
+        count = len(self.blockers) if isinstance(self.blockers, Spheres) else self.blockers
+        texture = "" if self.texture is None else f", texture {self.texture.shape[1]} × {self.texture.shape[0]}"
+        mesh = f"{self.mesh.vertex_count} vertices, {self.mesh.face_count} faces"
+        return f"Body({self.called!r}, {mesh}, {count} spheres{texture})"
+
+    @property
+    def called(self) -> str:
+        """Its name, or else its mesh's."""
+        return self.name or self.mesh.name
+
+    @property
+    def casts_shadow(self) -> bool:
+        """Whether the body blocks light."""
+        return bool(len(self.blockers) if isinstance(self.blockers, Spheres) else self.blockers)
+
+    @property
+    def blocks_as_parts(self) -> bool:
+        """Whether a method that knows convex parts takes these for what blocks the light of others."""
+        return isinstance(self.blockers, str) and bool(self.mesh.convex_parts)
+
+    def _read_mesh(self) -> None:
+        """Load the mesh from its file or from trimesh, and its surface where none is given."""
+        mesh, material = self.mesh, Material()
+        source = check.file("mesh", mesh) if check.is_path(mesh) else mesh
+        if check.is_path(source) or is_of_trimesh(source):
+            with check.located("mesh", MeshError):
+                if self.albedo is None and self.texture is None:
+                    mesh, material = load_material(source)
+                else:
+                    mesh = load_shape(source)
+        vars(self).update(
+            mesh=mesh,
+            albedo=_colors(mesh) if self.albedo is None else self.albedo,
+            texture=material.texture if self.texture is None else self.texture,
+        )
+        is_diffuse = self.shadow_catcher or self.receivers in ("vertex", "adaptive")
+        if all(getattr(self, name) is None for name in GLOSS_ARGUMENTS) and not is_diffuse:
+            vars(self).update(roughness=material.roughness, metallic=material.metallic)
+
+    def _read_files(self) -> None:
+        """Replace paths by the content of their files."""
+        readers: tuple[tuple[str, Callable[[Path], Any], str, type[ValueError]], ...] = (
+            ("texture", read_rgb, "", ImageError),
+            ("albedo", _read_colors, COLORS_SUFFIX, ValueError),
+            ("blockers", Spheres.read, _SPHERES_SUFFIX, ValueError),
+            *((name, _read_values, VALUES_SUFFIX, ValueError) for name in GLOSS_ARGUMENTS),
+        )
+        for name, read, suffix, error in readers:
+            value = getattr(self, name)
+            if check.is_path(value) and str(value).endswith(suffix):
+                path = check.file(name, value)
+                with check.located(name, error):
+                    object.__setattr__(self, name, read(path))
+
+    def _checked_albedo(self) -> np.ndarray:
+        count = self.mesh.vertex_count
+        expected = "a linear color such as (0.8, 0.1, 0.1), one for each vertex, [vertex, 3], or an .npy file of them"
+        if isinstance(self.albedo, str):
+            raise ValueError(f"albedo: got {self.albedo!r}, expected {expected}{_css_color_hint(self.albedo)}")
+        albedo = check.numbers("albedo", self.albedo, expected=expected)
+        if albedo.shape not in ((3,), (count, 3)):
+            raise ValueError(f"albedo: got shape {albedo.shape}, expected [3] or [{count}, 3] (one for each vertex)")
+        check.reflectance("albedo", albedo)
+        albedo.setflags(write=False)
+        if getattr(self.albedo, "dtype", None) == np.uint8:  # as it is, all but black
+            check.pixels("albedo", self.albedo, expected=expected)
+        return albedo
+
+    def _checked_texture(self, image: np.ndarray) -> np.ndarray:
+        if self.mesh.uvs is None:
+            raise ValueError(
+                f"texture: got an image, but mesh {self.mesh.name!r} has no uvs; expected none, or uvs, as "
+                "warpshadow.unwrap makes them"
+            )
+        texture = check.pixels("texture", image, expected="linear RGB [height, width, 3], or the path of a picture")
+        check.shape("texture", texture.shape, ("height", "width", 3), check.channels_last(texture.shape))
+        if texture.size == 0:
+            raise ValueError(f"texture: got shape {texture.shape}, expected at least one texel")
+        check.reflectance("texture", texture)
+        texture.setflags(write=False)
+        return texture
+
+    def _check_gloss(self) -> None:
+        """Hold roughness and its like as float32, [1] or [vertex]; without roughness there is none of them."""
+        expected = f"a number from 0 to 1, one for each vertex, [vertex], or an {VALUES_SUFFIX} file of them"
+        for name in GLOSS_ARGUMENTS:
+            value = getattr(self, name)
+            if value is None:
+                continue
+            if self.roughness is None:
+                raise ValueError(f"{name}: got {check.described(value)} without roughness, expected roughness, too")
+            numbers = np.atleast_1d(check.numbers(name, value, expected=expected))
+            check.shape(name, numbers.shape, (1 if numbers.shape == (1,) else self.mesh.vertex_count,), expected)
+            check.finite(name, numbers, minimum=0.0, maximum=1.0)
+            numbers.setflags(write=False)
+            object.__setattr__(self, name, numbers)
+        if self.roughness is not None and self.shadow_catcher:
+            raise ValueError("roughness: got some for a shadow catcher, expected None: it shows diffuse light alone")
+        if self.roughness is not None and self.receivers in ("vertex", "adaptive"):
+            raise ValueError(
+                f"receivers: got {self.receivers!r} beside roughness, expected 'pixel' or 'auto', since "
+                "reflections depend on the camera"
+            )
+
+    @property
+    def is_glossy(self) -> bool:
+        """Whether it shines."""
+        return self.roughness is not None
+
+    def rotation_matrix(self) -> np.ndarray:
+        """The rotation as a matrix, float64 of shape [3, 3]."""
+        return rotation_matrix(self.rotation)
+
+    def creased(self, angle: float = CREASE) -> Body:
+        """Part the vertices of its mesh along sharp edges, :meth:`warpshadow.Mesh.creased`; their colors go along.
+
+        Args:
+            angle: Edges are sharp where their faces bend by more [degrees], 0 to 180.
+        """
+        mesh = self.mesh.creased(angle)
+        values: dict[str, Any] = {name: getattr(self, name) for name in GLOSS_ARGUMENTS}
+        of_vertices = {name: array[mesh.origins] for name, array in values.items() if np.size(array) > 1}
+        colors = self.albedo if self.albedo.ndim == 1 else self.albedo[mesh.origins]
+        return replace(self, mesh=mesh, albedo=colors, **of_vertices)
+
+    @check.keywords(rotation="Body(…, rotation=…).on_ground(…)", scale="size", height="size", translation="foot")
+    def on_ground(self, foot: npt.ArrayLike = (0.0, 0.0, 0.0), *, size: float | None = None) -> Body:
+        """Stand the body on a ground, as it is turned; its spheres are not fitted again.
+
+        Rotated, it stands at the same place and has the same size, since both come from the mesh's bounds.
+
+        Args:
+            foot: Where its bottom goes, below the middle of the mesh's bounds [scene units], shape [3].
+            size: Longest edge of the mesh's bounds, turned with it [scene units]; by default its scale stays.
+        """
+        if np.ndim(foot) == 0:
+            raise ValueError(
+                f"foot: got {foot!r}, expected where its bottom goes, [3]; on_ground(size={foot!r}) scales it"
+            )
+        foot = check.array("foot", foot, (3,))
+        low, high = (corner.astype(np.float64) for corner in self.mesh.bounds)
+        scale = self.scale if size is None else check.positive("size", size) / (high - low).max()
+        points = self.mesh.world_points().astype(np.float64) @ self.rotation_matrix().T
+        bottom = self.rotation_matrix() @ (low + high) / 2
+        bottom[1] = points[:, 1].min()
+        return replace(self, scale=float(scale), translation=foot - scale * bottom)
+
+    def world_points(self) -> np.ndarray:
+        """The vertices that faces refer to, where they are in the world [scene units], float64 of shape [point, 3]."""
+        points = self.mesh.world_points().astype(np.float64)
+        return self.scale * points @ self.rotation_matrix().T + self.translation
+
+    def world_mesh(self) -> Mesh:
+        """The mesh in world space."""
+        return self.mesh.transformed(
+            rotation=self.rotation_matrix(), translation=np.array(self.translation), scale=self.scale
+        )
+
+
+def _colors(mesh: Mesh | MeshSource) -> npt.ArrayLike:
+    """The colors of a mesh, one where all are the same, or gray."""
+    colors = mesh.colors if isinstance(mesh, Mesh) else None
+    if colors is None:
+        return GRAY
+    return colors if np.ptp(colors, axis=0).any() else colors[0]
+
+
+def _read_colors(path: Path, shape: str = "[vertex, 3]") -> np.ndarray:
+    try:
+        return np.load(path, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise ValueError(f"got {path} ({error}), expected an .npy file of {shape}") from error
+
+
+def _read_values(path: Path) -> np.ndarray:
+    return _read_colors(path, "[vertex]")
+
+
+def _css_color_hint(color: str) -> str:
+    """The linear RGB of a color of CSS, for messages; nothing for other text."""
+    from PIL import ImageColor
+
+    try:
+        linear = srgb_to_linear(np.array(ImageColor.getrgb(color)[:3]) / 255)
+    except ValueError:
+        return ""
+    return f": that color is ({', '.join(f'{value:.4g}' for value in linear)})"
