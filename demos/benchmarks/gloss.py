@@ -99,10 +99,11 @@ def iteration_seconds(scene: ws.Scene, count: int = 5) -> float:
 
 
 def print_loops(of_bodies: dict[str, ws.Scene], bounces: int) -> None:
-    """Print times of iterations, of diffuse bodies and of the same that shine."""
+    """Print times of iterations, of bodies that are diffuse, with pixels as receivers, and of the same that shine."""
     print(f"{'body':16}{'diffuse':>10}" + "".join(f"{kind:>18}" for kind in KINDS))
     for name, plain in of_bodies.items():
-        plain = dataclasses.replace(plain, bounces=bounces)
+        by_pixel = dataclasses.replace(plain.bodies[0], receivers="pixel")
+        plain = dataclasses.replace(plain, bounces=bounces, bodies=(by_pixel, *plain.bodies[1:]))
         diffuse = iteration_seconds(plain)
         line = f"{name:16}{diffuse:8.3f} s"
         for kind in KINDS:

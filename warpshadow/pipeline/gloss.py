@@ -14,7 +14,7 @@ import warp as wp
 
 from warpshadow.device.batch import concatenate, cut
 from warpshadow.device.constants import constant
-from warpshadow.pipeline.lighting import KnownLight, Light, LitPoints, change_basis, map_of, receiver_text
+from warpshadow.pipeline.lighting import Light, LitPoints, change_basis, receiver_text
 from warpshadow.pipeline.node import Input, Node, detached
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.scene.body import GLOSS_ARGUMENTS
@@ -98,10 +98,9 @@ class GlossyPoints(LitPoints):
 
     def _prefiltered(self, light: Input) -> Node:
         """Node of the texels of light, vec3 of shape [batch, texel]."""
-        device = self.merged_scene.device
         if isinstance(light.value(), wp.array):
             return Node("prefiltering", self._blurred, light, items=lambda: f"{self.method.basis.size} coefficients")
-        return Node("prefiltering", functools.partial(_texels, device), light)
+        return self.method.prefiltered(light)
 
     def _blurred(self, light: wp.array) -> wp.array:
         """Texels of free light. Differentiable: light."""
@@ -116,10 +115,6 @@ def _blurred_basis(basis: object) -> np.ndarray:
     directions = sh.equirectangular_directions(_CELL_ROWS)
     functions = basis.functions(directions.reshape(-1, 3))  # type: ignore[attr-defined]
     return prefilter(functions.reshape(_CELL_ROWS, 2 * _CELL_ROWS, -1))
-
-
-def _texels(device: wp.Device, light: KnownLight) -> wp.array:
-    return wp.array(prefilter(map_of(light))[None], dtype=wp.vec3, device=device)
 
 
 def _sample(

@@ -20,6 +20,7 @@ from warpshadow.pipeline.geometry import Geometry
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.pipeline.reflectance import Materials
+from warpshadow.stages.gloss.prefilter import prefilter
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.receivers import Numbering, Receivers, number_receivers
 from warpshadow.stages.shading import shade
@@ -268,6 +269,17 @@ class Method:
     def transfers(self, points: LitPoints) -> Node:
         """Transfer vectors of points to :attr:`basis`, an array for each group."""
         raise NotImplementedError
+
+    @functools.cached_property
+    def _prefiltered_from_scene(self) -> Node:
+        return Node("prefiltering", self._prefilter, self.light)
+
+    def prefiltered(self, light: Input) -> Node:
+        """Node of known light, prefiltered for bodies that shine, vec3 [1, texel]; the scene's is cached."""
+        return self._prefiltered_from_scene if light is self.light else Node("prefiltering", self._prefilter, light)
+
+    def _prefilter(self, light: KnownLight) -> wp.array:
+        return wp.array(prefilter(map_of(light))[None], dtype=wp.vec3, device=self.merged_scene.device)
 
     def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input) -> Node:
         """Transmittance towards the samples of lobes of points, float32 of shape [batch, receiver, sample].
