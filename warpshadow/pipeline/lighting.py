@@ -334,3 +334,11 @@ def change_basis(light: wp.array, matrix: np.ndarray | None) -> wp.array:
 def joined(parts: list[wp.array]) -> wp.array:
     """Receivers of parts one after another, of shape [batch, receiver]. Differentiable: parts."""
     return parts[0] if len(parts) == 1 else concatenate(parts, [part.shape[1] for part in parts])
+
+
+def one_transfer(parts: list[wp.array]) -> wp.array:
+    """Transfer vectors of all groups one after another, float32 of shape [batch, receiver, coefficient]."""
+    if len(parts) == 1:
+        return parts[0]
+    rows = joined([part.reshape((part.shape[0], -1)) for part in parts])
+    return rows.reshape((rows.shape[0], -1, parts[0].shape[2]))
