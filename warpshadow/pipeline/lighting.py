@@ -226,7 +226,7 @@ class Method:
         return np.stack([receives[body_of_vertex], (receives & self.merged_scene.is_two_sided)[body_of_vertex]])
 
     def separate_bodies(self, blocker_kinds: BlockerKinds) -> np.ndarray | None:
-        """Bodies whose receivers are groups of their own, −1 for others, shape [body]; None where all share a group."""
+        """Number of each body whose receivers form a group, −1 for others, shape [body]; None where all share one."""
         bodies = np.arange(len(self.merged_scene.scene.bodies))
         if self.merged_scene.scene.bounces:
             return bodies
@@ -234,7 +234,7 @@ class Method:
         return np.where(np.isin(bodies, separate), bodies, -1) if separate else None
 
     def numbering(self, blocker_kinds: BlockerKinds, has_backs: bool) -> Numbering:
-        """Of all vertices, or of all with their backs; a first call makes both, so that a capture finds them."""
+        """Number all vertices, or all with their backs; the first call makes both, so that a capture finds them."""
         key = blocker_kinds.traced, blocker_kinds.planes
         if key not in self._numberings:
             faces, can_receive, separate_bodies = (
