@@ -19,6 +19,8 @@ BANNED = {
     *("past_solid", "seat", "sites", "stand_ins", "stands", "walk"),
     *("across_way", "colors_so_far", "falloff_pull", "first_site", "front_presence", "is_prepared"),
     *("narrow_past_planes", "open_sites", "own_bounces", "KEPT_METHOD", "OWN_BOUNCES"),
+    *("Blocking", "InParts", "LitParts", "PartsOfGroup", "PlanesOfGroup", "Reflection", "SceneParts"),
+    *("presence", "receiver_words", "solid_bodies", "READ_BY", "MEANT", "GLOSSY", "BOUNCING"),
     *("Assembly", "Flats", "Narrow", "Own", "Seen", "StandIns"),
 }
 FIRST_WORDS = ("What ", "Those ", "That which ", "Whatever ")

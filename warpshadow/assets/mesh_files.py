@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeGuard
 
 import numpy as np
 
 from warpshadow import check
-from warpshadow.assets.color import GRAY, srgb_to_linear
+from warpshadow.assets.color import srgb_to_linear
 from warpshadow.assets.gltf import (
     NO_FACTORS,
     Factors,
@@ -23,15 +23,14 @@ from warpshadow.assets.gltf import (
 )
 from warpshadow.assets.image import read_rgb
 from warpshadow.assets.mesh import (
-    DIFFUSE,
     BaseColor,
     Mesh,
     MeshError,
     MeshPart,
-    checked_indices,
     moved_part,
     turned_over,
 )
+from warpshadow.assets.mesh_joining import JoinedMesh, fan, join_parts, joined_normals, weld, with_colors
 from warpshadow.assets.ply import ply_colors, ply_corner_uvs, ply_fault
 from warpshadow.assets.topology import CREASE, is_listed_first, join_faces, part_at_creases, rounds_edges
 from warpshadow.check import AnyPath
@@ -55,20 +54,6 @@ def is_of_trimesh(value: object) -> TypeGuard[trimesh.Trimesh | trimesh.Scene]:
     """Whether a value is a mesh or a scene of trimesh."""
     trimesh = sys.modules.get("trimesh")  # before it is imported, nothing is
     return trimesh is not None and isinstance(value, (trimesh.Trimesh, trimesh.Scene))
-
-
-class _LoadedMesh(NamedTuple):
-    """A mesh, the picture that all its faces share, its gloss, and remarks on surprises: on shape, colors and gloss.
-
-    ``gloss`` has roughness and metallic of the body, [1] each, or of each vertex, [vertex].
-    """
-
-    mesh: Mesh
-    picture: BaseColor | None
-    gloss: tuple[np.ndarray, np.ndarray] | None
-    remarks: list[str]
-    of_colors: list[str]
-    of_gloss: list[str]
 
 
 class Material(NamedTuple):
@@ -158,9 +143,9 @@ def _remark(path: MeshSource, remarks: list[str]) -> None:
         check.warn(f"{path if check.is_path(path) else 'mesh'}: {', '.join(remarks)}")
 
 
-def _read(source: MeshSource) -> _LoadedMesh:
+def _read(source: MeshSource) -> JoinedMesh:
     if is_of_trimesh(source):
-        return _concatenate(_trimesh_parts(source), Path(source.metadata.get("file_name") or "mesh").stem)
+        return join_parts(_trimesh_parts(source), Path(source.metadata.get("file_name") or "mesh").stem)
     path = check.path("path", source)
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
@@ -168,7 +153,7 @@ def _read(source: MeshSource) -> _LoadedMesh:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such mesh file")
     try:
-        return _concatenate(reader(path), path.stem)
+        return join_parts(reader(path), path.stem)
     except (MeshError, ImportError) as error:
         raise type(error)(f"{path}: {error}") from error
     except Exception as error:  # the readers of other libraries raise anything on a damaged file
@@ -181,132 +166,6 @@ def _texels(picture: BaseColor) -> np.ndarray:
         return read_rgb(picture.image)
     codes = np.asarray(picture.image.convert("RGB"))
     return (srgb_to_linear(codes / 255) * picture.factor).astype(np.float32)
-
-
-def _concatenate(parts: list[MeshPart], name: str) -> _LoadedMesh:
-    """Join parts into one mesh, and find the picture that all have."""
-    vertex_count = sum(len(part.positions) for part in parts)
-    parts = [part for part in parts if len(part.faces)]
-    if not parts:
-        cause = "; is it a cloud of points, or cut off?" if vertex_count else ""
-        raise MeshError(f"faces: got none ({vertex_count} vertices), expected at least one triangle{cause}")
-    positions, faces = _stack((part.positions, part.faces) for part in parts)
-    textured = [(part.uvs, part.uv_faces) for part in parts if part.uvs is not None]
-    uvs, uv_faces = _stack(textured) if len(textured) == len(parts) else (None, None)
-    used = np.unique(checked_indices("faces", faces, len(positions), "vertex"))
-    is_first = is_listed_first(positions, faces)  # here, so that one warning has all remarks
-    own_uv_faces = None if uv_faces is None else uv_faces[is_first]
-    mesh = Mesh(positions, faces[is_first], uvs, own_uv_faces, name, colors=_joined_colors(parts))
-
-    a, b, c = np.moveaxis(mesh.positions.astype(np.float64)[mesh.faces], 1, 0)
-    counts = {
-        "degenerate faces (no area)": np.sum(~np.cross(b - a, c - a).any(axis=1)),
-        "duplicate faces dropped": np.sum(~is_first),
-        "unreferenced vertices": mesh.vertex_count - len(used) - sum(part.welded for part in parts),
-    }
-    remarks = [f"{count} {what}" for what, count in counts.items() if count]
-    remarks += [part.remark for part in parts if part.remark]
-    if 0 < len(textured) < len(parts):
-        remarks.append(f"uvs dropped because {len(parts) - len(textured)} of {len(parts)} parts have none")
-    of_colors = sorted({part.colorless for part in parts if part.colorless})
-    pictures = [picture for part in parts for picture in part.pictures]
-    is_one = mesh.uvs is not None and all(picture == pictures[0] for picture in pictures)
-    if any(pictures) and not is_one:
-        why = "which need uvs" if mesh.uvs is None else "since a body takes one that all its faces have"
-        of_colors.append(f"textures dropped, {why}")
-    of_gloss = sorted({part.gloss.remark for part in parts if part.gloss is not None and part.gloss.remark})
-    return _LoadedMesh(mesh, pictures[0] if is_one else None, _joined_gloss(parts), remarks, of_colors, of_gloss)
-
-
-def _joined_gloss(parts: list[MeshPart]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Roughness and metallic of all parts, of each vertex where they differ; None if all parts are diffuse."""
-    glosses = [part.gloss or DIFFUSE for part in parts]
-    if all(gloss.roughness == 1 and gloss.metallic == 0 for gloss in glosses):
-        return None
-    counts = [1] if len({gloss[:2] for gloss in glosses}) == 1 else [len(part.positions) for part in parts]
-    of_parts = [(gloss.roughness, gloss.metallic) for gloss in glosses[: len(counts)]]
-    roughness, metallic = np.repeat(np.array(of_parts, np.float32), counts, axis=0).T
-    return roughness, metallic
-
-
-def _joined_colors(parts: list[MeshPart]) -> np.ndarray | None:
-    """Colors of the vertices of all parts, gray where a part has none; None if no part has any."""
-    if all(part.colors is None for part in parts):
-        return None
-    gray = np.array(GRAY, np.float32)
-    shapes = [(len(part.positions), 3) for part in parts]
-    return np.concatenate(
-        [
-            np.broadcast_to(gray if part.colors is None else part.colors, shape)
-            for part, shape in zip(parts, shapes, strict=True)
-        ]
-    )
-
-
-def _stack(blocks: Iterable[tuple]) -> tuple[np.ndarray, np.ndarray]:
-    """Concatenate pairs of values and faces; the faces' indices move along."""
-    values, faces = zip(*blocks, strict=True)
-    offsets = np.cumsum([0] + [len(block) for block in values[:-1]])
-    moved = [block + offset for block, offset in zip(faces, offsets, strict=True)]
-    return np.concatenate(values), np.concatenate(moved)
-
-
-def _fan(corner_counts: np.ndarray) -> np.ndarray:
-    """Corner numbers [triangle, 3] of the fans that triangulate consecutive polygons."""
-    if (corner_counts < 3).any():
-        polygon = np.flatnonzero(corner_counts < 3)[0]
-        raise MeshError(f"faces: got {corner_counts[polygon]} corners at face {polygon}, expected 3 or more")
-    triangle_counts = corner_counts - 2
-    first = np.repeat(np.cumsum(corner_counts) - corner_counts, triangle_counts)
-    step = np.arange(len(first)) - np.repeat(np.cumsum(triangle_counts) - triangle_counts, triangle_counts)
-    return np.stack([first, first + step + 1, first + step + 2], axis=1)
-
-
-def _weld(faces: np.ndarray, *attributes: np.ndarray) -> np.ndarray:
-    """Let faces refer to the first of the vertices that agree in all attributes."""
-    rows = np.column_stack(attributes) + 0.0  # makes -0 equal to 0
-    _, first, group = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    return first[group.reshape(-1)][faces]
-
-
-def _joined_normals(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Normals [vertex, 3], where vertices at one place get the first one's, unless they bend by more than a crease."""
-    _, place = np.unique(positions + 0.0, axis=0, return_inverse=True)
-    place = place.reshape(-1)
-    joined, first, left = np.array(normals), np.empty(len(place), np.int64), np.arange(len(place))
-    while len(left):
-        first[place[left[::-1]]] = left[::-1]
-        of_first = normals[first[place[left]]]
-        is_close = (normals[left] * of_first).sum(axis=1) >= np.cos(np.radians(CREASE))
-        is_close |= (first[place[left]] == left) | ~normals[left].any(axis=1)  # vertices of no face get zero
-        joined[left[is_close]] = of_first[is_close]
-        left = left[~is_close]
-    return joined
-
-
-def _colored(part: MeshPart, values: np.ndarray, *, linear: bool = False) -> MeshPart:
-    """Give a part colors of its vertices, or of the corners of its faces if no vertex gets two.
-
-    Args:
-        part: Their mesh.
-        values: Codes, up to 65535 in unsigned numbers of 16 bits, up to 255 in other whole ones; or floats from 0 to 1;
-            of shape [vertex, 3 or 4] or [face, 3, 3 or 4].
-        linear: Whether they are; else they are sRGB.
-    """
-    values = values[..., :3]
-    values = values / (65535 if values.dtype == np.uint16 else 255 if values.dtype.kind in "ui" else 1.0)
-    if not ((values >= 0) & (values <= 1)).all():
-        why = f"got values from {values.min():g} to {values.max():g}, expected 0 to 1"
-        return part._replace(colorless=f"colors dropped ({why})")
-    colors = (values if linear else srgb_to_linear(values)).astype(np.float32)
-    if colors.ndim == 2:
-        return part._replace(colors=colors)
-    of_vertices = np.tile(np.array(GRAY, np.float32), (len(part.positions), 1))
-    of_vertices[part.faces] = colors
-    if np.array_equal(of_vertices[part.faces], colors):
-        return part._replace(colors=of_vertices)
-    why = "faces of different colors share vertices, which trimesh's unmerge_vertices() parts"
-    return part._replace(colorless=f"colors of faces dropped ({why})")
 
 
 def _read_plain_obj(text: str) -> MeshPart | None:
@@ -359,14 +218,14 @@ def _read_obj(path: Path) -> list[MeshPart]:
                     raise ValueError(f"{len(coordinates)} coordinates are too few")
         except ValueError as error:
             raise MeshError(f"line {number}: {error}, got {line.strip()!r}") from None
-    faces = _fan(np.array(corner_counts, dtype=np.int64))
+    faces = fan(np.array(corner_counts, dtype=np.int64))
     pictures = _obj_pictures([path.parent / library for library in libraries])
     part = MeshPart(np.array(positions).reshape(-1, 3), np.array(corners, dtype=np.int64)[faces])
     part = part._replace(pictures=tuple(pictures.get(name) for name in sorted(materials)))
     if 0 < len(colors) < len(positions):
         part = part._replace(colorless=f"colors dropped, which {len(positions) - len(colors)} vertices lack")
     elif colors:
-        part = _colored(part, np.array(colors))
+        part = with_colors(part, np.array(colors))
     if not uv_corners:
         return [part]
     if len(uv_corners) < len(corners):
@@ -436,7 +295,7 @@ def _merged(part: MeshPart) -> MeshPart:
     vertex_attributes = [] if part.colors is None else [part.colors]
     is_first = is_listed_first(part.positions, part.faces)  # edges of the others would have too many faces
     remark = "" if is_first.all() else f"{np.sum(~is_first)} duplicate faces dropped"
-    used, faces = np.unique(_weld(part.faces[is_first], part.positions, *vertex_attributes), return_inverse=True)
+    used, faces = np.unique(weld(part.faces[is_first], part.positions, *vertex_attributes), return_inverse=True)
     positions, faces = part.positions[used], faces.reshape(-1, 3)
     colors = None if part.colors is None else part.colors[used]
     surface = join_faces(positions, faces, None)
@@ -477,10 +336,10 @@ def _trimesh_part(shape, of_file: bool, factors: Factors) -> MeshPart:
         return part
     vertex_attributes = [] if part.colors is None else [part.colors]
     if not of_file:  # its normals may be read from a file, or computed; these differ a little at seams
-        vertex_attributes.append(_joined_normals(positions, shape.vertex_normals))
+        vertex_attributes.append(joined_normals(positions, shape.vertex_normals))
     elif "vertex_normals" in shape._cache:  # the file's: none were computed yet
         vertex_attributes.append(shape.vertex_normals)
-    welded = _weld(faces, positions, *vertex_attributes)
+    welded = weld(faces, positions, *vertex_attributes)
     lost = len(np.unique(faces)) - len(np.unique(welded))
     return part._replace(faces=welded, uvs=uvs, uv_faces=faces, welded=lost)
 
@@ -491,18 +350,18 @@ def _trimesh_colored(part: MeshPart, shape, factors: Factors) -> MeshPart:
 
     visual, linear = shape.visual, shape.source.file_type in ("glb", "gltf")
     if visual.kind == "face":
-        return _colored(part, visual.face_colors[:, None].repeat(3, axis=1), linear=linear)
+        return with_colors(part, visual.face_colors[:, None].repeat(3, axis=1), linear=linear)
     of_ply = ply_colors(shape)
     if visual.kind == "vertex":
         colors = visual.vertex_colors
         if of_ply is not None and np.array_equal(to_rgba(of_ply)[:, :3], colors[:, :3]):
             colors = of_ply  # which trimesh cut to 8 bits
-        return _colored(part, colors, linear=linear)
+        return with_colors(part, colors, linear=linear)
     if visual.kind != "texture":
         return part
     colors = visual.vertex_attributes.get("color", of_ply)
     if colors is not None:
-        part = _colored(part, colors, linear=linear)
+        part = with_colors(part, colors, linear=linear)
     factor = base_color_factor(visual.material, factors)
     if factor is None or any(part.pictures) or factor == (1.0, 1.0, 1.0):  # white, glTF's default, says nothing
         return part
@@ -554,7 +413,7 @@ def _usd_part(mesh, primvars, time) -> MeshPart:
     corner_counts = np.array(mesh.GetFaceVertexCountsAttr().Get(time) or [], dtype=np.int64)
     if corner_counts.sum() != len(corners):
         raise MeshError(f"{mesh.GetPath()}: got {len(corners)} corners, expected {corner_counts.sum()} from the counts")
-    faces = _fan(corner_counts)
+    faces = fan(corner_counts)
     part = MeshPart(positions, corners[faces])
     polygons = np.repeat(np.arange(len(corner_counts)), corner_counts)
     items = {"faceVarying": np.arange(len(corners)), "vertex": corners, "varying": corners}
@@ -562,7 +421,7 @@ def _usd_part(mesh, primvars, time) -> MeshPart:
     shown = primvars.GetPrimvar("displayColor")
     if shown.HasValue() and shown.GetInterpolation() in color_items:
         colors = np.array(shown.ComputeFlattened(time), dtype=np.float32)
-        part = _colored(part, colors[color_items[shown.GetInterpolation()]][faces], linear=True)
+        part = with_colors(part, colors[color_items[shown.GetInterpolation()]][faces], linear=True)
     st = primvars.GetPrimvar("st")
     if st.HasValue() and st.GetInterpolation() in items:
         uvs = np.array(st.Get(time), dtype=np.float32)

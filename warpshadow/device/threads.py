@@ -10,7 +10,9 @@ import functools
 import os
 import threading
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import Concatenate, ParamSpec, Protocol, TypeVar
+
+from warpshadow.device.progress import waiting
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -30,3 +32,22 @@ def one_at_a_time(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
 
     return alone
+
+
+class _HasProgress(Protocol):
+    progress: bool
+
+
+Shown = TypeVar("Shown", bound=_HasProgress)
+
+
+def announced(function: Callable[Concatenate[Shown, P], R]) -> Callable[Concatenate[Shown, P], R]:
+    """Make a method one of a call at a time that says in files that it runs, should that take long."""
+
+    @one_at_a_time
+    @functools.wraps(function)
+    def reporting(self: Shown, *args: P.args, **kwargs: P.kwargs) -> R:
+        with waiting("rendering", shows=self.progress):
+            return function(self, *args, **kwargs)
+
+    return reporting

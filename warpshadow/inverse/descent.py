@@ -196,7 +196,7 @@ class _Descent:
                 yield
 
     def _advance(self) -> bool:
-        """Whether there is a step to take; begins the next run or stage where one has ended.
+        """Begin the next run or stage if one has ended; return whether there is a step to take.
 
         It asks the state alone, so that a state saved after any step goes on as the descent itself does.
         """
@@ -240,7 +240,7 @@ class _Descent:
         return in_turn + sum((1 if self.is_found else item.candidates) * item.iterations for item in later)
 
     def _has_converged(self) -> bool:
-        """Whether the run gains no more than a part of its loss, by the optimizer's word where it has one."""
+        """Whether the loss has stopped falling by more than the tolerance; the optimizer decides where it can."""
         stage_tolerance = self.stages[self.stage].tolerance
         tolerance = self.tolerance if stage_tolerance is None else stage_tolerance
         losses = self.losses[-1]
@@ -251,7 +251,7 @@ class _Descent:
         return len(before) == CONVERGENCE_WINDOW and sum(last) >= (1 - tolerance) * sum(before)
 
     def _is_clearly_best(self, run: _FinishedRun) -> bool:
-        """Whether the loss of a run is far below that of values scattered around its best."""
+        """Whether a run's loss is far below the losses at perturbed values around its result."""
         part = self.stages[self.stage].standout
         if part == 0 or run.failure is not None:
             return False
@@ -262,7 +262,7 @@ class _Descent:
         return run.loss < part * min(filter(math.isfinite, losses), default=0.0)
 
     def _ended_run(self) -> _FinishedRun:
-        """The best values of a run; its last step may have led to them."""
+        """Finish a run: its best values, which its last step may have reached."""
         curvature = self.optimizer.curvature if isinstance(self.optimizer, QuasiNewton) else None
         best = _FinishedRun(min(self.losses[-1], default=math.inf), self.best, self.failure, curvature)
         if self.failure is not None:
@@ -275,7 +275,7 @@ class _Descent:
         return best._replace(loss=last, best=_copied(self.values)) if last < best.loss else best
 
     def best_so_far(self) -> dict[str, Values]:
-        """The best values of the stage that it is in."""
+        """The best values found in the current stage."""
         return min([*self.ended, self._ended_run()], key=lambda run: run.loss).best
 
     def _step(self) -> None:

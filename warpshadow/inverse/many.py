@@ -186,7 +186,7 @@ def fit_many(
 
 @dataclass(frozen=True)
 class _FitJob:
-    """One of many fits, as a worker is told of it."""
+    """One of many fits, as it is sent to a worker."""
 
     name: str
     results: Path  # the folder of all
@@ -226,7 +226,7 @@ def _digest(fit: Fit | Path) -> str:
 
 
 def _file_stamps(file: Path) -> Iterator[str]:
-    """The text of a TOML file, and size and time of all files that it names; of TOML files among them the same."""
+    """Yield a TOML file's text, and size and time of each file that it names; TOML files recursively."""
     text = file.read_text(encoding="utf-8", errors="replace")
     yield text
     try:
@@ -372,7 +372,7 @@ def find_fits(where: AnyPath | Sequence[AnyPath]) -> dict[str, Path]:
 
 
 def _names_of_files(files: Iterable[Path], start: Path, last: str) -> dict[str, Path]:
-    """Files by their paths from a folder, but for a last part."""
+    """Map each file to its path relative to `start`, without the last component."""
     named: dict[str, Path] = {}
     for file in files:
         relative = PurePath(os.path.relpath(file, start))

@@ -23,7 +23,7 @@ _SEEN_VERTICES = 0.5  # the part of all vertices that an image sees, about
 
 
 class Model:
-    """Images of a problem at a size, and how unlike the targets they are.
+    """Images of a problem at a stage's size, and their loss against the targets.
 
     Args:
         problem: The problem.

@@ -11,12 +11,12 @@ from warpshadow.check import AnyPath
 
 
 def write_preview(path: AnyPath, targets: torch.Tensor, images: torch.Tensor) -> None:
-    """Write a picture of targets, images and how they differ; see :func:`side_by_side`."""
+    """Write a picture of targets, images and differences; see :func:`side_by_side`."""
     write_image(path, side_by_side(targets, images))
 
 
 def side_by_side(targets: torch.Tensor, images: torch.Tensor) -> np.ndarray:
-    """Targets, images and how they differ (gray is alike), a row for each view: linear RGB of a picture, 0 to 1.
+    """Targets, images and differences (gray where equal), a row for each view: linear RGB, 0 to 1.
 
     Args:
         targets, images: Linear RGB, [view, height, width, 3 or more].

@@ -137,7 +137,7 @@ class QuasiNewton(torch.optim.Optimizer):
         memory["steps"], memory["changes"] = [*steps, step][-HISTORY:], [*changes, change][-HISTORY:]
 
     def _direction(self) -> torch.Tensor:
-        """Minus the gradient times the inverse of the curvature, as the steps tell it.
+        """Quasi-Newton direction: minus the gradient times the inverse curvature estimated from the steps.
 
         All vectors of the recursion are sums of steps, changes and the gradient. So it works on the factors of these
         [Chen et al. 2014, Large-scale L-BFGS using MapReduce], whose dot products are read all at once.
@@ -166,7 +166,7 @@ class QuasiNewton(torch.optim.Optimizer):
 
 
 def _products(step: T, change: T) -> tuple[tuple[T, T], ...]:
-    """Which dot products tell whether the loss curves upwards over a step."""
+    """Dot products that decide whether the loss curves upwards over a step."""
     return (step, change), (step, step), (change, change)
 
 

@@ -46,7 +46,7 @@ _RIDGE = 1e-9  # of normal matrices, as a share of their largest entry
 
 @dataclass(frozen=True, eq=False)
 class PoseUncertainty:
-    """How well a pose is known, as standard deviations.
+    """Standard deviations of a pose.
 
     Args:
         shift: Of the body's middle along x, y and z [scene units], shape [3].
@@ -326,7 +326,7 @@ def _pose_uncertainty(free: Pose, normal: NormalMatrix, covariance: np.ndarray) 
 def candidates_along_flat_direction(
     problem: Problem, setting: Setting, values: Mapping[str, Values], count: int
 ) -> list[dict[str, Values]]:
-    """Values beside some, along the direction of the poses that the images tell least of, either way, farther and
+    """Values displaced along the least determined direction of the poses, both ways, farther and
     farther; the light is solved for anew.
     """
     normal = NormalMatrix(problem, setting, values)

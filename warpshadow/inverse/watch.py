@@ -106,7 +106,7 @@ class Watch:
 
 
 def losses_by_stage(losses: Sequence[list[float]], descents: Sequence[int]) -> list[list[list[float]]]:
-    """Losses of a fit's descents, which stand one after another, for each stage, of which the numbers are given."""
+    """Split the losses of consecutive descents by the number of the stage that each belongs to."""
     runs = iter(losses)
     return [list(islice(runs, count)) for count in descents]
 

@@ -68,7 +68,7 @@ def find_squares(
 
 @functools.lru_cache(maxsize=16)
 def _keys(is_adaptive: bytes, first_face: bytes) -> np.ndarray:
-    """For each side of the bodies' faces, from the front and then from behind, which body's it is; −1 for others."""
+    """Body of each face side, fronts first and then backs; −1 for bodies that are not adaptive."""
     adaptive, starts = np.frombuffer(is_adaptive, bool), np.frombuffer(first_face, int)
     bodies = np.repeat(np.where(adaptive, np.arange(len(adaptive), dtype=np.int32), -1), np.diff(starts))
     return np.concatenate([bodies, np.where(bodies < 0, -1, len(adaptive) + bodies)]).astype(np.int32)
@@ -76,13 +76,13 @@ def _keys(is_adaptive: bytes, first_face: bytes) -> np.ndarray:
 
 @functools.lru_cache(maxsize=16)
 def _by_tiles(height: int, width: int) -> np.ndarray:
-    """The probes of a grid by tiles of 4 × 4: light is found fastest where neighbors follow each other."""
+    """Order the probes of a grid by 4 × 4 tiles, so that neighbors are shaded one after another."""
     row, column = np.divmod(np.arange(height * width), width)
     return np.lexsort((column // 4, row // 4))
 
 
 def _ragged(chosen: np.ndarray) -> np.ndarray:
-    """Columns that are chosen in each row, −1 after the last: [row, most of a row]."""
+    """List the chosen columns of each row, padded with −1, shape [row, longest row]."""
     row, column = np.nonzero(chosen)
     counts = np.bincount(row, minlength=len(chosen))
     columns = np.full((len(chosen), counts.max(initial=0)), -1)

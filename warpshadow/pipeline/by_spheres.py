@@ -86,7 +86,7 @@ class SphereMethod(Method):
         return BlockerKinds(traced, rotations, why, planes, self.convex_blockers(traced))
 
     def convex_blockers(self, traced: tuple[int, ...]) -> tuple[int, ...]:
-        """Bodies that block the light of others as convex parts, of some that block their own light as rays found."""
+        """Choose the bodies with traced self-visibility that block other bodies' light as convex parts."""
         return ()
 
     def blockers(
@@ -109,7 +109,7 @@ class SphereMethod(Method):
         raise NotImplementedError
 
     def coefficient_count(self, light: Input | None) -> int:
-        """Number of coefficients of the light that take part; None: light that is not known yet, so all of them."""
+        """Number of light coefficients that shading uses; all of them where the light is None, not known yet."""
         raise NotImplementedError
 
     def self_lookups(self, bodies: tuple[int, ...], rotations: wp.array, projected_light: Any) -> dict[int, Any]:
@@ -133,7 +133,7 @@ class SphereMethod(Method):
         raise NotImplementedError
 
     def sharp_share(self, group: Group) -> np.ndarray | None:
-        """Light of the scene whose shadows are sharpest, as a group gets it, over all light if nothing blocked any.
+        """Share of a group's unblocked light that comes from the cells with the sharpest shadows.
 
         Returns:
             Shape [batch, receiver]; None where no shadow is sharp.
@@ -346,7 +346,7 @@ def _pairs(method: SphereMethod, points: LitPoints) -> str:
 
 
 def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
-    """Why no visibility has to be found; empty if it has."""
+    """Reason why no visibility is computed; empty if it is."""
     counts = _sphere_counts(method, points) + _part_counts(method, points)
     _, moving, static = points.counts()
     if method.why_no_shadows or not counts.sum():

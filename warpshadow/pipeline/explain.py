@@ -108,7 +108,7 @@ def decide(image: Node, call: Call) -> dict[Node, Decision]:
     requested: set[Node] = set()
 
     def visit(node: AnyInput, reason: Decision) -> None:
-        """Decide on a node, which is asked for if the reason is that something runs."""
+        """Decide whether a node runs, given the decision of the node that asks for it."""
         if isinstance(node, Input) or node in requested or (node in decisions and not reason):
             return
         if reason:

@@ -81,7 +81,7 @@ def as_geometry(name: str, arguments: object) -> Geometry:
 
 
 def splice(whole: wp.array, runs: Sequence[tuple[int, int]], part_of: Callable[[int, int], wp.array]) -> wp.array:
-    """Put parts in the place of runs of items of a whole.
+    """Replace ranges of items of a whole array by parts.
 
     Args:
         whole: Shape [batch, item].

@@ -103,7 +103,7 @@ class GlossyPoints(LitPoints):
         return self.method.prefiltered(light)
 
     def _blurred(self, light: wp.array) -> wp.array:
-        """Texels of free light. Differentiable: light."""
+        """Prefiltered texels of free light. Differentiable: light."""
         return change_basis(light, _blurred_basis(self.method.basis))
 
 
@@ -143,7 +143,7 @@ def _chosen(light: wp.array, receivers: Receivers, is_glossy: np.ndarray) -> wp.
 
 
 def _of_spans(array: wp.array, spans: list[Span], first: int) -> wp.array:
-    """Items of spans, whose counting begins at an item."""
+    """Cut spans of items out of an array, counting from an item."""
     parts = [cut(array, span.first - first, span.end - first) for span in spans]
     if not parts:
         return wp.empty((len(array), 0), dtype=array.dtype, device=array.device)

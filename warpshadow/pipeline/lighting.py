@@ -227,7 +227,7 @@ class Method:
         return np.stack([receives[body_of_vertex], (receives & self.merged_scene.is_two_sided)[body_of_vertex]])
 
     def separate_bodies(self, blocker_kinds: BlockerKinds) -> np.ndarray | None:
-        """Bodies whose receivers are groups of their own, −1 for others, shape [body]; None where all share a group."""
+        """Number of each body whose receivers form a group, −1 for others, shape [body]; None where all share one."""
         bodies = np.arange(len(self.merged_scene.scene.bodies))
         if self.merged_scene.scene.bounces:
             return bodies
@@ -235,7 +235,7 @@ class Method:
         return np.where(np.isin(bodies, separate), bodies, -1) if separate else None
 
     def numbering(self, blocker_kinds: BlockerKinds, has_backs: bool) -> Numbering:
-        """Of all vertices, or of all with their backs; a first call makes both, so that a capture finds them."""
+        """Number all vertices, or all with their backs; the first call makes both, so that a capture finds them."""
         key = blocker_kinds.traced, blocker_kinds.planes
         if key not in self._numberings:
             faces, can_receive, separate_bodies = (
@@ -346,3 +346,11 @@ def change_basis(light: wp.array, matrix: np.ndarray | None) -> wp.array:
 def joined(parts: list[wp.array]) -> wp.array:
     """Receivers of parts one after another, of shape [batch, receiver]. Differentiable: parts."""
     return parts[0] if len(parts) == 1 else concatenate(parts, [part.shape[1] for part in parts])
+
+
+def one_transfer(parts: list[wp.array]) -> wp.array:
+    """Transfer vectors of all groups one after another, float32 of shape [batch, receiver, coefficient]."""
+    if len(parts) == 1:
+        return parts[0]
+    rows = joined([part.reshape((part.shape[0], -1)) for part in parts])
+    return rows.reshape((rows.shape[0], -1, parts[0].shape[2]))

@@ -260,7 +260,7 @@ class MergedScene:
         self._take_spheres = lambda: [other._spheres[number] for number in bodies]
 
     def part(self, geometry: Geometry, bodies: Sequence[int]) -> Geometry:
-        """The geometry of some bodies, rising, as that of a scene of these alone. Differentiable in it."""
+        """Cut some bodies, in rising order, out of a geometry of all. Differentiable in it."""
 
         def items(array: wp.array, starts: np.ndarray) -> wp.array:
             runs = self.runs(starts, bodies)
@@ -300,7 +300,7 @@ class MergedScene:
 
     @staticmethod
     def runs(starts: np.ndarray, bodies: Collection[int]) -> list[tuple[int, int]]:
-        """Ranges of the items of some bodies, consecutive ones joined and empty ones left out.
+        """Ranges of the items of some bodies; consecutive ranges are joined, empty ones left out.
 
         Args:
             starts: Where each body's items begin, and the end of the last: :attr:`first_vertex`, :attr:`first_sphere`
@@ -386,7 +386,7 @@ class MergedScene:
             )
 
     def _sphere_binding(self, number: int) -> SphereBinding:
-        """The spheres of a body, bound to the vertices of its faces."""
+        """Bind a body's spheres to the vertices of its faces."""
         if number not in self._bindings:
             mesh, spheres = self.scene.bodies[number].mesh, self._spheres[number]
             arguments = mesh.positions, np.unique(mesh.faces), spheres.centers, spheres.radii
@@ -447,7 +447,7 @@ class MergedScene:
 
 
 def _starts(parts: list[np.ndarray]) -> np.ndarray:
-    """Where each part begins when they are put after one another, and the end of the last."""
+    """Offsets of parts that are concatenated, and the end of the last."""
     return np.cumsum([0, *map(len, parts)])
 
 

@@ -18,7 +18,7 @@ from warpshadow.device.tape import record
 
 
 class Input:
-    """Something given.
+    """An input of the pipeline: a value that the caller gives.
 
     Args:
         name: Name of the stage.
@@ -43,7 +43,7 @@ class Input:
 
     @classmethod
     def renewed(cls, name: str, value: Any, last: "Input | None") -> "Input":
-        """A source with a copy of the given value; the last source if the value is the same.
+        """Make an input with a copy of the value, or return the last input if the value is the same.
 
         On a CPU values are compared. On a GPU, which would have to wait for that, an array is the same if it has the
         same ``origin``, the tensor whose memory it is, and the same ``version``, which counts the writes to that.
@@ -73,7 +73,7 @@ def _copied(value: Any) -> Any:
 
 
 def _is_same(new_value: Any, last: Input) -> bool:
-    """Whether a given value equals a source's, as far as can be told without waiting."""
+    """Whether a value equals an input's, as far as the host knows without waiting."""
     arrays, value = _arrays(new_value), last.value()
     if isinstance(new_value, np.ndarray):
         return isinstance(value, np.ndarray) and np.array_equal(new_value, value)
@@ -83,7 +83,7 @@ def _is_same(new_value: Any, last: Input) -> bool:
 
 
 def _is_same_array(array: wp.array, before: wp.array, copy: wp.array) -> bool:
-    """Whether an array has the values of a copy; on a GPU, whether it is the array before, not written to since."""
+    """Whether an array equals a stored copy; on a GPU, whether it is the array before, not written to since."""
     if is_readable(array.device):  # it sees writes by NumPy, which torch does not count; 20 µs for 35,000 vertices
         return np.array_equal(array.numpy(), copy.numpy())
     origin = getattr(array, "origin", None)
@@ -92,7 +92,7 @@ def _is_same_array(array: wp.array, before: wp.array, copy: wp.array) -> bool:
 
 
 class Node:
-    """Something computed.
+    """A value of the pipeline that a function computes from inputs.
 
     Args:
         name: Name of the stage; empty for a node that is neither timed nor explained.
@@ -179,7 +179,7 @@ AnyInput = Node | Input
 
 
 def detached(node: AnyInput, *, is_constant: bool = False) -> Node:
-    """Make an input that matters by its value alone: it gets no gradient.
+    """Make an input of a node's value that passes no gradient to the node.
 
     Args:
         node: The node or source.
@@ -193,7 +193,7 @@ def detached(node: AnyInput, *, is_constant: bool = False) -> Node:
 
 
 class Timing:
-    """How long a stage took when it last ran, seconds of the host; on a GPU that is the time to launch it."""
+    """Seconds of the host that a stage took when it last ran; on a GPU, the time to launch it."""
 
     def __init__(self) -> None:
         self.forward = 0.0
@@ -201,7 +201,7 @@ class Timing:
 
     @property
     def backward(self) -> float | None:
-        """How long its adjoint took; None where it was not played back."""
+        """Seconds that its adjoint took; None where it did not run."""
         return sum(self.adjoints.values()) if self.adjoints else None
 
 
@@ -226,7 +226,7 @@ class Clock:
 
 
 class Call(dict[Node, Any]):
-    """Values of a call that are not cached: by node.
+    """One call of the pipeline: the values that it computed and that are not cached, by node.
 
     Args:
         clock: Where times are noted.

@@ -4,9 +4,9 @@
 """
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import warp as wp
@@ -16,63 +16,35 @@ from warpshadow.assets.basis import Basis, check_basis
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.device.memory import empty
 from warpshadow.device.progress import waiting
 from warpshadow.device.tape import unrecorded
-from warpshadow.device.threads import one_at_a_time
+from warpshadow.device.threads import announced, one_at_a_time
+from warpshadow.pipeline.catchers import CatchersAlone
 from warpshadow.pipeline.choice_of_receivers import (
     choose_receivers,
-    face_sizes,
     receiver_notes,
-    warn_of_coarse_faces,
     with_receivers,
 )
+from warpshadow.pipeline.delegation import delegated
 from warpshadow.pipeline.explain import Explanation, bounce_notes, decide
 from warpshadow.pipeline.geometry import Geometry, as_geometry
 from warpshadow.pipeline.layers import LayerArrays, Layers, find_layer_arrays, find_layers
-from warpshadow.pipeline.lighting import Light, LitPoints, joined
+from warpshadow.pipeline.lighting import Light, LitPoints, one_transfer
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.methods import make_method
 from warpshadow.pipeline.node import Clock, Input, Node
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.scene_views import SceneViews, camera_batch
+from warpshadow.pipeline.shading_ratio import shading_ratio
 from warpshadow.pipeline.view import View
+from warpshadow.pipeline.view_warnings import warn_of_vertex_receivers, warn_of_view
 from warpshadow.scene.body import GLOSS_ARGUMENTS
-from warpshadow.scene.creases import rounded_edges
-from warpshadow.scene.placement import enclosures, misplacements
 from warpshadow.scene.scene import SCENE_TYPES, BodyLike, PerBody, Scene
 from warpshadow.scene.visibility import METHODS
-from warpshadow.stages.receivers import Receivers
 
 RendererType = TypeVar("RendererType", bound="SceneRenderer")
 
-P = ParamSpec("P")
-R = TypeVar("R")
-
-
-def _announced(function: Callable[Concatenate[RendererType, P], R]) -> Callable[Concatenate[RendererType, P], R]:
-    """Make a method one of a call at a time that says in files that it runs, should that take long."""
-
-    @one_at_a_time
-    @functools.wraps(function)
-    def announced(self: RendererType, *args: P.args, **kwargs: P.kwargs) -> R:
-        with waiting("rendering", shows=self.progress):
-            return function(self, *args, **kwargs)
-
-    return announced
-
-
-def _delegated(part: str, function: Callable[Concatenate[Any, P], R]) -> Callable[Concatenate["SceneRenderer", P], R]:
-    """Make a method of a part of a renderer one of the renderer."""
-
-    @functools.wraps(function)
-    def called(self: "SceneRenderer", *args: P.args, **kwargs: P.kwargs) -> R:
-        return function(getattr(self, part), *args, **kwargs)
-
-    return called
-
-
-_OF_CAMERAS = ("_scene_view", "_without_others")  # cached values of a renderer's cameras
+_OF_CAMERAS = ("_scene_view", "_catchers_alone")  # cached values of a renderer's cameras
 
 
 class SceneRenderer:
@@ -110,13 +82,8 @@ class SceneRenderer:
         check_basis(basis)
         where, scene = check.device("device", device), scene.with_method()
         check.choice("scene.visibility.method", scene.visibility.method, METHODS)
-        self._arguments = {
-            "scene": scene,
-            "cameras": cameras,
-            "device": str(where),
-            "basis": basis,
-            "progress": progress,
-        }
+        options = {"device": str(where), "basis": basis, "progress": progress}
+        self._arguments = {"scene": scene, "cameras": cameras, **options}
         self.has_camera_batch = cameras is not None
         self.cameras = (scene.camera,) if cameras is None else camera_batch(cameras)
         self.device = where
@@ -153,8 +120,8 @@ class SceneRenderer:
         other.cameras, other.has_camera_batch = camera_batch(cameras), True
         other._views = self._views.with_cameras(other.cameras)
         other._has_warned = True
-        if "_without_others" in vars(self):
-            vars(other)["_without_others"] = self._without_others.with_cameras(cameras)
+        if "_catchers_alone" in vars(self):
+            vars(other)["_catchers_alone"] = self._catchers_alone.with_cameras(cameras)
         return other
 
     def moved(self: RendererType, device: wp.DeviceLike) -> RendererType:
@@ -181,17 +148,17 @@ class SceneRenderer:
         """The bodies and their spheres at rest, each body in its own space; the batch is 1. Not to be written to."""
         return self.merged_scene.rest
 
-    scene_poses = _delegated("merged_scene", MergedScene.scene_poses)
-    placed = _delegated("merged_scene", MergedScene.placed)
-    deformed = _delegated("merged_scene", MergedScene.deformed)
-    deformation_graph = _delegated("merged_scene", MergedScene.deformation_graph)
+    scene_poses = delegated("merged_scene", MergedScene.scene_poses)
+    placed = delegated("merged_scene", MergedScene.placed)
+    deformed = delegated("merged_scene", MergedScene.deformed)
+    deformation_graph = delegated("merged_scene", MergedScene.deformation_graph)
 
     @property
     def clip_matrices(self) -> wp.array:
         """The cameras, mat44 of shape [camera]."""
         return self._views.clip_matrices.value()
 
-    @_announced
+    @announced
     def view(self, geometry: Geometry[wp.array] | None = None, clip_matrices: wp.array | None = None) -> View:
         """See a geometry through cameras; the last view again if nothing that it depends on changed.
 
@@ -218,27 +185,18 @@ class SceneRenderer:
     def _warn_of_nothing(self, view: View) -> None:
         """Say once why an image shows nothing, and of the scene itself what is likely to be wrong."""
         is_of_scene, device = self._views.is_of_scene(view), self.device
-        if self._has_warned or not (is_readable(device) or (is_of_scene and not device.is_capturing)):
-            return
-        remarks = [view.emptiness()]
-        if is_of_scene:
-            remarks += [*enclosures(self.scene, self.cameras), *misplacements(self.scene), *rounded_edges(self.scene)]
-        if result := [remark for remark in remarks if remark]:
-            check.warn("; ".join(result))
-            self._has_warned = True
+        if not self._has_warned and (is_readable(device) or (is_of_scene and not device.is_capturing)):
+            self._has_warned = warn_of_view(view, self.cameras if is_of_scene else None)
 
-    at_points = _delegated("_views", SceneViews.at_points)
-    on_faces = _delegated("_views", SceneViews.on_faces)
+    at_points = delegated("_views", SceneViews.at_points)
+    on_faces = delegated("_views", SceneViews.on_faces)
 
     @functools.cached_property
     def _scene_view(self) -> View:
         """Build the view of the cameras on the scene; a warning tells of coarse faces."""
         view = self.view()
-        bodies = self._given_scene.bodies
-        if any(body.receivers == "vertex" for body in bodies) and not self._method.lights_samples:
-            clip_positions = view.clip_positions.value(view.call).numpy()
-            images = zip(view.fragments.face_ids.numpy(), clip_positions, strict=True)
-            warn_of_coarse_faces(bodies, face_sizes(images, self.merged_scene, self.cameras[0]))
+        if not self._method.lights_samples:
+            warn_of_vertex_receivers(view, self._given_scene.bodies, self.cameras[0])
         return view
 
     @one_at_a_time
@@ -258,7 +216,7 @@ class SceneRenderer:
 
     # ------------------------------------------------------------------------------------------ light and reflectance
 
-    @_announced
+    @announced
     def transfer(self) -> wp.array:
         """Transfer vectors of the visible receivers to :attr:`basis`, float32 of shape [view, receiver, coefficient].
 
@@ -273,14 +231,9 @@ class SceneRenderer:
                 "shade and draw take free light that bounces, with any method"
             )
         view = self._scene_view
-        parts = view.transfers.value(self._views.call(view))
-        if len(parts) == 1:
-            return parts[0]
-        count = parts[0].shape[2]
-        rows = joined([part.reshape((part.shape[0], -1)) for part in parts])
-        return rows.reshape((rows.shape[0], -1, count))
+        return one_transfer(view.transfers.value(self._views.call(view)))
 
-    @_announced
+    @announced
     def shade(self, light: Light | None = None, view: LitPoints | None = None) -> wp.array:
         """Light the receivers of a view.
 
@@ -299,7 +252,7 @@ class SceneRenderer:
         view = self._checked(view)
         return view.shading(light).value(self._views.call(view))
 
-    @_announced
+    @announced
     def reflect(
         self,
         albedo: PerBody[wp.array] | None = None,
@@ -349,7 +302,7 @@ class SceneRenderer:
 
     # ------------------------------------------------------------------------------------------ image
 
-    @_announced
+    @announced
     def draw(
         self,
         light: Light | None = None,
@@ -395,7 +348,7 @@ class SceneRenderer:
             images = (self._in_photograph(None, light) if self.scene.catchers else self.draw(light)).numpy().copy()
         return images if self.has_camera_batch else images[0]
 
-    @_announced
+    @announced
     def insert(
         self,
         photograph: wp.array,
@@ -442,25 +395,17 @@ class SceneRenderer:
         clip_matrices: wp.array | None = None,
     ) -> wp.array:
         """Images of bodies in a photograph; or over nothing, where the shadows on catchers are coverage, vec4."""
-        catchers = self.scene.catchers
-        alone = None
+        catchers, materials, alone = self._catchers_alone, self._given_materials(albedo, textures, gloss), None
         if geometry is not None:
             geometry = as_geometry("geometry", geometry)
-            if geometry.moving is None or set(geometry.moving) & set(catchers):
-                alone = self.merged_scene.part(geometry, catchers)
+            alone = catchers.moved_geometry(geometry)
             geometry = replace(geometry, moving=None)  # else static catchers would be lit in another way than alone
-        materials, without = self._given_materials(albedo, textures, gloss), self._without_others
-        seen = without.view(alone, clip_matrices)
-        colors, images = self.scene.per_body(albedo, "albedo"), self.scene.per_body(textures, "textures")
-        catcher_materials = without._given_materials(
-            [colors[body] for body in catchers], [images[body] for body in catchers]
-        )
         view = self.view(geometry, clip_matrices)
-        if self._method.lights_samples:  # rays are drawn by the number of a receiver, and so are the same for both
-            seen = seen.at_receivers_of(view)
-        received = seen.white(light, catcher_materials).value(without._views.call(seen))
+        unshadowed = Input(
+            "light without the others", catchers.light(alone, clip_matrices, light, albedo, textures, view)
+        )
         photo_input = None if photograph is None else Input("photograph", photograph)
-        arguments = photo_input, Input("light without the others", received), self._catches, light, materials
+        arguments = photo_input, unshadowed, catchers.has_face, light, materials
         return view.in_photograph(*arguments).value(self._views.call(view))
 
     @property
@@ -469,20 +414,10 @@ class SceneRenderer:
         return self.cameras[0].height, self.cameras[0].width
 
     @functools.cached_property
-    def _catches(self) -> wp.array:
-        """Whether each face is one of a catcher, bool of shape [face]."""
-        return wp.array(np.isin(self.merged_scene.body_of_face, self.scene.catchers), dtype=wp.bool, device=self.device)
-
-    @functools.cached_property
-    def _without_others(self) -> "SceneRenderer":
-        """Renders the catchers alone, by the same receivers and spheres."""
-        bodies = tuple(self.scene.bodies[number] for number in self.scene.catchers)
-        scene = replace(self.scene, bodies=bodies)
+    def _catchers_alone(self) -> CatchersAlone:
+        scene = replace(self.scene, bodies=tuple(self.scene.bodies[number] for number in self.scene.catchers))
         arguments: dict[str, Any] = self._arguments | {"scene": scene, "cameras": self.cameras}
-        without = SceneRenderer(**arguments)
-        without.merged_scene.take_spheres(self.merged_scene, self.scene.catchers)
-        without._has_warned = True
-        return without
+        return CatchersAlone(SceneRenderer(**arguments), self.merged_scene)
 
     @one_at_a_time
     def layers(self, view: View | None = None) -> Layers:
@@ -522,18 +457,9 @@ class SceneRenderer:
         if self.scene.bounces:
             arguments: dict[str, Any] = self._arguments | {"scene": replace(self.scene, bounces=0)}
             return SceneRenderer(**arguments).shadow()
-        bodies = tuple(replace(body, blockers=0) for body in self.scene.bodies)
-        without_blockers = make_method(MergedScene(replace(self.scene, bodies=bodies), device=self.device), None)
         with unrecorded():
             view = self._scene_view
-            call = self._views.call(view)
-            receivers = Node("", Receivers.without_owners, view.receivers_node)
-            none = tuple(empty((1, 0), dtype=dtype, device=self.device) for dtype in (wp.vec3, wp.float32))
-            spheres = Input("spheres", none)
-            free = LitPoints(without_blockers, self._materials, self._views.vertices, spheres, receivers, call)
-            images = (view.white_image(item.shading(None)).value(call) for item in (view, free))
-            received, unblocked = (image.numpy()[..., :3].copy() for image in images)
-        ratio = np.divide(received, unblocked, out=np.ones_like(received), where=unblocked > 0)
+            ratio = shading_ratio(view, self._views.call(view))
         return ratio if self.has_camera_batch else ratio[0]
 
     # ------------------------------------------------------------------------------------------ explanation
@@ -553,12 +479,9 @@ class SceneRenderer:
         """List the stages that the next call computes, those it skips, and why.
 
         Args:
-            light: As for :meth:`draw`.
-            albedo: As for :meth:`draw`.
-            textures, gloss: As for :meth:`draw`.
+            light, albedo, textures, gloss: As for :meth:`draw`.
             view: As for :meth:`draw`: then only the stages after it are explained.
-            geometry: As for :meth:`view`, which is explained with it.
-            clip_matrices: As for :meth:`view`.
+            geometry, clip_matrices: As for :meth:`view`, which is explained with them.
         Returns:
             The stages, which print as a table: whether each runs and on how many items, how long it took last, and why
             it does or does not run; then the same of the adjoints. Nothing is computed.

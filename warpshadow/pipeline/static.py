@@ -60,7 +60,7 @@ class StaticBodies:
         self._rows: dict[Hashable, VertexRows] = {}
 
     def matches(self, geometry: Geometry) -> bool:
-        """Whether the static bodies of another geometry are these; on a GPU that is taken on trust."""
+        """Whether another geometry has the same static bodies; on a GPU this is assumed."""
         if geometry.moving != self.moving:
             return False
         if not is_readable(self._merged_scene.device):
@@ -103,7 +103,7 @@ class StaticBodies:
         return self._gathered[1:]
 
     def gathered(self, vertices: np.ndarray, normals: wp.array) -> tuple[wp.array, wp.array]:
-        """The same anew each time."""
+        """Gather points and normals as :meth:`receivers` does, without the cache."""
         vertices, is_back = split_sides(vertices, len(self.has_vertex))
         outward = np.where(is_back, -1, 1).astype(np.float32)[:, None]
         return tuple(
@@ -157,7 +157,7 @@ def _first_instance(array: wp.array) -> wp.array:
 
 
 class VertexRows:
-    """Rows of numbers that vertices get when they are first asked for; room for them doubles.
+    """Rows of numbers of vertices, each computed when it is first asked for; the array doubles when it is full.
 
     Args:
         count: Number of vertices and backs.

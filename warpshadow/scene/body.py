@@ -242,7 +242,7 @@ class Body:
         return texture
 
     def _check_gloss(self) -> None:
-        """Hold roughness and its like as float32, [1] or [vertex]; without roughness there is none of them."""
+        """Convert roughness, metallic and specular to float32 [1] or [vertex]; all are None without roughness."""
         expected = f"a number from 0 to 1, one for each vertex, [vertex], or an {VALUES_SUFFIX} file of them"
         for name in GLOSS_ARGUMENTS:
             value = getattr(self, name)

@@ -125,7 +125,7 @@ class PartwiseDirectLight(Node):
 
 
 def _open_shares(senders: Senders, visibility: list[PartVisibility]) -> wp.array:
-    """How much each source counts in its patch, vec3 of shape [batch, source]."""
+    """Weight of each source in its patch's mean, vec3 of shape [batch, source]."""
     parts = [find_openness(part.group.normals, *part.cells) for part in visibility]
     return open_shares(joined(parts), senders.mean, senders.patch_of_source)
 
@@ -360,7 +360,7 @@ class SphereBounces:
         return self._still.free_shading(direct, transfers, light, points, materials)
 
     def _cached_sources(self, points: LitPoints, materials: Materials) -> tuple[Node, LitPoints]:
-        """Node of the sources of bodies that do not move, and these as points that are lit."""
+        """Node of the static sources, and the same sources as lit points."""
         sources = self._still.sources(points, materials)
         return sources, points.cached("lit sources", sources, lambda: self._at(sources, points, materials))
 
@@ -371,7 +371,7 @@ class SphereBounces:
     def _at(
         self, sources: Node, points: LitPoints, materials: Materials, blocker_of_point: np.ndarray | None = None
     ) -> LitPoints:
-        """Sources, to be lit among the bodies among which points are; the blockers nearest to them, if any."""
+        """Make lit points of sources, among the same bodies as other points."""
         arguments = self._method, materials, points.vertices, points.spheres, sources, points.call
         return LitPoints(
             *arguments, normals=points.normals, blocker_kinds=points.blocker_kinds, blocker_of_point=blocker_of_point

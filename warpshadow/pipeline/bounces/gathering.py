@@ -155,7 +155,7 @@ class Proxies:
 
     @functools.cached_property
     def black_bodies(self) -> list[int]:
-        """Bodies that are not flat and send nothing: the spheres by which they block stand in for them."""
+        """Nonplanar bodies that send no light: their blocker spheres are their proxies."""
         return [body for body in self.nonplanar_bodies if body not in self.senders.bodies]
 
     def span_of(self, body: int | None) -> tuple[int, int]:
@@ -176,7 +176,7 @@ class Proxies:
 
     @functools.cached_property
     def _blockers(self) -> tuple[np.ndarray, np.ndarray]:
-        """The sphere of its body beside each patch, −1 for none, and the radius of its proxy in that sphere's."""
+        """For each patch, the nearest sphere of its body, −1 for none, and its proxy's radius relative to it."""
         rest, first_sphere, senders = self.merged_scene.rest, self.merged_scene.first_sphere, self.senders
         centers, radii = rest.centers.numpy()[0], rest.radii.numpy()[0]
         numbers, ratios = np.full(len(senders.areas), -1, np.int32), np.zeros(len(senders.areas), np.float32)

@@ -21,7 +21,7 @@ def after_bounces(
     *,
     self_bounces: int,
 ) -> wp.array:
-    """Radiosity of patches after all bounces but the last, which receivers find.
+    """Radiosity of patches after all bounces but the last, which the receivers gather.
 
     Args:
         bounces: How often light bounces.

@@ -159,7 +159,7 @@ def scaled_to_sky(factors: csr_matrix, casts: np.ndarray, sky: np.ndarray | None
 
 
 def ratios(target: np.ndarray, current: np.ndarray) -> np.ndarray:
-    """Factors from values to the wanted ones, 0 where these are negative; 1 where there is nothing."""
+    """Factors that scale current values to targets: 0 for negative targets, 1 where the value is 0."""
     return np.where(current > 0, np.maximum(target, 0) / np.where(current > 0, current, 1), 1)
 
 

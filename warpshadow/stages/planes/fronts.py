@@ -179,7 +179,7 @@ def find_fronts(
     frames: wp.array,
     planes: PlaneBlockers,
 ) -> wp.array:
-    """Part of the front of each plane that receivers see; of the back they see the rest.
+    """Weight of each plane's front for each receiver; its back has the rest, 1 minus that weight.
 
     Args:
         points: The receivers [scene units], vec3 of shape [batch, receiver].

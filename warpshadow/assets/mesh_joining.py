@@ -1,0 +1,159 @@
+"""Joining the parts of a mesh file: into one mesh with one picture, gloss and colors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from warpshadow.assets.color import GRAY, srgb_to_linear
+from warpshadow.assets.mesh import (
+    DIFFUSE,
+    BaseColor,
+    Mesh,
+    MeshError,
+    MeshPart,
+    checked_indices,
+)
+from warpshadow.assets.topology import CREASE, is_listed_first
+
+
+class JoinedMesh(NamedTuple):
+    """A mesh, the picture that all its faces share, its gloss, and remarks on surprises: on shape, colors and gloss.
+
+    ``gloss`` has roughness and metallic of the body, [1] each, or of each vertex, [vertex].
+    """
+
+    mesh: Mesh
+    picture: BaseColor | None
+    gloss: tuple[np.ndarray, np.ndarray] | None
+    remarks: list[str]
+    of_colors: list[str]
+    of_gloss: list[str]
+
+
+def join_parts(parts: list[MeshPart], name: str) -> JoinedMesh:
+    """Join parts into one mesh, and find the picture that all have."""
+    vertex_count = sum(len(part.positions) for part in parts)
+    parts = [part for part in parts if len(part.faces)]
+    if not parts:
+        cause = "; is it a cloud of points, or cut off?" if vertex_count else ""
+        raise MeshError(f"faces: got none ({vertex_count} vertices), expected at least one triangle{cause}")
+    positions, faces = stack((part.positions, part.faces) for part in parts)
+    textured = [(part.uvs, part.uv_faces) for part in parts if part.uvs is not None]
+    uvs, uv_faces = stack(textured) if len(textured) == len(parts) else (None, None)
+    used = np.unique(checked_indices("faces", faces, len(positions), "vertex"))
+    is_first = is_listed_first(positions, faces)  # here, so that one warning has all remarks
+    own_uv_faces = None if uv_faces is None else uv_faces[is_first]
+    mesh = Mesh(positions, faces[is_first], uvs, own_uv_faces, name, colors=_joined_colors(parts))
+
+    a, b, c = np.moveaxis(mesh.positions.astype(np.float64)[mesh.faces], 1, 0)
+    counts = {
+        "degenerate faces (no area)": np.sum(~np.cross(b - a, c - a).any(axis=1)),
+        "duplicate faces dropped": np.sum(~is_first),
+        "unreferenced vertices": mesh.vertex_count - len(used) - sum(part.welded for part in parts),
+    }
+    remarks = [f"{count} {what}" for what, count in counts.items() if count]
+    remarks += [part.remark for part in parts if part.remark]
+    if 0 < len(textured) < len(parts):
+        remarks.append(f"uvs dropped because {len(parts) - len(textured)} of {len(parts)} parts have none")
+    of_colors = sorted({part.colorless for part in parts if part.colorless})
+    pictures = [picture for part in parts for picture in part.pictures]
+    is_one = mesh.uvs is not None and all(picture == pictures[0] for picture in pictures)
+    if any(pictures) and not is_one:
+        why = "which need uvs" if mesh.uvs is None else "since a body takes one that all its faces have"
+        of_colors.append(f"textures dropped, {why}")
+    of_gloss = sorted({part.gloss.remark for part in parts if part.gloss is not None and part.gloss.remark})
+    return JoinedMesh(mesh, pictures[0] if is_one else None, _joined_gloss(parts), remarks, of_colors, of_gloss)
+
+
+def _joined_gloss(parts: list[MeshPart]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Roughness and metallic of all parts, of each vertex where they differ; None if all parts are diffuse."""
+    glosses = [part.gloss or DIFFUSE for part in parts]
+    if all(gloss.roughness == 1 and gloss.metallic == 0 for gloss in glosses):
+        return None
+    counts = [1] if len({gloss[:2] for gloss in glosses}) == 1 else [len(part.positions) for part in parts]
+    of_parts = [(gloss.roughness, gloss.metallic) for gloss in glosses[: len(counts)]]
+    roughness, metallic = np.repeat(np.array(of_parts, np.float32), counts, axis=0).T
+    return roughness, metallic
+
+
+def _joined_colors(parts: list[MeshPart]) -> np.ndarray | None:
+    """Colors of the vertices of all parts, gray where a part has none; None if no part has any."""
+    if all(part.colors is None for part in parts):
+        return None
+    gray = np.array(GRAY, np.float32)
+    shapes = [(len(part.positions), 3) for part in parts]
+    return np.concatenate(
+        [
+            np.broadcast_to(gray if part.colors is None else part.colors, shape)
+            for part, shape in zip(parts, shapes, strict=True)
+        ]
+    )
+
+
+def stack(blocks: Iterable[tuple]) -> tuple[np.ndarray, np.ndarray]:
+    """Concatenate pairs of values and faces; the faces' indices move along."""
+    values, faces = zip(*blocks, strict=True)
+    offsets = np.cumsum([0] + [len(block) for block in values[:-1]])
+    moved = [block + offset for block, offset in zip(faces, offsets, strict=True)]
+    return np.concatenate(values), np.concatenate(moved)
+
+
+def fan(corner_counts: np.ndarray) -> np.ndarray:
+    """Corner numbers [triangle, 3] of the fans that triangulate consecutive polygons."""
+    if (corner_counts < 3).any():
+        polygon = np.flatnonzero(corner_counts < 3)[0]
+        raise MeshError(f"faces: got {corner_counts[polygon]} corners at face {polygon}, expected 3 or more")
+    triangle_counts = corner_counts - 2
+    first = np.repeat(np.cumsum(corner_counts) - corner_counts, triangle_counts)
+    step = np.arange(len(first)) - np.repeat(np.cumsum(triangle_counts) - triangle_counts, triangle_counts)
+    return np.stack([first, first + step + 1, first + step + 2], axis=1)
+
+
+def weld(faces: np.ndarray, *attributes: np.ndarray) -> np.ndarray:
+    """Let faces refer to the first of the vertices that agree in all attributes."""
+    rows = np.column_stack(attributes) + 0.0  # makes -0 equal to 0
+    _, first, group = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    return first[group.reshape(-1)][faces]
+
+
+def joined_normals(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Normals [vertex, 3], where vertices at one place get the first one's, unless they bend by more than a crease."""
+    _, place = np.unique(positions + 0.0, axis=0, return_inverse=True)
+    place = place.reshape(-1)
+    joined, first, left = np.array(normals), np.empty(len(place), np.int64), np.arange(len(place))
+    while len(left):
+        first[place[left[::-1]]] = left[::-1]
+        of_first = normals[first[place[left]]]
+        is_close = (normals[left] * of_first).sum(axis=1) >= np.cos(np.radians(CREASE))
+        is_close |= (first[place[left]] == left) | ~normals[left].any(axis=1)  # vertices of no face get zero
+        joined[left[is_close]] = of_first[is_close]
+        left = left[~is_close]
+    return joined
+
+
+def with_colors(part: MeshPart, values: np.ndarray, *, linear: bool = False) -> MeshPart:
+    """Give a part colors of its vertices, or of the corners of its faces if no vertex gets two.
+
+    Args:
+        part: Their mesh.
+        values: Codes, up to 65535 in unsigned numbers of 16 bits, up to 255 in other whole ones; or floats from 0 to 1;
+            of shape [vertex, 3 or 4] or [face, 3, 3 or 4].
+        linear: Whether they are; else they are sRGB.
+    """
+    values = values[..., :3]
+    values = values / (65535 if values.dtype == np.uint16 else 255 if values.dtype.kind in "ui" else 1.0)
+    if not ((values >= 0) & (values <= 1)).all():
+        why = f"got values from {values.min():g} to {values.max():g}, expected 0 to 1"
+        return part._replace(colorless=f"colors dropped ({why})")
+    colors = (values if linear else srgb_to_linear(values)).astype(np.float32)
+    if colors.ndim == 2:
+        return part._replace(colors=colors)
+    of_vertices = np.tile(np.array(GRAY, np.float32), (len(part.positions), 1))
+    of_vertices[part.faces] = colors
+    if np.array_equal(of_vertices[part.faces], colors):
+        return part._replace(colors=of_vertices)
+    why = "faces of different colors share vertices, which trimesh's unmerge_vertices() parts"
+    return part._replace(colorless=f"colors of faces dropped ({why})")

@@ -1,0 +1,74 @@
+"""Shadow catchers: the light that they receive without the other bodies of their scene."""
+
+from __future__ import annotations
+
+import copy
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpshadow.assets.camera import Camera
+from warpshadow.pipeline.geometry import Geometry
+from warpshadow.pipeline.lighting import Light
+from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.view import View
+from warpshadow.scene.scene import PerBody
+
+
+class CatchersAlone:
+    """The catchers of a scene as a scene of their own, with the same receivers and spheres.
+
+    Args:
+        renderer: ``SceneRenderer`` of the catchers alone.
+        merged_scene: All bodies.
+    """
+
+    def __init__(self, renderer: Any, merged_scene: MergedScene):
+        self._renderer, self._merged_scene, self._numbers = renderer, merged_scene, merged_scene.scene.catchers
+        renderer.merged_scene.take_spheres(merged_scene, self._numbers)
+        renderer._has_warned = True
+
+    def with_cameras(self, cameras: Sequence[Camera]) -> CatchersAlone:
+        """The same for other cameras."""
+        alone = copy.copy(self)
+        alone._renderer = self._renderer.with_cameras(cameras)
+        return alone
+
+    @functools.cached_property
+    def has_face(self) -> wp.array:
+        """Whether each face of the whole scene is one of a catcher, bool of shape [face]."""
+        is_catcher = np.isin(self._merged_scene.body_of_face, self._numbers)
+        return wp.array(is_catcher, dtype=wp.bool, device=self._merged_scene.device)
+
+    def moved_geometry(self, geometry: Geometry[wp.array]) -> Geometry[wp.array] | None:
+        """The catchers' part of a geometry; None where they are where the scene has them. Differentiable in it."""
+        has_moved = geometry.moving is None or set(geometry.moving) & set(self._numbers)
+        return self._merged_scene.part(geometry, self._numbers) if has_moved else None
+
+    def light(
+        self,
+        geometry: Geometry[wp.array] | None,
+        clip_matrices: wp.array | None,
+        light: Light | None,
+        albedo: PerBody[wp.array] | None,
+        textures: PerBody[wp.array] | None,
+        view: View,
+    ) -> wp.array:
+        """Light received by samples of catchers, and whether they see one; vec4, as of :meth:`.view.View.white`.
+
+        Args:
+            geometry: Of the catchers, from :meth:`moved_geometry`.
+            clip_matrices, light, albedo, textures: Of the whole scene, as for ``SceneRenderer.insert``.
+            view: The view of the whole scene.
+        """
+        renderer, scene = self._renderer, self._merged_scene.scene
+        colors, images = scene.per_body(albedo, "albedo"), scene.per_body(textures, "textures")
+        colors, images = ([item[body] for body in self._numbers] for item in (colors, images))
+        materials = renderer._given_materials(colors, images)
+        alone = renderer.view(geometry, clip_matrices)
+        if renderer._method.lights_samples:  # rays are drawn by the number of a receiver, and so are the same for both
+            alone = alone.at_receivers_of(view)
+        return alone.white(light, materials).value(renderer._views.call(alone))

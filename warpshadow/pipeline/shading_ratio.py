@@ -1,0 +1,31 @@
+"""The layer "shadow": direct light, divided by the same light without blockers."""
+
+from dataclasses import replace
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.memory import empty
+from warpshadow.pipeline.lighting import LitPoints
+from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.methods import make_method
+from warpshadow.pipeline.node import Call, Input, Node
+from warpshadow.pipeline.view import View
+from warpshadow.stages.receivers import Receivers
+
+
+def shading_ratio(view: View, call: Call) -> np.ndarray:
+    """Divide a view's white image in direct light by that without blockers; 1 where there is no light.
+
+    Returns:
+        float32 of shape [view, height, width, 3].
+    """
+    device, scene = view.merged_scene.device, view.merged_scene.scene
+    bodies = tuple(replace(body, blockers=0) for body in scene.bodies)
+    without_blockers = make_method(MergedScene(replace(scene, bodies=bodies), device=device), None)
+    receivers = Node("", Receivers.without_owners, view.receivers_node)
+    spheres = Input("spheres", tuple(empty((1, 0), dtype=dtype, device=device) for dtype in (wp.vec3, wp.float32)))
+    free = LitPoints(without_blockers, view.materials, view.vertices, spheres, receivers, call)
+    images = (view.white_image(item.shading(None)).value(call) for item in (view, free))
+    received, unblocked = (image.numpy()[..., :3].copy() for image in images)
+    return np.divide(received, unblocked, out=np.ones_like(received), where=unblocked > 0)

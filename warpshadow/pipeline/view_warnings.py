@@ -1,0 +1,33 @@
+"""Warnings about what a view shows: nothing, a misplaced body, or faces too coarse for receivers at vertices."""
+
+from collections.abc import Sequence
+
+from warpshadow import check
+from warpshadow.assets.camera import Camera
+from warpshadow.pipeline.choice_of_receivers import face_sizes, warn_of_coarse_faces
+from warpshadow.pipeline.view import View
+from warpshadow.scene.body import Body
+from warpshadow.scene.creases import rounded_edges
+from warpshadow.scene.placement import enclosures, misplacements
+
+
+def warn_of_view(view: View, cameras: Sequence[Camera] | None) -> bool:
+    """Warn of an image that shows nothing, and of likely mistakes in the scene where its own cameras are given.
+
+    Returns:
+        Whether there was anything to warn of.
+    """
+    remarks, scene = [view.emptiness()], view.merged_scene.scene
+    if cameras is not None:
+        remarks += [*enclosures(scene, cameras), *misplacements(scene), *rounded_edges(scene)]
+    if result := [remark for remark in remarks if remark]:
+        check.warn("; ".join(result))
+    return bool(result)
+
+
+def warn_of_vertex_receivers(view: View, bodies: Sequence[Body], camera: Camera) -> None:
+    """Warn of bodies with receivers at vertices whose faces are so large that shadows fall between these."""
+    if any(body.receivers == "vertex" for body in bodies):
+        clip_positions = view.clip_positions.value(view.call).numpy()
+        images = zip(view.fragments.face_ids.numpy(), clip_positions, strict=True)
+        warn_of_coarse_faces(bodies, face_sizes(images, view.merged_scene, camera))
