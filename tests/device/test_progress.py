@@ -84,10 +84,10 @@ def test_a_loop_of_calls_says_nothing_and_one_long_call_does(lines):
 def test_lines_are_hidden_as_bars_are(lines):
     with progress_bar(3, "counting", "thing", shows=False):
         time.sleep(0.3)
-    with waiting("rendering", shows=False), progress._compiling("folder"):
+    with waiting("rendering", shows=False), progress._compiling():
         time.sleep(0.3)
     ws.quiet(progress=False)
-    with waiting("rendering"), progress_bar(3, "counting", "thing"), progress._compiling("folder"):
+    with waiting("rendering"), progress_bar(3, "counting", "thing"), progress._compiling():
         time.sleep(0.3)
     ws.quiet()
     assert not lines()
