@@ -32,8 +32,16 @@ from warpshadow.assets.mesh import (
     moved_part,
     turned_over,
 )
+from warpshadow.assets.obj import read_items, read_pictures
 from warpshadow.assets.ply import ply_colors, ply_corner_uvs, ply_fault
-from warpshadow.assets.topology import CREASE, is_listed_first, join_faces, part_at_creases, rounds_edges
+from warpshadow.assets.topology import (
+    CREASE,
+    is_listed_first,
+    join_faces,
+    number_places,
+    part_at_creases,
+    rounds_edges,
+)
 from warpshadow.check import AnyPath
 
 if TYPE_CHECKING:  # it is imported where a file is read by it
@@ -264,9 +272,10 @@ def _fan(corner_counts: np.ndarray) -> np.ndarray:
 
 def _weld(faces: np.ndarray, *attributes: np.ndarray) -> np.ndarray:
     """Let faces refer to the first of the vertices that agree in all attributes."""
-    rows = np.column_stack(attributes) + 0.0  # makes -0 equal to 0
-    _, first, group = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    return first[group.reshape(-1)][faces]
+    group = number_places(np.column_stack(attributes))
+    first = np.empty(len(group), np.int64)
+    first[group[::-1]] = np.arange(len(group))[::-1]  # the last of these assignments stays
+    return first[group][faces]
 
 
 def _joined_normals(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -309,90 +318,24 @@ def _colored(part: MeshPart, values: np.ndarray, *, linear: bool = False) -> Mes
     return part._replace(colorless=f"colors of faces dropped ({why})")
 
 
-def _read_plain_obj(text: str) -> MeshPart | None:
-    """Read an OBJ file of vertices and triangles alone, in a tenth of the time; None for any other."""
-    vertex_lines, face_lines = re.findall(r"^v (.*)", text, re.M), re.findall(r"^f (.*)", text, re.M)
-    other_lines = re.findall(r"^(?:#|vn |s |$)", text, re.M)
-    if len(vertex_lines) + len(face_lines) + len(other_lines) < text.count("\n") + 1:
-        return None
-    if not (vertex_lines and face_lines) or " ".join(face_lines).strip("0123456789 \t"):
-        return None
-    try:
-        positions = np.loadtxt(vertex_lines, ndmin=2, comments=None)
-        faces = np.loadtxt(face_lines, dtype=np.int64, ndmin=2, comments=None) - 1
-    except ValueError:  # as where lines differ in length: the other reader says which
-        return None
-    return MeshPart(positions, faces) if positions.shape[1] == faces.shape[1] == 3 else None
-
-
 def _read_obj(path: Path) -> list[MeshPart]:
-    """Read v, vt and f lines: trimesh would split the vertices at uv seams and reorder them."""
-    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
-    plain = _read_plain_obj(text)
-    if plain is not None:
-        return [plain]
-    positions, colors, uvs, corners, uv_corners, corner_counts = [], [], [], [], [], []
-    libraries, material, materials = [], "", set()
-    for number, line in enumerate(text.split("\n"), start=1):
-        try:
-            match line.partition("#")[0].split():
-                case ["v", x, y, z, *rest]:
-                    positions.append((float(x), float(y), float(z)))
-                    if len(rest) >= 3:  # a number before the color, or one alone, is a weight
-                        r, g, b = rest[len(rest) > 3 :][:3]
-                        colors.append((float(r), float(g), float(b)))
-                case ["vt", u, *rest]:
-                    uvs.append((float(u), float(rest[0]) if rest else 0.0))
-                case ["mtllib", *words]:
-                    libraries.append(" ".join(words))
-                case ["usemtl", *words]:
-                    material = " ".join(words)
-                case ["f", *tokens]:
-                    materials.add(material)
-                    corner_counts.append(len(tokens))
-                    for token in tokens:
-                        vertex, _, others = token.partition("/")
-                        corners.append(_obj_index(vertex, len(positions)))
-                        if uv := others.partition("/")[0]:
-                            uv_corners.append(_obj_index(uv, len(uvs)))
-                case ["v" | "vt", *coordinates]:
-                    raise ValueError(f"{len(coordinates)} coordinates are too few")
-        except ValueError as error:
-            raise MeshError(f"line {number}: {error}, got {line.strip()!r}") from None
-    faces = _fan(np.array(corner_counts, dtype=np.int64))
-    pictures = _obj_pictures([path.parent / library for library in libraries])
-    part = MeshPart(np.array(positions).reshape(-1, 3), np.array(corners, dtype=np.int64)[faces])
-    part = part._replace(pictures=tuple(pictures.get(name) for name in sorted(materials)))
+    """Read an OBJ file: trimesh would split the vertices at uv seams and reorder them."""
+    items = read_items(path)
+    positions, colors, corners = items.positions, items.colors, items.corners
+    faces = _fan(items.corner_counts)
+    pictures = read_pictures([path.parent / library for library in items.libraries])
+    part = MeshPart(positions, corners[faces])
+    part = part._replace(pictures=tuple(pictures.get(name) for name in sorted(items.materials)))
     if 0 < len(colors) < len(positions):
         part = part._replace(colorless=f"colors dropped, which {len(positions) - len(colors)} vertices lack")
-    elif colors:
-        part = _colored(part, np.array(colors))
-    if not uv_corners:
+    elif len(colors):
+        part = _colored(part, colors)
+    missing = len(corners) - len(items.uv_corners)
+    if missing == len(corners):
         return [part]
-    if len(uv_corners) < len(corners):
-        missing = len(corners) - len(uv_corners)
+    if missing:
         return [part._replace(remark=f"uvs dropped because {missing} of {len(corners)} corners have none")]
-    return [part._replace(uvs=np.array(uvs).reshape(-1, 2), uv_faces=np.array(uv_corners)[faces])]
-
-
-def _obj_pictures(libraries: list[Path]) -> dict[str, BaseColor]:
-    """The diffuse pictures of the materials of MTL files, as far as the files exist."""
-    pictures, material = {}, ""
-    for library in filter(Path.is_file, libraries):
-        for line in library.read_text(encoding="utf-8", errors="replace").splitlines():
-            match line.split():
-                case ["newmtl", *words]:
-                    material = " ".join(words)
-                case [keyword, *words] if keyword.lower() == "map_kd":
-                    name = words[-1] if words and words[0].startswith("-") else " ".join(words)  # after options
-                    pictures[material] = BaseColor(library.parent / name.replace("\\", "/"))
-    return pictures
-
-
-def _obj_index(token: str, count: int) -> int:
-    """Zero-based index of a one-based one, or of one that counts back from the last item so far."""
-    index = int(token)
-    return index + count if index < 0 else index - 1
+    return [part._replace(uvs=items.uvs, uv_faces=items.uv_corners[faces])]
 
 
 def _read_trimesh(path: Path) -> list[MeshPart]:
