@@ -1,5 +1,6 @@
 """Progress: one bar for one wait, from a second on; lines in files; and a quiet start."""
 
+import importlib
 import re
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import warp as wp
 import warpshadow as ws
 from warpshadow.device import progress
 from warpshadow.device.progress import progress_bar, waiting
+from warpshadow.device.warp_internals import kernel_modules
 
 
 @pytest.fixture
@@ -84,10 +86,10 @@ def test_a_loop_of_calls_says_nothing_and_one_long_call_does(lines):
 def test_lines_are_hidden_as_bars_are(lines):
     with progress_bar(3, "counting", "thing", shows=False):
         time.sleep(0.3)
-    with waiting("rendering", shows=False), progress._compiling("folder"):
+    with waiting("rendering", shows=False), progress._compiling():
         time.sleep(0.3)
     ws.quiet(progress=False)
-    with waiting("rendering"), progress_bar(3, "counting", "thing"), progress._compiling("folder"):
+    with waiting("rendering"), progress_bar(3, "counting", "thing"), progress._compiling():
         time.sleep(0.3)
     ws.quiet()
     assert not lines()
@@ -105,6 +107,25 @@ def test_compiled_kernels_are_counted(lines):
         assert re.match(r"compiling kernels, module \d+: \d s", lines()[0])
         wp.launch(name_that_no_other_kernel_has, dim=1, inputs=[wp.zeros(1, device="cpu"), 3], device="cpu")
     assert not lines()
+
+
+def test_kernels_of_the_library_are_loaded_without_a_line_of_warps(capfd, monkeypatch):
+    @wp.kernel(enable_backward=False, module="unique")
+    def somebody_elses(numbers: wp.array(dtype=float)):
+        numbers[wp.tid()] = 1.0
+
+    def said(level):
+        monkeypatch.setattr(wp.config, "log_level", level)
+        for module in (kernel_modules()["warpshadow.stages.film"], somebody_elses.module):
+            module.unload()
+            module.load("cpu", 1)
+        assert wp.config.log_level == level
+        return capfd.readouterr().out
+
+    importlib.import_module("warpshadow.stages.film")
+    assert "film" not in (lines := said(wp.LOG_INFO)) and "somebody_elses" in lines
+    assert "film" in said(wp.LOG_DEBUG)
+    assert "load" not in said(wp.LOG_WARNING)
 
 
 def test_a_wait_that_fails_is_over(lines):

@@ -1,10 +1,13 @@
 """Receivers: vertices, points that samples see, and how an image gets its light from them."""
 
+import itertools
+
 import numpy as np
 import pytest
 import warp as wp
 
 import warpshadow as ws
+from warpshadow.assets.primitives import icosphere
 from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.project import to_clip
@@ -195,3 +198,47 @@ def test_receivers_of_bodies_that_are_told_apart_follow_each_other(device, wants
             )
             gaps = np.abs(at - found.points.numpy()[:, first:end])[sides >= 0]
             assert gaps.max() < FLOAT32
+
+
+def seen_points(device, mesh, matrix, *, rises, turned=False):
+    """Points of all samples that see a mesh, from its front or, turned over, from behind."""
+    positions = wp.array(mesh.positions[None], dtype=wp.vec3, device=device)
+    faces = wp.array(mesh.faces[:, ::-1] if turned else mesh.faces, dtype=wp.vec3i, device=device)
+    normals = vertex_normals(positions, faces)
+    fragments = rasterize(to_clip(positions, wp.array([matrix], dtype=wp.mat44, device=device)), faces, 24, 24)
+    wants = np.ones(len(mesh.faces), bool)
+    numbering = number_receivers(faces, np.zeros((1, len(mesh.positions)), bool))
+    return find_receivers(positions, normals, faces, fragments, numbering, wants, rises=rises).points.numpy()[0]
+
+
+def test_points_for_rays_rise_towards_the_surface_that_normals_round(device):
+    ball, matrix = icosphere(1.0, 2), ws.Camera.look_at((0, 0, 3), (0, 0, 0), fov_y=30, size=(24, 24)).clip_matrix()
+    flat, risen = (np.linalg.norm(seen_points(device, ball, matrix, rises=rises), axis=1) for rises in (False, True))
+    assert 1 - flat.min() > 0.015
+    assert risen.min() > 1 - FLOAT32 and risen.max() - 1 < 1 - flat.min()  # out of its faces, and not far
+
+
+def test_points_for_rays_stay_where_normals_say_nothing_of_a_smooth_surface(device):
+    matrix = ws.Camera.look_at((1, 2, 3), (0, 0, 0), fov_y=30, size=(24, 24)).clip_matrix()
+    corners = np.array([*itertools.product((-0.5, 0.5), repeat=3)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    box = ws.Mesh(corners, [triangle for a, b, c, d in quads for triangle in ((a, b, c), (a, c, d))])
+    for mesh in (ws.plane(1.0, 2), box):  # vertices of the box have one normal for three faces
+        flat, risen = (seen_points(device, mesh, matrix, rises=rises) for rises in (False, True))
+        assert np.abs(risen - flat).max() < FLOAT32
+    hollow = seen_points(device, icosphere(1.0, 2), matrix, rises=True, turned=True)
+    np.testing.assert_allclose(hollow, seen_points(device, icosphere(1.0, 2), matrix, rises=False), atol=FLOAT32)
+
+
+@pytest.mark.parametrize("sampling", ["independent", "shared"])
+def test_a_coarse_ball_has_a_smooth_terminator_by_rays(sampling):
+    lamp = np.zeros((32, 64, 3), np.float32)
+    lamp[12, 16] = 1.0  # above the horizon, to one side
+    camera = ws.Camera.look_at((0, 0, 4), (0, 0, 0), fov_y=40, size=(48, 48))
+    rays = ws.Visibility("ray-traced", samples=64, sampling=sampling)
+    lit, unshadowed = (
+        ws.render(ws.Scene([body], ws.EnvironmentMap(lamp), camera, rays), progress=False)[..., 0]
+        for body in (ws.Body(icosphere(1.0, 2)), ws.Body(icosphere(1.0, 2), blockers=0))
+    )
+    assert unshadowed.max() > 0
+    assert np.abs(lit - unshadowed).max() < 0.02 * unshadowed.max()  # nothing is there to cast a shadow on the ball

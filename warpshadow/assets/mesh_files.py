@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -31,6 +30,7 @@ from warpshadow.assets.mesh import (
     turned_over,
 )
 from warpshadow.assets.mesh_joining import JoinedMesh, fan, join_parts, joined_normals, weld, with_colors
+from warpshadow.assets.obj import read_items, read_pictures
 from warpshadow.assets.ply import ply_colors, ply_corner_uvs, ply_fault
 from warpshadow.assets.topology import CREASE, is_listed_first, join_faces, part_at_creases, rounds_edges
 from warpshadow.check import AnyPath
@@ -168,90 +168,24 @@ def _texels(picture: BaseColor) -> np.ndarray:
     return (srgb_to_linear(codes / 255) * picture.factor).astype(np.float32)
 
 
-def _read_plain_obj(text: str) -> MeshPart | None:
-    """Read an OBJ file of vertices and triangles alone, in a tenth of the time; None for any other."""
-    vertex_lines, face_lines = re.findall(r"^v (.*)", text, re.M), re.findall(r"^f (.*)", text, re.M)
-    other_lines = re.findall(r"^(?:#|vn |s |$)", text, re.M)
-    if len(vertex_lines) + len(face_lines) + len(other_lines) < text.count("\n") + 1:
-        return None
-    if not (vertex_lines and face_lines) or " ".join(face_lines).strip("0123456789 \t"):
-        return None
-    try:
-        positions = np.loadtxt(vertex_lines, ndmin=2, comments=None)
-        faces = np.loadtxt(face_lines, dtype=np.int64, ndmin=2, comments=None) - 1
-    except ValueError:  # as where lines differ in length: the other reader says which
-        return None
-    return MeshPart(positions, faces) if positions.shape[1] == faces.shape[1] == 3 else None
-
-
 def _read_obj(path: Path) -> list[MeshPart]:
-    """Read v, vt and f lines: trimesh would split the vertices at uv seams and reorder them."""
-    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
-    plain = _read_plain_obj(text)
-    if plain is not None:
-        return [plain]
-    positions, colors, uvs, corners, uv_corners, corner_counts = [], [], [], [], [], []
-    libraries, material, materials = [], "", set()
-    for number, line in enumerate(text.split("\n"), start=1):
-        try:
-            match line.partition("#")[0].split():
-                case ["v", x, y, z, *rest]:
-                    positions.append((float(x), float(y), float(z)))
-                    if len(rest) >= 3:  # a number before the color, or one alone, is a weight
-                        r, g, b = rest[len(rest) > 3 :][:3]
-                        colors.append((float(r), float(g), float(b)))
-                case ["vt", u, *rest]:
-                    uvs.append((float(u), float(rest[0]) if rest else 0.0))
-                case ["mtllib", *words]:
-                    libraries.append(" ".join(words))
-                case ["usemtl", *words]:
-                    material = " ".join(words)
-                case ["f", *tokens]:
-                    materials.add(material)
-                    corner_counts.append(len(tokens))
-                    for token in tokens:
-                        vertex, _, others = token.partition("/")
-                        corners.append(_obj_index(vertex, len(positions)))
-                        if uv := others.partition("/")[0]:
-                            uv_corners.append(_obj_index(uv, len(uvs)))
-                case ["v" | "vt", *coordinates]:
-                    raise ValueError(f"{len(coordinates)} coordinates are too few")
-        except ValueError as error:
-            raise MeshError(f"line {number}: {error}, got {line.strip()!r}") from None
-    faces = fan(np.array(corner_counts, dtype=np.int64))
-    pictures = _obj_pictures([path.parent / library for library in libraries])
-    part = MeshPart(np.array(positions).reshape(-1, 3), np.array(corners, dtype=np.int64)[faces])
-    part = part._replace(pictures=tuple(pictures.get(name) for name in sorted(materials)))
+    """Read an OBJ file: trimesh would split the vertices at uv seams and reorder them."""
+    items = read_items(path)
+    positions, colors, corners = items.positions, items.colors, items.corners
+    faces = fan(items.corner_counts)
+    pictures = read_pictures([path.parent / library for library in items.libraries])
+    part = MeshPart(positions, corners[faces])
+    part = part._replace(pictures=tuple(pictures.get(name) for name in sorted(items.materials)))
     if 0 < len(colors) < len(positions):
         part = part._replace(colorless=f"colors dropped, which {len(positions) - len(colors)} vertices lack")
-    elif colors:
-        part = with_colors(part, np.array(colors))
-    if not uv_corners:
+    elif len(colors):
+        part = with_colors(part, colors)
+    missing = len(corners) - len(items.uv_corners)
+    if missing == len(corners):
         return [part]
-    if len(uv_corners) < len(corners):
-        missing = len(corners) - len(uv_corners)
+    if missing:
         return [part._replace(remark=f"uvs dropped because {missing} of {len(corners)} corners have none")]
-    return [part._replace(uvs=np.array(uvs).reshape(-1, 2), uv_faces=np.array(uv_corners)[faces])]
-
-
-def _obj_pictures(libraries: list[Path]) -> dict[str, BaseColor]:
-    """The diffuse pictures of the materials of MTL files, as far as the files exist."""
-    pictures, material = {}, ""
-    for library in filter(Path.is_file, libraries):
-        for line in library.read_text(encoding="utf-8", errors="replace").splitlines():
-            match line.split():
-                case ["newmtl", *words]:
-                    material = " ".join(words)
-                case [keyword, *words] if keyword.lower() == "map_kd":
-                    name = words[-1] if words and words[0].startswith("-") else " ".join(words)  # after options
-                    pictures[material] = BaseColor(library.parent / name.replace("\\", "/"))
-    return pictures
-
-
-def _obj_index(token: str, count: int) -> int:
-    """Zero-based index of a one-based one, or of one that counts back from the last item so far."""
-    index = int(token)
-    return index + count if index < 0 else index - 1
+    return [part._replace(uvs=items.uvs, uv_faces=items.uv_corners[faces])]
 
 
 def _read_trimesh(path: Path) -> list[MeshPart]:

@@ -16,7 +16,7 @@ from warpshadow.assets.mesh import (
     MeshPart,
     checked_indices,
 )
-from warpshadow.assets.topology import CREASE, is_listed_first
+from warpshadow.assets.topology import CREASE, is_listed_first, number_places
 
 
 class JoinedMesh(NamedTuple):
@@ -114,9 +114,10 @@ def fan(corner_counts: np.ndarray) -> np.ndarray:
 
 def weld(faces: np.ndarray, *attributes: np.ndarray) -> np.ndarray:
     """Let faces refer to the first of the vertices that agree in all attributes."""
-    rows = np.column_stack(attributes) + 0.0  # makes -0 equal to 0
-    _, first, group = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    return first[group.reshape(-1)][faces]
+    group = number_places(np.column_stack(attributes))
+    first = np.empty(len(group), np.int64)
+    first[group[::-1]] = np.arange(len(group))[::-1]  # the last of these assignments stays
+    return first[group][faces]
 
 
 def joined_normals(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:

@@ -27,22 +27,26 @@ def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np
         and has no neighbors itself.
     """
     check.shape("faces", faces.shape, ("face", 3))
-    faces = faces.astype(np.int64) if positions is None else _places(positions)[faces]
+    faces = faces.astype(np.int64) if positions is None else number_places(positions)[faces]
     neighbor = np.full(faces.shape, -1, np.int32)
     proper = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
     ends = np.sort(np.stack([np.roll(faces[proper], -1, axis=1), np.roll(faces[proper], -2, axis=1)], axis=-1), axis=-1)
     first, last = ends.reshape(-1, 2).T
-    _, edge, sharing = np.unique(first * (faces.max(initial=0) + 1) + last, return_inverse=True, return_counts=True)
-    owner = np.repeat(proper, 3)
-    total = np.zeros(len(sharing), np.int64)
-    np.add.at(total, edge, owner)
-    result = np.where(sharing[edge] == 2, total[edge] - owner, np.where(sharing[edge] == 1, -1, _NOT_MANIFOLD))
+    lines, owner = first * (faces.max(initial=0) + 1) + last, np.repeat(proper, 3)
+    order = np.argsort(lines)
+    is_next = np.zeros(len(lines) + 2, bool)  # of the same edge as the one before
+    is_next[1:-2] = lines[order[1:]] == lines[order[:-1]]
+    result = np.full(len(lines), -1, np.int32)
+    result[order[is_next[:-2] | is_next[1:-1]]] = _NOT_MANIFOLD
+    pair = np.flatnonzero(~is_next[:-2] & is_next[1:-1] & ~is_next[2:])
+    one, other = order[pair], order[pair + 1]
+    result[one], result[other] = owner[other], owner[one]
     neighbor[proper] = result.reshape(-1, 3)
     return neighbor
 
 
-def _places(positions: np.ndarray) -> np.ndarray:
-    """Number the distinct positions of vertices: vertices at the same position share a number, shape [vertex]."""
+def number_places(positions: np.ndarray) -> np.ndarray:
+    """Number the distinct positions of vertices, or rows of any width: equal ones share a number, shape [vertex]."""
     permutation = np.lexsort(positions.T)
     is_new = (np.diff(positions[permutation], axis=0) != 0).any(axis=1)
     places = np.zeros(len(positions), np.int64)
@@ -56,7 +60,7 @@ def welded(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     The first of each stays, in order: so split vertices become one again.
     """
     used = np.unique(faces)
-    places = _places(positions[used])
+    places = number_places(positions[used])
     _, first, place = np.unique(places, return_index=True, return_inverse=True)
     first_vertices = np.sort(first)
     number = np.searchsorted(first_vertices, first)[place]
@@ -81,7 +85,7 @@ def part_at_creases(
         The faces by new vertices, int32 of shape [face, 3]; and the vertex that each new one is a copy of, int32 of
         shape [vertex]: the old ones are the first, in their order.
     """
-    places, normals = _places(positions)[surface.faces], face_normals(positions[surface.faces])
+    places, normals = number_places(positions)[surface.faces], face_normals(positions[surface.faces])
     face, edge = np.nonzero(surface.neighbors >= 0)
     neighbor = surface.neighbors[face, edge]
     is_smooth = np.einsum("ij,ij->i", normals[face], normals[neighbor]) >= np.cos(np.radians(angle))
@@ -113,11 +117,12 @@ def rounds_edges(surface: MeshTopology, positions: np.ndarray) -> bool:
     Such pieces, as many boxes are, have most of the sharp edges, longer in all than the diagonal of the mesh.
     """
     corners = positions[surface.faces].astype(np.float64)
-    face, edge, neighbor, is_parted = _inner_edges(surface)
-    is_rounded = ~is_parted & (face < neighbor)
-    face, edge, neighbor = face[is_rounded], edge[is_rounded], neighbor[is_rounded]
-    normals = face_normals(corners)
+    face, edge = np.nonzero(surface.neighbors > np.arange(len(corners))[:, None])  # each edge once
+    neighbor, normals = surface.neighbors[face, edge], face_normals(corners)
     cosines = np.einsum("ij,ij->i", normals[face], normals[neighbor])
+    bent = np.flatnonzero(cosines < np.cos(np.radians(20)))
+    bent = bent[~_is_parted(surface, face[bent], edge[bent], neighbor[bent])]
+    face, edge, cosines = face[bent], edge[bent], cosines[bent]
     lengths = np.linalg.norm(np.subtract(*corners[face, (edge + [[1], [2]]) % 3]), axis=1)
     diagonal = np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0))
     if lengths[cosines < np.cos(np.radians(50))].sum() <= diagonal:
@@ -144,7 +149,9 @@ def creases(surface: MeshTopology, positions: np.ndarray) -> np.ndarray:
     Returns:
         2ᵏ for the edge opposite to corner k of each face, int32 of shape [face].
     """
-    face, edge, neighbor, is_parted = _inner_edges(surface)
+    face, edge = np.nonzero(surface.neighbors >= 0)
+    neighbor = surface.neighbors[face, edge]
+    is_parted = _is_parted(surface, face, edge, neighbor)
     face, edge, neighbor = face[is_parted], edge[is_parted], neighbor[is_parted]
     normals = (face_normals(positions[surface.faces[numbers]]) for numbers in (face, neighbor))
     is_bent = np.einsum("ij,ij->i", *normals) < np.cos(np.radians(1.0))
@@ -153,13 +160,11 @@ def creases(surface: MeshTopology, positions: np.ndarray) -> np.ndarray:
     return result @ np.array([1, 2, 4], np.int32)
 
 
-def _inner_edges(surface: MeshTopology) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Edges with a face across: face, opposite corner, face across, and whether an end is a vertex of one face only."""
-    face, edge = np.nonzero(surface.neighbors >= 0)
-    neighbor = surface.neighbors[face, edge]
+def _is_parted(surface: MeshTopology, face: np.ndarray, edge: np.ndarray, neighbor: np.ndarray) -> np.ndarray:
+    """Whether an end of edges, of faces, opposite to corners, is a vertex of one of their two faces only."""
     ends = surface.faces[face, (edge + [[1], [2]]) % 3]
     is_shared = [(surface.faces[neighbor] == vertex[:, None]).any(axis=1) for vertex in ends]
-    return face, edge, neighbor, ~np.logical_and(*is_shared)
+    return ~np.logical_and(*is_shared)
 
 
 def face_normals(corners: np.ndarray) -> np.ndarray:
@@ -197,19 +202,34 @@ def is_listed_first(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
     Faces without area are not compared.
     """
-    corners = np.sort(_places(positions)[faces], axis=1)
+    places = number_places(positions)
+    sums = _scrambled(places)[faces].sum(axis=1)  # equal for the same corners, and hardly ever for others
+    rising = np.sort(sums)
+    repeated = rising[1:][rising[1:] == rising[:-1]]
+    is_first = np.ones(len(faces), bool)
+    if not len(repeated):
+        return is_first
+    candidates = np.flatnonzero(np.isin(sums, repeated))
+    corners = np.sort(places[faces[candidates]], axis=1)
     permutation = np.lexsort(corners.T)  # which keeps the order of equal ones
     is_equal = (corners[permutation[1:]] == corners[permutation[:-1]]).all(axis=1) & (
         np.diff(corners[permutation[1:]], axis=1) != 0
     ).all(1)
-    is_first = np.ones(len(faces), bool)
-    is_first[permutation[1:]] = ~is_equal
+    is_first[candidates[permutation[1:]]] = ~is_equal
     return is_first
+
+
+def _scrambled(numbers: np.ndarray) -> np.ndarray:
+    """Scramble whole numbers to 64 bits, uint64 [Steele et al. 2014, SplitMix]."""
+    words = (numbers.astype(np.uint64) + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        words = (words ^ (words >> np.uint64(shift))) * np.uint64(factor)
+    return words ^ (words >> np.uint64(31))
 
 
 def join_faces(positions: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | None) -> MeshTopology:
     """Join faces of which none is listed twice."""
-    places = _places(positions)[faces]
+    places = number_places(positions)[faces]
     neighbors = edge_neighbors(places)
     first, last = np.roll(places, -1, axis=1), np.roll(places, -2, axis=1)  # of the edges opposite to corners
     neighbor = np.maximum(neighbors, 0)
@@ -221,26 +241,34 @@ def join_faces(positions: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | 
         winds_alike |= neighbors < 0
         faces, places, neighbors = (_with_turned(values, is_turned) for values in (faces, places, neighbors))
         uv_faces = None if uv_faces is None else _with_turned(uv_faces, is_turned)
-    return MeshTopology(faces, uv_faces, neighbors, bool(winds_alike.all()) and _is_closed(positions, faces, places))
+    is_closed = bool(winds_alike.all()) and _is_closed(positions, faces, places, neighbors)
+    return MeshTopology(faces, uv_faces, neighbors, is_closed)
 
 
-def _is_closed(positions: np.ndarray, faces: np.ndarray, places: np.ndarray) -> bool:
+def _is_closed(positions: np.ndarray, faces: np.ndarray, places: np.ndarray, neighbors: np.ndarray) -> bool:
     """Whether as many faces run along each edge one way as the other, and each piece encloses a positive volume.
 
-    So boxes that share an edge, at which four faces meet, are closed as each of them is. ``places`` of the faces'
-    corners are the same where positions are.
+    So boxes that share an edge, at which four faces meet, are closed as each of them is. Faces wind alike, and
+    ``places`` of their corners are the same where positions are.
     """
     is_proper = (places != np.roll(places, 1, axis=1)).all(axis=1)
-    places, corners = places[is_proper], (positions - positions[0].astype(np.float64))[faces[is_proper]]
-    starts, ends = places.ravel(), np.roll(places, -1, axis=1).ravel()
-    lines = np.minimum(starts, ends) * (places.max(initial=0) + 1) + np.maximum(starts, ends)
-    _, edge = np.unique(lines, return_inverse=True)
-    if np.bincount(edge, np.where(starts < ends, 1, -1)).any():
+    if (neighbors[is_proper] == -1).any():  # a border
         return False
-    count = len(places)
-    piece = connected_components(np.repeat(np.arange(count), 3), count + edge, count + len(edge))[:count]
-    a, b, c = np.moveaxis(corners, 1, 0)
-    return bool((np.bincount(piece, np.einsum("ij,ij->i", a, np.cross(b, c))) > 0).all())
+    count = len(faces)
+    if (neighbors[is_proper] >= 0).all():
+        face, edge = np.nonzero(neighbors > np.arange(count)[:, None])
+        piece = connected_components(face, neighbors[face, edge], count)
+    else:
+        starts, ends = places[is_proper].ravel(), np.roll(places[is_proper], -1, axis=1).ravel()
+        lines = np.minimum(starts, ends) * (places.max(initial=0) + 1) + np.maximum(starts, ends)
+        _, edge = np.unique(lines, return_inverse=True)
+        if np.bincount(edge, np.where(starts < ends, 1, -1)).any():
+            return False
+        links = np.repeat(np.flatnonzero(is_proper), 3), count + edge
+        piece = connected_components(*links, count + int(edge.max(initial=-1)) + 1)[:count]
+    a, b, c = np.moveaxis(positions[faces] - positions[0].astype(np.float64), 1, 0)
+    volumes = np.bincount(piece[is_proper], np.einsum("ij,ij->i", a, np.cross(b, c))[is_proper])
+    return bool((volumes[np.unique(piece[is_proper])] > 0).all())
 
 
 def _turned(neighbors: np.ndarray, winds_alike: np.ndarray) -> np.ndarray:

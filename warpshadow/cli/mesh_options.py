@@ -17,9 +17,13 @@ SceneOrMesh = Annotated[
     ),
 ]
 
+OF_MESHES = "Options of a mesh, which scene files have as keys"
+
 Up = Annotated[
     Optional[Literal["y", "z"]],
-    typer.Option(help="Of a mesh: the axis that points up; without it, it is guessed by how the mesh stands."),
+    typer.Option(
+        help="Axis that points up; without it, it is guessed by how the mesh stands.", rich_help_panel=OF_MESHES
+    ),
 ]
 
 
@@ -34,28 +38,35 @@ def _two_numbers(size: tuple[str, str] | None) -> tuple[str, str] | None:
 Size = Annotated[
     Optional[tuple[str, str]],
     typer.Option(
-        help="Of a mesh: width and height of the image, in pixels; without it 512 512.",
+        help="Width and height of the image, in pixels; without it 512 512.",
+        rich_help_panel=OF_MESHES,
         metavar="WIDTH HEIGHT",
         callback=_two_numbers,
     ),
 ]
 
 Light = Annotated[
-    Optional[Path], typer.Option(help="Of a mesh: file of an environment map, .exr or .hdr, in place of a sky.")
+    Optional[Path],
+    typer.Option(help="File of an environment map, .exr or .hdr, in place of a sky.", rich_help_panel=OF_MESHES),
 ]
 
 Direction = Annotated[
     Optional[tuple[float, float, float]],
     typer.Option(
-        help="Of a mesh: where the camera stands, seen from the mesh's middle, y up; without it 0.3 0.4 0.9; from "
-        "behind it is 0.3 0.4 -0.9.",
+        help="Where the camera stands, seen from the mesh's middle, y up; without it 0.3 0.4 0.9; from behind it is "
+        "0.3 0.4 -0.9.",
+        rich_help_panel=OF_MESHES,
         metavar="X Y Z",
     ),
 ]
 
 LightRotation = Annotated[
     Optional[float],
-    typer.Option(help="Of a mesh: turn the light, counterclockwise seen from above, in degrees.", metavar="DEGREES"),
+    typer.Option(
+        help="Turn the light, counterclockwise seen from above, in degrees.",
+        metavar="DEGREES",
+        rich_help_panel=OF_MESHES,
+    ),
 ]
 
 

@@ -29,6 +29,7 @@ from warpshadow.cli.mesh_options import (
 )
 from warpshadow.scene.scene import Scene
 
+_PICTURES, _VIDEOS, _METHOD = "Pictures", "Videos", "Method, in place of the scene's"  # panels of the help
 _BACKGROUNDS = ("transparent", "environment")  # beside colors
 
 
@@ -62,32 +63,47 @@ def render(
     light: Light = None,
     direction: Direction = None,
     light_rotation: LightRotation = None,
-    png: Annotated[Optional[Path], typer.Option(help="Beside an .exr, also write a picture: .png, or .jpg.")] = None,
+    png: Annotated[
+        Optional[Path],
+        typer.Option(help="Beside an .exr, also write a picture: .png, or .jpg.", rich_help_panel=_PICTURES),
+    ] = None,
     exposure: Annotated[
         Optional[float],
-        typer.Option(help="Exposure of the picture in stops; without it the brightest 1% just saturate."),
+        typer.Option(
+            help="Exposure in stops; without it the brightest 1% just saturate.",
+            rich_help_panel=_PICTURES,
+        ),
     ] = None,
     tone: Annotated[
-        Literal["clip", "filmic"], typer.Option(help="What becomes of bright color in the picture: cut off, or bent.")
+        Literal["clip", "filmic"],
+        typer.Option(help="What becomes of bright color: cut off, or bent.", rich_help_panel=_PICTURES),
     ] = "clip",
     background: Annotated[
         str,
         typer.Option(
             help="Background of the picture or video: environment, a color (white, #ffcc00), or transparent, which "
-            ".jpg files and videos show as white."
+            ".jpg files and videos show as white.",
+            rich_help_panel=_PICTURES,
         ),
     ] = "transparent",
     turntable: Annotated[
-        Optional[int], typer.Option(help="Write a video of so many frames in which the camera goes around.", min=1)
+        Optional[int],
+        typer.Option(
+            help="Write a video of so many frames in which the camera goes around.", min=1, rich_help_panel=_VIDEOS
+        ),
     ] = None,
     fps: Annotated[
         Optional[float],
-        typer.Option(help="Frames a second of a turntable, 24 by default; 0.1 to 1000, of .webp 90, of .gif 50."),
+        typer.Option(
+            help="Frames a second of a turntable, 24 by default; 0.1 to 1000, of .webp 90, of .gif 50.",
+            rich_help_panel=_VIDEOS,
+        ),
     ] = None,
     camera_path: Annotated[
         Optional[Path],
         typer.Option(
-            help="Write a video along the keyframes of a TOML file, whose keys warpshadow/scene/README.md lists."
+            help="Write a video along the keyframes of a TOML file, whose keys warpshadow/scene/README.md lists.",
+            rich_help_panel=_VIDEOS,
         ),
     ] = None,
     stills: Annotated[
@@ -96,6 +112,7 @@ def render(
             "--stills",
             help="Render each frame of a video as an image alone: by rays, if the scene names no method. Shadows are "
             "better, and nothing is prepared, but each frame takes two to three times as long.",
+            rich_help_panel=_VIDEOS,
         ),
     ] = False,
     layers: Annotated[
@@ -109,18 +126,21 @@ def render(
     method: Annotated[
         Optional[Literal["directional", "log-sh", "none", "ray-traced", "auto"]],
         typer.Option(
-            help="How visibility is computed, in place of the scene's; ray-traced, the reference, is a path tracer "
-            "where light bounces."
+            help="How visibility is computed; ray-traced, the reference, is a path tracer where light bounces.",
+            rich_help_panel=_METHOD,
         ),
     ] = None,
     samples: Annotated[
         Optional[int],
-        typer.Option(help="Of the ray-traced method: rays of a pixel, and with bounces half as many paths.", min=1),
+        typer.Option(
+            help="Of ray-traced: rays of a pixel, and with bounces half as many paths.", min=1, rich_help_panel=_METHOD
+        ),
     ] = None,
     bounces: Annotated[
         Any,
         typer.Option(
-            help="How often light bounces, 0 to 16 or all, in place of the scene's.",
+            help="How often light bounces, 0 to 16 or all.",
+            rich_help_panel=_METHOD,
             parser=count_of_bounces,
             metavar="INTEGER|all",
         ),

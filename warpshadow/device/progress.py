@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from warpshadow.device.parallel import thread_count
-from warpshadow.device.warp_internals import around_compilation
+from warpshadow.device.warp_internals import around_compilation, load_silently
 
 _DELAY = 1.0  # time before a bar shows, and between its states where nothing is done [s]
 _LINE_INTERVAL = 10.0  # time between lines [s]
@@ -297,10 +297,11 @@ def _within(wait: Wait, *, shows: bool) -> Iterator[None]:
 _module_numbers = itertools.count(1)
 
 
-def _compiling(folder: str) -> contextlib.AbstractContextManager:
+def _compiling() -> contextlib.AbstractContextManager:
     """Say that kernels are compiled, and of which module of this process."""
     what = f"compiling kernels, module {next(_module_numbers)}"
     return progress_bar(None, what, "", shows=not _this_thread.is_hidden)
 
 
 around_compilation(_compiling)
+load_silently("warpshadow")

@@ -286,29 +286,23 @@ def kernel_modules() -> dict[str, wp.Module]:
     return wp._src.context.user_modules
 
 
-def around_compilation(context: Callable[[str], contextlib.AbstractContextManager]) -> None:
-    """From now on, compile modules of kernels within a context, which is made of the folder that they are put in.
+def around_compilation(context: Callable[[], contextlib.AbstractContextManager]) -> None:
+    """From now on, compile modules of kernels within a context, and one that several processes need in one of them.
 
-    A module that was compiled before, maybe where nothing can be written, is read without.
+    The others wait, and load it from Warp's cache. Should the one be killed, its lock ends with it, and the next
+    compiles. A module that was compiled before, maybe where nothing can be written, is read without.
     """
     compile_before = wp.Module._compile
 
     def compile_within(
         module: wp.Module, device: Any = None, output_dir: Any = None, *rest: Any, **options: Any
     ) -> bool:
-        is_new = output_dir is not None and not os.path.exists(output_dir)
-        with context(os.fspath(output_dir)) if is_new else contextlib.nullcontext():
+        if output_dir is None or os.path.exists(output_dir):
+            return compile_before(module, device, output_dir, *rest, **options)
+        with context(), _locked(os.fspath(output_dir)):
             return compile_before(module, device, output_dir, *rest, **options)
 
     wp.Module._compile = compile_within
-
-
-def compile_in_turn() -> None:
-    """From now on, let one process compile a module that several need: others wait, and load it from Warp's cache.
-
-    Should it be killed, its lock ends with it, and the next compiles.
-    """
-    around_compilation(_locked)
 
 
 @contextlib.contextmanager
@@ -316,9 +310,40 @@ def _locked(folder: str) -> Iterator[None]:
     from filelock import FileLock
 
     lock = FileLock(f"{folder}.lock")
-    with lock:
-        try:
-            yield
-        finally:
+    with contextlib.suppress(OSError, NotImplementedError):  # where no file can be locked, each compiles for itself
+        lock.acquire()
+    try:
+        yield
+    finally:
+        if lock.is_locked:
+            lock.release()
             with contextlib.suppress(OSError):  # of Windows, where filelock removes it
                 os.unlink(lock.lock_file)
+
+
+def load_silently(package: str) -> None:
+    """From now on, load modules of a package's kernels without Warp's line for each.
+
+    Its other messages stay, and so do these where ``wp.config.log_level`` is ``wp.LOG_DEBUG``.
+    """
+    load = wp.Module.load
+
+    @functools.wraps(load)
+    def load_in_silence(module: wp.Module, *arguments: Any, **options: Any) -> Any:
+        level = getattr(wp.config, "log_level", None)  # releases without it say no more than config.verbose asks for
+        if level is None or level != wp.LOG_INFO or not _is_of(module, package):
+            return load(module, *arguments, **options)
+        wp.config.log_level = wp.LOG_WARNING
+        try:
+            return load(module, *arguments, **options)
+        finally:
+            if wp.config.log_level == wp.LOG_WARNING:
+                wp.config.log_level = level
+
+    wp.Module.load = load_in_silence
+
+
+def _is_of(module: wp.Module, package: str) -> bool:
+    """Whether kernels of a module are a package's; modules of single kernels are named after these alone."""
+    kernel = next(iter(module.kernels.values()), None)
+    return kernel is not None and kernel.func.__module__.partition(".")[0] == package

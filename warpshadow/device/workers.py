@@ -21,7 +21,6 @@ from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 from warpshadow.device.parallel import set_thread_count, thread_count
 from warpshadow.device.progress import show_bars
 from warpshadow.device.startup import start_quietly
-from warpshadow.device.warp_internals import compile_in_turn
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -220,7 +219,6 @@ def set_up(threads: int) -> None:
 
     tqdm.set_lock(threading.RLock())  # in place of a semaphore, which outlives a process that is killed
     start_quietly()
-    compile_in_turn()
     show_bars(False)
     set_thread_count(threads)
     threadpool_limits(limits=threads)

@@ -166,6 +166,7 @@ class View(LitPoints):
             supersampling=supersampling,
             quadtree=quadtree,
             shares_surfaces=shares_surfaces,
+            rises=method.lights_samples,
         )
 
     @functools.cached_property

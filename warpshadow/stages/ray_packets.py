@@ -47,23 +47,25 @@ def build_face_tree(positions: np.ndarray, faces: np.ndarray, device: wp.DeviceL
     """
     corners = np.asarray(positions, np.float32)[np.asarray(faces)]
     face_count, depth = len(corners), max(int(np.ceil(np.log2(max(len(corners), 1) / _LEAF))), 0)
-    middles, permutation = (corners.min(axis=1) + corners.max(axis=1)) / 2, np.arange(face_count)
+    lowest, highest = (np.ascontiguousarray(end(corners, axis=1).T) for end in (np.min, np.max))  # [3, face]
+    middles, permutation = (lowest + highest) / 2, np.arange(face_count)
     for level in range(depth):
         bounds, halves = _bounds(face_count, level), _bounds(face_count, level + 1)[1::2]
-        low, high = (ends.reduceat(middles[permutation], bounds[:-1]) for ends in (np.minimum, np.maximum))
-        longest_axis = np.argmax(high - low, axis=1)
+        low, high = (end.reduceat(middles, bounds[:-1], axis=1) for end in (np.minimum, np.maximum))
+        longest_axis = np.argmax(high - low, axis=0)
         sizes = np.stack([np.diff(bounds), halves - bounds[:-1]], axis=1)  # faces, and those of the first half
         for size, half in np.unique(sizes, axis=0):
             boxes = np.flatnonzero((sizes == (size, half)).all(axis=1))
             places = bounds[boxes, None] + np.arange(size)
-            faces_of = permutation[places]
-            parted = np.argpartition(middles[faces_of, longest_axis[boxes, None]], half, axis=1)
-            permutation[places] = np.take_along_axis(faces_of, parted, axis=1)
+            parted = np.argpartition(middles[longest_axis[boxes, None], places], half, axis=1)
+            parted += bounds[boxes, None]
+            permutation[places], middles[:, places] = permutation[parted], middles[:, parted]
     corners, leaf_count = corners[permutation], 1 << depth
     lowers, uppers = np.zeros((2, 2 * leaf_count, 3), np.float32)
     if face_count:
         starts = _bounds(face_count, depth)[:-1]
-        low, high = np.minimum.reduceat(corners.min(axis=1), starts), np.maximum.reduceat(corners.max(axis=1), starts)
+        low = np.minimum.reduceat(lowest[:, permutation], starts, axis=1).T
+        high = np.maximum.reduceat(highest[:, permutation], starts, axis=1).T
         slack = np.float32(_SLACK) * np.maximum(-low, high).max(axis=1, keepdims=True)
         lowers[leaf_count:], uppers[leaf_count:] = low - slack, high + slack
     for level in reversed(range(depth)):
