@@ -155,15 +155,18 @@ class View(LitPoints):
             numbering,
             wants_samples[merged_scene.body_of_face],
         )
-        shares_surfaces, supersampling = method.shares_directions, self._supersampling
-        if shares_surfaces and supersampling > MOST_SHARED:
-            shares_surfaces, supersampling = False, 1  # each sample is a receiver
+        smooth_pieces, supersampling = None, self._supersampling
+        if method.shares_directions:
+            if supersampling > MOST_SHARED:
+                supersampling = 1  # each sample is a receiver
+            else:
+                smooth_pieces = merged_scene.smooth_pieces
         return find_receivers(
             *arguments,
             bodies=bodies,
             supersampling=supersampling,
             quadtree=quadtree,
-            shares_surfaces=shares_surfaces,
+            smooth_pieces=smooth_pieces,
         )
 
     @functools.cached_property
