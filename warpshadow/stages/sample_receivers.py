@@ -3,8 +3,8 @@
 Samples of a pixel that see the same side share one, at the mean of their points: with four samples a pixel that is 1.1
 to 1.5 receivers a pixel, where faces have 400 to 10 pixels. In stills those that see different faces share one, too, if
 these belong to one smooth piece and the surface is even: shared by two slats of a bench, it lay in the gap or in the
-leg behind, and was black. (Stills of the cage of demos/kinds.py, 128², were 3.5% off, and are 2.5%.) In squares of a quadtree there is one at each corner, and
-samples interpolate in triangles of these.
+leg behind, and was black. (Stills of the cage of demos/kinds.py, 128², were 3.5% off, and are 2.5%.) In squares of a
+quadtree there is one at each corner, and samples interpolate in triangles of these.
 """
 
 import itertools

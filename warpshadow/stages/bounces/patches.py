@@ -144,7 +144,7 @@ def find_patches(
     if len(areas) and not is_two_sided:
         points = wp.array(positions, dtype=wp.vec3, device=device)
         mesh = wp.Mesh(points, wp.array(faces.ravel(), dtype=wp.int32, device=device))
-        is_outside, reaches_out = _find_outside(mesh, cut.pieces.positions(positions, faces), _LIFT * half_size)
+        is_outside, reaches_out = _find_outside(mesh, cut.pieces.positions(positions, faces), float(_LIFT * half_size))
     labels = np.full(len(areas), -1)
     labels[is_outside] = _clusters(features[is_outside], areas[is_outside], count)
     result: list[tuple[int, np.ndarray, int, float]] = []
