@@ -259,3 +259,14 @@ def test_round_meshes_and_irregular_ones_are_not_remarked_upon():
     lumpy = ws.Mesh(ball.positions * rng.uniform(0.85, 1.15, size=(ball.vertex_count, 1)), ball.faces)
     for mesh in (ball, ws.icosphere(1.0, 0), ws.icosphere(1.0, 1), ws.plane(2.0, 3), lumpy):
         assert not mesh.rounds_edges
+
+
+def test_smooth_pieces_end_at_sharp_edges_and_where_bodies_are_apart():
+    assert len(np.unique(CUBE.smooth_pieces)) == 6
+    np.testing.assert_array_equal(CUBE.smooth_pieces[::2], CUBE.smooth_pieces[1::2])  # the halves of its quads
+    assert len(np.unique(tube(24).smooth_pieces)) == 3
+    ball = ws.icosphere(1.0, 2)
+    for mesh in (ball, scattered(ball)):  # places join faces, whether they share vertices or not
+        assert not mesh.smooth_pieces.any()
+    two = ws.Mesh(np.concatenate([ball.positions, ball.positions + 3]), np.concatenate([ball.faces, ball.faces + 162]))
+    np.testing.assert_array_equal(two.smooth_pieces, np.repeat([0, 1], ball.face_count))

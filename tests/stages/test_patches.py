@@ -5,6 +5,7 @@ import pytest
 
 import warpshadow as ws
 from demos.scenes import shipped_mesh
+from warpshadow.stages.bounces.factors import patch_mesh, trace_factors
 from warpshadow.stages.bounces.patches import find_patches, find_plane_patches
 from warpshadow.stages.planes.grid import squeezed, stretched
 
@@ -71,6 +72,29 @@ def test_faces_between_boxes_that_touch_belong_to_no_patch():
     assert (front[is_outside] >= 0).all()
     np.testing.assert_allclose(patches.areas.sum(), area_of(steps) - 2, rtol=0.03)
     assert set(front) == {-1, *range(patches.count)}
+
+
+def test_narrow_steps_are_not_black_where_their_faces_go_on_below_the_next_one(device):
+    """Terraces narrower than pieces: rays from outside meet patches, whatever lies inside the next box."""
+    low, high = box((3.0, 0.1, 3.0)), box((2.8, 0.1, 2.8)).transformed(translation=np.array([0.1, 0.1, 0.1]))
+    steps = joined(low, high)
+    patches = patches_of(steps)
+    corners = patches.pieces.positions(steps.positions, steps.surface.faces)
+    assert np.linalg.norm(corners[:, 0] - corners[:, 1], axis=1).max() > 0.1  # pieces reach below the next box
+    places = np.linspace(0.1, 2.9, 60)
+    points = np.stack([np.full(60, 0.05), np.full(60, 0.11), places], axis=1)
+    normals = np.tile([0.0, -1.0, 0.0], (60, 1))
+    of_patches, of_body = (
+        trace_factors(
+            patch_mesh(patches, steps.positions, steps.surface.faces, device=device), *of_faces, points, normals
+        )
+        for of_faces in ((patches.of_pieces, patches.count), (np.zeros_like(patches.of_pieces), 1))
+    )
+    seen = of_body.toarray().ravel()
+    assert seen.min() > 0.9
+    np.testing.assert_allclose(of_patches.toarray().sum(axis=1), seen, atol=0.01)
+    hidden = 2 * 2.8**2
+    np.testing.assert_allclose(patches.areas.sum(), area_of(steps) - hidden, rtol=0.05)
 
 
 def test_every_patch_has_up_to_four_sources_on_it_that_weigh_one(mesh):

@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+import trimesh
 import warp as wp
 
 import warpshadow as ws
@@ -84,6 +85,63 @@ def test_samples_of_a_pixel_that_see_the_same_face_share_a_receiver_at_their_mea
         assert np.abs(got - expected).max() < FLOAT32
     own_count = found.points.shape[1] - 3 * (2 - sum(wants_samples))
     assert is_own.sum(axis=(1, 2)).max() / supersampling**2 < own_count < 0.8 * is_own.sum(axis=(1, 2)).max()
+
+
+def slats(device, *, bend: float = 0.0):
+    """Two slats side by side with a gap narrower than a pixel, of two long faces each, which bend along the diagonal.
+
+    Returns positions, faces, fragments and, for each sample of 10 × 10 pixels, the point that it sees.
+    """
+    corners = np.array([(-3, 0, 0), (3, 0, 0), (3, 0.45, bend), (-3, 0.45, 0)])
+    positions = np.concatenate([corners, corners + (0, 0.53, 0)])[None]
+    positions = wp.array(positions, dtype=wp.vec3, device=device)
+    faces = np.array([(0, 1, 2), (0, 2, 3), (4, 5, 6), (4, 6, 7)], np.int32)
+    faces = wp.array(faces, dtype=wp.vec3i, device=device)
+    camera = ws.Camera.look_at((0.1, 0.4, 3.0), (0, 0.38, 0), size=(20, 20), fov_y=40)
+    matrix = wp.array(camera.clip_matrix()[None], dtype=wp.mat44, device=device)
+    fragments = rasterize(to_clip(positions, matrix), faces, 20, 20)
+    return positions, faces, fragments, interpolate(fragments, faces, positions).numpy()[0]
+
+
+def shared_receivers(positions, faces, fragments, pieces):
+    wants, normals = np.ones(4, bool), vertex_normals(positions, faces)
+    numbering = number_receivers(faces, np.zeros((1, 8), bool))
+    pieces = wp.array(pieces, dtype=wp.int32, device=faces.device)
+    arguments = positions, normals, faces, fragments, numbering, wants
+    found = find_receivers(*arguments, supersampling=2, smooth_pieces=pieces)
+    return found.points.shape[1], interpolate(found.fragments, found.faces, found.points).numpy()[0]
+
+
+def test_samples_of_a_pixel_that_see_two_slats_have_receivers_on_their_own(device):
+    positions, faces, fragments, seen = slats(device)
+    is_seen, own_slat = (fragments.face_ids.numpy()[0] >= 0, seen[..., 1] > 0.49)
+    count, got = shared_receivers(positions, faces, fragments, (0, 0, 1, 1))
+    assert ((got[..., 1] > 0.49) == own_slat)[is_seen].all()
+    fewer, mixed = shared_receivers(positions, faces, fragments, (0, 0, 0, 0))
+    assert ((mixed[..., 1] > 0.49) != own_slat)[is_seen].any()  # pixels do see both
+    most, _ = shared_receivers(positions, faces, fragments, (0, 1, 2, 3))
+    assert fewer < count < most  # but faces of one slat share
+
+
+def test_a_receiver_of_several_faces_is_on_them_where_it_is_nearest_to_the_mean_of_its_samples(device):
+    positions, faces, fragments, seen = slats(device, bend=0.1)
+    face_ids = fragments.face_ids.numpy()[0]
+    _, got = shared_receivers(positions, faces, fragments, (0, 0, 1, 1))
+    corners = positions.numpy()[0][faces.numpy()]
+    several = 0
+    for row, column in np.ndindex(10, 10):
+        block = slice(2 * row, 2 * row + 2), slice(2 * column, 2 * column + 2)
+        for slat in (0, 1):
+            of_slat = face_ids[block] // 2 == slat
+            of_slat &= face_ids[block] >= 0
+            own = np.unique(face_ids[block][of_slat])
+            if len(own) == 2:
+                several += 1
+                middle = seen[block][of_slat].mean(axis=0)
+                on_faces = trimesh.triangles.closest_point(corners[own], np.tile(middle, (2, 1)))
+                nearest = on_faces[np.linalg.norm(on_faces - middle, axis=1).argmin()]
+                assert np.abs(got[block][of_slat] - nearest).max() < 10 * FLOAT32
+    assert several > 5
 
 
 def test_while_a_graph_is_captured_every_sample_has_room_for_a_receiver(device):

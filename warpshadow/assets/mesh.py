@@ -26,6 +26,7 @@ from warpshadow.assets.topology import (
     join_faces,
     part_at_creases,
     rounds_edges,
+    smooth_pieces,
 )
 from warpshadow.check import AnyPath
 from warpshadow.maths.convex import ConvexPart, find_convex_parts
@@ -221,6 +222,11 @@ class Mesh:
     def creases(self) -> np.ndarray:
         """Edges across which normals jump, 2ᵏ for that opposite to corner k of each face, int32 of shape [face]."""
         return creases(self.surface, self.positions)
+
+    @functools.cached_property
+    def smooth_pieces(self) -> np.ndarray:
+        """Number of the piece of each face of ``surface``, shape [face]; no sharp edge leads through a piece."""
+        return smooth_pieces(self.surface, self.positions)
 
     def write(self, path: AnyPath) -> None:
         """Write a Wavefront OBJ file that reads back as the same arrays, bit for bit; colors stand in it as sRGB."""

@@ -160,6 +160,15 @@ def creases(surface: MeshTopology, positions: np.ndarray) -> np.ndarray:
     return result @ np.array([1, 2, 4], np.int32)
 
 
+def smooth_pieces(surface: MeshTopology, positions: np.ndarray) -> np.ndarray:
+    """Number the pieces of a mesh within which faces join across edges that are not sharp, shape [face]."""
+    normals = face_normals(positions[surface.faces])
+    face, edge = np.nonzero(surface.neighbors > np.arange(len(surface.faces))[:, None])  # each edge once
+    neighbor = surface.neighbors[face, edge]
+    is_smooth = np.einsum("ij,ij->i", normals[face], normals[neighbor]) >= np.cos(np.radians(CREASE))
+    return connected_components(face[is_smooth], neighbor[is_smooth], len(surface.faces))
+
+
 def _is_parted(surface: MeshTopology, face: np.ndarray, edge: np.ndarray, neighbor: np.ndarray) -> np.ndarray:
     """Whether an end of edges, of faces, opposite to corners, is a vertex of one of their two faces only."""
     ends = surface.faces[face, (edge + [[1], [2]]) % 3]

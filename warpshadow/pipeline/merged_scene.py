@@ -102,6 +102,13 @@ class MergedScene:
         return self._array(result, wp.int32) if result.any() else None
 
     @functools.cached_property
+    def smooth_pieces(self) -> wp.array:
+        """Number of the smooth piece that each face is of, int32 of shape [face]: ``Mesh.smooth_pieces``."""
+        parts = [body.mesh.smooth_pieces for body in self.scene.bodies]
+        first = np.cumsum([0, *(part.max(initial=-1) + 1 for part in parts[:-1])])
+        return self._array(np.concatenate([part + shift for part, shift in zip(parts, first, strict=True)]), wp.int32)
+
+    @functools.cached_property
     def is_two_sided(self) -> np.ndarray:
         """Open bodies, which may be seen from behind, bool of shape [body]."""
         return np.array([not body.mesh.surface.is_closed for body in self.scene.bodies])

@@ -157,16 +157,19 @@ class View(LitPoints):
             numbering,
             wants_samples[merged_scene.body_of_face],
         )
-        shares_surfaces, supersampling = method.shares_directions, self._supersampling
-        if shares_surfaces and supersampling > MAX_SHARED:
-            shares_surfaces, supersampling = False, 1  # each sample is a receiver
+        smooth_pieces, supersampling = None, self._supersampling
+        if method.shares_directions:
+            if supersampling > MAX_SHARED:
+                supersampling = 1  # each sample is a receiver
+            else:
+                smooth_pieces = merged_scene.smooth_pieces
         return find_receivers(
             *arguments,
             bodies=bodies,
             supersampling=supersampling,
             quadtree=quadtree,
-            shares_surfaces=shares_surfaces,
             rises=method.lights_samples,
+            smooth_pieces=smooth_pieces,
         )
 
     @functools.cached_property

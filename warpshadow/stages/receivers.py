@@ -204,7 +204,7 @@ def find_receivers(
     bodies: np.ndarray | None = None,
     supersampling: int = 1,
     quadtree: Quadtree | None = None,
-    shares_surfaces: bool = False,
+    smooth_pieces: wp.array | None = None,
     rises: bool = False,
 ) -> Receivers:
     """Gather the points at which light is evaluated.
@@ -222,7 +222,8 @@ def find_receivers(
         supersampling: Supersampling, the samples of a pixel across and down: samples of a pixel with the same face
             share a receiver.
         quadtree: Squares in which samples of faces that want them interpolate; None for none.
-        shares_surfaces: Whether those that see different faces of one smooth surface share a receiver, too.
+        smooth_pieces: Smooth piece of each face, int32 of shape [face], where those that see different faces of one
+            share a receiver, too; None where they do not.
         rises: Whether samples' receivers rise from their faces towards the surface that normals round, for rays.
     Returns:
         Receivers; where no face wants samples, many views of one geometry share them. While a graph is captured every
@@ -239,9 +240,9 @@ def find_receivers(
         side_count, receiver_count = len(receiver_faces), numbering.receiver_count
         keys = np.zeros(len(faces), int) if bodies is None else bodies
         surface = None
-        if shares_surfaces and len(positions) == 1:
+        if smooth_pieces is not None and len(positions) == 1:
             seen_points = points_seen(positions, normals, faces, Fragments(*receiver_fragments.rows))
-            surface = SeenSurface(*seen_points, positions[0], faces)
+            surface = SeenSurface(*seen_points, positions[0], faces, smooth_pieces)
         arguments = receiver_fragments, side_count, wants_samples, keys, supersampling, quadtree, surface
         sample_receivers = find_sample_receivers(*arguments)
         receiver_fragments, seen = sample_receivers.fragments, sample_receivers.seen

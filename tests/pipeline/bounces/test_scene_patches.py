@@ -126,3 +126,20 @@ def test_many_bodies_share_a_scenes_patches_by_their_areas():
     assert len(few.of_body(0).sources.patches) > 3 * 256
     assert [many.of_body(number).count for number in (0, 19)] == [64, 32]
     assert len(many.of_body(0).sources.patches) == 3 * 64
+
+
+def test_closed_patches_have_the_nearest_open_one_of_their_body_for_a_stand_in(merged_scene):
+    senders = ScenePatches(merged_scene).senders(Materials.of_scene(merged_scene))
+    first, end, last = senders.first
+    ball = senders.patches[0]
+    is_open = np.ones(last, bool)
+    is_open[:end] = ball.centers[:, 1] > 0.2
+    found = senders.stand_ins(is_open)
+    np.testing.assert_array_equal(found[is_open], np.flatnonzero(is_open))
+    closed = np.flatnonzero(~is_open)
+    assert len(closed) > 20 and is_open[found[closed]].all() and (found[closed] < end).all()
+    away = np.linalg.norm(ball.centers[closed] - ball.centers[found[closed]], axis=1)
+    steps = np.linalg.norm(ball.centers[closed][:, None] - ball.centers[is_open[:end]], axis=2).min(axis=1)
+    np.testing.assert_allclose(away, steps, atol=0.05)  # normals count, too, which are a ball's places
+    is_open[:end] = False
+    np.testing.assert_array_equal(senders.stand_ins(is_open), np.arange(last))  # nothing stands in for a body

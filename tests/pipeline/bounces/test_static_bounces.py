@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import trimesh
 import warp as wp
 
 import warpshadow as ws
@@ -218,6 +219,32 @@ def test_white_balls_in_a_white_furnace_are_white(gap):
     image = TorchRenderer(scene, progress=False)(albedo=[torch.ones(1, 3), None]).numpy()
     seen = image[image[..., 3] > 0.99]
     np.testing.assert_allclose(seen[:, :3], 1, atol=0.03)
+
+
+def test_what_sticks_out_of_another_body_has_the_light_of_sources_outside():
+    """A ball shows a cap that is smaller than its patches: all sources of these lie in the box."""
+    box = trimesh.creation.box((2, 1, 2))
+    bodies = [
+        ws.Body(ws.icosphere(0.5, 3), albedo=(1, 1, 1), translation=(0, 0.06, 0)),
+        ws.Body(ws.Mesh(box.vertices, box.faces), albedo=(1, 1, 1)),
+    ]
+    camera = ws.Camera.look_at((0, 2, 4), (0, 0.5, 0), size=(16, 16), fov_y=30)
+    visibility = ws.Visibility("ray-traced", sampling="shared", samples=64)
+    engine = ws.Renderer(ws.Scene(bodies, ws.EnvironmentMap.constant(1.0), camera, visibility, bounces=1))
+    view = engine.view()
+    shading = view.shading(None)
+    shading.value(view.call)
+    (factors,) = (node for name, (_, node) in view._cached.items() if name == "form factors")
+    means = factors.value(view.call).of_sources.on_host()
+    senders = ScenePatches(engine.merged_scene).senders(view.materials)
+    points = senders.sources(view.vertices.value(view.call), view.normals.value(view.call)).points.numpy()[0]
+    is_outside = points[:, 1] > 0.5
+    of_ball = senders.body_of_patch[senders.patch_of_source] == 0
+    is_closed = senders.body_of_patch == 0
+    is_closed &= np.bincount(senders.patch_of_source, of_ball & is_outside, len(senders.areas)) == 0
+    assert 0 < (of_ball & is_outside).sum() < 0.1 * of_ball.sum() and is_closed.sum() > 50
+    outside_parts = means @ (of_ball & is_outside).astype(np.float32)
+    np.testing.assert_allclose(outside_parts[senders.body_of_patch == 0], 1, atol=1e-5)
 
 
 def gradient_and_difference(loss, tensor: torch.Tensor, step: float) -> tuple[float, float]:

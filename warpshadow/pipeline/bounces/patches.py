@@ -195,6 +195,27 @@ class Senders:
             positions, normals, self.merged_scene.faces, self.sides, self.barycentrics, self._bodies
         )
 
+    def stand_ins(self, is_open: np.ndarray) -> np.ndarray:
+        """The patch whose light each has: itself if it is open, else the nearest open one of its body, if any is.
+
+        Args:
+            is_open: Bool of shape [patch].
+        Returns:
+            Numbers of patches, int of shape [patch].
+        """
+        from scipy.spatial import cKDTree
+
+        result = np.arange(len(is_open))
+        for first, end, item in zip(self.first[:-1], self.first[1:], self.patches, strict=True):
+            open_patches = np.flatnonzero(is_open[first:end])
+            if 0 < len(open_patches) < end - first:
+                half_size = max(np.linalg.norm(np.ptp(item.centers, axis=0)) / 2, 1e-30)
+                features = np.concatenate([item.centers / half_size, item.normals], axis=1)
+                closed = np.flatnonzero(~is_open[first:end])
+                nearest = cKDTree(features[open_patches]).query(features[closed])[1]
+                result[first + closed] = first + open_patches[nearest]
+        return result
+
 
 def _joined(parts: list[np.ndarray], dtype: type) -> np.ndarray:
     return np.concatenate(parts).astype(dtype) if parts else np.empty(0, dtype)

@@ -11,8 +11,9 @@ Receivers of an image are many: F is found at some of them, and interpolated.
 Direct light and form factors must agree on how much of a hemisphere is open: where spheres block a part 1 − s of an
 even sky, and rays hit bodies in a part f, F is scaled by (1 − s) / f. Otherwise light is gained and lost: eighteen
 white balls in a white furnace were 0.91 to 1.06 bright. Points inside another body see its inside; they count neither
-in means over the sources of a patch nor as cache points. The radiosity is linear in light: of free light among bodies
-whose colors are known all of it is one matrix, which is cached. Differentiable in light and albedo.
+in means over the sources of a patch nor as cache points. A patch that has no other sources sticks out between them, if
+it is seen: it has the light of the nearest patch of its body. The radiosity is linear in light: of free light among
+bodies whose colors are known all of it is one matrix, which is cached. Differentiable in light and albedo.
 """
 
 from __future__ import annotations
@@ -230,7 +231,8 @@ class StaticBounces:
             at_receivers = [None] * len(at) if skies[1] is None else np.broadcast_to(skies[1], at.shape[:2])
             seen_by_sources = trace(sources.points.numpy()[0], sources.normals.numpy()[0], at_source)
             receiver_weights, to_cache_points = zip(*map(find_cache_points, at, facing, at_receivers), strict=True)
-            mean = mean_outside(senders.mean.on_host(), seen_by_sources.is_buried)
+            means, is_buried = senders.mean.on_host(), seen_by_sources.is_buried
+            mean = mean_outside(means, is_buried)[senders.stand_ins(means @ ~is_buried > 0)]
             between = (mean @ seen_by_sources.factors).tocoo()
             is_same_body = np.equal(*(senders.body_of_patch[patches] for patches in between.coords))
             within_bodies, between_bodies = (

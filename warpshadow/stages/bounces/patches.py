@@ -47,6 +47,8 @@ _LIFT = 1e-4
 """How far above a piece rays start that find out whether it is inside another part, in units of the body's size: where
 two parts touch, each is inside the other."""
 
+_INWARD = 0.1  # how far from a corner towards the middle a piece is looked at, to see whether it reaches out
+
 _LLOYD_STEPS = 8
 
 _LEARNED = 20_000  # pieces that k-means looks at, at most
@@ -117,7 +119,8 @@ def find_patches(
 ) -> Patches:
     """Find the patches of a body, by k-means of position and normal.
 
-    Pieces inside another part of a closed body, as those between the steps of stairs that are boxes, belong to none.
+    Pieces inside another part of a closed body, as those between the steps of stairs that are boxes, belong to none. A
+    piece that is mostly inside, and reaches out, sends the light of the nearest patch, whose area does not count it.
 
     Args:
         positions: Vertices [units of the body], shape [vertex, 3].
@@ -137,13 +140,11 @@ def find_patches(
     half_size = np.linalg.norm(np.ptp(cut.middles, axis=0)) / 2 if len(areas) else 1.0
     unit_normals = cut.areas / areas[:, None]
     features = np.concatenate([cut.middles / half_size, _NORMAL_WEIGHT * unit_normals], axis=1)
-    is_outside = np.ones(len(areas), bool)
+    is_outside, reaches_out = np.ones(len(areas), bool), np.zeros(len(areas), bool)
     if len(areas) and not is_two_sided:
         points = wp.array(positions, dtype=wp.vec3, device=device)
         mesh = wp.Mesh(points, wp.array(faces.ravel(), dtype=wp.int32, device=device))
-        lifted = (cut.middles + _LIFT * half_size * unit_normals).astype(np.float32)
-        is_buried = find_buried(mesh, lifted, unit_normals.astype(np.float32), len(areas))
-        is_outside = ~is_buried | is_buried.all()
+        is_outside, reaches_out = _find_outside(mesh, cut.pieces.positions(positions, faces), float(_LIFT * half_size))
     labels = np.full(len(areas), -1)
     labels[is_outside] = _clusters(features[is_outside], areas[is_outside], count)
     result: list[tuple[int, np.ndarray, int, float]] = []
@@ -160,6 +161,7 @@ def find_patches(
             result.append((cut.pieces.faces[piece], barycentrics, patch, areas[group].sum() / areas[members].sum()))
     weighted = np.concatenate([areas[:, None] * cut.middles, cut.areas, areas[:, None]], axis=1)
     sums = _sums(labels[is_outside], weighted[is_outside])
+    labels[reaches_out] = labels[is_outside][_nearest(features[is_outside], features[reaches_out])]
     return Patches(
         *_on_sides(sides, sums[:, 6], sums[:, :3] / sums[:, 6:], _unit(sums[:, 3:6])),
         _sources_of(result, sides, len(sums)),
@@ -244,26 +246,57 @@ def _cut(positions: np.ndarray, faces: np.ndarray, measured: Callable[[np.ndarra
     return _Cut(pieces, places.mean(axis=1), _areas(places))
 
 
+def _find_outside(mesh: wp.Mesh, corners: np.ndarray, lift: float) -> tuple[np.ndarray, np.ndarray]:
+    """Which pieces are outside of all parts of their body, and which of the others reach out.
+
+    Args:
+        mesh: The body, of parts that are closed.
+        corners: Of the pieces, shape [piece, 3, 3].
+        lift: How far above them rays start.
+    Returns:
+        Whether the middle is outside, bool of shape [piece]; all are where none would be. And whether it is not, but a
+        place near a corner is.
+    """
+    normals = _unit(_areas(corners))
+    middles = corners.mean(axis=1)
+
+    def is_buried(points: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        lifted, facing = (points + lift * normals[chosen]).astype(np.float32), normals[chosen].astype(np.float32)
+        return find_buried(mesh, lifted, facing, len(lifted))
+
+    is_inside = is_buried(middles, np.arange(len(corners)))
+    if is_inside.all():
+        return is_inside, ~is_inside
+    inside, reaches_out = np.flatnonzero(is_inside), np.zeros(len(corners), bool)
+    for corner in np.moveaxis(corners[inside], 1, 0):
+        reaches_out[inside] |= ~is_buried(corner + _INWARD * (middles[inside] - corner), inside)
+    return ~is_inside, reaches_out
+
+
 # ---------------------------------------------------------------------------------------------------- clusters
 
 
 def _clusters(features: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:
     """K-means [Lloyd 1982], from halves of halves: the cluster of each item, none empty."""
-    from scipy.spatial import cKDTree
-
     learned = np.arange(0, len(features), max(1, len(features) // _LEARNED))
     groups = _split(learned, features, weights, count)
     centers = np.array([np.average(features[group], axis=0, weights=weights[group]) for group in groups])
     if not len(centers):
         return np.zeros(0, int)
     for _ in range(_LLOYD_STEPS):
-        _, nearest = cKDTree(centers).query(features[learned])
+        nearest = _nearest(centers, features[learned])
         sums = _sums(nearest, weights[learned, None] * features[learned], len(centers))
         total = np.bincount(nearest, weights[learned], len(centers))[:, None]
         centers = np.where(total > 0, sums / np.where(total > 0, total, 1), centers)
-    _, nearest = cKDTree(centers).query(features)
-    used, labels = np.unique(nearest, return_inverse=True)
+    used, labels = np.unique(_nearest(centers, features), return_inverse=True)
     return np.argsort(compact_order(centers[used] * _COMPACT, runs=(_COMPACT_RUN,)))[labels]
+
+
+def _nearest(centers: np.ndarray, features: np.ndarray) -> np.ndarray:
+    """The nearest center of each feature."""
+    from scipy.spatial import cKDTree
+
+    return cKDTree(centers).query(features)[1]
 
 
 def _split(items: np.ndarray, points: np.ndarray, weights: np.ndarray, count: int) -> list[np.ndarray]:
