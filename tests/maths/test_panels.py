@@ -5,7 +5,8 @@ import pytest
 import trimesh
 
 import warpshadow as ws
-from warpshadow.maths.panels import find_panels
+from warpshadow.maths.convex import find_convex_parts
+from warpshadow.maths.panels import MOST_PANELS, TOLERANCES, find_panels
 
 TOLERANCE = 0.02
 
@@ -80,6 +81,19 @@ def test_sheets_that_bend_too_often_have_no_panels():
     assert find_panels(np.asarray(ball.vertices), half, TOLERANCE, 32) is None
     points, triangles = open_box()
     assert find_panels(points, triangles, TOLERANCE, 4) is None
+
+
+@pytest.mark.parametrize("height", [0.3, 0.5, 1.0])
+def test_domes_have_panels_and_deep_ones_coarser_ones(height):
+    ball = trimesh.creation.icosphere(4)
+    faces = np.asarray(ball.faces)[ball.triangles_center[:, 1] > 1 - height]
+    parts = find_convex_parts(np.asarray(ball.vertices, np.float32), faces)
+    assert 16 <= len(parts) <= MOST_PANELS
+    polygons = [part.corners for part in parts]
+    share = areas(ball.vertices, polygons).sum() / area(ball.vertices, faces)
+    assert 0.95 < share < 1.25  # they overlap
+    middles = np.array([ball.vertices[polygon].mean(axis=0) for polygon in polygons])
+    assert 1 - np.linalg.norm(middles, axis=1).min() < TOLERANCES[-1] * 2
 
 
 def test_triangles_without_area_do_not_count():

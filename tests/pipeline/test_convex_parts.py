@@ -31,7 +31,14 @@ def awning():
     return ws.Mesh(np.stack([2 * x, height, 1.4 * z], axis=1), grid.faces)
 
 
-AWNING = awning()
+def umbrella():
+    """Cloth of one layer that is arched."""
+    grid = ws.plane(1.0, 12)
+    x, _, z = grid.positions.T
+    return ws.Mesh(np.stack([x, 0.8 - 0.9 * (x**2 + z**2), z], axis=1), grid.faces)
+
+
+AWNING, UMBRELLA = awning(), umbrella()
 
 
 def scene_of(mesh=TABLE, *, method="directional", blockers="auto", bounces=0, **options):
@@ -51,7 +58,7 @@ def covered(image):
     return image[image[..., 3] > 0.99][:, :3]
 
 
-@pytest.mark.parametrize("mesh", [TABLE, AWNING], ids=["table", "awning"])
+@pytest.mark.parametrize("mesh", [TABLE, AWNING, UMBRELLA], ids=["table", "awning", "umbrella"])
 def test_images_are_those_of_rays_and_spheres_are_farther_off(mesh):
     truth = covered(ws.render(scene_of(mesh, method="ray-traced")))
     errors = [

@@ -214,3 +214,18 @@ def test_a_body_that_blocks_as_convex_parts_takes_few_spheres(method, body_optio
 
     scene = scene_of(ws.Body(trimesh.creation.box(), **body_options), method=method)
     assert blockers.fitted_counts(scene) == {0: expected}
+
+
+@pytest.mark.parametrize(("method", "warns"), [("directional", False), ("log-sh", True)])
+def test_spheres_beside_convex_parts_cost_no_warning(method, warns, monkeypatch):
+    import trimesh
+
+    asked = []
+
+    def fit(mesh, count, **options):
+        asked.append(options["warns"])
+        return dataclasses.make_dataclass("Fit", ["spheres"])(UNIT_SPHERE)
+
+    monkeypatch.setattr(blockers, "fit_spheres", fit)
+    blockers.scene_blockers(scene_of(ws.Body(trimesh.creation.box((1, 1, 0.01))), method=method))
+    assert asked == [warns]

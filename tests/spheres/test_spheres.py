@@ -462,6 +462,12 @@ def test_a_ragged_shadow_costs_one_warning_for_a_mesh_with_the_remedy(monkeypatc
     report = dataclasses.replace(good, nearby_error=0.5)
     with pytest.warns(UserWarning, match="the light in its cavities and around it is off by 50%"):
         fit_spheres(bumpy(), **others)
+    report = dataclasses.replace(good, surface_error=0.33)
+    with pytest.warns(UserWarning, match="the light on its sides is off by 33%, so some comes through"):
+        fit_spheres(bumpy(), **others)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit_spheres(bumpy(), **others, warns=False)
 
 
 @pytest.mark.parametrize(

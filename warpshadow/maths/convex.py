@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from warpshadow.maths.components import connected_components
-from warpshadow.maths.panels import MOST_PANELS, TOLERANCE, find_panels
+from warpshadow.maths.panels import MOST_PANELS, TOLERANCES, find_panels
 
 MAX_FACES = 64
 """Faces of a part at most; a cylinder of 48 sides has 50."""
@@ -40,7 +40,7 @@ def find_convex_parts(positions: np.ndarray, faces: np.ndarray) -> list[ConvexPa
 
     Returns:
         The parts, which may touch and overlap: a solid for each closed piece of the mesh, panels for each open one.
-        None where a closed piece is hollow or curved, or has more than 64 faces, or where there are more than 32
+        None where a closed piece is hollow or curved, or has more than 64 faces, or where there are more than 64
         panels.
     """
     _, first, vertex = np.unique(positions, axis=0, return_index=True, return_inverse=True)
@@ -48,24 +48,36 @@ def find_convex_parts(positions: np.ndarray, faces: np.ndarray) -> list[ConvexPa
     triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
     if not len(triangles):
         return None
-    points, solids = positions.astype(np.float64)[first], []
-    panels: list[np.ndarray] = []
-    tolerance = TOLERANCE * np.ptp(points, axis=0).max()
+    points, solids, sheets = positions.astype(np.float64)[first], [], []
     piece = _pieces(triangles)
     for number in range(piece.max() + 1):
         some = triangles[piece == number]
         if _is_open(some):
-            more = find_panels(points, some, tolerance, MOST_PANELS - len(panels))
-            if more is None:
-                return None
-            panels += more
-        else:
-            solid = _solid(points, some)
-            if solid is None:
-                return None
+            sheets.append(some)
+        elif (solid := _solid(points, some)) is not None:
             solids.append(solid)
+        else:
+            return None
+    panels = _find_panels(points, sheets)
+    if panels is None:
+        return None
     parts = [*solids, *map(_panel, panels)]
     return [part._replace(corners=first[part.corners]) for part in parts]
+
+
+def _find_panels(points: np.ndarray, sheets: list[np.ndarray]) -> list[np.ndarray] | None:
+    """Cut sheets into panels, as flat ones as there may be."""
+    size = np.ptp(points, axis=0).max()
+    for tolerance in TOLERANCES:
+        panels: list[np.ndarray] = []
+        for sheet in sheets:
+            more = find_panels(points, sheet, tolerance * size, MOST_PANELS - len(panels))
+            if more is None:
+                break
+            panels += more
+        else:
+            return panels
+    return None
 
 
 def _pieces(triangles: np.ndarray) -> np.ndarray:

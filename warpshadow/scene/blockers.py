@@ -32,7 +32,9 @@ def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: boo
     counts = fitted_counts(scene)
     _announce(scene, counts, device, progress)
     return [
-        fit_spheres(body.mesh, counts[number], device=device, progress=progress).spheres
+        fit_spheres(
+            body.mesh, counts[number], device=device, progress=progress, warns=not _takes_parts(scene, body)
+        ).spheres
         if number in counts
         else _given_spheres(body, ground)
         for number, (body, ground) in enumerate(zip(scene.bodies, _ground_spheres(scene), strict=True))
@@ -61,14 +63,18 @@ def fitted_counts(scene: Scene) -> dict[int, int | str]:
     Returns:
         Numbers of the bodies, from 0, and how many spheres each takes, or "auto".
     """
-    grounds, visibility = _ground_spheres(scene), scene.visibility.with_method()
-    result = {}
+    grounds, result = _ground_spheres(scene), {}
     for number, body in enumerate(scene.bodies):
         if (count := _wanted(body)) and grounds[number] is None:
-            takes_parts = visibility.method == "directional" and body.blocks_as_parts
-            traced = (body.self_shadows or visibility.self_shadows) != "spheres"
-            result[number] = SPHERES_BESIDE_PARTS if takes_parts and traced else count
+            result[number] = SPHERES_BESIDE_PARTS if _takes_parts(scene, body) else count
     return result
+
+
+def _takes_parts(scene: Scene, body: Body) -> bool:
+    """Whether a body blocks light as convex parts, so that its spheres do not."""
+    visibility = scene.visibility.with_method()
+    is_traced = (body.self_shadows or visibility.self_shadows) != "spheres"
+    return visibility.method == "directional" and is_traced and body.blocks_as_parts
 
 
 def _announce(scene: Scene, counts: dict[int, int | str], device: wp.DeviceLike, progress: bool) -> None:

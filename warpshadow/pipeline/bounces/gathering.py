@@ -26,7 +26,7 @@ from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.scene.visibility import Visibility
 from warpshadow.stages.bounces.plane_light import plane_light
 from warpshadow.stages.bounces.projected_areas import find_projected_areas, turn_from_planes
-from warpshadow.stages.bounces.proxies import place_proxies
+from warpshadow.stages.bounces.proxies import DEPTH, DEPTH_OF_SHEETS, place_proxies
 from warpshadow.stages.bounces.proxy_radiance import find_proxy_radiance, patches_of_clusters
 from warpshadow.stages.bounces.self_light import self_light
 from warpshadow.stages.bounces.sphere_light import sphere_light
@@ -193,6 +193,12 @@ class Proxies:
         return numbers, ratios
 
     @functools.cached_property
+    def _depths(self) -> np.ndarray:
+        """How far below each patch its proxy is, in radii."""
+        depths = [DEPTH_OF_SHEETS if self.merged_scene.is_two_sided[body] else DEPTH for body in self.senders.bodies]
+        return np.repeat(np.float32(depths), np.diff(self.senders.first))
+
+    @functools.cached_property
     def blocker_of_source(self) -> np.ndarray:
         """The blocker nearest to the patch of each source, among spheres of bodies that are not flat; −1 for none."""
         return self._blockers[0][self.senders.patch_of_source]
@@ -228,7 +234,7 @@ class Proxies:
         transmittance = joined([row.reshape((len(row), -1)) for row in rows])
         directions = cells[0].directions
         transmittance = transmittance.reshape((len(transmittance), len(senders.sides), len(directions)))
-        placed = place_proxies(sources, senders.mean, radii, *self._blockers)
+        placed = place_proxies(sources, senders.mean, radii, *self._blockers, self._depths)
         if self.black_bodies:
             others = self.merged_scene.spheres_of(self.black_bodies, spheres)
             counts = [len(senders.areas), others[1].shape[1]]

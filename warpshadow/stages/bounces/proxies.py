@@ -2,7 +2,9 @@
 
 A patch of area A has a sphere of radius ρ = √(A/2), whose center is ρ/2 below it: as wide as the diagonal of a square
 patch, so that neighbors overlap, bulging out of the body by ρ/2. As bodies grow, so does it, by the radius of the
-sphere that blocks light beside it.
+sphere that blocks light beside it. Of a sheet, whose other side has patches of its own, centers are ρ/4 above: a
+receiver is nearer to the patches that it sees than to those behind them. If they were below, too, the sunlit outside of
+a tent shone through: its image with all bounces is 6.8% off so, 3.9% with centers in the sheet, and 3.6% with these.
 
 If the spheres that block light stood in for the patches around them, the foot of a ball would be lit by the ball's
 whole side, where it sees the little below, which is dark: at 0.2, 0.4 and 0.6 radii from the contact of a ball with a
@@ -20,7 +22,7 @@ from warpshadow.device.memory import empty
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
-_CENTER_DEPTH = wp.constant(0.5)  # how far below its patch a center is, in radii
+DEPTH, DEPTH_OF_SHEETS = 0.5, -0.25  # how far below its patch a center is, in radii
 
 
 @wp.kernel
@@ -31,6 +33,7 @@ def _place(
     blocker_radii: wp.array2d(dtype=wp.float32),
     numbers: wp.array(dtype=wp.int32),
     ratios: wp.array(dtype=wp.float32),
+    depths: wp.array(dtype=wp.float32),
     # out
     centers: wp.array2d(dtype=wp.vec3),
     radii: wp.array2d(dtype=wp.float32),
@@ -42,12 +45,17 @@ def _place(
         radius = ratios[patch] * blocker_radii[instance_in(batch, blocker_radii.shape[0]), numbers[patch]]
     point = points[instance_in(batch, points.shape[0]), patch]
     normal = normals[instance_in(batch, normals.shape[0]), patch]
-    centers[batch, patch] = point - _CENTER_DEPTH * radius * normal
+    centers[batch, patch] = point - depths[patch] * radius * normal
     radii[batch, patch] = radius
 
 
 def place_proxies(
-    sources: Receivers, mean: SparseMatrix, blocker_radii: wp.array, numbers: np.ndarray, ratios: np.ndarray
+    sources: Receivers,
+    mean: SparseMatrix,
+    blocker_radii: wp.array,
+    numbers: np.ndarray,
+    ratios: np.ndarray,
+    depths: np.ndarray,
 ) -> tuple[wp.array, wp.array]:
     """Place the spheres that stand in for patches.
 
@@ -57,17 +65,20 @@ def place_proxies(
         blocker_radii: Radii of the spheres that block light [scene units], float32 of shape [batch, sphere].
         numbers: One of them beside each patch, −1 for patches that nothing stands in for, shape [patch].
         ratios: Radius of each proxy in radii of that sphere, shape [patch].
+        depths: How far below its patch the center of each is, in radii of the proxy, shape [patch].
     Returns:
         Centers, vec3 of shape [batch, patch], and radii, float32 of the same shape.
     Differentiable: points and normals of the sources, blocker_radii.
     """
     check.shape("numbers", numbers.shape, (mean.shape[0],))
     check.shape("ratios", ratios.shape, (mean.shape[0],))
+    check.shape("depths", depths.shape, (mean.shape[0],))
     count = common_batch({"sources": sources.points, "normals": sources.normals, "radii": blocker_radii})
     device = blocker_radii.device
     centers = empty((count, len(numbers)), dtype=wp.vec3, device=device)
     radii = empty((count, len(numbers)), dtype=wp.float32, device=device)
     means = multiply(mean, sources.points), multiply(mean, sources.normals)
-    fixed = constant(np.asarray(numbers, np.int32), wp.int32, device), constant(ratios, wp.float32, device)
+    fixed = [constant(np.asarray(numbers, np.int32), wp.int32, device)]
+    fixed += [constant(values, wp.float32, device) for values in (ratios, depths)]
     launch(_place, centers.shape, inputs=[*means, blocker_radii, *fixed], outputs=[centers, radii])
     return centers, radii
