@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 _STRAIGHT = 1e-5
-"""Distance from the line through its neighbors, over the size of the outline, up to which a corner is none; and angle
-[rad] by which a corner may be reflex."""
+"""Distance from the line through its neighbors, over the size of the outline, up to which a corner is none; and the
+angle [rad] up to which a corner of a polygon is straight."""
+
+_SLIVER = 1e-7  # area of a triangle, over the squared size of all, up to which rounding may turn it over
 
 
 def find_outline(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -16,13 +18,15 @@ def find_outline(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
     Args:
         points: Float64 of shape [point, 2], no two at one place.
-        triangles: Of any winding, shape [triangle, 3]; those without area do not count.
+        triangles: Of any winding, shape [triangle, 3]; slivers wind as most do.
     Returns:
         Points where each edge begins and ends, with the triangles to its left, int of shape [edge, 2].
     """
     a, b, c = np.moveaxis(points[triangles], 1, 0)
     areas = _cross(b - a, c - a)
-    corners = np.where((areas < 0)[:, None], triangles[:, ::-1], triangles)[areas != 0]
+    has_area = np.abs(areas) > _SLIVER * np.ptp(points, axis=0).max(initial=0.0) ** 2
+    is_turned = np.where(has_area, areas, areas.sum()) < 0
+    corners = np.where(is_turned[:, None], triangles[:, ::-1], triangles)
     begins, ends = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
     pairs, number = np.unique(np.sort([begins, ends], axis=0), axis=1, return_inverse=True)
     excess = np.bincount(number.reshape(-1), np.where(begins < ends, 1, -1), pairs.shape[1]).astype(int)
@@ -54,8 +58,8 @@ def _without_straight(points: np.ndarray, edges: np.ndarray) -> np.ndarray:
 def cut_outline(points: np.ndarray, edges: np.ndarray, maximum: int) -> list[np.ndarray] | None:
     """Cut what an outline encloses into convex polygons, by lines between its corners.
 
-    From each reflex corner a line goes to a corner that leaves none there, to another reflex one if it can be, or else
-    two lines go to the nearest. Lines that no corner needs any more are left out [Hertel and Mehlhorn 1983].
+    Each line begins at a reflex corner. It goes to one from which on that is reflex no more, to another reflex one if
+    it can be, else to the nearest. Lines that no corner needs any more are left out [Hertel and Mehlhorn 1983].
 
     Args:
         points: Float64 of shape [point, 2].
@@ -68,133 +72,111 @@ def cut_outline(points: np.ndarray, edges: np.ndarray, maximum: int) -> list[np.
     after, before = dict(edges.tolist()), dict(edges[:, ::-1].tolist())
     if not len(after) == len(before) == len(edges):
         return None
-    reflex = {corner for corner in after if _turns_right(points, before[corner], corner, after[corner])}
+    reflex = {corner for corner in after if _is_reflex(points, before[corner], corner, after[corner])}
     if len(reflex) > 2 * maximum:
         return None
-    plan = _Plan(points, edges)
+    cuts = _Cuts(points, edges)
     for corner in sorted(reflex):
-        while sector := plan.reflex_sector(corner):
-            end = plan.best_end(corner, sector, reflex)
+        while sector := cuts.reflex_sector(corner):
+            end = cuts.best_end(corner, sector, reflex)
             if end is None:
                 return None
-            plan.add(corner, end)
-    plan.leave_out_needless()
-    polygons = plan.polygons()
+            cuts.add(corner, end)
+    cuts.leave_out_needless()
+    polygons = cuts.polygons()
     return polygons if polygons is not None and len(polygons) <= maximum else None
 
 
-class _Plan:
-    """An outline, and the lines that cut it.
-
-    Attributes:
-        neighbors: Where lines lead from each corner, the next edge first, then counterclockwise, the edge before last.
+class _Cuts:
+    """An outline, and the lines that cut it: ends of lines from each corner, counterclockwise, first the edge after it
+    and last the edge before it.
     """
 
     def __init__(self, points: np.ndarray, edges: np.ndarray):
-        self._points, self._edges = points, edges
-        self._cuts: list[tuple[int, int]] = []
-        self._corners = np.unique(edges)
+        self._points, self._lines = points, edges
         before = dict(edges[:, ::-1].tolist())
-        self.neighbors = {begin: [end, before[begin]] for begin, end in edges.tolist()}
+        self._ends = {corner: [after, before[corner]] for corner, after in edges.tolist()}
 
     def reflex_sector(self, corner: int) -> tuple[int, int] | None:
-        """Neighbors of a corner, one after the other, between which it is reflex."""
-        around = self.neighbors[corner]
-        for first, last in zip(around[:-1], around[1:], strict=True):
-            if _turns_right(self._points, last, corner, first):
-                return first, last
-        return None
+        """Ends of two lines from a corner between which it is reflex."""
+        ends = self._ends[corner]
+        sectors = zip(ends[:-1], ends[1:], strict=True)
+        return next((sector for sector in sectors if _is_reflex(self._points, sector[1], corner, sector[0])), None)
 
     def best_end(self, corner: int, sector: tuple[int, int], reflex: set[int]) -> int | None:
-        """The corner to which a line goes; None where none is seen."""
+        """The corner to which a line in a reflex sector goes; None where none is seen."""
         first, last = sector
-        seen = [end for end in self._corners.tolist() if end not in (corner, first, last)]
-        seen = [end for end in seen if self._is_between(corner, first, end, last) and self._sees(corner, end)]
+        to_first, to_last = self._points[[first, last]] - self._points[corner]
+
+        def is_seen(end: int) -> bool:
+            along = self._points[end] - self._points[corner]
+            is_outside = _cross(to_last, along) >= 0 and _cross(along, to_first) >= 0
+            return not is_outside and not self._crosses(corner, end)
 
         def cost(end: int) -> tuple[bool, bool, float]:
-            leaves_none = not _turns_right(self._points, end, corner, first) and not _turns_right(
-                self._points, last, corner, end
-            )
-            return not leaves_none, end not in reflex, float(np.hypot(*(self._points[end] - self._points[corner])))
+            leaves_some = _is_reflex(self._points, end, corner, first) or _is_reflex(self._points, last, corner, end)
+            return leaves_some, end not in reflex, float(np.hypot(*(self._points[end] - self._points[corner])))
 
-        return min(seen, key=cost, default=None)
+        return min((end for end in self._ends if end != corner and is_seen(end)), key=cost, default=None)
 
-    def _is_between(self, corner: int, first: int, end: int, last: int) -> bool:
-        """Whether the line to an end is inside a reflex sector."""
-        to_first, to_end, to_last = self._points[[first, end, last]] - self._points[corner]
-        is_outside = _cross(to_last, to_end) >= 0 and _cross(to_end, to_first) >= 0
-        return not is_outside and self._is_inside(end, corner)
-
-    def _is_inside(self, corner: int, end: int) -> bool:
-        """Whether a line from a corner begins inside the outline."""
-        to_first, to_end, to_last = self._points[[self.neighbors[corner][0], end, self.neighbors[corner][-1]]] - (
-            self._points[corner]
-        )
-        if _cross(to_first, to_last) >= 0:
-            return bool(_cross(to_first, to_end) > 0 and _cross(to_end, to_last) > 0)
-        return not (_cross(to_last, to_end) >= 0 and _cross(to_end, to_first) >= 0)
-
-    def _sees(self, corner: int, end: int) -> bool:
-        """Whether nothing is between two corners."""
+    def _crosses(self, corner: int, end: int) -> bool:
+        """Whether a line from one corner to another crosses others, or passes a corner."""
         a, b = self._points[[corner, end]]
-        others = np.concatenate([self._edges, np.array(self._cuts, int).reshape(-1, 2)])
-        others = others[~np.isin(others, [corner, end]).any(axis=1)]
-        c, d = self._points[others[:, 0]], self._points[others[:, 1]]
-        parts = _cross(b - a, c - a) * _cross(b - a, d - a) <= 0
-        return not (parts & (_cross(d - c, a - c) * _cross(d - c, b - c) <= 0)).any()
+        along, offsets = b - a, self._points[[each for each in self._ends if each not in (corner, end)]] - a
+        heights, shares = _cross(along, offsets) / (along @ along), offsets @ along / (along @ along)
+        if ((np.abs(heights) < _STRAIGHT) & (shares > 0) & (shares < 1)).any():
+            return True
+        c, d = self._points[self._lines].swapaxes(0, 1)
+        parts_ends = _cross(along, c - a) * _cross(along, d - a) < 0
+        return bool((parts_ends & (_cross(d - c, a - c) * _cross(d - c, b - c) < 0)).any())
 
     def add(self, corner: int, end: int) -> None:
         """Cut from one corner to another."""
-        self._cuts.append((corner, end))
-        for own, other in ((corner, end), (end, corner)):
-            around = self.neighbors[own]
-            around.insert(1 + sum(self._precedes(own, each, other) for each in around[1:-1]), other)
-
-    def _precedes(self, corner: int, one: int, other: int) -> bool:
-        """Whether one line from a corner comes before another, counterclockwise from the next edge on."""
-        start = self._points[self.neighbors[corner][0]] - self._points[corner]
-        angles = [self._angle(start, self._points[end] - self._points[corner]) for end in (one, other)]
-        return angles[0] < angles[1]
-
-    @staticmethod
-    def _angle(start: np.ndarray, along: np.ndarray) -> float:
-        return float(np.arctan2(_cross(start, along), start @ along) % (2 * np.pi))
+        self._lines = np.concatenate([self._lines, [[corner, end]]])
+        for one, other in ((corner, end), (end, corner)):
+            ends = self._ends[one]
+            offsets = self._points[[*ends, other]] - self._points[one]
+            *angles, angle = np.arctan2(_cross(offsets[0], offsets), offsets @ offsets[0]) % (2 * np.pi)
+            ends.insert(1 + sum(each < angle for each in angles[1:-1]), other)
 
     def leave_out_needless(self) -> None:
-        """Take cuts away that leave no corner reflex."""
-        for cut in sorted(self._cuts, key=lambda cut: -np.hypot(*(self._points[cut[0]] - self._points[cut[1]]))):
-            if all(self._is_needless(own, other) for own, other in (cut, cut[::-1])):
-                self.neighbors[cut[0]].remove(cut[1])
-                self.neighbors[cut[1]].remove(cut[0])
-
-    def _is_needless(self, corner: int, end: int) -> bool:
-        around = self.neighbors[corner]
-        place = around.index(end)
-        return not _turns_right(self._points, around[place + 1], corner, around[place - 1])
+        """Take lines away, in the order in which they came, that leave no corner reflex where they are not."""
+        for line in self._lines[len(self._ends) :].tolist():
+            places = [self._ends[one].index(other) for one, other in (line, line[::-1])]
+            around = [(self._ends[one], place) for one, place in zip(line, places, strict=True)]
+            beside = [(ends[place + 1], one, ends[place - 1]) for one, (ends, place) in zip(line, around, strict=True)]
+            if not any(_is_reflex(self._points, *corner) for corner in beside):
+                for ends, place in around:
+                    del ends[place]
 
     def polygons(self) -> list[np.ndarray] | None:
         """Walk around each polygon; None where one is not convex."""
-        left = {(corner, end) for corner, around in self.neighbors.items() for end in around[:-1]}
+        steps = {(corner, end) for corner, ends in self._ends.items() for end in ends[:-1]}
         result = []
-        while left:
-            corner, end = start = min(left)
+        while steps:
+            corner, end = start = min(steps)
             polygon = []
-            while (corner, end) in left:
-                left.remove((corner, end))
+            while (corner, end) in steps:
+                steps.remove((corner, end))
                 polygon.append(corner)
-                around = self.neighbors[end]
-                corner, end = end, around[around.index(corner) - 1]
-            sides = zip(polygon, np.roll(polygon, -1).tolist(), np.roll(polygon, -2).tolist(), strict=True)
-            if (corner, end) != start or any(_turns_right(self._points, *side) for side in sides):
+                ends = self._ends[end]
+                corner, end = end, ends[ends.index(corner) - 1]
+            turns = _turns(self._points[polygon])
+            if (corner, end) != start or turns.min() < -_STRAIGHT:
                 return None
-            result.append(np.array(polygon))
+            result.append(np.array(polygon)[turns > _STRAIGHT])
         return result
 
 
-def _turns_right(points: np.ndarray, before: int, corner: int, after: int) -> bool:
-    """Whether a way past a corner turns right there."""
-    along, onward = points[corner] - points[before], points[after] - points[corner]
-    return bool(_cross(along, onward) < -_STRAIGHT * np.hypot(*along) * np.hypot(*onward))
+def _is_reflex(points: np.ndarray, before: int, corner: int, after: int) -> bool:
+    """Whether a way turns right at a corner."""
+    return bool(_turns(points[[before, corner, after]])[1] < -_STRAIGHT)
+
+
+def _turns(polygon: np.ndarray) -> np.ndarray:
+    """Sine of the angle by which the way around a polygon turns left at each corner, [corner]."""
+    along, onward = polygon - np.roll(polygon, 1, axis=0), np.roll(polygon, -1, axis=0) - polygon
+    return _cross(along, onward) / (np.linalg.norm(along, axis=1) * np.linalg.norm(onward, axis=1))
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
