@@ -354,7 +354,7 @@ def test_how_much_sources_count(double, device, check):
 
     def shown(albedo, light, normals, past_self, past_all):
         openness = sources.find_openness(normals, past_self, past_all, directions)
-        return radiosity.patch_radiosity(albedo, light, mean, sources.open_shares(openness, mean, owners))
+        return radiosity.patch_radiosity(albedo, light, mean, sources.open_shares(openness, mean, owners).shares)
 
     colors = (wp.vec3d, random(2, 1, 3, 3)), (wp.vec3d, random(3, 2, 3, 3))
     check(shown, *colors, (wp.vec3d, unit(random(4, 1, 3, 3))), (wp.float64, past_self), (wp.float64, past_self**2))

@@ -39,7 +39,7 @@ from warpshadow.pipeline.lighting import LitPoints, joined, receiver_words
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.scene.scene import Bounces
-from warpshadow.stages.bounces.open_sources import find_openness, open_shares
+from warpshadow.stages.bounces.open_sources import Openness, find_openness, open_shares
 from warpshadow.stages.bounces.radiosity import patch_radiosity
 from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.receivers import Receivers
@@ -117,8 +117,8 @@ class LitParts(Node):
         return LitPart(self._shade.run(call, part.transfer, part.group, projected_light), part.group, part.cells)
 
 
-def _open_shares(senders: Senders, seen: list[PartVisibility]) -> wp.array:
-    """How much each source counts in its patch, vec3 of shape [batch, source]."""
+def _openness(senders: Senders, seen: list[PartVisibility]) -> Openness:
+    """How open sources and patches are."""
     parts = [find_openness(part.group.normals, *part.cells) for part in seen]
     return open_shares(joined(parts), senders.mean, senders.patch_of_source)
 
@@ -129,7 +129,7 @@ class PatchSampleNodes(NamedTuple):
     seen: PartVisibilities  # visibility
     frames: Node  # of flat bodies
     shown: Node  # patches as receivers see them
-    shares: Node  # how much each counts in its patch, vec3 of shape [batch, source]
+    openness: Node  # how open they are, and their patches
 
 
 class Radiosity(Node):
@@ -145,7 +145,7 @@ class Radiosity(Node):
         albedo: Node,
         sources: PatchSampleNodes,
     ):
-        _, frames, shown, shares = sources
+        _, frames, shown, openness = sources
         self._count, self._proxies, self._self_form_factors, self._gathering = (
             count,
             proxies,
@@ -158,18 +158,18 @@ class Radiosity(Node):
         self._reflect = Node("radiosity", patch_radiosity, albedo, lit, items=words, caches=False)
         self._own = Node("self light of patches", patch_radiosity, albedo, lit, items=words, idle=idle, caches=False)
         extra_inputs = self._reflect, self._own, *gathering.stages
-        super().__init__("", None, lit, albedo, shown, frames, shares, extra_inputs=extra_inputs)
+        super().__init__("", None, lit, albedo, shown, frames, openness, extra_inputs=extra_inputs)
 
     def compute(self, call: Call) -> OutgoingRadiance:
         """Reflect direct light, then light that has bounced once, and so on; more often between patches of one body."""
-        lit, albedo, shown, frames, shares = self.values(call)
+        lit, albedo, shown, frames, openness = self.values(call)
         senders, count = self._proxies.senders, self._count
         between = (
             None if self._own.idle else self._self_form_factors.between_patches(senders, [part.group for part in lit])
         )
 
         def sent(radiosity: wp.array) -> OutgoingRadiance:
-            return OutgoingRadiance(self._proxies, radiosity, shown, frames)
+            return OutgoingRadiance(self._proxies, radiosity, shown, frames, openness.of_patches)
 
         def others_light_of(radiosity: wp.array | None) -> wp.array:
             """Radiosity of patches by light from the sky and from other bodies."""
@@ -178,7 +178,7 @@ class Radiosity(Node):
             else:
                 outgoing = sent(radiosity)
                 parts = [self._light(call, part, outgoing) for part in lit]
-            return self._reflect.run(call, albedo, joined(parts), senders.mean, shares)
+            return self._reflect.run(call, albedo, joined(parts), senders.mean, openness.shares)
 
         def with_self_light(others_light: wp.array, radiosity: wp.array | None) -> wp.array:
             if between is None or radiosity is None:
@@ -294,7 +294,7 @@ class SphereBounces:
         seen = see(self._at(sources, points, points.materials, proxies.blocker_of_source), where=_OF_SOURCES)
         frames = Node("", planes.all.frames if planes else lambda _: None, points.vertices)
         shown = Node("", show, sources, seen, spheres, frames)
-        return PatchSampleNodes(seen, frames, shown, Node("", functools.partial(_open_shares, senders), seen))
+        return PatchSampleNodes(seen, frames, shown, Node("", functools.partial(_openness, senders), seen))
 
     def _radiosity(
         self, sources: PatchSampleNodes, projected_light: Node, proxies: Proxies, materials: Materials

@@ -239,6 +239,7 @@ class OutgoingRadiance:
         radiosity: Of the patches, vec3 of shape [batch, patch].
         shown: The patches as receivers see them.
         frames: Where flat bodies are, vec3 of shape [batch, 3 · plane].
+        openness: Of the patches, vec3 of shape [batch, patch].
     """
 
     def __init__(
@@ -247,9 +248,10 @@ class OutgoingRadiance:
         radiosity: wp.array,
         shown: ProjectedPatches,
         frames: wp.array,
+        openness: wp.array,
     ):
         self.proxies, self.senders, self.radiosity = proxies, proxies.senders, radiosity
-        self.shown, self.frames = shown, frames
+        self.shown, self.frames, self.openness = shown, frames, openness
 
     def of_body(self, body: int) -> wp.array:
         """Radiosity of the patches of a body, vec3 of shape [batch, patch]."""
@@ -323,7 +325,8 @@ class Gathering:
         skip = planes.number.get(group.body)
         points, fronts = group.among(outgoing.frames, planes.all, skip)
         arguments = points, group.normals, cells.transmittance_spheres, outgoing.frames, outgoing.radiosity, planes.all
-        return plane_light(*arguments, cells.directions, fronts=fronts, skip=skip)
+        options = {"openness": outgoing.openness, "fronts": fronts, "skip": skip}
+        return plane_light(*arguments, cells.directions, **options)
 
     def _from_spheres(self, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
         if not any(body != group.body and not self._is_flat[body] for body in outgoing.senders.bodies):

@@ -29,6 +29,7 @@ from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import Scratch, scratch_place, split_row
 from warpshadow.maths.directions import cell_radius
+from warpshadow.stages.bounces.plane_texels import find_texels
 from warpshadow.stages.planes.cells import (
     PlaneArrays,
     PlaneFootprint,
@@ -53,7 +54,6 @@ from warpshadow.stages.planes.cells import (
     toward_side,
 )
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
-from warpshadow.stages.sparse import multiply
 
 _CELL_COST = 15.0  # mean time of a cell of a receiver [ns], over cells that hit a plane and cells that do not
 _LEAST = wp.constant(1.0e-30)  # the least Σ s
@@ -457,6 +457,7 @@ def plane_light(
     planes: PlaneBlockers,
     directions: np.ndarray,
     *,
+    openness: wp.array | None = None,
     fronts: wp.array | None = None,
     skip: int | None = None,
 ) -> wp.array:
@@ -470,25 +471,25 @@ def plane_light(
         radiosity: Of the patches of all bodies, vec3 of shape [batch, patch]. A batch of 1 serves all instances here
             and above.
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
+        openness: Of the patches, vec3 of shape [batch, patch], as for :func:`.plane_texels.find_texels`; None for 1.
         fronts: Part of the front of each plane that receivers see, float32 of shape [batch, receiver, plane], from
             :func:`warpshadow.stages.planes.fronts.find_fronts`; by default their heights decide.
         skip: Number of the plane that the receivers are part of, which sends them nothing; None for none.
     Returns:
         Light that white receivers reflect of it, vec3 of shape [batch, receiver].
-    Differentiable: points, normals, transmittance, frames, radiosity, fronts.
+    Differentiable: points, normals, transmittance, frames, radiosity, openness, fronts.
     """
     check_planes(planes, points, frames, directions, skip)
     check.shape("normals", normals.shape, ("batch", points.shape[1]))
     check.shape("transmittance", transmittance.shape, ("batch", points.shape[1], len(directions)))
     arguments = {"points": points, "normals": normals, "transmittance": transmittance, "frames": frames}
-    instances = common_batch({**arguments, "radiosity": radiosity, "fronts": fronts})
+    instances = common_batch({**arguments, "radiosity": radiosity, "openness": openness, "fronts": fronts})
     if planes.count == (skip is not None):
         return zeros((instances, points.shape[1]), wp.vec3, points.device)
-    assert planes.texels_of_patches is not None
     points, normals = (expand(array, instances) for array in (points, normals))
     transmittance = expand_rows(transmittance, instances)
     fronts = None if fronts is None else expand_rows(fronts, instances)
-    texels = multiply(planes.texels_of_patches, radiosity)
+    texels = find_texels(radiosity, openness, planes)
     scratch = Scratch((_ROWS * planes.count,), wp.vec3)
     variables = [points, normals, transmittance, frames, texels, fronts]
     scene, cells = (

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 MOST_EDGES = 128
 """Edges of an outline at most: beyond, the mesh takes the share of a footprint that it covers of its texels."""
 
+_BESIDE = 0.002  # how much texels count in those beside them, which have it if nothing of their own is seen
 _MARGIN = 0.001  # margin of planes, in widths of the smallest texel
 
 
@@ -64,7 +65,8 @@ class PlaneBlockers:
         level_scales: Its texels for one of the finest level, vec2 of shape [level].
         covered: Coverage of each texel by the mesh, in all three components, vec3 of shape [texel].
         edges: Begin and end of the edges of outlines, in the axes of their planes, vec4 of shape [edge].
-        texels_of_patches: Matrix of mip levels, [texel, patch]; None where no patches are given.
+        texels_of_patches: Area of patches in texels, and a little of it in the texels beside these, relative to a texel's
+            own, [texel, patch]; None where no patches are given.
         frames_of_vertices: Matrix that finds frames, [3 · plane, vertex].
         has_holes: Whether a mesh of the plane blockers leaves a part of its rectangle open, as a window.
     """
@@ -94,14 +96,14 @@ class PlaneBlockers:
                 edges.append(grid.outline.reshape(-1, 4))
             matrices = _halvings(*grid.covered.shape)
             for side in range(grid.sides):
-                for matrix, (height, width) in matrices:
+                for matrix, around, (height, width) in matrices:
                     levels.append((texel_count, width, height))
                     scales.append((width / grid.covered.shape[1], height / grid.covered.shape[0]))
                     texel_count += width * height
                     covered.append(matrix @ grid.covered.ravel())
                     if patch_count:
                         first = body.first_patch + side * grid.covered.size
-                        pyramids.append(_shifted(_over_mesh(matrix, grid, (height, width)), first, patch_count))
+                        pyramids.append(_shifted(around.multiply(grid.covered.ravel()).tocsr(), first, patch_count))
             edge_count = sum(map(len, edges)) - first_edge
             grids.append(_kernel_grid(body, first_level, len(matrices), first_edge, edge_count))
             frames.append(_frame_matrix(body, vertex_count))
@@ -132,17 +134,27 @@ class PlaneBlockers:
 
 
 @functools.lru_cache(16)
-def _halvings(height: int, width: int) -> list[tuple[csr_matrix, tuple[int, int]]]:
+def _halvings(height: int, width: int) -> list[tuple[csr_matrix, csr_matrix, tuple[int, int]]]:
     """Matrices from a grid to each of its mip levels, each half as large as the one before, and their sizes.
+
+    The second of each adds a little of the texels beside each one.
 
     Not to be written to: grids of different scenes are often of one size.
     """
-    from scipy.sparse import kron
+    from scipy.sparse import diags, kron
+
+    def around(count: int) -> csr_matrix:
+        return diags([_BESIDE, 1.0, _BESIDE], [-1, 0, 1], shape=(count, count)).tocsr()
 
     sizes = [(height, width)]
     while max(sizes[-1]) > 1:
         sizes.append((max(sizes[-1][0] // 2, 1), max(sizes[-1][1] // 2, 1)))
-    return [(kron(_means(height, rows), _means(width, columns)).tocsr(), (rows, columns)) for rows, columns in sizes]
+    result = []
+    for rows, columns in sizes:
+        down, along = _means(height, rows), _means(width, columns)
+        own, beside = kron(down, along), kron(around(rows) @ down, around(columns) @ along)
+        result.append((own.tocsr(), beside.tocsr(), (rows, columns)))
+    return result
 
 
 def _means(fine: int, coarse: int) -> csr_matrix:
@@ -160,21 +172,6 @@ def _shifted(matrix: csr_matrix, first: int, count: int) -> csr_matrix:
     from scipy.sparse import csr_matrix
 
     return csr_matrix((matrix.data, matrix.indices + first, matrix.indptr), shape=(matrix.shape[0], count))
-
-
-def _over_mesh(matrix: csr_matrix, grid: PlaneTexture, size: tuple[int, int]) -> csr_matrix:
-    """The matrix to a mip level of a size, by which its texels have means over the mesh; off it, the nearest one's."""
-    if (grid.covered == 1).all():
-        return matrix
-    weighted = matrix.multiply(grid.covered.ravel()).tocsr()
-    sums = np.asarray(weighted.sum(axis=1)).ravel()
-    some, places = np.flatnonzero(sums), np.stack(np.unravel_index(np.arange(len(sums)), size), axis=1)
-    if not len(some):
-        return weighted
-    from scipy.spatial import cKDTree
-
-    nearest = some[cKDTree(places[some]).query(places)[1]]
-    return weighted[nearest].multiply(1 / sums[nearest, None]).tocsr()
 
 
 def _kernel_grid(
