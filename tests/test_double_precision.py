@@ -273,8 +273,10 @@ def test_light_of_planes(double, planes, check):
     points, normals = plane_receivers()
     radiosity = np.random.default_rng(0).uniform(size=(1, planes.texels_of_patches.shape[1], 3))
     given = (wp.vec3d, points), (wp.vec3d, normals), (wp.float64, random(1, 1, 3, 16) ** 2), (wp.vec3d, FRAMES)
-    fixed = wp.array(radiosity, dtype=wp.vec3d, device=planes.grids.device)
-    check(lambda *scene: plane_light(*scene, fixed, planes, directions), *given)
+    openness = np.random.default_rng(1).uniform(0.02, 1, size=radiosity.shape[:2])[..., None] * np.ones(3)
+    fixed, is_open = (wp.array(value, dtype=wp.vec3d, device=planes.grids.device) for value in (radiosity, openness))
+    texels = double("stages.bounces.plane_texels").find_texels(fixed, is_open, planes)
+    check(lambda *scene: plane_light(*scene, texels, planes, directions), *given)
 
 
 def test_transmittance_past_planes(double, planes, check):

@@ -10,7 +10,8 @@ import warpshadow as ws
 from warpshadow.device.tape import recorded
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.stages.bounces.patches import find_plane_patches
-from warpshadow.stages.bounces.plane_light import plane_light
+from warpshadow.stages.bounces.plane_light import plane_light as light_of_texels
+from warpshadow.stages.bounces.plane_texels import find_texels
 from warpshadow.stages.planes import prepared
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneBody
 from warpshadow.stages.planes.transmittance import plane_coverage, transmittance_past_planes
@@ -19,6 +20,11 @@ pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
 FLOAT32 = 2e-5
 DIRECTIONS = fibonacci(64)
+
+
+def plane_light(points, normals, transmittance, frames, radiosity, planes, directions, **options):
+    texels = find_texels(radiosity, None, planes)
+    return light_of_texels(points, normals, transmittance, frames, texels, planes, directions, **options)
 
 
 def passing_flats(points, transmittance, frames, planes, directions, **options):

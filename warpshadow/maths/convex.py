@@ -1,5 +1,6 @@
-"""Convex parts: closed convex pieces of a mesh, such as the boxes and rods of furniture, prisms into which others are
-cut, such as a thick wall with a window, and panels of its sheets."""
+"""Convex parts of a mesh: its closed convex pieces, such as the boxes and rods of furniture, convex prisms into which
+other pieces are cut, such as a thick wall with a window, and panels of its sheets.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Outlines: the edges around triangles of a plane and around their holes, and convex polygons into which these cut it."""
+"""Outlines: the edges around triangles of a plane and around their holes, and the convex polygons that they enclose."""
 
 from __future__ import annotations
 

@@ -46,7 +46,8 @@ def find_panels(points: np.ndarray, triangles: np.ndarray, tolerance: float, max
     regions = _smooth_regions(points, triangles)
     if len(regions) > maximum:
         return None
-    deviations, exact = [_deviation(points, region) for region in regions], []
+    deviations = [_deviation(points, region) for region in regions]
+    exact: list[np.ndarray] = []
     for number in reversed(np.flatnonzero(np.array(deviations) > tolerance)):
         polygons = _flat_polygons(points, regions[number], maximum - len(regions) + 1)
         if polygons is not None:

@@ -25,6 +25,7 @@ from warpshadow.pipeline.lighting import joined
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.scene.scene import Visibility
 from warpshadow.stages.bounces.plane_light import plane_light
+from warpshadow.stages.bounces.plane_texels import find_texels
 from warpshadow.stages.bounces.projected_areas import find_projected_areas, turn_from_planes
 from warpshadow.stages.bounces.proxies import place_proxies
 from warpshadow.stages.bounces.proxy_radiance import find_proxy_radiance, patches_of_clusters
@@ -264,6 +265,12 @@ class OutgoingRadiance:
         proxies = self.proxies
         return find_proxy_radiance(self.radiosity, self.shown.areas, self.senders.areas, *proxies.patches_of_clusters)
 
+    @functools.cached_property
+    def texels(self) -> wp.array:
+        """Radiosity of the flat bodies, vec3 of shape [batch, texel]."""
+        assert self.proxies.planes is not None
+        return find_texels(self.radiosity, self.openness, self.proxies.planes.all)
+
 
 class Gathering:
     """Gather at receivers the light that patches send: G.
@@ -324,9 +331,8 @@ class Gathering:
         assert planes is not None
         skip = planes.number.get(group.body)
         points, fronts = group.among(outgoing.frames, planes.all, skip)
-        arguments = points, group.normals, cells.transmittance_spheres, outgoing.frames, outgoing.radiosity, planes.all
-        options = {"openness": outgoing.openness, "fronts": fronts, "skip": skip}
-        return plane_light(*arguments, cells.directions, **options)
+        arguments = points, group.normals, cells.transmittance_spheres, outgoing.frames, outgoing.texels, planes.all
+        return plane_light(*arguments, cells.directions, fronts=fronts, skip=skip)
 
     def _from_spheres(self, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
         if not any(body != group.body and not self._is_flat[body] for body in outgoing.senders.bodies):

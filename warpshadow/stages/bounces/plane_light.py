@@ -29,7 +29,6 @@ from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import Scratch, scratch_place, split_row
 from warpshadow.maths.directions import cell_radius
-from warpshadow.stages.bounces.plane_texels import find_texels
 from warpshadow.stages.planes.cells import (
     PlaneArrays,
     PlaneFootprint,
@@ -453,11 +452,10 @@ def plane_light(
     normals: wp.array,
     transmittance: wp.array,
     frames: wp.array,
-    radiosity: wp.array,
+    texels: wp.array,
     planes: PlaneBlockers,
     directions: np.ndarray,
     *,
-    openness: wp.array | None = None,
     fronts: wp.array | None = None,
     skip: int | None = None,
 ) -> wp.array:
@@ -468,28 +466,26 @@ def plane_light(
         normals: Their unit normals, vec3 of shape [batch, receiver].
         transmittance: Past all else, without the planes, float32 of shape [batch, receiver, direction].
         frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`PlaneBlockers.frames`.
-        radiosity: Of the patches of all bodies, vec3 of shape [batch, patch]. A batch of 1 serves all instances here
-            and above.
+        texels: Radiosity of the planes, vec3 of shape [batch, texel], from :func:`.plane_texels.find_texels`. A batch
+            of 1 serves all instances here and above.
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
-        openness: Of the patches, vec3 of shape [batch, patch], as for :func:`.plane_texels.find_texels`; None for 1.
         fronts: Part of the front of each plane that receivers see, float32 of shape [batch, receiver, plane], from
             :func:`warpshadow.stages.planes.fronts.find_fronts`; by default their heights decide.
         skip: Number of the plane that the receivers are part of, which sends them nothing; None for none.
     Returns:
         Light that white receivers reflect of it, vec3 of shape [batch, receiver].
-    Differentiable: points, normals, transmittance, frames, radiosity, openness, fronts.
+    Differentiable: points, normals, transmittance, frames, texels, fronts.
     """
     check_planes(planes, points, frames, directions, skip)
     check.shape("normals", normals.shape, ("batch", points.shape[1]))
     check.shape("transmittance", transmittance.shape, ("batch", points.shape[1], len(directions)))
     arguments = {"points": points, "normals": normals, "transmittance": transmittance, "frames": frames}
-    instances = common_batch({**arguments, "radiosity": radiosity, "openness": openness, "fronts": fronts})
+    instances = common_batch({**arguments, "texels": texels, "fronts": fronts})
     if planes.count == (skip is not None):
         return zeros((instances, points.shape[1]), wp.vec3, points.device)
     points, normals = (expand(array, instances) for array in (points, normals))
     transmittance = expand_rows(transmittance, instances)
     fronts = None if fronts is None else expand_rows(fronts, instances)
-    texels = find_texels(radiosity, openness, planes)
     scratch = Scratch((_ROWS * planes.count,), wp.vec3)
     variables = [points, normals, transmittance, frames, texels, fronts]
     scene, cells = (

@@ -9,7 +9,8 @@ little [normalized convolution: Knutsson and Westin 1993]:
 with o the openness of a patch (:mod:`.open_sources`), and k its share of the mesh in the texel, or 0.002 of that in a
 texel beside it. A texel of buried patches alone has the light of those beside it, others hardly any of it.
 
-Without it the foot of a box in the sun was 10% too dark, and 37% too bright where the sun was behind it; so 3 and 9%.
+Without it the foot of a thick wall in the sun was 10% too dark with all bounces, and 35% too bright with the sun behind
+it; so it is 4% too dark, and 10% too bright.
 """
 
 import warp as wp

@@ -65,8 +65,8 @@ class PlaneBlockers:
         level_scales: Its texels for one of the finest level, vec2 of shape [level].
         covered: Coverage of each texel by the mesh, in all three components, vec3 of shape [texel].
         edges: Begin and end of the edges of outlines, in the axes of their planes, vec4 of shape [edge].
-        texels_of_patches: Area of patches in texels, and a little of it in the texels beside these, relative to a texel's
-            own, [texel, patch]; None where no patches are given.
+        texels_of_patches: Part of the area of each texel that patches have, and a little in the texels beside it,
+            [texel, patch]; None where no patches are given.
         frames_of_vertices: Matrix that finds frames, [3 · plane, vertex].
         has_holes: Whether a mesh of the plane blockers leaves a part of its rectangle open, as a window.
     """
@@ -174,9 +174,7 @@ def _shifted(matrix: csr_matrix, first: int, count: int) -> csr_matrix:
     return csr_matrix((matrix.data, matrix.indices + first, matrix.indptr), shape=(matrix.shape[0], count))
 
 
-def _kernel_grid(
-    body: PlaneBody, first_level: int, level_count: int, first_edge: int, edge_count: int
-) -> PlaneGrid:
+def _kernel_grid(body: PlaneBody, first_level: int, level_count: int, first_edge: int, edge_count: int) -> PlaneGrid:
     grid, flat = body.grid, PlaneGrid()
     texels = np.array(grid.covered.shape[::-1]) / (grid.high - grid.low)
     flat.least, flat.most = (wp.vec2(*corner) for corner in grid.corners())
