@@ -46,9 +46,9 @@ def _without_straight(points: np.ndarray, edges: np.ndarray) -> np.ndarray:
         if len(outgoing[corner]) != 1 or len(incoming[corner]) != 1:
             continue
         (after,), (before,) = outgoing[corner], incoming[corner]
-        along, beside = points[after] - points[before], points[corner] - points[before]
-        length = np.hypot(*along)
-        if before != after and abs(_cross(along, beside)) <= tolerance * length and 0 < beside @ along < length**2:
+        side, offset = points[after] - points[before], points[corner] - points[before]
+        length = np.hypot(*side)
+        if before != after and abs(_cross(side, offset)) <= tolerance * length and 0 < offset @ side < length**2:
             del outgoing[corner], incoming[corner]
             outgoing[before][outgoing[before].index(corner)] = after
             incoming[after][incoming[after].index(corner)] = before
@@ -109,8 +109,8 @@ class _Cuts:
         to_first, to_last = self._points[[first, last]] - self._points[corner]
 
         def is_seen(end: int) -> bool:
-            along = self._points[end] - self._points[corner]
-            is_outside = _cross(to_last, along) >= 0 and _cross(along, to_first) >= 0
+            to_end = self._points[end] - self._points[corner]
+            is_outside = _cross(to_last, to_end) >= 0 and _cross(to_end, to_first) >= 0
             return not is_outside and not self._crosses(corner, end)
 
         def cost(end: int) -> tuple[bool, bool, float]:
@@ -122,12 +122,12 @@ class _Cuts:
     def _crosses(self, corner: int, end: int) -> bool:
         """Whether a line from one corner to another crosses others, or passes a corner."""
         a, b = self._points[[corner, end]]
-        along, offsets = b - a, self._points[[each for each in self._ends if each not in (corner, end)]] - a
-        heights, shares = _cross(along, offsets) / (along @ along), offsets @ along / (along @ along)
+        line, offsets = b - a, self._points[[other for other in self._ends if other not in (corner, end)]] - a
+        heights, shares = _cross(line, offsets) / (line @ line), offsets @ line / (line @ line)
         if ((np.abs(heights) < _STRAIGHT) & (shares > 0) & (shares < 1)).any():
             return True
         c, d = self._points[self._lines].swapaxes(0, 1)
-        parts_ends = _cross(along, c - a) * _cross(along, d - a) < 0
+        parts_ends = _cross(line, c - a) * _cross(line, d - a) < 0
         return bool((parts_ends & (_cross(d - c, a - c) * _cross(d - c, b - c) < 0)).any())
 
     def add(self, corner: int, end: int) -> None:
@@ -137,17 +137,19 @@ class _Cuts:
             ends = self._ends[one]
             offsets = self._points[[*ends, other]] - self._points[one]
             *angles, angle = np.arctan2(_cross(offsets[0], offsets), offsets @ offsets[0]) % (2 * np.pi)
-            ends.insert(1 + sum(each < angle for each in angles[1:-1]), other)
+            ends.insert(1 + sum(other_angle < angle for other_angle in angles[1:-1]), other)
 
     def leave_out_needless(self) -> None:
         """Take lines away, in the order in which they came, that leave no corner reflex where they are not."""
         for line in self._lines[len(self._ends) :].tolist():
-            places = [self._ends[one].index(other) for one, other in (line, line[::-1])]
-            around = [(self._ends[one], place) for one, place in zip(line, places, strict=True)]
-            beside = [(ends[place + 1], one, ends[place - 1]) for one, (ends, place) in zip(line, around, strict=True)]
-            if not any(_is_reflex(self._points, *corner) for corner in beside):
-                for ends, place in around:
-                    del ends[place]
+            sectors = []
+            for corner, end in (line, line[::-1]):
+                ends = self._ends[corner]
+                place = ends.index(end)
+                sectors.append((ends[place + 1], corner, ends[place - 1]))
+            if not any(_is_reflex(self._points, *sector) for sector in sectors):
+                for corner, end in (line, line[::-1]):
+                    self._ends[corner].remove(end)
 
     def polygons(self) -> list[np.ndarray] | None:
         """Walk around each polygon; None where one is not convex."""
@@ -175,8 +177,8 @@ def _is_reflex(points: np.ndarray, before: int, corner: int, after: int) -> bool
 
 def _turns(polygon: np.ndarray) -> np.ndarray:
     """Sine of the angle by which the way around a polygon turns left at each corner, [corner]."""
-    along, onward = polygon - np.roll(polygon, 1, axis=0), np.roll(polygon, -1, axis=0) - polygon
-    return _cross(along, onward) / (np.linalg.norm(along, axis=1) * np.linalg.norm(onward, axis=1))
+    inward, onward = polygon - np.roll(polygon, 1, axis=0), np.roll(polygon, -1, axis=0) - polygon
+    return _cross(inward, onward) / (np.linalg.norm(inward, axis=1) * np.linalg.norm(onward, axis=1))
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

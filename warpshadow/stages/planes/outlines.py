@@ -121,14 +121,14 @@ def share_in_outline_adjoint(edges: wp.array(dtype=wp.vec4), first: int, count: 
         if length > 0.0:
             outward = wp.vec2(edge.along[1], -edge.along[0])
             pull = (adj * length / wp.pi) * outward
-            along = 0.5 * (edge.begin + edge.end)
-            part = (along - edge.first) / edge.length
+            middle_at = 0.5 * (edge.begin + edge.end)
+            part = (middle_at - edge.first) / edge.length
             middle = wp.vec2(ends[0] + part * (ends[2] - ends[0]), ends[1] + part * (ends[3] - ends[1]))
             offset = middle - ellipse.center
             of_pull, of_offset = wp.dot(s, pull), wp.dot(s, offset)
             result.center -= ellipse.per_size * (pull + (ellipse.shrinking * of_pull) * s)
             result.slope += (ellipse.per_size * ellipse.shrinking) * (of_pull * offset + of_offset * pull)
-            result.log_size -= wp.dot(pull, edge.distance * outward + along * edge.along)
+            result.log_size -= wp.dot(pull, edge.distance * outward + middle_at * edge.along)
             adj_shrinking += ellipse.per_size * of_pull * of_offset
     r = wp.sqrt(1.0 + wp.dot(s, s))
     scale = adj_shrinking * (1.0 + 2.0 * r) * ellipse.shrinking * ellipse.shrinking / r

@@ -96,14 +96,14 @@ class PlaneBlockers:
                 edges.append(grid.outline.reshape(-1, 4))
             matrices = _halvings(*grid.covered.shape)
             for side in range(grid.sides):
-                for matrix, around, (height, width) in matrices:
+                for matrix, blurred, (height, width) in matrices:
                     levels.append((texel_count, width, height))
                     scales.append((width / grid.covered.shape[1], height / grid.covered.shape[0]))
                     texel_count += width * height
                     covered.append(matrix @ grid.covered.ravel())
                     if patch_count:
                         first = body.first_patch + side * grid.covered.size
-                        pyramids.append(_shifted(around.multiply(grid.covered.ravel()).tocsr(), first, patch_count))
+                        pyramids.append(_shifted(blurred.multiply(grid.covered.ravel()).tocsr(), first, patch_count))
             edge_count = sum(map(len, edges)) - first_edge
             grids.append(_kernel_grid(body, first_level, len(matrices), first_edge, edge_count))
             frames.append(_frame_matrix(body, vertex_count))
@@ -143,7 +143,7 @@ def _halvings(height: int, width: int) -> list[tuple[csr_matrix, csr_matrix, tup
     """
     from scipy.sparse import diags, kron
 
-    def around(count: int) -> csr_matrix:
+    def blur(count: int) -> csr_matrix:
         return diags([_BESIDE, 1.0, _BESIDE], [-1, 0, 1], shape=(count, count)).tocsr()
 
     sizes = [(height, width)]
@@ -151,9 +151,9 @@ def _halvings(height: int, width: int) -> list[tuple[csr_matrix, csr_matrix, tup
         sizes.append((max(sizes[-1][0] // 2, 1), max(sizes[-1][1] // 2, 1)))
     result = []
     for rows, columns in sizes:
-        down, along = _means(height, rows), _means(width, columns)
-        own, beside = kron(down, along), kron(around(rows) @ down, around(columns) @ along)
-        result.append((own.tocsr(), beside.tocsr(), (rows, columns)))
+        of_rows, of_columns = _means(height, rows), _means(width, columns)
+        matrices = kron(of_rows, of_columns), kron(blur(rows) @ of_rows, blur(columns) @ of_columns)
+        result.append((matrices[0].tocsr(), matrices[1].tocsr(), (rows, columns)))
     return result
 
 
