@@ -273,8 +273,10 @@ def test_light_of_planes(double, planes, check):
     points, normals = plane_receivers()
     radiosity = np.random.default_rng(0).uniform(size=(1, planes.texels_of_patches.shape[1], 3))
     given = (wp.vec3d, points), (wp.vec3d, normals), (wp.float64, random(1, 1, 3, 16) ** 2), (wp.vec3d, FRAMES)
-    fixed = wp.array(radiosity, dtype=wp.vec3d, device=planes.grids.device)
-    check(lambda *scene: plane_light(*scene, fixed, planes, directions), *given)
+    openness = np.random.default_rng(1).uniform(0.02, 1, size=radiosity.shape[:2])[..., None] * np.ones(3)
+    fixed, is_open = (wp.array(value, dtype=wp.vec3d, device=planes.grids.device) for value in (radiosity, openness))
+    texels = double("stages.bounces.plane_texels").find_texels(fixed, is_open, planes)
+    check(lambda *scene: plane_light(*scene, texels, planes, directions), *given)
 
 
 def test_transmittance_past_planes(double, planes, check):
@@ -354,7 +356,7 @@ def test_how_much_sources_count(double, device, check):
 
     def shown(albedo, light, normals, past_self, past_all):
         openness = sources.find_openness(normals, past_self, past_all, directions)
-        return radiosity.patch_radiosity(albedo, light, mean, sources.open_shares(openness, mean, owners))
+        return radiosity.patch_radiosity(albedo, light, mean, sources.open_shares(openness, mean, owners).shares)
 
     colors = (wp.vec3d, random(2, 1, 3, 3)), (wp.vec3d, random(3, 2, 3, 3))
     check(shown, *colors, (wp.vec3d, unit(random(4, 1, 3, 3))), (wp.float64, past_self), (wp.float64, past_self**2))

@@ -105,10 +105,82 @@ def test_facets_that_bend_little_each_are_no_face_together(facets):
     assert find_convex_parts(*extruded(np.stack([np.cos(angles), np.sin(angles)], axis=1))) is None
 
 
-@pytest.mark.parametrize(("height", "count"), [(5e-5, 6), (2e-3, None)])
+@pytest.mark.parametrize(("height", "count"), [(5e-6, 6), (5e-5, 6), (2e-3, 7)])
 def test_a_ridge_within_a_face_is_no_higher_than_the_tolerance(height, count):
-    parts = find_convex_parts(*extruded(np.array([[0, 0], [1, 0], [1, 1], [0.5, 1 + height], [0, 1]])))
-    assert (parts and len(parts[0].faces)) == count
+    (part,) = find_convex_parts(*extruded(np.array([[0, 0], [1, 0], [1, 1], [0.5, 1 + height], [0, 1]])))
+    assert len(part.faces) == count
+
+
+WINDOWS = {  # squares of a wall, and parts at most
+    "window": (["####", "#  #", "#  #", "####"], 4),
+    "two windows": (["#######", "#  #  #", "#######"], 6),
+    "ell": (["#   ", "#   ", "####"], 2),
+    "fork": (["# # #", "#####"], 4),
+}
+
+
+def wall_of(rows, thickness, seed=0):
+    """A closed wall of squares, each cut along either diagonal; turned."""
+    rng = np.random.default_rng(seed)
+    (row, column), width = np.nonzero([[letter == "#" for letter in line] for line in rows]), len(rows[0]) + 1
+    a = (row * width + column)[:, None]
+    halves = np.where(
+        rng.uniform(size=(len(a), 1)) < 0.5, [0, 1, width + 1, 0, width + 1, width], [0, 1, width, 1, width + 1, width]
+    )
+    used, faces = np.unique((a + halves).reshape(-1, 3), return_inverse=True)
+    points = np.stack([used % width, used // width], axis=1).astype(float)
+    wall = trimesh.creation.extrude_triangulation(points, faces.reshape(-1, 3), thickness)
+    wall.merge_vertices()
+    return wall.apply_transform(trimesh.transformations.random_rotation_matrix(rng.uniform(size=3)))
+
+
+def is_inside(points, mesh, part):
+    corners = mesh.vertices[part.corners]
+    a, b, c = np.moveaxis(corners[part.faces], 1, 0)
+    normals = np.cross(b - a, c - a)
+    return (np.einsum("pfx,fx->pf", points[:, None] - a, normals) < 0).all(axis=1)
+
+
+@pytest.mark.parametrize("thickness", [0.1, 3.0])
+@pytest.mark.parametrize("name", WINDOWS)
+def test_a_prism_with_holes_is_cut_into_few_convex_ones(name, thickness):
+    """Each point inside is in one of them, and no point outside in any, however the mesh is triangulated."""
+    rows, most = WINDOWS[name]
+    counts = set()
+    for seed in range(3):
+        wall = wall_of(rows, thickness, seed)
+        parts = parts_of(wall)
+        counts.add(len(parts))
+        points = np.random.default_rng(1).uniform(*wall.bounds, size=(4000, 3))
+        owners = sum(is_inside(points, wall, part).astype(int) for part in parts)
+        assert owners.max() == 1
+        assert np.mean(owners) * np.ptp(wall.bounds, axis=0).prod() == pytest.approx(wall.volume, rel=0.15)
+        assert sum(volume_of(wall, part) for part in parts) == pytest.approx(wall.volume, rel=1e-5)
+    assert len(counts) == 1
+    assert counts.pop() <= most
+
+
+def volume_of(mesh, part):
+    """Volume of a part by what is to the left of its edges."""
+    corners = mesh.vertices[part.corners]
+    middle = corners.mean(axis=0)
+    begin, end, left, right = part.edges.T
+    total = 0.0
+    for face, first, last in ((left, begin, end), (right, end, begin)):
+        apex = corners[part.faces[face, 0]] - middle
+        total += np.einsum("ex,ex->", apex, np.cross(corners[first] - middle, corners[last] - middle)) / 6
+    return total
+
+
+def test_prisms_that_are_none_have_no_parts():
+    rows = WINDOWS["window"][0]
+    tapered, twisted, sieve = wall_of(rows, 2.0), wall_of(["###", "# #", "###"], 2.0), ["#" * 21, "# " * 10 + "#"] * 5
+    tapered.vertices[np.linalg.norm(tapered.vertices, axis=1).argmax()] *= 1.1
+    assert parts_of(tapered) is None
+    twisted.vertices[:4] += 0.01
+    assert parts_of(twisted) is None
+    assert parts_of(wall_of([*sieve, "#" * 21], 1.0)) is None  # 50 windows
+    assert len(parts_of(together(wall_of(rows, 1.0), box(middle=(9, 0, 0))))) == 5
 
 
 def roof(ridge, top, slope):

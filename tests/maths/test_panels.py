@@ -6,7 +6,7 @@ import trimesh
 
 import warpshadow as ws
 from warpshadow.maths.convex import find_convex_parts
-from warpshadow.maths.panels import MOST_PANELS, TOLERANCES, find_panels
+from warpshadow.maths.panels import MAX_PANELS, TOLERANCES, find_panels
 
 TOLERANCE = 0.02
 
@@ -88,7 +88,7 @@ def test_domes_have_panels_and_deep_ones_coarser_ones(height):
     ball = trimesh.creation.icosphere(4)
     faces = np.asarray(ball.faces)[ball.triangles_center[:, 1] > 1 - height]
     parts = find_convex_parts(np.asarray(ball.vertices, np.float32), faces)
-    assert 16 <= len(parts) <= MOST_PANELS
+    assert 16 <= len(parts) <= MAX_PANELS
     polygons = [part.corners for part in parts]
     share = areas(ball.vertices, polygons).sum() / area(ball.vertices, faces)
     assert 0.95 < share < 1.25  # they overlap
@@ -101,3 +101,19 @@ def test_triangles_without_area_do_not_count():
     (panel,) = find_panels(points, np.array([[0, 1, 2], [0, 1, 3]]), TOLERANCE, 32)
     assert sorted(panel) == [0, 1, 2]
     assert find_panels(points, np.array([[0, 1, 3]]), TOLERANCE, 32) == []
+
+
+@pytest.mark.parametrize("divisions", [8, 16])
+def test_walls_with_windows_are_cut_exactly(divisions):
+    """Two walls at a right angle of one mesh, a window in each, as a house of sheets has."""
+    grid = ws.plane((4.0, 2.0), (2 * divisions, divisions))
+    x, _, z = grid.positions.astype(np.float64).T
+    middles = np.stack([x, z], axis=1)[grid.faces].mean(axis=1)
+    is_wall = (np.abs(np.abs(middles[:, 0]) - 1) > 0.5) | (np.abs(middles[:, 1]) > 0.5)
+    points = np.stack([np.maximum(x, 0), z, np.maximum(-x, 0)], axis=1)
+    panels = find_panels(points, grid.faces[is_wall], TOLERANCE, 32)
+    assert [len(panel) for panel in panels] == [4] * 8
+    assert areas(points, panels).sum() == pytest.approx(6)
+    assert all(np.ptp(points[panel], axis=0).min() == 0 for panel in panels)
+    assert len(find_panels(points, grid.faces[is_wall], TOLERANCE, 8)) == 8
+    assert find_panels(points, grid.faces[is_wall], TOLERANCE, 7) is None

@@ -41,6 +41,20 @@ def umbrella():
 AWNING, UMBRELLA = awning(), umbrella()
 
 
+def window():
+    """A board with a window, of one piece."""
+    squares = [(x, y) for x in range(6) for y in range(5) if x not in (2, 3) or y not in (2, 3)]
+    corners = sorted({(x + i, y + j) for x, y in squares for i in (0, 1) for j in (0, 1)})
+    number = {corner: k for k, corner in enumerate(corners)}
+    a, b, c, d = ([number[x + i, y + j] for x, y in squares] for i, j in ((0, 0), (1, 0), (1, 1), (0, 1)))
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    wall = trimesh.creation.extrude_triangulation(np.array(corners) * 0.2 - [0.6, 0], faces, 0.03)
+    return ws.Mesh(wall.vertices, wall.faces).creased()
+
+
+WINDOW = window()
+
+
 def scene_of(mesh=TABLE, *, method="directional", blockers="auto", bounces=0, **options):
     """A table, or an awning, beside a ball, over a ground."""
     table = ws.Body(mesh, albedo=(0.8, 0.5, 0.3), blockers=blockers, name="table", **options)
@@ -58,7 +72,7 @@ def covered(image):
     return image[image[..., 3] > 0.99][:, :3]
 
 
-@pytest.mark.parametrize("mesh", [TABLE, AWNING, UMBRELLA], ids=["table", "awning", "umbrella"])
+@pytest.mark.parametrize("mesh", [TABLE, AWNING, UMBRELLA, WINDOW], ids=["table", "awning", "umbrella", "window"])
 def test_images_are_those_of_rays_and_spheres_are_farther_off(mesh):
     truth = covered(ws.render(scene_of(mesh, method="ray-traced")))
     errors = [

@@ -12,6 +12,7 @@ from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.planes import ScenePlanes
 from warpshadow.scene.blockers import scene_blockers
+from warpshadow.stages.planes import prepared
 from warpshadow.torch import TorchRenderer
 
 STEP = 1e-3
@@ -135,6 +136,38 @@ def test_a_ball_that_touches_the_ground_has_the_gradient_of_wide_steps(bounces, 
     assert np.trapezoid(gradients, heights) / 0.006 == pytest.approx(wide, rel=off)
     np.testing.assert_allclose(gradients, wide, rtol=0.2)
     assert gradients[6] == pytest.approx(slope(0.0, 0.0005), rel=off)  # at contact
+
+
+# ---------------------------------------------------------------------------------------------------- holes
+
+
+def window_wall(*, is_cut):
+    """A floor behind a wall with a window, of one mesh, or of four planes; the sun is before it."""
+    grid = ws.plane((4.0, 2.4), (40, 24))
+    middles = grid.positions[grid.faces].mean(axis=1)
+    beside, above = np.abs(middles[:, 0]) > 0.7, np.abs(middles[:, 2]) > 0.4
+    parts = [above & (middles[:, 2] < 0), above & (middles[:, 2] > 0), ~above & beside & (middles[:, 0] < 0)]
+    parts = [*parts, ~above & beside & (middles[:, 0] > 0)] if is_cut else [above | beside]
+    walls = [
+        ws.Body(
+            ws.Mesh(grid.positions, grid.faces[part]), rotation=(90, 0, 0), translation=(0, 1.2, 1), name=f"{number}"
+        )
+        for number, part in enumerate(parts)
+    ]
+    floor = ws.Body(ws.plane(4.0, 1), receivers="pixel", name="floor")
+    sun = ws.synthetic_sky((0.2, 0.5, 0.6), sun_radius=2, sun_strength=3, height=128)
+    camera = ws.Camera.look_at((0, 2.2, -3), (0, 0, -0.3), fov_y=40, size=(48, 48))
+    return ws.Scene([floor, *walls], sun, camera, visibility=ws.Visibility("directional", directions=128))
+
+
+def test_a_wall_with_a_window_blocks_as_the_four_planes_around_it_do(monkeypatch):
+    """By texels the edges of the sun on the floor are blurred and elsewhere."""
+    images = [ws.Renderer(window_wall(is_cut=is_cut), progress=False).render()[16:, :, :3] for is_cut in (False, True)]
+    monkeypatch.setattr(prepared, "MAX_EDGES", 0)
+    by_texels = ws.Renderer(window_wall(is_cut=False), progress=False).render()[16:, :, :3]
+    off, off_by_texels = (np.abs(image - images[1]).mean() / images[1].mean() for image in (images[0], by_texels))
+    assert off < 0.015
+    assert off_by_texels > 3 * off
 
 
 # ---------------------------------------------------------------------------------------------------- seams

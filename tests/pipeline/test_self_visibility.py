@@ -260,7 +260,7 @@ def test_static_bodies_keep_their_lobes(moving):
 
 
 def test_a_mesh_of_too_many_vertices_has_fewer_rays_and_says_so(monkeypatch):
-    monkeypatch.setattr(trace, "MOST_MEMORY", 2**18)
+    monkeypatch.setattr(trace, "MAX_MEMORY", 2**18)
     with pytest.warns(UserWarning, match=r"642 points have 1024 rays each for the body's shadow on itself"):
         error = error_of(scene_of())
     assert error < 0.08

@@ -24,7 +24,7 @@ def twin(normals, past_self, past_all):
 
 def shares(normals, past_self, past_all, device):
     mean = mean_over_sources(PATCHES, WEIGHTS, 3, device=device)
-    return open_shares(find_openness(normals, past_self, past_all, DIRECTIONS), mean, PATCHES)
+    return open_shares(find_openness(normals, past_self, past_all, DIRECTIONS), mean, PATCHES).shares
 
 
 def test_shares_of_sources_are_those_of_the_twin(device):

@@ -10,7 +10,9 @@ import warpshadow as ws
 from warpshadow.device.tape import recorded
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.stages.bounces.patches import find_plane_patches
-from warpshadow.stages.bounces.plane_light import plane_light
+from warpshadow.stages.bounces.plane_light import plane_light as light_of_texels
+from warpshadow.stages.bounces.plane_texels import find_texels
+from warpshadow.stages.planes import prepared
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneBody
 from warpshadow.stages.planes.transmittance import plane_coverage, transmittance_past_planes
 
@@ -18,6 +20,11 @@ pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
 FLOAT32 = 2e-5
 DIRECTIONS = fibonacci(64)
+
+
+def plane_light(points, normals, transmittance, frames, radiosity, planes, directions, **options):
+    texels = find_texels(radiosity, None, planes)
+    return light_of_texels(points, normals, transmittance, frames, texels, planes, directions, **options)
 
 
 def passing_flats(points, transmittance, frames, planes, directions, **options):
@@ -54,7 +61,43 @@ def bilinear(image, x, y):
     return (1 - t) * upper + t * ((1 - s) * image[below, left] + s * image[below, right])
 
 
-def fetched(image, grid, y, cosine, t, radius):
+def area_in_disc(a, b):
+    """Area of the triangle of the middle of a disc of radius 1, a and b that the disc takes, by its pieces."""
+    across, along = a @ a - 1, b - a
+    half = (along @ a) ** 2 - (along @ along) * across
+    cuts = [(-along @ a + sign * np.sqrt(half)) / (along @ along) for sign in (-1, 1)] if half > 0 else []
+    ends = [a + t * along for t in (0, *np.clip(cuts, 0, 1), 1)]
+    total = 0.0
+    for p, q in zip(ends[:-1], ends[1:], strict=True):
+        cross = p[0] * q[1] - p[1] * q[0]
+        total += cross / 2 if np.linalg.norm(p + q) < 2 else np.arctan2(cross, p @ q) / 2
+    return total
+
+
+def share_in_outline(outline, y, slope, size):
+    """Part of the ellipse of a footprint that an outline encloses."""
+    values, axes = np.linalg.eigh(np.eye(2) + np.outer(slope, slope))
+    edges = (outline - y) @ axes / np.sqrt(values) / size
+    return np.clip(np.linalg.det(axes) * sum(area_in_disc(*edge) for edge in edges) / np.pi, 0, 1)  # axes may mirror
+
+
+def around(texels):
+    """A little of the texels beside each one, along both sides of [row, column, channel]."""
+    for axis in (0, 1):
+        padded = np.pad(texels, [(1, 1) if each == axis else (0, 0) for each in range(3)])
+        before, after = (np.take(padded, np.arange(texels.shape[axis]) + shift, axis) for shift in (0, 2))
+        texels = texels + 0.002 * (before + after)
+    return texels
+
+
+def mesh_means(grid, image, rows, columns, weights=1.0):
+    """Means of an image over the mesh in a mip level; of texels beside it, those of their neighbors."""
+    weights = weights * grid.covered[..., None].astype(float)
+    sums, totals = (around(halved(values, rows, columns)) for values in (image * weights, weights))
+    return sums / np.where(totals > 0, totals, 1)
+
+
+def fetched(image, grid, y, cosine, t, radius, level_of):
     """Mean of an image [row, column, channel] over a footprint at a place in the plane."""
     height, width = image.shape[:2]
     z = y / grid.spread
@@ -70,7 +113,7 @@ def fetched(image, grid, y, cosine, t, radius):
     values = []
     for rows, columns in sizes[level : level + 2]:
         x, y = texel / count * (columns, rows) - 0.5
-        values.append(bilinear(halved(image, rows, columns), x, y))
+        values.append(bilinear(level_of(image, rows, columns), x, y))
     return values[0] if part == 0 else (1 - part) * values[0] + part * values[1]
 
 
@@ -103,12 +146,16 @@ def met_sides(point, omega, radius, frames, grids, radiosity, skip, fronts=None)
             extents = t * radius * np.sqrt(1 + (axes @ omega / mean) ** 2)
             inside = ramp((edges[1] - y) / extents) - ramp((edges[0] - y) / extents)
             share = side_weight * ramp(ratio) * inside.prod()
-            covered = fetched(grid.covered[..., None].astype(float), grid, y, mean, t, radius)[0]
+            if not grid.is_whole and len(grid.outline) <= prepared.MAX_EDGES:
+                share = side_weight * ramp(ratio) * share_in_outline(grid.outline, y, axes @ omega / mean, t * radius)
+            elif not grid.is_whole:
+                share *= fetched(grid.covered[..., None].astype(float), grid, y, mean, t, radius, halved)[0]
             light = np.zeros(3)
             if side == 1 or grid.sides == 2:
-                image = radiosity[f][0 if side == 1 else 1] * grid.covered[..., None]
-                light = share * fetched(image, grid, y, mean, t, radius)
-            sides.append((share * covered, t, t * radius / mean, light, f))
+                image = radiosity[f][0 if side == 1 else 1]
+                means = functools.partial(mesh_means, grid)
+                light = share * fetched(image, grid, y, mean, t, radius, means)
+            sides.append((share, t, t * radius / mean, light, f))
     return sides
 
 
@@ -247,7 +294,10 @@ class Setting:
 @pytest.mark.parametrize("two_sided", [False, True])
 @pytest.mark.parametrize("skip", [None, 0])
 @pytest.mark.parametrize("names", [("ground",), ("l",), ("ground", "wall", "l")])
-def test_light_is_that_of_the_formula(names, skip, two_sided, device):
+@pytest.mark.parametrize("coverage", ["outline", "texels"])
+def test_light_is_that_of_the_formula(names, skip, two_sided, coverage, device, monkeypatch):
+    if coverage == "texels":
+        monkeypatch.setattr(prepared, "MAX_EDGES", 5)
     setting = Setting(device, names=names, two_sided=two_sided, batch=2)
     points, normals, transmittance, vertices, radiosity = setting.arrays()
     frames = setting.planes.frames(vertices)
@@ -274,7 +324,10 @@ def test_white_flats_send_what_they_block(skip, device):
 
 
 @pytest.mark.parametrize("skip", [None, 1])
-def test_what_passes_is_that_of_the_formula(skip, device):
+@pytest.mark.parametrize("coverage", ["outline", "texels"])
+def test_what_passes_is_that_of_the_formula(skip, coverage, device, monkeypatch):
+    if coverage == "texels":
+        monkeypatch.setattr(prepared, "MAX_EDGES", 5)
     setting = Setting(device, blocks=(True, False, True))
     points, _, transmittance, vertices, _ = setting.arrays()
     frames = setting.planes.frames(vertices)
@@ -310,7 +363,10 @@ def random_steps(setting, number, size=1e-6):
 
 @pytest.mark.parametrize("two_sided", [False, True])
 @pytest.mark.parametrize("names", [("ground",), ("l",), ("ground", "wall", "l")])
-def test_gradients_of_light_are_those_of_the_twin(names, two_sided, device, verified_tape):
+@pytest.mark.parametrize("coverage", ["outline", "texels"])
+def test_gradients_of_light_are_those_of_the_twin(names, two_sided, coverage, device, verified_tape, monkeypatch):
+    if coverage == "texels":
+        monkeypatch.setattr(prepared, "MAX_EDGES", 5)
     setting = Setting(device, names=names, two_sided=two_sided)
     variables = setting.arrays()
     points, normals, transmittance, vertices, radiosity = variables

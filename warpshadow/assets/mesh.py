@@ -164,7 +164,7 @@ class Mesh:
 
     @functools.cached_property
     def convex_parts(self) -> list[ConvexPart]:
-        """Its closed convex pieces and panels of cloth; empty where it has anything else."""
+        """The convex solids and panels of cloth of which it consists; empty where it has anything else."""
         return find_convex_parts(self.positions, self.surface.faces) or []
 
     def transformed(

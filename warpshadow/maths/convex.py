@@ -1,4 +1,6 @@
-"""Convex parts: closed convex pieces of a mesh, such as the boxes and rods of furniture, and panels of its sheets."""
+"""Convex parts of a mesh: its closed convex pieces, such as the boxes and rods of furniture, convex prisms into which
+other pieces are cut, such as a thick wall with a window, and panels of its sheets.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +9,16 @@ from typing import NamedTuple
 import numpy as np
 
 from warpshadow.maths.components import connected_components
-from warpshadow.maths.panels import MOST_PANELS, TOLERANCES, find_panels
+from warpshadow.maths.outline import cut_outline, find_outline
+from warpshadow.maths.panels import MAX_PANELS, TOLERANCES, find_panels
 
 MAX_FACES = 64
 """Faces of a part at most; a cylinder of 48 sides has 50."""
+
+MAX_PRISMS = 32
+"""Prisms into which a piece is cut at most. A gear with five round holes has 300: as many spheres are faster."""
+
+_MAX_AXES = 8  # directions in which a piece may be a prism, of its largest faces
 
 _MAX_TRIANGLES = 16 * MAX_FACES
 """Triangles of a solid at most: its faces may be divided."""
@@ -39,8 +47,9 @@ def find_convex_parts(positions: np.ndarray, faces: np.ndarray) -> list[ConvexPa
         faces: Triangles that wind alike, shape [face, 3].
 
     Returns:
-        The parts, which may touch and overlap: a solid for each closed piece of the mesh, panels for each open one.
-        None where a closed piece is hollow or curved, or has more than 64 faces, or where there are more than 64
+        The parts, which may touch and overlap: for each closed piece of the mesh a solid, or the prisms into which it
+        is cut if it is one, with holes or without; panels for each open one. None where a closed piece is hollow or
+        curved otherwise, where a part has more than 64 faces, or where there are more than 32 prisms of a piece, or 64
         panels.
     """
     _, first, vertex = np.unique(positions, axis=0, return_index=True, return_inverse=True)
@@ -54,10 +63,12 @@ def find_convex_parts(positions: np.ndarray, faces: np.ndarray) -> list[ConvexPa
         some = triangles[piece == number]
         if _is_open(some):
             sheets.append(some)
-        elif (solid := _solid(points, some)) is not None:
-            solids.append(solid)
-        else:
+            continue
+        solid = _solid(points, some)
+        prisms = _prisms(points, some) if solid is None else [solid]
+        if prisms is None:
             return None
+        solids += prisms
     panels = _find_panels(points, sheets)
     if panels is None:
         return None
@@ -71,7 +82,7 @@ def _find_panels(points: np.ndarray, sheets: list[np.ndarray]) -> list[np.ndarra
     for tolerance in TOLERANCES:
         panels: list[np.ndarray] = []
         for sheet in sheets:
-            more = find_panels(points, sheet, tolerance * size, MOST_PANELS - len(panels))
+            more = find_panels(points, sheet, tolerance * size, MAX_PANELS - len(panels))
             if more is None:
                 break
             panels += more
@@ -157,6 +168,64 @@ def _solid(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
             return None
         straight.append([begin, end, f, g])
     return ConvexPart(used, np.searchsorted(used, triangles[largest]), _renumbered(np.array(straight), used))
+
+
+def _prisms(points: np.ndarray, triangles: np.ndarray) -> list[ConvexPart] | None:
+    """The convex prisms into which the prism that triangles enclose is cut; None where they enclose none."""
+    corners = points[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    order = np.argsort(-lengths)[: np.count_nonzero(lengths)]
+    axes = normals[order] / lengths[order, None]
+    for _ in range(_MAX_AXES):
+        if not len(axes):
+            return None
+        prisms = _prisms_along(axes[0], points, triangles, normals)
+        if prisms is not None:
+            return prisms
+        axes = axes[np.abs(axes @ axes[0]) < 1 - _FLATNESS]
+    return None
+
+
+def _prisms_along(
+    axis: np.ndarray, points: np.ndarray, triangles: np.ndarray, normals: np.ndarray
+) -> list[ConvexPart] | None:
+    """The convex prisms with bases across an axis."""
+    from scipy.spatial import cKDTree
+
+    used = np.unique(triangles)
+    heights, size = points @ axis, np.ptp(points[used], axis=0).max()
+    low, high = heights[used].min(), heights[used].max()
+    is_high, is_low = (np.abs(heights - level) < _FLATNESS * size for level in (high, low))
+    on_top, on_bottom = is_high[triangles].all(axis=1), is_low[triangles].all(axis=1)
+    rises = np.abs(normals @ axis) > _FLATNESS * size**2
+    if high - low < 2 * _FLATNESS * size or not (is_high | is_low)[used].all() or rises[~(on_top | on_bottom)].any():
+        return None
+    aside = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    plane = points @ np.stack([aside, np.cross(axis, aside)]).T / np.linalg.norm(aside)
+    polygons = cut_outline(plane, find_outline(plane, triangles[on_top]), MAX_PRISMS)
+    bottom = np.unique(find_outline(plane, triangles[on_bottom]))
+    if not polygons or max(map(len, polygons)) > MAX_FACES - 2 or not len(bottom):
+        return None
+    gaps, below = cKDTree(plane[bottom]).query(plane[np.concatenate(polygons)])
+    if gaps.max() > _FLATNESS * size:
+        return None
+    below = np.split(bottom[below], np.cumsum([len(polygon) for polygon in polygons])[:-1])
+    return [_prism(polygon, base) for polygon, base in zip(polygons, below, strict=True)]
+
+
+def _prism(top: np.ndarray, bottom: np.ndarray) -> ConvexPart:
+    """A prism, given the corners of its top, counterclockwise from above, and those below them."""
+    count = len(top)
+    begin, third = np.arange(count), count // 3
+    end = np.roll(begin, -1)
+    face, bases = begin + 2, np.array([[0, third, 2 * third], [count, count + 2 * third, count + third]])
+    sides = np.stack([count + begin, count + end, end], axis=1)
+    around_top = np.stack([begin, end, np.zeros_like(begin), face], axis=1)
+    around_bottom = np.stack([count + begin, count + end, face, np.ones_like(begin)], axis=1)
+    upward = np.stack([count + end, end, face, np.roll(face, -1)], axis=1)
+    faces, edges = np.concatenate([bases, sides]), np.concatenate([around_top, around_bottom, upward])
+    return ConvexPart(np.concatenate([top, bottom]), faces, edges)
 
 
 def _bulge(points: np.ndarray, begin: np.ndarray, end: np.ndarray) -> float:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from warpshadow.maths.components import connected_components
+from warpshadow.maths.outline import cut_outline, find_outline
+from warpshadow.maths.plane import is_flat
 
 TOLERANCES = (0.02, 0.03)
 """Thickness and mean gap of a panel at most, over the size of the mesh: the second where the first takes too many.
@@ -15,7 +17,7 @@ off, in 1.5 times the time. With spheres it was 10.2% off. An umbrella of eight 
 shell, which has 48 of 0.03.
 """
 
-MOST_PANELS = 64
+MAX_PANELS = 64
 """Panels of a mesh at most: beyond, spheres are faster.
 
 With a panel for each of the 162 leaves of the tree of demos/kinds.py its image takes 2.4 times as long, and is 5.3% off
@@ -29,9 +31,10 @@ _CREASE = 0.94
 def find_panels(points: np.ndarray, triangles: np.ndarray, tolerance: float, maximum: int) -> list[np.ndarray] | None:
     """Cut a sheet into panels.
 
-    First along creases. A region that is too thick then, or whose outline is not convex, is cut in two across the
-    principal axis that leaves the flatter halves, until none is [Lien and Amato 2007: approximate convex
-    decomposition]. Then neighbors are joined that make one panel.
+    First along creases. A region that lies in a plane and whose outline is not convex, such as a wall with a window, is
+    cut into convex ones exactly. Another, or one that is too thick, is cut in two across the principal axis that leaves
+    the flatter halves, until none is [Lien and Amato 2007: approximate convex decomposition]. Then neighbors are joined
+    that make one panel.
 
     Args:
         points: Vertices, float64 of shape [vertex, 3].
@@ -46,10 +49,16 @@ def find_panels(points: np.ndarray, triangles: np.ndarray, tolerance: float, max
     if len(regions) > maximum:
         return None
     deviations = [_deviation(points, region) for region in regions]
+    exact: list[np.ndarray] = []
+    for number in reversed(np.flatnonzero(np.array(deviations) > tolerance)):
+        polygons = _flat_polygons(points, regions[number], maximum - len(regions) + 1)
+        if polygons is not None:
+            exact, maximum = exact + polygons, maximum - len(polygons)
+            del regions[number], deviations[number]
     while len(regions) + sum(deviation > tolerance for deviation in deviations) <= maximum:
         if max(deviations, default=0.0) <= tolerance:
             panels = _joined(points, regions, tolerance)
-            return [_outline(points, panel, tolerance / 2) for panel in panels]
+            return exact + [_outline(points, panel, tolerance / 2) for panel in panels]
         worst = int(np.argmax(deviations))
         halves = min(_cuts(points, regions[worst]), key=lambda cut: max(_deviation(points, half) for half in cut))
         regions[worst : worst + 1] = halves
@@ -71,6 +80,16 @@ def _smooth_regions(points: np.ndarray, triangles: np.ndarray) -> list[np.ndarra
     pairs = pairs[:, np.abs((normals[pairs[0]] * normals[pairs[1]]).sum(axis=1)) > _CREASE]
     region = connected_components(pairs[0], pairs[1], count)
     return [triangles[region == number] for number in range(region.max(initial=-1) + 1)]
+
+
+def _flat_polygons(points: np.ndarray, region: np.ndarray, maximum: int) -> list[np.ndarray] | None:
+    """Corners of the convex polygons into which a region of a plane is cut; None if it lies in none, or of more."""
+    used, faces = np.unique(region, return_inverse=True)
+    if not is_flat(points[used]):
+        return None
+    flat = points[used] @ _principal_axes(points[used])[:2].T
+    polygons = cut_outline(flat, find_outline(flat, faces.reshape(region.shape)), maximum)
+    return None if polygons is None else [used[polygon] for polygon in polygons]
 
 
 def _principal_axes(places: np.ndarray) -> np.ndarray:

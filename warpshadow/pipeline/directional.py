@@ -274,12 +274,13 @@ class Directional(SphereMethod):
         return shade_cells(*arguments, maximum=LARGEST_COEFFICIENT)
 
     @functools.cached_property
-    def _sharpest(self) -> tuple[np.ndarray, wp.array, float, wp.array]:
+    def _sharpest(self) -> tuple[np.ndarray, wp.array, float, float, np.ndarray]:
         """Cells of the scene's light whose shadows are sharpest: sharp cells, or else the brightest.
 
         Returns:
             Directions [16, 3], their light in channel 0, with which 16 cells are lit as all are, their radius in radii
-            of 16 cells, and the light of all cells [direction].
+            of 16 cells, how soft the edges of planes and parts are in them [rad], and the light of all cells
+            [direction].
         """
         with unrecorded():
             projected_light = self.project_light(self.light.value())
@@ -290,15 +291,17 @@ class Directional(SphereMethod):
             chosen = np.sort(np.argsort(-power, kind="stable")[:CHUNK])
             directions, light = projected_light.directions[chosen], power[chosen]
             scale = cell_radius(len(power)) / cell_radius(CHUNK)
+            radius = cell_radius(len(power))
         else:
             directions, places, scale = projected_light.sharp_cells_past_planes
             light[places[places >= 0]] = power[places >= 0]
+            radius = self.visibility.softness * scale * cell_radius(CHUNK)
         light = light[:, None] * [CHUNK / len(power), 0, 0]
-        return directions, wp.array(light[None], dtype=wp.vec3, device=self.merged_scene.device), scale, power
+        return directions, wp.array(light[None], dtype=wp.vec3, device=self.merged_scene.device), scale, radius, power
 
     def sharp_share(self, group: Group) -> np.ndarray | None:
         """Light of the sharpest cells, over all light if nothing blocked any."""
-        directions, light, scale, power = self._sharpest
+        directions, light, scale, radius, power = self._sharpest
         points, normals, centers, radii = group[:4]
         if not radii.shape[1] and group.planes is None and group.convex_parts_around is None:
             return None
@@ -308,7 +311,6 @@ class Directional(SphereMethod):
             )
         else:
             transmittance = wp.full((*points.shape, CHUNK), 1.0, dtype=wp.float32, device=points.device)
-        radius = scale * cell_radius(CHUNK)
         if group.convex_parts_around is not None:
             past_parts = group.convex_parts_around.transmittance(points, normals, directions, radius)
             transmittance = multiply_transmittances(transmittance, past_parts)

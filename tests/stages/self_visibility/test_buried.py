@@ -8,7 +8,7 @@ import warpshadow as ws
 from warpshadow.stages.ray_packets import build_face_tree
 from warpshadow.stages.self_visibility.buried import find_buried, find_dilation
 from warpshadow.stages.self_visibility.probes import find_probes
-from warpshadow.stages.self_visibility.trace import LEAST_RAYS, trace_rows
+from warpshadow.stages.self_visibility.trace import MIN_RAYS, trace_rows
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -26,7 +26,7 @@ def buried_of(points, faces, normals, sides, device) -> np.ndarray:
         wp.array(points, dtype=wp.vec3, device=device), wp.array(faces.ravel(), dtype=wp.int32, device=device)
     )
     places, facing = np.tile(points, (len(sides), 1)), np.concatenate([side * normals for side in sides])
-    rows = trace_rows(build_face_tree(points, faces, device), places, facing, LEAST_RAYS)
+    rows = trace_rows(build_face_tree(points, faces, device), places, facing, MIN_RAYS)
     return find_buried(mesh, places, facing, len(points), rows)
 
 

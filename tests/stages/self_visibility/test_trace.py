@@ -7,7 +7,7 @@ import warpshadow as ws
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.stages.ray_packets import build_face_tree
 from warpshadow.stages.self_visibility import trace
-from warpshadow.stages.self_visibility.trace import LEAST_RAYS, MOST_MEMORY, RAYS, RUN, ray_count, trace_rows
+from warpshadow.stages.self_visibility.trace import MAX_MEMORY, MIN_RAYS, RAYS, RUN, ray_count, trace_rows
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -99,6 +99,6 @@ def test_a_convex_body_blocks_none_of_its_own_light(device):
 
 
 def test_memory_is_bounded_by_fewer_rays():
-    assert ray_count(10_000) == ray_count(MOST_MEMORY * 4 // RAYS) == RAYS
-    assert ray_count(1_000_000) == 1024 and MOST_MEMORY >= 1_000_000 * 1024 // 4
-    assert ray_count(10**9) == LEAST_RAYS
+    assert ray_count(10_000) == ray_count(MAX_MEMORY * 4 // RAYS) == RAYS
+    assert ray_count(1_000_000) == 1024 and MAX_MEMORY >= 1_000_000 * 1024 // 4
+    assert ray_count(10**9) == MIN_RAYS

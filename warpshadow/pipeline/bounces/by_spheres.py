@@ -39,7 +39,7 @@ from warpshadow.pipeline.lighting import LitPoints, joined, receiver_text
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.scene.scene import Bounces
-from warpshadow.stages.bounces.open_sources import find_openness, open_shares
+from warpshadow.stages.bounces.open_sources import Openness, find_openness, open_shares
 from warpshadow.stages.bounces.radiosity import patch_radiosity
 from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.receivers import Receivers
@@ -124,8 +124,8 @@ class PartwiseDirectLight(Node):
         )
 
 
-def _open_shares(senders: Senders, visibility: list[PartVisibility]) -> wp.array:
-    """Weight of each source in its patch's mean, vec3 of shape [batch, source]."""
+def _openness(senders: Senders, visibility: list[PartVisibility]) -> Openness:
+    """How open sources and patches are."""
     parts = [find_openness(part.group.normals, *part.cells) for part in visibility]
     return open_shares(joined(parts), senders.mean, senders.patch_of_source)
 
@@ -136,7 +136,7 @@ class PatchSampleNodes(NamedTuple):
     visibility: PartwiseVisibility  # visibility
     frames: Node  # of flat bodies
     projected_patches: Node  # patches as receivers see them
-    shares: Node  # how much each counts in its patch, vec3 of shape [batch, source]
+    openness: Node  # how open they are, and their patches
 
 
 class Radiosity(Node):
@@ -152,7 +152,7 @@ class Radiosity(Node):
         albedo: Node,
         sources: PatchSampleNodes,
     ):
-        _, frames, projected_patches, shares = sources
+        _, frames, projected_patches, openness = sources
         self._count, self._proxies, self._self_form_factors, self._gathering = (
             count,
             proxies,
@@ -167,18 +167,18 @@ class Radiosity(Node):
             "self light of patches", patch_radiosity, albedo, lit, items=item_text, idle=idle, caches=False
         )
         extra_inputs = self._reflect, self._own, *gathering.stages
-        super().__init__("", None, lit, albedo, projected_patches, frames, shares, extra_inputs=extra_inputs)
+        super().__init__("", None, lit, albedo, projected_patches, frames, openness, extra_inputs=extra_inputs)
 
     def compute(self, call: Call) -> OutgoingRadiance:
         """Reflect direct light, then light that has bounced once, and so on; more often between patches of one body."""
-        lit, albedo, projected_patches, frames, shares = self.values(call)
+        lit, albedo, projected_patches, frames, openness = self.values(call)
         senders, count = self._proxies.senders, self._count
         between = (
             None if self._own.idle else self._self_form_factors.between_patches(senders, [part.group for part in lit])
         )
 
         def sent(radiosity: wp.array) -> OutgoingRadiance:
-            return OutgoingRadiance(self._proxies, radiosity, projected_patches, frames)
+            return OutgoingRadiance(self._proxies, radiosity, projected_patches, frames, openness.of_patches)
 
         def others_light_of(radiosity: wp.array | None) -> wp.array:
             """Radiosity of patches by light from the sky and from other bodies."""
@@ -187,7 +187,7 @@ class Radiosity(Node):
             else:
                 outgoing = sent(radiosity)
                 parts = [self._light(call, part, outgoing) for part in lit]
-            return self._reflect.run(call, albedo, joined(parts), senders.mean, shares)
+            return self._reflect.run(call, albedo, joined(parts), senders.mean, openness.shares)
 
         def with_self_light(others_light: wp.array, radiosity: wp.array | None) -> wp.array:
             if between is None or radiosity is None:
@@ -310,7 +310,7 @@ class SphereBounces:
         frames = Node("", planes.all.frames if planes else lambda _: None, points.vertices)
         projected_patches = Node("", project, sources, visibility, spheres, frames)
         return PatchSampleNodes(
-            visibility, frames, projected_patches, Node("", functools.partial(_open_shares, senders), visibility)
+            visibility, frames, projected_patches, Node("", functools.partial(_openness, senders), visibility)
         )
 
     def _radiosity(

@@ -25,6 +25,7 @@ from warpshadow.pipeline.lighting import joined
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.scene.visibility import Visibility
 from warpshadow.stages.bounces.plane_light import plane_light
+from warpshadow.stages.bounces.plane_texels import find_texels
 from warpshadow.stages.bounces.projected_areas import find_projected_areas, turn_from_planes
 from warpshadow.stages.bounces.proxies import DEPTH, DEPTH_OF_SHEETS, place_proxies
 from warpshadow.stages.bounces.proxy_radiance import find_proxy_radiance, patches_of_clusters
@@ -196,7 +197,7 @@ class Proxies:
     def _depths(self) -> np.ndarray:
         """How far below each patch its proxy is, in radii."""
         depths = [DEPTH_OF_SHEETS if self.merged_scene.is_two_sided[body] else DEPTH for body in self.senders.bodies]
-        return np.repeat(np.float32(depths), np.diff(self.senders.first))
+        return np.repeat(np.array(depths, np.float32), np.diff(self.senders.first))
 
     @functools.cached_property
     def blocker_of_source(self) -> np.ndarray:
@@ -251,6 +252,7 @@ class OutgoingRadiance:
         radiosity: Of the patches, vec3 of shape [batch, patch].
         projected_patches: The patches as receivers see them.
         frames: Where flat bodies are, vec3 of shape [batch, 3 · plane].
+        openness: Of the patches, vec3 of shape [batch, patch].
     """
 
     def __init__(
@@ -259,9 +261,10 @@ class OutgoingRadiance:
         radiosity: wp.array,
         projected_patches: ProjectedPatches,
         frames: wp.array,
+        openness: wp.array,
     ):
         self.proxies, self.senders, self.radiosity = proxies, proxies.senders, radiosity
-        self.projected_patches, self.frames = projected_patches, frames
+        self.projected_patches, self.frames, self.openness = projected_patches, frames, openness
 
     def of_body(self, body: int) -> wp.array:
         """Radiosity of the patches of a body, vec3 of shape [batch, patch]."""
@@ -275,6 +278,12 @@ class OutgoingRadiance:
         return find_proxy_radiance(
             self.radiosity, self.projected_patches.areas, self.senders.areas, *proxies.patches_of_clusters
         )
+
+    @functools.cached_property
+    def texels(self) -> wp.array:
+        """Radiosity of the flat bodies, vec3 of shape [batch, texel]."""
+        assert self.proxies.planes is not None
+        return find_texels(self.radiosity, self.openness, self.proxies.planes.all)
 
 
 class Gathering:
@@ -336,7 +345,7 @@ class Gathering:
         assert planes is not None
         skip = planes.number.get(group.body)
         points, fronts = group.lifted_points_and_fronts(outgoing.frames, planes.all, skip)
-        arguments = points, group.normals, cells.transmittance_spheres, outgoing.frames, outgoing.radiosity, planes.all
+        arguments = points, group.normals, cells.transmittance_spheres, outgoing.frames, outgoing.texels, planes.all
         return plane_light(*arguments, cells.directions, fronts=fronts, skip=skip)
 
     def _from_spheres(self, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:

@@ -17,8 +17,8 @@ from warpshadow.pipeline.planes import ScenePlanes
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.albedo import mean_over_texels, mean_over_vertices
 from warpshadow.stages.bounces.patches import (
-    LEAST_PATCHES,
-    MOST_PATCHES,
+    MAX_PATCHES,
+    MIN_PATCHES,
     PIECES,
     SOURCES,
     Patches,
@@ -91,9 +91,9 @@ class ScenePatches:
         total, counts = sum(areas.values()), {}
         for number, area in areas.items():
             share = _SCENE_PATCHES * area / total if total > 0 else _MIN_BODY_PATCHES
-            minimum = max(LEAST_PATCHES, len(bodies[number].mesh.surface.faces) // PIECES)
-            maximum = MOST_PATCHES
-            if len(areas) * MOST_PATCHES > _SCENE_PATCHES:
+            minimum = max(MIN_PATCHES, len(bodies[number].mesh.surface.faces) // PIECES)
+            maximum = MAX_PATCHES
+            if len(areas) * MAX_PATCHES > _SCENE_PATCHES:
                 maximum = min(maximum, int(2 ** np.floor(np.log2(max(share, _MIN_BODY_PATCHES)))))
             counts[number] = min(minimum, maximum)
         return counts

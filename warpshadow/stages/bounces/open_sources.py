@@ -15,6 +15,8 @@ a shelf full of books that on the shelf 14%.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import warp as wp
 
@@ -109,7 +111,14 @@ def _share(
     shares[batch, source] = wp.cw_div(openness[batch, source], means[batch, patch_of_source[source]])
 
 
-def open_shares(openness: wp.array, mean: SparseMatrix, patch_of_source: np.ndarray) -> wp.array:
+class Openness(NamedTuple):
+    """How open sources and patches are."""
+
+    shares: wp.array  # f, how much each source counts in its patch, vec3 of shape [batch, source]
+    of_patches: wp.array  # Σ_s w_ps o_s, vec3 of shape [batch, patch]
+
+
+def open_shares(openness: wp.array, mean: SparseMatrix, patch_of_source: np.ndarray) -> Openness:
     """How much sources count in their patches, by their openness: 1 on average.
 
     Args:
@@ -117,11 +126,12 @@ def open_shares(openness: wp.array, mean: SparseMatrix, patch_of_source: np.ndar
         mean: The weights w, [patch, source], from :func:`.radiosity.mean_over_sources`.
         patch_of_source: The patch of each source, shape [source].
     Returns:
-        f, vec3 of shape [batch, source].
+        f, and the openness of patches.
     Differentiable: openness.
     """
     check.shape("patch_of_source", patch_of_source.shape, (openness.shape[1],))
     owners = constant(np.asarray(patch_of_source, np.int32), wp.int32, openness.device)
     shares = empty(openness.shape, dtype=wp.vec3, device=openness.device)
-    launch(_share, shares.shape, inputs=[openness, multiply(mean, openness), owners], outputs=[shares])
-    return shares
+    of_patches = multiply(mean, openness)
+    launch(_share, shares.shape, inputs=[openness, of_patches, owners], outputs=[shares])
+    return Openness(shares, of_patches)

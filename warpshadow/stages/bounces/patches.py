@@ -18,11 +18,11 @@ from warpshadow.maths.spatial_sort import compact_order
 from warpshadow.stages.planes.grid import PlaneTexture, find_grid
 from warpshadow.stages.self_visibility.buried import find_buried
 
-LEAST_PATCHES = 128
+MIN_PATCHES = 128
 """Patches of a body of few faces, which may have as many sides as stairs. With 32 in place of 128 images of stairs with
 all bounces were 7.2 in place of 6.2% off, of nested boxes 7.5 in place of 6.7%; a room's, a corner's the same."""
 
-MOST_PATCHES = 256  # patches of a body
+MAX_PATCHES = 256  # patches of a body
 PIECES = 8  # pieces of each patch, at least
 
 _NEEDLE = 0.01
@@ -113,7 +113,7 @@ def find_patches(
     faces: np.ndarray,
     *,
     is_two_sided: bool,
-    count: int = MOST_PATCHES,
+    count: int = MAX_PATCHES,
     sources: int = SOURCES,
     device: wp.DeviceLike = None,
 ) -> Patches:
@@ -132,7 +132,7 @@ def find_patches(
         Patches; none where no face has an area.
     """
     sides = 2 if is_two_sided else 1
-    count = min(count, max(LEAST_PATCHES, len(faces) // PIECES)) // sides
+    count = min(count, max(MIN_PATCHES, len(faces) // PIECES)) // sides
     total = np.linalg.norm(_areas(positions.astype(np.float64)[faces]), axis=1).sum()
     longest = 2 * np.sqrt(total / (PIECES * count))  # as in right triangles
     cut = _cut(positions, faces, lambda points: points / longest)

@@ -17,6 +17,7 @@ from warpshadow.stages.planes.cells import (
     find_spot,
     front_of,
     front_of_adjoint,
+    is_covered_by_texels,
     on_side,
     scatter,
     side_adjoint,
@@ -37,7 +38,7 @@ _MIN_WEIGHT_SUM = wp.constant(1.0e-30)  # the least Σ s
 # The hit of a cell on each of these sides, from ``6 flat_count`` on:
 #     4 i        coverage, distance, and how much that varies over the cell
 #     4 i + 1    radiosity
-#     4 i + 2    coverage of the rectangle, the mesh's share of it, and 1 / c′
+#     4 i + 2    coverage of the outline or the rectangle, the mesh's share of that by texels, and 1 / c′
 #     4 i + 3    place in the plane, and the transmittance of the sides in front of it
 SCRATCH_ROWS = 14
 
@@ -150,10 +151,10 @@ def hit_sides(
                 covered = float(1.0)
                 radiosity = wp.vec3()
                 sends = grid.sides == 2 or not is_back
-                if sends or grid.is_whole == 0:
+                if sends or is_covered_by_texels(grid):
                     first_level = levels_of(grid, is_back)
                     spot = find_spot(grid, scene, footprint)
-                    if grid.is_whole == 0:
+                    if is_covered_by_texels(grid):
                         covered = fetch(scene.covered, scene, first_level, spot)[0]
                     if sends:
                         radiosity = fetch(texels, scene, first_level, spot)
@@ -197,22 +198,20 @@ def hit_sides_adjoint(
             footprint.per_cosine = stored[2]
             footprint.center = wp.vec2(spot_place[0], spot_place[1])
             adj_met = adj_store[cells + 4 * i]  # of coverage, distance, and t ρ / c′
-            adj_light = adj_store[cells + 4 * i + 1]  # of share × radiosity
+            adj_light = adj_store[cells + 4 * i + 1]  # of radiosity
             adj_share = adj_met[0] * stored[1]
             adj_spot = wp.vec3()
             sends = grid.sides == 2 or not is_back
-            if sends or grid.is_whole == 0:
+            if sends or is_covered_by_texels(grid):
                 first_level = levels_of(grid, is_back)
                 spot = find_spot(grid, scene, footprint)
-                if grid.is_whole == 0:
+                if is_covered_by_texels(grid):
                     adj_covered = wp.vec3(adj_met[0] * stored[0], 0.0, 0.0)
                     adj_spot += fetch_adjoint(scene.covered, grid, scene, first_level, footprint, spot, adj_covered)
                 if sends:
-                    adj_share += wp.dot(adj_light, store[cells + 4 * i + 1])
-                    adj = stored[0] * adj_light
-                    adj_spot += fetch_adjoint(texels, grid, scene, first_level, footprint, spot, adj)
+                    adj_spot += fetch_adjoint(texels, grid, scene, first_level, footprint, spot, adj_light)
                     if adj_texels:
-                        scatter(adj_texels[instance], scene, first_level, spot, adj)
+                        scatter(adj_texels[instance], scene, first_level, spot, adj_light)
             # a footprint is as wide as t / √c′
             adj_distance = adj_met[1] + adj_met[2] * scene.radius * footprint.per_cosine
             adj_cosine = -footprint.per_cosine * (
@@ -271,7 +270,7 @@ def mean_light(cells: int, side_count: int, store: wp.array(dtype=wp.vec3)):
         if coverage > 0.0:
             transmitted = side_transmittance(i, i, cells, side_count, store)
             store[cells + 4 * i + 3][2] = transmitted
-            light += (store[cells + 4 * i + 2][0] * transmitted) * store[cells + 4 * i + 1]
+            light += (coverage * transmitted) * store[cells + 4 * i + 1]
             weights += coverage * transmitted
             covered += coverage
     weights = wp.max(weights, _MIN_WEIGHT_SUM)

@@ -44,7 +44,6 @@ from warpshadow.stages.planes.cells import (
     plane_arrays,
 )
 from warpshadow.stages.planes.prepared import PlaneBlockers
-from warpshadow.stages.sparse import multiply
 
 _CELL_COST = 15.0  # mean time of a cell of a receiver [ns], over cells that hit a plane and cells that do not
 
@@ -144,14 +143,10 @@ def _light_receivers_adjoint(
                 coverage = store[cells + 4 * i][0]
                 if coverage > 0.0:
                     transmitted = store[cells + 4 * i + 3][2]
-                    adj_transmitted = (
-                        store[cells + 4 * i + 2][0] * wp.dot(adj, store[cells + 4 * i + 1]) - coverage * value
-                    )
-                    adj_store[cells + 4 * i] = adj_store[cells + 4 * i] - wp.vec3(
-                        factor * transmitted * value, 0.0, 0.0
-                    )
-                    adj_store[cells + 4 * i + 1] = (factor * transmitted) * adj
-                    side_transmittance_adjoint(i, factor * adj_transmitted, cells, side_count, store, adj_store)
+                    adj_weight = factor * (wp.dot(adj, store[cells + 4 * i + 1]) - value)
+                    adj_store[cells + 4 * i] = adj_store[cells + 4 * i] + wp.vec3(transmitted * adj_weight, 0.0, 0.0)
+                    adj_store[cells + 4 * i + 1] = (factor * coverage * transmitted) * adj
+                    side_transmittance_adjoint(i, coverage * adj_weight, cells, side_count, store, adj_store)
             adj_normal += (passing * total) * direction
             if adj_transmittance:
                 adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + cosine * total
@@ -182,7 +177,7 @@ def plane_light(
     normals: wp.array,
     transmittance: wp.array,
     frames: wp.array,
-    radiosity: wp.array,
+    texels: wp.array,
     planes: PlaneBlockers,
     directions: np.ndarray,
     *,
@@ -196,28 +191,26 @@ def plane_light(
         normals: Their unit normals, vec3 of shape [batch, receiver].
         transmittance: Past all else, without the planes, float32 of shape [batch, receiver, direction].
         frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`PlaneBlockers.frames`.
-        radiosity: Of the patches of all bodies, vec3 of shape [batch, patch]. A batch of 1 serves all instances here
-            and above.
+        texels: Radiosity of the planes, vec3 of shape [batch, texel], from :func:`.plane_texels.find_texels`. A batch
+            of 1 serves all instances here and above.
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
         fronts: Part of the front of each plane that receivers see, float32 of shape [batch, receiver, plane], from
             :func:`warpshadow.stages.planes.fronts.find_fronts`; by default their heights decide.
         skip: Number of the plane that the receivers are part of, which sends them nothing; None for none.
     Returns:
         Light that white receivers reflect of it, vec3 of shape [batch, receiver].
-    Differentiable: points, normals, transmittance, frames, radiosity, fronts.
+    Differentiable: points, normals, transmittance, frames, texels, fronts.
     """
     check_planes(planes, points, frames, directions, skip)
     check.shape("normals", normals.shape, ("batch", points.shape[1]))
     check.shape("transmittance", transmittance.shape, ("batch", points.shape[1], len(directions)))
     arguments = {"points": points, "normals": normals, "transmittance": transmittance, "frames": frames}
-    instances = common_batch({**arguments, "radiosity": radiosity, "fronts": fronts})
+    instances = common_batch({**arguments, "texels": texels, "fronts": fronts})
     if planes.count == (skip is not None):
         return zeros((instances, points.shape[1]), wp.vec3, points.device)
-    assert planes.texels_of_patches is not None
     points, normals = (expand(array, instances) for array in (points, normals))
     transmittance = expand_rows(transmittance, instances)
     fronts = None if fronts is None else expand_rows(fronts, instances)
-    texels = multiply(planes.texels_of_patches, radiosity)
     scratch = Scratch((SCRATCH_ROWS * planes.count,), wp.vec3)
     variables = [points, normals, transmittance, frames, texels, fronts]
     scene, cells = (

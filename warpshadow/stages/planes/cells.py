@@ -11,11 +11,12 @@ distance d below the receiver:
     h = S(c/ρ) · Π_axes [S((y_most − y)/e) − S((y_least − y)/e)],  e = t ρ √(1 + (ω_axis / c′)²)
                                               coverage: part of the cell that the rectangle takes
 
-S(z) is the smoothstep from 0 at −1 to 1 at 1, so h has no step at the horizon, or at the border. Where the mesh has
-holes, h is multiplied with the mesh's share of the footprint. Radiosity is bilinear in two mip levels of the grid,
-which are blended so that their texels are as wide as the footprint is in the mean of both axes, 2 t ρ / √c′: twice the
-disc of the cell, as interpolation between means is, so that together cells see all texels alike. For a sun alone that
-is too wide: there texels are half as wide.
+S(z) is the smoothstep from 0 at −1 to 1 at 1, so h has no step at the horizon, or at the border. Of a mesh with holes,
+or one that is no rectangle, the outline takes the place of the product (:mod:`.outlines`), or, where it has very many
+edges, the product is multiplied with the mesh's share of the footprint, by texels. Radiosity is bilinear in two mip
+levels of the grid, which are blended so that their texels are as wide as the footprint is in the mean of both axes,
+2 t ρ / √c′: twice the disc of the cell, as interpolation between means is, so that together cells see all texels alike.
+For a sun alone that is too wide: there texels are half as wide.
 
 No receiver is nearer to a side than a margin, so that t is not 0. Which side it is on, :mod:`.fronts` says; by height
 alone the front fades away and the back appears from the plane to a margin below it.
@@ -25,6 +26,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
+from warpshadow.stages.planes.outlines import find_ellipse, share_in_outline, share_in_outline_adjoint
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 
 
@@ -36,6 +38,7 @@ class PlaneArrays:
     levels: wp.array(dtype=wp.vec3i)
     level_scales: wp.array(dtype=wp.vec2)
     covered: wp.array(dtype=wp.vec3)
+    edges: wp.array(dtype=wp.vec4)
     skip: int  # the plane that the receivers are part of, -1 for none
     radius: float  # ρ
     spot_radius: float  # half the width of texels, for a unit of distance
@@ -64,8 +67,8 @@ def plane_arrays(planes: PlaneBlockers, radius: float, skip: int | None, *, tile
     """
     scene = PlaneArrays()
     scene.grids, scene.levels, scene.level_scales = planes.grids, planes.levels, planes.level_scales
-    scene.covered, scene.skip = planes.covered, -1 if skip is None else skip
-    scene.radius = radius
+    scene.covered, scene.edges = planes.covered, planes.edges
+    scene.skip, scene.radius = -1 if skip is None else skip, radius
     scene.spot_radius = scene.radius if tiles else 0.5 * scene.radius
     scene.per_radius = 1 / scene.radius
     return scene
@@ -240,7 +243,7 @@ def side_adjoint(
 class PlaneFootprint:
     """Footprint of a cell on a plane, for a receiver over one side."""
 
-    share: float  # part of the cell that the rectangle takes
+    share: float  # part of the cell that the outline takes, or the rectangle
     distance: float  # [units of the body]
     per_cosine: float  # 1 / c′, the mean cosine of the part of the cell below the horizon
     center: wp.vec2  # in the plane
@@ -282,7 +285,17 @@ def find_footprint(grid: PlaneGrid, scene: PlaneArrays, at: wp.vec3, toward: wp.
             extent = footprint.distance * scene.radius * wp.sqrt(1.0 + slope * slope)
             upper_bound = (grid.most[axis] - footprint.center[axis]) / extent
             before = (grid.least[axis] - footprint.center[axis]) / extent
-            footprint.share = footprint.share * (step(upper_bound) - step(before))
+            if grid.edge_count == 0:
+                footprint.share = footprint.share * (step(upper_bound) - step(before))
+            elif upper_bound <= -1.0 or before >= 1.0:
+                footprint.share = 0.0
+    if grid.edge_count > 0 and footprint.share > 0.0:
+        ellipse = find_ellipse(
+            footprint.center,
+            footprint.per_cosine * wp.vec2(toward[0], toward[1]),
+            footprint.distance * scene.radius,
+        )
+        footprint.share *= share_in_outline(scene.edges, grid.first_edge, grid.edge_count, ellipse)
     return footprint
 
 
@@ -308,19 +321,29 @@ def find_footprint_adjoint(
     adj_x = adj_center[0]
     adj_y = adj_center[1]
     adj_toward = wp.vec3()
-    if not _is_amid(grid, footprint, radius):
-        slope = wp.vec2(toward[0], toward[1]) * footprint.per_cosine
+    slope = wp.vec2(toward[0], toward[1]) * footprint.per_cosine
+    if grid.edge_count > 0:
+        ellipse = find_ellipse(footprint.center, slope, footprint.distance * radius)
+        inside_x = share_in_outline(scene.edges, grid.first_edge, grid.edge_count, ellipse)
+        adj_inside = adj_share * side_weight * horizon
+        adj = share_in_outline_adjoint(scene.edges, grid.first_edge, grid.edge_count, ellipse, adj_inside)
+        adj_x += adj.center[0]
+        adj_y += adj.center[1]
+        adj_t += adj.log_size / footprint.distance
+        adj_toward = footprint.per_cosine * wp.vec3(adj.slope[0], adj.slope[1], 0.0)
+        adj_c -= wp.dot(adj.slope, slope) * footprint.per_cosine
+    elif not _is_amid(grid, footprint, radius):
         stretch = wp.vec2(wp.sqrt(1.0 + slope[0] * slope[0]), wp.sqrt(1.0 + slope[1] * slope[1]))
         extent = footprint.distance * radius * stretch
         upper_bound = wp.cw_div(grid.most - footprint.center, extent)
         before = wp.cw_div(grid.least - footprint.center, extent)
         inside_x = step(upper_bound[0]) - step(before[0])
         inside_y = step(upper_bound[1]) - step(before[1])
-        adj_inside = adj_share * side_weight * horizon * wp.vec2(inside_y, inside_x)
+        adj_insides = adj_share * side_weight * horizon * wp.vec2(inside_y, inside_x)
         at_most = wp.cw_div(
-            wp.cw_mul(adj_inside, wp.vec2(step_slope(upper_bound[0]), step_slope(upper_bound[1]))), extent
+            wp.cw_mul(adj_insides, wp.vec2(step_slope(upper_bound[0]), step_slope(upper_bound[1]))), extent
         )
-        at_least = wp.cw_div(wp.cw_mul(adj_inside, wp.vec2(step_slope(before[0]), step_slope(before[1]))), extent)
+        at_least = wp.cw_div(wp.cw_mul(adj_insides, wp.vec2(step_slope(before[0]), step_slope(before[1]))), extent)
         adj_x += at_least[0] - at_most[0]
         adj_y += at_least[1] - at_most[1]
         adj_extent = wp.cw_mul(at_least, before) - wp.cw_mul(at_most, upper_bound)
@@ -350,6 +373,12 @@ class TexelFootprint:
     level: int  # finer of the two levels
     part: float  # of the coarser one
     part_slope: float  # of that by the logarithm of the footprint's width
+
+
+@wp.func
+def is_covered_by_texels(grid: PlaneGrid):
+    """Whether texels say how much of a footprint the mesh covers."""
+    return grid.is_whole == 0 and grid.edge_count == 0
 
 
 @wp.func

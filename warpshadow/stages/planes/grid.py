@@ -6,14 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from warpshadow.maths.outline import find_outline
 from warpshadow.maths.plane import plane_normal
 
 _GRID = 24  # texels along a grid's longer side
 _EVEN_SPREAD = 100.0  # spread of a grid that is even, in sizes of its body
 _ROUNDING = 1e-6  # how far off a face a point may lie and still count as on it, as a part of the face or texel
-_TESTS_PER_SIDE = (
-    3  # points along each side of a texel that are tested to lie on the mesh; odd, so that its middle is one
-)
+_WHOLE = 1e-4  # share of its rectangle up to which gaps of a mesh do not count
+# points along each side of a texel that are tested to lie on the mesh; odd, so that its middle is one
+_TESTS_PER_SIDE = 3
 
 
 class PlaneTexture(NamedTuple):
@@ -33,6 +34,18 @@ class PlaneTexture(NamedTuple):
     high: np.ndarray  # corners of the rectangle in (ξ, η), float64 of shape [2]
     covered: np.ndarray  # share of each texel that the mesh covers, float32 of shape [row, column]
     sides: int  # 1 if the front alone sends light, 2 if the back does, too; its patches follow the front's
+    outline: np.ndarray  # edges (a, b) around the mesh and its holes, the mesh to their left, float64 [edge, 2, 2]
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the mesh covers the rectangle."""
+        (a, b), (low, high) = self.outline.swapaxes(0, 1), self.corners()
+        area = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / 2
+        return bool((self.covered == 1).all() and area > (1 - _WHOLE) * (high - low).prod())
+
+    def corners(self) -> np.ndarray:
+        """Corners of the rectangle in the plane, (a, b), float64 of shape [2, 2]."""
+        return self.spread * stretched(np.stack([self.low, self.high]))
 
     def middles(self) -> np.ndarray:
         """Middles of the texels in the plane, (a, b), float64 of shape [row, column, 2]."""
@@ -119,8 +132,12 @@ def find_grid(
     low, high = squeezed((low - middle) / spread), squeezed((high - middle) / spread)
     width, height = np.maximum(np.rint(_GRID * (high - low) / (high - low).max()), 1).astype(int)
     sides = 2 if is_two_sided else 1
-    grid = PlaneTexture(frame, origin, float(spread), low, high, np.ones((height, width), np.float32), sides)
     corners = ((corners - origin) @ frame.T)[..., :2]
+    _, first, place = np.unique(positions, axis=0, return_index=True, return_inverse=True)
+    in_plane = (positions[first].astype(np.float64) - origin) @ frame[:2].T
+    outline = in_plane[find_outline(in_plane, place.reshape(-1)[faces])]
+    whole = np.ones((height, width), np.float32)
+    grid = PlaneTexture(frame, origin, float(spread), low, high, whole, sides, outline)
     covered, result = _find_covered(grid, corners)
     return grid._replace(covered=covered), result
 

@@ -9,8 +9,8 @@ that are drawn from its light, and in as many even ones ν_s, each with a cell o
 within [0, 1], with h_k the coverage by plane k (:mod:`.cells`). So even light passes as it did, and what passes and
 what planes send still add up. Other cells, and seams in which walls meet, take no time.
 
-In a room that is lit through a window direct light on a box was 25% too dark by C in 128 cells, and is 5% by C′ with 4
-directions of each.
+In closed_room of demos/kinds.py, which is lit through a window, ceiling and back wall with all bounces are 8 and 9% too
+bright by C in 128 cells, and 3% off by C′ with 4 directions of each.
 """
 
 from __future__ import annotations

@@ -10,12 +10,16 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.stages.planes.grid import PlaneTexture, stretched
+from warpshadow.stages.planes.grid import PlaneTexture
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
+MAX_EDGES = 128
+"""Edges of an outline at most: beyond, the mesh takes the share of a footprint that it covers of its texels."""
+
+_BESIDE = 0.002  # how much texels count in those beside them, which have it if nothing of their own is seen
 _MARGIN = 0.001  # margin of planes, in widths of the smallest texel
 
 
@@ -44,6 +48,8 @@ class PlaneGrid:
     level_count: int
     sides: int
     is_whole: int  # the mesh covers the rectangle
+    first_edge: int  # of its outline, where it does not
+    edge_count: int  # 0 where texels say how much the mesh covers
     blocks: int
 
 
@@ -58,7 +64,9 @@ class PlaneBlockers:
         levels: First texel, width and height of each mip level, for each side of each plane, vec3i of shape [level].
         level_scales: Its texels for one of the finest level, vec2 of shape [level].
         covered: Coverage of each texel by the mesh, in all three components, vec3 of shape [texel].
-        texels_of_patches: Matrix of mip levels, [texel, patch]; None where no patches are given.
+        edges: Begin and end of the edges of outlines, in the axes of their planes, vec4 of shape [edge].
+        texels_of_patches: Part of the area of each texel that patches have, and a little in the texels beside it,
+            [texel, patch]; None where no patches are given.
         frames_of_vertices: Matrix that finds frames, [3 · plane, vertex].
         has_holes: Whether a mesh of the plane blockers leaves a part of its rectangle open, as a window.
     """
@@ -69,6 +77,7 @@ class PlaneBlockers:
     levels: wp.array
     level_scales: wp.array
     covered: wp.array
+    edges: wp.array
     texels_of_patches: SparseMatrix | None
     frames_of_vertices: SparseMatrix
     has_holes: bool
@@ -80,20 +89,23 @@ class PlaneBlockers:
 
         levels: list[tuple[int, int, int]] = []
         scales: list[tuple[float, float]] = []
-        grids, covered, pyramids, frames, texel_count = [], [], [], [], 0
+        grids, covered, edges, pyramids, frames, texel_count = [], [], [np.empty((0, 4))], [], [], 0
         for body in bodies:
-            grid, first_level = body.grid, len(levels)
+            grid, first_level, first_edge = body.grid, len(levels), sum(map(len, edges))
+            if not grid.is_whole and len(grid.outline) <= MAX_EDGES:
+                edges.append(grid.outline.reshape(-1, 4))
             matrices = _halvings(*grid.covered.shape)
             for side in range(grid.sides):
-                for matrix, (height, width) in matrices:
+                for matrix, blurred, (height, width) in matrices:
                     levels.append((texel_count, width, height))
                     scales.append((width / grid.covered.shape[1], height / grid.covered.shape[0]))
                     texel_count += width * height
                     covered.append(matrix @ grid.covered.ravel())
                     if patch_count:
                         first = body.first_patch + side * grid.covered.size
-                        pyramids.append(_shifted(matrix.multiply(grid.covered.ravel()).tocsr(), first, patch_count))
-            grids.append(_kernel_grid(body, first_level, len(matrices)))
+                        pyramids.append(_shifted(blurred.multiply(grid.covered.ravel()).tocsr(), first, patch_count))
+            edge_count = sum(map(len, edges)) - first_edge
+            grids.append(_kernel_grid(body, first_level, len(matrices), first_edge, edge_count))
             frames.append(_frame_matrix(body, vertex_count))
         return PlaneBlockers(
             len(bodies),
@@ -102,9 +114,10 @@ class PlaneBlockers:
             wp.array(np.array(levels), dtype=wp.vec3i, device=device),
             wp.array(np.array(scales), dtype=wp.vec2, device=device),
             wp.array(np.repeat(np.concatenate(covered)[:, None], 3, axis=1), dtype=wp.vec3, device=device),
+            wp.array(np.concatenate(edges), dtype=wp.vec4, device=device),
             SparseMatrix.of(vstack(pyramids), device=device) if patch_count else None,
             SparseMatrix.of(vstack(frames), device=device),
-            any(body.blocks and (body.grid.covered < 1).any() for body in bodies),
+            any(body.blocks and not body.grid.is_whole for body in bodies),
         )
 
     def frames(self, positions: wp.array) -> wp.array:
@@ -121,17 +134,27 @@ class PlaneBlockers:
 
 
 @functools.lru_cache(16)
-def _halvings(height: int, width: int) -> list[tuple[csr_matrix, tuple[int, int]]]:
+def _halvings(height: int, width: int) -> list[tuple[csr_matrix, csr_matrix, tuple[int, int]]]:
     """Matrices from a grid to each of its mip levels, each half as large as the one before, and their sizes.
+
+    The second of each adds a little of the texels beside each one.
 
     Not to be written to: grids of different scenes are often of one size.
     """
-    from scipy.sparse import kron
+    from scipy.sparse import diags, kron
+
+    def blur(count: int) -> csr_matrix:
+        return diags([_BESIDE, 1.0, _BESIDE], [-1, 0, 1], shape=(count, count)).tocsr()
 
     sizes = [(height, width)]
     while max(sizes[-1]) > 1:
         sizes.append((max(sizes[-1][0] // 2, 1), max(sizes[-1][1] // 2, 1)))
-    return [(kron(_means(height, rows), _means(width, columns)).tocsr(), (rows, columns)) for rows, columns in sizes]
+    result = []
+    for rows, columns in sizes:
+        of_rows, of_columns = _means(height, rows), _means(width, columns)
+        matrices = kron(of_rows, of_columns), kron(blur(rows) @ of_rows, blur(columns) @ of_columns)
+        result.append((matrices[0].tocsr(), matrices[1].tocsr(), (rows, columns)))
+    return result
 
 
 def _means(fine: int, coarse: int) -> csr_matrix:
@@ -151,15 +174,15 @@ def _shifted(matrix: csr_matrix, first: int, count: int) -> csr_matrix:
     return csr_matrix((matrix.data, matrix.indices + first, matrix.indptr), shape=(matrix.shape[0], count))
 
 
-def _kernel_grid(body: PlaneBody, first_level: int, level_count: int) -> PlaneGrid:
+def _kernel_grid(body: PlaneBody, first_level: int, level_count: int, first_edge: int, edge_count: int) -> PlaneGrid:
     grid, flat = body.grid, PlaneGrid()
     texels = np.array(grid.covered.shape[::-1]) / (grid.high - grid.low)
-    flat.least = wp.vec2(*(grid.spread * stretched(grid.low)))
-    flat.most = wp.vec2(*(grid.spread * stretched(grid.high)))
+    flat.least, flat.most = (wp.vec2(*corner) for corner in grid.corners())
     flat.texels, flat.first = wp.vec2(*texels), wp.vec2(*(-grid.low * texels))
     flat.per_spread, flat.margin = 1 / grid.spread, _MARGIN * float(grid.texel_sizes().min())
     flat.first_level, flat.level_count, flat.sides = first_level, level_count, grid.sides
-    flat.is_whole, flat.blocks = int((grid.covered == 1).all()), int(body.blocks)
+    flat.is_whole, flat.blocks = int(grid.is_whole), int(body.blocks)
+    flat.first_edge, flat.edge_count = first_edge, edge_count
     return flat
 
 

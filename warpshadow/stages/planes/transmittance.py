@@ -32,6 +32,7 @@ from warpshadow.stages.planes.cells import (
     find_spot,
     front_of,
     front_of_adjoint,
+    is_covered_by_texels,
     on_side,
     plane_arrays,
     side_adjoint,
@@ -48,7 +49,7 @@ class PlaneCover:
     """Coverage of a cell by a side."""
 
     coverage: float
-    part: float  # of the footprint, that the mesh covers
+    part: float  # of the footprint, that the mesh covers, by texels
     footprint: PlaneFootprint
 
 
@@ -64,7 +65,7 @@ def cover(
             grid, scene, on_side(grid, place, is_back), toward_side(place, is_back, direction), side_weight
         )
         covered.part = 1.0
-        if grid.is_whole == 0 and covered.footprint.share > 0.0:
+        if is_covered_by_texels(grid) and covered.footprint.share > 0.0:
             spot = find_spot(grid, scene, covered.footprint)
             covered.part = fetch(scene.covered, scene, grid.first_level, spot)[0]
         covered.coverage = covered.footprint.share * covered.part
@@ -86,7 +87,7 @@ def cover_adjoint(
     """Add to the gradients of the place, and of the presence."""
     footprint = covered.footprint
     adj_spot = wp.vec3()
-    if grid.is_whole == 0:
+    if is_covered_by_texels(grid):
         spot = find_spot(grid, scene, footprint)
         adj_part = wp.vec3(adj * footprint.share, 0.0, 0.0)
         adj_spot = fetch_adjoint(scene.covered, grid, scene, grid.first_level, footprint, spot, adj_part)

@@ -23,8 +23,8 @@ from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.stages.self_visibility.trace import RUN
 
-_LEAST_REACH = 2.2  # least h, in radii of the coarse cells
-_MOST_RAYS = 32  # rays that a cell looks up on average at most; a wider one looks up coarse cells
+_MIN_REACH = 2.2  # least h, in radii of the coarse cells
+_MAX_RAYS = 32  # rays that a cell looks up on average at most; a wider one looks up coarse cells
 _CELL_COST = 1600.0  # nanoseconds that a cell takes
 
 
@@ -61,10 +61,10 @@ def find_resampling_kernels(
     count, cell_count = len(directions), ray_count // RUN
     spreads = np.full(count, cell_radius(count)) if spreads is None else np.minimum(spreads, cell_radius(count))
     of_rays, of_cells = (
-        np.maximum(np.sqrt(2 * np.maximum(spreads**2 - radius**2, 0)), _LEAST_REACH * radius)
+        np.maximum(np.sqrt(2 * np.maximum(spreads**2 - radius**2, 0)), _MIN_REACH * radius)
         for radius in map(cell_radius, (ray_count, cell_count))
     )
-    looks_at_rays = ray_count * (1 - np.cos(of_rays)) / 2 <= _MOST_RAYS
+    looks_at_rays = ray_count * (1 - np.cos(of_rays)) / 2 <= _MAX_RAYS
     reaches = np.cos(np.where(looks_at_rays, of_rays, of_cells))
     counts = np.where(looks_at_rays, ray_count, cell_count) * (1 - reaches) / 2
     rays = fibonacci(ray_count)

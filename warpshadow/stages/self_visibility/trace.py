@@ -5,7 +5,7 @@ escape, weighted with their cosines. A ray below the horizon of its probe takes 
 it mirrored at the tangent plane: so a cell at the horizon, half of which is below, is as open as its upper half.
 
 A probe takes D/8 bytes of bits and D/8 bytes of cells, 1 kB with 4096 rays; its back takes as much. Of a body whose
-probes would so take more than :data:`MOST_MEMORY`, fewer rays are traced.
+probes would so take more than :data:`MAX_MEMORY`, fewer rays are traced.
 """
 
 import functools
@@ -23,9 +23,9 @@ from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open, pack
 from warpshadow.stages.ray_tracing import parts
 
 RAYS = 4096  # rays of a probe, if memory allows
-LEAST_RAYS = 256  # rays of a probe, for any amount of memory
+MIN_RAYS = 256  # rays of a probe, for any amount of memory
 RUN = 8  # rays of a coarse cell
-MOST_MEMORY = 2**28  # bytes that the rows of a body take at most, as long as probes have :data:`LEAST_RAYS`
+MAX_MEMORY = 2**28  # bytes that the rows of a body take at most, as long as probes have :data:`MIN_RAYS`
 
 _MIRRORED = 3.5
 """Angle below the horizon to which rays are mirrored, in radii of a coarse cell: no lookup reaches farther."""
@@ -72,7 +72,7 @@ class VisibilityRows(NamedTuple):
 def ray_count(row_count: int) -> int:
     """Rays of a probe of a body with so many rows, a power of two."""
     count = RAYS
-    while count > LEAST_RAYS and row_count * count // 4 > MOST_MEMORY:
+    while count > MIN_RAYS and row_count * count // 4 > MAX_MEMORY:
         count //= 2
     return count
 

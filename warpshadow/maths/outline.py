@@ -1,0 +1,185 @@
+"""Outlines: the edges around triangles of a plane and around their holes, and the convex polygons that they enclose."""
+
+from __future__ import annotations
+
+import numpy as np
+
+_STRAIGHT = 1e-5
+"""Distance from the line through its neighbors, over the size of the outline, up to which a corner is none; and the
+angle [rad] up to which a corner of a polygon is straight."""
+
+_SLIVER = 1e-7  # area of a triangle, over the squared size of all, up to which rounding may turn it over
+
+
+def find_outline(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Find the edges that the triangles of a plane have not in common.
+
+    The outline of a sheet does not depend on how it is triangulated. Where triangles overlap, their outlines do, too.
+
+    Args:
+        points: Float64 of shape [point, 2], no two at one place.
+        triangles: Of any winding, shape [triangle, 3]; slivers wind as most do.
+    Returns:
+        Points where each edge begins and ends, with the triangles to its left, int of shape [edge, 2].
+    """
+    a, b, c = np.moveaxis(points[triangles], 1, 0)
+    areas = _cross(b - a, c - a)
+    has_area = np.abs(areas) > _SLIVER * np.ptp(points, axis=0).max(initial=0.0) ** 2
+    is_turned = np.where(has_area, areas, areas.sum()) < 0
+    corners = np.where(is_turned[:, None], triangles[:, ::-1], triangles)
+    begins, ends = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
+    pairs, number = np.unique(np.sort([begins, ends], axis=0), axis=1, return_inverse=True)
+    excess = np.bincount(number.reshape(-1), np.where(begins < ends, 1, -1), pairs.shape[1]).astype(int)
+    directed = np.where(excess > 0, pairs, pairs[::-1])
+    return _without_straight(points, np.repeat(directed, np.abs(excess), axis=1).T)
+
+
+def _without_straight(points: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Join edges at corners that are none."""
+    outgoing: dict[int, list[int]] = {}
+    incoming: dict[int, list[int]] = {}
+    for begin, end in edges.tolist():
+        outgoing.setdefault(begin, []).append(end)
+        incoming.setdefault(end, []).append(begin)
+    tolerance = _STRAIGHT * np.ptp(points[edges], axis=(0, 1)).max() if len(edges) else 0.0
+    for corner in sorted(outgoing):
+        if len(outgoing[corner]) != 1 or len(incoming[corner]) != 1:
+            continue
+        (after,), (before,) = outgoing[corner], incoming[corner]
+        side, offset = points[after] - points[before], points[corner] - points[before]
+        length = np.hypot(*side)
+        if before != after and abs(_cross(side, offset)) <= tolerance * length and 0 < offset @ side < length**2:
+            del outgoing[corner], incoming[corner]
+            outgoing[before][outgoing[before].index(corner)] = after
+            incoming[after][incoming[after].index(corner)] = before
+    return np.array([[begin, end] for begin, others in outgoing.items() for end in others], int).reshape(-1, 2)
+
+
+def cut_outline(points: np.ndarray, edges: np.ndarray, maximum: int) -> list[np.ndarray] | None:
+    """Cut what an outline encloses into convex polygons, by lines between its corners.
+
+    Each line begins at a reflex corner. It goes to one from which on that is reflex no more, to another reflex one if
+    it can be, else to the nearest. Lines that no corner needs any more are left out [Hertel and Mehlhorn 1983].
+
+    Args:
+        points: Float64 of shape [point, 2].
+        edges: Of the outline, shape [edge, 2], with the inside to their left.
+        maximum: Number of polygons at most.
+    Returns:
+        Corners of each polygon, numbers of points counterclockwise, int of shape [corner]; None where there are more,
+        or where the outline touches or crosses itself.
+    """
+    after, before = dict(edges.tolist()), dict(edges[:, ::-1].tolist())
+    if not len(after) == len(before) == len(edges):
+        return None
+    reflex = {corner for corner in after if _is_reflex(points, before[corner], corner, after[corner])}
+    if len(reflex) > 2 * maximum:
+        return None
+    cuts = _Cuts(points, edges)
+    for corner in sorted(reflex):
+        while sector := cuts.reflex_sector(corner):
+            end = cuts.best_end(corner, sector, reflex)
+            if end is None:
+                return None
+            cuts.add(corner, end)
+    cuts.leave_out_needless()
+    polygons = cuts.polygons()
+    return polygons if polygons is not None and len(polygons) <= maximum else None
+
+
+class _Cuts:
+    """An outline, and the lines that cut it: ends of lines from each corner, counterclockwise, first the edge after it
+    and last the edge before it.
+    """
+
+    def __init__(self, points: np.ndarray, edges: np.ndarray):
+        self._points, self._lines = points, edges
+        before = dict(edges[:, ::-1].tolist())
+        self._ends = {corner: [after, before[corner]] for corner, after in edges.tolist()}
+
+    def reflex_sector(self, corner: int) -> tuple[int, int] | None:
+        """Ends of two lines from a corner between which it is reflex."""
+        ends = self._ends[corner]
+        sectors = zip(ends[:-1], ends[1:], strict=True)
+        return next((sector for sector in sectors if _is_reflex(self._points, sector[1], corner, sector[0])), None)
+
+    def best_end(self, corner: int, sector: tuple[int, int], reflex: set[int]) -> int | None:
+        """The corner to which a line in a reflex sector goes; None where none is seen."""
+        first, last = sector
+        to_first, to_last = self._points[[first, last]] - self._points[corner]
+
+        def is_seen(end: int) -> bool:
+            to_end = self._points[end] - self._points[corner]
+            is_outside = _cross(to_last, to_end) >= 0 and _cross(to_end, to_first) >= 0
+            return not is_outside and not self._crosses(corner, end)
+
+        def cost(end: int) -> tuple[bool, bool, float]:
+            leaves_some = _is_reflex(self._points, end, corner, first) or _is_reflex(self._points, last, corner, end)
+            return leaves_some, end not in reflex, float(np.hypot(*(self._points[end] - self._points[corner])))
+
+        return min((end for end in self._ends if end != corner and is_seen(end)), key=cost, default=None)
+
+    def _crosses(self, corner: int, end: int) -> bool:
+        """Whether a line from one corner to another crosses others, or passes a corner."""
+        a, b = self._points[[corner, end]]
+        line, offsets = b - a, self._points[[other for other in self._ends if other not in (corner, end)]] - a
+        heights, shares = _cross(line, offsets) / (line @ line), offsets @ line / (line @ line)
+        if ((np.abs(heights) < _STRAIGHT) & (shares > 0) & (shares < 1)).any():
+            return True
+        c, d = self._points[self._lines].swapaxes(0, 1)
+        parts_ends = _cross(line, c - a) * _cross(line, d - a) < 0
+        return bool((parts_ends & (_cross(d - c, a - c) * _cross(d - c, b - c) < 0)).any())
+
+    def add(self, corner: int, end: int) -> None:
+        """Cut from one corner to another."""
+        self._lines = np.concatenate([self._lines, [[corner, end]]])
+        for one, other in ((corner, end), (end, corner)):
+            ends = self._ends[one]
+            offsets = self._points[[*ends, other]] - self._points[one]
+            *angles, angle = np.arctan2(_cross(offsets[0], offsets), offsets @ offsets[0]) % (2 * np.pi)
+            ends.insert(1 + sum(other_angle < angle for other_angle in angles[1:-1]), other)
+
+    def leave_out_needless(self) -> None:
+        """Take lines away, in the order in which they came, that leave no corner reflex where they are not."""
+        for line in self._lines[len(self._ends) :].tolist():
+            sectors = []
+            for corner, end in (line, line[::-1]):
+                ends = self._ends[corner]
+                place = ends.index(end)
+                sectors.append((ends[place + 1], corner, ends[place - 1]))
+            if not any(_is_reflex(self._points, *sector) for sector in sectors):
+                for corner, end in (line, line[::-1]):
+                    self._ends[corner].remove(end)
+
+    def polygons(self) -> list[np.ndarray] | None:
+        """Walk around each polygon; None where one is not convex."""
+        steps = {(corner, end) for corner, ends in self._ends.items() for end in ends[:-1]}
+        result = []
+        while steps:
+            corner, end = start = min(steps)
+            polygon = []
+            while (corner, end) in steps:
+                steps.remove((corner, end))
+                polygon.append(corner)
+                ends = self._ends[end]
+                corner, end = end, ends[ends.index(corner) - 1]
+            turns = _turns(self._points[polygon])
+            if (corner, end) != start or turns.min() < -_STRAIGHT:
+                return None
+            result.append(np.array(polygon)[turns > _STRAIGHT])
+        return result
+
+
+def _is_reflex(points: np.ndarray, before: int, corner: int, after: int) -> bool:
+    """Whether a way turns right at a corner."""
+    return bool(_turns(points[[before, corner, after]])[1] < -_STRAIGHT)
+
+
+def _turns(polygon: np.ndarray) -> np.ndarray:
+    """Sine of the angle by which the way around a polygon turns left at each corner, [corner]."""
+    inward, onward = polygon - np.roll(polygon, 1, axis=0), np.roll(polygon, -1, axis=0) - polygon
+    return _cross(inward, onward) / (np.linalg.norm(inward, axis=1) * np.linalg.norm(onward, axis=1))
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
