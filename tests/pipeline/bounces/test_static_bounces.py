@@ -198,7 +198,7 @@ def test_iterations_are_those_of_a_twin_in_float64(given, method, monkeypatch):
     for _ in range(static_bounces.SELF_BOUNCES):
         past = at_sources + (between * ~is_own) @ once
         radiosity = albedo * (mean @ (past + (between * is_own) @ radiosity))
-    expected = dense(factors.of_receivers) @ (of_nodes @ radiosity)
+    expected = dense(factors.receiver_weights) @ (of_nodes @ radiosity)
     rows = np.concatenate([each.numpy()[0] for each in view.transfers.value(view.call)]).astype(np.float64)
     direct = rows @ light.numpy()[0]
     scale = np.abs(shading).max()
@@ -235,7 +235,7 @@ def test_what_sticks_out_of_another_body_has_the_light_of_sources_outside():
     shading = view.shading(None)
     shading.value(view.call)
     (factors,) = (node for name, (_, node) in view._cached.items() if name == "form factors")
-    means = factors.value(view.call).of_sources.on_host()
+    means = factors.value(view.call).source_means.on_host()
     senders = ScenePatches(engine.merged_scene).senders(view.materials)
     points = senders.sources(view.vertices.value(view.call), view.normals.value(view.call)).points.numpy()[0]
     is_outside = points[:, 1] > 0.5
