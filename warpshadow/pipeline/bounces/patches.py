@@ -18,8 +18,6 @@ from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.albedo import mean_over_texels, mean_over_vertices
 from warpshadow.stages.bounces.patches import (
     MAX_PATCHES,
-    MIN_PATCHES,
-    PIECES,
     SOURCES,
     Patches,
     find_patches,
@@ -28,6 +26,15 @@ from warpshadow.stages.bounces.patches import (
 from warpshadow.stages.bounces.radiosity import mean_over_sources
 from warpshadow.stages.receivers import Receivers, receivers_on_faces
 from warpshadow.stages.sparse import SparseMatrix, multiply
+
+_MIN_PATCHES = 128
+"""Patches of a body of few faces, which may have as many sides as stairs. With 32 in place of 128 images of stairs with
+all bounces were 7.2 in place of 6.2% off, of nested boxes 7.5 in place of 6.7%; a room's, a corner's the same."""
+
+_PATCHES_OF_SIDE = 3
+"""Patches of each smooth side: a shelf whose rows of books have 78 each was 3.3% off with 128 patches, and is 3.0%."""
+
+_FACES_OF_PATCH = 8
 
 _SCENE_PATCHES = 2048  # patches of a scene of more than 8 bodies, but no fewer than _MIN_BODY_PATCHES of each
 _MIN_BODY_PATCHES = 32  # patches of each of many bodies, at least: a side of a box has some
@@ -38,6 +45,14 @@ def _area(mesh: Mesh) -> float:
     """Area of a mesh [square of its units]."""
     a, b, c = np.moveaxis(mesh.positions.astype(np.float64)[mesh.surface.faces], 1, 0)
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+
+def _patch_count(mesh: Mesh) -> int:
+    """Number of patches that a mesh wants, by its faces and its smooth sides."""
+    side_count = len(np.unique(mesh.smooth_pieces))
+    return min(
+        MAX_PATCHES, max(_MIN_PATCHES, _PATCHES_OF_SIDE * side_count, len(mesh.surface.faces) // _FACES_OF_PATCH)
+    )
 
 
 class ScenePatches:
@@ -91,11 +106,10 @@ class ScenePatches:
         total, counts = sum(areas.values()), {}
         for number, area in areas.items():
             share = _SCENE_PATCHES * area / total if total > 0 else _MIN_BODY_PATCHES
-            minimum = max(MIN_PATCHES, len(bodies[number].mesh.surface.faces) // PIECES)
-            maximum = MAX_PATCHES
+            counts[number] = _patch_count(bodies[number].mesh)
             if len(areas) * MAX_PATCHES > _SCENE_PATCHES:
-                maximum = min(maximum, int(2 ** np.floor(np.log2(max(share, _MIN_BODY_PATCHES)))))
-            counts[number] = min(minimum, maximum)
+                maximum = int(2 ** np.floor(np.log2(max(share, _MIN_BODY_PATCHES))))
+                counts[number] = min(counts[number], maximum)
         return counts
 
     def senders(self, materials: Materials) -> Senders:

@@ -18,10 +18,6 @@ from warpshadow.maths.spatial_sort import compact_order
 from warpshadow.stages.planes.grid import PlaneTexture, find_grid
 from warpshadow.stages.self_visibility.buried import find_buried
 
-MIN_PATCHES = 128
-"""Patches of a body of few faces, which may have as many sides as stairs. With 32 in place of 128 images of stairs with
-all bounces were 7.2 in place of 6.2% off, of nested boxes 7.5 in place of 6.7%; a room's, a corner's the same."""
-
 MAX_PATCHES = 256  # patches of a body
 PIECES = 8  # pieces of each patch, at least
 
@@ -126,13 +122,13 @@ def find_patches(
         positions: Vertices [units of the body], shape [vertex, 3].
         faces: Faces that wind alike, shape [face, 3].
         is_two_sided: Whether the backs of faces send light, too: each side then has half of the patches.
-        count: Number of patches, at most. A body of few faces has fewer.
+        count: Number of patches, at most.
         sources: Number of sources of each, at most.
     Returns:
         Patches; none where no face has an area.
     """
     sides = 2 if is_two_sided else 1
-    count = min(count, max(MIN_PATCHES, len(faces) // PIECES)) // sides
+    count //= sides
     total = np.linalg.norm(_areas(positions.astype(np.float64)[faces]), axis=1).sum()
     longest = 2 * np.sqrt(total / (PIECES * count))  # as in right triangles
     cut = _cut(positions, faces, lambda points: points / longest)
