@@ -309,7 +309,7 @@ def around_compilation(context: Callable[[], contextlib.AbstractContextManager])
 def _locked(folder: str) -> Iterator[None]:
     from filelock import FileLock
 
-    lock = FileLock(f"{folder}.lock")
+    lock = FileLock(f"{folder}.lock", is_singleton=True)  # two copies of the package lock it twice in a thread
     with contextlib.suppress(OSError, NotImplementedError):  # where no file can be locked, each compiles for itself
         lock.acquire()
     try:
@@ -317,6 +317,7 @@ def _locked(folder: str) -> Iterator[None]:
     finally:
         if lock.is_locked:
             lock.release()
+        if not lock.is_locked:
             with contextlib.suppress(OSError):  # of Windows, where filelock removes it
                 os.unlink(lock.lock_file)
 

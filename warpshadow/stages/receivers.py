@@ -62,8 +62,10 @@ def _rise(positions: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3), 
     dark specks where light grazes its normals, which come from flat faces in their own shadow.
     """
     point = at_point(positions, corners, weights)
-    edge = positions[corners[1]] - positions[corners[0]]
-    face_normal = wp.normalize(wp.cross(edge, positions[corners[2]] - positions[corners[0]]))
+    # of unit length, so that no product of three leaves the range of float32
+    edge = wp.normalize(positions[corners[1]] - positions[corners[0]])
+    other_edge = wp.normalize(positions[corners[2]] - positions[corners[0]])
+    face_normal = wp.normalize(wp.cross(edge, other_edge))
     front = wp.vec3()
     back = wp.vec3()
     cosine = float(1.0)

@@ -1,0 +1,63 @@
+"""Openness between the vertices of faces, by which bodies get their receivers."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+
+import warpshadow as ws
+from warpshadow.pipeline.choice_of_receivers import UNEVEN, choose_receivers
+from warpshadow.pipeline.merged_scene import MergedScene
+
+
+def scene_of(*, sunk=0.1, **options):
+    """Pegs whose feet are in a box, of short faces in a small image, beside a ball."""
+    rods = [trimesh.creation.cylinder(0.05, 0.4, sections=12) for _ in range(12)]
+    for number, rod in enumerate(rods):
+        rod.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
+        rod.apply_translation((0.3 * (number % 4), 0.2 - sunk, 0.3 * (number // 4)))
+    pegs = trimesh.util.concatenate(rods)
+    slab = ws.Mesh(*(lambda box: (box.vertices, box.faces))(trimesh.creation.box((3, 0.4, 3)))).creased()
+    bodies = [
+        ws.Body(ws.Mesh(pegs.vertices, pegs.faces).creased(), name="pegs", **options),
+        ws.Body(slab, translation=(0, -0.2, 0), name="slab"),
+        ws.Body(ws.icosphere(0.3, 3), translation=(-0.7, 0.3, 0), name="ball"),
+    ]
+    camera = ws.Camera.look_at((0.4, 4.0, 7.0), (0.2, 0, 0), fov_y=30, size=(48, 48))
+    return ws.Scene(bodies, ws.synthetic_sky(), camera)
+
+
+def chosen(scene):
+    return choose_receivers(MergedScene(scene), [scene.camera])
+
+
+def test_bodies_whose_vertices_are_in_others_are_shaded_by_pixel():
+    pegs, _, ball = chosen(scene_of())
+    assert pegs.size.length < 16  # short enough for their vertices, but for what they see
+    assert pegs.receivers == "pixel" and pegs.unevenness > 2 * UNEVEN
+    assert ball.receivers == "vertex" and ball.unevenness < UNEVEN / 2
+
+
+def test_it_says_why():
+    notes = " ".join(ws.Renderer(scene_of()).explain().notes)
+    assert "between its vertices the openness to light is off by" in notes
+
+
+@pytest.mark.parametrize(("options", "method"), [({"receivers": "vertex"}, "directional"), ({}, "none")])
+def test_nobody_looks_where_it_does_not_matter(options, method):
+    scene = dataclasses.replace(scene_of(**options), visibility=ws.Visibility(method))
+    assert chosen(scene)[0].unevenness == 0
+    assert chosen(scene)[0].receivers == "vertex"
+
+
+def test_their_light_is_that_of_rays():
+    scene = scene_of()
+    truth = ws.render(dataclasses.replace(scene, visibility=ws.Visibility("ray-traced")))
+    shows = (truth[..., 3] > 0.99) & (ws.Renderer(scene).layers().bodies == 0)
+    errors = []
+    for receivers in ("auto", "vertex"):
+        bodies = [dataclasses.replace(scene.bodies[0], receivers=receivers), *scene.bodies[1:]]
+        image = ws.Renderer(dataclasses.replace(scene, bodies=bodies)).render()
+        errors.append(np.abs(image - truth)[shows].mean())
+    assert errors[0] < 0.7 * errors[1]
