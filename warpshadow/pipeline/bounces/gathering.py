@@ -190,7 +190,7 @@ class Proxies:
     def _depths(self) -> np.ndarray:
         """How far below each patch its proxy is, in radii."""
         depths = [DEPTH_OF_SHEETS if self.merged_scene.is_two_sided[body] else DEPTH for body in self.senders.bodies]
-        return np.repeat(np.float32(depths), np.diff(self.senders.first))
+        return np.repeat(np.array(depths, np.float32), np.diff(self.senders.first))
 
     @functools.cached_property
     def blocker_of_source(self) -> np.ndarray:
