@@ -16,7 +16,7 @@ crosses the disc, what lies between the edge and the disc's border:
     π ρ² h = π ρ² [ω inside] + ½ Σ_edges d (s₁ − s₀) − ρ² sign(d) atan2(|d| (s₁ − s₀), d² + s₀ s₁)
 
 The angles together are that of the product of complex numbers d² + s₀ s₁ − i d (s₁ − s₀), and a turn each time that it
-crosses the negative axis: one arc tangent for a cell, not one for an edge, saves a fifth of the time.
+crosses the negative axis: one arc tangent for a cell, not one for an edge, saves 12 to 20% of the time.
 
 As a line moves by δ(s), the area grows by ∫ δ ds between s₀ and s₁, so with y the direction in the middle of it
 
