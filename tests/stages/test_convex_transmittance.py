@@ -95,6 +95,20 @@ def test_a_panel_is_two_sided_and_blocks_nothing_of_receivers_in_its_plane(devic
     np.testing.assert_array_equal(got[2:], 1)
 
 
+@pytest.mark.parametrize("turn", range(4))
+def test_a_cell_whose_middle_is_on_an_edge_is_half_covered(turn, device):
+    """Wherever the outline begins."""
+    corners = np.roll(np.array([[0, 0, 1], [3, 0, 1], [3, 3, 1], [0, 3, 1.0]]), turn, axis=0)
+    (panel,) = find_convex_parts(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    some = ConvexBlockers.of([ConvexBody([panel], 0)], 4, device=device)
+    placed = some.placed(wp.array(corners[None], dtype=wp.vec3, device=device))
+    points = np.array([[0, 1, 0], [1, 0, 0], [0, 2, 2], [1, 1, 0.0]])
+    directions = np.tile([0, 0, 1.0], (16, 1)) * np.where(np.arange(16) < 8, 1, -1)[:, None]
+    arguments = wp.array(points[None], dtype=wp.vec3, device=device), placed, some, directions
+    got = transmittance_past_parts(*arguments, radius=0.1).numpy()[0][:, [0, 15]]
+    np.testing.assert_allclose(got, [[0.5, 1], [0.5, 1], [1, 0.5], [0, 1]], atol=1e-5)
+
+
 def test_narrow_cells_and_a_receivers_own_body_are_left_to_it(device):
     toward = (
         np.concatenate([VERTICES[0], VERTICES[1]])[:16] - POINTS[0] + 0.004

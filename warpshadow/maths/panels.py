@@ -21,7 +21,7 @@ MAX_PANELS = 64
 """Panels of a mesh at most: beyond, spheres are faster.
 
 With a panel for each of the 162 leaves of the tree of demos/kinds.py its image takes 2.4 times as long, and is 5.3% off
-in place of 5.6%. With the 48 of an umbrella an image takes 1.8 times as long as with 1024 spheres.
+in place of 5.6%. With the 48 of an umbrella it takes 1.6 times as long as with 1024 spheres.
 """
 
 _CREASE = 0.94
