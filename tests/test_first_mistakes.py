@@ -69,3 +69,10 @@ def test_a_map_in_place_of_coefficients_gets_the_way_to_them():
 def test_fields_do_not_change_and_the_error_says_how_to_make_another(value, field, message):
     with pytest.raises(dataclasses.FrozenInstanceError, match=message):
         setattr(value, field, None)
+
+
+def test_several_cameras_go_to_a_renderer_and_not_to_a_scene():
+    with pytest.raises(
+        ValueError, match=r"camera: got .*several go to Renderer\(scene, .* to TorchRenderer\(scene, cameras"
+    ):
+        ws.Scene([BALL], SKY, [SCENE.camera, SCENE.camera])
