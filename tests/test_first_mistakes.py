@@ -1,5 +1,6 @@
 """The first mistakes of everybody get an answer that says what to write."""
 
+import copy
 import dataclasses
 
 import pytest
@@ -76,3 +77,10 @@ def test_several_cameras_go_to_a_renderer_and_not_to_a_scene():
         ValueError, match=r"camera: got .*several go to Renderer\(scene, .* to TorchRenderer\(scene, cameras"
     ):
         ws.Scene([BALL], SKY, [SCENE.camera, SCENE.camera])
+
+
+def test_names_that_arrays_of_a_mesh_have_elsewhere_get_theirs():
+    with pytest.raises(AttributeError, match=r"a Mesh has no 'vertices' \(write positions\)"):
+        BALL.mesh.vertices  # noqa: B018
+    assert not hasattr(BALL.mesh, "color")
+    assert (copy.deepcopy(BALL.mesh).positions == BALL.mesh.positions).all()

@@ -10,7 +10,7 @@ import functools
 import hashlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -120,6 +120,13 @@ class Mesh:
 
     def __repr__(self) -> str:
         return f"Mesh({self.name!r}, {self.vertex_count} vertices, {self.face_count} faces)"
+
+    if not TYPE_CHECKING:  # to which it would hide names that there are not
+
+        def __getattr__(self, name: str) -> Any:
+            """Say what other libraries' names are here."""
+            hint = {"vertices": "positions", "verts": "positions", "triangles": "faces"}.get(name)
+            raise AttributeError(f"a Mesh has no {name!r}{hint and f' (write {hint})' or ''}")
 
     @property
     def vertex_count(self) -> int:
