@@ -36,6 +36,7 @@ SCENE = ws.Scene([BALL], SKY, ws.Camera.framing(BALL, size=(8, 8)), ws.Visibilit
             r"\(write TorchRenderer\(.*clip_matrices=",
         ),
         (lambda: TorchRenderer(SCENE)(vertices=None), r"\(write geometry=renderer.placed\(.*renderer.deformed\("),
+        (lambda: ws.Body(BALL.mesh, size=2), r"Body: unknown argument 'size' \(write Body\(…\).on_ground\(size=…\)\)"),
         (lambda: ws.Body(), "Body: missing a required argument: 'mesh'"),
     ],
 )
