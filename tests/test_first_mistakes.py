@@ -2,12 +2,13 @@
 
 import copy
 import dataclasses
+import warnings
 
 import pytest
 import torch
 
 import warpshadow as ws
-from warpshadow.torch import TorchRenderer
+from warpshadow.torch import TorchRenderer, rotation_matrices
 
 BALL = ws.Body(ws.icosphere(1.0, 0))
 SKY = ws.EnvironmentMap.constant(1.0)
@@ -85,3 +86,11 @@ def test_names_that_arrays_of_a_mesh_have_elsewhere_get_theirs():
         BALL.mesh.vertices  # noqa: B018
     assert not hasattr(BALL.mesh, "color")
     assert (copy.deepcopy(BALL.mesh).positions == BALL.mesh.positions).all()
+
+
+def test_angles_that_look_like_degrees_draw_a_warning():
+    with pytest.warns(UserWarning, match="axis-angle vector of 90 radians, .*are they degrees"):
+        rotation_matrices(torch.tensor([0.0, 90.0, 0.0]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rotation_matrices(torch.tensor([0.0, 6.3, 0.0]))
