@@ -94,3 +94,10 @@ def test_angles_that_look_like_degrees_draw_a_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         rotation_matrices(torch.tensor([0.0, 6.3, 0.0]))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+@pytest.mark.parametrize("move", [lambda: TorchRenderer(SCENE).cuda(), lambda: TorchRenderer(SCENE, device="cuda")])
+def test_without_a_gpu_cuda_is_refused_by_the_devices_that_there_are(move):
+    with pytest.raises(ValueError, match="device: got 'cuda', expected one of 'cpu'; there is no CUDA device"):
+        move()
