@@ -86,8 +86,8 @@ def join_at_places(positions: np.ndarray, faces: np.ndarray, *attributes: np.nda
     is_first = is_listed_first(positions, faces)  # edges of the others would have too many faces
     once = joined[faces[is_first]].astype(np.int32)
     surface = join_faces(positions, once, None)
-    apart = join_faces(positions, faces[is_first], None)
-    if rounds_edges(surface, positions) and _parted_share(apart, positions, CREASE, 180.0) > 0.5:
+    split_surface = join_faces(positions, faces[is_first], None)
+    if rounds_edges(surface, positions) and _parted_share(split_surface, positions, CREASE, 180.0) > 0.5:
         fans, _ = part_at_creases(once, surface, positions, CREASE)
         count = len(positions)
         fan_count = int(fans.max()) + 1
@@ -184,13 +184,13 @@ def draws_lines(surface: MeshTopology, positions: np.ndarray) -> bool:
     return 0 < _parted_share(surface, positions, 1.0, CREASE) <= 0.5
 
 
-def _parted_share(surface: MeshTopology, positions: np.ndarray, least: float, most: float) -> float:
+def _parted_share(surface: MeshTopology, positions: np.ndarray, low: float, high: float) -> float:
     """Part of the edges that bend by some angles [degrees] whose faces have vertices of their own; 0 without any."""
     face, edge = np.nonzero(surface.neighbors > np.arange(len(surface.faces))[:, None])  # each edge once
     neighbor = surface.neighbors[face, edge]
     normals = (face_normals(positions[surface.faces[numbers]]) for numbers in (face, neighbor))
     cosines = np.einsum("ij,ij->i", *normals)
-    is_bent = (np.cos(np.radians(most)) <= cosines) & (cosines < np.cos(np.radians(least)))
+    is_bent = (np.cos(np.radians(high)) <= cosines) & (cosines < np.cos(np.radians(low)))
     is_parted = _is_parted(surface, face[is_bent], edge[is_bent], neighbor[is_bent])
     return float(is_parted.mean()) if len(is_parted) else 0.0
 
