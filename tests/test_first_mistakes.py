@@ -1,12 +1,14 @@
 """The first mistakes of everybody get an answer that says what to write."""
 
+import copy
 import dataclasses
+import warnings
 
 import pytest
 import torch
 
 import warpshadow as ws
-from warpshadow.torch import TorchRenderer
+from warpshadow.torch import TorchRenderer, rotation_matrices
 
 BALL = ws.Body(ws.icosphere(1.0, 0))
 SKY = ws.EnvironmentMap.constant(1.0)
@@ -35,6 +37,7 @@ SCENE = ws.Scene([BALL], SKY, ws.Camera.framing(BALL, size=(8, 8)), ws.Visibilit
             r"\(write TorchRenderer\(.*clip_matrices=",
         ),
         (lambda: TorchRenderer(SCENE)(vertices=None), r"\(write geometry=renderer.placed\(.*renderer.deformed\("),
+        (lambda: ws.Body(BALL.mesh, size=2), r"Body: unknown argument 'size' \(write Body\(…\).on_ground\(size=…\)\)"),
         (lambda: ws.Body(), "Body: missing a required argument: 'mesh'"),
     ],
 )
@@ -69,3 +72,32 @@ def test_a_map_in_place_of_coefficients_gets_the_way_to_them():
 def test_fields_do_not_change_and_the_error_says_how_to_make_another(value, field, message):
     with pytest.raises(dataclasses.FrozenInstanceError, match=message):
         setattr(value, field, None)
+
+
+def test_several_cameras_go_to_a_renderer_and_not_to_a_scene():
+    with pytest.raises(
+        ValueError, match=r"camera: got .*several go to Renderer\(scene, .* to TorchRenderer\(scene, cameras"
+    ):
+        ws.Scene([BALL], SKY, [SCENE.camera, SCENE.camera])
+
+
+def test_names_that_arrays_of_a_mesh_have_elsewhere_get_theirs():
+    with pytest.raises(AttributeError, match=r"a Mesh has no 'vertices' \(write positions\)"):
+        BALL.mesh.vertices  # noqa: B018
+    assert not hasattr(BALL.mesh, "color")
+    assert (copy.deepcopy(BALL.mesh).positions == BALL.mesh.positions).all()
+
+
+def test_angles_that_look_like_degrees_draw_a_warning():
+    with pytest.warns(UserWarning, match="axis-angle vector of 90 radians, .*are they degrees"):
+        rotation_matrices(torch.tensor([0.0, 90.0, 0.0]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rotation_matrices(torch.tensor([0.0, 6.3, 0.0]))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+@pytest.mark.parametrize("move", [lambda: TorchRenderer(SCENE).cuda(), lambda: TorchRenderer(SCENE, device="cuda")])
+def test_without_a_gpu_cuda_is_refused_by_the_devices_that_there_are(move):
+    with pytest.raises(ValueError, match="device: got 'cuda', expected one of 'cpu'; there is no CUDA device"):
+        move()

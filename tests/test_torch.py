@@ -390,7 +390,7 @@ def test_albedo_that_does_not_fit_is_refused(renderer, albedo, message):
         ([None, torch.ones(3, 8, 8)], r"textures\[1\]: got shape \(3, 8, 8\), .*: channels come last"),
         ([None, torch.ones(0, 4, 3)], r"textures\[1\]: got shape \(0, 4, 3\)"),
         ([None, torch.ones(4, 4, 3).double()], r"textures\[1\]: got torch.float64"),
-        ([torch.ones(4, 4, 3), None], r"textures\[0\]: got an image, but the mesh has no uvs"),
+        ([torch.ones(4, 4, 3), None], r"textures\[0\]: got an image, but the mesh of 'icosphere' has no uvs; .*unwrap"),
     ],
 )
 def test_a_texture_that_does_not_fit_is_refused(renderer, textures, message):

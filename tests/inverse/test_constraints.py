@@ -1,6 +1,7 @@
 """Constraints of a pose: poses that stay possible, at any values, with their derivatives; and priors."""
 
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
@@ -231,3 +232,12 @@ def test_a_hull_has_the_lowest_vertex_of_any_rotation():
     for seed in range(5):
         down = np.random.default_rng(seed).standard_normal(3)
         assert (hull @ down).min() == pytest.approx((mesh.positions.astype(np.float64) @ down).min(), abs=1e-12)
+
+
+def test_a_warning_says_by_how_much_a_body_is_turned_onto_its_stable_support():
+    with pytest.warns(UserWarning, match=r"box: its stable support differs from the scene's pose by 0\.2°.*given"):
+        prepared(scene(box((0.2, 0.0, 0.0))), Pose("box", stands_on="table"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        prepared(scene(box((0.0, 30.0, 0.0))), Pose("box", stands_on="table"))
+        prepared(scene(box((0.2, 0.0, 0.0))), Pose("box", stands_on="table", resting="given"))

@@ -10,7 +10,7 @@ import functools
 import hashlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +22,9 @@ from warpshadow.assets.topology import (
     CREASE,
     MeshTopology,
     creases,
+    draws_lines,
     is_listed_first,
+    join_at_places,
     join_faces,
     part_at_creases,
     rounds_edges,
@@ -119,6 +121,13 @@ class Mesh:
     def __repr__(self) -> str:
         return f"Mesh({self.name!r}, {self.vertex_count} vertices, {self.face_count} faces)"
 
+    if not TYPE_CHECKING:  # to which it would hide names that there are not
+
+        def __getattr__(self, name: str) -> Any:
+            """Say what other libraries' names are here."""
+            hint = {"vertices": "positions", "verts": "positions", "triangles": "faces"}.get(name)
+            raise AttributeError(f"a Mesh has no {name!r}{hint and f' (write {hint})' or ''}")
+
     @property
     def vertex_count(self) -> int:
         """Number of vertices, referenced by a face or not."""
@@ -212,6 +221,23 @@ class Mesh:
         faces, origins = part_at_creases(self.faces, self.surface, self.positions, angle)
         colors = None if self.colors is None else self.colors[origins]
         return replace(self, positions=self.positions[origins], faces=faces, origins=origins, colors=colors)
+
+    def welded(self) -> Mesh:
+        """Join the vertices at one place, so that normals are smooth across them; a seam of uvs stays one of uvs alone.
+
+        Exporters split vertices along such seams, and each part has normals of its own: lines run over the surface.
+        Vertices of two colors stay apart, and those at sharp edges of boxes and the like, if they are. Vertices keep
+        their numbers: faces refer to the first at each place.
+        """
+        colors = [] if self.colors is None else [self.colors]
+        return replace(self, faces=join_at_places(self.positions, self.faces, *colors), origins=None)
+
+    @functools.cached_property
+    def split_count(self) -> int:
+        """How many vertices :meth:`welded` joins to others, if their normals draw lines over a smooth surface, or 0."""
+        if self.origins is not None or not draws_lines(self.surface, self.positions):  # creased on purpose, or none
+            return 0
+        return len(self._used) - len(self.welded()._used)
 
     @functools.cached_property
     def rounds_edges(self) -> bool:

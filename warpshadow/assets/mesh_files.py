@@ -26,13 +26,21 @@ from warpshadow.assets.mesh import (
     Mesh,
     MeshError,
     MeshPart,
+    checked_indices,
     moved_part,
     turned_over,
 )
 from warpshadow.assets.mesh_joining import JoinedMesh, fan, join_parts, joined_normals, weld, with_colors
 from warpshadow.assets.obj import read_items, read_pictures
 from warpshadow.assets.ply import ply_colors, ply_corner_uvs, ply_fault
-from warpshadow.assets.topology import CREASE, is_listed_first, join_faces, part_at_creases, rounds_edges
+from warpshadow.assets.topology import (
+    CREASE,
+    is_listed_first,
+    join_at_places,
+    join_faces,
+    part_at_creases,
+    rounds_edges,
+)
 from warpshadow.check import AnyPath
 
 if TYPE_CHECKING:  # it is imported where a file is read by it
@@ -78,9 +86,10 @@ def load_mesh(path: MeshSource) -> Mesh:
     triangles. The nodes of a scene are concatenated in world space. Where a format ties uvs to vertices (PLY, glTF),
     faces refer to the first of the vertices that are duplicated only for their uvs (same position and color, and same
     normal where the file stores normals; of trimesh's objects, normals that bend by 30° or less), so that a seam does
-    not break the shading; without uvs they stay as they are. A USD stage is read at its earliest time, z-up turned to
-    y-up, subdivision surfaces as their control cage. uvs are kept only when every face has them. Textures are not read:
-    they are a body's, and ``Body(path)`` takes them.
+    not break the shading. PLY and trimesh's objects without stored normals are joined as by :meth:`Mesh.welded`; others
+    without uvs stay as they are. A USD stage is read at its earliest time, z-up turned to y-up, subdivision surfaces as
+    their control cage. uvs are kept only when every face has them. Textures are not read: they are a body's, and
+    ``Body(path)`` takes them.
 
     Colors are read where each vertex gets one: from vertices; from faces, where no vertex has faces of two colors; and
     from the base color factor of a glTF material. PLY and OBJ files and trimesh have sRGB, which is decoded; glTF and
@@ -266,16 +275,29 @@ def _trimesh_part(shape, of_file: bool, factors: Factors) -> MeshPart:
     if corner_uvs is not None and len(corner_uvs) == 3 * len(faces):
         return part._replace(uvs=corner_uvs, uv_faces=np.arange(len(corner_uvs)).reshape(-1, 3))
     uvs = getattr(shape.visual, "uv", None)
-    if uvs is None:
-        return part
     vertex_attributes = [] if part.colors is None else [part.colors]
-    if not of_file:  # its normals may be read from a file, or computed; these differ a little at seams
-        vertex_attributes.append(joined_normals(positions, shape.vertex_normals))
-    elif "vertex_normals" in shape._cache:  # the file's: none were computed yet
-        vertex_attributes.append(shape.vertex_normals)
-    welded = weld(faces, positions, *vertex_attributes)
+    normals = _stored_normals(shape)
+    stays = shape.source.file_type in ("glb", "gltf", "stl")  # faces without normals are flat; or welded later
+    if normals is None and not stays and len(faces) and np.isfinite(positions).all():
+        checked = checked_indices("faces", faces, len(positions), "vertex")
+        welded = join_at_places(positions, checked, *vertex_attributes)
+    elif uvs is None:
+        return part
+    else:  # those of meshes that were changed differ a little at seams
+        stored = [] if normals is None else [normals if of_file else joined_normals(positions, normals)]
+        welded = weld(faces, positions, *vertex_attributes, *stored)
     lost = len(np.unique(faces)) - len(np.unique(welded))
-    return part._replace(faces=welded, uvs=uvs, uv_faces=faces, welded=lost)
+    return part._replace(faces=welded, uvs=uvs, uv_faces=None if uvs is None else faces, welded=lost)
+
+
+def _stored_normals(shape: trimesh.Trimesh) -> np.ndarray | None:
+    """Normals of vertices that are not those that trimesh computes of the faces; None where it has no such ones."""
+    import trimesh
+
+    if "vertex_normals" not in shape._cache:
+        return None
+    computed = trimesh.Trimesh(shape.vertices, shape.faces, process=False).vertex_normals
+    return None if np.allclose(shape.vertex_normals, computed, atol=1e-4) else shape.vertex_normals
 
 
 def _trimesh_colored(part: MeshPart, shape, factors: Factors) -> MeshPart:

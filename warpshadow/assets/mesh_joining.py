@@ -16,7 +16,7 @@ from warpshadow.assets.mesh import (
     MeshPart,
     checked_indices,
 )
-from warpshadow.assets.topology import CREASE, is_listed_first, number_places
+from warpshadow.assets.topology import CREASE, first_at_places, is_listed_first
 
 
 class JoinedMesh(NamedTuple):
@@ -114,10 +114,7 @@ def fan(corner_counts: np.ndarray) -> np.ndarray:
 
 def weld(faces: np.ndarray, *attributes: np.ndarray) -> np.ndarray:
     """Let faces refer to the first of the vertices that agree in all attributes."""
-    group = number_places(np.column_stack(attributes))
-    first = np.empty(len(group), np.int64)
-    first[group[::-1]] = np.arange(len(group))[::-1]  # the last of these assignments stays
-    return first[group][faces]
+    return first_at_places(np.column_stack(attributes))[faces]
 
 
 def joined_normals(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:

@@ -69,6 +69,41 @@ def welded(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     return positions[used[first_vertices]], renumbered[faces]
 
 
+def join_at_places(positions: np.ndarray, faces: np.ndarray, *attributes: np.ndarray) -> np.ndarray:
+    """Let faces refer to the first of the vertices at one place that agree in all attributes.
+
+    Where a mesh has many sharp edges, as boxes have, and most of them are parted, they stay so. Where angles of all
+    sizes occur, normals round them.
+
+    Args:
+        positions: Vertices, shape [vertex, 3].
+        faces: Indices of positions, shape [face, 3].
+        attributes: Of vertices, such as colors, [vertex, n] each.
+    Returns:
+        The faces by the vertices that stay, shape [face, 3].
+    """
+    joined = first_at_places(np.column_stack([positions, *attributes]))
+    is_first = is_listed_first(positions, faces)  # edges of the others would have too many faces
+    once = joined[faces[is_first]].astype(np.int32)
+    surface = join_faces(positions, once, None)
+    split_surface = join_faces(positions, faces[is_first], None)
+    if rounds_edges(surface, positions) and _parted_share(split_surface, positions, CREASE, 180.0) > 0.5:
+        fans, _ = part_at_creases(once, surface, positions, CREASE)
+        count = len(positions)
+        fan_count = int(fans.max()) + 1
+        smooth = connected_components(faces[is_first].ravel(), count + fans.ravel(), count + fan_count)[:count]
+        joined = first_at_places(smooth[:, None])
+    return joined[faces]
+
+
+def first_at_places(rows: np.ndarray) -> np.ndarray:
+    """Index of the first row that equals each, shape [row]."""
+    group = number_places(rows)
+    first = np.empty(len(group), np.int64)
+    first[group[::-1]] = np.arange(len(group))[::-1]  # the last of these assignments stays
+    return first[group]
+
+
 def part_at_creases(
     faces: np.ndarray, surface: MeshTopology, positions: np.ndarray, angle: float
 ) -> tuple[np.ndarray, ...]:
@@ -139,6 +174,25 @@ def rounds_edges(surface: MeshTopology, positions: np.ndarray) -> bool:
     diagonals = np.linalg.norm(high - low, axis=1)
     is_many = (diagonals < sharp) & (sharp < 25 * diagonals) & (bent - sharp < 0.1 * sharp)
     return bool(sharp[is_many].sum() > max(diagonal, sharp.sum() / 2))
+
+
+def draws_lines(surface: MeshTopology, positions: np.ndarray) -> bool:
+    """Whether lines run over a smooth surface: faces at edges that bend by 1° to 30° have vertices of their own.
+
+    Not where those at most such edges have: then the mesh is faceted on purpose.
+    """
+    return 0 < _parted_share(surface, positions, 1.0, CREASE) <= 0.5
+
+
+def _parted_share(surface: MeshTopology, positions: np.ndarray, low: float, high: float) -> float:
+    """Part of the edges that bend by some angles [degrees] whose faces have vertices of their own; 0 without any."""
+    face, edge = np.nonzero(surface.neighbors > np.arange(len(surface.faces))[:, None])  # each edge once
+    neighbor = surface.neighbors[face, edge]
+    normals = (face_normals(positions[surface.faces[numbers]]) for numbers in (face, neighbor))
+    cosines = np.einsum("ij,ij->i", *normals)
+    is_bent = (np.cos(np.radians(high)) <= cosines) & (cosines < np.cos(np.radians(low)))
+    is_parted = _is_parted(surface, face[is_bent], edge[is_bent], neighbor[is_bent])
+    return float(is_parted.mean()) if len(is_parted) else 0.0
 
 
 def creases(surface: MeshTopology, positions: np.ndarray) -> np.ndarray:

@@ -336,7 +336,7 @@ def _pairs(method: SphereMethod, points: LitPoints) -> str:
 
     def blockers(bodies: list[int]) -> str:
         solids = f" and {parts[bodies].sum():,} convex parts" if parts[bodies].sum() else ""
-        return f"{spheres[bodies].sum():,} spheres{solids}"
+        return f"up to {spheres[bodies].sum():,} spheres{solids}"  # some are culled, or merged
 
     item_text = f"{receiver_text(points, static=False)} × {blockers(list(range(len(spheres))))}"
     if points.static is None:

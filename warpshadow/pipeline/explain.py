@@ -38,7 +38,7 @@ class StageReport:
 
 
 class Explanation:
-    """The stages of the next call; as text a table.
+    """The stages of the next call; as text a table, in which adjoints stand where a gradient is asked for.
 
     Args:
         image: The node that the call asks for.
@@ -81,8 +81,10 @@ class Explanation:
         for stage in self.stages.values():
             timing = self.timings.get(stage.name)
             rows.append(_row(stage.name, stage.forward, timing.forward if timing else None, stage.items))
-        rows.append(("backward", "", "last", "items", "why"))
-        for stage in reversed(self.stages.values()):
+        is_differentiated = any(stage.backward for stage in self.stages.values())
+        if is_differentiated:
+            rows.append(("backward", "", "last", "items", "why"))
+        for stage in reversed(self.stages.values()) if is_differentiated else ():
             timing = self.timings.get(stage.name)
             items = stage.items if stage.backward else ""
             rows.append(_row(stage.name, stage.backward, timing.backward if timing else None, items))

@@ -128,7 +128,10 @@ class Materials:
         if name == "textures":
             check.shape(where, array.shape, ("batch", "height", "width"))
             if body.mesh.uvs is None:
-                raise ValueError(f"{where}: got an image, but the mesh has no uvs; expected None")
+                raise ValueError(
+                    f"{where}: got an image, but the mesh of {body.called!r} has no uvs; expected None, or a body of "
+                    "warpshadow.unwrap(mesh)"
+                )
             if not array.is_contiguous:
                 raise ValueError(f"{where}: got a strided array, expected a contiguous one")
         else:

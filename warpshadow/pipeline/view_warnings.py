@@ -7,7 +7,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.choice_of_receivers import face_sizes, warn_of_coarse_faces
 from warpshadow.pipeline.view import View
 from warpshadow.scene.body import Body
-from warpshadow.scene.creases import rounded_edges
+from warpshadow.scene.creases import lined_surfaces, rounded_edges
 from warpshadow.scene.placement import enclosures, misplacements
 
 
@@ -19,7 +19,7 @@ def warn_of_view(view: View, cameras: Sequence[Camera] | None) -> bool:
     """
     remarks, scene = [view.emptiness()], view.merged_scene.scene
     if cameras is not None:
-        remarks += [*enclosures(scene, cameras), *misplacements(scene), *rounded_edges(scene)]
+        remarks += [*enclosures(scene, cameras), *misplacements(scene), *rounded_edges(scene), *lined_surfaces(scene)]
     if result := [remark for remark in remarks if remark]:
         check.warn("; ".join(result))
     return bool(result)

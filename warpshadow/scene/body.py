@@ -109,7 +109,7 @@ class Body:
     metallic: np.ndarray | None
     specular: np.ndarray | None
 
-    @check.keywords(**LIKELY_MISTAKES, spheres="blockers", path="mesh")
+    @check.keywords(**LIKELY_MISTAKES, spheres="blockers", path="mesh", size="Body(…).on_ground(size=…)")
     def __init__(
         self,
         mesh: Mesh | MeshSource,

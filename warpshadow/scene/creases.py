@@ -1,4 +1,4 @@
-"""Sharp edges: which bodies have normals that round them."""
+"""Normals: which bodies have some that round sharp edges, or that break where the surface is smooth."""
 
 from warpshadow.assets.topology import CREASE
 from warpshadow.scene.scene import Scene
@@ -11,4 +11,14 @@ def rounded_edges(scene: Scene) -> list[str]:
         f"dark or bright; Body(…).creased(), in scene files and recipes creased = {CREASE:g}, parts them"
         for number, body in enumerate(scene.bodies)
         if body.mesh.rounds_edges
+    ]
+
+
+def lined_surfaces(scene: Scene) -> list[str]:
+    """Say over which bodies lines run, where vertices at one place have normals of their own."""
+    return [
+        f"body {number} ({body.called!r}): {body.mesh.split_count:,} vertices coincide with others, and their "
+        "normals differ, which shows as lines over smooth surfaces; mesh.welded() joins them"
+        for number, body in enumerate(scene.bodies)
+        if body.mesh.split_count
     ]

@@ -32,6 +32,8 @@ PerBody = Sequence[Item | None] | Mapping[int, Item | None] | Mapping[str, Item 
 
 _DEFAULT_VISIBILITY = Visibility()
 
+_SEVERAL_CAMERAS = "several go to Renderer(scene, cameras=[…]), or in a torch loop to TorchRenderer(scene, cameras=[…])"
+
 
 def check_supersampling(count: object) -> None:
     """Raise ValueError unless it is a number of samples across a pixel, 1 to 16."""
@@ -96,7 +98,7 @@ class Scene:
     bounces: Bounces = 0
 
     @check.keywords(
-        cameras="camera; several go to Renderer(scene, cameras=[…])",
+        cameras=f"camera; {_SEVERAL_CAMERAS}",
         method="visibility=Visibility(method)",
         light="Scene(bodies, synthetic_sky()), or the path of a map",
     )
@@ -121,7 +123,7 @@ class Scene:
                 raise ValueError(f"bodies[{number}]: name: got {body.name!r}, as another has, expected one of its own")
         if camera is None:
             object.__setattr__(self, "camera", Camera.framing(self.bodies))
-        check.instance("camera", self.camera, Camera, "a Camera; several go to Renderer(scene, cameras=[…])")
+        check.instance("camera", self.camera, Camera, f"a Camera; {_SEVERAL_CAMERAS}")
         check.instance("visibility", self.visibility, Visibility, "a Visibility, such as Visibility('directional')")
         value: Any = self.light
         if check.is_path(value):

@@ -92,7 +92,7 @@ _ROTATION_KERNELS = {
 
 @one_at_a_time
 def rotation_matrices(parameters: wp.array) -> wp.array:
-    """Make rotation matrices of free parameters.
+    """Make rotation matrices of free parameters, such as axis-angle vectors in radians.
 
     Args:
         parameters: Shape [batch, body]; the dtype decides their meaning: vec4, quaternions (x, y, z, w) of any length
@@ -117,12 +117,24 @@ def rotation_matrices(parameters: wp.array) -> wp.array:
     return rotations
 
 
+def _warn_of_degrees(vectors: np.ndarray) -> None:
+    """Warn of axis-angle vectors so long that they may be in degrees."""
+    angle = np.sqrt((vectors.astype(np.float64) ** 2).sum(axis=-1).max(initial=0.0))
+    if angle > 4 * np.pi:
+        check.warn(
+            f"parameters: got an axis-angle vector of {angle:.4g} radians, more than two turns; are they degrees? "
+            "np.radians or torch.deg2rad converts these"
+        )
+
+
 def _check_rotations(parameters: wp.array) -> None:
     """Raise ValueError for parameters that no rotation has."""
     if parameters.device.is_capturing:
         return
     check.finite_arrays({"parameters": parameters})
     if parameters.dtype is wp.vec3:
+        if parameters.device.is_cpu:
+            _warn_of_degrees(parameters.numpy())
         return
     values = parameters.numpy().astype(np.float64)
     if parameters.dtype is wp.vec4:

@@ -127,7 +127,12 @@ class TorchRenderer(torch.nn.Module):
 
     def _apply(self, fn: Callable[[torch.Tensor], torch.Tensor], recurse: bool = True) -> "TorchRenderer":
         """Go where a tensor would go: torch calls this for ``to``, ``cuda``, ``half`` and the like."""
-        moved = fn(torch.empty(0, device=self.device))
+        try:
+            moved = fn(torch.empty(0, device=self.device))
+        except (AssertionError, RuntimeError):
+            if not torch.cuda.is_available():
+                check.device("device", "cuda")  # which raises an error that says so
+            raise
         if moved.dtype != torch.float32:
             raise ValueError(
                 f"dtype: got {moved.dtype} for a TorchRenderer, expected torch.float32, as it computes in: "

@@ -14,7 +14,9 @@ _ROTATION_PARAMETERS = {3: wp.vec3, 4: wp.vec4, 6: Vec6, 9: wp.mat33}
 
 @uncompiled
 def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
-    """Make rotation matrices of free parameters, as :func:`warpshadow.stages.rotations.rotation_matrices` does.
+    """Make rotation matrices of free parameters: of axis-angle vectors in radians (``torch.deg2rad``), quaternions, ….
+
+    It does so as :func:`warpshadow.stages.rotations.rotation_matrices`.
 
     Args:
         parameters: Shape [..., n], where n decides their meaning: 4, quaternions (x, y, z, w) of any length but 0; 3,
@@ -25,6 +27,8 @@ def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
     Raises:
         ValueError: for another n, and for parameters without a rotation, as
         :func:`warpshadow.stages.rotations.rotation_matrices` says.
+    Warns:
+        Of axis-angle vectors of more than two turns, which look like degrees; on a CPU.
     Differentiable: parameters.
     """
     check_float32("parameters", parameters)

@@ -29,6 +29,9 @@ _TURNS = np.array(
 )
 
 
+_SEEN_TURN = 0.05  # degrees that a warning names
+
+
 @dataclass(frozen=True)
 class Pose(FreeOfBody):
     """The pose of a body: a rotation about the middle of its bounding box, a translation, and maybe a scale.
@@ -138,9 +141,21 @@ class Pose(FreeOfBody):
             turns = plane.normal[None]
         if self.resting == "stable":
             rotation = constraints.stable_rotation(body.mesh, rotation, plane.normal)
+            self._warn_of_turn(rotation @ body.rotation_matrix().T, body.called)
         shifts = constraints.remaining([plane.normal, *stays])
         onto = constraints.onto_plane(plane.normal, self.fixed)
         return PoseConstraint(turns, shifts, rotation, plane, onto, constraints.hull_points(body.mesh))
+
+    def _warn_of_turn(self, turn: np.ndarray, name: str) -> None:
+        """Say that a body is turned onto its stable support, and how it is kept from that."""
+        from scipy.spatial.transform import Rotation
+
+        angle = np.degrees(Rotation.from_matrix(turn).magnitude())
+        if angle > _SEEN_TURN:
+            check.warn(
+                f"{name}: its stable support differs from the scene's pose by {angle:.2g}°, by which it is turned; "
+                'resting = "given" keeps it'
+            )
 
     def start(self, setting: Setting) -> Values:
         """Where the body is."""
