@@ -6,9 +6,10 @@ Patches of bodies have a radiosity B, reflected from direct light S and bounced 
 
 and G is applied as often as light bounces: first at the sources, points where patches are lit, at last at the receivers
 of the image. G has three parts, each a stage of its own: light from a body's own patches, light from plane bodies, and
-light from bodies represented by spheres. Where the light of a cell is blocked one of them takes its place. Between
-patches of one body the first part is a small matrix that does not change. Hollow bodies keep light for long: there it
-goes on when it has bounced often enough between bodies. :mod:`.repeated` has how often.
+light from bodies represented by spheres. A blocked part of a cell sends light of one of the three.
+
+Between patches of one body the first part is a small matrix that does not change. After the last bounce between bodies,
+light within each body bounces ``SELF_BOUNCES`` times more, since hollow bodies keep it long.
 """
 
 from __future__ import annotations
@@ -133,7 +134,7 @@ def _openness(senders: Senders, visibility: list[PartVisibility]) -> Openness:
 class PatchSampleNodes(NamedTuple):
     """Nodes of the points at which patches are lit."""
 
-    visibility: PartwiseVisibility  # visibility
+    visibility: PartwiseVisibility  # of the sources, for any light
     frames: Node  # of flat bodies
     projected_patches: Node  # patches as receivers see them
     openness: Node  # how open they are, and their patches
@@ -180,7 +181,7 @@ class Radiosity(Node):
         def sent(radiosity: wp.array) -> OutgoingRadiance:
             return OutgoingRadiance(self._proxies, radiosity, projected_patches, frames, openness.of_patches)
 
-        def others_light_of(radiosity: wp.array | None) -> wp.array:
+        def radiosity_by_others(radiosity: wp.array | None) -> wp.array:
             """Radiosity of patches by light from the sky and from other bodies."""
             if radiosity is None:
                 parts = [part.direct for part in lit]
@@ -189,13 +190,15 @@ class Radiosity(Node):
                 parts = [self._light(call, part, outgoing) for part in lit]
             return self._reflect.run(call, albedo, joined(parts), senders.mean, openness.shares)
 
-        def with_self_light(others_light: wp.array, radiosity: wp.array | None) -> wp.array:
+        def add_radiosity_by_self(by_others: wp.array, radiosity: wp.array | None) -> wp.array:
             if between is None or radiosity is None:
-                return others_light
-            return total_light([others_light, self._own.run(call, albedo, radiosity, between)])
+                return by_others
+            return total_light([by_others, self._own.run(call, albedo, radiosity, between)])
 
         self_bounces = 0 if between is None else SELF_BOUNCES
-        return sent(after_bounces(count, others_light_of, with_self_light, senders.areas, self_bounces=self_bounces))
+        return sent(
+            after_bounces(count, radiosity_by_others, add_radiosity_by_self, senders.areas, self_bounces=self_bounces)
+        )
 
     def _light(self, call: Call, part: DirectLightPart, outgoing: OutgoingRadiance) -> wp.array:
         """Light of a part of the sources past its own body, from the sky and from others."""

@@ -146,8 +146,8 @@ class Proxies:
             starts = int(merged_scene.first_vertex[number]), int(senders.first[place])
             bodies.append(PlaneBody(grid, body.mesh.positions, body.mesh.surface.faces, *starts, body.casts_shadow))
         counts = len(senders.areas), int(merged_scene.first_vertex[-1])
-        form_factors = PlaneBlockers.of(bodies, *counts, device=merged_scene.device)
-        return SenderPlanes(form_factors, {number: k for k, number in enumerate(numbers)})
+        planes = PlaneBlockers.of(bodies, *counts, device=merged_scene.device)
+        return SenderPlanes(planes, {number: k for k, number in enumerate(numbers)})
 
     @functools.cached_property
     def nonplanar_bodies(self) -> list[int]:
@@ -293,7 +293,7 @@ class Gathering:
         visibility: How spheres block light.
         senders: The bodies whose patches send light.
         self_form_factors: Form factors of bodies for themselves.
-        given: Nodes that radiosity, receivers and spheres depend on.
+        arguments: Nodes that radiosity, receivers and spheres depend on.
         item_text: Number of receivers, in words.
         where: Put after the names of its stages.
         why_not: Why nobody asks for it, in words; empty if somebody does.
@@ -331,8 +331,8 @@ class Gathering:
 
     def run(self, call: Call, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> list[wp.array]:
         """Bounced light of a group by each path: planes, spheres, its own body; vec3 of shape [batch, receiver]."""
-        form_factors = [node.run(call, group, cells, outgoing) for node in self.stages if not node.idle]
-        return [light for light in form_factors if light is not None]
+        lights = [node.run(call, group, cells, outgoing) for node in self.stages if not node.idle]
+        return [light for light in lights if light is not None]
 
     def _from_itself(self, group: Group, _: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
         if group.body not in outgoing.senders.bodies or self._is_flat[group.body]:

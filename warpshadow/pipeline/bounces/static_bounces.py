@@ -168,17 +168,17 @@ class StaticBounces:
     ) -> wp.array:
         """Bounced light at cache points, vec3 of shape [batch, cache point]. Differentiable: albedo, patch_light."""
 
-        def others_light_of(radiosity: wp.array | None) -> wp.array:
+        def light_of_others(radiosity: wp.array | None) -> wp.array:
             """Light on patches from the sky and from other bodies."""
             return patch_light if radiosity is None else multiply(factors.between_bodies, radiosity, plus=patch_light)
 
-        def with_self_light(others_light: wp.array, radiosity: wp.array | None) -> wp.array:
+        def reflect_all(by_others: wp.array, radiosity: wp.array | None) -> wp.array:
             return reflect(
                 albedo,
-                others_light if radiosity is None else multiply(factors.within_bodies, radiosity, plus=others_light),
+                by_others if radiosity is None else multiply(factors.within_bodies, radiosity, plus=by_others),
             )
 
-        arguments = self._bounces, others_light_of, with_self_light, senders.areas
+        arguments = self._bounces, light_of_others, reflect_all, senders.areas
         return multiply(factors.to_cache_points, after_bounces(*arguments, self_bounces=SELF_BOUNCES))
 
     def _item_text(self, points: LitPoints, senders: Senders) -> Callable[[], str]:
