@@ -65,20 +65,26 @@ class Group(NamedTuple):
         For a gradient all of them come at once, and so do receivers with cached rows.
         """
         self_lookup, planes, clusters = self.self_lookup, self.planes, self.clusters
-        turns = None if self_lookup is None else self_lookup.turned
+        rotation_data = None if self_lookup is None else self_lookup.turned
         frames = None if planes is None else planes.frames
-        solids = None if self.convex_parts_around is None else self.convex_parts_around.placed.corners
+        part_corners = None if self.convex_parts_around is None else self.convex_parts_around.placed.corners
         arguments = points, normals, centers, radii = self[:4]
-        if radii.shape[1] or any(array is not None for array in (turns, frames, solids)):
-            arrays = {"points": points, "centers": centers, "radii": radii, "rotations": turns, "planes": frames}
-            count = common_batch(arrays | {"corners": self.corners, "parts": solids})
+        if radii.shape[1] or any(array is not None for array in (rotation_data, frames, part_corners)):
+            arrays = {
+                "points": points,
+                "centers": centers,
+                "radii": radii,
+                "rotations": rotation_data,
+                "planes": frames,
+            }
+            count = common_batch(arrays | {"corners": self.corners, "parts": part_corners})
             points, normals, centers, radii = [expand(array, count) for array in arguments]
             clusters = clusters if radii is self.radii and centers is self.centers else None
         size = points.shape[1]
         if (
             self.cached_rows is not None
             or size <= PART_SIZE
-            or varies([*arguments, turns, frames, solids, self.corners])
+            or varies([*arguments, rotation_data, frames, part_corners, self.corners])
         ):
             yield self._replace(points=points, normals=normals, centers=centers, radii=radii, clusters=clusters)
             return

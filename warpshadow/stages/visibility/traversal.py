@@ -224,9 +224,10 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
 
     Args:
         cull: (receivers, bound, place, among, task) → how many of ``among`` candidates the spheres in a bound may
-            matter to. The first sphere has that place in the traversal; a quad's candidates are the receivers that its
-            run left.
-        visit: (receivers, seen, count, task), called for each sphere with the count of its quad; for an adjoint → Pull.
+            matter to. The first sphere has that place in the traversal; a quad has the
+            candidates that its run left.
+        visit: (receivers, seen, count, task), called for each sphere with the count of its quad; for an adjoint →
+            SphereAdjoint.
         Task: Struct of all else that these two read and write.
         is_adjoint: Whether to sum the results of the visits.
         lanes: Receivers of a group.
