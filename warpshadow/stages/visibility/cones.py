@@ -43,7 +43,7 @@ def check_spheres(points: wp.array, normals: wp.array | None, centers: wp.array,
 
 @functools.cache
 def cone_type(lanes: int) -> Any:
-    """Struct of the cones of a sphere, one for each receiver of a group."""
+    """Struct of the cones of a sphere, one for each receiver of a block."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
 
     @wp.struct
@@ -58,7 +58,7 @@ def cone_type(lanes: int) -> Any:
 
 @functools.cache
 def make_cone(lanes: int) -> wp.Function:
-    """Make the kernel function of a group of receivers: offsets to a sphere's center, and 1/radius → its cones."""
+    """Make the kernel function of a block of receivers: offsets to a sphere's center, and 1/radius → its cones."""
     Lane, Vectors, Cone = lane_type(lanes), vectors_type(lanes), cone_type(lanes)
     fn = make_lane_functions(lanes)
     sqrt, scale, dot = fn.sqrt, fn.scale, fn.dot

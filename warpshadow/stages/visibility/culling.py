@@ -1,6 +1,6 @@
-"""Culling: which directions spheres can block for a group of receivers, found for a bundle of four at once.
+"""Culling: the directions that spheres can darken for a block of receivers, found for a bundle of four at once.
 
-Spheres that are below the horizon of all receivers of a group, or too far from a bundle's cone, block nothing there.
+Spheres that are below the horizon of all receivers of a block, or too far from a bundle's cone, block nothing there.
 Nothing is lost by leaving them out. Order in memory does not change results, but how much is left out: neighbors had
 best be near each other, spheres as well as receivers (:mod:`warpshadow.maths.spatial_sort`).
 """
@@ -52,7 +52,7 @@ def make_cells(directions: np.ndarray, softness: float, device: wp.Device) -> Di
 
 @functools.cache
 def cap_type(lanes: int) -> Any:
-    """Struct of the caps of directions that a sphere blocks in part, one for each receiver of a group."""
+    """Struct of the caps of directions that a sphere blocks in part, one for each receiver of a block."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
 
     @wp.struct
@@ -122,7 +122,7 @@ def make_cull(has_horizon: bool, Task: type, lanes: int) -> wp.Function:
             - ``reached_bundles`` [2, bundle], int32: bundles that a run, and then a quad, may reach, where they are
               listed.
 
-        lanes: Receivers of a group.
+        lanes: Receivers of a block.
     """
     Lane, ReceiverLanes = lane_type(lanes), receiver_lanes_type(lanes)
     fn = make_lane_functions(lanes)

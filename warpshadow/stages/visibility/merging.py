@@ -188,7 +188,7 @@ class Gradients:
 
 @functools.cache
 def make_add_to_node(lanes: int) -> wp.Function:
-    """Make the kernel function that adds a group's share to the gradients of a node."""
+    """Make the kernel function that adds a block's share to the gradients of a node."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
     total = make_lane_functions(lanes).total
 
@@ -229,7 +229,7 @@ def _make_blend(lanes: int) -> wp.Function:
 
 @functools.cache
 def _make_relative(lanes: int) -> wp.Function:
-    """Make the kernel function of the offset from a group of receivers to a quad, over its extent: d/E and 1/E."""
+    """Make the kernel function of the offset from a block of receivers to a quad, over its extent: d/E and 1/E."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
 
     @wp.func
@@ -248,7 +248,7 @@ def _make_relative(lanes: int) -> wp.Function:
 
 @functools.cache
 def make_merged(lanes: int) -> wp.Function:
-    """Make the kernel function of the share that a quad's sphere has for a group of receivers."""
+    """Make the kernel function of the share that a quad's sphere has for a block of receivers."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
     blend, relative = _make_blend(lanes), _make_relative(lanes)
 
