@@ -13,7 +13,7 @@ from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.harmonic_light import as_light
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
-from warpshadow.pipeline.by_spheres import PartwiseShading, SphereMethod
+from warpshadow.pipeline.by_spheres import PortionedShading, SphereMethod
 from warpshadow.pipeline.convex import GroupConvexParts
 from warpshadow.pipeline.groups import Group, GroupVisibility
 from warpshadow.pipeline.lighting import (
@@ -265,7 +265,7 @@ class Directional(SphereMethod):
         )
 
     def shade_transfer(self, transfer: wp.array, group: Group, projected_light: ProjectedCells) -> wp.array:
-        """Shading of a part, vec3 of shape [batch, receiver]."""
+        """Shading of a portion, vec3 of shape [batch, receiver]."""
         if group.cached_rows is not None and _has_light(group.cached_rows):
             return light_cells(transfer, group.cached_rows)
         return super().shade_transfer(transfer, group, projected_light)
@@ -371,13 +371,13 @@ class Directional(SphereMethod):
         return blocked_radiance(diffuse, direct, openness)
 
     def _lobe_cells(self, points: LitPoints, light: Input) -> tuple[Node, Any]:
-        """Node of the transmittance of cells, in parts, and the projected light that says which."""
+        """Node of the transmittance of cells, in portions, and the projected light that says which."""
         is_free = isinstance(light.value(), wp.array)
         make = functools.partial(self.projected, light)
         projected_light = self.free_projection if is_free else points.cached("projected", light, make)
 
         def in_cells() -> Node:
-            return PartwiseCellTransmittance(
+            return PortionedCellTransmittance(
                 self, points, projected_light, None, list, where=" of gloss", is_shaded=False
             )
 
@@ -405,14 +405,14 @@ class Directional(SphereMethod):
         return cell_samples(samples, self._directions, device=self.merged_scene.device)
 
 
-class PartwiseCellTransmittance(PartwiseShading):
-    """Transmittance of receivers past all bodies, in parts, float32 of shape [batch, receiver, direction]."""
+class PortionedCellTransmittance(PortionedShading):
+    """Transmittance of receivers past all bodies, in portions, float32 of shape [batch, receiver, direction]."""
 
     def find(
-        self, call: Call, part: Group, projected_light: ProjectedCells, spheres: tuple[wp.array, wp.array]
+        self, call: Call, portion: Group, projected_light: ProjectedCells, spheres: tuple[wp.array, wp.array]
     ) -> wp.array:
-        """Find that of a part."""
-        return self.find_visibility(call, part, projected_light).transmittance_total
+        """Find that of a portion."""
+        return self.find_visibility(call, portion, projected_light).transmittance_total
 
 
 def _towards(
@@ -426,8 +426,8 @@ def _towards(
 
 
 def _joined_cells(cells: list[wp.array], count: int) -> wp.array:
-    """Transmittance of all parts, [batch, receiver, direction]. Differentiable."""
-    rows = joined([part.reshape((len(part), -1)) for part in cells])
+    """Transmittance of all portions, [batch, receiver, direction]. Differentiable."""
+    rows = joined([portion.reshape((len(portion), -1)) for portion in cells])
     return rows.reshape((len(rows), -1, count))
 
 

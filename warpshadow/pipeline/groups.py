@@ -24,7 +24,7 @@ from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 
-PART_SIZE = 1 << 13  # receivers of each instance that are lit at once where no gradient is asked for
+RECEIVERS_AT_ONCE = 1 << 13  # receivers of each instance that are lit at once where no gradient is asked for
 
 
 def nonplanar_bodies(merged_scene: MergedScene) -> list[int]:
@@ -59,8 +59,8 @@ class Group(NamedTuple):
         fronts = find_fronts(self.points, self.normals, self.corners, self.nearest_blockers, frames, planes)
         return lifted_points(self.points, fronts, frames, planes, skip), fronts
 
-    def parts(self) -> Iterator[Group]:
-        """Parts of at most PART_SIZE receivers, with as many instances in all arrays where there are spheres.
+    def portions(self) -> Iterator[Group]:
+        """Portions of the receivers, with as many instances in all arrays where there are spheres.
 
         For a gradient all of them come at once, and so do receivers with cached rows.
         """
@@ -83,20 +83,20 @@ class Group(NamedTuple):
         size = points.shape[1]
         if (
             self.cached_rows is not None
-            or size <= PART_SIZE
+            or size <= RECEIVERS_AT_ONCE
             or varies([*arguments, rotation_data, frames, part_corners, self.corners])
         ):
             yield self._replace(points=points, normals=normals, centers=centers, radii=radii, clusters=clusters)
             return
-        for start in range(0, size, PART_SIZE):
-            part = slice(start, min(start + PART_SIZE, size))
+        for start in range(0, size, RECEIVERS_AT_ONCE):
+            portion = slice(start, min(start + RECEIVERS_AT_ONCE, size))
             yield self._replace(
-                points=points[:, part].contiguous(),
-                normals=normals[:, part].contiguous(),
+                points=points[:, portion].contiguous(),
+                normals=normals[:, portion].contiguous(),
                 centers=centers,
                 radii=radii,
-                probe_weights=None if self.probe_weights is None else self.probe_weights.part(part),
-                nearest_blockers=None if self.nearest_blockers is None else self.nearest_blockers.part(part),
+                probe_weights=None if self.probe_weights is None else self.probe_weights.cut(portion),
+                nearest_blockers=None if self.nearest_blockers is None else self.nearest_blockers.cut(portion),
                 clusters=clusters,
             )
 
@@ -222,7 +222,7 @@ def _groups_that_move(
                 bounds = blockers.planes.first_corner[span.body : span.body + 2].tolist()
                 group = group._replace(corners=cut(corners, *bounds))
         if nearest_blockers is not None:
-            group = group._replace(nearest_blockers=nearest_blockers.part(slice(span.first, span.end)))
+            group = group._replace(nearest_blockers=nearest_blockers.cut(slice(span.first, span.end)))
         yield group
 
 

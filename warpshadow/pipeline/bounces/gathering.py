@@ -48,7 +48,7 @@ And as a proxy came or went, light jumped: a table's gradient was up to twice as
 
 
 class CellTransmittance(NamedTuple):
-    """Transmittance of a part of the receivers in cells of directions."""
+    """Transmittance of a portion of the receivers in cells of directions."""
 
     transmittance_self: (
         wp.array | None
@@ -215,7 +215,7 @@ class Proxies:
 
         Args:
             sources: Where they are lit.
-            cells: Transmittance of the sources, in parts.
+            cells: Transmittance of the sources, in portions.
             spheres: Centers and radii of all spheres.
             frames: Where flat bodies are.
         """
@@ -227,10 +227,10 @@ class Proxies:
             fronts = find_fronts(points, normals, None, of_sources, frames, planes.all)
             normals = turn_from_planes(points, normals, radii, numbers, fronts, frames, planes.all)
         rows = [
-            wp.full_like(part.transmittance_spheres, 1.0, requires_grad=False)
-            if part.transmittance_self is None
-            else part.transmittance_self
-            for part in cells
+            wp.full_like(portion.transmittance_spheres, 1.0, requires_grad=False)
+            if portion.transmittance_self is None
+            else portion.transmittance_self
+            for portion in cells
         ]
         transmittance = joined([row.reshape((len(row), -1)) for row in rows])
         directions = cells[0].directions

@@ -59,9 +59,9 @@ class NearestBlockers(NamedTuple):
     radii: wp.array  # [batch, sphere] float32
     numbers: wp.array  # [point] int32, the sphere of each; −1 for none
 
-    def part(self, part: slice) -> NearestBlockers:
+    def cut(self, points: slice) -> NearestBlockers:
         """The same of some points."""
-        return self._replace(numbers=self.numbers[part])
+        return self._replace(numbers=self.numbers[points])
 
 
 @wp.func
