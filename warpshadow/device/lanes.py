@@ -217,6 +217,7 @@ class LaneFunctions(NamedTuple):
     store_rows: wp.Function
     store_columns: wp.Function
     sqrt: wp.Function
+    smoothstep: wp.Function
     total: wp.Function
 
 
@@ -252,6 +253,11 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
     return part[0];
     """)
     def total(value: Lane) -> float: ...  # type: ignore[empty-body]
+
+    @wp.func(inline=True)
+    def smoothstep(t: Lane):
+        """From 0 at 0 to 1 at 1."""
+        return wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
 
     @wp.func(inline=True)
     def dot(a: Vectors, b: Vectors):

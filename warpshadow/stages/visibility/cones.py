@@ -61,7 +61,7 @@ def make_cone(lanes: int) -> wp.Function:
     """Make the kernel function of a block of receivers: offsets to a sphere's center, and 1/radius → its cones."""
     Lane, Vectors, Cone = lane_type(lanes), vectors_type(lanes), cone_type(lanes)
     fn = make_lane_functions(lanes)
-    sqrt, scale, dot = fn.sqrt, fn.scale, fn.dot
+    sqrt, scale, dot, smoothstep = fn.sqrt, fn.scale, fn.dot, fn.smoothstep
     SINE2 = wp.constant(float(_SINE2))
     COSINE = wp.constant(float(_COSINE))
     RISE = wp.constant(float(_RISE))
@@ -83,8 +83,7 @@ def make_cone(lanes: int) -> wp.Function:
         cosine = sqrt(Lane(1.0) - sine2) - lack
         sine2 = sine2 + wp.cw_mul(lack, Lane(2.0 * COSINE) - lack)
         near = wp.min((1.0 / FADE) * distance, Lane(1.0))
-        weight = wp.cw_mul(wp.cw_mul(near, near), Lane(3.0) - 2.0 * near)
-        return Cone(scale(inverse, relative), cosine, sine2, weight)
+        return Cone(scale(inverse, relative), cosine, sine2, smoothstep(near))
 
     return cone
 

@@ -78,7 +78,7 @@ def make_cap_functions(has_horizon: bool, lanes: int) -> CapFunctions:
     """Make the kernel functions for a number of lanes."""
     Lane, Vectors, Cap = lane_type(lanes), vectors_type(lanes), cap_type(lanes)
     fn = make_lane_functions(lanes)
-    is_any_above, dot, dot_direction = fn.is_any_above, fn.dot, fn.dot_direction
+    is_any_above, dot, dot_direction, smoothstep = fn.is_any_above, fn.dot, fn.dot_direction, fn.smoothstep
 
     @wp.func(inline=True)
     def widen(axis: Vectors, cosine: Lane, sine: Lane, cells: DirectionCells):
@@ -104,7 +104,7 @@ def make_cap_functions(has_horizon: bool, lanes: int) -> CapFunctions:
     def soften(direction: wp.vec3, cap: Cap, slope: Lane):
         t = wp.cw_mul(dot_direction(direction, cap.axis) - cap.cosine, slope)
         t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
-        return t, wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
+        return t, smoothstep(t)
 
     return CapFunctions(widen, reaches, rises, soften)
 

@@ -118,7 +118,7 @@ def _make_measure(order: int, lanes: int) -> wp.Function:
             # overflows
             root[lane] = wp.exp(0.5 * s * log[0][lane] / UNIT)
             t = wp.clamp((s * depth[lane] / threshold - 0.5) * PER_BLEND, 0.0, 1.0)
-            blend[lane] = t * t * (3.0 - 2.0 * t)
+            blend[lane] = wp.smoothstep(0.0, 1.0, t)
             blend_slope[lane] = 6.0 * PER_BLEND * t * (1.0 - t) * s / threshold
         return count, scale, sqrt(norm2), depth, maximum, root, blend, blend_slope
 

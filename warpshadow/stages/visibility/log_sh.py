@@ -52,13 +52,13 @@ def _task_type(order: int, lanes: int) -> Any:
 @functools.cache
 def _make_horizon(lanes: int) -> wp.Function:
     """Make the kernel function of the fade at the horizon: n·d/r → weight and its derivative."""
-    Lane = lane_type(lanes)
+    Lane, smoothstep = lane_type(lanes), make_lane_functions(lanes).smoothstep
 
     @wp.func(inline=True)
     def horizon(height: Lane):
         t = wp.min(wp.max((height + Lane(1.0)) / HORIZON_FADE, Lane(0.0)), Lane(1.0))
         slope = 6.0 / HORIZON_FADE * wp.cw_mul(t, Lane(1.0) - t)
-        return wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t), slope
+        return smoothstep(t), slope
 
     return horizon
 

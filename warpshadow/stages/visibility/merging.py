@@ -211,7 +211,8 @@ def make_add_to_node(lanes: int) -> wp.Function:
 def _make_blend(lanes: int) -> wp.Function:
     """Make the kernel function of the share m of a quad's sphere: d/E, τ → m, and its derivative by (D/E)²."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
-    dot = make_lane_functions(lanes).dot
+    fn = make_lane_functions(lanes)
+    dot, smoothstep = fn.dot, fn.smoothstep
     BLEND2 = wp.constant(_BLEND_ANGLE_RATIO**2)
     FARTHEST2 = wp.constant(_FARTHEST2)
 
@@ -222,7 +223,7 @@ def _make_blend(lanes: int) -> wp.Function:
         slope = 1.0 / (angle * angle * (1.0 - BLEND2))
         t = wp.min(wp.max(slope * (Lane(angle * angle) - inverse2), Lane(0.0)), Lane(1.0))
         rise = (6.0 * slope) * wp.cw_mul(wp.cw_mul(t, Lane(1.0) - t), wp.cw_mul(inverse2, inverse2))
-        return wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t), rise
+        return smoothstep(t), rise
 
     return blend
 
