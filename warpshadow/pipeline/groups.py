@@ -141,25 +141,31 @@ class Blockers(NamedTuple):
     def planes_around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> GroupPlanes | None:
         """Flat bodies around receivers of one body: all that block, or some."""
         planes = self.blocker_kinds.planes
-        chosen = planes if of_bodies is None else tuple(number for number in planes if number in of_bodies)
-        if self.frames is None or not set(chosen) - {body}:
+        chosen, skip = _blocking(planes, body, of_bodies)
+        if self.frames is None or not chosen:
             return None
-        skip = planes.index(body) if body in planes else None
         return GroupPlanes(self.planes.blockers(planes, chosen), self.frames, skip)
 
     def convex_parts_around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> GroupConvexParts | None:
         """Convex parts of bodies around receivers of one body: all that block, or some."""
         bodies = self.blocker_kinds.convex
-        chosen = bodies if of_bodies is None else tuple(number for number in bodies if number in of_bodies)
-        if self.placed is None or not set(chosen) - {body}:
+        chosen, skip = _blocking(bodies, body, of_bodies)
+        if self.placed is None or not chosen:
             return None
-        skip = bodies.index(body) if body in bodies else None
         return GroupConvexParts(self.parts.blockers(bodies, chosen), self.placed, skip)
 
     def around_plane(self, points: wp.array, normals: wp.array, body: int) -> Group:
         """The group of points of a flat body."""
         planes, parts = self.planes_around(body), self.convex_parts_around()
         return Group(points, normals, *self.spheres_of(self.bodies), planes=planes, convex_parts_around=parts)
+
+
+def _blocking(
+    bodies: tuple[int, ...], body: int, of_bodies: Iterable[int] | None
+) -> tuple[tuple[int, ...], int | None]:
+    """Bodies of one kind that block light around a body, () if none but itself does; and which of them it is itself."""
+    chosen = bodies if of_bodies is None else tuple(number for number in bodies if number in of_bodies)
+    return chosen if set(chosen) - {body} else (), bodies.index(body) if body in bodies else None
 
 
 def find_groups(
