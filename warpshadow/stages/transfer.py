@@ -1,9 +1,8 @@
 """Transfer vectors: visibility times cosine, so that light is shaded by a dot product.
 
-    B(x) = a(x)/π ∫ L(ω) V(ω, x) max(n·ω, 0) dω
-
-is linear in the light, so a receiver has a *transfer vector* T with B = a · (T · L): its coefficients belong to the
-light's, either spherical harmonics or cells of directions. The 1/π is in T: white under L = 1, unoccluded, gives 1.
+The radiance B that a receiver of albedo a reflects (README.md has the integral) is linear in the light L, so it has a
+*transfer vector* T with B = a · (T · L): its coefficients belong to the light's, either spherical harmonics or cells of
+directions. The 1/π is in T: white under L = 1, unoccluded, gives 1.
 """
 
 import functools
