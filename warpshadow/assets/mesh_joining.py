@@ -114,10 +114,10 @@ def fan(corner_counts: np.ndarray) -> np.ndarray:
 
 def weld(faces: np.ndarray, *attributes: np.ndarray) -> np.ndarray:
     """Let faces refer to the first of the vertices that agree in all attributes."""
-    group = number_places(np.column_stack(attributes))
-    first = np.empty(len(group), np.int64)
-    first[group[::-1]] = np.arange(len(group))[::-1]  # the last of these assignments stays
-    return first[group][faces]
+    place = number_places(np.column_stack(attributes))
+    first = np.empty(len(place), np.int64)
+    first[place[::-1]] = np.arange(len(place))[::-1]  # the last of these assignments stays
+    return first[place][faces]
 
 
 def joined_normals(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:

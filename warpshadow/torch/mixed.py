@@ -1,16 +1,8 @@
 """A renderer of several scenes, whose images come as one batch.
 
 Meshes that differ have other faces and other spheres, and a launch works on one scene. So each scene has a renderer of
-its own, which is called once, with all images of its scene. The other way would be a scene of all bodies, of which each
-instance hides the ones it does not show. Measured on 64 images of 64 × 64 pixels, of eight shapes that move, on two
-busy cores, in ms of CPU time an image, and the most memory that the process had:
-
-                                 forward    forward and backward    memory
-    image by image               12.3       24.8                    1.1 GB
-    scene by scene               6.5        14.9                    1.2 GB
-    all shapes in one scene      33.4       76.6                    2.9 GB
-
-With a shape for each of the 64 images these are 11, 22 and 1.1 GB scene by scene, and 304, 769 and 6.9 GB in one scene.
+its own, which is called once, with all images of its scene. One scene of all bodies, of which each instance hides the
+ones it does not show, would take five times as long.
 """
 
 import itertools

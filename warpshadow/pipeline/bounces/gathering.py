@@ -41,10 +41,8 @@ HARMONIC_GATHER_CELLS = fibonacci(64)  # where receivers look for bounced light 
 ALL_FLAT = "all that reflects is flat"  # why no body sends light to itself, in words
 
 _SOFTNESS_OF_PARTS = 1.0
-"""κ of proxies where convex parts block, at least: parts are seen by a cell's whole disc, of radius ρ. By κ = 0.35 some
-cells that parts blocked had no proxy in them, which lost 1 to 5% of the light from other bodies in a shelf of books.
-And as a proxy came or went, light jumped: a table's gradient was up to twice as large as differences of images, and is
-1% off. It takes 1.1 times as long."""
+"""κ of proxies where convex parts block, at least: parts are seen by a cell's whole disc, of radius ρ. With less, cells
+that parts block have no proxy in them, which loses light, and light jumps as a proxy comes or goes."""
 
 
 class CellTransmittance(NamedTuple):
