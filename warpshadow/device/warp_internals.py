@@ -309,7 +309,7 @@ def around_compilation(context: Callable[[], contextlib.AbstractContextManager])
 def _locked(folder: str) -> Iterator[None]:
     from filelock import FileLock
 
-    lock = FileLock(f"{folder}.lock")
+    lock = FileLock(f"{folder}.lock", is_singleton=True)  # which a thread may take again: in a copy of this package
     with contextlib.suppress(OSError, NotImplementedError):  # where no file can be locked, each compiles for itself
         lock.acquire()
     try:
