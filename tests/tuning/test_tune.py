@@ -39,7 +39,14 @@ def few(monkeypatch):
 @pytest.fixture
 def instant(few, monkeypatch):
     """Times that are given, the same each time: 1 ms a setting, in the order in which they are tried."""
-    monkeypatch.setattr(tune, "image_times", lambda scenes, **_: list(np.arange(1.0, len(scenes) + 1)))
+    given = {}
+
+    def estimate(scenes, **_):
+        given.update({id(scene): 1.0 + number for number, scene in enumerate(scenes)})
+        return [given[id(scene)] for scene in scenes]
+
+    monkeypatch.setattr(tune, "image_times", estimate)
+    monkeypatch.setattr(tune, "whole_image_times", lambda scenes, **_: [given[id(scene)] for scene in scenes])
 
 
 @pytest.fixture
@@ -242,6 +249,23 @@ def test_it_says_of_which_image_times_are(instant):
     assert "> nearest" in str(dataclasses.replace(found, is_reached=False))
     bounced = [trial._replace(scene=dataclasses.replace(scene, bounces=1)) for trial in found.trials]
     assert "extrapolated" not in str(dataclasses.replace(found, trials=bounced))
+
+
+def test_times_on_the_front_are_those_of_whole_images(few, monkeypatch):
+    """With estimates that put the slowest first, and are wrong the other way round."""
+    monkeypatch.setattr(tune, "image_times", lambda scenes, **_: [100.0 - n for n in range(len(scenes))])
+    whole = []
+
+    def times(scenes, **_):
+        whole.extend(scenes)
+        return [200.0 + len(whole)] * len(scenes)
+
+    monkeypatch.setattr(tune, "whole_image_times", times)
+    found = ws.tune(make_scene(), error=0.2)
+    front = [found.trials[number] for number in pareto_front([trial[:0:-1] for trial in found.trials])]
+    assert front and all(trial.milliseconds > 200 and trial.scene in whole for trial in front)
+    assert len({id(scene) for scene in whole}) == len(whole)
+    assert found.milliseconds > 200
 
 
 @pytest.mark.parametrize(("load", "is_busy"), [(1.9, False), (3.2, True)])

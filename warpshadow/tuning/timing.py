@@ -23,7 +23,7 @@ NEIGHBORS = 64  # receivers of a neighborhood
 def image_times(
     scenes: Sequence[Scene], *, runs: int = 5, device: wp.DeviceLike = "cpu", progress: bool = False
 ) -> list[float]:
-    """Estimate how long images take once kernels are compiled and renderers made.
+    """Estimate how long images take once kernels are compiled and renderers made, from few of their receivers.
 
     The whole image is timed without shadows, once for each choice of receivers. The time of shadows is measured on
     TIMED_RECEIVERS of the image's receivers, and extrapolated to all of them. Where light bounces, which takes time for
@@ -36,8 +36,7 @@ def image_times(
         Milliseconds of each scene's image, forward.
     """
     if any(scene.bounces for scene in scenes):
-        images = [whole_image(SceneRenderer(scene, device=device)) for scene in scenes]
-        return median_times(images, runs, progress=progress)
+        return whole_image_times(scenes, runs=runs, device=device, progress=progress)
     keys = [tuple(body.receivers for body in scene.bodies) for scene in scenes]
     firsts = dict(zip(reversed(keys), reversed(scenes), strict=True))
     stages = {key: _SharedTiming(scene, device) for key, scene in firsts.items()}
@@ -50,6 +49,14 @@ def image_times(
         whole, sampled = unshadowed[key]
         estimates.append(whole + stages[key].extrapolation * max(milliseconds - sampled, 0.0))
     return estimates
+
+
+def whole_image_times(
+    scenes: Sequence[Scene], *, runs: int = 3, device: wp.DeviceLike = "cpu", progress: bool = False
+) -> list[float]:
+    """Measure how long images take, as :func:`image_times` estimates it: milliseconds of each scene's."""
+    images = [whole_image(SceneRenderer(scene, device=device)) for scene in scenes]
+    return median_times(images, runs, progress=progress)
 
 
 def median_times(

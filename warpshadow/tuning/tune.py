@@ -28,7 +28,7 @@ from warpshadow.scene.visibility import AUTO, SPHERE_METHODS, Visibility
 from warpshadow.spheres import Spheres, fit_spheres, is_fitted
 from warpshadow.stages.visibility.zonal_logs import LOGS
 from warpshadow.tuning.point_sample import PointSample
-from warpshadow.tuning.timing import TIMED_RECEIVERS, image_times
+from warpshadow.tuning.timing import TIMED_RECEIVERS, image_times, whole_image_times
 
 DIRECTION_COUNTS = (32, 64, 128, 256, 512)
 ORDERS = (4, 6, 8)
@@ -101,7 +101,11 @@ class Tuning:
         """The table, the units of its errors and times, and the meaning of its marks."""
         camera, samples = self.given.camera, self.given.supersampling
         has_bounces = any(trial.scene.bounces for trial in self.trials)
-        sampled = "" if has_bounces else f"; shadows timed on {TIMED_RECEIVERS} of its receivers, extrapolated to all"
+        sampled = (
+            ""
+            if has_bounces
+            else f"; but for those marked *, shadows timed on {TIMED_RECEIVERS} of its receivers, extrapolated to all"
+        )
         mark = "chosen" if self.is_reached else "nearest"
         return (
             "error: of the shading at points of the image, relative, against rays\n"
@@ -257,6 +261,8 @@ def tune(
         if progress:  # timing takes as long again, and may be interrupted
             print(_error_table(settings, errors, fitted_counts(scene)), file=sys.stderr)
         times = image_times(settings, device=device, progress=progress)
+        if not any(item.bounces for item in bounced):
+            _time_front(settings, errors, times, device=device, progress=progress)
     trials = sorted(map(Trial, settings, errors, times), key=lambda trial: trial.milliseconds)
     if milliseconds is None:
         reaching = [trial for trial in trials if trial.error <= requested]
@@ -265,6 +271,18 @@ def tune(
         reaching = [trial for trial in trials if trial.milliseconds <= requested]
         chosen = min(reaching, key=lambda trial: trial.error) if reaching else _cheapest(trials)
     return Tuning(scene, chosen, bool(reaching), tuple(trials))
+
+
+def _time_front(
+    settings: Sequence[Scene], errors: Sequence[float], times: list[float], *, device: wp.Device, progress: bool
+) -> None:
+    """Replace estimates by times of whole images, until all on the Pareto front are such."""
+    timed: set[int] = set()
+    while untimed := sorted(set(pareto_front(list(zip(times, errors, strict=True)))) - timed):
+        whole = whole_image_times([settings[number] for number in untimed], device=device, progress=progress)
+        for number, milliseconds in zip(untimed, whole, strict=True):
+            times[number] = milliseconds
+        timed.update(untimed)
 
 
 def _warn_if_busy() -> None:
