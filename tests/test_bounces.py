@@ -302,7 +302,7 @@ def test_one_bounce_asks_for_no_light_between_bodies_sources():
 def test_receivers_lit_in_parts_are_lit_alike(method, monkeypatch):
     scene = bounced(method, ON_BOTH)
     whole = ws.Renderer(scene).shade().numpy()
-    monkeypatch.setattr(groups, "PART_SIZE", 200)
+    monkeypatch.setattr(groups, "RECEIVERS_AT_ONCE", 200)
     np.testing.assert_allclose(ws.Renderer(scene).shade().numpy(), whole, rtol=2e-5, atol=1e-6)
 
 

@@ -22,6 +22,7 @@ BANNED = {
     *("Blocking", "InParts", "LitParts", "PartsOfGroup", "PlanesOfGroup", "Reflection", "SceneParts"),
     *("presence", "receiver_words", "solid_bodies", "READ_BY", "MEANT", "GLOSSY", "BOUNCING"),
     *("Assembly", "Flats", "Narrow", "Own", "Seen", "StandIns"),
+    *("DirectLightPart", "PartVisibility", "PartwiseShading", "PART_SIZE", "rooms", "with_self_light"),
 }
 FIRST_WORDS = ("What ", "Those ", "That which ", "Whatever ")
 

@@ -264,11 +264,12 @@ def test_the_node_that_a_page_adds_is_one_of_the_image(tmp_path, monkeypatch):
     """Pasted where the page says; then explain lists it, and the corners are darker."""
     page = (ROOT / "warpshadow" / "README.md").read_text("utf-8")
     (snippet,) = blocks(ROOT / "warpshadow" / "README.md", "python")
-    (line,) = re.findall(r"^    (averaged = .*)$", page, re.MULTILINE)
+    (lines,) = re.findall(r"^    (averaged = .*\n    return .*)$", page, re.MULTILINE)
+    replaced = "return" + lines.partition("\n")[0].removeprefix("averaged =")
     source = (ROOT / "warpshadow" / "pipeline" / "view.py").read_text("utf-8")
-    assert source.count("        return averaged\n") == 1
+    assert source.count(replaced) == 1
     (tmp_path / "vignette.py").write_text(snippet, "utf-8")
-    pasted = source.replace("        return averaged\n", f"        {line}\n        return averaged\n")
+    pasted = source.replace(replaced, lines.replace("\n", "\n    "))
     (tmp_path / "darker_view.py").write_text("from vignette import darken_corners\n" + pasted, "utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     camera = ws.Camera.look_at((0, 2, 0.1), (0, 0, 0), size=(8, 8))

@@ -458,7 +458,7 @@ def shape(name: str, got: tuple[int, ...], expected: tuple[int | str, ...], mean
     If ``meaning`` is given, the message ends with it and with how to make such an array.
     """
     matches = len(got) == len(expected) and all(
-        isinstance(requested, str) or have == requested for have, requested in zip(got, expected, strict=True)
+        isinstance(length, str) or got_length == length for got_length, length in zip(got, expected, strict=True)
     )
     if not matches:
         lengths = ", ".join(map(str, expected))

@@ -11,7 +11,7 @@ from warpshadow.stages.transfer import sh_transfer
 from warpshadow.stages.visibility import directional, log_sh
 from warpshadow.stages.visibility.exponential import exponentiate
 
-OPAQUE = 1e-4  # relative L2: where less than this passes, a group of receivers looks no further, and others may
+OPAQUE = 1e-4  # relative L2: where less than this passes, a block of receivers looks no further, and others may
 ROUNDING = 2e-6  # relative L2: sums over the lanes, in another order
 NATIVE = "-march=native"
 OWN = f"{NATIVE} -mllvm=-inline-threshold=9000"

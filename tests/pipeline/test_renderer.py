@@ -678,20 +678,20 @@ def test_a_coarse_face_in_one_view_of_two_is_as_coarse_as_in_one_alone():
 
 
 @pytest.mark.parametrize("method", ["directional", "log-sh", "none"])
-def test_receivers_lit_in_parts_are_those_lit_at_once(method, monkeypatch):
-    """In parts, transfer vectors take memory for those alone that are lit at once."""
+def test_receivers_lit_in_portions_are_those_lit_at_once(method, monkeypatch):
+    """In portions, transfer vectors take memory for those alone that are lit at once."""
     ball = ws.Body(ws.icosphere(1.0, 3), blockers=UNIT_SPHERE, translation=(0, 1, 0))
     scene = ws.Scene((ball, ws.Body(ws.plane(4, 16), blockers=0)), dome(), CAMERA, ws.Visibility(method))
     whole = SceneRenderer(scene).render()
-    monkeypatch.setattr(groups, "PART_SIZE", 37)
+    monkeypatch.setattr(groups, "RECEIVERS_AT_ONCE", 37)
     renderer = SceneRenderer(scene)
     np.testing.assert_array_equal(renderer.render(), whole)
     assert "transfer" in str(renderer.explain())
 
 
-def test_parts_of_receivers_need_little_memory(monkeypatch):
+def test_portions_of_receivers_need_little_memory(monkeypatch):
     """What is shaded at once is told by the largest array of what is seen."""
-    monkeypatch.setattr(groups, "PART_SIZE", 64)
+    monkeypatch.setattr(groups, "RECEIVERS_AT_ONCE", 64)
     sizes = []
     shade = directional.shade_cells
     monkeypatch.setattr(

@@ -35,29 +35,29 @@ def cone_kernel(lanes, is_fused):
         # out
         result: wp.array2d(dtype=Lane),
     ):
-        """A thread owns a group of receivers that see one sphere."""
-        group = wp.tid()
-        cone = find_cone(load(offsets, group), 1.0 / radii[group])
-        result[group, 0] = cone.axis.x
-        result[group, 1] = cone.axis.y
-        result[group, 2] = cone.axis.z
-        result[group, 3] = cone.cosine
-        result[group, 4] = cone.sine2
-        result[group, 5] = cone.weight
+        """A thread owns a block of receivers that see one sphere."""
+        block = wp.tid()
+        cone = find_cone(load(offsets, block), 1.0 / radii[block])
+        result[block, 0] = cone.axis.x
+        result[block, 1] = cone.axis.y
+        result[block, 2] = cone.axis.z
+        result[block, 3] = cone.cosine
+        result[block, 4] = cone.sine2
+        result[block, 5] = cone.weight
 
     return write_cones
 
 
 def kernel_cones(offsets, radius, device, lanes=16, is_fused=False):
     """Direction [n, 3], cos θ [n], sin²θ [n], weight [n] of offsets [n, 3] to a sphere of one radius, float64."""
-    groups = -(-len(offsets) // lanes)
-    result = wp.full((groups, 6), np.nan, dtype=lane_type(lanes), device=device)
+    blocks = -(-len(offsets) // lanes)
+    result = wp.full((blocks, 6), np.nan, dtype=lane_type(lanes), device=device)
     inputs = [
         wp.array(offsets, dtype=wp.vec3, device=device),
-        wp.full(groups, float(radius), dtype=wp.float32, device=device),
+        wp.full(blocks, float(radius), dtype=wp.float32, device=device),
     ]
-    wp.launch(cone_kernel(lanes, is_fused), dim=groups, inputs=inputs, outputs=[result], device=device)
-    rows = result.numpy().reshape(groups, 6, lanes).transpose(0, 2, 1).reshape(-1, 6)[: len(offsets)]
+    wp.launch(cone_kernel(lanes, is_fused), dim=blocks, inputs=inputs, outputs=[result], device=device)
+    rows = result.numpy().reshape(blocks, 6, lanes).transpose(0, 2, 1).reshape(-1, 6)[: len(offsets)]
     return rows[:, :3].astype(float), *rows[:, 3:].astype(float).T
 
 

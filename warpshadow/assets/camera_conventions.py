@@ -97,8 +97,8 @@ def from_pytorch3d(
     if principal_point is None:
         center = middle
     else:
-        arguments = _shaped("principal_point", principal_point, (2,), (1, 2)).ravel()
-        center = middle - half * arguments if in_ndc else arguments
+        point = _shaped("principal_point", principal_point, (2,), (1, 2)).ravel()
+        center = middle - half * point if in_ndc else point
     focal = half * focal if in_ndc else focal
     return Pinhole(intrinsics_of(*focal, *center), rotation, translation)
 
@@ -136,10 +136,10 @@ def intrinsics_of(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def _shaped(name: str, arguments: object, *shapes: tuple[int, ...]) -> np.ndarray:
+def _shaped(name: str, given_numbers: object, *shapes: tuple[int, ...]) -> np.ndarray:
     """Copy finite numbers of one of some shapes to float64."""
     expected = "an array of shape " + " or ".join(map(str, shapes))
-    values = check.numbers(name, arguments, expected=expected, dtype=np.float64)
+    values = check.numbers(name, given_numbers, expected=expected, dtype=np.float64)
     if values.shape not in shapes:
         raise ValueError(f"{name}: got {check.described(values)}, expected {expected}")
     check.finite(name, values)

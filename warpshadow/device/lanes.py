@@ -1,9 +1,9 @@
 """Lanes: how one thread works on several receivers at once.
 
 Warp runs a CPU kernel one thread after another. A thread that owns one receiver leaves the vector units idle; so here
-a thread owns a *group* of receivers and holds each quantity as one vector with a lane for every receiver: as many as a
+a thread owns a *block* of receivers and holds each quantity as one vector with a lane for every receiver: as many as a
 vector register has floats on a CPU, 1 on a GPU, where threads play that part. Arrays in memory stay [batch, vertex, …];
-only scratch is [batch, group, …] of lanes. A group that runs past the last receiver repeats it and writes it once.
+only scratch is [batch, block, …] of lanes. A block that runs past the last receiver repeats it and writes it once.
 
 Small functions on structs are inlined by force. Otherwise LLVM calls them, and copies the structs through memory:
 kernels of visibility take 1.1 to 1.35 times as long.
@@ -173,7 +173,7 @@ def block_count(vertex_count: int, lanes: int) -> int:
 
 
 def span_count(device: wp.Device, direction_count: int) -> int:
-    """Threads of a group of receivers, a span of directions each: on a CPU one, which finds a sphere's cone once."""
+    """Threads of a block of receivers, a span of directions each: on a CPU one, which finds a sphere's cone once."""
     return 1 if device.is_cpu else direction_count // CHUNK
 
 
@@ -217,6 +217,7 @@ class LaneFunctions(NamedTuple):
     store_rows: wp.Function
     store_columns: wp.Function
     sqrt: wp.Function
+    smoothstep: wp.Function
     total: wp.Function
 
 
@@ -254,6 +255,11 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
     def total(value: Lane) -> float: ...  # type: ignore[empty-body]
 
     @wp.func(inline=True)
+    def smoothstep(t: Lane):
+        """From 0 at 0 to 1 at 1."""
+        return wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
+
+    @wp.func(inline=True)
     def dot(a: Vectors, b: Vectors):
         return wp.cw_mul(a.x, b.x) + wp.cw_mul(a.y, b.y) + wp.cw_mul(a.z, b.z)
 
@@ -281,18 +287,18 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
 
     @wp.func
     def find_block(row: int, vertex_count: int):
-        """Instance and group of a row, where the groups of all instances follow each other."""
+        """Instance and block of a row, where the blocks of all instances follow each other."""
         return split_row(row, (vertex_count + (lanes - 1)) // lanes)
 
     @wp.func
-    def load(values: wp.array(dtype=wp.vec3), group: int):
-        """A group's vectors."""
+    def load(values: wp.array(dtype=wp.vec3), block: int):
+        """A block's vectors."""
         last = values.shape[0] - 1
         x = Lane()
         y = Lane()
         z = Lane()
         for lane in range(lanes):
-            value = values[wp.min(group * lanes + lane, last)]
+            value = values[wp.min(block * lanes + lane, last)]
             x[lane] = value[0]
             y[lane] = value[1]
             z[lane] = value[2]
@@ -304,58 +310,58 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
         b: wp.array2d(dtype=wp.float32),
         begin: int,
         count: int,
-        group: int,
+        block: int,
         scratch: wp.array(dtype=Lane),
     ):
-        """scratch[k] = a b of the group's vertices in the column ``begin`` + k, 0 past the last vertex."""
+        """scratch[k] = a b of the block's vertices in the column ``begin`` + k, 0 past the last vertex."""
         for k in range(count):
             value = Lane()
-            for lane in range(wp.min(lanes, a.shape[0] - group * lanes)):
-                vertex = group * lanes + lane
+            for lane in range(wp.min(lanes, a.shape[0] - block * lanes)):
+                vertex = block * lanes + lane
                 value[lane] = a[vertex, begin + k] * b[vertex, begin + k]
             scratch[k] = value
 
     @wp.func
-    def add_vectors(a: Vectors, group: int, values: wp.array(dtype=wp.vec3)):
-        """Add to a group's vectors."""
-        for lane in range(wp.min(lanes, values.shape[0] - group * lanes)):
-            wp.atomic_add(values, group * lanes + lane, wp.vec3(a.x[lane], a.y[lane], a.z[lane]))
+    def add_vectors(a: Vectors, block: int, values: wp.array(dtype=wp.vec3)):
+        """Add to a block's vectors."""
+        for lane in range(wp.min(lanes, values.shape[0] - block * lanes)):
+            wp.atomic_add(values, block * lanes + lane, wp.vec3(a.x[lane], a.y[lane], a.z[lane]))
 
     @wp.func
-    def load_rows(rows: wp.array2d(dtype=wp.float32), group: int, scratch: wp.array(dtype=Lane)):
-        """scratch[k] = rows[the group's vertices, k], 0 past the last vertex."""
+    def load_rows(rows: wp.array2d(dtype=wp.float32), block: int, scratch: wp.array(dtype=Lane)):
+        """scratch[k] = rows[the block's vertices, k], 0 past the last vertex."""
         for k in range(rows.shape[1]):
             value = Lane()
-            for lane in range(wp.min(lanes, rows.shape[0] - group * lanes)):
-                value[lane] = rows[group * lanes + lane, k]
+            for lane in range(wp.min(lanes, rows.shape[0] - block * lanes)):
+                value[lane] = rows[block * lanes + lane, k]
             scratch[k] = value
 
     @wp.func
-    def add_rows(scratch: wp.array(dtype=Lane), group: int, rows: wp.array2d(dtype=wp.float32)):
-        """rows[the group's vertices, k] += scratch[k]."""
-        for lane in range(wp.min(lanes, rows.shape[0] - group * lanes)):
-            vertex = group * lanes + lane
+    def add_rows(scratch: wp.array(dtype=Lane), block: int, rows: wp.array2d(dtype=wp.float32)):
+        """rows[the block's vertices, k] += scratch[k]."""
+        for lane in range(wp.min(lanes, rows.shape[0] - block * lanes)):
+            vertex = block * lanes + lane
             for k in range(rows.shape[1]):
                 rows[vertex, k] = rows[vertex, k] + scratch[k][lane]
 
     # Plain Warp loads a whole vector for each of its numbers.
     @wp.func_native(f"""
-    const int first = group * {lanes};
+    const int first = block * {lanes};
     const int past = first + {lanes} < rows.shape[0] ? first + {lanes} : rows.shape[0];
     for (int vertex = first; vertex < past; ++vertex)
         for (int k = 0; k < count; ++k)
             wp::index(rows, vertex, begin + k) = wp::index(scratch, k).c[vertex - first];
     """)
     def store_columns(
-        scratch: wp.array(dtype=Lane), begin: int, count: int, group: int, rows: wp.array2d(dtype=wp.float32)
+        scratch: wp.array(dtype=Lane), begin: int, count: int, block: int, rows: wp.array2d(dtype=wp.float32)
     ):
-        """rows[the group's vertices, begin + k] = scratch[k] for ``count`` columns."""
+        """rows[the block's vertices, begin + k] = scratch[k] for ``count`` columns."""
         ...
 
     @wp.func
-    def store_rows(scratch: wp.array(dtype=Lane), group: int, rows: wp.array2d(dtype=wp.float32)):
-        """rows[the group's vertices, k] = scratch[k]."""
-        store_columns(scratch, 0, rows.shape[1], group, rows)
+    def store_rows(scratch: wp.array(dtype=Lane), block: int, rows: wp.array2d(dtype=wp.float32)):
+        """rows[the block's vertices, k] = scratch[k]."""
+        store_columns(scratch, 0, rows.shape[1], block, rows)
 
     @wp.func
     def sqrt(value: Lane):

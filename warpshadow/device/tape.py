@@ -38,9 +38,9 @@ def record_adjoint(adjoint: Callable[[], None], arrays: Iterable[wp.array | None
         arrays: Arrays whose gradients it reads and writes; the tape zeroes them; None is skipped.
     """
     tape = current_tape()
-    requested = [array for array in arrays if array is not None and array.requires_grad]
-    if tape is not None and requested:
-        tape.record_func(adjoint, requested)
+    variables = [array for array in arrays if array is not None and array.requires_grad]
+    if tape is not None and variables:
+        tape.record_func(adjoint, variables)
 
 
 def record_kernel(kernel: wp.Kernel, dim: Sequence[int], arguments: Sequence[Any], device: wp.Device) -> None:

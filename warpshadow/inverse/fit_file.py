@@ -188,11 +188,11 @@ def _free(table: Table, scene: Scene) -> list[Free]:
         check.known_keys("key", table, (*_FREE_OF_SCENE, *_FREE_OF_BODIES))
     free: list[Free] = []
     for key, kind in _FREE_OF_SCENE.items():
-        arguments = table.get(key, False)
-        if arguments is False:
+        entry = table.get(key, False)
+        if entry is False:
             continue
         with check.located(f"[free] {key}"):
-            settings = {} if arguments is True else arguments
+            settings = {} if entry is True else entry
             toml_tables.check_table(settings)
             if kind is Light and "directions" in settings:
                 settings = {"order": None} | settings  # in place of the default

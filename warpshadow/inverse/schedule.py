@@ -82,8 +82,8 @@ class Stage:
 
     def visibility(self, visibility: Visibility) -> Visibility:
         """A scene's visibility with the overrides of a stage."""
-        arguments: dict[str, Any] = {"softness": self.softness, "directions": self.directions}
-        return replace(visibility, **{name: value for name, value in arguments.items() if value is not None})
+        overrides: dict[str, Any] = {"softness": self.softness, "directions": self.directions}
+        return replace(visibility, **{name: value for name, value in overrides.items() if value is not None})
 
 
 def check_part(name: str, value: object, of: str) -> None:

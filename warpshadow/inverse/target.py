@@ -93,9 +93,9 @@ class Target:
             )
         if self.mask is not None:
             is_bool = np.asarray(self.mask).dtype == bool
-            arguments = np.asarray(self.mask, np.float32) if is_bool else self.mask
+            given_mask = np.asarray(self.mask, np.float32) if is_bool else self.mask
             mask = check.numbers(
-                "mask", arguments, expected="weights of pixels [height, width], or the path of a picture"
+                "mask", given_mask, expected="weights of pixels [height, width], or the path of a picture"
             )
             check.shape("mask", mask.shape, image.shape[:2])
             check.finite("mask", mask)

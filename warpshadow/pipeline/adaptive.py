@@ -58,8 +58,8 @@ def find_squares(
             seen = see_samples(fragments, samples)
             facing = points_seen(detached(positions), detached(normals), merged_scene.faces, seen)
             group = blockers.around_plane(*facing, body)
-            parts = [method.sharp_share(part) for part in group.parts()]
-            known = [part for part in parts if part is not None]
+            portions = [method.sharp_share(portion) for portion in group.portions()]
+            known = [portion for portion in portions if portion is not None]
             if known:
                 view, place = np.nonzero(columns >= 0)
                 shares[view, places[columns[view, place]]] = np.concatenate(known, axis=1)[view, place]

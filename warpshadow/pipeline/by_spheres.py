@@ -152,27 +152,33 @@ class SphereMethod(Method):
         """Node of known light, projected; the scene's is cached."""
         return self._projected_from_scene if light is self.light else Node("", self.project_light, light)
 
-    def shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
+    def known_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
         """Shading of points in known light, which bounces from the materials."""
         projected_light = self.projected(light)
         if self.bounces is not None:
             is_cached = points.is_static and materials is not points.materials
-            return (self.bounces.cached_shading if is_cached else self.bounces.shading)(
+            return (self.bounces.cached_bounced_shading if is_cached else self.bounces.bounced_shading)(
                 points, projected_light, light, materials
             )
-        return PartwiseShading(self, points, projected_light, light, joined)
+        return PortionedShading(self, points, projected_light, light, joined)
 
     def free_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
         """Shading of points in free light; where it bounces between moving bodies, computed as for known light."""
         if self.bounces is not None and not points.is_static:
-            return self.bounces.free_shading(points, Node("", self._projected_if_given, light), light, materials)
+            return self.bounces.bounced_free_shading(
+                points, Node("", self._projected_if_given, light), light, materials
+            )
         direct = super().free_shading(points, light, materials)
-        return direct if self.bounces is None else self.bounces.cached_free_shading(direct, points, light, materials)
+        return (
+            direct
+            if self.bounces is None
+            else self.bounces.cached_bounced_free_shading(direct, points, light, materials)
+        )
 
     def openness(self, points: LitPoints) -> Node:
         """Light that points reflect as white surfaces under an even sky of 1, vec3 of shape [batch, receiver]."""
         sky = Input("light", EnvironmentMap.constant(1.0))
-        return PartwiseShading(self, points, Node("", self.project_light, sky), sky, joined, where=" in an even sky")
+        return PortionedShading(self, points, Node("", self.project_light, sky), sky, joined, where=" in an even sky")
 
     def _projected_if_given(self, light: wp.array) -> Any:
         """Project given free light for the method. Differentiable: light."""
@@ -181,7 +187,7 @@ class SphereMethod(Method):
     def transfers(self, points: LitPoints, where: str = "") -> Node:
         """Transfer vectors of points to :attr:`basis`; where they vary, to the method's native basis."""
         matrix = self.native_from_basis
-        transfers = PartwiseShading(self, points, self.free_projection, None, list, caches=matrix is None, where=where)
+        transfers = PortionedShading(self, points, self.free_projection, None, list, caches=matrix is None, where=where)
         if matrix is None or transfers.requires_grad:
             return transfers
 
@@ -191,8 +197,8 @@ class SphereMethod(Method):
         return Node("", to_basis, transfers)
 
 
-class PartwiseShading(Node):
-    """Shading or transfer vectors of receivers, found group by group and part by part.
+class PortionedShading(Node):
+    """Shading or transfer vectors of receivers, found group by group and portion by portion.
 
     So without a gradient transfer vectors of all receivers are in memory at once only where light is free.
 
@@ -200,11 +206,11 @@ class PartwiseShading(Node):
         method: The method.
         points: The receivers.
         projected_light: The light projected for the method.
-        light: Known or free light; None where it is not given yet: parts end with transfer vectors.
-        finish: Combines the list of results of all parts.
+        light: Known or free light; None where it is not given yet: portions end with transfer vectors.
+        finish: Combines the list of results of all portions.
         caches: As for :class:`Node`.
         where: Suffix of the names of its stages, to tell them from others.
-        is_shaded: Whether parts are shaded in known light; else they end with transfer vectors, too.
+        is_shaded: Whether portions are shaded in known light; else they end with transfer vectors, too.
         extra_inputs: As for :class:`Node`.
     """
 
@@ -263,9 +269,9 @@ class PartwiseShading(Node):
         )
         self._shading = None
         if is_lit:
-            shade_part = method.shade_transfer if self._is_transferred else method.shade_transmittance
+            shade_portion = method.shade_transfer if self._is_transferred else method.shade_transmittance
             arguments = self._transfer, projected_light
-            self._shading = result = Node(f"shading{where}", shade_part, *arguments, items=item_text, caches=False)
+            self._shading = result = Node(f"shading{where}", shade_portion, *arguments, items=item_text, caches=False)
         shadows = _static_shadows(method, points, light)
         cached_rows = shadows if shadows.function else None
         looked_up: Node | dict = self_visibility if self_visibility.function else {}
@@ -276,40 +282,40 @@ class PartwiseShading(Node):
         )
 
     def compute(self, call: Call) -> Any:
-        """Find it for all parts."""
-        return self._finish(list(self.parts(call)))
+        """Find it for all portions."""
+        return self._finish(list(self.portions(call)))
 
-    def parts(self, call: Call) -> Iterator[Any]:
-        """Find it for one part after another."""
+    def portions(self, call: Call) -> Iterator[Any]:
+        """Find it for one portion after another."""
         receivers, blockers, projected_light, *cached = self.values(call)
         groups = find_groups(self._points, receivers, blockers, *cached)
         total = len(receivers.on_static) + receivers.points.shape[1]
         with progress_bar(total, "shading", "receiver", shows=self._progress) as bar:
             for group in groups:
-                for part in group.parts():
-                    yield self.find(call, part, projected_light, blockers.spheres)
-                    bar.update(part.points.shape[1])
+                for portion in group.portions():
+                    yield self.find(call, portion, projected_light, blockers.spheres)
+                    bar.update(portion.points.shape[1])
 
-    def find(self, call: Call, part: Group, projected_light: Any, spheres: tuple[wp.array, wp.array]) -> Any:
-        """Compute a part's visibility, given the projected light and all spheres."""
-        return self.light(call, part, self.find_visibility(call, part, projected_light), projected_light)
+    def find(self, call: Call, portion: Group, projected_light: Any, spheres: tuple[wp.array, wp.array]) -> Any:
+        """Compute a portion's visibility, given the projected light and all spheres."""
+        return self.light(call, portion, self.find_visibility(call, portion, projected_light), projected_light)
 
-    def find_visibility(self, call: Call, part: Group, projected_light: Any) -> GroupVisibility:
-        """Find the visibility of a part."""
-        visibility = self._visibility.run(call, part, projected_light)
+    def find_visibility(self, call: Call, portion: Group, projected_light: Any) -> GroupVisibility:
+        """Find the visibility of a portion."""
+        visibility = self._visibility.run(call, portion, projected_light)
         return (
             visibility
-            if part.planes is None
-            else self._visibility_past_planes.run(call, part, visibility, projected_light)
+            if portion.planes is None
+            else self._visibility_past_planes.run(call, portion, visibility, projected_light)
         )
 
-    def light(self, call: Call, part: Group, visibility: GroupVisibility, projected_light: Any) -> wp.array:
-        """Transfer vectors of a part, or its shading."""
+    def light(self, call: Call, portion: Group, visibility: GroupVisibility, projected_light: Any) -> wp.array:
+        """Transfer vectors of a portion, or its shading."""
         if not self._is_transferred:
             assert self._shading is not None
-            return self._shading.run(call, visibility, part, projected_light)
-        transfer = self._transfer.run(call, visibility, part, projected_light)
-        return transfer if self._shading is None else self._shading.run(call, transfer, part, projected_light)
+            return self._shading.run(call, visibility, portion, projected_light)
+        transfer = self._transfer.run(call, visibility, portion, projected_light)
+        return transfer if self._shading is None else self._shading.run(call, transfer, portion, projected_light)
 
 
 def _sphere_counts(method: SphereMethod, points: LitPoints) -> np.ndarray:

@@ -7,32 +7,9 @@ have edges, with directional visibility, where the light is known, and where arr
 takes about 1.5 times as long as at the vertices of 64² quads, an iteration of a pose 1.2 times, and the ground has
 about the error that it has by pixel. Where a renderer has a basis, light is free, and nobody knows where edges will be.
 
-Between vertices light is interpolated, which shows where a face is large. Measured on a ground of 6 × 6 units under a
-sky with a sun, 256 × 256 pixels with 4 samples each, error of the image against rays, two cores:
-
-    quads    pixels a face    at vertices    by pixel
-    32²      34               5.8%           2.9%, in 3.5 times the time
-    64²      9                4.0%           2.9%, in 4 times the time
-
-Faces may be small and long: spokes, rails, sides of cylinders of two rings. So their longest edges count, too. Measured
-at 256 × 256 pixels, bodies of 2 units from 5.5 units away:
-
-    body                            pixels a face    length beyond which faces show 5% of the body's pixels
-    bunny, bear, spot, rocks        2.9–5.3          7.7–10.3 pixels
-    torus of 48 × 24 quads          14               12
-    ground of 64², of 32² quads     9, 34            13, 25
-    cylinder of 32, of 128 sides    120, 30          78, 75
-    capsule; wheel of 12 spokes     3.1; 6.4         56; 72
-    picket fence                    75               145
-
-A picture that is made once can afford per-pixel receivers on its grounds and walls, where shadows' edges show most: a
-bunny of 64 spheres on a ground of 6 × 6 units and 64² quads, timed as a whole ``ws.render`` on a busy machine:
-
-    light            pixels    at vertices              by pixel
-    sky with a sun   256²       3,724 points, 5.0%       31,176, 4.4%, 0.3 s longer
-    sky with a sun   512²       3,735         5.2%       99,334  4.6%  0.7 s
-    bare sun         256²       3,724         3.2%       31,176  2.8%  0.3 s
-    bare sun         512²       3,735         3.5%       99,334  3.1%  0.2 s
+Between vertices light is interpolated, which shows where a face is large, or small and long, as spokes and rails are;
+so faces count by their pixels and by their longest edges. A picture that is made once can afford per-pixel receivers on
+its grounds and walls, where shadows' edges show most. pipeline/README.md has the figures.
 """
 
 import dataclasses

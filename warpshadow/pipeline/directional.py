@@ -13,7 +13,7 @@ from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.harmonic_light import as_light
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
-from warpshadow.pipeline.by_spheres import PartwiseShading, SphereMethod
+from warpshadow.pipeline.by_spheres import PortionedShading, SphereMethod
 from warpshadow.pipeline.convex import GroupConvexParts
 from warpshadow.pipeline.groups import Group, GroupVisibility
 from warpshadow.pipeline.lighting import (
@@ -64,6 +64,16 @@ class ProjectedCells(NamedTuple):
     sharp_cells_past_planes: SharpCells | None = None  # and where planes do
     samples: np.ndarray | None = None  # directions drawn from known light in its cells, and even ones [direction, 8, 3]
     sun: SunCells | None = None  # the brightest cells, where bodies want rays to them
+
+
+class SharpestCells(NamedTuple):
+    """Sixteen cells of the scene's light whose shadows are sharpest."""
+
+    directions: np.ndarray  # [16, 3]
+    light: wp.array  # luminance in channel 0, for cells of 4π/16, vec3 of shape [1, 16]
+    scale: float  # their radius, over that of cells of 4π/16
+    edge_radius: float  # how soft the edges of planes and convex parts are in them [rad]
+    power: np.ndarray  # luminance of all cells [direction]
 
 
 class Directional(SphereMethod):
@@ -147,12 +157,15 @@ class Directional(SphereMethod):
         transmittance = parts.transmittance(points, horizon_normals, projected_light.directions)
         if projected_light.sharp_cells_past_planes is None:
             return transmittance
-        directions, places, scale = projected_light.sharp_cells_past_planes
-        # a part has its own edges: they need no room for the rest of a cell, as spheres do not
-        radius = self.visibility.softness * scale * cell_radius(len(directions))
+        directions, places, _ = projected_light.sharp_cells_past_planes
+        radius = self._edge_radius(projected_light.sharp_cells_past_planes)
         return overwrite_sharp_cells(
             transmittance, parts.transmittance(points, horizon_normals, directions, radius), places
         )
+
+    def _edge_radius(self, sharp_cells: SharpCells) -> float:
+        """How soft edges of planes and convex parts are in sharp cells [rad]; they need no room for a cell's rest."""
+        return self.visibility.softness * sharp_cells.scale * cell_radius(len(sharp_cells.directions))
 
     def _past_spheres(
         self, group: Group, horizon_normals: wp.array | None, projected_light: ProjectedCells
@@ -213,11 +226,10 @@ class Directional(SphereMethod):
                 skip=planes.skip,
             )
         if projected_light.sharp_cells_past_planes is not None:
-            directions, places, scale = projected_light.sharp_cells_past_planes
-            # a plane has its own edges: they need no room for the rest of a cell, as spheres do not
-            sharp_cells = cover(directions, radius=self.visibility.softness * scale * cell_radius(len(directions)))
-            assert sharp_cells is not None
-            covered = overwrite_sharp_cells(covered, sharp_cells, places)
+            directions, places, _ = projected_light.sharp_cells_past_planes
+            sharp_coverage = cover(directions, radius=self._edge_radius(projected_light.sharp_cells_past_planes))
+            assert sharp_coverage is not None
+            covered = overwrite_sharp_cells(covered, sharp_coverage, places)
         return visibility._replace(
             transmittance_total=transmittance_past_planes(transmittance_spheres, covered),
             transmittance_spheres=transmittance_spheres,
@@ -253,7 +265,7 @@ class Directional(SphereMethod):
         )
 
     def shade_transfer(self, transfer: wp.array, group: Group, projected_light: ProjectedCells) -> wp.array:
-        """Shading of a part, vec3 of shape [batch, receiver]."""
+        """Shading of a portion, vec3 of shape [batch, receiver]."""
         if group.cached_rows is not None and _has_light(group.cached_rows):
             return light_cells(transfer, group.cached_rows)
         return super().shade_transfer(transfer, group, projected_light)
@@ -274,14 +286,8 @@ class Directional(SphereMethod):
         return shade_cells(*arguments, maximum=LARGEST_COEFFICIENT)
 
     @functools.cached_property
-    def _sharpest(self) -> tuple[np.ndarray, wp.array, float, float, np.ndarray]:
-        """Cells of the scene's light whose shadows are sharpest: sharp cells, or else the brightest.
-
-        Returns:
-            Directions [16, 3], their light in channel 0, with which 16 cells are lit as all are, their radius in radii
-            of 16 cells, how soft the edges of planes and parts are in them [rad], and the light of all cells
-            [direction].
-        """
+    def _sharpest_cells(self) -> SharpestCells:
+        """Cells of the scene's light whose shadows are sharpest: sharp cells, or else the brightest."""
         with unrecorded():
             projected_light = self.project_light(self.light.value())
         assert projected_light.coefficients is not None
@@ -295,13 +301,13 @@ class Directional(SphereMethod):
         else:
             directions, places, scale = projected_light.sharp_cells_past_planes
             light[places[places >= 0]] = power[places >= 0]
-            radius = self.visibility.softness * scale * cell_radius(CHUNK)
+            radius = self._edge_radius(projected_light.sharp_cells_past_planes)
         light = light[:, None] * [CHUNK / len(power), 0, 0]
-        return directions, wp.array(light[None], dtype=wp.vec3, device=self.merged_scene.device), scale, radius, power
+        return SharpestCells(directions, self._on_device(light), scale, radius, power)
 
     def sharp_share(self, group: Group) -> np.ndarray | None:
-        """Light of the sharpest cells, over all light if nothing blocked any."""
-        directions, light, scale, radius, power = self._sharpest
+        """Share of a group's unblocked light that still comes from the sharpest cells; None where nothing blocks."""
+        directions, light, scale, radius, power = self._sharpest_cells
         points, normals, centers, radii = group[:4]
         if not radii.shape[1] and group.planes is None and group.convex_parts_around is None:
             return None
@@ -324,7 +330,7 @@ class Directional(SphereMethod):
             transmittance = transmittance if covered is None else transmittance_past_planes(transmittance, covered)
         lit = shade_cells(transmittance, normals, directions, light, maximum=LARGEST_COEFFICIENT).numpy()[..., 0]
         receiver_normals, towards = normals.numpy(), self.free_projection.directions
-        plane_normals = receiver_normals[:, :1]  # of all points of a plane, or the opposite
+        plane_normals = receiver_normals[:, :1]  # points of a plane have this normal or its opposite
         whole = [
             4 / len(power) * np.maximum(sign * plane_normals @ towards.T, 0) @ power for sign in (1, -1)
         ]  # [batch, 1]
@@ -365,13 +371,13 @@ class Directional(SphereMethod):
         return blocked_radiance(diffuse, direct, openness)
 
     def _lobe_cells(self, points: LitPoints, light: Input) -> tuple[Node, Any]:
-        """Node of the transmittance of cells, in parts, and the projected light that says which."""
+        """Node of the transmittance of cells, in portions, and the projected light that says which."""
         is_free = isinstance(light.value(), wp.array)
         make = functools.partial(self.projected, light)
         projected_light = self.free_projection if is_free else points.cached("projected", light, make)
 
         def in_cells() -> Node:
-            return PartwiseCellTransmittance(
+            return PortionedCellTransmittance(
                 self, points, projected_light, None, list, where=" of gloss", is_shaded=False
             )
 
@@ -399,14 +405,14 @@ class Directional(SphereMethod):
         return cell_samples(samples, self._directions, device=self.merged_scene.device)
 
 
-class PartwiseCellTransmittance(PartwiseShading):
-    """Transmittance of receivers past all bodies, in parts, float32 of shape [batch, receiver, direction]."""
+class PortionedCellTransmittance(PortionedShading):
+    """Transmittance of receivers past all bodies, in portions, float32 of shape [batch, receiver, direction]."""
 
     def find(
-        self, call: Call, part: Group, projected_light: ProjectedCells, spheres: tuple[wp.array, wp.array]
+        self, call: Call, portion: Group, projected_light: ProjectedCells, spheres: tuple[wp.array, wp.array]
     ) -> wp.array:
-        """Find that of a part."""
-        return self.find_visibility(call, part, projected_light).transmittance_total
+        """Find that of a portion."""
+        return self.find_visibility(call, portion, projected_light).transmittance_total
 
 
 def _towards(
@@ -420,8 +426,8 @@ def _towards(
 
 
 def _joined_cells(cells: list[wp.array], count: int) -> wp.array:
-    """Transmittance of all parts, [batch, receiver, direction]. Differentiable."""
-    rows = joined([part.reshape((len(part), -1)) for part in cells])
+    """Transmittance of all portions, [batch, receiver, direction]. Differentiable."""
+    rows = joined([portion.reshape((len(portion), -1)) for portion in cells])
     return rows.reshape((len(rows), -1, count))
 
 

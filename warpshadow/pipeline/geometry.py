@@ -63,21 +63,21 @@ GEOMETRY_DTYPES = {"positions": wp.vec3, "centers": wp.vec3, "radii": wp.float32
 """Dtypes of a geometry's arrays, by their names."""
 
 
-def as_geometry(name: str, arguments: object) -> Geometry:
+def as_geometry(name: str, value: object) -> Geometry:
     """A geometry as it is, and a plain tuple of its arrays as one in which any body may move.
 
     Raises:
         ValueError: for anything else, by the name of the argument.
     """
-    if isinstance(arguments, Geometry):
-        return arguments
-    if not isinstance(arguments, (tuple, list)) or len(arguments) != len(GEOMETRY_DTYPES):
-        count = f" of {len(arguments)}" if isinstance(arguments, (tuple, list)) else ""
+    if isinstance(value, Geometry):
+        return value
+    if not isinstance(value, (tuple, list)) or len(value) != len(GEOMETRY_DTYPES):
+        count = f" of {len(value)}" if isinstance(value, (tuple, list)) else ""
         raise ValueError(
-            f"{name}: got {type(arguments).__name__}{count}, expected a Geometry, as placed and deformed return, or a "
+            f"{name}: got {type(value).__name__}{count}, expected a Geometry, as placed and deformed return, or a "
             f"tuple of {', '.join(GEOMETRY_DTYPES)}"
         )
-    return Geometry(*arguments)
+    return Geometry(*value)
 
 
 def splice(whole: wp.array, runs: Sequence[tuple[int, int]], part_of: Callable[[int, int], wp.array]) -> wp.array:

@@ -24,7 +24,7 @@ from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 
-PART_SIZE = 1 << 13  # receivers of each instance that are lit at once where no gradient is asked for
+RECEIVERS_AT_ONCE = 1 << 13  # receivers of each instance that are lit at once where no gradient is asked for
 
 
 def nonplanar_bodies(merged_scene: MergedScene) -> list[int]:
@@ -59,38 +59,44 @@ class Group(NamedTuple):
         fronts = find_fronts(self.points, self.normals, self.corners, self.nearest_blockers, frames, planes)
         return lifted_points(self.points, fronts, frames, planes, skip), fronts
 
-    def parts(self) -> Iterator[Group]:
-        """Parts of at most PART_SIZE receivers, with as many instances in all arrays where there are spheres.
+    def portions(self) -> Iterator[Group]:
+        """Portions of the receivers, with as many instances in all arrays where there are spheres.
 
         For a gradient all of them come at once, and so do receivers with cached rows.
         """
         self_lookup, planes, clusters = self.self_lookup, self.planes, self.clusters
-        turns = None if self_lookup is None else self_lookup.turned
+        rotation_data = None if self_lookup is None else self_lookup.turned
         frames = None if planes is None else planes.frames
-        solids = None if self.convex_parts_around is None else self.convex_parts_around.placed.corners
+        part_corners = None if self.convex_parts_around is None else self.convex_parts_around.placed.corners
         arguments = points, normals, centers, radii = self[:4]
-        if radii.shape[1] or any(array is not None for array in (turns, frames, solids)):
-            arrays = {"points": points, "centers": centers, "radii": radii, "rotations": turns, "planes": frames}
-            count = common_batch(arrays | {"corners": self.corners, "parts": solids})
+        if radii.shape[1] or any(array is not None for array in (rotation_data, frames, part_corners)):
+            arrays = {
+                "points": points,
+                "centers": centers,
+                "radii": radii,
+                "rotations": rotation_data,
+                "planes": frames,
+            }
+            count = common_batch(arrays | {"corners": self.corners, "parts": part_corners})
             points, normals, centers, radii = [expand(array, count) for array in arguments]
             clusters = clusters if radii is self.radii and centers is self.centers else None
         size = points.shape[1]
         if (
             self.cached_rows is not None
-            or size <= PART_SIZE
-            or varies([*arguments, turns, frames, solids, self.corners])
+            or size <= RECEIVERS_AT_ONCE
+            or varies([*arguments, rotation_data, frames, part_corners, self.corners])
         ):
             yield self._replace(points=points, normals=normals, centers=centers, radii=radii, clusters=clusters)
             return
-        for start in range(0, size, PART_SIZE):
-            part = slice(start, min(start + PART_SIZE, size))
+        for start in range(0, size, RECEIVERS_AT_ONCE):
+            portion = slice(start, min(start + RECEIVERS_AT_ONCE, size))
             yield self._replace(
-                points=points[:, part].contiguous(),
-                normals=normals[:, part].contiguous(),
+                points=points[:, portion].contiguous(),
+                normals=normals[:, portion].contiguous(),
                 centers=centers,
                 radii=radii,
-                probe_weights=None if self.probe_weights is None else self.probe_weights.part(part),
-                nearest_blockers=None if self.nearest_blockers is None else self.nearest_blockers.part(part),
+                probe_weights=None if self.probe_weights is None else self.probe_weights.cut(portion),
+                nearest_blockers=None if self.nearest_blockers is None else self.nearest_blockers.cut(portion),
                 clusters=clusters,
             )
 
@@ -135,25 +141,31 @@ class Blockers(NamedTuple):
     def planes_around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> GroupPlanes | None:
         """Flat bodies around receivers of one body: all that block, or some."""
         planes = self.blocker_kinds.planes
-        chosen = planes if of_bodies is None else tuple(number for number in planes if number in of_bodies)
-        if self.frames is None or not set(chosen) - {body}:
+        chosen, skip = _blocking(planes, body, of_bodies)
+        if self.frames is None or not chosen:
             return None
-        skip = planes.index(body) if body in planes else None
         return GroupPlanes(self.planes.blockers(planes, chosen), self.frames, skip)
 
     def convex_parts_around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> GroupConvexParts | None:
         """Convex parts of bodies around receivers of one body: all that block, or some."""
         bodies = self.blocker_kinds.convex
-        chosen = bodies if of_bodies is None else tuple(number for number in bodies if number in of_bodies)
-        if self.placed is None or not set(chosen) - {body}:
+        chosen, skip = _blocking(bodies, body, of_bodies)
+        if self.placed is None or not chosen:
             return None
-        skip = bodies.index(body) if body in bodies else None
         return GroupConvexParts(self.parts.blockers(bodies, chosen), self.placed, skip)
 
     def around_plane(self, points: wp.array, normals: wp.array, body: int) -> Group:
         """The group of points of a flat body."""
         planes, parts = self.planes_around(body), self.convex_parts_around()
         return Group(points, normals, *self.spheres_of(self.bodies), planes=planes, convex_parts_around=parts)
+
+
+def _blocking(
+    bodies: tuple[int, ...], body: int, of_bodies: Iterable[int] | None
+) -> tuple[tuple[int, ...], int | None]:
+    """Bodies of one kind that block light around a body, () if none but itself does; and which of them it is itself."""
+    chosen = bodies if of_bodies is None else tuple(number for number in bodies if number in of_bodies)
+    return chosen if set(chosen) - {body} else (), bodies.index(body) if body in bodies else None
 
 
 def find_groups(
@@ -216,7 +228,7 @@ def _groups_that_move(
                 bounds = blockers.planes.first_corner[span.body : span.body + 2].tolist()
                 group = group._replace(corners=cut(corners, *bounds))
         if nearest_blockers is not None:
-            group = group._replace(nearest_blockers=nearest_blockers.part(slice(span.first, span.end)))
+            group = group._replace(nearest_blockers=nearest_blockers.cut(slice(span.first, span.end)))
         yield group
 
 

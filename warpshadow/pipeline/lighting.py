@@ -136,7 +136,7 @@ class LitPoints:
         source = self.light_input(light)
         if isinstance(light, wp.array):
             return self.method.free_shading(self, source, materials)
-        shade = functools.partial(self.method.shading, self, source, materials)
+        shade = functools.partial(self.method.known_shading, self, source, materials)
         if materials is not self.materials:
             return shade()
         return self.cached("shading of the scene" if source is self.method.light else "shading", source, shade)
@@ -159,16 +159,20 @@ class LitPoints:
 class Bouncing(Protocol):
     """Bounced light for a method of spheres."""
 
-    def shading(self, points: LitPoints, projected_light: Node, light: Input, materials: Materials) -> Node:
+    def bounced_shading(self, points: LitPoints, projected_light: Node, light: Input, materials: Materials) -> Node:
         """Shading of points, direct and bounced, given the projected light."""
 
-    def free_shading(self, points: LitPoints, projected_light: Node, light: Input, materials: Materials) -> Node:
+    def bounced_free_shading(
+        self, points: LitPoints, projected_light: Node, light: Input, materials: Materials
+    ) -> Node:
         """The same in free light."""
 
-    def cached_shading(self, points: LitPoints, projected_light: Any, light: Input, materials: Materials) -> Node:
+    def cached_bounced_shading(
+        self, points: LitPoints, projected_light: Any, light: Input, materials: Materials
+    ) -> Node:
         """The same for static points; results that do not depend on light and materials are cached."""
 
-    def cached_free_shading(self, direct: Node, points: LitPoints, light: Input, materials: Materials) -> Node:
+    def cached_bounced_free_shading(self, direct: Node, points: LitPoints, light: Input, materials: Materials) -> Node:
         """The same in free light, given the direct shading."""
 
 
@@ -248,7 +252,7 @@ class Method:
             self._numberings[key] = [number_receivers(faces, item, bodies=bodies) for item in sides]
         return self._numberings[key][has_backs]
 
-    def shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
+    def known_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
         """Shading of points in known light, which bounces from the materials."""
         raise NotImplementedError
 
@@ -343,14 +347,14 @@ def change_basis(light: wp.array, matrix: np.ndarray | None) -> wp.array:
     return light if matrix is None else shade(constant(matrix[None], wp.float32, light.device), light)
 
 
-def joined(parts: list[wp.array]) -> wp.array:
-    """Receivers of parts one after another, of shape [batch, receiver]. Differentiable: parts."""
-    return parts[0] if len(parts) == 1 else concatenate(parts, [part.shape[1] for part in parts])
+def joined(portions: list[wp.array]) -> wp.array:
+    """Receivers of portions one after another, of shape [batch, receiver]. Differentiable: portions."""
+    return portions[0] if len(portions) == 1 else concatenate(portions, [portion.shape[1] for portion in portions])
 
 
-def one_transfer(parts: list[wp.array]) -> wp.array:
+def one_transfer(portions: list[wp.array]) -> wp.array:
     """Transfer vectors of all groups one after another, float32 of shape [batch, receiver, coefficient]."""
-    if len(parts) == 1:
-        return parts[0]
-    rows = joined([part.reshape((part.shape[0], -1)) for part in parts])
-    return rows.reshape((rows.shape[0], -1, parts[0].shape[2]))
+    if len(portions) == 1:
+        return portions[0]
+    rows = joined([portion.reshape((portion.shape[0], -1)) for portion in portions])
+    return rows.reshape((rows.shape[0], -1, portions[0].shape[2]))

@@ -144,7 +144,7 @@ class MergedScene:
         if self.scene.visibility.method not in SPHERE_METHODS:
             return np.zeros(len(self.scene.bodies), int)
         blockers = (MANY if body.blockers == AUTO else body.blockers for body in self.scene.bodies)
-        return np.array([len(requested) if isinstance(requested, Spheres) else requested for requested in blockers])
+        return np.array([len(spheres) if isinstance(spheres, Spheres) else spheres for spheres in blockers])
 
     @functools.cached_property
     def first_sphere(self) -> np.ndarray:
@@ -245,8 +245,8 @@ class MergedScene:
         own = self.scene_geometry
         if turned is not None:
             assert own.rotations is not None
-            every, arguments = self.runs(np.arange(len(self.scene.bodies) + 1), bodies), turned
-            turned = splice(own.rotations, every, lambda a, b: arguments[:, a:b])
+            every, given_rotations = self.runs(np.arange(len(self.scene.bodies) + 1), bodies), turned
+            turned = splice(own.rotations, every, lambda a, b: given_rotations[:, a:b])
         return Geometry(
             splice(
                 own.positions, vertices, lambda a, b: poses.points(rest.positions[:, a:b], self._vertex_bodies[a:b])

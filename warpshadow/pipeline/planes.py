@@ -1,4 +1,4 @@
-"""PlaneBlockers: bodies that lie in a plane, such as a ground or walls, and block light as that.
+"""Plane blockers: bodies that lie in a plane, such as a ground or walls, and block light as that.
 
 Small spheres in a sheet would bulge out of it, and a large one that touches it from behind leaves light between them.
 Instead, the share of a cell of directions that a plane covers is computed.
@@ -95,9 +95,7 @@ class ScenePlanes:
         from scipy.sparse import csr_matrix
 
         starts = self._merged_scene.first_vertex
-        columns = np.concatenate(
-            [first + plane_body for first, plane_body in zip(starts[:-1], self._corners, strict=True)]
-        )
+        columns = np.concatenate([first + corners for first, corners in zip(starts[:-1], self._corners, strict=True)])
         entries = np.ones(len(columns)), (np.arange(len(columns)), columns)
         matrix = csr_matrix(entries, shape=(len(columns), int(starts[-1])))
         return SparseMatrix.of(matrix, device=self._merged_scene.device)
@@ -105,8 +103,8 @@ class ScenePlanes:
     def _body(self, number: int) -> PlaneBody:
         if number not in self._bodies:
             mesh, others = self._merged_scene.scene.bodies[number].mesh, self.others(number)
-            corners = mesh.positions, mesh.surface.faces
-            grid, _ = find_grid(*corners, is_two_sided=False, others=np.concatenate(others) if others else None)
+            surface = mesh.positions, mesh.surface.faces
+            grid, _ = find_grid(*surface, is_two_sided=False, others=np.concatenate(others) if others else None)
             first_vertex = int(self._merged_scene.first_vertex[number])
-            self._bodies[number] = PlaneBody(grid, *corners, first_vertex, 0, blocks=True)
+            self._bodies[number] = PlaneBody(grid, *surface, first_vertex, 0, blocks=True)
         return self._bodies[number]

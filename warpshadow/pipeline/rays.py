@@ -38,7 +38,7 @@ class Rays(Method):
         super().__init__(merged_scene, HarmonicBasis(merged_scene.scene.visibility.order), basis, progress=progress)
         self.shares_directions = self.visibility.sampling == "shared"
 
-    def shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
+    def known_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
         """Shading of points in known light, towards which rays are drawn.
 
         By what the scene's bodies reflect, light bounces along paths, without a gradient; by reflectance that a call
@@ -73,7 +73,7 @@ class Rays(Method):
             return Node("", shade, self._blockers(points, sources), sources, light)
 
         at_sources = points.cached("direct at sources", (light, sources), shaded_sources)
-        return self._bounces.shading(direct, at_sources, points, materials)
+        return self._bounces.add_bounces(direct, at_sources, points, materials)
 
     def free_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
         """Shading of points in free light."""
@@ -86,7 +86,7 @@ class Rays(Method):
             return Node("", self._transfer, self._meshes_for(points, sources), sources)
 
         at_sources = points.cached("transfer of sources", sources, transfers)
-        return self._bounces.free_shading(direct, at_sources, light, points, materials)
+        return self._bounces.add_free_bounces(direct, at_sources, light, points, materials)
 
     @functools.cached_property
     def _bounces(self) -> "StaticBounces":

@@ -137,7 +137,7 @@ class SceneViews:
         Differentiable: all.
         """
         receivers = Input("receivers", Receivers(points, normals, None, None, None))  # type: ignore[arg-type]
-        node = Node("", lambda arguments: arguments, receivers)
+        node = Node("", lambda same: same, receivers)
         bodies, blocker_kinds = self._bodies(geometry), self._method.blocker_kinds(geometry, None)
         return LitPoints(self._method, self._materials, *bodies, node, self.call(), blocker_kinds=blocker_kinds)
 

@@ -269,15 +269,15 @@ class SelfVisibility:
 
     def _announce(self, bodies: tuple[int, ...]) -> None:
         """Say how long rows that are to be traced take, if that is long."""
-        seconds, point_count, requested = 0.0, 0, set()
+        seconds, point_count, untraced_paths = 0.0, 0, set()
         for body in bodies:
             is_known = self._merged_scene.is_flat[body] or body in self._rows
-            if not is_known and (path := self._rows_path(body)) not in requested and not path.exists():
-                requested.add(path)
+            if not is_known and (path := self._rows_path(body)) not in untraced_paths and not path.exists():
+                untraced_paths.add(path)
                 point_count += self._row_count(body)
                 faces = self._merged_scene.scene.bodies[body].mesh.surface.faces
                 seconds += trace_seconds(self._row_count(body), len(faces))
-        of_bodies = "a body on itself" if len(requested) == 1 else f"{len(requested)} bodies on themselves"
+        of_bodies = "a body on itself" if len(untraced_paths) == 1 else f"{len(untraced_paths)} bodies on themselves"
         announce(
             f"tracing the shadow of {of_bodies}, from {point_count:,} points,",
             seconds,

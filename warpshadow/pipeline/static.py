@@ -161,12 +161,12 @@ class VertexRows:
 
     Args:
         count: Number of vertices and backs.
-        most: Upper bound of the count.
+        maximum: Upper bound of the count.
         find: Finds the rows of some vertices, float32 of shape [vertex, channel, item], given normals.
     """
 
     def __init__(self, count: int, maximum: int, find: Callable[[np.ndarray, wp.array], wp.array]):
-        self._most, self._find = maximum, find
+        self._maximum, self._find = maximum, find
         self._row_of_vertex = np.full(count, -1, np.int32)
         self._count = 0
         self._rows: wp.array | None = None
@@ -176,7 +176,7 @@ class VertexRows:
     def missing(self, vertices: np.ndarray | None = None) -> int:
         """Number of vertices, all or some, without a row."""
         if vertices is None:
-            return self._most - self._count
+            return self._maximum - self._count
         return int((self._row_of_vertex[vertices] < 0).sum())
 
     def of_receivers(self, receivers: Receivers, normals: wp.array) -> CachedRows | None:
@@ -197,7 +197,7 @@ class VertexRows:
     def _append(self, rows: wp.array) -> None:
         count = self._count + rows.shape[0]
         if self._rows is None or self._rows.shape[0] < count:
-            room = min(max(2 * self._count, count), self._most)
+            room = min(max(2 * self._count, count), self._maximum)
             larger = empty((room, *rows.shape[1:]), dtype=wp.float32, device=rows.device)
             if self._rows is not None:
                 wp.copy(larger[: self._count], self._rows[: self._count])

@@ -189,21 +189,20 @@ class View(LitPoints):
         if materials.roughness:
             samples = self._glossy(shading, light, materials, reflectance.samples)
         elif reflectance.pyramids.requires_grad and not (shading.requires_grad or clip.requires_grad):
-            result = (Node("reflectance", None, idle="found with the radiance"),)
+            replaced_stages = (Node("reflectance", None, idle="found with the radiance"),)
             reflectance_inputs = reflectance.vertex_albedo, reflectance.pyramids, reflectance.footprints
             arguments = fragments, self.merged_scene.faces, *reflectance_inputs, self._white_radiance_of(shading)
             samples = Node(
-                "radiance", textured_radiance, *arguments, items=item_text, caches=False, extra_inputs=result
+                "radiance", textured_radiance, *arguments, items=item_text, caches=False, extra_inputs=replaced_stages
             )
         else:
             samples = self._radiance(shading, reflectance.samples)
-        averaged = self._averaged(samples, is_moving=self._is_moving)
-        return averaged
+        return self._averaged(samples, is_moving=self._is_moving)
 
     def reflectance(self, materials: Materials) -> SampleReflectance:
         """Nodes of the samples' reflectance; the scene's own are cached."""
         wire = functools.partial(self._find_reflectance, materials)
-        return self.cached("reflection", None, wire) if materials is self.materials else wire()
+        return self.cached("reflectance", None, wire) if materials is self.materials else wire()
 
     def _find_reflectance(self, materials: Materials) -> SampleReflectance:
         if not materials.images:

@@ -50,19 +50,19 @@ _PLACE = 12  # numbers that say where a receiver is: its point, and the rows of 
 
 @functools.cache
 def _make_see(lanes: int) -> wp.Function:
-    """Make the kernel function of a sphere as a group of receivers sees it, in their frames."""
+    """Make the kernel function of a sphere as a block of receivers sees it, in their frames."""
     Lane, Vectors, SphereView = lane_type(lanes), vectors_type(lanes), sphere_view_type(lanes)
     cone_of = make_cone(lanes)
 
     @wp.func(inline=True)
-    def see(places: wp.array2d(dtype=Lane), group: int, ball: wp.vec4):
-        x = Lane(ball[0]) - places[0, group]
-        y = Lane(ball[1]) - places[1, group]
-        z = Lane(ball[2]) - places[2, group]
+    def see(places: wp.array2d(dtype=Lane), block: int, ball: wp.vec4):
+        x = Lane(ball[0]) - places[0, block]
+        y = Lane(ball[1]) - places[1, block]
+        z = Lane(ball[2]) - places[2, block]
         offset = Vectors(
-            wp.cw_mul(places[3, group], x) + wp.cw_mul(places[4, group], y) + wp.cw_mul(places[5, group], z),
-            wp.cw_mul(places[6, group], x) + wp.cw_mul(places[7, group], y) + wp.cw_mul(places[8, group], z),
-            wp.cw_mul(places[9, group], x) + wp.cw_mul(places[10, group], y) + wp.cw_mul(places[11, group], z),
+            wp.cw_mul(places[3, block], x) + wp.cw_mul(places[4, block], y) + wp.cw_mul(places[5, block], z),
+            wp.cw_mul(places[6, block], x) + wp.cw_mul(places[7, block], y) + wp.cw_mul(places[8, block], z),
+            wp.cw_mul(places[9, block], x) + wp.cw_mul(places[10, block], y) + wp.cw_mul(places[11, block], z),
         )
         seen = SphereView()
         seen.offset = offset
@@ -94,10 +94,10 @@ def _make_project(lanes: int) -> wp.Kernel:
         edges: wp.array2d(dtype=wp.vec3),
         reached: wp.array2d(dtype=wp.int32),
     ):
-        """A thread owns a group of receivers and a sphere: its direction; lo, 1/(hi − lo), opacity; bundles reached."""
+        """A thread owns a block of receivers and a sphere: its direction; lo, 1/(hi − lo), opacity; bundles reached."""
         row, sphere = wp.tid()
-        group = first_row + row
-        seen = see(places, group, balls[sphere])
+        block = first_row + row
+        seen = see(places, block, balls[sphere])
         cone = seen.cone
         sine = sqrt(cone.sine2)
         low = cos_width * cone.cosine - sin_width * sine
@@ -111,7 +111,7 @@ def _make_project(lanes: int) -> wp.Kernel:
             bits += bit * wp.min(wp.max(1.0e20 * excess, Lane(0.0)), Lane(1.0))
             bit *= 2.0
         for lane in range(lanes):
-            i = group * lanes + lane
+            i = block * lanes + lane
             axes[i, sphere] = wp.vec3(cone.axis.x[lane], cone.axis.y[lane], cone.axis.z[lane])
             edges[i, sphere] = wp.vec3(low[lane], slope[lane], opacity[lane])
             reached[i, sphere] = int(bits[lane])
@@ -140,10 +140,10 @@ def _make_pull(lanes: int) -> wp.Kernel:
         # out
         by_balls: wp.array2d(dtype=wp.vec4),
     ):
-        """A thread owns a group of receivers and a sphere, and sums up the gradients of all of the group."""
+        """A thread owns a block of receivers and a sphere, and sums up the gradients of all of the block."""
         row, sphere = wp.tid()
-        group = first_row + row
-        seen = see(places, group, balls[sphere])
+        block = first_row + row
+        seen = see(places, block, balls[sphere])
         sine = sqrt(seen.cone.sine2)
         low = cos_width * seen.cone.cosine - sin_width * sine
         x = Lane()
@@ -154,7 +154,7 @@ def _make_pull(lanes: int) -> wp.Kernel:
         by_opacity = Lane()
         slope = Lane()
         for lane in range(lanes):
-            i = group * lanes + lane
+            i = block * lanes + lane
             edge = edges[i, sphere]
             own = sums[i, sphere]
             factor = -6.0 * edge[2]
@@ -168,21 +168,21 @@ def _make_pull(lanes: int) -> wp.Kernel:
         by_offset, by_radius, _ = sphere_adjoint(
             seen, sine, low, cos_width, sin_width, slope, by_opacity, sum_, sum_t, Vectors(x, y, z)
         )
-        by_balls[group, sphere] = wp.vec4(
+        by_balls[block, sphere] = wp.vec4(
             total(
-                wp.cw_mul(places[3, group], by_offset.x)
-                + wp.cw_mul(places[6, group], by_offset.y)
-                + wp.cw_mul(places[9, group], by_offset.z)
+                wp.cw_mul(places[3, block], by_offset.x)
+                + wp.cw_mul(places[6, block], by_offset.y)
+                + wp.cw_mul(places[9, block], by_offset.z)
             ),
             total(
-                wp.cw_mul(places[4, group], by_offset.x)
-                + wp.cw_mul(places[7, group], by_offset.y)
-                + wp.cw_mul(places[10, group], by_offset.z)
+                wp.cw_mul(places[4, block], by_offset.x)
+                + wp.cw_mul(places[7, block], by_offset.y)
+                + wp.cw_mul(places[10, block], by_offset.z)
             ),
             total(
-                wp.cw_mul(places[5, group], by_offset.x)
-                + wp.cw_mul(places[8, group], by_offset.y)
-                + wp.cw_mul(places[11, group], by_offset.z)
+                wp.cw_mul(places[5, block], by_offset.x)
+                + wp.cw_mul(places[8, block], by_offset.y)
+                + wp.cw_mul(places[11, block], by_offset.z)
             ),
             total(by_radius),
         )
@@ -305,7 +305,7 @@ def _transmit_adjoint(
 class _View(NamedTuple):
     """Spheres as the receivers of a batch see them."""
 
-    places: wp.array  # [12, group] lanes
+    places: wp.array  # [12, block] lanes
     balls: wp.array  # [sphere] vec4
     axes: wp.array  # [receiver, sphere] vec3
     edges: wp.array  # [receiver, sphere] vec3
@@ -346,11 +346,11 @@ class Refinement:
 
     def _project(self, spheres: np.ndarray, chosen: np.ndarray, width: float) -> _View:
         lanes = lane_count(self.device)
-        groups = np.pad(chosen, (0, -len(chosen) % lanes), mode="edge")
-        places = np.ascontiguousarray(self.receivers.places[:, groups]).reshape(_PLACE, -1, lanes)
+        padded = np.pad(chosen, (0, -len(chosen) % lanes), mode="edge")
+        places = np.ascontiguousarray(self.receivers.places[:, padded]).reshape(_PLACE, -1, lanes)
         placed = wp.array(places, dtype=lane_type(lanes), device=self.device)
         balls = wp.array(spheres.astype(np.float32), dtype=wp.vec4, device=self.device)
-        shape = len(groups), len(spheres)
+        shape = len(padded), len(spheres)
         outputs = [empty(shape, dtype=dtype, device=self.device) for dtype in (wp.vec3, wp.vec3, wp.int32)]
         launch(
             _make_project(lanes),
@@ -396,7 +396,7 @@ class Refinement:
         inputs = [view.axes, view.edges, view.reached, self.directions, by_logs]
         cost = 2 * _PAIR_COST * len(self.receivers.directions)
         launch(_transmit_adjoint, sums.shape, inputs=inputs, outputs=[sums], cost=cost)
-        # every group of receivers has a gradient of its own: sums in a fixed order give the same bits on every run
+        # every block of receivers has a gradient of its own: sums in a fixed order give the same bits on every run
         shape = view.places.shape[1], len(spheres)
         by_balls = empty(shape, dtype=wp.vec4, device=self.device)
         inputs = [view.places, view.balls, np.cos(width), np.sin(width), view.edges, sums]

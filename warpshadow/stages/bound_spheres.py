@@ -84,9 +84,9 @@ def _grow_radii(
     """A thread owns a sphere of an instance."""
     instance, sphere = wp.tid()
     radius = rest_radii[instance_in(instance, rest_radii.shape[0]), sphere]
-    minimum = softening * radius * radius
-    before = rest_spreads[instance_in(instance, rest_spreads.shape[0]), sphere]
-    radii[instance, sphere] = radius * wp.sqrt((spreads[instance, sphere] + minimum) / (before + minimum))
+    regularizer = softening * radius * radius
+    rest_spread = rest_spreads[instance_in(instance, rest_spreads.shape[0]), sphere]
+    radii[instance, sphere] = radius * wp.sqrt((spreads[instance, sphere] + regularizer) / (rest_spread + regularizer))
 
 
 @dataclass(frozen=True)

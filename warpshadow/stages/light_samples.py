@@ -167,8 +167,8 @@ def _cut(
     sums = high - low
     first, last = _between(sums, axis_ends[0]), _between(sums, axis_ends[1])
     half = count // 2
-    requested = first + (last - first) * half / count
-    place = float(np.interp(requested, sums, np.arange(len(sums)))) if last > first else np.nan
+    cut_sum = first + (last - first) * half / count
+    place = float(np.interp(cut_sum, sums, np.arange(len(sums)))) if last > first else np.nan
     if not axis_ends[0] < place < axis_ends[1]:
         place = axis_ends[0] + (axis_ends[1] - axis_ends[0]) * half / count
     for part, parts in (np.array([axis_ends[0], place]), half), (np.array([place, axis_ends[1]]), count - half):

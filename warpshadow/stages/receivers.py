@@ -120,15 +120,15 @@ def _add_faces(
     faces: wp.array(dtype=wp.vec3i),
     receiver_count: int,
     # out
-    with_self_light: wp.array(dtype=wp.vec3i),
+    receiver_faces: wp.array(dtype=wp.vec3i),
 ):
     """A thread owns a face: of the mesh, or of an own receiver."""
-    face = wp.tid()  # with_self_light may have more
+    face = wp.tid()  # the array may have room for triangles after these
     receiver = receiver_count + face - faces.shape[0]
     corners = wp.vec3i(receiver, receiver, receiver)
     if receiver < receiver_count:
         corners = faces[face]
-    with_self_light[face] = corners
+    receiver_faces[face] = corners
 
 
 class Numbering(NamedTuple):

@@ -141,9 +141,9 @@ def _check_rotations(parameters: wp.array) -> None:
         _refuse(np.linalg.norm(values, axis=-1) < MIN_LENGTH, f"quaternions shorter than {MIN_LENGTH:g}")
         return
     if parameters.dtype is wp.mat33:
-        largest, middle, minimum = np.moveaxis(np.linalg.svd(values, compute_uv=False), -1, 0)
+        largest, middle, smallest = np.moveaxis(np.linalg.svd(values, compute_uv=False), -1, 0)
         _refuse(largest < MIN_LENGTH, f"matrices smaller than {MIN_LENGTH:g}")
-        gaps = middle + np.sign(np.linalg.det(values / largest[..., None, None])) * minimum
+        gaps = middle + np.sign(np.linalg.det(values / largest[..., None, None])) * smallest
         _refuse(gaps < MIN_ANGLE * largest, "matrices as near to several rotations, as mirrored ones are,")
         return
     x, y = values[..., :3], values[..., 3:]

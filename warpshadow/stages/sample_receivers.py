@@ -93,15 +93,15 @@ def _find_sharing(
     supersampling: int,
     run: int,
     # out
-    firsts: wp.array2d(dtype=wp.int32),
+    owner_samples: wp.array2d(dtype=wp.int32),
     weights: wp.array2d(dtype=wp.vec3),
-    is_first: wp.array2d(dtype=wp.bool),
+    is_owner: wp.array2d(dtype=wp.bool),
 ):
     """A thread owns a run of pixels of a row.
 
-    A sample gets the first sample with which it shares a receiver, −1 if its receivers are vertices, or −2 − t in a
-    triangle t; and the weights of its receivers. A corner of squares is shared by the samples of its pixel that see its
-    body.
+    A sample gets the owner of its receiver, the first sample that shares it, −1 if its receivers are vertices, or
+    −2 − t in a triangle t; and the weights of its receivers. A corner of squares is shared by the samples of its pixel
+    that see its body.
     """
     view, thread = split_row(first_row + wp.tid(), sides.shape[1] // (supersampling * supersampling) // run)
     pixels = width // supersampling
@@ -133,30 +133,30 @@ def _find_sharing(
                 sample = corner + i * width + j
                 side = sides[view, sample]
                 weight = barycentrics[view, sample]
-                first = int(-1)
+                owner = int(-1)
                 key = int(-1)
                 if sizes and side >= 0:
                     key = keys[side]
                 if key >= 0 and key == square_key:
                     u = low[0] + float(j) * step[0]
                     v = low[1] + float(i) * step[1]
-                    first = square
+                    owner = square
                     weight = wp.vec3(1.0 - u - v, u, v)
                     if u + v > 1.0:
-                        first -= 1
+                        owner -= 1
                         weight = wp.vec3(u + v - 1.0, 1.0 - u, 1.0 - v)
                 elif key >= 0 and key == corner_key:
-                    first = corner
+                    owner = corner
                     weight = wp.vec3(1.0, 0.0, 0.0)
                 elif side >= 0 and wants_samples[side % wants_samples.shape[0]]:
-                    first = sample
+                    owner = sample
                     weight = wp.vec3(1.0, 0.0, 0.0)
                     for k in range(i * supersampling + j):
                         other = corner + k // supersampling * width + k % supersampling
-                        if first == sample and sides[view, other] == side:
-                            first = firsts[view, other]
+                        if owner == sample and sides[view, other] == side:
+                            owner = owner_samples[view, other]
                         # (kernels evaluate both sides of "and")
-                        if points and first == sample and firsts[view, other] == other:
+                        if points and owner == sample and owner_samples[view, other] == other:
                             other_side = sides[view, other]
                             # (two slats are no surface, however even they are)
                             if pieces[side % pieces.shape[0]] == pieces[other_side % pieces.shape[0]]:  # noqa: SIM102
@@ -166,13 +166,13 @@ def _find_sharing(
                                     points[view, other],
                                     normals[view, other],
                                 ):
-                                    first = other
-                firsts[view, sample] = first
+                                    owner = other
+                owner_samples[view, sample] = owner
                 weights[view, sample] = weight
-                is_own = first == sample
+                has_receiver = owner == sample
                 if sizes:
-                    is_own = is_own or is_corner[view, sample]
-                is_first[view, sample] = is_own
+                    has_receiver = has_receiver or is_corner[view, sample]
+                is_owner[view, sample] = has_receiver
 
 
 @wp.kernel(enable_backward=False)
@@ -181,10 +181,10 @@ def _see_fragments(
     worker: int,
     # in
     sides: wp.array2d(dtype=wp.int32),
-    firsts: wp.array2d(dtype=wp.int32),
-    is_first: wp.array2d(dtype=wp.bool),
+    owner_samples: wp.array2d(dtype=wp.int32),
+    is_owner: wp.array2d(dtype=wp.bool),
     numbers: wp.array2d(dtype=wp.int32),
-    rooms: wp.array(dtype=wp.int32),
+    body_ranks: wp.array(dtype=wp.int32),
     side_count: int,
     run: int,
     # out
@@ -192,25 +192,27 @@ def _see_fragments(
     samples: wp.array2d(dtype=wp.int32),
 ):
     """A thread owns a run of samples.
-    Receivers have numbers, or else a room each among the receivers of their face's body.
+
+    ``numbers`` are the receivers' numbers; where they cannot be read (a capture), each body gets a range with a place
+    for every sample.
     """
     view, thread = split_row(first_row + wp.tid(), sides.shape[1] // run)
     for sample in range(thread * run, (thread + 1) * run):
         side = sides[view, sample]
-        first = firsts[view, sample]
-        room = int(0)
+        owner = owner_samples[view, sample]
+        first_number = int(0)
         if not numbers and side >= 0:
-            room = rooms[side % rooms.shape[0]] * sides.shape[1]
-        if first >= 0:
-            number = room + first
+            first_number = body_ranks[side % body_ranks.shape[0]] * sides.shape[1]
+        if owner >= 0:
+            number = first_number + owner
             if numbers:
-                number = numbers[view, first]
+                number = numbers[view, owner]
             side = side_count + number
-        elif first < -1:
-            side = side_count + samples.shape[1] - 2 - first
+        elif owner < -1:
+            side = side_count + samples.shape[1] - 2 - owner
         own_sides[view, sample] = side
-        if is_first[view, sample]:
-            number = room + sample
+        if is_owner[view, sample]:
+            number = first_number + sample
             if numbers:
                 number = numbers[view, sample]
             samples[view, number] = sample
@@ -218,10 +220,10 @@ def _see_fragments(
 
 @wp.func
 def _shares(
-    firsts: wp.array(dtype=wp.int32), sides: wp.array(dtype=wp.int32), is_corner: bool, sample: int, other: int
+    owner_samples: wp.array(dtype=wp.int32), sides: wp.array(dtype=wp.int32), is_corner: bool, sample: int, other: int
 ):
-    """Whether a receiver at a first sample is at the mean of others, too, of its face: a corner of squares is not."""
-    return other == sample or (firsts[other] == sample and sides[other] == sides[sample] and not is_corner)
+    """Whether an owner's receiver takes the mean with another sample: of its face, and not at squares' corners."""
+    return other == sample or (owner_samples[other] == sample and sides[other] == sides[sample] and not is_corner)
 
 
 @wp.func
@@ -263,7 +265,7 @@ def _find_means(
     faces: wp.array(dtype=wp.vec3i),
     sides: wp.array2d(dtype=wp.int32),
     barycentrics: wp.array2d(dtype=wp.vec3),
-    firsts: wp.array2d(dtype=wp.int32),
+    owner_samples: wp.array2d(dtype=wp.int32),
     is_corner: wp.array2d(dtype=wp.bool),
     samples: wp.array2d(dtype=wp.int32),
     width: int,
@@ -273,7 +275,7 @@ def _find_means(
     means: wp.array2d(dtype=wp.vec3),
     counts: wp.array2d(dtype=wp.int32),
 ):
-    """A thread owns a receiver, which its first sample names, −1 for none."""
+    """A thread owns a receiver, whose owner ``samples`` has, −1 for none."""
     view, receiver = wp.tid()
     sample = samples[view, receiver]
     side = int(-1)
@@ -288,7 +290,7 @@ def _find_means(
         corner = (sample // width // supersampling * width + sample % width // supersampling) * supersampling
         for i in range(supersampling * supersampling):
             other = corner + i // supersampling * width + i % supersampling
-            if _shares(firsts[view], sides[view], at_corner, sample, other):
+            if _shares(owner_samples[view], sides[view], at_corner, sample, other):
                 total += barycentrics[view, other]
                 count += 1
         mean = total / float(count)
@@ -298,7 +300,7 @@ def _find_means(
             shared = int(0)
             for i in range(supersampling * supersampling):
                 other = corner + i // supersampling * width + i % supersampling
-                if firsts[view, other] == sample:
+                if owner_samples[view, other] == sample:
                     middle += points[view, other]
                     shared += 1
             if shared > count:
@@ -306,7 +308,7 @@ def _find_means(
                 nearest = float(wp.inf)
                 for i in range(supersampling * supersampling):
                     other = corner + i // supersampling * width + i % supersampling
-                    if firsts[view, other] == sample:
+                    if owner_samples[view, other] == sample:
                         face = faces[sides[view, other] % faces.shape[0]]
                         a = positions[face[0]]
                         b = positions[face[1]]
@@ -326,7 +328,7 @@ def _find_means(
 def _find_means_adjoint(
     # in
     sides: wp.array2d(dtype=wp.int32),
-    firsts: wp.array2d(dtype=wp.int32),
+    owner_samples: wp.array2d(dtype=wp.int32),
     is_corner: wp.array2d(dtype=wp.bool),
     samples: wp.array2d(dtype=wp.int32),
     counts: wp.array2d(dtype=wp.int32),
@@ -347,7 +349,7 @@ def _find_means_adjoint(
         corner = (sample // width // supersampling * width + sample % width // supersampling) * supersampling
         for i in range(supersampling * supersampling):
             other = corner + i // supersampling * width + i % supersampling
-            if _shares(firsts[view], sides[view], at_corner, sample, other):
+            if _shares(owner_samples[view], sides[view], at_corner, sample, other):
                 wp.atomic_add(adj_barycentrics, view, other, adj)
 
 
@@ -383,9 +385,9 @@ def find_sample_receivers(
     if quadtree is not None:
         sizes, squares, keys = quadtree.sizes, quadtree.numbers, quadtree.keys
         is_corner = from_numpy(quadtree.is_corner, dtype=wp.bool, device=device)
-    firsts, own_sides = (empty(sides.shape, dtype=wp.int32, device=device) for _ in range(2))
+    owner_samples, own_sides = (empty(sides.shape, dtype=wp.int32, device=device) for _ in range(2))
     weights = empty(sides.shape, dtype=wp.vec3, device=device)
-    is_first = empty(sides.shape, dtype=wp.bool, device=device)
+    is_owner = empty(sides.shape, dtype=wp.bool, device=device)
     run = run_length(device, width // supersampling)
     launch(
         _find_sharing,
@@ -404,20 +406,20 @@ def find_sample_receivers(
             supersampling,
             run,
         ],
-        outputs=[firsts, weights, is_first],
+        outputs=[owner_samples, weights, is_owner],
     )
-    names, rooms, rooms_there = _rooms(bodies, wants_samples, device)
+    names, body_ranks, ranks_on_device = _body_ranks(bodies, wants_samples, device)
     triangles = np.empty((0, 3), np.int32)
     numbers, ends = None, sample_count * np.arange(len(names) + 1)
     if not device.is_capturing:
-        chosen = np.flatnonzero(is_first.numpy())
-        room = rooms[sides.numpy().ravel()[chosen] % len(bodies)]
+        chosen = np.flatnonzero(is_owner.numpy())
+        rank = body_ranks[sides.numpy().ravel()[chosen] % len(bodies)]
         if quadtree is not None:
             # in tiles: light is found fastest where neighbors follow each other
             tile = chosen // width // (TILE * supersampling) * width + chosen % width // (TILE * supersampling)
             permutation = np.argsort(tile, kind="stable")
-            chosen, room = chosen[permutation], room[permutation]
-        numbers_of_chosen, ends = _in_rooms(chosen // sample_count, room, view_count, len(names))
+            chosen, rank = chosen[permutation], rank[permutation]
+        numbers_of_chosen, ends = _packed_by_body(chosen // sample_count, rank, view_count, len(names))
         numbers_of = np.empty(sides.size, np.int32)
         numbers_of[chosen] = numbers_of_chosen
         numbers = from_numpy(numbers_of.reshape(sides.shape), dtype=wp.int32, device=device)
@@ -429,18 +431,18 @@ def find_sample_receivers(
         _see_fragments,
         view_count * (sample_count // run),
         cost=_SAMPLE_COST * run,
-        inputs=[sides, firsts, is_first, numbers, rooms_there, side_count, run],
+        inputs=[sides, owner_samples, is_owner, numbers, ranks_on_device, side_count, run],
         outputs=[own_sides, samples],
     )
     seen_sides, counts = (empty(samples.shape, dtype=wp.int32, device=device) for _ in range(2))
     on_surface = (surface.points, surface.positions, surface.faces) if surface else (None, None, None)
-    inputs = [*on_surface, sides, barycentrics, firsts, is_corner, samples, width, supersampling]
+    inputs = [*on_surface, sides, barycentrics, owner_samples, is_corner, samples, width, supersampling]
     means = differentiable(
         lambda means: launch(_find_means, samples.shape, inputs=inputs, outputs=[seen_sides, means, counts]),
         lambda adj_means: launch(
             _find_means_adjoint,
             samples.shape,
-            inputs=[sides, firsts, is_corner, samples, counts, width, supersampling, adj_means],
+            inputs=[sides, owner_samples, is_corner, samples, counts, width, supersampling, adj_means],
             outputs=[barycentrics.grad],
         ),
         result=empty(samples.shape, dtype=wp.vec3, device=device),
@@ -459,31 +461,33 @@ def find_sample_receivers(
 
 
 @cached_by_values
-def _rooms(
+def _body_ranks(
     bodies: np.ndarray, wants_samples: np.ndarray, device: wp.DeviceLike
 ) -> tuple[np.ndarray, np.ndarray, wp.array]:
-    """The bodies whose samples have receivers, and for each face which of them it is of; that for the device, too."""
+    """The bodies whose samples have receivers, and the rank among them of each face's body; that on the device, too."""
     names = np.unique(bodies[wants_samples])
-    rooms = np.searchsorted(names, bodies)
-    return names, rooms, constant(rooms, wp.int32, device)
+    body_ranks = np.searchsorted(names, bodies)
+    return names, body_ranks, constant(body_ranks, wp.int32, device)
 
 
-def _in_rooms(view: np.ndarray, room: np.ndarray, view_count: int, room_count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Put items into rooms one after another, each as wide as the view with the most needs it.
+def _packed_by_body(
+    view: np.ndarray, rank: np.ndarray, view_count: int, body_count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Number receivers body by body, with as many numbers for a body as the view with the most of its receivers has.
 
     Args:
-        view, room: Of each item.
-        view_count, room_count: Numbers of them.
+        view, rank: View and body of each receiver.
+        view_count, body_count: Numbers of them.
     Returns:
-        The place of each; and where the rooms begin, and the last ends.
+        The number of each; and where the bodies begin, and the last ends.
     """
-    part = view * room_count + room
-    counts = np.bincount(part, minlength=view_count * room_count)
-    ends = np.concatenate([[0], np.cumsum(counts.reshape(view_count, room_count).max(axis=0))])
-    places = np.empty(len(part), int)
-    permutation = np.argsort(part, kind="stable")
-    places[permutation] = np.arange(len(part)) - np.repeat(np.cumsum(counts) - counts, counts)
-    return places + ends[room], ends
+    view_and_body = view * body_count + rank
+    counts = np.bincount(view_and_body, minlength=view_count * body_count)
+    ends = np.concatenate([[0], np.cumsum(counts.reshape(view_count, body_count).max(axis=0))])
+    places = np.empty(len(view_and_body), int)
+    permutation = np.argsort(view_and_body, kind="stable")
+    places[permutation] = np.arange(len(view_and_body)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return places + ends[rank], ends
 
 
 def see_samples(fragments: Fragments, samples: np.ndarray) -> Fragments:

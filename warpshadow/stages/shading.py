@@ -68,19 +68,21 @@ def _shade(
 ):
     """A thread owns a receiver; whole chunks of coefficients use the vector units, the remainder follows."""
     batch, vertex = split_row(first_row + wp.tid(), shading.shape[1])
-    seen = instance_in(batch, transfer.shape[0])
-    lit = instance_in(batch, light.shape[0])
+    transfer_batch = instance_in(batch, transfer.shape[0])
+    light_batch = instance_in(batch, light.shape[0])
     red = Chunk(0.0)
     green = Chunk(0.0)
     blue = Chunk(0.0)
     for chunk in range(transfer_chunks.shape[2]):
-        t = transfer_chunks[seen, vertex, chunk]
-        red += wp.cw_mul(t, light_chunks[lit, 0, chunk])
-        green += wp.cw_mul(t, light_chunks[lit, 1, chunk])
-        blue += wp.cw_mul(t, light_chunks[lit, 2, chunk])
+        t = transfer_chunks[transfer_batch, vertex, chunk]
+        red += wp.cw_mul(t, light_chunks[light_batch, 0, chunk])
+        green += wp.cw_mul(t, light_chunks[light_batch, 1, chunk])
+        blue += wp.cw_mul(t, light_chunks[light_batch, 2, chunk])
     total = wp.vec3(_sum(red), _sum(green), _sum(blue))
     for k in range(CHUNK * transfer_chunks.shape[2], transfer.shape[2]):
-        total += transfer[seen, vertex, k] * wp.vec3(light[lit, 0, k], light[lit, 1, k], light[lit, 2, k])
+        total += transfer[transfer_batch, vertex, k] * wp.vec3(
+            light[light_batch, 0, k], light[light_batch, 1, k], light[light_batch, 2, k]
+        )
     shading[batch, vertex] = total
 
 
@@ -97,24 +99,24 @@ def _shade_adjoint_transfer(
     adj_transfer_chunks: wp.array3d(dtype=Chunk),
 ):
     """A thread owns a transfer vector and the instances that it serves:  T̄ = Σ_instances L s̄."""
-    seen, vertex = split_row(first_row + wp.tid(), adj_shading.shape[1])
-    begin = seen
-    end = seen + 1
+    transfer_batch, vertex = split_row(first_row + wp.tid(), adj_shading.shape[1])
+    begin = transfer_batch
+    end = transfer_batch + 1
     if adj_transfer.shape[0] == 1:
         end = adj_shading.shape[0]
     for batch in range(begin, end):
-        lit = instance_in(batch, light.shape[0])
+        light_batch = instance_in(batch, light.shape[0])
         adj = adj_shading[batch, vertex]
         for chunk in range(light_chunks.shape[2]):
-            adj_transfer_chunks[seen, vertex, chunk] = (
-                adj_transfer_chunks[seen, vertex, chunk]
-                + adj[0] * light_chunks[lit, 0, chunk]
-                + adj[1] * light_chunks[lit, 1, chunk]
-                + adj[2] * light_chunks[lit, 2, chunk]
+            adj_transfer_chunks[transfer_batch, vertex, chunk] = (
+                adj_transfer_chunks[transfer_batch, vertex, chunk]
+                + adj[0] * light_chunks[light_batch, 0, chunk]
+                + adj[1] * light_chunks[light_batch, 1, chunk]
+                + adj[2] * light_chunks[light_batch, 2, chunk]
             )
         for k in range(CHUNK * light_chunks.shape[2], light.shape[2]):
-            adj_transfer[seen, vertex, k] = adj_transfer[seen, vertex, k] + wp.dot(
-                adj, wp.vec3(light[lit, 0, k], light[lit, 1, k], light[lit, 2, k])
+            adj_transfer[transfer_batch, vertex, k] = adj_transfer[transfer_batch, vertex, k] + wp.dot(
+                adj, wp.vec3(light[light_batch, 0, k], light[light_batch, 1, k], light[light_batch, 2, k])
             )
 
 
@@ -132,8 +134,8 @@ def _shade_adjoint_light(
     """A thread owns a chunk of coefficients, the last one the remainder, and a slab of receivers:  L̄ = Σ T s̄."""
     row, batch, slab = wp.tid()
     chunk = first_row + row
-    seen = instance_in(batch, transfer.shape[0])
-    lit = instance_in(batch, adj_light.shape[0])
+    transfer_batch = instance_in(batch, transfer.shape[0])
+    light_batch = instance_in(batch, adj_light.shape[0])
     begin = slab * _SLAB
     end = wp.min(begin + _SLAB, transfer.shape[1])
     first = chunk * CHUNK
@@ -143,21 +145,21 @@ def _shade_adjoint_light(
         blue = Chunk(0.0)
         for vertex in range(begin, end):
             adj = adj_shading[batch, vertex]
-            t = transfer_chunks[seen, vertex, chunk]
+            t = transfer_chunks[transfer_batch, vertex, chunk]
             red += adj[0] * t
             green += adj[1] * t
             blue += adj[2] * t
         for i in range(CHUNK):
-            wp.atomic_add(adj_light, lit, 0, first + i, red[i])
-            wp.atomic_add(adj_light, lit, 1, first + i, green[i])
-            wp.atomic_add(adj_light, lit, 2, first + i, blue[i])
+            wp.atomic_add(adj_light, light_batch, 0, first + i, red[i])
+            wp.atomic_add(adj_light, light_batch, 1, first + i, green[i])
+            wp.atomic_add(adj_light, light_batch, 2, first + i, blue[i])
     else:
         for k in range(first, transfer.shape[2]):
             total = wp.vec3()
             for vertex in range(begin, end):
-                total += transfer[seen, vertex, k] * adj_shading[batch, vertex]
+                total += transfer[transfer_batch, vertex, k] * adj_shading[batch, vertex]
             for channel in range(3):
-                wp.atomic_add(adj_light, lit, channel, k, total[channel])
+                wp.atomic_add(adj_light, light_batch, channel, k, total[channel])
 
 
 def _channels(light: wp.array) -> wp.array:
@@ -189,7 +191,7 @@ def shade(transfer: wp.array, light: wp.array, *, maximum: float = check.LARGEST
     instances = common_batch({"transfer": transfer, "light": light})
     use_vector_registers(__name__, device)
     channels = _channels(light)
-    seen, lit = [transfer, as_chunks(transfer)], [channels, as_chunks(channels)]
+    transfer_inputs, light_inputs = [transfer, as_chunks(transfer)], [channels, as_chunks(channels)]
     cost = _RECEIVER_COST + _COEFFICIENT_COST * count
 
     def adjoint(adj_shading: wp.array) -> None:
@@ -197,7 +199,7 @@ def shade(transfer: wp.array, light: wp.array, *, maximum: float = check.LARGEST
             launch(
                 _shade_adjoint_transfer,
                 transfer.shape[0] * transfer.shape[1],
-                inputs=[*lit, adj_shading],
+                inputs=[*light_inputs, adj_shading],
                 outputs=[transfer.grad, as_chunks(transfer.grad)],
                 cost=cost * instances / transfer.shape[0],
             )
@@ -206,14 +208,16 @@ def shade(transfer: wp.array, light: wp.array, *, maximum: float = check.LARGEST
             launch(
                 _shade_adjoint_light,
                 (-(-count // CHUNK), instances, -(-transfer.shape[1] // _SLAB)),
-                inputs=[*seen, adj_shading],
+                inputs=[*transfer_inputs, adj_shading],
                 outputs=[adj_channels],
                 cost=_COEFFICIENT_COST * CHUNK * _SLAB,
             )
             launch(_join_channels, light.shape, inputs=[adj_channels], outputs=[light.grad])
 
     return differentiable(
-        lambda shading: launch(_shade, shading.size, inputs=[*seen, *lit], outputs=[shading], cost=cost),
+        lambda shading: launch(
+            _shade, shading.size, inputs=[*transfer_inputs, *light_inputs], outputs=[shading], cost=cost
+        ),
         adjoint,
         result=empty((instances, transfer.shape[1]), dtype=wp.vec3, device=device),
         variables=[transfer, light],
@@ -235,7 +239,7 @@ def _shade_cells(
 ):
     """A thread owns a receiver."""
     batch, receiver = split_row(first_row + wp.tid(), shading.shape[1])
-    lit = instance_in(batch, light.shape[0])
+    light_batch = instance_in(batch, light.shape[0])
     normal = cells.normals[batch, receiver]
     red = Chunk(0.0)
     green = Chunk(0.0)
@@ -243,9 +247,9 @@ def _shade_cells(
     for chunk in range(cells.directions.shape[1]):
         cosine = wp.max(cosines(normal, cells.directions, chunk), Chunk(0.0))
         transfer = wp.cw_mul(cosine, cells.transmittance[batch, receiver, chunk])
-        red += wp.cw_mul(transfer, light[lit, 0, chunk])
-        green += wp.cw_mul(transfer, light[lit, 1, chunk])
-        blue += wp.cw_mul(transfer, light[lit, 2, chunk])
+        red += wp.cw_mul(transfer, light[light_batch, 0, chunk])
+        green += wp.cw_mul(transfer, light[light_batch, 1, chunk])
+        blue += wp.cw_mul(transfer, light[light_batch, 2, chunk])
     shading[batch, receiver] = cells.weight * wp.vec3(_sum(red), _sum(green), _sum(blue))
 
 
@@ -263,7 +267,7 @@ def _shade_cells_adjoint(
 ):
     """A thread owns a receiver:  T̄_q = w max(n·ω_q, 0) L_q·s̄,  n̄ = Σ w T_q (L_q·s̄) ω_q where n·ω_q > 0."""
     batch, receiver = split_row(first_row + wp.tid(), adj_shading.shape[1])
-    lit = instance_in(batch, light.shape[0])
+    light_batch = instance_in(batch, light.shape[0])
     normal = cells.normals[batch, receiver]
     directions = cells.directions
     adj = cells.weight * adj_shading[batch, receiver]
@@ -272,7 +276,11 @@ def _shade_cells_adjoint(
     z = Chunk(0.0)
     for chunk in range(directions.shape[1]):
         cosine = cosines(normal, directions, chunk)
-        pull = adj[0] * light[lit, 0, chunk] + adj[1] * light[lit, 1, chunk] + adj[2] * light[lit, 2, chunk]
+        pull = (
+            adj[0] * light[light_batch, 0, chunk]
+            + adj[1] * light[light_batch, 1, chunk]
+            + adj[2] * light[light_batch, 2, chunk]
+        )
         if adj_transmittance:
             adj_transmittance[batch, receiver, chunk] = adj_transmittance[batch, receiver, chunk] + wp.cw_mul(
                 pull, wp.max(cosine, Chunk(0.0))

@@ -1,9 +1,8 @@
 """Transfer vectors: visibility times cosine, so that light is shaded by a dot product.
 
-    B(x) = a(x)/π ∫ L(ω) V(ω, x) max(n·ω, 0) dω
-
-is linear in the light, so a receiver has a *transfer vector* T with B = a · (T · L): its coefficients belong to the
-light's, either spherical harmonics or cells of directions. The 1/π is in T: white under L = 1, unoccluded, gives 1.
+The radiance B that a receiver of albedo a reflects (README.md has the integral) is linear in the light L, so it has a
+*transfer vector* T with B = a · (T · L): its coefficients belong to the light's, either spherical harmonics or cells of
+directions. The 1/π is in T: white under L = 1, unoccluded, gives 1.
 """
 
 import functools
@@ -64,14 +63,14 @@ def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
         # out
         transfer: wp.array3d(dtype=wp.float32),
     ):
-        """A thread owns a group of receivers: the SH product of their visibility and clamped cosine."""
+        """A thread owns a block of receivers: the SH product of their visibility and clamped cosine."""
         row = first_row + wp.tid()
-        batch, group = find_block(row, normals.shape[1])
+        batch, block = find_block(row, normals.shape[1])
         place = scratch_place(worker, row)
         cosine = scratch[place, 0]
         for i in range(wp.static(order**2)):
             cosine[i] = Lane(0.0)
-        normal = load(normals[batch], group)
+        normal = load(normals[batch], block)
         # there is no cosine around a zero normal
         is_there = wp.min(dot(normal, normal) * 1.0e30, Lane(1.0))
         zonal = Zonal()
@@ -81,11 +80,11 @@ def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
         if wp.static(is_shadowed):
             factor = scratch[place, 1]
             product = scratch[place, 2]
-            load_rows(visibility[batch], group, factor)
+            load_rows(visibility[batch], block, factor)
             multiply(factor, cosine, table, product)
-            store_rows(product, group, transfer[batch])
+            store_rows(product, block, transfer[batch])
         else:
-            store_rows(cosine, group, transfer[batch])
+            store_rows(cosine, block, transfer[batch])
 
     return transfer_sh
 
@@ -115,35 +114,35 @@ def _sh_transfer_adjoint_kernel(order: int, is_shadowed: bool, lanes: int) -> wp
         adj_visibility: wp.array3d(dtype=wp.float32),
         adj_normals: wp.array2d(dtype=wp.vec3),
     ):
-        """A thread owns a group of receivers. Γ is symmetric:  T = V * H  has  V̄ = H * T̄  and  H̄ = V * T̄."""
+        """A thread owns a block of receivers. Γ is symmetric:  T = V * H  has  V̄ = H * T̄  and  H̄ = V * T̄."""
         row = first_row + wp.tid()
-        batch, group = find_block(row, normals.shape[1])
+        batch, block = find_block(row, normals.shape[1])
         place = scratch_place(worker, row)
         adj_row = scratch[place, 0]
         factor = scratch[place, 1]
         product = scratch[place, 2]
-        normal = load(normals[batch], group)
+        normal = load(normals[batch], block)
         is_there = wp.min(dot(normal, normal) * 1.0e30, Lane(1.0))
         zonal = Zonal()
         for band in range(order):
             zonal[band] = COSINE[band] * is_there
         for i in range(adj_transfer.shape[2], wp.static(order**2)):
             adj_row[i] = Lane(0.0)
-        load_rows(adj_transfer[batch], group, adj_row)
+        load_rows(adj_transfer[batch], block, adj_row)
         if wp.static(is_shadowed):
             if adj_visibility:
                 for i in range(wp.static(order**2)):
                     factor[i] = Lane(0.0)
                 add_rotated_zonal(normal, zonal, factor)
                 multiply(factor, adj_row, table, product)
-                add_rows(product, group, adj_visibility[batch])
-            load_rows(visibility[batch], group, factor)
+                add_rows(product, block, adj_visibility[batch])
+            load_rows(visibility[batch], block, factor)
             multiply(factor, adj_row, table, product)
             for i in range(wp.static(order**2)):
                 adj_row[i] = product[i]
         if adj_normals:
             adj_normal, _adj_zonal = rotated_zonal_adjoint(normal, zonal, adj_row)
-            add_vectors(adj_normal, group, adj_normals[batch])
+            add_vectors(adj_normal, block, adj_normals[batch])
 
     return transfer_sh_adjoint
 
@@ -217,19 +216,19 @@ def _sh_product_kernel(order: int, lanes: int) -> wp.Kernel:
         # out
         products: wp.array3d(dtype=wp.float32),
     ):
-        """A thread owns a group of receivers, to whose products it adds. Factors may have bands 0 … n' < n only."""
+        """A thread owns a block of receivers, to whose products it adds. Factors may have bands 0 … n' < n only."""
         row = first_row + wp.tid()
-        batch, group = find_block(row, products.shape[1])
+        batch, block = find_block(row, products.shape[1])
         place = scratch_place(worker, row)
         first = scratch[place, 0]
         second = scratch[place, 1]
         product = scratch[place, 2]
         for i in range(second_factor.shape[2], wp.static(order**2)):
             second[i] = Lane(0.0)
-        load_rows(first_factor[batch], group, first)
-        load_rows(second_factor[batch], group, second)
+        load_rows(first_factor[batch], block, first)
+        load_rows(second_factor[batch], block, second)
         multiply(first, second, table, product)
-        add_rows(product, group, products[batch])
+        add_rows(product, block, products[batch])
 
     return multiply_sh
 

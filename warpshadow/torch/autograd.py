@@ -249,10 +249,10 @@ class _WarpAdjoint(torch.autograd.Function):
             changes = ctx.call.moved(arguments[: ctx.count], directions)
             pairs = zip(arguments[ctx.count :], changes, strict=True)
             total = torch.stack([(adjoint * change).sum() for adjoint, change in pairs]).sum()
-            requested = [tensor for tensor in arguments if tensor.requires_grad] if total.requires_grad else []
+            variables = [tensor for tensor in arguments if tensor.requires_grad] if total.requires_grad else []
             result = iter(
-                torch.autograd.grad(total, requested, create_graph=creates_graph, allow_unused=True)
-                if requested
+                torch.autograd.grad(total, variables, create_graph=creates_graph, allow_unused=True)
+                if variables
                 else ()
             )
         gradients = [next(result, None) if tensor.requires_grad else None for tensor in arguments]

@@ -1,16 +1,8 @@
 """A renderer of several scenes, whose images come as one batch.
 
 Meshes that differ have other faces and other spheres, and a launch works on one scene. So each scene has a renderer of
-its own, which is called once, with all images of its scene. The other way would be a scene of all bodies, of which each
-instance hides the ones it does not show. Measured on 64 images of 64 × 64 pixels, of eight shapes that move, on two
-busy cores, in ms of CPU time an image, and the most memory that the process had:
-
-                                 forward    forward and backward    memory
-    image by image               12.3       24.8                    1.1 GB
-    scene by scene               6.5        14.9                    1.2 GB
-    all shapes in one scene      33.4       76.6                    2.9 GB
-
-With a shape for each of the 64 images these are 11, 22 and 1.1 GB scene by scene, and 304, 769 and 6.9 GB in one scene.
+its own, which is called once, with all images of its scene. One scene of all bodies, of which each instance hides the
+ones it does not show, would take five times as long.
 """
 
 import itertools
@@ -61,9 +53,9 @@ class MixedRenderer(torch.nn.Module):
             {key: body.mesh.vertex_count for number, body in enumerate(scene.bodies) for key in (number, body.called)}
             for scene in scenes
         ]
-        self._most_vertices: dict[BodyLike, int] = {}  # of items with a number or a name
+        self._maximum_vertices: dict[BodyLike, int] = {}  # of items with a number or a name
         for counts in self._vertex_counts:
-            self._most_vertices |= {key: max(n, self._most_vertices.get(key, 0)) for key, n in counts.items()}
+            self._maximum_vertices |= {key: max(n, self._maximum_vertices.get(key, 0)) for key, n in counts.items()}
 
     @property
     def basis(self) -> Basis:
@@ -105,12 +97,12 @@ class MixedRenderer(torch.nn.Module):
         batch = _Batch(which, len(self.renderers))
         lights, cameras = batch.split("light", light, 2), batch.split("clip_matrices", clip_matrices, 2)
         colors = {
-            body: batch.split(f"albedo[{body!r}]", self._checked_colors(body, arguments), 2)
-            for body, arguments in self._by_body("albedo", albedo).items()
+            body: batch.split(f"albedo[{body!r}]", self._checked_colors(body, color), 2)
+            for body, color in self._by_body("albedo", albedo).items()
         }
         maps = {
-            body: batch.split(f"textures[{body!r}]", arguments, 3)
-            for body, arguments in self._by_body("textures", textures).items()
+            body: batch.split(f"textures[{body!r}]", texture, 3)
+            for body, texture in self._by_body("textures", textures).items()
         }
         geometries = batch.of_scenes(geometry)
         drawn = {}
@@ -218,49 +210,49 @@ class MixedRenderer(torch.nn.Module):
             raise ValueError(f"{argument}: got {check.described(bodies)}, expected a list of bodies, such as [0]")
         known = list(bodies)
         for body in known:
-            check.choice(argument, body, self._most_vertices)
+            check.choice(argument, body, self._maximum_vertices)
         return known
 
-    def _by_body(self, argument: str, arguments: PerBody[torch.Tensor] | None) -> dict[Any, torch.Tensor]:
+    def _by_body(self, argument: str, tensors: PerBody[torch.Tensor] | None) -> dict[Any, torch.Tensor]:
         """Arguments for bodies, by their numbers or names."""
-        if arguments is None:
+        if tensors is None:
             return {}
-        if isinstance(arguments, Mapping):
-            self._check_bodies(argument, arguments)
-            pairs = arguments.items()
+        if isinstance(tensors, Mapping):
+            self._check_bodies(argument, tensors)
+            pairs = tensors.items()
         else:
             check.instance(
-                argument, arguments, (list, tuple), f"a list of {self._body_count} items, or a mapping by bodies"
+                argument, tensors, (list, tuple), f"a list of {self._body_count} items, or a mapping by bodies"
             )
-            if len(arguments) != self._body_count:
+            if len(tensors) != self._body_count:
                 raise ValueError(
-                    f"{argument}: got {len(arguments)} items, expected {self._body_count}, "
+                    f"{argument}: got {len(tensors)} items, expected {self._body_count}, "
                     "one for each body of the scene with the most"
                 )
-            pairs = dict(enumerate(arguments)).items()
+            pairs = dict(enumerate(tensors)).items()
         return {body: tensor for body, tensor in pairs if tensor is not None}
 
-    def _checked_colors(self, body: BodyLike, arguments: torch.Tensor) -> torch.Tensor:
+    def _checked_colors(self, body: BodyLike, colors: torch.Tensor) -> torch.Tensor:
         """Colors of a body, padded where they are one for each vertex."""
-        name, maximum = f"albedo[{body!r}]", self._most_vertices[body]
-        check_float32(name, arguments)
-        if arguments.ndim > 1 and arguments.shape[-2] != 1:
-            shape = ("batch", maximum, 3) if arguments.ndim > 2 else (maximum, 3)
+        name, maximum = f"albedo[{body!r}]", self._maximum_vertices[body]
+        check_float32(name, colors)
+        if colors.ndim > 1 and colors.shape[-2] != 1:
+            shape = ("batch", maximum, 3) if colors.ndim > 2 else (maximum, 3)
             check.shape(
-                name, tuple(arguments.shape), shape, f"or one color; the mesh with the most vertices has {maximum}"
+                name, tuple(colors.shape), shape, f"or one color; the mesh with the most vertices has {maximum}"
             )
-        return arguments
+        return colors
 
-    def _checked_poses(self, name: str, arguments: torch.Tensor | None, item: tuple[int, ...]) -> torch.Tensor | None:
+    def _checked_poses(self, name: str, poses: torch.Tensor | None, item: tuple[int, ...]) -> torch.Tensor | None:
         """Poses of as many bodies as the scene with the most has."""
-        if arguments is None:
+        if poses is None:
             return None
-        check_float32(name, arguments)
+        check_float32(name, poses)
         shape = self._body_count, *item
-        has_batch = arguments.ndim > len(shape)
+        has_batch = poses.ndim > len(shape)
         meaning = "for as many bodies as the scene with the most has"
-        check.shape(name, tuple(arguments.shape), ("batch", *shape) if has_batch else shape, meaning)
-        return arguments
+        check.shape(name, tuple(poses.shape), ("batch", *shape) if has_batch else shape, meaning)
+        return poses
 
 
 class _Batch:
@@ -277,21 +269,21 @@ class _Batch:
         for row, scene in enumerate(numbers):
             self.rows.setdefault(scene, []).append(row)
 
-    def split(self, name: str, arguments: Any, ndim: int) -> Callable[[int], Any]:
-        """The arguments of the images of a scene: all that serve every image, or their items of a batch.
+    def split(self, name: str, values: Any, ndim: int) -> Callable[[int], Any]:
+        """The values of the images of a scene: all that serve every image, or their items of a batch.
 
         Args:
             name: Its name in messages.
-            arguments: A tensor; anything else is given to all.
+            values: A tensor; anything else is given to all.
             ndim: Dimensions of an item.
         """
-        if not isinstance(arguments, torch.Tensor) or arguments.ndim <= ndim or len(arguments) == 1:
-            return lambda scene: arguments
-        if len(arguments) != self.count:
-            raise ValueError(f"{name}: got a batch of {len(arguments)}, expected 1 or {self.count}, as which has")
+        if not isinstance(values, torch.Tensor) or values.ndim <= ndim or len(values) == 1:
+            return lambda scene: values
+        if len(values) != self.count:
+            raise ValueError(f"{name}: got a batch of {len(values)}, expected 1 or {self.count}, as which has")
         if len(self.rows) == 1:
-            return lambda scene: arguments
-        items = arguments.unbind()  # once: the gradient of a choice of items is as large as the whole
+            return lambda scene: values
+        items = values.unbind()  # once: the gradient of a choice of items is as large as the whole
         return lambda scene: torch.stack([items[row] for row in self.rows[scene]])
 
     def of_scenes(
@@ -309,9 +301,9 @@ class _Batch:
                 f"geometry: got that of placed with which = {check.described([*geometry.which])}, expected that of the "
                 f"same which, {check.described([*self.numbers])}: its poses are those of images in their order"
             )
-        for scene, arguments in enumerate(geometry):
+        for scene, geometry_of_scene in enumerate(geometry):
             count = len(self.rows.get(scene, ()))
-            got = 0 if arguments is None else _instances(as_geometry(f"geometry[{scene}]", arguments))
+            got = 0 if geometry_of_scene is None else _instances(as_geometry(f"geometry[{scene}]", geometry_of_scene))
             if got != count and not (got == 1 and count):
                 raise ValueError(
                     f"geometry[{scene}]: got {got} instances, expected {count}, as many images as which has of the "
@@ -334,28 +326,28 @@ def _instances(geometry: Geometry[torch.Tensor]) -> int:
     return len(geometry.positions) if geometry.positions.ndim > 2 else 1
 
 
-def _cut(arguments: Any, ndim: int, count: int) -> Any:
+def _cut(tensor: Any, ndim: int, count: int) -> Any:
     """Without padding: the first items of the dimension that begins the last ``ndim``, unless one item serves all."""
-    if arguments is None or arguments.ndim < ndim or arguments.shape[-ndim] == 1:
-        return arguments
-    return arguments.narrow(-ndim, 0, count)
+    if tensor is None or tensor.ndim < ndim or tensor.shape[-ndim] == 1:
+        return tensor
+    return tensor.narrow(-ndim, 0, count)
 
 
 def _as_batch(renderers: Iterable[TorchRenderer]) -> list[TorchRenderer]:
     """Renderers whose images are a batch, checked."""
     check.instance("renderers", renderers, Iterable, "a list of TorchRenderers, one for each scene")
-    arguments = list(renderers)
-    if not arguments:
+    checked = list(renderers)
+    if not checked:
         raise ValueError("renderers: got none, expected at least one")
-    for number, renderer in enumerate(arguments):
+    for number, renderer in enumerate(checked):
         name = f"renderers[{number}]"
         check.instance(name, renderer, TorchRenderer, "a TorchRenderer")
         if renderer.warp.has_camera_batch:
             raise ValueError(f"{name}: got one with cameras of its own, expected one that has its scene's camera")
-        got, expected = _batch_description(renderer), _batch_description(arguments[0])
-        if got != expected or not _is_same_basis(renderer.basis, arguments[0].basis):
+        got, expected = _batch_description(renderer), _batch_description(checked[0])
+        if got != expected or not _is_same_basis(renderer.basis, checked[0].basis):
             raise ValueError(f"{name}: got {got}, expected {expected}, as the first has")
-    return arguments
+    return checked
 
 
 def _batch_description(renderer: TorchRenderer) -> str:

@@ -54,9 +54,9 @@ def insert(
     height, width, _ = pixels.shape
     camera, gain = fitting_camera(scene.camera, width, height), 2.0 ** check.number("exposure", exposure)
     renderer = Renderer(for_picture(replace(scene, camera=camera)), device=device, progress=progress)
-    arguments = wp.array(pixels[None] / gain, dtype=wp.vec3, device=renderer.device)
+    photo = wp.array(pixels[None] / gain, dtype=wp.vec3, device=renderer.device)
     with unrecorded():
-        image: np.ndarray = renderer.insert(arguments).numpy()[0] * np.float32(gain)
+        image: np.ndarray = renderer.insert(photo).numpy()[0] * np.float32(gain)
     drawn = [number for number in range(len(scene.bodies)) if number not in scene.catchers]
     if remark := _overexposure(image, pixels, renderer.layers().masks[drawn].sum(axis=0), exposure):
         check.warn(remark)

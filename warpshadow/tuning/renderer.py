@@ -52,11 +52,9 @@ def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = True
     Where the scene names no method, and no settings or spheres that "directional" alone reads, this is by rays that all
     pixels share (:func:`warpshadow.pipeline.choice_of_receivers.for_picture`): nothing is fitted or tabulated first,
     and the image does not depend on what the cache holds. Light that bounces goes between patches, by rays, too. A
-    renderer that is kept is by "directional" then, whose images differ from this by its error: by 4 to 7% of a table,
-    a bowl and a room, and by 12% of a tent of thin cloth, of 128² pixels, as ``demos/benchmarks/scenes_of_all_kinds.py
-    --scenes table open_room bowl tent --size 128`` prints on two cores of an AMD EPYC; a method that is named
-    gives the same method in both: ``Visibility("directional")``, or ``Visibility("ray-traced", sampling="shared")``,
-    which is what this takes.
+    :class:`Renderer` is by "directional" then, and its images differ from this by that method's error, of which
+    pipeline/README.md has figures. A method that is named gives the same method in both: ``Visibility("directional")``,
+    or ``Visibility("ray-traced", sampling="shared")``, which this takes.
 
     By "directional" flat bodies, such as grounds, are shaded by pixel unless they say otherwise, so that shadows have
     smooth edges there; under a sun so are all, and their pixels find by rays where they lie in their own body's shadow.

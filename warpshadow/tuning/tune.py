@@ -349,20 +349,22 @@ def resolved(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = Fa
 
 
 def _resolve(scene: Scene, device: wp.DeviceLike, progress: bool) -> Scene:
-    requested = scene.visibility.error
+    accepted_error = scene.visibility.error
     sample = PointSample(scene, device=device, progress=progress)
     tried: list[tuple[float, Scene]] = []
     for setting in _by_work(scene, sample):
         tried.append((sample.error(sample.shading(setting)), setting))
-        if tried[-1][0] <= requested:
+        if tried[-1][0] <= accepted_error:
             return setting
     error, nearest = min(tried, key=lambda item: item[0])
-    minimum = _interpolation_error(scene, sample)
+    interpolation_error = _interpolation_error(scene, sample)
     reason = (
-        "" if minimum < requested else f"; interpolation between vertices alone has {minimum:.3f}: receivers = 'pixel'"
+        ""
+        if interpolation_error < accepted_error
+        else f"; interpolation between vertices alone has {interpolation_error:.3f}: receivers = 'pixel'"
     )
     check.warn(
-        f"visibility: no setting of method = 'auto' reaches error = {requested:g}; {describe(nearest)} "
+        f"visibility: no setting of method = 'auto' reaches error = {accepted_error:g}; {describe(nearest)} "
         f"comes nearest, with {error:.3f}{reason}",
     )
     return nearest

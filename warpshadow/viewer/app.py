@@ -161,11 +161,11 @@ class _ViserPage:
     def send(self, frame: Frame, delay: float) -> None:
         """Begin to send a picture."""
         quality = _MOVING_JPEG if frame.quality.is_moving else _RESTING_JPEG
-        requested = time.monotonic() - delay
+        asked_at = time.monotonic() - delay
         self._client.scene.set_background_image(frame.rgb, format="jpeg", jpeg_quality=quality, depth=frame.depth)
         self._client.flush()
         with contextlib.suppress(RuntimeError):  # it was closed in the meantime
-            self._taken = self._asking.submit(self._ask, frame, requested)
+            self._taken = self._asking.submit(self._ask, frame, asked_at)
 
     def wait(self) -> None:
         """Return when the page has taken the last picture, or after some seconds."""
@@ -188,14 +188,14 @@ class _ViserPage:
         """Ask nothing more."""
         self._asking.shutdown(wait=False, cancel_futures=True)
 
-    def _ask(self, frame: Frame, requested: float) -> None:
+    def _ask(self, frame: Frame, asked_at: float) -> None:
         with contextlib.suppress(RuntimeError, TimeoutError):  # RuntimeError: gone, or its storage is blocked
             self._client.local_storage.get_item("taken", timeout=_PICTURE_TIMEOUT)
         now = time.monotonic()
         if not self._message and (now - self._last_status > _STATUS_SECONDS or not frame.quality.is_moving):
             self._last_status = now
             height, width, _ = frame.rgb.shape
-            delay = f"{1e3 * (now - requested):.0f} ms from mouse to picture" if frame.quality.is_moving else "at rest"
+            delay = f"{1e3 * (now - asked_at):.0f} ms from mouse to picture" if frame.quality.is_moving else "at rest"
             error = "" if frame.error is None else f"<br>error against rays {frame.error:.2%}"
             self._write(f"{delay}<br>{width} × {height}, {frame.cells}, {1e3 * frame.seconds:.0f} ms{error}")
 

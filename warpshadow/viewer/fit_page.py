@@ -93,13 +93,13 @@ class FitPage:
         self._note.content = _padded(html.escape(note))
         self._plot.content = _padded(loss_plot(losses))
         color = COLORS[stage % len(COLORS)]
-        minimum = [min(run, default=np.inf) for run in losses[stage]]
+        least_losses = [min(run, default=np.inf) for run in losses[stage]]
         rows = []
         for number in range(candidates if candidates > 1 else 0):
-            has_begun = number < len(minimum) and np.isfinite(minimum[number])
-            style = f"color:{color}" if has_begun and minimum[number] == min(minimum) else ""
-            is_present = number == len(minimum) - 1
-            messages = f"{minimum[number]:.3e}" if has_begun else "waits"
+            has_begun = number < len(least_losses) and np.isfinite(least_losses[number])
+            style = f"color:{color}" if has_begun and least_losses[number] == min(least_losses) else ""
+            is_present = number == len(least_losses) - 1
+            messages = f"{least_losses[number]:.3e}" if has_begun else "waits"
             rows.append(
                 f'<tr style="{style}"><td>{"▸" if is_present else ""}</td><td>{number + 1}</td><td>{messages}</td>'
             )

@@ -139,7 +139,7 @@ class Loop:
     def _serve(self, client: _Client) -> None:
         frame_rate, last = FrameRate(), None
         while (job := self._next(client, frame_rate, last)) is not None:
-            camera, quality, requested = job
+            camera, quality, asked_at = job
             try:
                 with self._painting:
                     start = time.monotonic()
@@ -155,7 +155,7 @@ class Loop:
             client.page.fail(None)
             client.page.wait()
             if client.is_open:
-                client.page.send(frame, time.monotonic() - requested)
+                client.page.send(frame, time.monotonic() - asked_at)
             last = camera, quality, seconds
 
     def _next(
@@ -165,8 +165,8 @@ class Loop:
         with self._asked:
             while client.is_open:
                 if client.asked is not None and client.camera is not None:
-                    requested, client.asked, client.is_content = client.asked, None, False
-                    return client.camera, frame_rate.moving(), requested
+                    asked_at, client.asked, client.is_content = client.asked, None, False
+                    return client.camera, frame_rate.moving(), asked_at
                 better = None
                 if last is not None:
                     camera, quality, seconds = last

@@ -40,10 +40,10 @@ def as_toml(path: Path, scene: Scene, viewer_state: ViewerState, camera: Camera)
     light["scale"] = light.get("scale", 1.0) * viewer_state.scale
     settings = viewer_state.settings(scene)
     light["bounces"] = settings.bounces
-    visibility, arguments = tables.setdefault("visibility", {}), scene.visibility.with_method()
+    visibility, given_visibility = tables.setdefault("visibility", {}), scene.visibility.with_method()
     for name in ("method", *METHODS_OF_SETTING):
         value = getattr(settings.visibility, name)
-        if value != getattr(arguments, name):
+        if value != getattr(given_visibility, name):
             visibility[name] = value
     if "method" in visibility:  # "auto" was replaced
         visibility["method"] = settings.visibility.method

@@ -126,10 +126,10 @@ class ViewerState:
             poses=tuple(BodyPose(tuple(body.rotation), tuple(body.translation)) for body in scene.bodies),
         )
 
-    def visibility(self, arguments: Visibility, quality: Quality | None = None) -> Visibility:
+    def visibility(self, visibility: Visibility, quality: Quality | None = None) -> Visibility:
         """The settings of a scene, as they are changed; no better than a quality asks for."""
         names = "method", "sampling", "directions", "softness"
-        settings = {name: getattr(arguments, name) for name in METHODS_OF_SETTING}
+        settings = {name: getattr(visibility, name) for name in METHODS_OF_SETTING}
         requested = Visibility.of(settings | {name: getattr(self, name) for name in names})
         if quality is None:
             return requested
@@ -137,18 +137,18 @@ class ViewerState:
         bounded = {"directions": min(requested.directions, quality.cells), "samples": min(requested.ray_count, rays)}
         return Visibility.of(vars(requested) | bounded)
 
-    def bodies(self, arguments: tuple[Body, ...]) -> tuple[Body, ...]:
+    def bodies(self, bodies: tuple[Body, ...]) -> tuple[Body, ...]:
         """Bodies with the spheres and receivers that are asked for, where the scene has them."""
         changed: dict[str, object] = {} if self.receivers == AS_GIVEN else {"receivers": self.receivers}
         counts = {} if self.spheres is None else {"blockers": self.spheres}
         return tuple(
             dataclasses.replace(body, **changed, **(counts if body.casts_shadow else {}))  # type: ignore[arg-type]
-            for body in arguments
+            for body in bodies
         )
 
-    def light(self, arguments: EnvironmentMap | np.ndarray) -> EnvironmentMap | np.ndarray:
+    def light(self, light: EnvironmentMap | np.ndarray) -> EnvironmentMap | np.ndarray:
         """Light as it is turned and scaled."""
-        return turned_light(arguments, self.turn, self.scale)
+        return turned_light(light, self.turn, self.scale)
 
     def settings(self, scene: Scene, quality: Quality | None = None) -> Scene:
         """The scene with the settings that are asked for; its bodies where they were, its light as it was."""

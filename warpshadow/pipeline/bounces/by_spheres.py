@@ -6,9 +6,10 @@ Patches of bodies have a radiosity B, reflected from direct light S and bounced 
 
 and G is applied as often as light bounces: first at the sources, points where patches are lit, at last at the receivers
 of the image. G has three parts, each a stage of its own: light from a body's own patches, light from plane bodies, and
-light from bodies represented by spheres. Where the light of a cell is blocked one of them takes its place. Between
-patches of one body the first part is a small matrix that does not change. Hollow bodies keep light for long: there it
-goes on when it has bounced often enough between bodies. :mod:`.repeated` has how often.
+light from bodies represented by spheres. A blocked part of a cell sends light of one of the three.
+
+Between patches of one body the first part is a small matrix that does not change. After the last bounce between bodies,
+light within each body bounces ``SELF_BOUNCES`` times more, since hollow bodies keep it long.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.bounces.static_bounces import StaticBounces
-from warpshadow.pipeline.by_spheres import PartwiseShading, SphereMethod
+from warpshadow.pipeline.by_spheres import PortionedShading, SphereMethod
 from warpshadow.pipeline.groups import Group
 from warpshadow.pipeline.lighting import LitPoints, joined, receiver_text
 from warpshadow.pipeline.node import Call, Input, Node
@@ -52,7 +53,7 @@ def _source_text(senders: Senders) -> str:
     return f"{len(senders.sides):,} sources"
 
 
-class PartVisibility(NamedTuple):
+class PortionVisibility(NamedTuple):
     """Some receivers, and their visibility, which holds for any light."""
 
     transfer: wp.array  # of direct light, [batch, receiver, coefficient]
@@ -60,7 +61,7 @@ class PartVisibility(NamedTuple):
     cells: CellTransmittance
 
 
-class DirectLightPart(NamedTuple):
+class PortionDirectLight(NamedTuple):
     """Some receivers in direct light, and their visibility of bounced light."""
 
     direct: wp.array  # vec3 of shape [batch, receiver]
@@ -68,21 +69,23 @@ class DirectLightPart(NamedTuple):
     cells: CellTransmittance
 
 
-class PartwiseVisibility(PartwiseShading):
-    """Visibility of receivers for direct and bounced light, in parts."""
+class PortionedVisibility(PortionedShading):
+    """Visibility of receivers for direct and bounced light, in portions."""
 
-    def find(self, call: Call, part: Group, projected_light: Any, spheres: tuple[wp.array, wp.array]) -> PartVisibility:
-        """Find the visibility of a part."""
-        visibility = self.find_visibility(call, part, projected_light)
-        return PartVisibility(
-            self.light(call, part, visibility, projected_light),
-            part,
-            find_cell_transmittance(self.method, part, visibility, projected_light, spheres),
+    def find(
+        self, call: Call, portion: Group, projected_light: Any, spheres: tuple[wp.array, wp.array]
+    ) -> PortionVisibility:
+        """Find the visibility of a portion."""
+        visibility = self.find_visibility(call, portion, projected_light)
+        return PortionVisibility(
+            self.light(call, portion, visibility, projected_light),
+            portion,
+            find_cell_transmittance(self.method, portion, visibility, projected_light, spheres),
         )
 
 
-class PartwiseDirectLight(Node):
-    """Direct light, in parts.
+class PortionedDirectLight(Node):
+    """Direct light, in portions.
 
     Args:
         visibility: Visibility of the receivers.
@@ -95,7 +98,7 @@ class PartwiseDirectLight(Node):
 
     def __init__(
         self,
-        visibility: PartwiseVisibility,
+        visibility: PortionedVisibility,
         projected_light: Node,
         item_text: str | Callable[[], str],
         where: str = "",
@@ -114,26 +117,26 @@ class PartwiseDirectLight(Node):
         super().__init__("", None, projected_light, *others, extra_inputs=(visibility, self._shade, *extra_inputs))
 
     def compute(self, call: Call) -> Any:
-        """Light all parts."""
+        """Light all portions."""
         (projected_light,) = self.values(call)
-        return [self._light(call, part, projected_light) for part in self._visibilities.value(call)]
+        return [self._light(call, portion, projected_light) for portion in self._visibilities.value(call)]
 
-    def _light(self, call: Call, part: PartVisibility, projected_light: Any) -> DirectLightPart:
-        return DirectLightPart(
-            self._shade.run(call, part.transfer, part.group, projected_light), part.group, part.cells
+    def _light(self, call: Call, portion: PortionVisibility, projected_light: Any) -> PortionDirectLight:
+        return PortionDirectLight(
+            self._shade.run(call, portion.transfer, portion.group, projected_light), portion.group, portion.cells
         )
 
 
-def _openness(senders: Senders, visibility: list[PartVisibility]) -> Openness:
+def _openness(senders: Senders, visibility: list[PortionVisibility]) -> Openness:
     """How open sources and patches are."""
-    parts = [find_openness(part.group.normals, *part.cells) for part in visibility]
-    return open_shares(joined(parts), senders.mean, senders.patch_of_source)
+    portions = [find_openness(portion.group.normals, *portion.cells) for portion in visibility]
+    return open_shares(joined(portions), senders.mean, senders.patch_of_source)
 
 
 class PatchSampleNodes(NamedTuple):
     """Nodes of the points at which patches are lit."""
 
-    visibility: PartwiseVisibility  # visibility
+    visibility: PortionedVisibility  # of the sources, for any light
     frames: Node  # of flat bodies
     projected_patches: Node  # patches as receivers see them
     openness: Node  # how open they are, and their patches
@@ -174,39 +177,43 @@ class Radiosity(Node):
         lit, albedo, projected_patches, frames, openness = self.values(call)
         senders, count = self._proxies.senders, self._count
         between = (
-            None if self._own.idle else self._self_form_factors.between_patches(senders, [part.group for part in lit])
+            None
+            if self._own.idle
+            else self._self_form_factors.between_patches(senders, [portion.group for portion in lit])
         )
 
         def sent(radiosity: wp.array) -> OutgoingRadiance:
             return OutgoingRadiance(self._proxies, radiosity, projected_patches, frames, openness.of_patches)
 
-        def others_light_of(radiosity: wp.array | None) -> wp.array:
+        def radiosity_by_others(radiosity: wp.array | None) -> wp.array:
             """Radiosity of patches by light from the sky and from other bodies."""
             if radiosity is None:
-                parts = [part.direct for part in lit]
+                portions = [portion.direct for portion in lit]
             else:
                 outgoing = sent(radiosity)
-                parts = [self._light(call, part, outgoing) for part in lit]
-            return self._reflect.run(call, albedo, joined(parts), senders.mean, openness.shares)
+                portions = [self._light(call, portion, outgoing) for portion in lit]
+            return self._reflect.run(call, albedo, joined(portions), senders.mean, openness.shares)
 
-        def with_self_light(others_light: wp.array, radiosity: wp.array | None) -> wp.array:
+        def add_radiosity_by_self(by_others: wp.array, radiosity: wp.array | None) -> wp.array:
             if between is None or radiosity is None:
-                return others_light
-            return total_light([others_light, self._own.run(call, albedo, radiosity, between)])
+                return by_others
+            return total_light([by_others, self._own.run(call, albedo, radiosity, between)])
 
         self_bounces = 0 if between is None else SELF_BOUNCES
-        return sent(after_bounces(count, others_light_of, with_self_light, senders.areas, self_bounces=self_bounces))
+        return sent(
+            after_bounces(count, radiosity_by_others, add_radiosity_by_self, senders.areas, self_bounces=self_bounces)
+        )
 
-    def _light(self, call: Call, part: DirectLightPart, outgoing: OutgoingRadiance) -> wp.array:
-        """Light of a part of the sources past its own body, from the sky and from others."""
-        return total_light([part.direct, *self._gathering.run(call, part.group, part.cells, outgoing)])
+    def _light(self, call: Call, portion: PortionDirectLight, outgoing: OutgoingRadiance) -> wp.array:
+        """Light of a portion of the sources past its own body, from the sky and from others."""
+        return total_light([portion.direct, *self._gathering.run(call, portion.group, portion.cells, outgoing)])
 
 
-class BouncedShading(PartwiseDirectLight):
+class BouncedShading(PortionedDirectLight):
     """Shading of receivers, direct and bounced.
 
     Args:
-        visibility: Visibility; one part after another where none of it is cached.
+        visibility: Visibility; one portion after another where none of it is cached.
         projected_light: The light projected for the method.
         item_text: Number of receivers, in words.
         radiosity: Radiosity of the patches.
@@ -215,7 +222,7 @@ class BouncedShading(PartwiseDirectLight):
 
     def __init__(
         self,
-        visibility: PartwiseVisibility,
+        visibility: PortionedVisibility,
         projected_light: Node,
         item_text: Callable[[], str],
         radiosity: Radiosity,
@@ -225,13 +232,15 @@ class BouncedShading(PartwiseDirectLight):
         super().__init__(visibility, projected_light, item_text, others=(radiosity,), extra_inputs=gathering.stages)
 
     def compute(self, call: Call) -> wp.array:
-        """Light all parts, directly and by the patches' radiosity."""
+        """Light all portions, directly and by the patches' radiosity."""
         projected_light, outgoing = self.values(call)
-        parts = self._visibilities.value(call) if self._visibilities.caches else self._visibilities.parts(call)
-        return joined([self._bounced(call, self._light(call, part, projected_light), outgoing) for part in parts])
+        portions = self._visibilities.value(call) if self._visibilities.caches else self._visibilities.portions(call)
+        return joined(
+            [self._bounced(call, self._light(call, portion, projected_light), outgoing) for portion in portions]
+        )
 
-    def _bounced(self, call: Call, part: DirectLightPart, outgoing: OutgoingRadiance) -> wp.array:
-        return total_light([part.direct, *self._gathering.run(call, part.group, part.cells, outgoing)])
+    def _bounced(self, call: Call, portion: PortionDirectLight, outgoing: OutgoingRadiance) -> wp.array:
+        return total_light([portion.direct, *self._gathering.run(call, portion.group, portion.cells, outgoing)])
 
 
 class SphereBounces:
@@ -247,7 +256,7 @@ class SphereBounces:
         self._self_form_factors = SelfFormFactors(method.self_visibility, self._patches, progress=method.progress)
         self._proxies: dict[Senders, Proxies] = {}
 
-    def shading(self, points: LitPoints, projected_light: Node, light: Input, materials: Materials) -> Node:
+    def bounced_shading(self, points: LitPoints, projected_light: Node, light: Input, materials: Materials) -> Node:
         """Node of the shading of points, direct and bounced, vec3 of shape [batch, receiver].
 
         If colors vary, the visibility of points is cached; otherwise their shading is.
@@ -260,7 +269,9 @@ class SphereBounces:
         """
         return self._shading(points, projected_light, projected_light, light, materials, is_free=False)
 
-    def free_shading(self, points: LitPoints, projected_light: Node, light: Input, materials: Materials) -> Node:
+    def bounced_free_shading(
+        self, points: LitPoints, projected_light: Node, light: Input, materials: Materials
+    ) -> Node:
         """The same in free light; the points' visibility, which holds for any light, is cached."""
         return self._shading(points, projected_light, self._method.free_projection, light, materials, is_free=True)
 
@@ -278,10 +289,10 @@ class SphereBounces:
         method, senders = self._method, self._patches.senders(materials)
         if not senders.bodies:
             idle = Node("bounces", None, idle="every body is black")
-            return PartwiseShading(method, points, projected_light, light, joined, extra_inputs=(idle,))
+            return PortionedShading(method, points, projected_light, light, joined, extra_inputs=(idle,))
         proxies = self._proxies.setdefault(senders, Proxies(senders, method.visibility.merging))
         make_visibility = functools.partial(
-            PartwiseVisibility, method, projected_light=visibility_light, light=light, finish=list, is_shaded=False
+            PortionedVisibility, method, projected_light=visibility_light, light=light, finish=list, is_shaded=False
         )
         key, is_cached = None if is_free else light, is_free or materials is not points.materials
         visibility = points.cached("visibility", (key, is_cached), lambda: make_visibility(points, caches=is_cached))
@@ -294,13 +305,13 @@ class SphereBounces:
         return BouncedShading(visibility, projected_light, item_text, radiosity, at_points)
 
     def _sources(
-        self, make_visibility: Callable[..., PartwiseVisibility], proxies: Proxies, points: LitPoints
+        self, make_visibility: Callable[..., PortionedVisibility], proxies: Proxies, points: LitPoints
     ) -> PatchSampleNodes:
         """Sources among the bodies among which points are."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
 
-        def project(sources: Receivers, visibility: list[PartVisibility], *arguments: Any) -> ProjectedPatches:
-            return proxies.projected_patches(sources, [part.cells for part in visibility], *arguments)
+        def project(sources: Receivers, visibility: list[PortionVisibility], *arguments: Any) -> ProjectedPatches:
+            return proxies.projected_patches(sources, [portion.cells for portion in visibility], *arguments)
 
         make = functools.partial(Node, "sources", senders.sources, points.vertices, points.normals)
         sources = points.cached("sources", senders, lambda: make(items=_source_text(senders)))
@@ -318,7 +329,7 @@ class SphereBounces:
     ) -> Radiosity:
         """Radiosity of the patches, given the light at their sources."""
         senders, why_not = proxies.senders, "light bounces once" if self._count == 1 else ""
-        lit = PartwiseDirectLight(sources.visibility, projected_light, _source_text(senders), _OF_SOURCES)
+        lit = PortionedDirectLight(sources.visibility, projected_light, _source_text(senders), _OF_SOURCES)
         albedo = self._patches.albedo(materials, senders.bodies)
         arguments = lit, albedo, sources.frames
         among_senders = self._gathering(
@@ -329,7 +340,9 @@ class SphereBounces:
     def _gathering(self, senders: Senders, *arguments: Any, **options: Any) -> Gathering:
         return Gathering(self._method.visibility, senders, self._self_form_factors, *arguments, **options)
 
-    def cached_shading(self, points: LitPoints, projected_light: Any, light: Input, materials: Materials) -> Node:
+    def cached_bounced_shading(
+        self, points: LitPoints, projected_light: Any, light: Input, materials: Materials
+    ) -> Node:
         """The same for static points: their and the sources' visibility is cached, and so are form factors by rays.
 
         Args:
@@ -340,15 +353,15 @@ class SphereBounces:
         """
         sources, at_sources = self._cached_sources(points, materials)
         direct = points.cached(
-            "direct", light, lambda: PartwiseShading(self._method, points, projected_light, light, joined)
+            "direct", light, lambda: PortionedShading(self._method, points, projected_light, light, joined)
         )
         make = functools.partial(
-            PartwiseShading, self._method, at_sources, projected_light, light, joined, where=_OF_SOURCES
+            PortionedShading, self._method, at_sources, projected_light, light, joined, where=_OF_SOURCES
         )
         lit = points.cached("direct at sources", (light, sources), make)
-        return self._still.shading(direct, lit, points, materials)
+        return self._still.add_bounces(direct, lit, points, materials)
 
-    def cached_free_shading(self, direct: Node, points: LitPoints, light: Input, materials: Materials) -> Node:
+    def cached_bounced_free_shading(self, direct: Node, points: LitPoints, light: Input, materials: Materials) -> Node:
         """The same in free light.
 
         Args:
@@ -357,7 +370,7 @@ class SphereBounces:
         """
         sources, at_sources = self._cached_sources(points, materials)
         transfers = points.cached("transfer", sources, lambda: self._method.transfers(at_sources, _OF_SOURCES))
-        return self._still.free_shading(direct, transfers, light, points, materials)
+        return self._still.add_free_bounces(direct, transfers, light, points, materials)
 
     def _cached_sources(self, points: LitPoints, materials: Materials) -> tuple[Node, LitPoints]:
         """Node of the static sources, and the same sources as lit points."""

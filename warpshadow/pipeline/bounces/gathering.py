@@ -41,14 +41,12 @@ HARMONIC_GATHER_CELLS = fibonacci(64)  # where receivers look for bounced light 
 ALL_FLAT = "all that reflects is flat"  # why no body sends light to itself, in words
 
 _SOFTNESS_OF_PARTS = 1.0
-"""κ of proxies where convex parts block, at least: parts are seen by a cell's whole disc, of radius ρ. By κ = 0.35 some
-cells that parts blocked had no proxy in them, which lost 1 to 5% of the light from other bodies in a shelf of books.
-And as a proxy came or went, light jumped: a table's gradient was up to twice as large as differences of images, and is
-1% off. It takes 1.1 times as long."""
+"""κ of proxies where convex parts block, at least: parts are seen by a cell's whole disc, of radius ρ. With less, cells
+that parts block have no proxy in them, which loses light, and light jumps as a proxy comes or goes."""
 
 
 class CellTransmittance(NamedTuple):
-    """Transmittance of a part of the receivers in cells of directions."""
+    """Transmittance of a portion of the receivers in cells of directions."""
 
     transmittance_self: (
         wp.array | None
@@ -146,8 +144,8 @@ class Proxies:
             starts = int(merged_scene.first_vertex[number]), int(senders.first[place])
             bodies.append(PlaneBody(grid, body.mesh.positions, body.mesh.surface.faces, *starts, body.casts_shadow))
         counts = len(senders.areas), int(merged_scene.first_vertex[-1])
-        form_factors = PlaneBlockers.of(bodies, *counts, device=merged_scene.device)
-        return SenderPlanes(form_factors, {number: k for k, number in enumerate(numbers)})
+        planes = PlaneBlockers.of(bodies, *counts, device=merged_scene.device)
+        return SenderPlanes(planes, {number: k for k, number in enumerate(numbers)})
 
     @functools.cached_property
     def nonplanar_bodies(self) -> list[int]:
@@ -215,7 +213,7 @@ class Proxies:
 
         Args:
             sources: Where they are lit.
-            cells: Transmittance of the sources, in parts.
+            cells: Transmittance of the sources, in portions.
             spheres: Centers and radii of all spheres.
             frames: Where flat bodies are.
         """
@@ -227,10 +225,10 @@ class Proxies:
             fronts = find_fronts(points, normals, None, of_sources, frames, planes.all)
             normals = turn_from_planes(points, normals, radii, numbers, fronts, frames, planes.all)
         rows = [
-            wp.full_like(part.transmittance_spheres, 1.0, requires_grad=False)
-            if part.transmittance_self is None
-            else part.transmittance_self
-            for part in cells
+            wp.full_like(portion.transmittance_spheres, 1.0, requires_grad=False)
+            if portion.transmittance_self is None
+            else portion.transmittance_self
+            for portion in cells
         ]
         transmittance = joined([row.reshape((len(row), -1)) for row in rows])
         directions = cells[0].directions
@@ -293,7 +291,7 @@ class Gathering:
         visibility: How spheres block light.
         senders: The bodies whose patches send light.
         self_form_factors: Form factors of bodies for themselves.
-        given: Nodes that radiosity, receivers and spheres depend on.
+        arguments: Nodes that radiosity, receivers and spheres depend on.
         item_text: Number of receivers, in words.
         where: Put after the names of its stages.
         why_not: Why nobody asks for it, in words; empty if somebody does.
@@ -331,8 +329,8 @@ class Gathering:
 
     def run(self, call: Call, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> list[wp.array]:
         """Bounced light of a group by each path: planes, spheres, its own body; vec3 of shape [batch, receiver]."""
-        form_factors = [node.run(call, group, cells, outgoing) for node in self.stages if not node.idle]
-        return [light for light in form_factors if light is not None]
+        lights = [node.run(call, group, cells, outgoing) for node in self.stages if not node.idle]
+        return [light for light in lights if light is not None]
 
     def _from_itself(self, group: Group, _: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
         if group.body not in outgoing.senders.bodies or self._is_flat[group.body]:

@@ -131,15 +131,15 @@ class ScenePatches:
         counts = [self.of_body(number).count for number in bodies]
 
         def means(colors: Sequence[wp.array], images: Sequence[wp.array | None]) -> wp.array:
-            arguments = {n: colors[n] if images[n] is None else rows(images[n]) for n in bodies}
+            reflectance = {n: colors[n] if images[n] is None else rows(images[n]) for n in bodies}
             total = None
             # so only varying inputs have an adjoint
-            for number in sorted(bodies, key=lambda n: arguments[n].requires_grad):
+            for number in sorted(bodies, key=lambda n: reflectance[n].requires_grad):
                 image = images[number]
                 mean = self._mean(
-                    number, bodies, arguments[number].shape[1], None if image is None else image.shape[1:]
+                    number, bodies, reflectance[number].shape[1], None if image is None else image.shape[1:]
                 )
-                total = multiply(mean, arguments[number], plus=total)
+                total = multiply(mean, reflectance[number], plus=total)
             return total
 
         return Node("patch albedo", means, materials.albedo, materials.textures, items=f"{sum(counts):,} patches")

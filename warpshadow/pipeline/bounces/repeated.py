@@ -23,14 +23,21 @@ def after_bounces(
 ) -> wp.array:
     """Radiosity of patches after all bounces but the last, which the receivers gather.
 
+        B₀ = reflect(light(None), None),   Bₙ₊₁ = reflect(light(Bₙ), Bₙ)
+
+    After the last of these, ``light`` is not asked again, but ``reflect`` goes on: light within bodies.
+
     Args:
         bounces: How often light bounces.
-        light: Of the radiosity of patches, or of the sky alone for None: light on patches from the sky and from other
-            bodies, in the form that ``reflect`` takes.
-        reflect: Of that and of the radiosity, None for none: the radiosity with their own body's light for it.
+        light: Function of the radiosity B, None before the first bounce: the light of patches that is not from their
+            own body, so from the sky and from other bodies. Only ``reflect`` reads its result.
+        reflect: Function of that light and of B: adds the light from their own body, none for None, and returns the
+            next radiosity.
         areas: Of patches, shape [patch].
-        self_bounces: How often a body's light for itself goes on: after the last of a number of bounces, and
-            after each of "all"; 0 where there is none.
+        self_bounces: How often ``reflect`` goes on alone: after the last of a number of bounces, and after each of
+            "all"; 0 where bodies send themselves no light.
+    Returns:
+        Radiosity, vec3 of shape [batch, patch].
     """
     bounced_light = light(None)
     radiosity = reflect(bounced_light, None)

@@ -98,8 +98,8 @@ class StaticBounces:
         senders = self._patches.senders(materials)
         return points.cached("sources", senders, lambda: Node("", senders.sources, points.vertices, points.normals))
 
-    def shading(self, direct: Node, at_sources: Node, points: LitPoints, materials: Materials) -> Node:
-        """Shading with bounces.
+    def add_bounces(self, direct: Node, at_sources: Node, points: LitPoints, materials: Materials) -> Node:
+        """Add bounces to direct shading.
 
         Args:
             direct: Node of the direct shading of the receivers, vec3 of shape [batch, receiver].
@@ -113,14 +113,14 @@ class StaticBounces:
         make = functools.partial(Node, "", _light_on_patches, at_sources, self._factors(points, materials, senders))
         return self._shading(direct, points.cached("light of patches", at_sources, make), points, materials)
 
-    def free_shading(
+    def add_free_bounces(
         self, direct: Node, transfers: Node, light: Input, points: LitPoints, materials: Materials
     ) -> Node:
         """The same in free light; its transfer among the colors of the scene is cached.
 
         Args:
             direct: As above.
-            transfers: Node of the transfer vectors of the sources, [1, source, coefficient], in parts.
+            transfers: Node of the transfer vectors of the sources, [1, source, coefficient], in portions.
             light: The coefficients.
             points: The receivers.
             materials: Reflectance of the bodies.
@@ -129,11 +129,11 @@ class StaticBounces:
         if not senders.bodies:
             return direct
 
-        def light_on_patches(parts: list[wp.array], factors: _GeometryFactors) -> wp.array:
+        def light_on_patches(portions: list[wp.array], factors: _GeometryFactors) -> wp.array:
             """Light on patches by each coefficient of white light, vec3 of shape [coefficient, patch]."""
-            white_light = np.concatenate([part.numpy()[0] for part in parts]).T[..., None]
+            white_light = np.concatenate([portion.numpy()[0] for portion in portions]).T[..., None]
             return _light_on_patches(
-                wp.array(np.repeat(white_light, 3, axis=2), dtype=wp.vec3, device=parts[0].device), factors
+                wp.array(np.repeat(white_light, 3, axis=2), dtype=wp.vec3, device=portions[0].device), factors
             )
 
         arguments = transfers, self._factors(points, materials, senders)
@@ -168,17 +168,17 @@ class StaticBounces:
     ) -> wp.array:
         """Bounced light at cache points, vec3 of shape [batch, cache point]. Differentiable: albedo, patch_light."""
 
-        def others_light_of(radiosity: wp.array | None) -> wp.array:
+        def light_of_others(radiosity: wp.array | None) -> wp.array:
             """Light on patches from the sky and from other bodies."""
             return patch_light if radiosity is None else multiply(factors.between_bodies, radiosity, plus=patch_light)
 
-        def with_self_light(others_light: wp.array, radiosity: wp.array | None) -> wp.array:
+        def reflect_all(by_others: wp.array, radiosity: wp.array | None) -> wp.array:
             return reflect(
                 albedo,
-                others_light if radiosity is None else multiply(factors.within_bodies, radiosity, plus=others_light),
+                by_others if radiosity is None else multiply(factors.within_bodies, radiosity, plus=by_others),
             )
 
-        arguments = self._bounces, others_light_of, with_self_light, senders.areas
+        arguments = self._bounces, light_of_others, reflect_all, senders.areas
         return multiply(factors.to_cache_points, after_bounces(*arguments, self_bounces=SELF_BOUNCES))
 
     def _item_text(self, points: LitPoints, senders: Senders) -> Callable[[], str]:

@@ -66,7 +66,7 @@ def _tabulate(
     starts: wp.array(dtype=wp.int32),
     numbers: wp.array(dtype=wp.int32),
     shares: wp.array(dtype=wp.float32),
-    minimum: wp.array(dtype=wp.float32),
+    weight_if_black: wp.array(dtype=wp.float32),
     # out
     proxy_radiance: wp.array3d(dtype=wp.vec4),
 ):
@@ -75,7 +75,7 @@ def _tabulate(
     sent = radiosity[instance_in(batch, radiosity.shape[0])]
     areas_of_instance = projected_areas[instance_in(batch, projected_areas.shape[0])]
     light = wp.vec3()
-    open = float(minimum[node])
+    open = float(weight_if_black[node])
     for k in range(starts[node], starts[node + 1]):
         patch = numbers[k]
         part = shares[k] * (areas_of_instance[patch, direction] + _HIDDEN_WEIGHT)

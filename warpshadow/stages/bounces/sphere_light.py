@@ -117,7 +117,7 @@ def _make_begin(lanes: int) -> wp.Function:
         reached_bundles: wp.array3d(dtype=wp.int32),
         sums: wp.array2d(dtype=Lane),
     ):
-        batch, group, receivers = load_receivers(inputs.traversed, row)
+        batch, block, receivers = load_receivers(inputs.traversed, row)
         spheres = inputs.traversed.spheres
         item = row * inputs.span_count + span
         place = scratch_place(worker, item)
@@ -140,8 +140,8 @@ def _make_begin(lanes: int) -> wp.Function:
             if is_any_above(dot_direction(task.cells.axes[at], receivers.normals), -task.cells.half_angles[at][1]):
                 for i in range(BUNDLE):
                     blocked = Lane()
-                    for lane in range(wp.min(lanes, inputs.traversed.points.shape[1] - group * lanes)):
-                        vertex = group * lanes + lane
+                    for lane in range(wp.min(lanes, inputs.traversed.points.shape[1] - block * lanes)):
+                        vertex = block * lanes + lane
                         maximum = float(1.0)
                         if inputs.unblocked:
                             serving = instance_in(batch, inputs.unblocked.shape[0])
@@ -150,7 +150,7 @@ def _make_begin(lanes: int) -> wp.Function:
                     task.blocked[bundle * BUNDLE + i] = blocked
                     if is_any_above(wp.max(blocked, -blocked), 0.0):
                         task.ends[bundle] = spheres.bounds_of_quads.shape[1] * ITEMS
-        return batch, group, receivers, task
+        return batch, block, receivers, task
 
     return begin
 
@@ -223,10 +223,10 @@ def _make_light(lanes: int) -> wp.Kernel:
         # out
         light: wp.array2d(dtype=wp.vec3),
     ):
-        """A thread owns a group of receivers and a span of bundles, and adds to the light."""
+        """A thread owns a block of receivers and a span of bundles, and adds to the light."""
         i, j = wp.tid()
         span, row = find_run(worker, first_row + i, j)
-        batch, group, receivers, task = begin(row, span, worker, inputs, scratch, reached_bundles, sums)
+        batch, block, receivers, task = begin(row, span, worker, inputs, scratch, reached_bundles, sums)
         for bundle in range(task.ends.shape[0]):
             if task.ends[bundle] > 0:
                 for k in range(BUNDLE * SUMS):
@@ -244,7 +244,7 @@ def _make_light(lanes: int) -> wp.Kernel:
                     total.x += wp.cw_mul(part, task.sums[place * SUMS])
                     total.y += wp.cw_mul(part, task.sums[place * SUMS + 1])
                     total.z += wp.cw_mul(part, task.sums[place * SUMS + 2])
-        add_vectors(total, group, light[batch])
+        add_vectors(total, block, light[batch])
 
     return add_light
 
@@ -356,14 +356,14 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         adj_radii: wp.array2d(dtype=wp.float32),
         adj_extents: wp.array2d(dtype=wp.float32),
     ):
-        """A thread owns a group of receivers and a span of bundles.
+        """A thread owns a block of receivers and a span of bundles.
 
         T̄ = −4/Q max(n·ω, 0) Ī·R = −F̄,  n̄ = 4/Q Σ ω (F − T) Ī·R where n·ω > 0
         """
         i, j = wp.tid()
         span, row = find_run(worker, first_row + i, j)
-        batch, group, receivers, task = begin(row, span, worker, inputs, scratch, reached_bundles, sums)
-        task.adj_light = load(adj_light[batch], group)
+        batch, block, receivers, task = begin(row, span, worker, inputs, scratch, reached_bundles, sums)
+        task.adj_light = load(adj_light[batch], block)
         if adj_radiance:
             task.adj_radiance = adj_radiance[instance_in(batch, inputs.proxy_radiance.shape[0])]
         turned = Vectors()
@@ -384,8 +384,8 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                     turned.z += omega[2] * adj_cosine
                     facing = inputs.factor * wp.max(cosine, Lane(0.0))
                     adj_blocked = wp.cw_mul(facing, pulled)
-                    for lane in range(wp.min(lanes, inputs.traversed.points.shape[1] - group * lanes)):
-                        vertex = group * lanes + lane
+                    for lane in range(wp.min(lanes, inputs.traversed.points.shape[1] - block * lanes)):
+                        vertex = block * lanes + lane
                         if adj_transmittance:
                             adj_transmittance[batch, vertex, direction] = (
                                 adj_transmittance[batch, vertex, direction] - adj_blocked[lane]
@@ -399,9 +399,9 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                     task.pulls[place] = pulled
         adj = traverse(receivers, batch, inputs.traversed.spheres, Gradients(adj_centers, adj_radii, adj_extents), task)
         if adj_points:
-            add_vectors(adj.points, group, adj_points[batch])
+            add_vectors(adj.points, block, adj_points[batch])
         if adj_normals:
-            add_vectors(turned, group, adj_normals[batch])
+            add_vectors(turned, block, adj_normals[batch])
 
     return add_light_adjoint
 

@@ -283,11 +283,11 @@ def find_footprint(grid: PlaneGrid, scene: PlaneArrays, at: wp.vec3, toward: wp.
         for axis in range(2):
             slope = toward[axis] * footprint.per_cosine
             extent = footprint.distance * scene.radius * wp.sqrt(1.0 + slope * slope)
-            upper_bound = (grid.most[axis] - footprint.center[axis]) / extent
-            before = (grid.least[axis] - footprint.center[axis]) / extent
+            to_most = (grid.most[axis] - footprint.center[axis]) / extent
+            to_least = (grid.least[axis] - footprint.center[axis]) / extent
             if grid.edge_count == 0:
-                footprint.share = footprint.share * (step(upper_bound) - step(before))
-            elif upper_bound <= -1.0 or before >= 1.0:
+                footprint.share = footprint.share * (step(to_most) - step(to_least))
+            elif to_most <= -1.0 or to_least >= 1.0:
                 footprint.share = 0.0
     if grid.edge_count > 0 and footprint.share > 0.0:
         ellipse = find_ellipse(
@@ -335,18 +335,18 @@ def find_footprint_adjoint(
     elif not _is_amid(grid, footprint, radius):
         stretch = wp.vec2(wp.sqrt(1.0 + slope[0] * slope[0]), wp.sqrt(1.0 + slope[1] * slope[1]))
         extent = footprint.distance * radius * stretch
-        upper_bound = wp.cw_div(grid.most - footprint.center, extent)
-        before = wp.cw_div(grid.least - footprint.center, extent)
-        inside_x = step(upper_bound[0]) - step(before[0])
-        inside_y = step(upper_bound[1]) - step(before[1])
+        to_most = wp.cw_div(grid.most - footprint.center, extent)
+        to_least = wp.cw_div(grid.least - footprint.center, extent)
+        inside_x = step(to_most[0]) - step(to_least[0])
+        inside_y = step(to_most[1]) - step(to_least[1])
         adj_insides = adj_share * side_weight * horizon * wp.vec2(inside_y, inside_x)
-        at_most = wp.cw_div(
-            wp.cw_mul(adj_insides, wp.vec2(step_slope(upper_bound[0]), step_slope(upper_bound[1]))), extent
+        adj_to_most = wp.cw_div(wp.cw_mul(adj_insides, wp.vec2(step_slope(to_most[0]), step_slope(to_most[1]))), extent)
+        adj_to_least = wp.cw_div(
+            wp.cw_mul(adj_insides, wp.vec2(step_slope(to_least[0]), step_slope(to_least[1]))), extent
         )
-        at_least = wp.cw_div(wp.cw_mul(adj_insides, wp.vec2(step_slope(before[0]), step_slope(before[1]))), extent)
-        adj_x += at_least[0] - at_most[0]
-        adj_y += at_least[1] - at_most[1]
-        adj_extent = wp.cw_mul(at_least, before) - wp.cw_mul(at_most, upper_bound)
+        adj_x += adj_to_least[0] - adj_to_most[0]
+        adj_y += adj_to_least[1] - adj_to_most[1]
+        adj_extent = wp.cw_mul(adj_to_least, to_least) - wp.cw_mul(adj_to_most, to_most)
         adj_t += radius * wp.dot(adj_extent, stretch)
         adj_slope = (footprint.distance * radius) * wp.cw_div(wp.cw_mul(adj_extent, slope), stretch)
         adj_toward = wp.vec3(adj_slope[0] * footprint.per_cosine, adj_slope[1] * footprint.per_cosine, 0.0)

@@ -6,10 +6,14 @@ of normal n, on a body that reaches from height l to height u over a plane with 
 
     front = S(b + (1 − b²) n·N + 2 h / m),  b = (u + l) / max(u − l, m), from −1 to 1
 
-S is the smoothstep of :mod:`.cells`, and m its margin, a thousandth of a texel. Over so short a way a front changes by
-a step, so the last term has no gradient: with one, a row of vertices of a wall in the plane of a ground had 280 times
-the gradient that it has beside it. So a body that is wholly in front has all its receivers in front, and one through
-which the plane passes has them where they are. Of a body in the same plane their normals decide.
+S is the smoothstep of :mod:`.cells`, and m the margin of the plane, a thousandth of a texel. So
+
+- a body wholly in front of the plane (b = 1) has all its receivers in front, one wholly behind it (b = −1) all behind;
+- a body that the plane cuts has its receivers where their heights are;
+- of a body in the same plane (b = 0, h = 0) the normals decide.
+
+The height term has no gradient. Over so short a way as the margin it would be steep: a row of vertices of a wall in the
+plane of a ground had 280 times the gradient of the rows beside it.
 
 Where two or three planes meet, a receiver on the seam must see each of them as one before it does: at its own place it
 is at the border of both, and half of each would cover nothing. So receivers within 2 k of planes are lit where they are
@@ -55,9 +59,9 @@ class NearestBlockers(NamedTuple):
     radii: wp.array  # [batch, sphere] float32
     numbers: wp.array  # [point] int32, the sphere of each; −1 for none
 
-    def part(self, part: slice) -> NearestBlockers:
+    def cut(self, points: slice) -> NearestBlockers:
         """The same of some points."""
-        return self._replace(numbers=self.numbers[part])
+        return self._replace(numbers=self.numbers[points])
 
 
 @wp.func

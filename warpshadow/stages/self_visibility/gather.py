@@ -5,7 +5,7 @@
 over the lookups of cell q (:mod:`.lookup`) and the three rows of the receiver with their weights b (:mod:`.probes`).
 It is found where the receiver's horizon is below, and 1 elsewhere, where the cosine is zero.
 
-Receivers of a group look up the same coarse cells, each in rows of its own. So these are first brought into lanes: then
+Receivers of a block look up the same coarse cells, each in rows of its own. So these are first brought into lanes: then
 a lookup is one vector, where it would be bytes from all over memory. A single lane reads its bytes.
 """
 
@@ -56,7 +56,7 @@ class GatherInputs:
 
 @functools.cache
 def _probes_type(lanes: int) -> Any:
-    """Struct of where a group of receivers lies."""
+    """Struct of where a block of receivers lies."""
     Rows = wp.types.matrix(shape=(3, lanes), dtype=wp.int32)
     Weights = wp.types.matrix(shape=(3, lanes), dtype=wp.float32)
 
@@ -70,7 +70,7 @@ def _probes_type(lanes: int) -> Any:
 
 
 class _ProbeFunctions(NamedTuple):
-    """Kernel functions on the probes of a group."""
+    """Kernel functions on the probes of a block."""
 
     begin: wp.Function
     spread: wp.Function
@@ -86,13 +86,13 @@ def _make_probe_functions(lanes: int) -> _ProbeFunctions:
     find_block, load = fn.find_block, fn.load
 
     @wp.func
-    def load_probes(inputs: GatherInputs, batch: int, group: int):
+    def load_probes(inputs: GatherInputs, batch: int, block: int):
         rows = inputs.rows[instance_in(batch, inputs.rows.shape[0])]
         weights = inputs.place_weights[instance_in(batch, inputs.place_weights.shape[0])]
         probes = ProbeLanes()
         probes.corner_count = 1
         for lane in range(lanes):
-            receiver = wp.min(group * lanes + lane, rows.shape[0] - 1)
+            receiver = wp.min(block * lanes + lane, rows.shape[0] - 1)
             row = rows[receiver]
             weight = wp.vec3(1.0, 0.0, 0.0)
             if row[0] != row[1] or row[0] != row[2]:
@@ -136,15 +136,15 @@ def _make_probe_functions(lanes: int) -> _ProbeFunctions:
 
     @wp.func
     def begin(inputs: GatherInputs, row: int, receiver_count: int, shares: wp.array(dtype=Lane)):
-        """Load a group of receivers, and S of all coarse cells where there are several."""
-        batch, group = find_block(row, receiver_count)
-        probes = load_probes(inputs, batch, group)
+        """Load a block of receivers, and S of all coarse cells where there are several."""
+        batch, block = find_block(row, receiver_count)
+        probes = load_probes(inputs, batch, block)
         if wp.static(lanes > 1):
             for cell in range(shares.shape[0]):
                 shares[cell] = Lane(0.0)
             for corner in range(probes.corner_count):
                 spread(probes.rows[corner], probes.weights[corner], inputs.words, shares)
-        return batch, group, load(inputs.normals[instance_in(batch, inputs.normals.shape[0])], group), probes
+        return batch, block, load(inputs.normals[instance_in(batch, inputs.normals.shape[0])], block), probes
 
     return _ProbeFunctions(begin, spread, look)
 
@@ -166,11 +166,11 @@ def _make_gather(lanes: int) -> wp.Kernel:
         # out
         own: wp.array3d(dtype=wp.float32),
     ):
-        """A thread owns a group of receivers."""
+        """A thread owns a block of receivers."""
         item = first_row + wp.tid()
         shares = scratch[scratch_place(worker, item), 0]
         columns = scratch[scratch_place(worker, item), 1]
-        batch, group, normal, probes = begin(inputs, item, own.shape[1], shares)
+        batch, block, normal, probes = begin(inputs, item, own.shape[1], shares)
         turn = instance_in(batch, inputs.counts.shape[0])
         for q in range(inputs.directions.shape[0]):
             passing = Lane(0.0)
@@ -190,11 +190,11 @@ def _make_gather(lanes: int) -> wp.Kernel:
             for lane in range(lanes):
                 passing[lane] = wp.where(cosine[lane] > 0.0, passing[lane], 1.0)
             if wp.static(lanes == 1):
-                own[batch, group, q] = passing[0]
+                own[batch, block, q] = passing[0]
             else:
                 columns[q] = passing
         if wp.static(lanes > 1):
-            store_columns(columns, 0, inputs.directions.shape[0], group, own[batch])
+            store_columns(columns, 0, inputs.directions.shape[0], block, own[batch])
 
     return gather
 
@@ -219,26 +219,26 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
         adj_place_weights: wp.array2d(dtype=wp.vec3),
         adj_all_weights: wp.array3d(dtype=wp.float32),
     ):
-        """A thread owns a group of receivers:  w̄_qk += T̄_q Σ_j b_j S_jqk,  b̄_j += Σ_qk T̄_q w_qk S_jqk.
+        """A thread owns a block of receivers:  w̄_qk += T̄_q Σ_j b_j S_jqk,  b̄_j += Σ_qk T̄_q w_qk S_jqk.
 
         The latter is summed up by cells first:  S̄_c = Σ_qk T̄_q w_qk where c_qk = c,  b̄_j += Σ_c S̄_c S_jc.
         """
         item = first_row + wp.tid()
         shares = scratch[scratch_place(worker, item), 0]
         adj_shares = scratch[scratch_place(worker, item), 1]
-        batch, group, normal, probes = begin(inputs, item, adj_own.shape[1], shares)
+        batch, block, normal, probes = begin(inputs, item, adj_own.shape[1], shares)
         turn = instance_in(batch, inputs.counts.shape[0])
         if wp.static(lanes > 1):
             for cell in range(shares.shape[0]):
                 adj_shares[cell] = Lane(0.0)
-        receiver_count = wp.min(lanes, adj_own.shape[1] - group * lanes)
+        receiver_count = wp.min(lanes, adj_own.shape[1] - block * lanes)
         adj_place = Weights()
         for q in range(inputs.directions.shape[0]):
             cosine = dot_direction(inputs.directions[q], normal)
             if is_any_above(cosine, 0.0):
                 adj = Lane()
                 for lane in range(receiver_count):
-                    adj[lane] = wp.where(cosine[lane] > 0.0, adj_own[batch, group * lanes + lane, q], 0.0)
+                    adj[lane] = wp.where(cosine[lane] > 0.0, adj_own[batch, block * lanes + lane, q], 0.0)
                 indices = inputs.indices[turn, q]
                 weights = inputs.weights[turn, q]
                 of_rays = inputs.looks_at_rays[q]
@@ -272,7 +272,7 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
                     for cell in range(shares.shape[0]):
                         adj_corner += wp.cw_mul(adj_shares[cell], shares[cell])
                 for lane in range(receiver_count):
-                    receiver = group * lanes + lane
+                    receiver = block * lanes + lane
                     gained = wp.vec3()
                     gained[corner] = adj_corner[lane]
                     adj_place_weights[batch, receiver] = adj_place_weights[batch, receiver] + gained

@@ -38,9 +38,9 @@ class ProbeWeights(NamedTuple):
     rows: wp.array  # [batch, receiver] vec3i, probes and then their backs; a vertex has one thrice
     weights: wp.array  # [batch, receiver] vec3 with sum 1
 
-    def part(self, part: slice) -> "ProbeWeights":
+    def cut(self, receivers: slice) -> "ProbeWeights":
         """Places of some receivers, without a gradient."""
-        return ProbeWeights(self.rows[:, part].contiguous(), self.weights[:, part].contiguous())
+        return ProbeWeights(self.rows[:, receivers].contiguous(), self.weights[:, receivers].contiguous())
 
 
 class VisibilityProbes(NamedTuple):

@@ -112,8 +112,8 @@ def _make_blend_adjoint(dtype: type) -> wp.Kernel:
                     if adj_areas:
                         contrast = image[instance, other] - image[instance, sample]
                         if edge_colors:
-                            upper_bound = edge_colors[instance, entries[other], opposite(direction)]
-                            contrast = upper_bound - edge_colors[instance, entry, direction]
+                            color_across = edge_colors[instance, entries[other], opposite(direction)]
+                            contrast = color_across - edge_colors[instance, entry, direction]
                         change = inner(adj, contrast)
                         wp.atomic_add(adj_areas, entry, direction, counts * change)
                         perpendicular = wp.where(direction < 2, 2, 0)

@@ -43,7 +43,7 @@ def check_spheres(points: wp.array, normals: wp.array | None, centers: wp.array,
 
 @functools.cache
 def cone_type(lanes: int) -> Any:
-    """Struct of the cones of a sphere, one for each receiver of a group."""
+    """Struct of the cones of a sphere, one for each receiver of a block."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
 
     @wp.struct
@@ -58,10 +58,10 @@ def cone_type(lanes: int) -> Any:
 
 @functools.cache
 def make_cone(lanes: int) -> wp.Function:
-    """Make the kernel function of a group of receivers: offsets to a sphere's center, and 1/radius → its cones."""
+    """Make the kernel function of a block of receivers: offsets to a sphere's center, and 1/radius → its cones."""
     Lane, Vectors, Cone = lane_type(lanes), vectors_type(lanes), cone_type(lanes)
     fn = make_lane_functions(lanes)
-    sqrt, scale, dot = fn.sqrt, fn.scale, fn.dot
+    sqrt, scale, dot, smoothstep = fn.sqrt, fn.scale, fn.dot, fn.smoothstep
     SINE2 = wp.constant(float(_SINE2))
     COSINE = wp.constant(float(_COSINE))
     RISE = wp.constant(float(_RISE))
@@ -83,8 +83,7 @@ def make_cone(lanes: int) -> wp.Function:
         cosine = sqrt(Lane(1.0) - sine2) - lack
         sine2 = sine2 + wp.cw_mul(lack, Lane(2.0 * COSINE) - lack)
         near = wp.min((1.0 / FADE) * distance, Lane(1.0))
-        weight = wp.cw_mul(wp.cw_mul(near, near), Lane(3.0) - 2.0 * near)
-        return Cone(scale(inverse, relative), cosine, sine2, weight)
+        return Cone(scale(inverse, relative), cosine, sine2, smoothstep(near))
 
     return cone
 
@@ -113,11 +112,11 @@ def make_cone_adjoint(lanes: int) -> wp.Function:
         distance = sqrt(wp.min(wp.max(dot(relative, relative), Lane(NEAREST2)), Lane(FARTHEST2)))
         inverse = wp.cw_div(Lane(1.0), distance)
         ratio2 = wp.min(wp.cw_mul(inverse, inverse), Lane(SINE2))
-        upper_bound = wp.cw_div(wp.cw_mul(ratio2, sqrt(ratio2)), sqrt(Lane(1.0) - ratio2))
+        exact_slope = wp.cw_div(wp.cw_mul(ratio2, sqrt(ratio2)), sqrt(Lane(1.0) - ratio2))
         u = Lane(1.0) - wp.min(wp.max((1.0 / BLEND) * (distance - Lane(1.0)), Lane(0.0)), Lane(1.0))
-        within = Lane(RISE) + wp.cw_mul(u, Lane(6.0 * COSINE - 4.0 * RISE) + (3.0 * RISE - 6.0 * COSINE) * u)
-        is_within = wp.min(wp.max((Lane(1.0 + BLEND) - distance) * 1.0e20, Lane(0.0)), Lane(1.0))
-        cosine_slope = upper_bound + wp.cw_mul(is_within, (1.0 / BLEND) * within - upper_bound)
+        blend_slope = Lane(RISE) + wp.cw_mul(u, Lane(6.0 * COSINE - 4.0 * RISE) + (3.0 * RISE - 6.0 * COSINE) * u)
+        is_blended = wp.min(wp.max((Lane(1.0 + BLEND) - distance) * 1.0e20, Lane(0.0)), Lane(1.0))
+        cosine_slope = exact_slope + wp.cw_mul(is_blended, (1.0 / BLEND) * blend_slope - exact_slope)
         near = wp.min((1.0 / FADE) * distance, Lane(1.0))
         weight_slope = (6.0 / FADE) * wp.cw_mul(near, Lane(1.0) - near)
 

@@ -1,6 +1,6 @@
-"""Culling: which directions spheres can block for a group of receivers, found for a bundle of four at once.
+"""Culling: the directions that spheres can darken for a block of receivers, found for a bundle of four at once.
 
-Spheres that are below the horizon of all receivers of a group, or too far from a bundle's cone, block nothing there.
+Spheres that are below the horizon of all receivers of a block, or too far from a bundle's cone, block nothing there.
 Nothing is lost by leaving them out. Order in memory does not change results, but how much is left out: neighbors had
 best be near each other, spheres as well as receivers (:mod:`warpshadow.maths.spatial_sort`).
 """
@@ -52,7 +52,7 @@ def make_cells(directions: np.ndarray, softness: float, device: wp.Device) -> Di
 
 @functools.cache
 def cap_type(lanes: int) -> Any:
-    """Struct of the caps of directions that a sphere blocks in part, one for each receiver of a group."""
+    """Struct of the caps of directions that a sphere blocks in part, one for each receiver of a block."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
 
     @wp.struct
@@ -78,7 +78,7 @@ def make_cap_functions(has_horizon: bool, lanes: int) -> CapFunctions:
     """Make the kernel functions for a number of lanes."""
     Lane, Vectors, Cap = lane_type(lanes), vectors_type(lanes), cap_type(lanes)
     fn = make_lane_functions(lanes)
-    is_any_above, dot, dot_direction = fn.is_any_above, fn.dot, fn.dot_direction
+    is_any_above, dot, dot_direction, smoothstep = fn.is_any_above, fn.dot, fn.dot_direction, fn.smoothstep
 
     @wp.func(inline=True)
     def widen(axis: Vectors, cosine: Lane, sine: Lane, cells: DirectionCells):
@@ -104,7 +104,7 @@ def make_cap_functions(has_horizon: bool, lanes: int) -> CapFunctions:
     def soften(direction: wp.vec3, cap: Cap, slope: Lane):
         t = wp.cw_mul(dot_direction(direction, cap.axis) - cap.cosine, slope)
         t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
-        return t, wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
+        return t, smoothstep(t)
 
     return CapFunctions(widen, reaches, rises, soften)
 
@@ -122,7 +122,7 @@ def make_cull(has_horizon: bool, Task: type, lanes: int) -> wp.Function:
             - ``reached_bundles`` [2, bundle], int32: bundles that a run, and then a quad, may reach, where they are
               listed.
 
-        lanes: Receivers of a group.
+        lanes: Receivers of a block.
     """
     Lane, ReceiverLanes = lane_type(lanes), receiver_lanes_type(lanes)
     fn = make_lane_functions(lanes)

@@ -84,23 +84,23 @@ def _make_begin(has_horizon: bool, lanes: int) -> wp.Function:
         scratch: wp.array2d(dtype=Lane),
         reached_bundles: wp.array3d(dtype=wp.int32),
     ):
-        batch, group, receivers = load_receivers(inputs, row)
+        batch, block, receivers = load_receivers(inputs, row)
         place = scratch_place(worker, row * all_ends.shape[1] + span)
         ends = all_ends[row, span]
         task = TransmittanceTask(cells, span * ends.shape[0], ends, reached_bundles[place], scratch[place])
-        return batch, group, receivers, task
+        return batch, block, receivers, task
 
     return begin
 
 
 @functools.cache
-def _make_block(lanes: int) -> wp.Function:
+def _make_attenuate(lanes: int) -> wp.Function:
     """Make the kernel function that lets a sphere block its share of a bundle's transmittance."""
     Lane, TransmittanceTask, Cap = lane_type(lanes), _task_type(lanes), cap_type(lanes)
     is_any_above, soften = make_lane_functions(lanes).is_any_above, make_cap_functions(False, lanes).soften
 
     @wp.func(inline=True)
-    def block(cap: Cap, slope: Lane, opacity: Lane, bundle: int, task: TransmittanceTask):
+    def attenuate(cap: Cap, slope: Lane, opacity: Lane, bundle: int, task: TransmittanceTask):
         """Returns whether anything is left."""
         maximum = Lane(0.0)
         direction = (task.first_bundle + bundle) * BUNDLE
@@ -112,7 +112,7 @@ def _make_block(lanes: int) -> wp.Function:
             task.passing[place + i] = left
         return is_any_above(maximum, _OPAQUE)
 
-    return block
+    return attenuate
 
 
 @functools.cache
@@ -121,7 +121,7 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
     ReceiverLanes, SphereView = receiver_lanes_type(lanes), sphere_view_type(lanes)
     fn = make_lane_functions(lanes)
     store_columns, sqrt, is_any_above, dot_direction = fn.store_columns, fn.sqrt, fn.is_any_above, fn.dot_direction
-    begin, falloff, block = _make_begin(has_horizon, lanes), make_falloff(lanes), _make_block(lanes)
+    begin, falloff, attenuate = _make_begin(has_horizon, lanes), make_falloff(lanes), _make_attenuate(lanes)
     widen, reaches, rises, _soften = make_cap_functions(has_horizon, lanes)
 
     @wp.func(inline=True)
@@ -136,7 +136,7 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
                 bundle = task.reached_bundles[1, k]
                 at = task.first_bundle + bundle
                 is_met = task.ends[bundle] > seen.place and reaches(cap, cells.axes[at], cells.half_angles[at])
-                if is_met and not block(cap, slope, opacity, bundle, task):
+                if is_met and not attenuate(cap, slope, opacity, bundle, task):
                     task.ends[bundle] = seen.place + 1
 
     traverse = make_traversal(make_cull(has_horizon, TransmittanceTask, lanes), visit, TransmittanceTask, False, lanes)
@@ -155,10 +155,10 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
         all_ends: wp.array3d(dtype=wp.int32),
         transmittance: wp.array3d(dtype=wp.float32),
     ):
-        """A thread owns a group of receivers and a span of bundles; ends are the spheres where it stopped looking."""
+        """A thread owns a block of receivers and a span of bundles; ends are the spheres where it stopped looking."""
         i, j = wp.tid()
         span, row = find_run(worker, first_row + i, j)
-        batch, group, receivers, task = begin(row, span, worker, inputs, cells, all_ends, scratch, reached_bundles)
+        batch, block, receivers, task = begin(row, span, worker, inputs, cells, all_ends, scratch, reached_bundles)
         for bundle in range(task.ends.shape[0]):
             for i in range(BUNDLE):
                 task.passing[bundle * BUNDLE + i] = Lane(1.0)
@@ -169,7 +169,7 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
                     task.ends[bundle] = 0  # wholly below the horizon: the cosine is zero there
         traverse(receivers, batch, inputs.spheres, Gradients(), task)
         direction_count = task.ends.shape[0] * BUNDLE
-        store_columns(task.passing, task.first_bundle * BUNDLE, direction_count, group, transmittance[batch])
+        store_columns(task.passing, task.first_bundle * BUNDLE, direction_count, block, transmittance[batch])
 
     return transmit
 
@@ -253,15 +253,15 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
         adj_radii: wp.array2d(dtype=wp.float32),
         adj_extents: wp.array2d(dtype=wp.float32),
     ):
-        """A thread owns a group of receivers and a span of bundles."""
+        """A thread owns a block of receivers and a span of bundles."""
         i, j = wp.tid()
         span, row = find_run(worker, first_row + i, j)
-        batch, group, receivers, task = begin(row, span, worker, inputs, cells, all_ends, scratch, reached_bundles)
+        batch, block, receivers, task = begin(row, span, worker, inputs, cells, all_ends, scratch, reached_bundles)
         begin_column, count = task.first_bundle * BUNDLE, task.ends.shape[0] * BUNDLE
-        load_products(transmittance[batch], adj_transmittance[batch], begin_column, count, group, task.passing)
+        load_products(transmittance[batch], adj_transmittance[batch], begin_column, count, block, task.passing)
         adj = traverse(receivers, batch, inputs.spheres, Gradients(adj_centers, adj_radii, adj_extents), task)
         if adj_points:
-            add_vectors(adj.points, group, adj_points[batch])
+            add_vectors(adj.points, block, adj_points[batch])
 
     return transmit_adjoint
 

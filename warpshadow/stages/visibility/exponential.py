@@ -118,7 +118,7 @@ def _make_measure(order: int, lanes: int) -> wp.Function:
             # overflows
             root[lane] = wp.exp(0.5 * s * log[0][lane] / UNIT)
             t = wp.clamp((s * depth[lane] / threshold - 0.5) * PER_BLEND, 0.0, 1.0)
-            blend[lane] = t * t * (3.0 - 2.0 * t)
+            blend[lane] = wp.smoothstep(0.0, 1.0, t)
             blend_slope[lane] = 6.0 * PER_BLEND * t * (1.0 - t) * s / threshold
         return count, scale, sqrt(norm2), depth, maximum, root, blend, blend_slope
 
@@ -209,20 +209,20 @@ def _make_exponentiate(order: int, base: str, keeps_powers: bool, lanes: int) ->
         visibility: wp.array3d(dtype=wp.float32),
         faults: wp.array(dtype=wp.int32),
     ):
-        """A thread owns a group of receivers: base approximation of f / 2^p, then p squarings.
+        """A thread owns a block of receivers: base approximation of f / 2^p, then p squarings.
 
         Powers are the approximation of f / 2^{p+1}, then its squares. Faults count the receivers whose squarings are
         held, and the receivers whose log is too large or not finite.
         """
         thread = first_row + wp.tid()
-        batch, group = find_block(thread, log_sh.shape[1])
+        batch, block = find_block(thread, log_sh.shape[1])
         thread_scratch = scratch[scratch_place(worker, thread)]
         row = thread_scratch[0]
         square = thread_scratch[1]
         half = thread_scratch[2]
         if wp.static(keeps_powers):
-            half = powers[batch, group, 0]
-        load_rows(log_sh[batch], group, row)
+            half = powers[batch, block, 0]
+        load_rows(log_sh[batch], block, row)
         count, scale, norm, depth, maximum, root, blend, _slope = measure(row, threshold)
         mean = row[0]
         row[0] = Lane(0.0)
@@ -238,17 +238,17 @@ def _make_exponentiate(order: int, base: str, keeps_powers: bool, lanes: int) ->
         for step in range(maximum):
             if wp.static(keeps_powers):
                 for i in range(wp.static(order**2)):
-                    powers[batch, group, step + 1, i] = row[i]
+                    powers[batch, block, step + 1, i] = row[i]
             is_due = wp.min(wp.max(count - Lane(float(step)), Lane(0.0)), Lane(1.0))  # 1 while step < p
             held += wp.cw_mul(is_due, square_held(row, depth, table, square))
             for i in range(wp.static(order**2)):
                 row[i] = wp.cw_mul(Lane(1.0) - is_due, row[i]) + wp.cw_mul(is_due, square[i])
-        for lane in range(wp.min(lanes, log_sh.shape[1] - group * lanes)):
+        for lane in range(wp.min(lanes, log_sh.shape[1] - block * lanes)):
             if not wp.isfinite(depth[lane] + mean[lane]):
                 wp.atomic_add(faults, 1, 1)
             elif held[lane] > 0.0:
                 wp.atomic_add(faults, 0, 1)
-        store_rows(row, group, visibility[batch])
+        store_rows(row, block, visibility[batch])
 
     return exponentiate_log_sh
 
@@ -278,7 +278,7 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
         # out
         adj_log_sh: wp.array3d(dtype=wp.float32),
     ):
-        """A thread owns a group of receivers and goes back through the squarings, then the base.
+        """A thread owns a block of receivers and goes back through the squarings, then the base.
 
         The base is v = q + w (H(u) − q) with q of h = f̂ / 2^p and u of h/2, each F (a 1 + b h + c h * h), and
         F = exp(2^−p f0/√4π), of u its root. So q̄ = (1 − w) v̄, ū = w H̄, w̄ = Σ v̄ H(u) − Σ v̄ q, |f̂|¯ = w̄ w', and
@@ -286,25 +286,25 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
         also F (√4π q̄0 a' + b' Σ q̄ h) h/|h| and the like of ū. For `quadratic` q = 4 √F u − F (3 + h).
         """
         thread = first_row + wp.tid()
-        batch, group = find_block(thread, log_sh.shape[1])
+        batch, block = find_block(thread, log_sh.shape[1])
         thread_scratch = scratch[scratch_place(worker, thread)]
         log = thread_scratch[0]
         adj_row = thread_scratch[1]
         product = thread_scratch[2]
         bent = thread_scratch[3]
-        load_rows(log_sh[batch], group, log)
-        load_rows(adj_visibility[batch], group, adj_row)
+        load_rows(log_sh[batch], block, log)
+        load_rows(adj_visibility[batch], block, adj_row)
         count, scale, norm, depth, maximum, root, blend, blend_slope = measure(log, threshold)
         adj_depth = Lane(0.0)
         for back in range(maximum):
             step = maximum - 1 - back
             is_due = wp.min(wp.max(count - Lane(float(step)), Lane(0.0)), Lane(1.0))
-            _along, change = square_held_adjoint(powers[batch, group, step + 1], depth, table, adj_row, product)
+            _along, change = square_held_adjoint(powers[batch, block, step + 1], depth, table, adj_row, product)
             adj_depth += wp.cw_mul(is_due, change)
             for i in range(wp.static(order**2)):
                 adj_row[i] = adj_row[i] + wp.cw_mul(is_due, product[i] - adj_row[i])
 
-        half = powers[batch, group, 0]
+        half = powers[batch, block, 0]
         above = wp.cw_mul(scale, wp.max(log[0], Lane(0.0)))
         log[0] = Lane(0.0)
         factor = wp.cw_mul(root, root)
@@ -358,7 +358,7 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
         for i in range(1, wp.static(order**2)):
             adj_row[i] = wp.cw_mul(scale, adj_row[i]) + wp.cw_mul(adj_depth, log[i])
         adj_row[0] = wp.cw_mul(scale, dc) / UNIT + wp.cw_mul(adj_depth, above)
-        add_rows(adj_row, group, adj_log_sh[batch])
+        add_rows(adj_row, block, adj_log_sh[batch])
 
     return exponentiate_log_sh_adjoint
 
@@ -400,11 +400,11 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
     device = log_sh.device
     lanes = lane_count(device)
     batch_count, vertex_count = log_sh.shape[:2]
-    groups = block_count(vertex_count, lanes)
-    row_count = batch_count * groups
+    blocks = block_count(vertex_count, lanes)
+    row_count = batch_count * blocks
     scratch = [Scratch((4, order**2), lane_type(lanes))]
     # memory that no squaring reaches is never touched
-    powers_shape = batch_count, groups, MAX_SQUARINGS + 1, order**2
+    powers_shape = batch_count, blocks, MAX_SQUARINGS + 1, order**2
     powers = empty(powers_shape, dtype=lane_type(lanes), device=device) if log_sh.requires_grad else None
     optimal = _optimal_table(order, str(device)) if base == "optimal_linear" else None
     faults = zeros(2, dtype=wp.int32, device=device)

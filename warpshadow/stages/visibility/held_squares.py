@@ -45,7 +45,7 @@ def _make_hold(lanes: int) -> wp.Function:
             for lane in range(lanes):
                 if loudness[lane] > SQUARED_BELOW:
                     t = wp.min(wp.log(loudness[lane] / SQUARED_BELOW) * PER_OCTAVES, 1.0)
-                    share[lane] = 1.0 - t * t * (3.0 - 2.0 * t)
+                    share[lane] = 1.0 - wp.smoothstep(0.0, 1.0, t)
                     slope[lane] = -6.0 * PER_OCTAVES * t * (1.0 - t) / loudness[lane]
         return share, slope
 

@@ -38,7 +38,7 @@ _PAIR_COST = 0.25  # nanoseconds that a sphere costs for a receiver and a coeffi
 
 @functools.cache
 def _task_type(order: int, lanes: int) -> Any:
-    """Struct of a thread's work: a group's coefficients."""
+    """Struct of a thread's work: a block's coefficients."""
     Lane, Band = lane_type(lanes), band_type(order)
 
     @wp.struct
@@ -52,13 +52,13 @@ def _task_type(order: int, lanes: int) -> Any:
 @functools.cache
 def _make_horizon(lanes: int) -> wp.Function:
     """Make the kernel function of the fade at the horizon: n·d/r → weight and its derivative."""
-    Lane = lane_type(lanes)
+    Lane, smoothstep = lane_type(lanes), make_lane_functions(lanes).smoothstep
 
     @wp.func(inline=True)
     def horizon(height: Lane):
         t = wp.min(wp.max((height + Lane(1.0)) / HORIZON_FADE, Lane(0.0)), Lane(1.0))
         slope = 6.0 / HORIZON_FADE * wp.cw_mul(t, Lane(1.0) - t)
-        return wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t), slope
+        return smoothstep(t), slope
 
     return horizon
 
@@ -119,14 +119,14 @@ def _make_accumulate(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
         # out
         log_sh: wp.array3d(dtype=wp.float32),
     ):
-        """A thread owns a group of receivers and sums the log-visibility of all spheres."""
+        """A thread owns a block of receivers and sums the log-visibility of all spheres."""
         thread = first_row + wp.tid()
-        batch, group, receivers = load_receivers(inputs, thread)
+        batch, block, receivers = load_receivers(inputs, thread)
         row = total[scratch_place(worker, thread)]
         for i in range(wp.static(order**2)):
             row[i] = Lane(0.0)
         traverse(receivers, batch, inputs.spheres, Gradients(), LogTask(table, row))
-        store_rows(row, group, log_sh[batch])
+        store_rows(row, block, log_sh[batch])
 
     return accumulate_log_sh
 
@@ -210,17 +210,17 @@ def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Ke
         adj_radii: wp.array2d(dtype=wp.float32),
         adj_extents: wp.array2d(dtype=wp.float32),
     ):
-        """A thread owns a group of receivers."""
+        """A thread owns a block of receivers."""
         thread = first_row + wp.tid()
-        batch, group, receivers = load_receivers(inputs, thread)
+        batch, block, receivers = load_receivers(inputs, thread)
         row = scratch[scratch_place(worker, thread)]
-        load_rows(adj_log_sh[batch], group, row)
+        load_rows(adj_log_sh[batch], block, row)
         gradients = Gradients(adj_centers, adj_radii, adj_extents)
         adj = traverse(receivers, batch, inputs.spheres, gradients, LogTask(table, row))
         if adj_points:
-            add_vectors(adj.points, group, adj_points[batch])
+            add_vectors(adj.points, block, adj_points[batch])
         if adj_normals:
-            add_vectors(adj.normals, group, adj_normals[batch])
+            add_vectors(adj.normals, block, adj_normals[batch])
 
     return accumulate_log_sh_adjoint
 

@@ -188,7 +188,7 @@ class Gradients:
 
 @functools.cache
 def make_add_to_node(lanes: int) -> wp.Function:
-    """Make the kernel function that adds a group's share to the gradients of a node."""
+    """Make the kernel function that adds a block's share to the gradients of a node."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
     total = make_lane_functions(lanes).total
 
@@ -211,7 +211,8 @@ def make_add_to_node(lanes: int) -> wp.Function:
 def _make_blend(lanes: int) -> wp.Function:
     """Make the kernel function of the share m of a quad's sphere: d/E, τ → m, and its derivative by (D/E)²."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
-    dot = make_lane_functions(lanes).dot
+    fn = make_lane_functions(lanes)
+    dot, smoothstep = fn.dot, fn.smoothstep
     BLEND2 = wp.constant(_BLEND_ANGLE_RATIO**2)
     FARTHEST2 = wp.constant(_FARTHEST2)
 
@@ -222,14 +223,14 @@ def _make_blend(lanes: int) -> wp.Function:
         slope = 1.0 / (angle * angle * (1.0 - BLEND2))
         t = wp.min(wp.max(slope * (Lane(angle * angle) - inverse2), Lane(0.0)), Lane(1.0))
         rise = (6.0 * slope) * wp.cw_mul(wp.cw_mul(t, Lane(1.0) - t), wp.cw_mul(inverse2, inverse2))
-        return wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t), rise
+        return smoothstep(t), rise
 
     return blend
 
 
 @functools.cache
 def _make_relative(lanes: int) -> wp.Function:
-    """Make the kernel function of the offset from a group of receivers to a quad, over its extent: d/E and 1/E."""
+    """Make the kernel function of the offset from a block of receivers to a quad, over its extent: d/E and 1/E."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
 
     @wp.func
@@ -248,7 +249,7 @@ def _make_relative(lanes: int) -> wp.Function:
 
 @functools.cache
 def make_merged(lanes: int) -> wp.Function:
-    """Make the kernel function of the share that a quad's sphere has for a group of receivers."""
+    """Make the kernel function of the share that a quad's sphere has for a block of receivers."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
     blend, relative = _make_blend(lanes), _make_relative(lanes)
 

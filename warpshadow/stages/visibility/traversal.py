@@ -1,4 +1,4 @@
-"""The traversal of spheres: a group of receivers visits the spheres that it can see, many at once left out.
+"""The traversal of spheres: a block of receivers visits the spheres that it can see, many at once left out.
 
 Four spheres that follow each other make up a quad, which has a sphere of its own for receivers far away
 (:mod:`warpshadow.stages.visibility.merging`), and four quads a run. Runs are culled as a whole; then quads; then
@@ -151,7 +151,7 @@ def _find_bounds(nodes: ClusterNodes, sphere_count: int, quad_count: int) -> wp.
 
 @functools.cache
 def receiver_lanes_type(lanes: int) -> Any:
-    """Struct of a group of receivers."""
+    """Struct of a block of receivers."""
     Vectors = vectors_type(lanes)
 
     @wp.struct
@@ -164,25 +164,25 @@ def receiver_lanes_type(lanes: int) -> Any:
 
 @functools.cache
 def make_load_receivers(has_horizon: bool, lanes: int) -> wp.Function:
-    """Make the kernel function that loads a group of receivers: inputs, row → instance, group, receivers."""
+    """Make the kernel function that loads a block of receivers: inputs, row → instance, block, receivers."""
     Vectors, ReceiverLanes = vectors_type(lanes), receiver_lanes_type(lanes)
     fn = make_lane_functions(lanes)
     find_block, load = fn.find_block, fn.load
 
     @wp.func(inline=True)
     def load_receivers(inputs: TraversalInputs, row: int):
-        batch, group = find_block(row, inputs.points.shape[1])
+        batch, block = find_block(row, inputs.points.shape[1])
         normals = Vectors()
         if wp.static(has_horizon):
-            normals = load(inputs.normals[batch], group)
-        return batch, group, ReceiverLanes(load(inputs.points[batch], group), normals)
+            normals = load(inputs.normals[batch], block)
+        return batch, block, ReceiverLanes(load(inputs.points[batch], block), normals)
 
     return load_receivers
 
 
 @functools.cache
 def sphere_view_type(lanes: int) -> Any:
-    """Struct of a sphere as a group of receivers sees it."""
+    """Struct of a sphere as a block of receivers sees it."""
     Lane, Vectors, Cone = lane_type(lanes), vectors_type(lanes), cone_type(lanes)
 
     @wp.struct
@@ -199,7 +199,7 @@ def sphere_view_type(lanes: int) -> Any:
 
 @functools.cache
 def sphere_adjoint_type(lanes: int) -> Any:
-    """Struct of the adjoints of a sphere's contribution to a group of receivers."""
+    """Struct of the adjoints of a sphere's contribution to a block of receivers."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
 
     @wp.struct
@@ -220,16 +220,17 @@ def lane_structs(lanes: int) -> tuple[Any, Any, Any]:
 
 @functools.cache
 def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint: bool, lanes: int) -> wp.Function:
-    """Make the kernel function that visits the spheres that a group of receivers can see.
+    """Make the kernel function that visits the spheres that a block of receivers can see.
 
     Args:
         cull: (receivers, bound, place, among, task) → how many of ``among`` candidates the spheres in a bound may
-            matter to. The first sphere has that place in the traversal; a quad's candidates are the receivers that its
-            run left.
-        visit: (receivers, seen, count, task), called for each sphere with the count of its quad; for an adjoint → Pull.
+            matter to. The first sphere has that place in the traversal; a quad has the
+            candidates that its run left.
+        visit: (receivers, seen, count, task), called for each sphere with the count of its quad; for an adjoint →
+            SphereAdjoint.
         Task: Struct of all else that these two read and write.
         is_adjoint: Whether to sum the results of the visits.
-        lanes: Receivers of a group.
+        lanes: Receivers of a block.
     """
     Lane = lane_type(lanes)
     ReceiverLanes, SphereView = receiver_lanes_type(lanes), sphere_view_type(lanes)
