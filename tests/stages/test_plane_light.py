@@ -75,10 +75,10 @@ def area_in_disc(a, b):
 
 
 def share_in_outline(outline, y, slope, size):
-    """Part of the ellipse of a footprint that an outline encloses."""
+    """Part of the ellipse of a footprint that an outline encloses; that of holes alone is negative."""
     values, axes = np.linalg.eigh(np.eye(2) + np.outer(slope, slope))
     edges = (outline - y) @ axes / np.sqrt(values) / size
-    return np.clip(np.linalg.det(axes) * sum(area_in_disc(*edge) for edge in edges) / np.pi, 0, 1)  # axes may mirror
+    return np.linalg.det(axes) * sum(area_in_disc(*edge) for edge in edges) / np.pi  # axes may mirror
 
 
 def around(texels):
@@ -147,7 +147,9 @@ def met_sides(point, omega, radius, frames, grids, radiosity, skip, fronts=None)
             inside = ramp((edges[1] - y) / extents) - ramp((edges[0] - y) / extents)
             share = side_weight * ramp(ratio) * inside.prod()
             if not grid.is_whole and len(grid.outline) <= prepared.MAX_EDGES:
-                share = side_weight * ramp(ratio) * share_in_outline(grid.outline, y, axes @ omega / mean, t * radius)
+                outline, within = (grid.outline, 0.0) if grid.holes() is None else (grid.holes(), inside.prod())
+                within += share_in_outline(outline, y, axes @ omega / mean, t * radius)
+                share = side_weight * ramp(ratio) * np.clip(within, 0, 1)
             elif not grid.is_whole:
                 share *= fetched(grid.covered[..., None].astype(float), grid, y, mean, t, radius, halved)[0]
             light = np.zeros(3)

@@ -279,23 +279,26 @@ def find_footprint(grid: PlaneGrid, scene: PlaneArrays, at: wp.vec3, toward: wp.
     footprint.per_cosine = 1.0 / cosine
     footprint.distance = at[2] * footprint.per_cosine
     footprint.center = wp.vec2(at[0] + footprint.distance * toward[0], at[1] + footprint.distance * toward[1])
+    inside = float(1.0)
     if not _is_amid(grid, footprint, scene.radius):
         for axis in range(2):
             slope = toward[axis] * footprint.per_cosine
             extent = footprint.distance * scene.radius * wp.sqrt(1.0 + slope * slope)
             to_most = (grid.most[axis] - footprint.center[axis]) / extent
             to_least = (grid.least[axis] - footprint.center[axis]) / extent
-            if grid.edge_count == 0:
-                footprint.share = footprint.share * (step(to_most) - step(to_least))
+            if grid.edge_count == 0 or grid.is_framed == 1:
+                inside = inside * (step(to_most) - step(to_least))
             elif to_most <= -1.0 or to_least >= 1.0:
-                footprint.share = 0.0
-    if grid.edge_count > 0 and footprint.share > 0.0:
+                inside = 0.0
+    if grid.edge_count > 0 and inside > 0.0 and footprint.share > 0.0:
         ellipse = find_ellipse(
             footprint.center,
             footprint.per_cosine * wp.vec2(toward[0], toward[1]),
             footprint.distance * scene.radius,
         )
-        footprint.share *= share_in_outline(scene.edges, grid.first_edge, grid.edge_count, ellipse)
+        in_outline = share_in_outline(scene.edges, grid.first_edge, grid.edge_count, ellipse)
+        inside = wp.clamp(wp.where(grid.is_framed == 1, inside, 0.0) + in_outline, 0.0, 1.0)
+    footprint.share *= inside
     return footprint
 
 
@@ -314,32 +317,34 @@ def find_footprint_adjoint(
     """Gradients of ``at``, ``toward`` and ``side_weight``, given the footprint's and the mean cosine's, c′."""
     radius = scene.radius
     horizon = step(toward[2] * scene.per_radius)
-    inside_x = float(1.0)
-    inside_y = float(1.0)
+    inside = float(1.0)
+    adj_inside = adj_share * side_weight * horizon
     adj_t = adj_distance
     adj_c = adj_cosine
     adj_x = adj_center[0]
     adj_y = adj_center[1]
     adj_toward = wp.vec3()
     slope = wp.vec2(toward[0], toward[1]) * footprint.per_cosine
+    is_soft = (grid.edge_count == 0 or grid.is_framed == 1) and not _is_amid(grid, footprint, radius)
     if grid.edge_count > 0:
         ellipse = find_ellipse(footprint.center, slope, footprint.distance * radius)
-        inside_x = share_in_outline(scene.edges, grid.first_edge, grid.edge_count, ellipse)
-        adj_inside = adj_share * side_weight * horizon
+        inside = wp.where(grid.is_framed == 1, 1.0, 0.0)
+        inside += share_in_outline(scene.edges, grid.first_edge, grid.edge_count, ellipse)
         adj = share_in_outline_adjoint(scene.edges, grid.first_edge, grid.edge_count, ellipse, adj_inside)
         adj_x += adj.center[0]
         adj_y += adj.center[1]
         adj_t += adj.log_size / footprint.distance
-        adj_toward = footprint.per_cosine * wp.vec3(adj.slope[0], adj.slope[1], 0.0)
+        adj_toward += footprint.per_cosine * wp.vec3(adj.slope[0], adj.slope[1], 0.0)
         adj_c -= wp.dot(adj.slope, slope) * footprint.per_cosine
-    elif not _is_amid(grid, footprint, radius):
+    if is_soft:
         stretch = wp.vec2(wp.sqrt(1.0 + slope[0] * slope[0]), wp.sqrt(1.0 + slope[1] * slope[1]))
         extent = footprint.distance * radius * stretch
         to_most = wp.cw_div(grid.most - footprint.center, extent)
         to_least = wp.cw_div(grid.least - footprint.center, extent)
         inside_x = step(to_most[0]) - step(to_least[0])
         inside_y = step(to_most[1]) - step(to_least[1])
-        adj_insides = adj_share * side_weight * horizon * wp.vec2(inside_y, inside_x)
+        inside += inside_x * inside_y - 1.0
+        adj_insides = adj_inside * wp.vec2(inside_y, inside_x)
         adj_to_most = wp.cw_div(wp.cw_mul(adj_insides, wp.vec2(step_slope(to_most[0]), step_slope(to_most[1]))), extent)
         adj_to_least = wp.cw_div(
             wp.cw_mul(adj_insides, wp.vec2(step_slope(to_least[0]), step_slope(to_least[1]))), extent
@@ -349,9 +354,9 @@ def find_footprint_adjoint(
         adj_extent = wp.cw_mul(adj_to_least, to_least) - wp.cw_mul(adj_to_most, to_most)
         adj_t += radius * wp.dot(adj_extent, stretch)
         adj_slope = (footprint.distance * radius) * wp.cw_div(wp.cw_mul(adj_extent, slope), stretch)
-        adj_toward = wp.vec3(adj_slope[0] * footprint.per_cosine, adj_slope[1] * footprint.per_cosine, 0.0)
+        adj_toward += footprint.per_cosine * wp.vec3(adj_slope[0], adj_slope[1], 0.0)
         adj_c -= wp.dot(adj_slope, slope) * footprint.per_cosine
-    adj_inside_share = adj_share * inside_x * inside_y
+    adj_inside_share = adj_share * wp.clamp(inside, 0.0, 1.0)
     adj_t += adj_x * toward[0] + adj_y * toward[1]
     adj_c -= adj_t * footprint.distance * footprint.per_cosine
     if toward[2] < radius:

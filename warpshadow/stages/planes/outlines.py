@@ -85,7 +85,7 @@ def _find_edge(ellipse: Ellipse, ends: wp.vec4):
 
 @wp.func
 def share_in_outline(edges: wp.array(dtype=wp.vec4), first: int, count: int, ellipse: Ellipse):
-    """Share of a footprint, h, in an outline of ``count`` edges from ``first`` on."""
+    """Share of a footprint, h, in an outline of ``count`` edges from ``first`` on; that of holes alone is negative."""
     winding = int(0)
     area = float(0.0)
     for e in range(first, first + count):
@@ -96,7 +96,7 @@ def share_in_outline(edges: wp.array(dtype=wp.vec4), first: int, count: int, ell
             d = edge.distance
             angle = wp.atan2(wp.abs(d) * length, d * d + edge.begin * edge.end)
             area += 0.5 * (d * length - wp.where(edge.is_left, angle, -angle))
-    return wp.clamp(float(winding) + area / wp.pi, 0.0, 1.0)
+    return float(winding) + area / wp.pi
 
 
 @wp.struct

@@ -50,6 +50,7 @@ class PlaneGrid:
     is_whole: int  # the mesh covers the rectangle
     first_edge: int  # of its outline, where it does not
     edge_count: int  # 0 where texels say how much the mesh covers
+    is_framed: int  # whether these are of holes in the rectangle, the border of which is as soft as its neighbors'
     blocks: int
 
 
@@ -92,8 +93,9 @@ class PlaneBlockers:
         grids, covered, edges, pyramids, frames, texel_count = [], [], [np.empty((0, 4))], [], [], 0
         for body in bodies:
             grid, first_level, first_edge = body.grid, len(levels), sum(map(len, edges))
+            holes = grid.holes()
             if not grid.is_whole and len(grid.outline) <= MAX_EDGES:
-                edges.append(grid.outline.reshape(-1, 4))
+                edges.append((grid.outline if holes is None else holes).reshape(-1, 4))
             matrices = _halvings(*grid.covered.shape)
             for side in range(grid.sides):
                 for matrix, blurred, (height, width) in matrices:
@@ -106,6 +108,7 @@ class PlaneBlockers:
                         pyramids.append(_shifted(blurred.multiply(grid.covered.ravel()).tocsr(), first, patch_count))
             edge_count = sum(map(len, edges)) - first_edge
             grids.append(_kernel_grid(body, first_level, len(matrices), first_edge, edge_count))
+            grids[-1].is_framed = int(holes is not None)
             frames.append(_frame_matrix(body, vertex_count))
         return PlaneBlockers(
             len(bodies),
