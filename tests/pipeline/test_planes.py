@@ -235,3 +235,27 @@ def test_the_edge_of_a_plate_in_a_sun_is_as_soft_as_the_sun():
         for visibility in (ws.Visibility("directional"), ws.Visibility("ray-traced", samples=1024))
     )
     assert np.sqrt(np.mean((image - truth)[..., :3] ** 2)) < 0.02 * truth[..., :3].mean()
+
+
+def in_a_corner(*, has_window):
+    """A floor in the shadow of two walls that meet, one of which may have a window; the sun stands behind the seam."""
+    wall = ws.plane(2.0, 8)
+    middles = wall.positions[wall.faces].mean(axis=1)
+    is_open = has_window & (np.abs(middles[:, 0] + 0.5) < 0.25) & (np.abs(middles[:, 2]) < 0.25)
+    walls = [
+        ws.Body(ws.Mesh(wall.positions, wall.faces[~is_open]), rotation=(90, 0, 0), translation=(0, 1, 0)),
+        ws.Body(wall, rotation=(0, 0, 90), translation=(1, 1, -1)),
+    ]
+    floor = ws.Body(ws.plane(0.8, 24), translation=(0.6, 0.3, -0.4), receivers="pixel", name="floor")
+    sky = ws.synthetic_sky((0.5, 0.4, 0.5), sun_radius=3, sun_strength=20)
+    camera = ws.Camera.look_at((0.6, 3, -0.39), (0.6, 0, -0.4), fov_y=15, size=(32, 32))
+    return ws.Scene([*walls, floor], sky, camera)
+
+
+def test_no_sun_comes_through_the_seam_of_a_wall_with_a_window():
+    lit = dataclasses.replace(in_a_corner(has_window=False), visibility=ws.Visibility("none"))
+    dark, with_window = (ws.Renderer(in_a_corner(has_window=value)).render() for value in (False, True))
+    shadow = (ws.Renderer(lit).render() - dark)[..., :3].max()
+    assert shadow > 0.5
+    away_from_window = np.s_[16:, 20:, :3]
+    assert np.abs(with_window - dark)[away_from_window].max() < 0.003 * shadow
