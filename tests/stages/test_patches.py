@@ -127,7 +127,7 @@ def test_sources_of_small_faces_are_vertices():
 def test_needles_do_not_make_pieces_without_end():
     needles = np.array([[[0, y, 0], [100, y, 0], [0, y + 1e-4, 0]] for y in range(50)]).reshape(-1, 3)
     positions = np.concatenate([needles, [[0, 0, 1], [1, 0, 1], [0, 1, 1]]])
-    patches = find_patches(positions, np.arange(len(positions)).reshape(-1, 3), is_two_sided=True)
+    patches = find_patches(positions, np.arange(len(positions)).reshape(-1, 3), is_two_sided=True, count=128)
     assert len(patches.pieces.faces) < 40 * 256
     assert patches.areas.sum() == pytest.approx(2 * (0.5 + 50 * 100 * 1e-4 / 2))
 

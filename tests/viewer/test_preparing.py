@@ -53,7 +53,7 @@ def test_another_process_fills_the_caches_and_says_how_far_it_is():
 
 def test_a_process_that_is_closed_ends_and_keeps_what_it_has():
     notes = []
-    preparation = Preparation(scene(512, subdivisions=4), notes.append)
+    preparation = Preparation(scene(1024, subdivisions=5), notes.append)
     eventually(lambda: any("fitting" in note and " 0 of" not in note for note in notes))
     preparation.close()
     assert preparation._process.wait(LONG) is not None

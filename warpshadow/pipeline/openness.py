@@ -34,18 +34,16 @@ def openness_errors(
     Returns:
         Of each of these bodies, shape [body]; 0 where no image shows it.
     """
-    device = merged_scene.device
-    points = wp.array(positions, dtype=wp.vec3, device=device)
-    mesh = merged_scene.casting_mesh(points)
-    result = np.zeros(len(bodies))
-    if mesh is None:
-        return result
-    normals = vertex_normals(points.reshape((1, -1)), merged_scene.faces).numpy()[0]
+    device, result = merged_scene.device, np.zeros(len(bodies))
     seen, counts = (np.concatenate(parts) for parts in zip(*images, strict=True))
     of_body = [np.flatnonzero(merged_scene.body_of_face[seen] == body) for body in bodies]
     chosen = [rows[:: -(-len(rows) // _FACES)] if len(rows) else rows for rows in of_body]
-    if not any(map(len, chosen)):
+    if not merged_scene.casting or not any(map(len, chosen)):
         return result
+    points = wp.array(positions, dtype=wp.vec3, device=device)
+    mesh = merged_scene.casting_mesh(points)
+    assert mesh is not None
+    normals = vertex_normals(points.reshape((1, -1)), merged_scene.faces).numpy()[0]
     corners = merged_scene.faces.numpy()[seen[np.concatenate(chosen)]]
     vertices, place = np.unique(corners, return_inverse=True)
     middles = positions[corners].mean(axis=1), _unit(normals[corners].mean(axis=1))
