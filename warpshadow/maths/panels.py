@@ -12,16 +12,15 @@ TOLERANCES = (0.02, 0.03)
 """Thickness and mean gap of a panel at most, over the size of the mesh: the second where the first takes too many.
 
 The tent of demos/kinds.py has 6 panels, and its image by pixel is 3.1% off; with 0.01 it has 16, and the image is 2.9%
-off, in 1.5 times the time. With spheres it was 10.2% off. An umbrella of eight arched fields has 48, and its image is
-2.1% off, with 24 of 0.03 it is 2.7%, with spheres 7.1%. With 0.04 light comes through between the panels of half a
-shell, which has 48 of 0.03.
+off, in 1.5 times the time. With spheres it was 10.2% off. With 0.04 light comes through between the panels of half a
+shell.
 """
 
 MAX_PANELS = 64
 """Panels of a mesh at most: beyond, spheres are faster.
 
 With a panel for each of the 162 leaves of the tree of demos/kinds.py its image takes 2.4 times as long, and is 5.3% off
-in place of 5.6%. With the 48 of an umbrella it takes 1.6 times as long as with 1024 spheres.
+in place of 5.6%. An umbrella of eight arched fields has 48.
 """
 
 _CREASE = 0.94
