@@ -11,12 +11,12 @@ distance d below the receiver:
     h = S(c/ρ) · Π_axes [S((y_most − y)/e) − S((y_least − y)/e)],  e = t ρ √(1 + (ω_axis / c′)²)
                                               coverage: part of the cell that the rectangle takes
 
-S(z) is the smoothstep from 0 at −1 to 1 at 1, so h has no step at the horizon, or at the border. Of a mesh with holes,
-or one that is no rectangle, the outline takes the place of the product (:mod:`.outlines`), or, where it has very many
-edges, the product is multiplied with the mesh's share of the footprint, by texels. Radiosity is bilinear in two mip
-levels of the grid, which are blended so that their texels are as wide as the footprint is in the mean of both axes,
-2 t ρ / √c′: twice the disc of the cell, as interpolation between means is, so that together cells see all texels alike.
-For a sun alone that is too wide: there texels are half as wide.
+S(z) is the smoothstep from 0 at −1 to 1 at 1, so h has no step at the horizon, or at the border. From a rectangle with
+holes their shares of the footprint are taken off the product, and of a mesh that is no rectangle the outline takes its
+place (:mod:`.outlines`); where edges are many, the product is multiplied with the mesh's share of the footprint, by
+texels. Radiosity is bilinear in two mip levels of the grid, which are blended so that their texels are as wide as the
+footprint is in the mean of both axes, 2 t ρ / √c′: twice the disc of the cell, as interpolation between means is, so
+that together cells see all texels alike. For a sun alone that is too wide: there texels are half as wide.
 
 No receiver is nearer to a side than a margin, so that t is not 0. Which side it is on, :mod:`.fronts` says; by height
 alone the front fades away and the back appears from the plane to a margin below it.

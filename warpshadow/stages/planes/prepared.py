@@ -93,8 +93,9 @@ class PlaneBlockers:
         grids, covered, edges, pyramids, frames, texel_count = [], [], [np.empty((0, 4))], [], [], 0
         for body in bodies:
             grid, first_level, first_edge = body.grid, len(levels), sum(map(len, edges))
-            holes = grid.holes()
+            holes = None
             if not grid.is_whole and len(grid.outline) <= MAX_EDGES:
+                holes = grid.holes()
                 edges.append((grid.outline if holes is None else holes).reshape(-1, 4))
             matrices = _halvings(*grid.covered.shape)
             for side in range(grid.sides):
@@ -107,8 +108,8 @@ class PlaneBlockers:
                         first = body.first_patch + side * grid.covered.size
                         pyramids.append(_shifted(blurred.multiply(grid.covered.ravel()).tocsr(), first, patch_count))
             edge_count = sum(map(len, edges)) - first_edge
-            grids.append(_kernel_grid(body, first_level, len(matrices), first_edge, edge_count))
-            grids[-1].is_framed = int(holes is not None)
+            is_framed = holes is not None
+            grids.append(_kernel_grid(body, first_level, len(matrices), first_edge, edge_count, is_framed))
             frames.append(_frame_matrix(body, vertex_count))
         return PlaneBlockers(
             len(bodies),
@@ -177,7 +178,9 @@ def _shifted(matrix: csr_matrix, first: int, count: int) -> csr_matrix:
     return csr_matrix((matrix.data, matrix.indices + first, matrix.indptr), shape=(matrix.shape[0], count))
 
 
-def _kernel_grid(body: PlaneBody, first_level: int, level_count: int, first_edge: int, edge_count: int) -> PlaneGrid:
+def _kernel_grid(
+    body: PlaneBody, first_level: int, level_count: int, first_edge: int, edge_count: int, is_framed: bool
+) -> PlaneGrid:
     grid, flat = body.grid, PlaneGrid()
     texels = np.array(grid.covered.shape[::-1]) / (grid.high - grid.low)
     flat.least, flat.most = (wp.vec2(*corner) for corner in grid.corners())
@@ -185,7 +188,7 @@ def _kernel_grid(body: PlaneBody, first_level: int, level_count: int, first_edge
     flat.per_spread, flat.margin = 1 / grid.spread, _MARGIN * float(grid.texel_sizes().min())
     flat.first_level, flat.level_count, flat.sides = first_level, level_count, grid.sides
     flat.is_whole, flat.blocks = int(grid.is_whole), int(body.blocks)
-    flat.first_edge, flat.edge_count = first_edge, edge_count
+    flat.first_edge, flat.edge_count, flat.is_framed = first_edge, edge_count, int(is_framed)
     return flat
 
 
