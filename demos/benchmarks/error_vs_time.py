@@ -1,11 +1,12 @@
 """What each millisecond buys: error against the time of an image, for all settings and for a path tracer.
 
     python demos/benchmarks/error_vs_time.py [--data FOLDER] [--output FOLDER] [--light direct full] [--quick]
-        [--kinds NAME ...] [--one-thread]
+        [--scenes NAME ...] [--one-thread]
 
 Three scenes of 256 × 256 pixels: a body in the sun, one under an overcast sky, and three bodies under a low sun.
 ``--data`` takes meshes (FOLDER/meshes) and environment maps (FOLDER/envmaps) from a folder: the map with the brightest
-spot, the most even one and the one between. Four more are of demos/kinds.py, or as many as ``--kinds`` names.
+spot, the most even one and the one between. Four more are of demos/kinds.py. ``--scenes`` takes some of these, or
+others of demos/kinds.py; what an earlier run wrote of other scenes to the same folder stays in tables and pictures.
 
 Time is that of a warm image, forward, with the renderer made: each call places the bodies a hair's breadth elsewhere,
 so that nothing can be kept from the call before: projection, rasterization, visibility, shading and film run anew. With
@@ -54,6 +55,7 @@ from warpshadow.tuning.tune import describe, pareto_front
 DIRECTION_COUNTS = (32, 64, 128, 256, 512)
 ORDERS = (4, 6, 8)
 SPHERE_COUNTS = (16, 32, 64, 128, 256, 512)
+THREE = ("sun", "overcast", "low_sun")
 KINDS = ("bowl", "chair_wheel_fence", "city", "open_room")
 KIND_COUNTS = (64, 256)  # of spheres, for scenes of several bodies
 SIZE = 256  # pixels across
@@ -108,26 +110,25 @@ def main(
     runs: int,
     quick: bool,
     lights: Sequence[str] = ("direct", "full"),
-    kinds: Sequence[str] = (),
+    names: Sequence[str] = (*THREE, *KINDS),
 ) -> None:
     ws.quiet()
     warnings.filterwarnings("ignore", module="warpshadow")  # many spheres in spherical harmonics; coarse faces
-    scenes = quick_scenes() if quick else load_scenes(data)
-    scenes |= {name: SCENES[name](Sources(data), SIZE) for name in kinds}
+    scenes = quick_scenes() if quick else load_scenes(data, names)
     true_count = 1024 if quick else TRUE_COUNT
     output.mkdir(exist_ok=True)
     for light in lights:
-        results = {}
+        path = output / ("full_light_vs_time.json" if light == "full" else "error_vs_time.json")
+        results = json.loads(path.read_text()) if path.exists() else {}
         for name, scene in scenes.items():
             print(f"\n{name}, {light} light", flush=True)
             if light == "full":
                 results[name] = compare_full(scene, runs, true_count=true_count)
             else:
-                counts = KIND_COUNTS if name in kinds else SPHERE_COUNTS
+                counts = KIND_COUNTS if name in SCENES else SPHERE_COUNTS
                 results[name] = compare(scene, () if quick else counts, runs, true_count=true_count)
-        path = output / ("full_light_vs_time.json" if light == "full" else "error_vs_time.json")
-        path.write_text(json.dumps(results, indent=1, ensure_ascii=False))
-        plot(results, path.with_suffix(".png"))
+            path.write_text(json.dumps(results, indent=1, ensure_ascii=False))
+            plot(results, path.with_suffix(".png"))
 
 
 def compare(scene: ws.Scene, sphere_counts: Sequence[int], runs: int, *, true_count: int) -> dict:
@@ -202,7 +203,13 @@ def better_than(default: Measured, others: Sequence[Measured]) -> list[Measured]
 # ---------------------------------------------------------------------------------------------- scenes
 
 
-def load_scenes(data: Path | None) -> dict[str, ws.Scene]:
+def load_scenes(data: Path | None, wanted: Sequence[str]) -> dict[str, ws.Scene]:
+    """Scenes of THREE by their meshes and maps, and of all kinds by name."""
+    three = dict(zip(THREE, three_scenes(data).items(), strict=True))
+    return dict(three[name] if name in three else (name, SCENES[name](Sources(data), SIZE)) for name in wanted)
+
+
+def three_scenes(data: Path | None) -> dict[str, ws.Scene]:
     """A sunny, an overcast scene, and one with several bodies."""
     meshes = [shipped_mesh(name) for name in ("bunny", "bear", "rocks")]
     names = ["sun", "overcast", "low sun"]
@@ -527,8 +534,12 @@ def plot(results: dict[str, dict], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, len(results), figsize=(5.5 * len(results), 4.5), squeeze=False)
-    for axis, (name, result) in zip(axes[0], results.items(), strict=True):
+    columns = min(len(results), 4)
+    rows = -(-len(results) // columns)
+    figure, axes = plt.subplots(rows, columns, figsize=(5.5 * columns, 4.5 * rows), squeeze=False)
+    for axis in axes.flat[len(results) :]:
+        axis.axis("off")
+    for axis, (name, result) in zip(axes.flat, results.items(), strict=False):
         measured = [Measured(**each) for each in result["settings"]]
         for family, color in COLORS.items():
             of_family = sorted((each.milliseconds, 100 * each.error) for each in measured if each.family == family)
@@ -549,7 +560,7 @@ def plot(results: dict[str, dict], path: Path) -> None:
             each.set_major_formatter("{x:g}")
         axis.yaxis.set_minor_formatter("{x:g}")
         axis.grid(which="both", alpha=0.2)
-    axes[0, -1].legend(fontsize=8)
+    axes.flat[len(results) - 1].legend(fontsize=8)
     figure.tight_layout()
     figure.savefig(path, dpi=110)
     plt.close(figure)
@@ -563,13 +574,10 @@ if __name__ == "__main__":
     parser.add_argument(
         "--light", nargs="+", choices=["direct", "full"], default=["direct", "full"], help="what errors are against"
     )
-    parser.add_argument(
-        "--kinds", nargs="*", choices=SCENES, default=KINDS, help="scenes of all kinds beside the three"
-    )
+    parser.add_argument("--scenes", nargs="+", choices=[*THREE, *SCENES], default=[*THREE, *KINDS], help="which scenes")
     parser.add_argument("--quick", action="store_true", help="a ball on a ground of few pixels, to try it out")
     parser.add_argument("--one-thread", action="store_true", help="one thread for all, and its time of the processor")
     arguments = parser.parse_args()
     if arguments.one_thread:
         ws.set_thread_count(1)
-    kinds = () if arguments.quick else arguments.kinds
-    main(arguments.data, arguments.output, arguments.runs, arguments.quick, arguments.light, kinds)
+    main(arguments.data, arguments.output, arguments.runs, arguments.quick, arguments.light, arguments.scenes)

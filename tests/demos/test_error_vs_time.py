@@ -68,7 +68,7 @@ def test_scenes_of_a_folder_have_its_sunniest_its_most_even_map_and_one_between(
         ws.icosphere(1.0, 0).write(tmp_path / "meshes" / f"{name}.obj")
     for name, strength in (("dull", 0.0), ("bright", 3.0), ("hazy", 0.5)):
         ws.synthetic_sky(sun_strength=strength, sun_radius=8, height=16).write(tmp_path / "envmaps" / f"{name}.exr")
-    scenes = error_vs_time.load_scenes(tmp_path)
+    scenes = error_vs_time.load_scenes(tmp_path, error_vs_time.THREE)
     assert list(scenes) == ["one, bright", "three, dull", "one, three, two, hazy"]
     assert [len(scene.bodies) for scene in scenes.values()] == [2, 2, 4]
 
