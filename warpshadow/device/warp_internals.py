@@ -15,6 +15,8 @@ from typing import Any
 
 import warp as wp
 
+from warpshadow.device.spare_memory import SpareMemory
+
 
 class _TapeOfThread(threading.local):
     """Warp's ``runtime.tape`` as each thread sees it; Warp asks and sets it by this attribute alone."""
@@ -203,8 +205,15 @@ def _cpu_array(shape: Any, dtype: type) -> tuple[dict[str, Any], bytes, int]:
     return attributes, bytes(array.__ctype__()), array.capacity
 
 
+_spare_memory = SpareMemory(
+    lambda size: wp._src.context.runtime.core.wp_alloc_host(size, None) or 0,
+    lambda block: wp._src.context.runtime.core.wp_free_host(block),
+    limit=2**29,
+)
+
+
 def _free(pointer: int, size: int) -> None:
-    wp._src.context.runtime.core.wp_free_host(pointer)
+    _spare_memory.give_back(pointer, size)
 
 
 def new_array(shape: int | Sequence[int], dtype: type, device: wp.Device) -> wp.array:
@@ -213,7 +222,7 @@ def new_array(shape: int | Sequence[int], dtype: type, device: wp.Device) -> wp.
     if not device.is_cpu or runtime._apic_capture is not None:
         return wp.empty(shape, dtype, device=device)
     attributes, descriptor, size = _cpu_array(shape if isinstance(shape, int) else tuple(shape), dtype)
-    pointer = runtime.core.wp_alloc_host(size, None) if size else None
+    pointer = _spare_memory.take(size) if size else None
     if size and not pointer:
         raise MemoryError(f"got no memory for an array of {size:,} bytes")
     array = object.__new__(wp.array)

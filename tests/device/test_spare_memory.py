@@ -1,0 +1,85 @@
+"""Spare memory: blocks are given to one array at a time, come back for others of about their size, up to a limit."""
+
+import gc
+
+import pytest
+import warp as wp
+
+from warpshadow.device import memory
+from warpshadow.device.spare_memory import SpareMemory
+
+SIZE = 2**20
+
+
+class System:
+    """A system that gives blocks at rising addresses, and knows which are out and how large they are."""
+
+    def __init__(self, capacity=2**62):
+        self.blocks, self.next, self.capacity = {}, 2**12, capacity
+
+    def take(self, size):
+        if sum(self.blocks.values()) + size > self.capacity:
+            return 0
+        self.blocks[self.next] = size
+        self.next += size
+        return self.next - size
+
+    def give_back(self, block):
+        del self.blocks[block]
+
+
+def spare_memory(system, limit=2**40):
+    return SpareMemory(system.take, system.give_back, limit=limit)
+
+
+@pytest.mark.parametrize("size", [1, 2**16, 2**16 + 1, 12345678, SIZE, SIZE + 1, 2**30, 2**30 + 1, 2**33])
+def test_a_block_is_as_large_as_asked_for_and_little_larger(size):
+    system = System()
+    block = spare_memory(system).take(size)
+    assert size <= system.blocks[block] < 1.25 * size + 1
+
+
+def test_a_block_serves_the_next_of_about_its_size_and_nobody_beside_it():
+    system = System()
+    spare = spare_memory(system)
+    first, second = spare.take(SIZE), spare.take(SIZE)
+    assert first != second
+    spare.give_back(first, SIZE)
+    assert spare.take(2 * SIZE) != first
+    assert spare.take(SIZE - 1000) == first
+    assert spare.take(SIZE) not in (first, second)
+
+
+def test_small_and_huge_blocks_go_back_at_once():
+    system = System()
+    spare = spare_memory(system)
+    for size in (100, 2**32):
+        spare.give_back(spare.take(size), size)
+    assert not system.blocks and spare.bytes_kept == 0
+
+
+def test_beyond_the_limit_all_go_back():
+    system = System()
+    spare = spare_memory(system, limit=3 * SIZE)
+    blocks = [spare.take(SIZE) for _ in range(4)]
+    for number, block in enumerate(blocks[:3]):
+        spare.give_back(block, SIZE)
+        assert spare.bytes_kept == (number + 1) * SIZE
+    spare.give_back(blocks[3], SIZE)
+    assert not system.blocks and spare.bytes_kept == 0
+
+
+def test_where_the_system_has_no_more_spare_blocks_make_place():
+    system = System(capacity=4 * SIZE)
+    spare = spare_memory(system)
+    spare.give_back(spare.take(2 * SIZE), 2 * SIZE)
+    assert spare.take(3 * SIZE)
+    assert spare.take(3 * SIZE) == 0
+
+
+def test_arrays_take_memory_that_others_have_left():
+    array = memory.empty(12_345_678, wp.uint8, "cpu")
+    pointer = array.ptr
+    del array
+    gc.collect()
+    assert memory.empty(12_345_000, wp.uint8, "cpu").ptr == pointer
