@@ -4,6 +4,7 @@ An iteration frees what the next one takes again. The C library gives large bloc
 page of a new one stops the kernel that first writes to it: a fifth of an iteration of a pose.
 """
 
+import threading
 from collections.abc import Callable
 
 _MIN_BYTES = 2**16  # smaller blocks the C library keeps itself
@@ -26,20 +27,18 @@ class SpareMemory:
         self._take, self._give_back, self._limit = take, give_back, limit
         octaves = range(_MIN_BYTES.bit_length() - 1, _MAX_BYTES.bit_length())
         steps = [2**octave * (_STEPS + step) // _STEPS for octave in octaves for step in range(_STEPS)]
-        self._kept: dict[int, list[int]] = {size: [] for size in steps if size <= _MAX_BYTES}  # it never grows
-
-    @property
-    def bytes_kept(self) -> int:
-        """Bytes of blocks that nobody uses."""
-        return sum(size * len(blocks) for size, blocks in self._kept.items())
+        self._kept: dict[int, list[int]] = {size: [] for size in steps if size <= _MAX_BYTES}
+        self._lock = threading.RLock()
+        self.bytes_kept = 0  # of blocks that nobody uses
 
     def take(self, size: int) -> int:
         """Take a block of at least ``size`` bytes; returns its address, 0 where there is no memory."""
         size = _rounded(size)
-        try:
-            return self._kept[size].pop()
-        except (KeyError, IndexError):  # too small or large to be kept, or none is left
-            block = self._take(size)
+        with self._lock:
+            if self._kept.get(size):
+                self.bytes_kept -= size
+                return self._kept[size].pop()
+        block = self._take(size)
         if not block and self.bytes_kept:
             self.clear()
             block = self._take(size)
@@ -48,23 +47,22 @@ class SpareMemory:
     def give_back(self, block: int, size: int) -> None:
         """Give back a block that was taken for ``size`` bytes."""
         size = _rounded(size)
-        blocks = self._kept.get(size)
-        if blocks is None:
+        if size not in self._kept:
             self._give_back(block)
             return
-        blocks.append(block)
+        with self._lock:
+            self._kept[size].append(block)
+            self.bytes_kept += size
         if self.bytes_kept > self._limit:
             self.clear()
 
     def clear(self) -> None:
         """Give all that is kept back to the system."""
-        for blocks in self._kept.values():
-            while True:
-                try:
-                    block = blocks.pop()
-                except IndexError:
-                    break
-                self._give_back(block)
+        with self._lock:
+            for blocks in self._kept.values():
+                while blocks:
+                    self._give_back(blocks.pop())
+            self.bytes_kept = 0
 
 
 def _rounded(size: int) -> int:
