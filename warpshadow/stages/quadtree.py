@@ -120,8 +120,12 @@ def _cut_squares(
     tolerance: float,
     # out
     sizes: wp.array3d(dtype=wp.int32),
+    is_first: wp.array3d(dtype=wp.bool),
 ):
-    """A thread owns a row of the largest squares: pixels get the side of the square that holds there, 0 for none."""
+    """A thread owns a row of the largest squares: pixels get the side of the square that holds there, 0 for none.
+
+    The first pixel of a square is its upper left.
+    """
     view, i = split_row(first_row + wp.tid(), probe_keys.shape[1] / 2)
     seen = sides[view]
     near = probe_keys[view]
@@ -175,6 +179,7 @@ def _cut_squares(
                             if key < 0 or _key_at(seen, keys, other) != key:
                                 pixel_size = 0
                     sizes[view, y, x] = pixel_size
+                    is_first[view, y, x] = pixel_size > 0 and y % pixel_size == 0 and x % pixel_size == 0
 
 
 def find_quadtree(
@@ -193,7 +198,7 @@ def find_quadtree(
     device, (view_count, height, width) = sides.device, sides.shape
     flat, shape = rows(sides), (view_count, height // supersampling, width // supersampling)
     keys_there = constant(keys, wp.int32, device)
-    sizes = empty(shape, dtype=wp.int32, device=device)
+    sizes, is_first = empty(shape, dtype=wp.int32, device=device), empty(shape, dtype=wp.bool, device=device)
     probe_keys = keys_of(sides, keys, supersampling)
     inputs = [
         flat,
@@ -206,20 +211,18 @@ def find_quadtree(
         view_count * (probe_keys.shape[1] // 2),
         cost=_SQUARE_COST * (probe_keys.shape[2] // 2),
         inputs=[*inputs, supersampling, height, width, tolerance],
-        outputs=[sizes],
+        outputs=[sizes, is_first],
     )
-    result = sizes.numpy()
-    row, column = np.arange(shape[1])[:, None], np.arange(shape[2])
-    is_first = result == 1
-    for size in (2, MAX_SIDE):
-        is_first |= (result == size) & (row % size == 0) & (column % size == 0)
-    view, row, column = np.nonzero(is_first)
+    first = np.flatnonzero(is_first.numpy())
     numbers = np.zeros(shape, np.int32)
-    numbers[is_first] = np.arange(len(view))
-    ends = np.array([(0, 0), (0, 1), (1, 0), (1, 1)]) * result[is_first][:, None, None]
-    rows_ = np.minimum((row[:, None] + ends[..., 0]) * supersampling, height - 1)
-    columns = np.minimum((column[:, None] + ends[..., 1]) * supersampling, width - 1)
-    corners = (view[:, None] * height + rows_) * width + columns
+    numbers.ravel()[first] = np.arange(len(first))
+    view_and_row, column = np.divmod(first, shape[2])
+    view, row = np.divmod(view_and_row, shape[1])
+    side = sizes.numpy().ravel()[first]
+    top, bottom = (np.minimum(end * supersampling, height - 1) for end in (row, row + side))
+    left, right = (np.minimum(end * supersampling, width - 1) for end in (column, column + side))
+    top, bottom = ((view * height + end) * width for end in (top, bottom))
+    corners = np.stack([top + left, top + right, bottom + left, bottom + right], axis=1)
     is_corner = np.zeros(flat.shape, bool)
     is_corner.ravel()[corners] = True
     return Quadtree(sizes, from_numpy(numbers, dtype=wp.int32, device=device), corners, is_corner, keys_there)
