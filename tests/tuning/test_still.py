@@ -45,6 +45,20 @@ def test_a_white_surface_that_nothing_blocks_gets_all_light_of_a_map():
             np.testing.assert_allclose(received, (fine.radiance * cosine[..., None]).sum(axis=(0, 1)), rtol=0.01)
 
 
+@pytest.mark.parametrize("rows", [2, 64, 75, 600])
+def test_open_level_ground_gets_all_light_above_its_horizon(rows):
+    even = ws.EnvironmentMap.constant(1.0, height=rows).radiance
+
+    def find_upper_shares(samples):
+        cosine = np.maximum(samples.directions[0, :, 1], 0)
+        return cosine / cosine.sum()
+
+    for find in (None, find_upper_shares):
+        samples = cut_map(even, 512, find)
+        received = samples.radiance[0, :, 0] @ np.maximum(samples.directions[0, :, 1], 0)
+        np.testing.assert_allclose(received, np.pi, rtol=1e-3)
+
+
 def test_packets_give_each_receiver_what_single_rays_do(device):
     mesh = ws.icosphere(1.0, 3)
     rng = np.random.default_rng(0)

@@ -86,7 +86,7 @@ def cut_map(
     This is the median cut of Debevec [2005, "A median cut algorithm for light probe sampling"], for any count, through
     pixels where they are large. A direction is the mean of its rectangle's light, and stands for all of it: so
     receivers that see a whole rectangle get exactly its light, whatever their normal, and those on whose horizon it
-    lies get it little by little.
+    lies get too little: so the first cut is along the horizon of level ground.
 
     Importance is luminance, to which even light adds a tenth. But suns, what is :data:`_SUN_BRIGHTNESS` times as bright
     as all is on average, have :data:`_SUN_SHARE` of it at most: their many directions would be close to each other.
@@ -114,7 +114,11 @@ def cut_map(
     def cut(importance: np.ndarray) -> np.ndarray:
         table = np.zeros((height + 1, width + 1))
         table[1:, 1:] = importance.cumsum(axis=0).cumsum(axis=1)
-        return np.array([*_cut(table, np.array([0.0, height]), np.array([0.0, width]), count)])
+        horizon, all_columns = height / 2, np.array([0.0, width])
+        above = np.clip(round(count * _between(table, horizon)[-1] / table[-1, -1]), 1, count - 1)
+        upper = _cut(table, np.array([0.0, horizon]), all_columns, above)
+        lower = _cut(table, np.array([horizon, height]), all_columns, count - above)
+        return np.array([*upper, *lower])
 
     cuts = cut(importance)
     samples = _mean_light(radiance, solid_angle, cuts)
