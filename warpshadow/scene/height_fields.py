@@ -24,8 +24,9 @@ Land of 5000 faces with rocks and trees on it takes 1024 spheres with 1/40, 256 
 _POINTS = 1024  # of meshes, from which rays tell which bodies lie before the field, and which behind
 
 _STUCK = 0.1
-"""Rays that meet a body before the field, over those that meet it behind, from which it sticks in the field, as water and
-rocks in land. A ground that a tent stands on has none before the tent."""
+"""Rays that meet a body before the field, over those that meet it behind, from which it sticks in the field.
+
+So do rocks and water in land; a ground that a tent stands on does not."""
 
 
 def solid_behind(mesh: Mesh, others: Sequence[Mesh], *, device: wp.DeviceLike) -> Mesh | None:
