@@ -141,8 +141,12 @@ class SelfVisibility:
                 positions[used], *_ = normalize(mesh.positions[used].astype(np.float64))
                 points = from_numpy(positions[None], dtype=wp.vec3, device=device)
                 normals = vertex_normals(points, from_numpy(faces, dtype=wp.vec3i, device=device)).numpy()[0]
-                longest = longest_edge(positions, faces, samples_receive=bool(self._samples_receive[body]))
-                return find_probes(positions, normals, faces, longest)
+                samples_receive = bool(self._samples_receive[body])
+                longest = longest_edge(positions, faces, samples_receive=samples_receive)
+                if not samples_receive or mesh.smooth_pieces.max() == 0:
+                    return find_probes(positions, normals, faces, longest)
+                whole = wp.Mesh(points.flatten(), from_numpy(faces.ravel(), dtype=wp.int32, device=device))
+                return find_probes(positions, normals, faces, longest, functools.partial(find_buried, whole))
 
             self._probes[body] = self._of_mesh(body, "probes", find)
         return self._probes[body]

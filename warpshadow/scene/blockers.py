@@ -1,5 +1,7 @@
 """Blockers: the spheres that stand in for the bodies of a scene."""
 
+from collections.abc import Iterable
+
 import numpy as np
 import warp as wp
 
@@ -8,6 +10,7 @@ from warpshadow.device.progress import ANNOUNCED_SECONDS, announce
 from warpshadow.maths.plane import plane_normal
 from warpshadow.maths.solid_angle import solid_angles
 from warpshadow.scene.body import Body
+from warpshadow.scene.height_fields import solid_behind
 from warpshadow.scene.scene import Scene
 from warpshadow.scene.visibility import SPHERE_METHODS
 from warpshadow.spheres import Spheres, fit_spheres
@@ -29,13 +32,11 @@ def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: boo
     """
     if scene.visibility.with_method().method not in SPHERE_METHODS:
         return [Spheres.concatenate([])] * len(scene.bodies)
-    counts = fitted_counts(scene)
-    _announce(scene, counts, device, progress)
+    fits = fitted_meshes(scene, device=device)
+    _announce(fits.values(), device, progress)
     return [
-        fit_spheres(
-            body.mesh, counts[number], device=device, progress=progress, warns=not _takes_parts(scene, body)
-        ).spheres
-        if number in counts
+        fit_spheres(*fits[number], device=device, progress=progress, warns=not _takes_parts(scene, body)).spheres
+        if number in fits
         else _given_spheres(body, ground)
         for number, (body, ground) in enumerate(zip(scene.bodies, _ground_spheres(scene), strict=True))
     ]
@@ -58,7 +59,7 @@ def blocking_planes(scene: Scene) -> tuple[int, ...]:
 
 
 def fitted_counts(scene: Scene) -> dict[int, int | str]:
-    """Find the bodies to whose meshes spheres are fitted: neither grounds, nor bodies with spheres of their own.
+    """Find the bodies to which spheres are fitted: neither grounds, nor bodies with spheres of their own.
 
     Returns:
         Numbers of the bodies, from 0, and how many spheres each takes, or "auto".
@@ -70,6 +71,33 @@ def fitted_counts(scene: Scene) -> dict[int, int | str]:
     return result
 
 
+def fitted_meshes(scene: Scene, *, device: wp.DeviceLike = "cpu") -> dict[int, tuple[Mesh, int | str]]:
+    """Find the meshes to which spheres are fitted, and how many, by the number of the body: see :func:`fitted_counts`.
+
+    A mesh is the body's own, or the solid behind it where it is a height field.
+    """
+    counts = fitted_counts(scene)
+    return {
+        number: (_solid_behind(scene, number, device) or scene.bodies[number].mesh, counts[number]) for number in counts
+    }
+
+
+def _solid_behind(scene: Scene, number: int, device: wp.DeviceLike) -> Mesh | None:
+    """The solid behind a body that is a height field, in its own space; None if it is none."""
+    body = scene.bodies[number]
+    if _takes_parts(scene, body) or body.mesh.surface.is_closed:
+        return None
+    to_own = body.rotation_matrix().T
+    others = [
+        other.world_mesh().transformed(
+            rotation=to_own, translation=-to_own @ body.translation / body.scale, scale=1 / body.scale
+        )
+        for other in scene.bodies
+        if other is not body
+    ]
+    return solid_behind(body.mesh, others, device=device)
+
+
 def _takes_parts(scene: Scene, body: Body) -> bool:
     """Whether a body blocks light as convex parts, so that its spheres do not."""
     visibility = scene.visibility.with_method()
@@ -77,9 +105,9 @@ def _takes_parts(scene: Scene, body: Body) -> bool:
     return visibility.method == "directional" and is_traced and body.blocks_as_parts
 
 
-def _announce(scene: Scene, counts: dict[int, int | str], device: wp.DeviceLike, progress: bool) -> None:
+def _announce(fits: Iterable[tuple[Mesh, int | str]], device: wp.DeviceLike, progress: bool) -> None:
     """Say how long fits that are to be made take, if that is long."""
-    requested = {(scene.bodies[body].mesh, count) for body, count in counts.items()}
+    requested = set(fits)
     if sum(fit_seconds(count) for _, count in requested) <= ANNOUNCED_SECONDS:
         return
     missing = [count for mesh, count in requested if not is_fitted(mesh, count, device=device)]

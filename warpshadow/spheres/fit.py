@@ -160,9 +160,11 @@ def _warn_of_holes(mesh: Mesh, count: int | str, report: FitReport) -> None:
         return
     _warned.add(mesh)
     more = "" if count == AUTO else 'blockers = "auto" takes as many as it needs, and '
+    parts = "parts of it that are bodies of their own have spheres each"
+    closed = "closed with walls and a bottom, where nothing is behind it, it has room for them"
     check.warn(
-        f"{mesh.name!r} is thin for {number} spheres: {wrong}; {more}parts of it that are bodies of their own have "
-        'spheres each, and method = "ray-traced" has the shadow of the mesh'
+        f"{mesh.name!r} is thin for {number} spheres: {wrong}; {more}{parts if mesh.surface.is_closed else closed}, "
+        'and method = "ray-traced" has the shadow of the mesh'
     )
 
 

@@ -22,7 +22,7 @@ from warpshadow import check
 from warpshadow.device.progress import progress_bar
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.scene import toml_tables
-from warpshadow.scene.blockers import fitted_counts
+from warpshadow.scene.blockers import fitted_counts, fitted_meshes
 from warpshadow.scene.scene import SCENE_TYPES, Bounces, Scene, check_bounces
 from warpshadow.scene.visibility import AUTO, SPHERE_METHODS, Visibility
 from warpshadow.spheres import Spheres, fit_spheres, is_fitted
@@ -382,10 +382,8 @@ def _by_work(scene: Scene, sample: PointSample) -> Iterator[Scene]:
         yield replace(scene, visibility=scene.visibility.by("none"))
     yield from _all_directions(scene)
     own = {
-        number: len(fit_spheres(scene.bodies[number].mesh, device=sample.device).spheres)
-        if count == AUTO
-        else int(count)
-        for number, count in fitted_counts(scene).items()
+        number: len(fit_spheres(mesh, device=sample.device).spheres) if count == AUTO else int(count)
+        for number, (mesh, count) in fitted_meshes(scene, device=sample.device).items()
     }
     factor, maximum = 2, max(own.values(), default=SPHERE_COUNTS[-1])
     while factor * maximum <= SPHERE_COUNTS[-1] and _interpolation_error(scene, sample) < scene.visibility.error:
@@ -417,7 +415,8 @@ def _sphere_variants(scene: Scene, fits: bool, device: wp.DeviceLike) -> Iterato
     yield scene
     own = fitted_counts(scene)
     for count in SPHERE_COUNTS if own else ():
-        is_at_hand = fits or all(is_fitted(scene.bodies[number].mesh, count, device=device) for number in own)
+        meshes = (mesh for mesh, _ in fitted_meshes(scene, device=device).values())
+        is_at_hand = fits or all(is_fitted(mesh, count, device=device) for mesh in meshes)
         if is_at_hand and set(own.values()) != {count}:
             yield _with_spheres(scene, dict.fromkeys(own, count))
 

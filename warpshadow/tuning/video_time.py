@@ -7,7 +7,7 @@ import warp as wp
 from warpshadow.device.parallel import thread_count
 from warpshadow.device.progress import show_time
 from warpshadow.pipeline.choice_of_receivers import for_picture
-from warpshadow.scene.blockers import fitted_counts
+from warpshadow.scene.blockers import fitted_meshes
 from warpshadow.scene.scene import Scene
 from warpshadow.scene.visibility import SHARED_DIRECTIONS
 from warpshadow.spheres.fit import fit_seconds, is_fitted
@@ -25,7 +25,7 @@ def setup_seconds(scene: Scene, *, device: wp.DeviceLike = "cpu") -> float:
     Both are on disk for a mesh whose spheres are.
     """
     seconds = 0.0
-    for mesh, count in {(scene.bodies[body].mesh, count) for body, count in fitted_counts(scene).items()}:
+    for mesh, count in set(fitted_meshes(scene, device=device).values()):
         if not is_fitted(mesh, count, device=device):
             seconds += fit_seconds(count) + trace_seconds(mesh.vertex_count, mesh.face_count)
     return seconds

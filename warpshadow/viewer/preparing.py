@@ -23,7 +23,7 @@ import warp as wp
 from warpshadow.device.parallel import ENVIRONMENT_VARIABLE, thread_count
 from warpshadow.device.progress import report_every
 from warpshadow.device.startup import start_quietly
-from warpshadow.scene.blockers import fitted_counts
+from warpshadow.scene.blockers import fitted_meshes
 from warpshadow.scene.scene import Scene
 from warpshadow.scene.visibility import SPHERE_METHODS
 from warpshadow.spheres import is_fitted
@@ -47,8 +47,8 @@ def is_prepared(painter: Painter, *, device: wp.DeviceLike = "cpu") -> bool:
     scene = painter.scene
     if scene.visibility.method not in SPHERE_METHODS:
         return True
-    counts = fitted_counts(scene).items()
-    has_spheres = all(is_fitted(scene.bodies[body].mesh, count, device=device) for body, count in counts)
+    fits = fitted_meshes(scene, device=device).values()
+    has_spheres = all(is_fitted(mesh, count, device=device) for mesh, count in fits)
     return has_spheres and all(painter.has_tables(ViewerState.of(scene), quality) for quality in _QUALITIES)
 
 

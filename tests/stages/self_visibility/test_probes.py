@@ -6,7 +6,7 @@ import warp as wp
 
 import warpshadow as ws
 from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.self_visibility.probes import ProbeTable, VisibilityProbes, find_probes, longest_edge
+from warpshadow.stages.self_visibility.probes import _ENTRY, ProbeTable, VisibilityProbes, find_probes, longest_edge
 
 # Interpolated float32 positions of size 1.
 FLOAT32 = 1e-6
@@ -44,6 +44,22 @@ def test_no_edge_is_long_and_faces_share_the_probes_of_their_common_edge(longest
     assert np.linalg.norm(probes.positions[ends[:, 0]] - probes.positions[ends[:, 1]], axis=1).max() <= longest
     # Euler: pieces that agree at all edges are a disc
     assert len(probes.positions) - len(ends) + counts.sum() // 3 == 1
+
+
+@pytest.mark.parametrize("longest", [np.inf, 0.7, 0.3])
+def test_edges_that_enter_another_part_are_cut_finer_and_faces_agree(longest):
+    def is_inside(points: np.ndarray, _normals: np.ndarray | None = None) -> np.ndarray:
+        return np.linalg.norm(points - POSITIONS[1], axis=1) < 0.4
+
+    probes = find_probes(POSITIONS, NORMALS, FACES, longest, is_inside)
+    ends, counts = np.unique(np.sort(probes.edges, axis=1), axis=0, return_counts=True)
+    lengths = np.linalg.norm(probes.positions[ends[:, 0]] - probes.positions[ends[:, 1]], axis=1)
+    inside = is_inside(probes.positions)
+    enters = inside[ends[:, 0]] != inside[ends[:, 1]]
+    assert enters.any() and lengths[enters].max() <= _ENTRY * longest and lengths.max() <= longest
+    assert len(probes.positions) - len(ends) + counts.sum() // 3 == 1
+    without = find_probes(POSITIONS, NORMALS, FACES, longest)
+    assert len(without.positions) <= len(probes.positions) < len(without.positions) + 60
 
 
 def test_a_long_rail_is_cut_and_the_small_faces_beside_it_are_not():

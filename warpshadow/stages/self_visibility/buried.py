@@ -53,7 +53,11 @@ def _find_buried(
 
 
 def find_buried(
-    mesh: wp.Mesh, points: np.ndarray, normals: np.ndarray, probe_count: int, rows: VisibilityRows | None = None
+    mesh: wp.Mesh,
+    points: np.ndarray,
+    normals: np.ndarray,
+    probe_count: int | None = None,
+    rows: VisibilityRows | None = None,
 ) -> np.ndarray:
     """Find the rows of probes that no ray escapes from, and whose rays mostly meet faces on their other side.
 
@@ -61,7 +65,7 @@ def find_buried(
         mesh: The mesh, in the frame of the points.
         points: Probes, and their backs if they have any, [row, 3].
         normals: Unit normals [row, 3].
-        probe_count: Number of probes.
+        probe_count: Number of probes; by default all are.
         rows: What they see, where that is known.
     Returns:
         Bool of shape [row].
@@ -71,7 +75,7 @@ def find_buried(
         wp.array(values, dtype=wp.vec3, device=device) for values in (points, normals, fibonacci(_RAYS))
     )
     is_buried = empty(len(points), dtype=wp.bool, device=device)
-    inputs = [mesh.id, places, facing, probe_count, directions, None if rows is None else rows.bits]
+    inputs = [mesh.id, places, facing, probe_count or len(points), directions, None if rows is None else rows.bits]
     launch(_find_buried, len(points), inputs=inputs, outputs=[is_buried])
     return is_buried.numpy()
 

@@ -1,0 +1,100 @@
+"""Land and other height fields: which meshes are closed behind, and on which side."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import warpshadow as ws
+from warpshadow.scene.blockers import fitted_meshes
+
+CAMERA = ws.Camera.look_at((0, 2, 6), (0, 0.5, 0), size=(16, 16))
+
+
+def height(x, z):
+    return 0.3 * np.sin(2 * x) * np.cos(1.5 * z) + 0.1 * np.sin(5 * x - 3 * z)
+
+
+def land(count: int = 16, size: float = 4.0) -> ws.Mesh:
+    grid = ws.plane(size, count)
+    positions = grid.positions.copy()
+    positions[:, 1] = height(positions[:, 0], positions[:, 2])
+    return ws.Mesh(positions, grid.faces, name="land")
+
+
+def tent() -> ws.Mesh:
+    grid = ws.plane(2.0, 8)
+    positions = grid.positions.copy()
+    positions[:, 1] = 0.8 - 0.8 * positions[:, 0] ** 2
+    return ws.Mesh(positions, grid.faces, name="tent")
+
+
+def ball(at=(0.3, 1.0, 0.2)) -> ws.Body:
+    return ws.Body(ws.icosphere(1.0, 2), scale=0.2, translation=at, blockers=8)
+
+
+def fitted(body: ws.Body, *others: ws.Body) -> ws.Mesh:
+    return fitted_meshes(ws.Scene([body, *others], ws.EnvironmentMap.constant(), CAMERA))[0][0]
+
+
+def volume(mesh: ws.Mesh) -> float:
+    a, b, c = np.moveaxis(mesh.positions[mesh.faces].astype(np.float64), 1, 0)
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+
+@pytest.mark.parametrize("winds_down", [False, True])
+@pytest.mark.parametrize("rotation", [(0, 0, 0), (40, 70, 150)])
+def test_land_is_closed_on_the_side_where_no_body_stands(winds_down, rotation):
+    mesh = land()
+    if winds_down:
+        mesh = dataclasses.replace(mesh, faces=mesh.faces[:, ::-1])
+    turn = Rotation.from_rotvec(rotation, degrees=True)
+    poses = [
+        {"rotation": rotation, "translation": (1, 2, 3), "scale": 2.0},
+        {"translation": turn.apply((0.6, 2, 0.4)) + (1, 2, 3)},
+    ]
+    above = dataclasses.replace(ball(), **poses[1])
+    solid = fitted(ws.Body(mesh, **poses[0]), above)
+    assert solid.surface.is_closed
+    assert {tuple(point) for point in mesh.positions} <= {tuple(point) for point in solid.positions}
+    lowest = mesh.positions[:, 1].min()
+    assert solid.positions[:, 1].max() == mesh.positions[:, 1].max()  # nothing before it
+    assert solid.positions[:, 1].min() == pytest.approx(lowest - 4 / 16, abs=0.02)  # the mean normal leans a little
+    assert volume(solid) == pytest.approx(16 * (mesh.positions[:, 1].mean() - lowest + 4 / 16), rel=0.05)
+
+
+def test_bodies_below_land_are_on_its_other_side():
+    solid = fitted(ws.Body(land()), ball((0.3, -1, 0.2)))
+    assert solid.positions[:, 1].max() > land().positions[:, 1].max() + 0.2
+
+
+@pytest.mark.parametrize(
+    ("body", "others"),
+    [
+        (ws.Body(land()), ()),  # nobody knows which side is seen
+        (ws.Body(land()), (ball(), ball((-1, -1, 0)))),
+        (ws.Body(tent()), (ball(), ws.Body(ws.plane(6.0), translation=(0, -0.01, 0)))),
+        (ws.Body(ws.icosphere(1.0, 2)), (ball((0, 2, 0)),)),
+    ],
+    ids=["alone", "between bodies", "tent on a ground", "closed"],
+)
+def test_other_meshes_stay_as_they_are(body, others):
+    assert fitted(body, *others) is body.mesh
+
+
+def test_spirals_are_no_height_field():
+    turns, radii = np.linspace(0, 4 * np.pi, 65), np.array([0.5, 1.0])
+    points = np.stack(
+        [np.outer(np.cos(turns), radii), np.outer(turns / 10, [1, 1]), np.outer(np.sin(turns), radii)], -1
+    )
+    first = 2 * np.arange(64)[:, None]
+    faces = np.concatenate([first + [0, 1, 3], first + [0, 3, 2]])
+    body = ws.Body(ws.Mesh(points.reshape(-1, 3), faces))
+    assert fitted(body, ball((0.75, 3, 0))) is body.mesh
+
+
+def test_water_and_rocks_stick_in_land():
+    water = ws.Body(ws.plane(4.0), translation=(0, -0.1, 0))
+    rock = ball((0.5, height(0.5, 0.5), 0.5))
+    assert fitted(ws.Body(land()), water, rock, ball()).surface.is_closed
