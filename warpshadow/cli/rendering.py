@@ -69,10 +69,7 @@ def render(
     ] = None,
     exposure: Annotated[
         Optional[float],
-        typer.Option(
-            help="Exposure in stops; without it the brightest 1% just saturate.",
-            rich_help_panel=_PICTURES,
-        ),
+        typer.Option(help="Exposure in stops; without it the brightest 1% just saturate.", rich_help_panel=_PICTURES),
     ] = None,
     tone: Annotated[
         Literal["clip", "filmic"],

@@ -62,8 +62,7 @@ def scene(
 @app.command()
 def insert(
     scene: Annotated[
-        Path,
-        typer.Argument(help="Scene file, TOML, with the photograph's camera; a body has shadow_catcher = true."),
+        Path, typer.Argument(help="Scene file, TOML, with the photograph's camera; a body has shadow_catcher = true.")
     ],
     into: Annotated[Path, typer.Option(help="Photograph: .jpg, .png, or linear .exr, .hdr.")],
     output: Annotated[

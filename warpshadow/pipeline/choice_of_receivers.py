@@ -209,7 +209,7 @@ def warn_of_coarse_faces(bodies: Sequence[Body], sizes: Sequence[FaceSize]) -> N
         if body.receivers == "vertex" and size.exceeds(COARSE_FACE):
             check.warn(
                 f"body {number} ({body.called!r}): {size}, and light is evaluated at their corners alone; "
-                'receivers = "auto" or "pixel" evaluates it at every pixel',
+                'receivers = "auto" or "pixel" evaluates it at every pixel'
             )
 
 

@@ -20,11 +20,7 @@ from warpshadow.device.progress import waiting
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import announced, one_at_a_time
 from warpshadow.pipeline.catchers import CatchersAlone
-from warpshadow.pipeline.choice_of_receivers import (
-    choose_receivers,
-    receiver_notes,
-    with_receivers,
-)
+from warpshadow.pipeline.choice_of_receivers import choose_receivers, receiver_notes, with_receivers
 from warpshadow.pipeline.delegation import delegated
 from warpshadow.pipeline.explain import Explanation, bounce_notes, decide
 from warpshadow.pipeline.geometry import Geometry, as_geometry

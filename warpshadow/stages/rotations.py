@@ -83,11 +83,7 @@ def _rotate_by_columns(
     rotations[batch, body] = wp.matrix_from_cols(wp.vec3(x), wp.vec3(y), wp.vec3(wp.cross(x, y)))
 
 
-_ROTATION_KERNELS = {
-    wp.vec4: _rotate_by_quaternions,
-    wp.vec3: _rotate_by_axis_angles,
-    Vec6: _rotate_by_columns,
-}
+_ROTATION_KERNELS = {wp.vec4: _rotate_by_quaternions, wp.vec3: _rotate_by_axis_angles, Vec6: _rotate_by_columns}
 
 
 @one_at_a_time

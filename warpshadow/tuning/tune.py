@@ -163,10 +163,7 @@ def describe(scene: Scene) -> str:
 
 
 def _method(visibility: Visibility) -> str:
-    details = {
-        "directional": f" {visibility.directions}",
-        "log-sh": f" {visibility.log} {visibility.order}",
-    }
+    details = {"directional": f" {visibility.directions}", "log-sh": f" {visibility.log} {visibility.order}"}
     method = str(visibility.method)
     return method + details.get(method, "")
 
@@ -365,7 +362,7 @@ def _resolve(scene: Scene, device: wp.DeviceLike, progress: bool) -> Scene:
     )
     check.warn(
         f"visibility: no setting of method = 'auto' reaches error = {accepted_error:g}; {describe(nearest)} "
-        f"comes nearest, with {error:.3f}{reason}",
+        f"comes nearest, with {error:.3f}{reason}"
     )
     return nearest
 

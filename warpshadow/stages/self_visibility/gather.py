@@ -348,12 +348,7 @@ def multiply_transmittances(own: wp.array, others: wp.array) -> wp.array:
     use_vector_registers(__name__, own.device)
 
     def add_product(first: wp.array, second: wp.array, total: wp.array) -> None:
-        launch(
-            _add_products,
-            own.shape[:2],
-            inputs=[as_chunks(first), as_chunks(second)],
-            outputs=[as_chunks(total)],
-        )
+        launch(_add_products, own.shape[:2], inputs=[as_chunks(first), as_chunks(second)], outputs=[as_chunks(total)])
 
     def adjoint(adj: wp.array) -> None:
         for factor, other in ((own, others), (others, own)):

@@ -16,15 +16,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import run_length, split_row, strip_count
 from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.screen import (
-    half_size,
-    has_neighbor,
-    neighbor,
-    orientation,
-    plane,
-    sample_center,
-    sense,
-)
+from warpshadow.stages.screen import half_size, has_neighbor, neighbor, orientation, plane, sample_center, sense
 from warpshadow.stages.silhouettes.areas import measure_areas
 from warpshadow.stages.silhouettes.edges import SNAP, edge_at, edge_between, is_crease, is_silhouette
 from warpshadow.stages.silhouettes.lines import (
