@@ -48,8 +48,7 @@ direct light) stills have a mean error of 1.5%, at worst 2.5%, in a cage. With 2
 """
 
 _INDEPENDENT_RAYS = 1024  # rays unless ``samples`` says how many, where each receiver has its own
-GLOSS_METHODS = ("directional", "none", "ray-traced", AUTO)
-"""The methods that show it."""
+GLOSS_METHODS = ("directional", "none", "ray-traced", AUTO)  # the methods that show it
 
 
 @check.frozen

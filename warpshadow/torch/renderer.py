@@ -39,8 +39,7 @@ _ELSEWHERE = {
 }
 """Remedies for keywords that a call does not have."""
 
-REFLECTANCE = ("albedo", "textures", *GLOSS_ARGUMENTS)
-"""Arguments that bodies have, each its own."""
+REFLECTANCE = ("albedo", "textures", *GLOSS_ARGUMENTS)  # arguments that bodies have, each its own
 
 
 class LayerTensors(NamedTuple):
