@@ -42,9 +42,8 @@ Where none is accurate enough, the same holds of their errors; then the faster i
 """
 
 ERROR_STEP = 0.003  # errors that differ by less than this count as equal, too: nobody sees it
-COARSE_FACES_ERROR = (
-    0.005  # error of interpolation between a body's vertices from which on its pixels are tried as receivers
-)
+# error of interpolation between a body's vertices from which on its pixels are tried as receivers
+COARSE_FACES_ERROR = 0.005
 
 
 class Trial(NamedTuple):
