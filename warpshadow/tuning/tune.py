@@ -11,7 +11,7 @@ import os
 import sys
 import warnings
 import weakref
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -23,7 +23,7 @@ from warpshadow.device.progress import progress_bar
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.scene import toml_tables
 from warpshadow.scene.blockers import fitted_counts
-from warpshadow.scene.scene import SCENE_TYPES, Bounces, Scene, check_bounces
+from warpshadow.scene.scene import SCENE_TYPES, Bounces, Scene, change_bodies, check_bounces
 from warpshadow.scene.visibility import AUTO, SPHERE_METHODS, Visibility
 from warpshadow.spheres import Spheres, fit_spheres, is_fitted
 from warpshadow.stages.visibility.zonal_logs import LOGS
@@ -99,12 +99,8 @@ class Tuning:
     def __str__(self) -> str:
         """The table, the units of its errors and times, and the meaning of its marks."""
         camera, samples = self.given.camera, self.given.supersampling
-        has_bounces = any(trial.scene.bounces for trial in self.trials)
-        sampled = (
-            ""
-            if has_bounces
-            else f"; but for those marked *, shadows timed on {TIMED_RECEIVERS} of its receivers, extrapolated to all"
-        )
+        sampled = f"; but for those marked *, shadows timed on {TIMED_RECEIVERS} of its receivers, extrapolated to all"
+        sampled *= not any(trial.scene.bounces for trial in self.trials)
         mark = "chosen" if self.is_reached else "nearest"
         return (
             "error: of the shading at points of the image, relative, against rays\n"
@@ -236,12 +232,10 @@ def tune(
     scene = scene.with_method()
     sample = PointSample(scene, bounces=bounces, device=device, progress=progress)
     is_coarse = sample.interpolation_errors() > COARSE_FACES_ERROR
-    fine = [
-        body.receivers if receivers == own.receivers else receivers
-        for body, own, receivers in zip(
-            scene.bodies, sample.decided(scene).bodies, np.where(is_coarse, "pixel", "vertex").tolist(), strict=True
-        )
-    ]
+    pairs = zip(
+        scene.bodies, sample.decided(scene).bodies, np.where(is_coarse, "pixel", "vertex").tolist(), strict=True
+    )
+    fine = [body.receivers if receivers == own.receivers else receivers for body, own, receivers in pairs]
     counts: Sequence[Bounces] = (scene.bounces,)
     if bounces is not None:
         counts = (*BOUNCE_COUNTS, "all") if bounces == "all" else [count for count in BOUNCE_COUNTS if count <= bounces]
@@ -354,11 +348,8 @@ def _resolve(scene: Scene, device: wp.DeviceLike, progress: bool) -> Scene:
             return setting
     error, nearest = min(tried, key=lambda item: item[0])
     interpolation_error = _interpolation_error(scene, sample)
-    reason = (
-        ""
-        if interpolation_error < accepted_error
-        else f"; interpolation between vertices alone has {interpolation_error:.3f}: receivers = 'pixel'"
-    )
+    reason = f"; interpolation between vertices alone has {interpolation_error:.3f}: receivers = 'pixel'"
+    reason *= interpolation_error >= accepted_error
     check.warn(
         f"visibility: no setting of method = 'auto' reaches error = {accepted_error:g}; {describe(nearest)} "
         f"comes nearest, with {error:.3f}{reason}"
@@ -385,7 +376,8 @@ def _by_work(scene: Scene, sample: PointSample) -> Iterator[Scene]:
     }
     factor, maximum = 2, max(own.values(), default=SPHERE_COUNTS[-1])
     while factor * maximum <= SPHERE_COUNTS[-1] and _interpolation_error(scene, sample) < scene.visibility.error:
-        yield from _all_directions(_with_spheres(scene, {number: factor * count for number, count in own.items()}))
+        more = change_bodies(scene, "blockers", {number: factor * count for number, count in own.items()})
+        yield from _all_directions(more)
         factor *= 2
 
 
@@ -399,8 +391,7 @@ def _all_directions(scene: Scene) -> Iterator[Scene]:
 def _settings(scene: Scene, fine: Sequence[str], fits: bool, device: wp.DeviceLike) -> Iterator[Scene]:
     """Trials, a variant of the scene each: with its own receivers, and with fine ones."""
     for receivers in dict.fromkeys((_receivers(scene), tuple(fine))):
-        bodies = tuple(replace(body, receivers=item) for body, item in zip(scene.bodies, receivers, strict=True))
-        placed = replace(scene, bodies=bodies)
+        placed = change_bodies(scene, "receivers", dict(enumerate(receivers)))
         if not scene.bounces:
             yield replace(placed, visibility=scene.visibility.by("none"))
         for more in _sphere_variants(placed, fits, device):
@@ -415,15 +406,7 @@ def _sphere_variants(scene: Scene, fits: bool, device: wp.DeviceLike) -> Iterato
     for count in SPHERE_COUNTS if own else ():
         is_at_hand = fits or all(is_fitted(scene.bodies[number].mesh, count, device=device) for number in own)
         if is_at_hand and set(own.values()) != {count}:
-            yield _with_spheres(scene, dict.fromkeys(own, count))
-
-
-def _with_spheres(scene: Scene, counts: Mapping[int, int]) -> Scene:
-    """Other numbers of spheres for some bodies."""
-    bodies = (
-        replace(body, blockers=counts[number]) if number in counts else body for number, body in enumerate(scene.bodies)
-    )
-    return replace(scene, bodies=tuple(bodies))
+            yield change_bodies(scene, "blockers", dict.fromkeys(own, count))
 
 
 def _directional(visibility: Visibility) -> Iterator[Visibility]:
