@@ -15,18 +15,8 @@ import warp as wp
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.picture import SUFFIXES, Picture
 from warpshadow.assets.video import VIDEO_SUFFIXES, check_video, write_video
+from warpshadow.cli import mesh_options
 from warpshadow.cli.console import Device, Quiet, app, check_output, clear_errors, device_of, note
-from warpshadow.cli.mesh_options import (
-    Direction,
-    Light,
-    LightRotation,
-    MeshOptions,
-    SceneOrMesh,
-    Size,
-    Up,
-    count_of_bounces,
-    load,
-)
 from warpshadow.scene.scene import Scene
 
 _PICTURES, _VIDEOS, _METHOD = "Pictures", "Videos", "Method, in place of the scene's"  # panels of the help
@@ -48,7 +38,7 @@ class _Render(typer.core.TyperCommand):
 
 @app.command(cls=_Render)
 def render(
-    scene: SceneOrMesh,
+    scene: mesh_options.SceneOrMesh,
     output: Annotated[
         Path,
         typer.Option(
@@ -58,11 +48,11 @@ def render(
             "--turntable or --camera-path a video: .mp4, .gif, .webp.",
         ),
     ],
-    up: Up = None,
-    size: Size = None,
-    light: Light = None,
-    direction: Direction = None,
-    light_rotation: LightRotation = None,
+    up: mesh_options.Up = None,
+    size: mesh_options.Size = None,
+    light: mesh_options.Light = None,
+    direction: mesh_options.Direction = None,
+    light_rotation: mesh_options.LightRotation = None,
     png: Annotated[
         Optional[Path],
         typer.Option(help="Beside an .exr, also write a picture: .png, or .jpg.", rich_help_panel=_PICTURES),
@@ -138,7 +128,7 @@ def render(
         typer.Option(
             help="How often light bounces, 0 to 16 or all.",
             rich_help_panel=_METHOD,
-            parser=count_of_bounces,
+            parser=mesh_options.count_of_bounces,
             metavar="INTEGER|all",
         ),
     ] = None,
@@ -186,7 +176,7 @@ def render(
             raise ValueError(f"--{error}{others}") from error
         arguments: dict[str, Any] = {"method": method, "samples": samples, "bounces": bounces}
         arguments = {name: value for name, value in arguments.items() if value is not None}
-        parsed = load(scene, is_quiet, MeshOptions(up, size, light, direction, light_rotation), **arguments)
+        parsed = mesh_options.load(scene, is_quiet, up, size, light, direction, light_rotation, **arguments)
         where = device_of(device)
         loaded = parsed
         if parsed.visibility.method == AUTO:
