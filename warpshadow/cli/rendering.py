@@ -18,6 +18,7 @@ from warpshadow.assets.video import VIDEO_SUFFIXES, check_video, write_video
 from warpshadow.cli import mesh_options
 from warpshadow.cli.console import Device, Quiet, app, check_output, clear_errors, device_of, note
 from warpshadow.scene.scene import Scene
+from warpshadow.scene.visibility import AUTO, METHOD_TRAITS
 
 _PICTURES, _VIDEOS, _METHOD = "Pictures", "Videos", "Method, in place of the scene's"  # panels of the help
 _BACKGROUNDS = ("transparent", "environment")  # beside colors
@@ -111,7 +112,7 @@ def render(
         ),
     ] = False,
     method: Annotated[
-        Optional[Literal["directional", "log-sh", "none", "ray-traced", "auto"]],
+        Optional[Literal[tuple(METHOD_TRAITS)]],  # type: ignore[valid-type]
         typer.Option(
             help="How visibility is computed; ray-traced, the reference, is a path tracer where light bounces.",
             rich_help_panel=_METHOD,
@@ -140,7 +141,6 @@ def render(
     from warpshadow.pipeline.choice_of_receivers import for_picture
     from warpshadow.pipeline.renderer import SceneRenderer
     from warpshadow.scene.camera_path import CameraPath
-    from warpshadow.scene.visibility import AUTO
     from warpshadow.tuning.tune import describe, resolved
     from warpshadow.tuning.video_time import remark_on_stills
 

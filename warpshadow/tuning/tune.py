@@ -24,7 +24,7 @@ from warpshadow.device.threads import one_at_a_time
 from warpshadow.scene import toml_tables
 from warpshadow.scene.blockers import fitted_counts
 from warpshadow.scene.scene import SCENE_TYPES, Bounces, Scene, change_bodies, check_bounces
-from warpshadow.scene.visibility import AUTO, SPHERE_METHODS, Visibility
+from warpshadow.scene.visibility import AUTO, METHOD_TRAITS, SPHERE_METHODS, Visibility
 from warpshadow.spheres import Spheres, fit_spheres, is_fitted
 from warpshadow.stages.visibility.zonal_logs import LOGS
 from warpshadow.tuning.point_sample import PointSample
@@ -122,8 +122,7 @@ class Tuning:
     def toml(self) -> str:
         """The settings as lines of a scene file: [visibility], and changes of the bodies."""
         visibility = self.scene.visibility
-        keys = {"directional": ("method", "directions"), "log-sh": ("method", "order", "log")}
-        chosen = {key: getattr(visibility, key) for key in keys.get(str(visibility.method), ("method",))}
+        chosen = {key: getattr(visibility, key) for key in ("method", *_tuned_settings(visibility))}
         blocks = [toml_tables.block("[visibility]", chosen)]
         if self.scene.bounces != self.given.bounces:
             blocks.insert(0, toml_tables.block("[light]", {"bounces": self.scene.bounces}))
@@ -158,9 +157,11 @@ def describe(scene: Scene) -> str:
 
 
 def _method(visibility: Visibility) -> str:
-    details = {"directional": f" {visibility.directions}", "log-sh": f" {visibility.log} {visibility.order}"}
-    method = str(visibility.method)
-    return method + details.get(method, "")
+    return " ".join(str(getattr(visibility, name)) for name in ("method", *_tuned_settings(visibility)))
+
+
+def _tuned_settings(visibility: Visibility) -> tuple[str, ...]:
+    return METHOD_TRAITS[visibility.method].tuned if visibility.method else ()
 
 
 def _bounces(scene: Scene) -> str:
