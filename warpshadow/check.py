@@ -414,8 +414,7 @@ def _outside_on_host(arrays: Mapping[str, wp.array], ranges: Mapping[str, tuple[
     return [name for name, array in arrays.items() if not _is_within(array.numpy(), *ranges[name])]
 
 
-_SMALL = 10_000
-"""Numbers up to which BLAS sums on one thread."""
+_SMALL = 10_000  # numbers up to which BLAS sums on one thread
 
 
 def _is_within(values: np.ndarray, minimum: float, maximum: float) -> bool:

@@ -58,7 +58,7 @@ def tape_gradients(function, inputs, weights, device):
     with wp.Tape() as tape:
         result = function(*inputs)
     tape.backward(grads={result: wp.array(weights, dtype=wp.vec3, device=device)})
-    return [tape.gradients[value].numpy().astype(float) for value in inputs]
+    return [value.grad.numpy().astype(float) for value in inputs]
 
 
 def difference(function, inputs, index, direction, weights, step=0.1):

@@ -462,7 +462,7 @@ def _centered_intrinsics(fov_y: float, width: int, height: int) -> np.ndarray:
     if fov_y < _RADIANS_LIMIT:
         check.warn(
             f"fov_y: got {fov_y:g} degrees, which is as narrow as a telescope's; if these are radians, they are "
-            f"{np.degrees(fov_y):.4g} degrees",
+            f"{np.degrees(fov_y):.4g} degrees"
         )
     focal = 0.5 * height / np.tan(np.radians(0.5 * fov_y))
     return np.array([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])

@@ -11,8 +11,7 @@ from warpshadow.assets.cells import CellLight
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths import sh
 
-_ROWS = 64
-"""Of maps of harmonics: the last of eight bands loses 0.5% to the size of a pixel."""
+_ROWS = 64  # of maps of harmonics: the last of eight bands loses 0.5% to the size of a pixel
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,11 +31,7 @@ class ImageError(ValueError):
 
 
 def read_image(
-    path: AnyPath,
-    *,
-    part: str | int | None = None,
-    max_pixels: int = 2**28,
-    undo_exposure: bool | None = None,
+    path: AnyPath, *, part: str | int | None = None, max_pixels: int = 2**28, undo_exposure: bool | None = None
 ) -> np.ndarray:
     """Read a picture as linear values.
 

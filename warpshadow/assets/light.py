@@ -82,12 +82,7 @@ class EnvironmentMap:
 
     @classmethod
     def read(
-        cls,
-        path: AnyPath,
-        *,
-        sanitize: str | None = None,
-        part: str | int | None = None,
-        convention: str = "mitsuba",
+        cls, path: AnyPath, *, sanitize: str | None = None, part: str | int | None = None, convention: str = "mitsuba"
     ) -> EnvironmentMap:
         """Read a map; gray becomes RGB and alpha is dropped.
 

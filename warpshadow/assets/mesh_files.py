@@ -21,15 +21,7 @@ from warpshadow.assets.gltf import (
     gltf_tree,
 )
 from warpshadow.assets.image import read_rgb
-from warpshadow.assets.mesh import (
-    BaseColor,
-    Mesh,
-    MeshError,
-    MeshPart,
-    checked_indices,
-    moved_part,
-    turned_over,
-)
+from warpshadow.assets.mesh import BaseColor, Mesh, MeshError, MeshPart, checked_indices, moved_part, turned_over
 from warpshadow.assets.mesh_joining import JoinedMesh, fan, join_parts, joined_normals, weld, with_colors
 from warpshadow.assets.obj import read_items, read_pictures
 from warpshadow.assets.ply import ply_colors, ply_corner_uvs, ply_fault

@@ -8,14 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from warpshadow.assets.color import GRAY, srgb_to_linear
-from warpshadow.assets.mesh import (
-    DIFFUSE,
-    BaseColor,
-    Mesh,
-    MeshError,
-    MeshPart,
-    checked_indices,
-)
+from warpshadow.assets.mesh import DIFFUSE, BaseColor, Mesh, MeshError, MeshPart, checked_indices
 from warpshadow.assets.topology import CREASE, first_at_places, is_listed_first
 
 

@@ -122,10 +122,9 @@ def part_at_creases(
         The faces by new vertices, int32 of shape [face, 3]; and the vertex that each new one is a copy of, int32 of
         shape [vertex]: the old ones are the first, in their order.
     """
-    places, normals = number_places(positions)[surface.faces], face_normals(positions[surface.faces])
-    face, edge = np.nonzero(surface.neighbors >= 0)
-    neighbor = surface.neighbors[face, edge]
-    is_smooth = np.einsum("ij,ij->i", normals[face], normals[neighbor]) >= np.cos(np.radians(angle))
+    places = number_places(positions)[surface.faces]
+    face, edge, neighbor, cosines = _bends(surface, positions, each_once=False)
+    is_smooth = cosines >= np.cos(np.radians(angle))
     face, edge, neighbor = face[is_smooth], edge[is_smooth], neighbor[is_smooth]
     links = []
     for end in (1, 2):
@@ -154,9 +153,7 @@ def rounds_edges(surface: MeshTopology, positions: np.ndarray) -> bool:
     Such pieces, as many boxes are, have most of the sharp edges, longer in all than the diagonal of the mesh.
     """
     corners = positions[surface.faces].astype(np.float64)
-    face, edge = np.nonzero(surface.neighbors > np.arange(len(corners))[:, None])  # each edge once
-    neighbor, normals = surface.neighbors[face, edge], face_normals(corners)
-    cosines = np.einsum("ij,ij->i", normals[face], normals[neighbor])
+    face, edge, neighbor, cosines = _bends(surface, positions)
     bent = np.flatnonzero(cosines < np.cos(np.radians(20)))
     bent = bent[~_is_parted(surface, face[bent], edge[bent], neighbor[bent])]
     face, edge, cosines = face[bent], edge[bent], cosines[bent]
@@ -188,10 +185,7 @@ def draws_lines(surface: MeshTopology, positions: np.ndarray) -> bool:
 
 def _parted_share(surface: MeshTopology, positions: np.ndarray, low: float, high: float) -> float:
     """Part of the edges that bend by some angles [degrees] whose faces have vertices of their own; 0 without any."""
-    face, edge = np.nonzero(surface.neighbors > np.arange(len(surface.faces))[:, None])  # each edge once
-    neighbor = surface.neighbors[face, edge]
-    normals = (face_normals(positions[surface.faces[numbers]]) for numbers in (face, neighbor))
-    cosines = np.einsum("ij,ij->i", *normals)
+    face, edge, neighbor, cosines = _bends(surface, positions)
     is_bent = (np.cos(np.radians(high)) <= cosines) & (cosines < np.cos(np.radians(low)))
     is_parted = _is_parted(surface, face[is_bent], edge[is_bent], neighbor[is_bent])
     return float(is_parted.mean()) if len(is_parted) else 0.0
@@ -218,11 +212,17 @@ def creases(surface: MeshTopology, positions: np.ndarray) -> np.ndarray:
 
 def smooth_pieces(surface: MeshTopology, positions: np.ndarray) -> np.ndarray:
     """Number the pieces of a mesh within which faces join across edges that are not sharp, shape [face]."""
-    normals = face_normals(positions[surface.faces])
-    face, edge = np.nonzero(surface.neighbors > np.arange(len(surface.faces))[:, None])  # each edge once
-    neighbor = surface.neighbors[face, edge]
-    is_smooth = np.einsum("ij,ij->i", normals[face], normals[neighbor]) >= np.cos(np.radians(CREASE))
+    face, _, neighbor, cosines = _bends(surface, positions)
+    is_smooth = cosines >= np.cos(np.radians(CREASE))
     return connected_components(face[is_smooth], neighbor[is_smooth], len(surface.faces))
+
+
+def _bends(surface: MeshTopology, positions: np.ndarray, *, each_once: bool = True) -> tuple[np.ndarray, ...]:
+    """Edges of faces, opposite to corners, with the faces across and the cosines of the angles by which they bend."""
+    normals = face_normals(positions[surface.faces])
+    face, edge = np.nonzero(surface.neighbors > (np.arange(len(normals))[:, None] if each_once else -1))
+    neighbor = surface.neighbors[face, edge]
+    return face, edge, neighbor, np.einsum("ij,ij->i", normals[face], normals[neighbor])
 
 
 def _is_parted(surface: MeshTopology, face: np.ndarray, edge: np.ndarray, neighbor: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ def fit(
         list[Path],
         typer.Argument(
             help="Fit file, TOML; warpshadow/inverse/README.md lists its keys. Or many: a pattern, a folder with "
-            "files called fit.toml, or a .txt file with a path on each line.",
+            "files called fit.toml, or a .txt file with a path on each line."
         ),
     ],
     output: Annotated[

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Optional
+from typing import Annotated, Any, Literal, Optional
 
 import typer
 
@@ -70,16 +70,6 @@ LightRotation = Annotated[
 ]
 
 
-class MeshOptions(NamedTuple):
-    """Options of the default scene of a mesh; None as it is without."""
-
-    up: str | None
-    size: tuple[str, str] | None
-    light: Path | None
-    direction: tuple[float, float, float] | None
-    light_rotation: float | None
-
-
 _KEYS_OF_SCENES = {
     "--up": "[[body]] rotation",
     "--size": "[camera] size",
@@ -90,7 +80,16 @@ _KEYS_OF_SCENES = {
 """Keys that scene files have in place of the options of meshes, in the order of these."""
 
 
-def load(file: Path, is_quiet: bool, options: MeshOptions, **settings: Any) -> Scene:
+def load(
+    file: Path,
+    is_quiet: bool,
+    up: str | None,
+    size: tuple[str, str] | None,
+    light: Path | None,
+    direction: tuple[float, float, float] | None,
+    light_rotation: float | None,
+    **settings: Any,
+) -> Scene:
     """The scene of a file, or the default one of a mesh's file; of that a note says which way is up."""
     from warpshadow.assets.mesh_files import MESH_SUFFIXES
     from warpshadow.scene.body import Body
@@ -102,23 +101,22 @@ def load(file: Path, is_quiet: bool, options: MeshOptions, **settings: Any) -> S
         expected = f".toml for a scene file, or a mesh's: {', '.join(MESH_SUFFIXES)}"
         raise ValueError(f"{file}: got extension {file.suffix!r}, expected {expected}")
     if file.suffix.lower() not in MESH_SUFFIXES:
+        options = up, size, light, direction, light_rotation
         for (option, key), value in zip(_KEYS_OF_SCENES.items(), options, strict=True):
             if value is not None:
                 shown = " ".join(map(str, value)) if isinstance(value, tuple) else value
                 raise ValueError(f"{option}: got {shown} with {file}, expected a mesh; scene files have {key}")
         return load_scene(file, **settings)
     body = Body(file)
-    up = options.up
     if up is None:
         guess = guess_up(body.mesh, file.suffix.lower())
         up = guess.axis
         note(f"{file}: {up} is taken to be up ({guess.reason}); --up {'zy'['yz'.index(up)]} says otherwise", is_quiet)
-    width, height = map(int, options.size or ("512", "512"))
-    direction = options.direction or DIRECTION
-    scene = default_scene(body, up=up, size=(width, height), light=options.light, direction=direction)
-    light = turned_light(scene.light, options.light_rotation or 0.0, 1.0)
+    width, height = map(int, size or ("512", "512"))
+    scene = default_scene(body, up=up, size=(width, height), light=light, direction=direction or DIRECTION)
+    turned = turned_light(scene.light, light_rotation or 0.0, 1.0)
     bounces = settings.pop("bounces", scene.bounces)
-    return replace(scene, light=light, visibility=Visibility.of(settings), bounces=bounces)
+    return replace(scene, light=turned, visibility=Visibility.of(settings), bounces=bounces)
 
 
 def count_of_bounces(text: str) -> Any:

@@ -19,8 +19,7 @@ def spheres(
         Optional[int], typer.Option(help="Number of spheres; as many as the mesh needs by default.", min=1)
     ] = None,
     error: Annotated[
-        Optional[float],
-        typer.Option(help="In place of --count: as many spheres as this relative error takes."),
+        Optional[float], typer.Option(help="In place of --count: as many spheres as this relative error takes.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the fit.")] = 0,
     picture: Annotated[Optional[Path], typer.Option(help="Draw the spheres in the mesh: .png.")] = None,
@@ -84,8 +83,7 @@ def envmap(
         Optional[Literal["zero", "neighbors"]], typer.Option(help="Repair NaN, Inf and negative pixels.")
     ] = None,
     output: Annotated[
-        Optional[Path],
-        typer.Option("-o", "--output", help="Where to write the map; sh_path FILE by default."),
+        Optional[Path], typer.Option("-o", "--output", help="Where to write the map; sh_path FILE by default.")
     ] = None,
     is_quiet: Quiet = False,
 ) -> None:

@@ -15,19 +15,10 @@ import warp as wp
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.picture import SUFFIXES, Picture
 from warpshadow.assets.video import VIDEO_SUFFIXES, check_video, write_video
+from warpshadow.cli import mesh_options
 from warpshadow.cli.console import Device, Quiet, app, check_output, clear_errors, device_of, note
-from warpshadow.cli.mesh_options import (
-    Direction,
-    Light,
-    LightRotation,
-    MeshOptions,
-    SceneOrMesh,
-    Size,
-    Up,
-    count_of_bounces,
-    load,
-)
 from warpshadow.scene.scene import Scene
+from warpshadow.scene.visibility import AUTO, METHOD_TRAITS
 
 _PICTURES, _VIDEOS, _METHOD = "Pictures", "Videos", "Method, in place of the scene's"  # panels of the help
 _BACKGROUNDS = ("transparent", "environment")  # beside colors
@@ -48,7 +39,7 @@ class _Render(typer.core.TyperCommand):
 
 @app.command(cls=_Render)
 def render(
-    scene: SceneOrMesh,
+    scene: mesh_options.SceneOrMesh,
     output: Annotated[
         Path,
         typer.Option(
@@ -58,21 +49,18 @@ def render(
             "--turntable or --camera-path a video: .mp4, .gif, .webp.",
         ),
     ],
-    up: Up = None,
-    size: Size = None,
-    light: Light = None,
-    direction: Direction = None,
-    light_rotation: LightRotation = None,
+    up: mesh_options.Up = None,
+    size: mesh_options.Size = None,
+    light: mesh_options.Light = None,
+    direction: mesh_options.Direction = None,
+    light_rotation: mesh_options.LightRotation = None,
     png: Annotated[
         Optional[Path],
         typer.Option(help="Beside an .exr, also write a picture: .png, or .jpg.", rich_help_panel=_PICTURES),
     ] = None,
     exposure: Annotated[
         Optional[float],
-        typer.Option(
-            help="Exposure in stops; without it the brightest 1% just saturate.",
-            rich_help_panel=_PICTURES,
-        ),
+        typer.Option(help="Exposure in stops; without it the brightest 1% just saturate.", rich_help_panel=_PICTURES),
     ] = None,
     tone: Annotated[
         Literal["clip", "filmic"],
@@ -124,7 +112,7 @@ def render(
         ),
     ] = False,
     method: Annotated[
-        Optional[Literal["directional", "log-sh", "none", "ray-traced", "auto"]],
+        Optional[Literal[tuple(METHOD_TRAITS)]],  # type: ignore[valid-type]
         typer.Option(
             help="How visibility is computed; ray-traced, the reference, is a path tracer where light bounces.",
             rich_help_panel=_METHOD,
@@ -141,7 +129,7 @@ def render(
         typer.Option(
             help="How often light bounces, 0 to 16 or all.",
             rich_help_panel=_METHOD,
-            parser=count_of_bounces,
+            parser=mesh_options.count_of_bounces,
             metavar="INTEGER|all",
         ),
     ] = None,
@@ -153,7 +141,6 @@ def render(
     from warpshadow.pipeline.choice_of_receivers import for_picture
     from warpshadow.pipeline.renderer import SceneRenderer
     from warpshadow.scene.camera_path import CameraPath
-    from warpshadow.scene.visibility import AUTO
     from warpshadow.tuning.tune import describe, resolved
     from warpshadow.tuning.video_time import remark_on_stills
 
@@ -189,7 +176,7 @@ def render(
             raise ValueError(f"--{error}{others}") from error
         arguments: dict[str, Any] = {"method": method, "samples": samples, "bounces": bounces}
         arguments = {name: value for name, value in arguments.items() if value is not None}
-        parsed = load(scene, is_quiet, MeshOptions(up, size, light, direction, light_rotation), **arguments)
+        parsed = mesh_options.load(scene, is_quiet, up, size, light, direction, light_rotation, **arguments)
         where = device_of(device)
         loaded = parsed
         if parsed.visibility.method == AUTO:

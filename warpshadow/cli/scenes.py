@@ -11,18 +11,8 @@ import typer
 
 from warpshadow.assets.camera import DIRECTION
 from warpshadow.assets.picture import SUFFIXES
+from warpshadow.cli import mesh_options
 from warpshadow.cli.console import Device, Quiet, app, check_output, clear_errors, device_of, note
-from warpshadow.cli.mesh_options import (
-    Direction,
-    Light,
-    LightRotation,
-    MeshOptions,
-    SceneOrMesh,
-    Size,
-    Up,
-    count_of_bounces,
-    load,
-)
 from warpshadow.viewer import HOST, PORT, serve
 
 if TYPE_CHECKING:
@@ -35,11 +25,11 @@ def scene(
         Optional[Path], typer.Argument(help="Mesh: .obj, .ply, .stl, .glb, .usd; without one, Warp's bunny.")
     ] = None,
     output: Annotated[Path, typer.Option("-o", "--output", help="Scene file to write, .toml.")] = Path("scene.toml"),
-    up: Up = None,
-    size: Size = None,
-    light: Light = None,
-    direction: Direction = None,
-    light_rotation: LightRotation = None,
+    up: mesh_options.Up = None,
+    size: mesh_options.Size = None,
+    light: mesh_options.Light = None,
+    direction: mesh_options.Direction = None,
+    light_rotation: mesh_options.LightRotation = None,
     is_quiet: Quiet = False,
 ) -> None:
     """Write a scene file of a mesh on a ground under a sky, to be edited, rendered and viewed.
@@ -53,7 +43,7 @@ def scene(
         if mesh is None:
             mesh = write_bunny(output.parent)
             note(f"{mesh}: Warp's bunny", is_quiet)
-        loaded = load(mesh, is_quiet, MeshOptions(up, size, light, direction, light_rotation))
+        loaded = mesh_options.load(mesh, is_quiet, up, size, light, direction, light_rotation)
         seen_from, turned_by = direction or DIRECTION, light_rotation or 0.0
         write_starter(output, mesh, loaded, light=light, direction=seen_from, rotation=turned_by)
         note(f"{output}: warpshadow view {output} shows it", is_quiet)
@@ -62,8 +52,7 @@ def scene(
 @app.command()
 def insert(
     scene: Annotated[
-        Path,
-        typer.Argument(help="Scene file, TOML, with the photograph's camera; a body has shadow_catcher = true."),
+        Path, typer.Argument(help="Scene file, TOML, with the photograph's camera; a body has shadow_catcher = true.")
     ],
     into: Annotated[Path, typer.Option(help="Photograph: .jpg, .png, or linear .exr, .hdr.")],
     output: Annotated[
@@ -94,11 +83,11 @@ def insert(
 
 @app.command()
 def view(
-    scene: SceneOrMesh,
-    up: Up = None,
-    light: Light = None,
-    direction: Direction = None,
-    light_rotation: LightRotation = None,
+    scene: mesh_options.SceneOrMesh,
+    up: mesh_options.Up = None,
+    light: mesh_options.Light = None,
+    direction: mesh_options.Direction = None,
+    light_rotation: mesh_options.LightRotation = None,
     host: Annotated[
         str, typer.Option(help="Address to serve at; by default for this machine alone, 0.0.0.0 is for everybody.")
     ] = HOST,
@@ -109,7 +98,7 @@ def view(
 ) -> None:
     """Show a scene, or a mesh on a ground under a sky, in the browser, to be turned with the mouse, until Ctrl+C."""
     with clear_errors():
-        loaded = load(scene, is_quiet, MeshOptions(up, None, light, direction, light_rotation))
+        loaded = mesh_options.load(scene, is_quiet, up, None, light, direction, light_rotation)
         file = scene if scene.suffix.lower() == ".toml" else None
         viewer = serve(loaded, host=host, port=port, device=device_of(device), path=file)
         with contextlib.suppress(KeyboardInterrupt):  # from the first moment that a page can be seen
@@ -122,7 +111,7 @@ def view(
 
 @app.command()
 def tune(
-    scene: SceneOrMesh,
+    scene: mesh_options.SceneOrMesh,
     error: Annotated[Optional[float], typer.Option(help="Largest relative error of shading, such as 0.03.")] = None,
     ms: Annotated[
         Optional[float], typer.Option(help="In place of --error: longest time of an image, in milliseconds.")
@@ -132,18 +121,18 @@ def tune(
         typer.Option(
             help="How often light bounces in the truth, such as 12; then 0 to 4 bounces are tried, which takes some "
             "five to ten minutes in place of one.",
-            parser=count_of_bounces,
+            parser=mesh_options.count_of_bounces,
             metavar="INTEGER|all",
         ),
     ] = None,
     fit: Annotated[
         bool, typer.Option(help="Also fit 16 to 512 spheres a body, some 20 s in all; they are kept for later.")
     ] = False,
-    up: Up = None,
-    size: Size = None,
-    light: Light = None,
-    direction: Direction = None,
-    light_rotation: LightRotation = None,
+    up: mesh_options.Up = None,
+    size: mesh_options.Size = None,
+    light: mesh_options.Light = None,
+    direction: mesh_options.Direction = None,
+    light_rotation: mesh_options.LightRotation = None,
     device: Device = "cpu",
     is_quiet: Quiet = False,
 ) -> None:
@@ -158,7 +147,7 @@ def tune(
     with clear_errors():
         if (error is None) == (ms is None):
             raise ValueError(f"--error, --ms: got {'neither' if error is None else 'both'}, expected one of them")
-        loaded = load(scene, is_quiet, MeshOptions(up, size, light, direction, light_rotation))
+        loaded = mesh_options.load(scene, is_quiet, up, size, light, direction, light_rotation)
         where = device_of(device)
         tuning = tune_scene(
             loaded, error=error, milliseconds=ms, bounces=bounces, fits=fit, device=where, progress=True

@@ -9,13 +9,4 @@ from warpshadow.dataset.recipe import Recipe, RecipeError, load_recipe
 from warpshadow.dataset.samples import Sample, read_shard
 from warpshadow.dataset.shards import Shard, write_shards
 
-__all__ = [
-    "DataSet",
-    "Recipe",
-    "RecipeError",
-    "Sample",
-    "Shard",
-    "load_recipe",
-    "read_shard",
-    "write_shards",
-]
+__all__ = ["DataSet", "Recipe", "RecipeError", "Sample", "Shard", "load_recipe", "read_shard", "write_shards"]

@@ -31,11 +31,9 @@ def run_on_ray(
     """Do tasks on a Ray cluster, each on one core, and one GPU if it needs it.
 
     Args:
-        function: Called for each task.
-        tasks: Taken one by one as cores are free.
+        function, tasks, attempts: As for :func:`.workers.run_tasks`.
         address: Of the cluster: "HOST:PORT", or "auto" for that of which this machine is part.
         workers: How many tasks at a time, at most; by default one for each of the cluster's cores.
-        attempts: How often a task is begun whose process or machine dies.
         is_on_gpu: Whether each task needs a GPU.
     Yields:
         The tasks that are over, as they end.

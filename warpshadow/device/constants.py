@@ -11,8 +11,7 @@ import warp as wp
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_MAX_RESULTS = 256
-"""Results of a function that are cached; the oldest go first."""
+_MAX_RESULTS = 256  # results of a function that are cached; the oldest go first
 
 _collections: dict[int, list[wp.array]] = {}  # by their identity
 

@@ -87,9 +87,10 @@ def as_items(array: wp.array, dtype: type, count: int) -> wp.array:
     """View every ``count`` items of the last dimension as one of another dtype; the remainder is left out."""
     *lengths, last = array.shape
     shape, strides = (*lengths, last // count), (*array.strides[:-1], count * array.strides[-1])
-    is_whole = last % count == 0 and not array.requires_grad
+    is_whole = last % count == 0
     if is_whole and (view := contiguous_view(array, shape, dtype)) is not None:
         return view
-    items = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, strides=strides, device=array.device)
+    gradient = as_items(array.grad, dtype, count) if array.requires_grad else None
+    items = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, strides=strides, device=array.device, grad=gradient)
     items.viewed = array  # the memory stays while the view does
     return items

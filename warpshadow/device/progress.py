@@ -26,8 +26,7 @@ _LINE_INTERVAL = 10.0  # time between lines [s]
 ANNOUNCED_SECONDS = 30.0  # time of work that is announced, with the way around it [s]
 
 
-_bars_show = True
-"""Whether bars and lines may show, in all of the process."""
+_bars_show = True  # whether bars and lines may show, in all of the process
 
 
 def show_bars(shows: bool) -> None:

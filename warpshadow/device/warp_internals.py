@@ -68,8 +68,7 @@ if "inline" not in inspect.signature(wp.func).parameters:  # Warp 1.17, whose co
 
 _types = wp._src.types
 
-_NO_ARRAY = _types.array_t()
-"""The descriptor of an argument None."""
+_NO_ARRAY = _types.array_t()  # the descriptor of an argument None
 
 
 @functools.cache

@@ -15,14 +15,11 @@ from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
 from warpshadow.inverse.world import Setting
 
-MAX_UNSEEN_SHARE = 0.01
-"""Share of the counted pixels that may see no body without a warning."""
+MAX_UNSEEN_SHARE = 0.01  # share of the counted pixels that may see no body without a warning
 
-MAX_LAST_GAIN = 0.01
-"""Part of its loss that a fit may still gain over a window of iterations without a warning."""
+MAX_LAST_GAIN = 0.01  # part of its loss that a fit may still gain over a window of iterations without a warning
 
-MAX_EXPLAINED_SHARE = 0.5
-"""Part of the residual's squares that a factor of an image may explain without a warning."""
+MAX_EXPLAINED_SHARE = 0.5  # part of the residual's squares that a factor of an image may explain without a warning
 
 MIN_EXPOSURE_GAP = 0.2
 """Logarithm to the base 2 of the factor from which that is of interest; a wrong pose has one, too."""

@@ -46,9 +46,8 @@ TABLE = "table.csv"  # the file, in the folder of all results, that says how eac
 _FIT_FILE = "fit.toml"  # pattern of fit files in a folder
 _RECORD = "ending.json"
 _ATTEMPTS = 4  # begins of a fit whose workers are killed
-_LOCK_TIMEOUT = (
-    60.0  # how long a worker waits for another that is at the same fit, such as one that Ray believed dead [s]
-)
+# how long a worker waits for another that is at the same fit, such as one that Ray believed dead [s]
+_LOCK_TIMEOUT = 60.0
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.target import Target
 from warpshadow.inverse.world import FittedScene, Setting
 from warpshadow.scene.blockers import blocking_planes, scene_blockers
-from warpshadow.scene.scene import SCENE_TYPES, Scene
+from warpshadow.scene.scene import SCENE_TYPES, Scene, change_bodies
 from warpshadow.scene.visibility import METHODS, SPHERE_METHODS, Visibility
 from warpshadow.tuning.tune import resolved
 
@@ -143,10 +143,8 @@ class Problem:
         scene = replace(self.scene, camera=cameras[0], visibility=self.visibility)
         if scene.visibility.method in SPHERE_METHODS:  # another one would leave the found scene without its blockers
             spheres = scene_blockers(scene, device=str(device), progress=progress)
-            bodies = list(scene.bodies)
-            for number in set(range(len(bodies))) - self._planes(scene):
-                bodies[number] = replace(bodies[number], blockers=spheres[number])
-            scene = replace(scene, bodies=tuple(bodies))
+            numbers = set(range(len(spheres))) - self._planes(scene)
+            scene = change_bodies(scene, "blockers", {number: spheres[number] for number in numbers})
         color = np.stack([target.image[..., :3] for target in self.targets]).astype(np.float64)
         weights = np.stack([target.weights() for target in self.targets])[..., None]
         unit = float(np.sqrt((weights * color**2).sum() / (3 * weights.sum())))

@@ -11,11 +11,9 @@ import torch
 
 T = TypeVar("T")
 
-Curvature = tuple[list[torch.Tensor], list[torch.Tensor]]
-"""Steps, and how the gradient changed over them, [value] each."""
+Curvature = tuple[list[torch.Tensor], list[torch.Tensor]]  # steps, and how the gradient changed over them, [value] each
 
-HISTORY = 12
-"""How many steps are kept: of six values, their curvature wholly."""
+HISTORY = 12  # how many steps are kept: of six values, their curvature wholly
 
 _BOUND_GROWTH = 2.0  # of the bound, where a step that reached it was kept
 _MIN_BOUND_FACTOR, _MAX_BOUND_FACTOR = 0.1, 0.5  # factors of the bound after a rejected step, relative to the step

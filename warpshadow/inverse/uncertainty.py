@@ -33,11 +33,9 @@ from warpshadow.inverse.world import FittedScene, Setting
 MAX_UNCERTAIN_NUMBERS = 32
 """Numbers that a parameter has at most to be among the uncertain ones; textures are taken as they are."""
 
-MAX_POSE_UNCERTAINTY = 0.02
-"""Part of its diagonal by which a body may be uncertain without a warning."""
+MAX_POSE_UNCERTAINTY = 0.02  # part of its diagonal by which a body may be uncertain without a warning
 
-CANDIDATE_SPACING = 0.06
-"""Distance between candidates along a flat direction [half diagonals of the body]."""
+CANDIDATE_SPACING = 0.06  # distance between candidates along a flat direction [half diagonals of the body]
 
 _STEP = 0.01  # of differences: half a pixel or less of the small images
 _TILE = 8  # pixels across of the small images

@@ -42,6 +42,7 @@ class SphereMethod(Method):
         joins_cached: Whether visibility combines cached rows with moving blockers.
         traces_self_visibility: Whether bodies' shadows on themselves may come from rays, not spheres.
         shades_transmittance: Whether known light is shaded without transfer vectors, by :meth:`shade_transmittance`.
+        bounces: The ``SphereBounces`` by which light bounces; None where it does not.
     """
 
     free_projection: Any
@@ -49,6 +50,7 @@ class SphereMethod(Method):
     joins_cached = False
     traces_self_visibility = False
     shades_transmittance = False
+    bounces: Any = None
 
     @functools.cached_property
     def plane_blockers(self) -> tuple[int, ...]:
@@ -157,23 +159,20 @@ class SphereMethod(Method):
         projected_light = self.projected(light)
         if self.bounces is not None:
             is_cached = points.is_static and materials is not points.materials
-            return (self.bounces.cached_bounced_shading if is_cached else self.bounces.bounced_shading)(
-                points, projected_light, light, materials
-            )
+            shade_all = self.bounces.cached_bounced_shading if is_cached else self.bounces.bounced_shading
+            return shade_all(points, projected_light, light, materials)
         return PortionedShading(self, points, projected_light, light, joined)
 
     def free_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
         """Shading of points in free light; where it bounces between moving bodies, computed as for known light."""
-        if self.bounces is not None and not points.is_static:
+        if self.bounces is None:
+            return super().free_shading(points, light, materials)
+        if not points.is_static:
             return self.bounces.bounced_free_shading(
                 points, Node("", self._projected_if_given, light), light, materials
             )
         direct = super().free_shading(points, light, materials)
-        return (
-            direct
-            if self.bounces is None
-            else self.bounces.cached_bounced_free_shading(direct, points, light, materials)
-        )
+        return self.bounces.cached_bounced_free_shading(direct, points, light, materials)
 
     def openness(self, points: LitPoints) -> Node:
         """Light that points reflect as white surfaces under an even sky of 1, vec3 of shape [batch, receiver]."""
@@ -303,11 +302,9 @@ class PortionedShading(Node):
     def find_visibility(self, call: Call, portion: Group, projected_light: Any) -> GroupVisibility:
         """Find the visibility of a portion."""
         visibility = self._visibility.run(call, portion, projected_light)
-        return (
-            visibility
-            if portion.planes is None
-            else self._visibility_past_planes.run(call, portion, visibility, projected_light)
-        )
+        if portion.planes is None:
+            return visibility
+        return self._visibility_past_planes.run(call, portion, visibility, projected_light)
 
     def light(self, call: Call, portion: Group, visibility: GroupVisibility, projected_light: Any) -> wp.array:
         """Transfer vectors of a portion, or its shading."""
@@ -320,12 +317,9 @@ class PortionedShading(Node):
 
 def _sphere_counts(method: SphereMethod, points: LitPoints) -> np.ndarray:
     """Number of spheres by which each body blocks the light of others."""
-    bodies = np.arange(len(method.merged_scene.scene.bodies))
-    return np.where(
-        np.isin(bodies, (*points.blocker_kinds.planes, *points.blocker_kinds.convex)),
-        0,
-        method.merged_scene.sphere_counts,
-    )
+    counts = method.merged_scene.sphere_counts.copy()
+    counts[[*points.blocker_kinds.planes, *points.blocker_kinds.convex]] = 0
+    return counts
 
 
 def _part_counts(method: SphereMethod, points: LitPoints) -> np.ndarray:

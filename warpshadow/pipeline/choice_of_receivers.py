@@ -27,7 +27,7 @@ from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.openness import openness_errors
 from warpshadow.scene.body import Body
-from warpshadow.scene.scene import Scene
+from warpshadow.scene.scene import Scene, change_bodies
 from warpshadow.scene.visibility import AUTO, Visibility
 from warpshadow.spheres import Spheres
 from warpshadow.stages.project import to_clip
@@ -111,9 +111,8 @@ def choose_receivers(
     sizes = face_sizes(images, merged_scene, cameras[0])
     share = LARGE_SHARE * cameras[0].width * cameras[0].height
     largest = min(max(LARGE_FACE, share), COARSE_FACE)
-    is_sharp = (
-        merged_scene.device.is_cpu and merged_scene.scene.visibility.method == "directional" and not is_light_free
-    )
+    has_edges = merged_scene.scene.visibility.method == "directional" and not is_light_free
+    is_sharp = has_edges and merged_scene.device.is_cpu
     has_few = np.diff(merged_scene.first_face) <= FEW_FACES
     limits = np.where(has_few, 1.0, largest)
     chosen = np.where([size.exceeds(limit) for size, limit in zip(sizes, limits, strict=True)], "pixel", "vertex")
@@ -133,13 +132,9 @@ def choose_receivers(
 
 def with_receivers(scene: Scene, choices: Sequence[ReceiverChoice]) -> Scene:
     """The scene with a choice for each body in place of "auto"."""
-    if all(body.receivers == choice.receivers for body, choice in zip(scene.bodies, choices, strict=True)):
-        return scene
-    bodies = (
-        dataclasses.replace(body, receivers=choice.receivers)
-        for body, choice in zip(scene.bodies, choices, strict=True)
-    )
-    return dataclasses.replace(scene, bodies=tuple(bodies))
+    pairs = enumerate(zip(scene.bodies, choices, strict=True))
+    changed = {number: choice.receivers for number, (body, choice) in pairs if body.receivers != choice.receivers}
+    return change_bodies(scene, "receivers", changed)
 
 
 def for_picture(scene: Scene) -> Scene:
@@ -169,13 +164,7 @@ def for_picture(scene: Scene) -> Scene:
     if has_sun and visibility.self_shadows == "traced":
         scene = dataclasses.replace(scene, visibility=dataclasses.replace(visibility, self_shadows="rays"))
     by_pixel = [body.receivers == AUTO and (has_sun or body.mesh.is_flat) for body in scene.bodies]
-    if not any(by_pixel):
-        return scene
-    bodies = (
-        dataclasses.replace(body, receivers="pixel") if is_by_pixel else body
-        for body, is_by_pixel in zip(scene.bodies, by_pixel, strict=True)
-    )
-    return dataclasses.replace(scene, bodies=tuple(bodies))
+    return change_bodies(scene, "receivers", dict.fromkeys(np.flatnonzero(by_pixel).tolist(), "pixel"))
 
 
 def _has_sun(scene: Scene) -> bool:
@@ -209,7 +198,7 @@ def warn_of_coarse_faces(bodies: Sequence[Body], sizes: Sequence[FaceSize]) -> N
         if body.receivers == "vertex" and size.exceeds(COARSE_FACE):
             check.warn(
                 f"body {number} ({body.called!r}): {size}, and light is evaluated at their corners alone; "
-                'receivers = "auto" or "pixel" evaluates it at every pixel',
+                'receivers = "auto" or "pixel" evaluates it at every pixel'
             )
 
 

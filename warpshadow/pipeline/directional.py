@@ -123,10 +123,8 @@ class Directional(SphereMethod):
         self, bodies: tuple[int, ...], rotations: wp.array, projected_light: ProjectedCells
     ) -> dict[int, SelfVisibilityLookup]:
         """Lookups of the receivers of some bodies. Differentiable: rotations."""
-        has_sun, towards = (
-            projected_light.sun is not None,
-            projected_light.directions if projected_light.spots is None else projected_light.spots,
-        )
+        towards = projected_light.directions if projected_light.spots is None else projected_light.spots
+        has_sun = projected_light.sun is not None
         return self.self_visibility.lookups(bodies, rotations, towards, projected_light.spreads, has_sun=has_sun)
 
     def find_visibility(self, group: Group, projected_light: ProjectedCells) -> GroupVisibility:
@@ -201,30 +199,16 @@ class Directional(SphereMethod):
             return visibility
         horizon_normals = group.normals if group.cached_rows is None else None
         points, fronts = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
-        cover = functools.partial(
-            plane_coverage,
-            points,
-            planes.frames,
-            planes.planes,
-            horizon_normals=horizon_normals,
-            fronts=fronts,
-            skip=planes.skip,
+        options: dict[str, Any] = {"horizon_normals": horizon_normals, "fronts": fronts, "skip": planes.skip}
+        cover: Callable[..., wp.array | None] = functools.partial(
+            plane_coverage, points, planes.frames, planes.planes, **options
         )
         covered = cover(projected_light.directions)
         if covered is None:
             return visibility
         if projected_light.samples is not None and planes.planes.has_holes:
-            covered = coverage_of_light(
-                points,
-                covered,
-                planes.frames,
-                planes.planes,
-                projected_light.directions,
-                projected_light.samples,
-                horizon_normals=horizon_normals,
-                fronts=fronts,
-                skip=planes.skip,
-            )
+            cells = projected_light.directions, projected_light.samples
+            covered = coverage_of_light(points, covered, planes.frames, planes.planes, *cells, **options)
         if projected_light.sharp_cells_past_planes is not None:
             directions, places, _ = projected_light.sharp_cells_past_planes
             sharp_coverage = cover(directions, radius=self._edge_radius(projected_light.sharp_cells_past_planes))
@@ -258,11 +242,9 @@ class Directional(SphereMethod):
         assert visibility.transmittance_total is not None
         if group.cached_rows is None:
             return directional_transfer(visibility.transmittance_total, group.normals, projected_light.directions)
-        return (
-            visibility.transmittance_total
-            if _has_light(group.cached_rows)
-            else cell_transfer(visibility.transmittance_total, group.cached_rows)
-        )
+        if _has_light(group.cached_rows):
+            return visibility.transmittance_total
+        return cell_transfer(visibility.transmittance_total, group.cached_rows)
 
     def shade_transfer(self, transfer: wp.array, group: Group, projected_light: ProjectedCells) -> wp.array:
         """Shading of a portion, vec3 of shape [batch, receiver]."""
@@ -277,13 +259,8 @@ class Directional(SphereMethod):
         if group.cached_rows is not None:
             return self.shade_transfer(self.transfer(visibility, group, projected_light), group, projected_light)
         assert visibility.transmittance_total is not None and projected_light.coefficients is not None
-        arguments = (
-            visibility.transmittance_total,
-            group.normals,
-            projected_light.directions,
-            projected_light.coefficients,
-        )
-        return shade_cells(*arguments, maximum=LARGEST_COEFFICIENT)
+        cells = projected_light.directions, projected_light.coefficients
+        return shade_cells(visibility.transmittance_total, group.normals, *cells, maximum=LARGEST_COEFFICIENT)
 
     @functools.cached_property
     def _sharpest_cells(self) -> SharpestCells:

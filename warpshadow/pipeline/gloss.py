@@ -26,8 +26,7 @@ from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sample_receivers import Span
 
-_CELL_ROWS = 64
-"""Rows of the map of free light in cells: each pixel has the light of the nearest cell."""
+_CELL_ROWS = 64  # rows of the map of free light in cells: each pixel has the light of the nearest cell
 
 
 class GlossyPoints(LitPoints):

@@ -42,9 +42,8 @@ class Group(NamedTuple):
     cached_rows: CachedRows | None = None  # of static bodies, which block their light, too
     body: int | None = None  # whose receivers they are, where bodies are told apart
     probe_weights: ProbeWeights | None = None  # where they lie on that body
-    self_lookup: SelfVisibilityLookup | SelfVisibilityLobes | None = (
-        None  # by rays; None where there is none, or its spheres block
-    )
+    # by rays; None where there is none, or its spheres block
+    self_lookup: SelfVisibilityLookup | SelfVisibilityLobes | None = None
     planes: GroupPlanes | None = None  # bodies that block as planes; None without any
     convex_parts_around: GroupConvexParts | None = None  # bodies that block as convex parts; None without any
     nearest_blockers: NearestBlockers | None = None  # None where they are not sources of light

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Callable, Hashable
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 import warp as wp
@@ -156,26 +156,6 @@ class LitPoints:
         return self.cached("transfers", None, lambda: self.method.transfers(self))
 
 
-class Bouncing(Protocol):
-    """Bounced light for a method of spheres."""
-
-    def bounced_shading(self, points: LitPoints, projected_light: Node, light: Input, materials: Materials) -> Node:
-        """Shading of points, direct and bounced, given the projected light."""
-
-    def bounced_free_shading(
-        self, points: LitPoints, projected_light: Node, light: Input, materials: Materials
-    ) -> Node:
-        """The same in free light."""
-
-    def cached_bounced_shading(
-        self, points: LitPoints, projected_light: Any, light: Input, materials: Materials
-    ) -> Node:
-        """The same for static points; results that do not depend on light and materials are cached."""
-
-    def cached_bounced_free_shading(self, direct: Node, points: LitPoints, light: Input, materials: Materials) -> Node:
-        """The same in free light, given the direct shading."""
-
-
 class Method:
     """How light is blocked: a method of visibility.
 
@@ -193,9 +173,6 @@ class Method:
     lobe_samples = 32
     """Samples of a lobe of a body that shines. Light without shadows of an indoor map is 2.1% off with 32, 3.5% with 16
     (roughness 0.35)."""
-
-    bounces: Bouncing | None = None
-    """How light bounces by spheres; None where none does, and where rays find it."""
 
     def __init__(self, merged_scene: MergedScene, native_basis: Basis, basis: Basis | None, *, progress: bool = False):
         self.merged_scene, self.native_basis, self.progress = merged_scene, native_basis, progress

@@ -259,11 +259,7 @@ class MergedScene:
         )
 
     def take_spheres(self, other: "MergedScene", bodies: Sequence[int]) -> None:
-        """Have the spheres that some bodies of another merged_scene have, which are this one's, once they are asked
-        for.
-
-        The spheres of a ground depend on the bodies on it.
-        """
+        """Have the spheres of this scene's bodies in another, with its ground, once they are asked for."""
         self._take_spheres = lambda: [other._spheres[number] for number in bodies]
 
     def part(self, geometry: Geometry, bodies: Sequence[int]) -> Geometry:

@@ -1,14 +1,19 @@
 """Methods of visibility by their names; a method's modules are imported with the first renderer that takes it."""
 
-from typing import TYPE_CHECKING
+import importlib
 
 from warpshadow.assets.basis import Basis
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.pipeline.lighting import Method
 from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.scene.visibility import DEFAULT_METHOD, SPHERE_METHODS
 
-if TYPE_CHECKING:
-    from warpshadow.pipeline.by_spheres import SphereMethod
+_CLASSES = {
+    "directional": ("directional", "Directional"),
+    "log-sh": ("log_sh", "LogSH"),
+    "none": ("log_sh", "LogSH"),  # without blockers
+    "ray-traced": ("rays", "Rays"),
+}
 
 
 @one_at_a_time  # kernels must not be made while another thread loads some
@@ -20,19 +25,10 @@ def make_method(merged_scene: MergedScene, basis: Basis | None, *, progress: boo
         basis: Basis of free light; None for the method's own.
     """
     scene = merged_scene.scene
-    if scene.visibility.method == "ray-traced":
-        from warpshadow.pipeline.rays import Rays
-
-        return Rays(merged_scene, basis, progress=progress)
-    if scene.visibility.method == "directional":
-        from warpshadow.pipeline.directional import Directional
-
-        method: SphereMethod = Directional(merged_scene, basis, progress=progress)
-    else:  # "none", too: log-SH without blockers
-        from warpshadow.pipeline.log_sh import LogSH
-
-        method = LogSH(merged_scene, basis, progress=progress)
-    if scene.bounces:
+    module, name = _CLASSES[scene.visibility.method or DEFAULT_METHOD]
+    kind = getattr(importlib.import_module(f"{__package__}.{module}"), name)
+    method = kind(merged_scene, basis, progress=progress)
+    if scene.bounces and scene.visibility.method in SPHERE_METHODS:
         from warpshadow.pipeline.bounces.by_spheres import SphereBounces
 
         method.bounces = SphereBounces(method)

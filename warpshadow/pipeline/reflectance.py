@@ -145,7 +145,7 @@ class Materials:
         if self.merged_scene.scene.bounces and is_readable(values.device) and values.numpy().max(initial=0.0) > 1:
             check.warn(
                 f"{name}: got values above 1, with which light grows with each bounce, expected reflectances in "
-                "[0, 1]; clamp them after each step of an optimizer, or free the input of a sigmoid",
+                "[0, 1]; clamp them after each step of an optimizer, or free the input of a sigmoid"
             )
 
     def of_vertices(self, name: str) -> Node:

@@ -20,11 +20,7 @@ from warpshadow.device.progress import waiting
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import announced, one_at_a_time
 from warpshadow.pipeline.catchers import CatchersAlone
-from warpshadow.pipeline.choice_of_receivers import (
-    choose_receivers,
-    receiver_notes,
-    with_receivers,
-)
+from warpshadow.pipeline.choice_of_receivers import choose_receivers, receiver_notes, with_receivers
 from warpshadow.pipeline.delegation import delegated
 from warpshadow.pipeline.explain import Explanation, bounce_notes, decide
 from warpshadow.pipeline.geometry import Geometry, as_geometry
@@ -345,13 +341,13 @@ class SceneRenderer:
                 "renderer.with_cameras([camera]).render(), or Renderer(scene, cameras=[camera])"
             )
         with unrecorded():
-            images = (self._in_photograph(None, light) if self.scene.catchers else self.draw(light)).numpy().copy()
+            images = (self.insert(None, light) if self.scene.catchers else self.draw(light)).numpy().copy()
         return images if self.has_camera_batch else images[0]
 
     @announced
     def insert(
         self,
-        photograph: wp.array,
+        photograph: wp.array | None,
         light: Light | None = None,
         *,
         albedo: PerBody[wp.array] | None = None,
@@ -363,14 +359,15 @@ class SceneRenderer:
         """Draw images of the bodies in a photograph whose surfaces the shadow catchers model.
 
         Args:
-            photograph: Linear RGB, of radiance in the units of the light, vec3 of shape [batch, height, width].
+            photograph: Linear RGB, of radiance in the units of the light, vec3 of shape [batch, height, width]; None
+                for nothing, where shadows on catchers are coverage.
             light: As for :meth:`draw`.
             albedo: As for :meth:`draw`; a catcher's matters where light bounces.
             textures, gloss: As for :meth:`draw`.
             geometry: As for :meth:`view`; but bodies that do not move have no kept rows.
             clip_matrices: As for :meth:`view`. Batches of 1 serve every instance of the others.
         Returns:
-            Linear RGB, vec3 of shape [batch, height, width].
+            Linear RGB, vec3 of shape [batch, height, width]; vec4 with coverage, without a photograph.
         Raises:
             ValueError: where no body of the scene is a catcher.
         Differentiable: all, as :meth:`draw` is; see :mod:`warpshadow.stages.photograph`.
@@ -379,22 +376,9 @@ class SceneRenderer:
             raise ValueError(
                 "scene: got no body that is a shadow catcher, expected one or more: Body(…, shadow_catcher=True)"
             )
-        check.shape("photograph", photograph.shape, ("batch", *self._size))
-        check.finite_arrays({"photograph": photograph})
-        return self._in_photograph(photograph, light, albedo, textures, gloss, geometry, clip_matrices)
-
-    @one_at_a_time
-    def _in_photograph(
-        self,
-        photograph: wp.array | None,
-        light: Light | None = None,
-        albedo: PerBody[wp.array] | None = None,
-        textures: PerBody[wp.array] | None = None,
-        gloss: Mapping[str, PerBody[wp.array]] | None = None,
-        geometry: Geometry[wp.array] | None = None,
-        clip_matrices: wp.array | None = None,
-    ) -> wp.array:
-        """Images of bodies in a photograph; or over nothing, where the shadows on catchers are coverage, vec4."""
+        if photograph is not None:
+            check.shape("photograph", photograph.shape, ("batch", *self._size))
+            check.finite_arrays({"photograph": photograph})
         catchers, materials, alone = self._catchers_alone, self._given_materials(albedo, textures, gloss), None
         if geometry is not None:
             geometry = as_geometry("geometry", geometry)

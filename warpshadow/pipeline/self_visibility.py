@@ -313,7 +313,7 @@ class SelfVisibility:
             called = self._merged_scene.scene.bodies[body].called
             check.warn(
                 f"body {body} ({called!r}): {len(probes.positions):,} points have {count} rays each for the body's "
-                f"shadow on itself, in place of {RAYS}, which would take too much memory",
+                f"shadow on itself, in place of {RAYS}, which would take too much memory"
             )
 
         def read(stored: Mapping[str, np.ndarray]) -> VisibilityRows:

@@ -251,12 +251,7 @@ class View(LitPoints):
         return wp.full((1, height, width), wp.vec3(1.0), dtype=wp.vec3, device=self.merged_scene.device)
 
     def in_photograph(
-        self,
-        photograph: Input | None,
-        unshadowed: Input,
-        catches: wp.array,
-        light: Light | None,
-        materials: Materials,
+        self, photograph: Input | None, unshadowed: Input, catches: wp.array, light: Light | None, materials: Materials
     ) -> Node:
         """The image in a photograph that the catchers model: linear RGB, vec3 of shape [batch, height, width].
 

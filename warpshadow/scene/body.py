@@ -25,13 +25,11 @@ RECEIVERS = (AUTO, "vertex", "pixel", "adaptive")
 
 COLORS_SUFFIX = ".npy"  # suffixes of files with a color for each vertex; other text is no albedo
 
-VALUES_SUFFIX = ".npy"
-"""Suffix of files with a number for each vertex."""
+VALUES_SUFFIX = ".npy"  # suffix of files with a number for each vertex
 
 _SPHERES_SUFFIX = ".npz"
 
-GLOSS_ARGUMENTS = ("roughness", "metallic", "specular")
-"""Arguments of a body that say how it shines."""
+GLOSS_ARGUMENTS = ("roughness", "metallic", "specular")  # arguments of a body that say how it shines
 
 LIKELY_MISTAKES = {"color": "albedo", "colour": "albedo", "position": "translation"}
 """Replacements for likely mistakes in a body's arguments, and keys."""

@@ -239,3 +239,13 @@ class Scene:
         if len(value) != count:
             raise ValueError(f"{argument}: got {len(value)} items, expected {count}, one for each body")
         return list(value)
+
+
+def change_bodies(scene: Scene, field: str, values: Mapping[int, Any]) -> Scene:
+    """The scene with other values of a field of some bodies, by their numbers; itself where there are none."""
+    if not values:
+        return scene
+    bodies = list(scene.bodies)
+    for number, value in values.items():
+        bodies[number] = replace(bodies[number], **{field: value})
+    return replace(scene, bodies=tuple(bodies))

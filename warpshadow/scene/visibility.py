@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from warpshadow import check
 from warpshadow.maths import sh
@@ -13,30 +14,43 @@ from warpshadow.stages.visibility.exponential import THRESHOLDS
 from warpshadow.stages.visibility.merging import MERGING, check_merging
 from warpshadow.stages.visibility.zonal_logs import LOGS
 
-SPHERE_METHODS = ("directional", "log-sh")
-METHODS = (*SPHERE_METHODS, "none", "ray-traced")
 DEFAULT_METHOD = "directional"  # method of renderers that are kept, where none is named
 AUTO = "auto"
+
+
+class MethodTraits(NamedTuple):
+    """A method of visibility for all that ask for one by its name."""
+
+    settings: tuple[str, ...]  # of a :class:`Visibility` that it reads
+    has_spheres: bool = False  # whether these stand in for bodies
+    finds_bounces: bool = True  # whether light may bounce
+    shows_gloss: bool = True  # whether bodies may shine
+    tuned: tuple[str, ...] = ()  # settings that tuning varies
+
+
+METHOD_TRAITS = {
+    "directional": MethodTraits(
+        ("directions", "softness", "merging", "self_shadows", "samples"), has_spheres=True, tuned=("directions",)
+    ),
+    "log-sh": MethodTraits(
+        ("merging", "self_shadows", "order", "log", "base"), has_spheres=True, shows_gloss=False, tuned=("log", "order")
+    ),
+    "none": MethodTraits(("order",), finds_bounces=False),
+    "ray-traced": MethodTraits(("order", "samples", "sampling")),
+    AUTO: MethodTraits(("softness", "merging", "self_shadows", "order", "error")),  # some are left to the chosen one
+}
+METHODS = tuple(method for method in METHOD_TRAITS if method != AUTO)
+SPHERE_METHODS = tuple(method for method, traits in METHOD_TRAITS.items() if traits.has_spheres)
+BOUNCE_METHODS = tuple(method for method, traits in METHOD_TRAITS.items() if traits.finds_bounces)
+GLOSS_METHODS = tuple(method for method, traits in METHOD_TRAITS.items() if traits.shows_gloss)
 METHODS_OF_SETTING = {
-    "directions": ("directional",),
-    "softness": ("directional", AUTO),
-    "merging": (*SPHERE_METHODS, AUTO),
-    "self_shadows": (*SPHERE_METHODS, AUTO),
-    "order": ("log-sh", "none", "ray-traced", AUTO),
-    "log": ("log-sh",),
-    "base": ("log-sh",),
-    "samples": ("directional", "ray-traced"),
-    "sampling": ("ray-traced",),
-    "error": (AUTO,),
+    setting: tuple(method for method, traits in METHOD_TRAITS.items() if setting in traits.settings)
+    for setting in dict.fromkeys(setting for traits in METHOD_TRAITS.values() for setting in traits.settings)
 }
-"""The methods that read each setting of a :class:`Visibility`; "auto" leaves some to the chosen method."""
+"""The methods that read each setting."""
 
-_DIRECTIONAL_SETTINGS = {
-    name for name, methods in METHODS_OF_SETTING.items() if DEFAULT_METHOD in methods and "ray-traced" not in methods
-}
+_DIRECTIONAL_SETTINGS = {*METHOD_TRAITS[DEFAULT_METHOD].settings} - {*METHOD_TRAITS["ray-traced"].settings}
 """Settings that name :data:`DEFAULT_METHOD` where they are not the default."""
-
-BOUNCE_METHODS = (*SPHERE_METHODS, "ray-traced", AUTO)  # the methods that find light that bounces
 
 SELF_SHADOWS = ("traced", "rays", "spheres")
 
@@ -48,8 +62,6 @@ direct light) stills have a mean error of 1.5%, at worst 2.5%, in a cage. With 2
 """
 
 _INDEPENDENT_RAYS = 1024  # rays unless ``samples`` says how many, where each receiver has its own
-GLOSS_METHODS = ("directional", "none", "ray-traced", AUTO)
-"""The methods that show it."""
 
 
 @check.frozen
@@ -102,7 +114,7 @@ class Visibility:
         reader = self.method or DEFAULT_METHOD
         changed = [name for name in METHODS_OF_SETTING if getattr(self, name) != getattr(Visibility, name)]
         for name in changed:
-            if reader not in METHODS_OF_SETTING[name]:
+            if name not in METHOD_TRAITS[reader].settings:
                 readers = " or ".join(map(repr, METHODS_OF_SETTING[name]))
                 raise ValueError(
                     f"{name}: got {getattr(self, name)!r}, which {reader!r} does not read, expected the default, "
@@ -143,10 +155,7 @@ class Visibility:
         vars(every).update(settings)
         every._check_values()
         reader = every.method or DEFAULT_METHOD
-        return cls(
-            every.method,
-            **{name: getattr(every, name) for name in METHODS_OF_SETTING if reader in METHODS_OF_SETTING[name]},
-        )
+        return cls(every.method, **{name: getattr(every, name) for name in METHOD_TRAITS[reader].settings})
 
     def with_method(self) -> Visibility:
         """The same by "directional" where no method is named, as renderers that are kept have it."""

@@ -4,14 +4,14 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import rows
-from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import run_length, split_row
 from warpshadow.stages.screen import center, relative, relative_adjoint, volumes
 
 TINY_VOLUME = 1.0e-36  # below this the volumes of a face are subnormal numbers, which have no reciprocal in float32
 
-_COST, _ADJOINT_COST = 5.0, 15.0  # nanoseconds that a sample takes
+_COST = 5.0  # nanoseconds that a sample takes
 
 
 @wp.func
@@ -31,47 +31,37 @@ def _weights(a: wp.vec4, b: wp.vec4, c: wp.vec4, ray: wp.vec2):
     return wp.vec3(1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0)  # edge-on, drawn only because its vertices snapped
 
 
-@wp.struct
-class _AdjointCorners:
-    """Gradients to the corners of a face in clip space."""
-
-    a: wp.vec4
-    b: wp.vec4
-    c: wp.vec4
-
-
-@wp.func
+@wp.func_grad(_weights)
 def _weights_adjoint(a: wp.vec4, b: wp.vec4, c: wp.vec4, ray: wp.vec2, adj_weights: wp.vec3):
     """The adjoint of `_weights`.
 
     With volumes v, their sum t and weights w = v/t: dL/dv_i = (dL/dw_i - Σ_j w_j dL/dw_j) / t, but 0 where v_i is
     clamped. A volume of exactly 0, on an edge, is not clamped: meshes aligned with the samples would lose gradients
-    there.
+    there. An attribute that is equal at all corners does not depend on the weights, whose sum is 1.
     """
-    at_a = relative(a, ray)
-    at_b = relative(b, ray)
-    at_c = relative(c, ray)
-    spanned = volumes(at_a, at_b, at_c)
-    sign = wp.sign(spanned[0] + spanned[1] + spanned[2])
-    inside = wp.max(sign * spanned, wp.vec3(0.0, 0.0, 0.0))
-    total = inside[0] + inside[1] + inside[2]
-    adj = _AdjointCorners()
-    if total > TINY_VOLUME:
-        scale = sign / total
-        mean = wp.dot(inside, adj_weights) / total
-        adj_a = wp.where(sign * spanned[0] < 0.0, 0.0, scale * (adj_weights[0] - mean))
-        adj_b = wp.where(sign * spanned[1] < 0.0, 0.0, scale * (adj_weights[1] - mean))
-        adj_c = wp.where(sign * spanned[2] < 0.0, 0.0, scale * (adj_weights[2] - mean))
-        by_a = wp.vec3(adj_c * at_b[1] - adj_b * at_c[1], adj_b * at_c[0] - adj_c * at_b[0], 0.0)
-        by_b = wp.vec3(adj_a * at_c[1] - adj_c * at_a[1], adj_c * at_a[0] - adj_a * at_c[0], 0.0)
-        by_c = wp.vec3(adj_b * at_a[1] - adj_a * at_b[1], adj_a * at_b[0] - adj_b * at_a[0], 0.0)
-        adj.a = relative_adjoint(ray, by_a)
-        adj.b = relative_adjoint(ray, by_b)
-        adj.c = relative_adjoint(ray, by_c)
-    return adj
+    if adj_weights[0] != adj_weights[1] or adj_weights[1] != adj_weights[2]:
+        at_a = relative(a, ray)
+        at_b = relative(b, ray)
+        at_c = relative(c, ray)
+        spanned = volumes(at_a, at_b, at_c)
+        sign = wp.sign(spanned[0] + spanned[1] + spanned[2])
+        inside = wp.max(sign * spanned, wp.vec3(0.0, 0.0, 0.0))
+        total = inside[0] + inside[1] + inside[2]
+        if total > TINY_VOLUME:
+            scale = sign / total
+            mean = wp.dot(inside, adj_weights) / total
+            adj_a = wp.where(sign * spanned[0] < 0.0, 0.0, scale * (adj_weights[0] - mean))
+            adj_b = wp.where(sign * spanned[1] < 0.0, 0.0, scale * (adj_weights[1] - mean))
+            adj_c = wp.where(sign * spanned[2] < 0.0, 0.0, scale * (adj_weights[2] - mean))
+            by_a = wp.vec3(adj_c * at_b[1] - adj_b * at_c[1], adj_b * at_c[0] - adj_c * at_b[0], 0.0)
+            by_b = wp.vec3(adj_a * at_c[1] - adj_c * at_a[1], adj_c * at_a[0] - adj_a * at_c[0], 0.0)
+            by_c = wp.vec3(adj_b * at_a[1] - adj_a * at_b[1], adj_a * at_b[0] - adj_b * at_a[0], 0.0)
+            wp.adjoint[a] += relative_adjoint(ray, by_a)
+            wp.adjoint[b] += relative_adjoint(ray, by_b)
+            wp.adjoint[c] += relative_adjoint(ray, by_c)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _find_barycentrics(
     first_row: int,
     worker: int,
@@ -91,45 +81,13 @@ def _find_barycentrics(
     row = thread * run / width
     for sample in range(thread * run, (thread + 1) * run):
         face = face_ids[instance, sample]
-        weights = wp.vec3()
         if face >= 0:
             corners = faces[face]
             ray = center(sample - row * width, row, width, height)
             weights = _weights(clip[corners[0]], clip[corners[1]], clip[corners[2]], ray)
-        barycentrics[instance, sample] = weights
-
-
-@wp.kernel(enable_backward=False)
-def _find_barycentrics_adjoint(
-    first_row: int,
-    worker: int,
-    # in
-    face_ids: wp.array2d(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
-    clip_positions: wp.array2d(dtype=wp.vec4),
-    width: int,
-    run: int,
-    adj_barycentrics: wp.array2d(dtype=wp.vec3),
-    # out
-    adj_clip_positions: wp.array2d(dtype=wp.vec4),
-):
-    """A thread owns a run of samples."""
-    instance, thread = split_row(first_row + wp.tid(), face_ids.shape[1] // run)
-    clip = clip_positions[instance]
-    adj_clip = adj_clip_positions[instance]
-    height = face_ids.shape[1] // width
-    row = thread * run / width
-    for sample in range(thread * run, (thread + 1) * run):
-        face = face_ids[instance, sample]
-        adj_weights = adj_barycentrics[instance, sample]
-        # An attribute that is equal at all corners does not depend on the weights, whose sum is 1.
-        if face >= 0 and (adj_weights[0] != adj_weights[1] or adj_weights[1] != adj_weights[2]):
-            i = faces[face]
-            ray = center(sample - row * width, row, width, height)
-            adj = _weights_adjoint(clip[i[0]], clip[i[1]], clip[i[2]], ray, adj_weights)
-            wp.atomic_add(adj_clip, i[0], adj.a)
-            wp.atomic_add(adj_clip, i[1], adj.b)
-            wp.atomic_add(adj_clip, i[2], adj.c)
+            barycentrics[instance, sample] = weights
+        else:
+            barycentrics[instance, sample] = wp.vec3()
 
 
 def find_barycentrics(face_ids: wp.array, faces: wp.array, clip_positions: wp.array) -> wp.array:
@@ -149,19 +107,13 @@ def find_barycentrics(face_ids: wp.array, faces: wp.array, clip_positions: wp.ar
     check.shape("clip_positions", clip_positions.shape, (face_ids.shape[0], "vertex"))
     device, width = clip_positions.device, face_ids.shape[2]
     run = run_length(device, width)
-    run_count = face_ids.size // run
-    inputs = [rows(face_ids), faces, clip_positions, width, run]
-    return differentiable(
-        lambda barycentrics: launch(
-            _find_barycentrics, run_count, cost=_COST * run, inputs=inputs, outputs=[rows(barycentrics)]
-        ),
-        lambda adj_barycentrics: launch(
-            _find_barycentrics_adjoint,
-            run_count,
-            cost=_ADJOINT_COST * run,
-            inputs=[*inputs, rows(adj_barycentrics)],
-            sums=[clip_positions.grad],
-        ),
-        result=empty(face_ids.shape, dtype=wp.vec3, device=device),
-        variables=[clip_positions],
+    barycentrics = empty((len(face_ids), face_ids[0].size), dtype=wp.vec3, device=device)
+    launch(
+        _find_barycentrics,
+        face_ids.size // run,
+        cost=_COST * run,
+        inputs=[rows(face_ids), faces, clip_positions, width, run],
+        outputs=[barycentrics],
+        shared=[clip_positions],
     )
+    return barycentrics.reshape(face_ids.shape)

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import warp as wp
 
 from warpshadow.device.lanes import Chunk, as_chunks, use_vector_registers
-from warpshadow.device.launch import differentiable, launch
-from warpshadow.device.memory import empty, zeros
+from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty, require_gradient
 
 
 class CachedRows(NamedTuple):
@@ -16,7 +16,19 @@ class CachedRows(NamedTuple):
     index: wp.array  # [receiver] int32
 
 
-@wp.kernel(enable_backward=False)
+@wp.func
+def _light(t: Chunk, red: Chunk, green: Chunk, blue: Chunk):
+    """Light of a chunk of cells:  Σ_q T_q S_q."""
+    return wp.vec3(wp.dot(t, red), wp.dot(t, green), wp.dot(t, blue))
+
+
+@wp.func_grad(_light)
+def _light_adjoint(t: Chunk, red: Chunk, green: Chunk, blue: Chunk, adj: wp.vec3):
+    """The gradient to transmittance alone, by the vector units:  T̄_q = S_q · B̄."""
+    wp.adjoint[t] += adj[0] * red + adj[1] * green + adj[2] * blue
+
+
+@wp.kernel
 def _light_cells(
     # in
     transmittance: wp.array3d(dtype=Chunk),
@@ -25,38 +37,15 @@ def _light_cells(
     # out
     shading: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a receiver:  B = Σ_q T_q S_q."""
+    """A thread owns a receiver."""
     batch, receiver = wp.tid()
     row = index[receiver]
     total = wp.vec3()
     for chunk in range(cells.shape[2]):
-        t = transmittance[batch, receiver, chunk]
-        total += wp.vec3(
-            wp.dot(t, cells[row, 0, chunk]), wp.dot(t, cells[row, 1, chunk]), wp.dot(t, cells[row, 2, chunk])
+        total += _light(
+            transmittance[batch, receiver, chunk], cells[row, 0, chunk], cells[row, 1, chunk], cells[row, 2, chunk]
         )
     shading[batch, receiver] = total
-
-
-@wp.kernel(enable_backward=False)
-def _light_cells_adjoint(
-    # in
-    index: wp.array(dtype=wp.int32),
-    cells: wp.array3d(dtype=Chunk),
-    adj_shading: wp.array2d(dtype=wp.vec3),
-    # out
-    adj_transmittance: wp.array3d(dtype=Chunk),
-):
-    """A thread owns a receiver:  T̄_q += S_q · B̄."""
-    batch, receiver = wp.tid()
-    row = index[receiver]
-    adj = adj_shading[batch, receiver]
-    for chunk in range(cells.shape[2]):
-        adj_transmittance[batch, receiver, chunk] = (
-            adj_transmittance[batch, receiver, chunk]
-            + adj[0] * cells[row, 0, chunk]
-            + adj[1] * cells[row, 1, chunk]
-            + adj[2] * cells[row, 2, chunk]
-        )
 
 
 def light_cells(transmittance: wp.array, cached: CachedRows) -> wp.array:
@@ -71,20 +60,13 @@ def light_cells(transmittance: wp.array, cached: CachedRows) -> wp.array:
     """
     device = transmittance.device
     use_vector_registers(__name__, device)
-    factors = [cached.index, as_chunks(cached.rows)]
-
-    def forward(shading: wp.array) -> None:
-        launch(_light_cells, shading.shape, inputs=[as_chunks(transmittance), *factors], outputs=[shading])
-
-    def adjoint(adj_shading: wp.array) -> None:
-        outputs = [as_chunks(transmittance.grad)]
-        launch(_light_cells_adjoint, adj_shading.shape, inputs=[*factors, adj_shading], outputs=outputs)
-
     shading = empty(transmittance.shape[:2], dtype=wp.vec3, device=device)
-    return differentiable(forward, adjoint, shading, variables=[transmittance])
+    inputs = [as_chunks(transmittance), cached.index, as_chunks(cached.rows)]
+    launch(_light_cells, shading.shape, inputs=inputs, outputs=[shading])
+    return shading
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _multiply_cells(
     # in
     factors: wp.array3d(dtype=Chunk),
@@ -93,13 +75,11 @@ def _multiply_cells(
     # out
     products: wp.array3d(dtype=Chunk),
 ):
-    """A thread owns a receiver, to whose products it adds."""
+    """A thread owns a receiver."""
     batch, receiver = wp.tid()
     row = index[receiver]
     for chunk in range(cells.shape[2]):
-        products[batch, receiver, chunk] = products[batch, receiver, chunk] + wp.cw_mul(
-            factors[batch, receiver, chunk], cells[row, 0, chunk]
-        )
+        products[batch, receiver, chunk] = wp.cw_mul(factors[batch, receiver, chunk], cells[row, 0, chunk])
 
 
 def cell_transfer(transmittance: wp.array, cached: CachedRows) -> wp.array:
@@ -114,18 +94,12 @@ def cell_transfer(transmittance: wp.array, cached: CachedRows) -> wp.array:
     """
     device = transmittance.device
     use_vector_registers(__name__, device)
-    factors = [cached.index, as_chunks(cached.rows)]
-
-    def multiply(values: wp.array, products: wp.array) -> None:
-        inputs = [as_chunks(values), *factors]
-        launch(_multiply_cells, values.shape[:2], inputs=inputs, outputs=[as_chunks(products)])
-
-    return differentiable(
-        lambda transfer: multiply(transmittance, transfer),
-        lambda adj_transfer: multiply(adj_transfer, transmittance.grad),
-        result=zeros(transmittance.shape, dtype=wp.float32, device=device),
-        variables=[transmittance],
-    )
+    transfer = empty(transmittance.shape, dtype=wp.float32, device=device)
+    if transmittance.requires_grad:
+        require_gradient(transfer)  # before it is seen as chunks
+    inputs = [as_chunks(transmittance), cached.index, as_chunks(cached.rows)]
+    launch(_multiply_cells, transfer.shape[:2], inputs=inputs, outputs=[as_chunks(transfer)])
+    return transfer
 
 
 @wp.kernel(enable_backward=False)

@@ -23,9 +23,8 @@ WALL_COSINE = 1.0e-3
 in front of it then, against rounding.
 """
 
-MIN_HIT_HEIGHT = (
-    1.0e-4  # height above a face, as a part of its size, from which rays of receivers on it start to meet it
-)
+# height above a face, as a part of its size, from which rays of receivers on it start to meet it
+MIN_HIT_HEIGHT = 1.0e-4
 
 
 @wp.func

@@ -28,21 +28,7 @@ def _rotate_by_quaternions(
     """A thread owns a rotation."""
     batch, body = wp.tid()
     q = wp.vec4(wp.normalize(wp.vec4d(quaternions[batch, body])))  # whose length squared may not be a float32
-    x = q[0]
-    y = q[1]
-    z = q[2]
-    w = q[3]
-    rotations[batch, body] = wp.mat33(
-        1.0 - 2.0 * (y * y + z * z),
-        2.0 * (x * y - z * w),
-        2.0 * (x * z + y * w),
-        2.0 * (x * y + z * w),
-        1.0 - 2.0 * (x * x + z * z),
-        2.0 * (y * z - x * w),
-        2.0 * (x * z - y * w),
-        2.0 * (y * z + x * w),
-        1.0 - 2.0 * (x * x + y * y),
-    )
+    rotations[batch, body] = wp.quat_to_matrix(wp.quat(q[0], q[1], q[2], q[3]))
 
 
 @wp.kernel
@@ -83,11 +69,7 @@ def _rotate_by_columns(
     rotations[batch, body] = wp.matrix_from_cols(wp.vec3(x), wp.vec3(y), wp.vec3(wp.cross(x, y)))
 
 
-_ROTATION_KERNELS = {
-    wp.vec4: _rotate_by_quaternions,
-    wp.vec3: _rotate_by_axis_angles,
-    Vec6: _rotate_by_columns,
-}
+_ROTATION_KERNELS = {wp.vec4: _rotate_by_quaternions, wp.vec3: _rotate_by_axis_angles, Vec6: _rotate_by_columns}
 
 
 @one_at_a_time

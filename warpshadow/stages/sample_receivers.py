@@ -23,14 +23,10 @@ from warpshadow.stages.rasterization import Fragments
 
 TILE = 16  # pixels of a side of the tiles whose receivers follow each other
 
-
 ALIKE = 0.9  # cosine between normals of samples of a pixel from which they may share a receiver …
 LEVEL = 0.3  # … where a line from one to the other is not steeper than that: the sine of its angle to the surface
 
-_SHARING_COST, _SAMPLE_COST = (
-    12.0,
-    3.5,
-)  # nanoseconds that a sample takes, to find whose receiver it shares and to get it
+_SHARING_COST, _SAMPLE_COST = 12.0, 3.5  # nanoseconds of a sample, to find whose receiver it shares and to get it
 
 
 class Span(NamedTuple):
@@ -68,10 +64,11 @@ class SampleReceivers(NamedTuple):
 
 
 @wp.func
-def _is_one_surface(point: wp.vec3, normal: wp.vec3, other: wp.vec3, other_normal: wp.vec3):
-    """Whether two points lie on one smooth surface, which is not steep between them."""
-    step = other - point
-    return wp.dot(normal, other_normal) > ALIKE and wp.abs(wp.dot(normal, step)) <= LEVEL * wp.length(step)
+def _is_one_surface(points: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3), sample: int, other: int):
+    """Whether two samples see one smooth surface, which is not steep between them."""
+    normal = normals[sample]
+    step = points[other] - points[sample]
+    return wp.dot(normal, normals[other]) > ALIKE and wp.abs(wp.dot(normal, step)) <= LEVEL * wp.length(step)
 
 
 @wp.kernel(enable_backward=False)
@@ -160,12 +157,7 @@ def _find_sharing(
                             other_side = sides[view, other]
                             # (two slats are no surface, however even they are)
                             if pieces[side % pieces.shape[0]] == pieces[other_side % pieces.shape[0]]:  # noqa: SIM102
-                                if _is_one_surface(
-                                    points[view, sample],
-                                    normals[view, sample],
-                                    points[view, other],
-                                    normals[view, other],
-                                ):
+                                if _is_one_surface(points[view], normals[view], sample, other):
                                     owner = other
                 owner_samples[view, sample] = owner
                 weights[view, sample] = weight

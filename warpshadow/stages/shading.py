@@ -13,7 +13,7 @@ from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK
-from warpshadow.stages.transfer import CellInputs, are_up, cell_inputs, cosines
+from warpshadow.stages.transfer import cell_inputs, spread, transfer_chunk
 
 _SLAB = 256  # receivers whose gradients to light a thread sums before it adds them to the others'
 _COEFFICIENT_COST, _RECEIVER_COST = 0.4, 30.0  # nanoseconds that a coefficient of a receiver takes, and a receiver
@@ -227,12 +227,26 @@ def shade(transfer: wp.array, light: wp.array, *, maximum: float = check.LARGEST
 # ---------------------------------------------------------------------------------------------------- known light
 
 
-@wp.kernel(enable_backward=False)
+@wp.func
+def _lit(transfer: Chunk, light: Chunk):
+    return wp.cw_mul(transfer, light)
+
+
+@wp.func_grad(_lit)
+def _lit_adjoint(transfer: Chunk, light: Chunk, adj: Chunk):
+    """The gradient to transfer alone: light is known."""
+    wp.adjoint[transfer] += wp.cw_mul(light, adj)
+
+
+@wp.kernel
 def _shade_cells(
     first_row: int,
     worker: int,
     # in
-    cells: CellInputs,
+    transmittance: wp.array3d(dtype=Chunk),
+    normals: wp.array2d(dtype=wp.vec3),
+    directions: wp.array2d(dtype=Chunk),
+    weight: float,
     light: wp.array3d(dtype=Chunk),
     # out
     shading: wp.array2d(dtype=wp.vec3),
@@ -240,57 +254,19 @@ def _shade_cells(
     """A thread owns a receiver."""
     batch, receiver = split_row(first_row + wp.tid(), shading.shape[1])
     light_batch = instance_in(batch, light.shape[0])
-    normal = cells.normals[batch, receiver]
+    nx, ny, nz = spread(normals[batch, receiver])
     red = Chunk(0.0)
     green = Chunk(0.0)
     blue = Chunk(0.0)
-    for chunk in range(cells.directions.shape[1]):
-        cosine = wp.max(cosines(normal, cells.directions, chunk), Chunk(0.0))
-        transfer = wp.cw_mul(cosine, cells.transmittance[batch, receiver, chunk])
-        red += wp.cw_mul(transfer, light[light_batch, 0, chunk])
-        green += wp.cw_mul(transfer, light[light_batch, 1, chunk])
-        blue += wp.cw_mul(transfer, light[light_batch, 2, chunk])
-    shading[batch, receiver] = cells.weight * wp.vec3(_sum(red), _sum(green), _sum(blue))
-
-
-@wp.kernel(enable_backward=False)
-def _shade_cells_adjoint(
-    first_row: int,
-    worker: int,
-    # in
-    cells: CellInputs,
-    light: wp.array3d(dtype=Chunk),
-    adj_shading: wp.array2d(dtype=wp.vec3),
-    # out
-    adj_transmittance: wp.array3d(dtype=Chunk),
-    adj_normals: wp.array2d(dtype=wp.vec3),
-):
-    """A thread owns a receiver:  T̄_q = w max(n·ω_q, 0) L_q·s̄,  n̄ = Σ w T_q (L_q·s̄) ω_q where n·ω_q > 0."""
-    batch, receiver = split_row(first_row + wp.tid(), adj_shading.shape[1])
-    light_batch = instance_in(batch, light.shape[0])
-    normal = cells.normals[batch, receiver]
-    directions = cells.directions
-    adj = cells.weight * adj_shading[batch, receiver]
-    x = Chunk(0.0)
-    y = Chunk(0.0)
-    z = Chunk(0.0)
     for chunk in range(directions.shape[1]):
-        cosine = cosines(normal, directions, chunk)
-        pull = (
-            adj[0] * light[light_batch, 0, chunk]
-            + adj[1] * light[light_batch, 1, chunk]
-            + adj[2] * light[light_batch, 2, chunk]
-        )
-        if adj_transmittance:
-            adj_transmittance[batch, receiver, chunk] = adj_transmittance[batch, receiver, chunk] + wp.cw_mul(
-                pull, wp.max(cosine, Chunk(0.0))
-            )
-        pull = wp.cw_mul(wp.cw_mul(pull, cells.transmittance[batch, receiver, chunk]), are_up(cosine))
-        x += wp.cw_mul(pull, directions[0, chunk])
-        y += wp.cw_mul(pull, directions[1, chunk])
-        z += wp.cw_mul(pull, directions[2, chunk])
-    if adj_normals:
-        adj_normals[batch, receiver] = adj_normals[batch, receiver] + wp.vec3(_sum(x), _sum(y), _sum(z))
+        x = directions[0, chunk]
+        y = directions[1, chunk]
+        z = directions[2, chunk]
+        transfer = transfer_chunk(1.0, nx, ny, nz, x, y, z, transmittance[batch, receiver, chunk])
+        red += _lit(transfer, light[light_batch, 0, chunk])
+        green += _lit(transfer, light[light_batch, 1, chunk])
+        blue += _lit(transfer, light[light_batch, 2, chunk])
+    shading[batch, receiver] = weight * wp.vec3(_sum(red), _sum(green), _sum(blue))
 
 
 def shade_cells(
@@ -319,17 +295,8 @@ def shade_cells(
     check.shape("light", light.shape, ("batch", len(directions)))
     check.finite_arrays({"light": light}, maximum=maximum)
     use_vector_registers(__name__, device)
-    inputs = [cells, as_chunks(_channels(light))]
+    shading = empty(normals.shape, dtype=wp.vec3, device=device)
     cost = _RECEIVER_COST + _COEFFICIENT_COST * len(directions)
-    return differentiable(
-        lambda shading: launch(_shade_cells, shading.size, inputs=inputs, outputs=[shading], cost=cost),
-        lambda adj_shading: launch(
-            _shade_cells_adjoint,
-            adj_shading.size,
-            inputs=[*inputs, adj_shading],
-            outputs=[as_chunks(transmittance.grad), normals.grad],
-            cost=2 * cost,
-        ),
-        result=empty(normals.shape, dtype=wp.vec3, device=device),
-        variables=[transmittance, normals],
-    )
+    inputs = [*cells, as_chunks(_channels(light))]
+    launch(_shade_cells, shading.size, inputs=inputs, outputs=[shading], cost=cost)
+    return shading

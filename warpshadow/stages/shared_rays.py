@@ -37,8 +37,7 @@ SQUARES = 128
 power of two. With squares of 4 pixels at 128², thin shadows are missed: chair_wheel_fence of demos/kinds.py is 4.4% off
 a path tracer, in place of 2.5%."""
 
-TOLERANCE = 0.02
-"""Part of a receiver's light that may come from rays whose visibility is interpolated."""
+TOLERANCE = 0.02  # part of a receiver's light that may come from rays whose visibility is interpolated
 
 
 @functools.cache

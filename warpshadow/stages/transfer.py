@@ -6,6 +6,7 @@ directions. The 1/π is in T: white under L = 1, unoccluded, gives 1.
 """
 
 import functools
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -23,7 +24,7 @@ from warpshadow.device.lanes import (
     use_vector_registers,
 )
 from warpshadow.device.launch import differentiable, launch
-from warpshadow.device.memory import empty, zeros
+from warpshadow.device.memory import empty, require_gradient, zeros
 from warpshadow.device.parallel import Scratch, scratch_place, split_row
 from warpshadow.maths import sh
 from warpshadow.maths.directions import CHUNK, check_count
@@ -279,86 +280,65 @@ def sh_product(visibility: wp.array, lobes: wp.array, *, order: int, bands: int 
 
 
 @wp.func(inline=True)
-def cosines(normal: wp.vec3, directions: wp.array2d(dtype=Chunk), chunk: int):
-    """Cosines of a chunk of directions."""
-    return normal[0] * directions[0, chunk] + normal[1] * directions[1, chunk] + normal[2] * directions[2, chunk]
+def spread(normal: wp.vec3):
+    """A normal's coordinates, each for all cells of a chunk."""
+    return Chunk(normal[0]), Chunk(normal[1]), Chunk(normal[2])
 
 
 @wp.func(inline=True)
-def are_up(cosine: Chunk):
-    """1 where a cosine is above 0, else 0."""
-    return wp.min(wp.max(cosine * 1.0e30, Chunk(0.0)), Chunk(1.0))
+def transfer_chunk(weight: float, nx: Chunk, ny: Chunk, nz: Chunk, x: Chunk, y: Chunk, z: Chunk, transmittance: Chunk):
+    """Transfer w max(n·ω_q, 0) T_q to a chunk of cells."""
+    cosine = wp.cw_mul(nx, x) + wp.cw_mul(ny, y) + wp.cw_mul(nz, z)
+    return wp.cw_mul(weight * wp.max(cosine, Chunk(0.0)), transmittance)
 
 
-@wp.struct
-class CellInputs:
-    """Transmittance of receivers towards cells, and what a cell sends to a normal."""
+@wp.func_grad(transfer_chunk)
+def transfer_chunk_adjoint(
+    weight: float, nx: Chunk, ny: Chunk, nz: Chunk, x: Chunk, y: Chunk, z: Chunk, transmittance: Chunk, adj: Chunk
+):
+    """T̄_q = w max(n·ω_q, 0) t̄_q,  n̄ = Σ w T_q t̄_q ω_q where n·ω_q > 0, by the vector units."""
+    cosine = wp.cw_mul(nx, x) + wp.cw_mul(ny, y) + wp.cw_mul(nz, z)
+    weighted = weight * adj
+    wp.adjoint[transmittance] += wp.cw_mul(weighted, wp.max(cosine, Chunk(0.0)))
+    is_up = wp.min(wp.max(cosine * 1.0e30, Chunk(0.0)), Chunk(1.0))
+    pull = wp.cw_mul(wp.cw_mul(weighted, transmittance), is_up)
+    wp.adjoint[nx] += wp.cw_mul(pull, x)
+    wp.adjoint[ny] += wp.cw_mul(pull, y)
+    wp.adjoint[nz] += wp.cw_mul(pull, z)
 
-    transmittance: wp.array3d(dtype=Chunk)
-    normals: wp.array2d(dtype=wp.vec3)
-    directions: wp.array2d(dtype=Chunk)
-    weight: float  # solid angle over π
 
-
-def cell_inputs(transmittance: wp.array, normals: wp.array, directions: np.ndarray) -> CellInputs:
-    """Check transmittance of receivers towards cells and put all together for kernels, which may be on chunks."""
+def cell_inputs(transmittance: wp.array, normals: wp.array, directions: np.ndarray) -> list[Any]:
+    """Check transmittance towards cells; it in chunks, normals, directions and the cells' solid angle over π."""
     count, device = len(directions), normals.device
     check_count("directions", count)
     check.shape("transmittance", transmittance.shape, (*normals.shape, count))
     if transmittance.requires_grad and not transmittance.is_contiguous:
         raise ValueError("transmittance: got a strided array that requires a gradient, expected a contiguous one")
-    inputs = CellInputs()
-    inputs.transmittance, inputs.normals = as_chunks(transmittance.contiguous()), normals
-    inputs.directions, inputs.weight = constant(directions.T.reshape(3, -1, CHUNK), Chunk, device), 4.0 / count
-    return inputs
+    chunks = constant(directions.T.reshape(3, -1, CHUNK), Chunk, device)
+    return [as_chunks(transmittance.contiguous()), normals, chunks, 4.0 / count]
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _transfer_directions(
     first_row: int,
     worker: int,
     # in
-    cells: CellInputs,
+    transmittance: wp.array3d(dtype=Chunk),
+    normals: wp.array2d(dtype=wp.vec3),
+    directions: wp.array2d(dtype=Chunk),
+    weight: float,
     # out
     transfer: wp.array3d(dtype=Chunk),
 ):
     """A thread owns a receiver."""
-    batch, vertex = split_row(first_row + wp.tid(), cells.normals.shape[1])
-    n = cells.normals[batch, vertex]
-    for chunk in range(cells.directions.shape[1]):
-        cosine = cells.weight * wp.max(cosines(n, cells.directions, chunk), Chunk(0.0))
-        transfer[batch, vertex, chunk] = wp.cw_mul(cosine, cells.transmittance[batch, vertex, chunk])
-
-
-@wp.kernel(enable_backward=False)
-def _transfer_directions_adjoint(
-    first_row: int,
-    worker: int,
-    # in
-    cells: CellInputs,
-    adj_transfer: wp.array3d(dtype=Chunk),
-    # out
-    adj_transmittance: wp.array3d(dtype=Chunk),
-    adj_normals: wp.array2d(dtype=wp.vec3),
-):
-    """A thread owns a receiver:  T̄_q = w max(n·ω_q, 0) t̄_q,  n̄ = Σ w T_q t̄_q ω_q where n·ω_q > 0."""
-    batch, vertex = split_row(first_row + wp.tid(), cells.normals.shape[1])
-    n = cells.normals[batch, vertex]
-    directions = cells.directions
-    total = wp.vec3()
+    batch, vertex = split_row(first_row + wp.tid(), normals.shape[1])
+    nx, ny, nz = spread(normals[batch, vertex])
     for chunk in range(directions.shape[1]):
-        cosine = cosines(n, directions, chunk)
-        adj = cells.weight * adj_transfer[batch, vertex, chunk]
-        if adj_transmittance:
-            adj_transmittance[batch, vertex, chunk] = adj_transmittance[batch, vertex, chunk] + wp.cw_mul(
-                adj, wp.max(cosine, Chunk(0.0))
-            )
-        adj = wp.cw_mul(wp.cw_mul(adj, cells.transmittance[batch, vertex, chunk]), are_up(cosine))
-        total += wp.vec3(
-            wp.dot(adj, directions[0, chunk]), wp.dot(adj, directions[1, chunk]), wp.dot(adj, directions[2, chunk])
-        )
-    if adj_normals:
-        adj_normals[batch, vertex] = adj_normals[batch, vertex] + total
+        x = directions[0, chunk]
+        y = directions[1, chunk]
+        z = directions[2, chunk]
+        t = transmittance[batch, vertex, chunk]
+        transfer[batch, vertex, chunk] = transfer_chunk(weight, nx, ny, nz, x, y, z, t)
 
 
 def directional_transfer(transmittance: wp.array, normals: wp.array, directions: np.ndarray) -> wp.array:
@@ -372,19 +352,11 @@ def directional_transfer(transmittance: wp.array, normals: wp.array, directions:
         Transfer vectors, float32 of shape [batch, vertex, direction].
     Differentiable: transmittance, normals.
     """
-    cells, cost, device = cell_inputs(transmittance, normals, directions), _CELL_COST * len(directions), normals.device
+    inputs, device = cell_inputs(transmittance, normals, directions), normals.device
     use_vector_registers(__name__, device)
-    return differentiable(
-        lambda transfer: launch(
-            _transfer_directions, normals.size, inputs=[cells], outputs=[as_chunks(transfer)], cost=cost
-        ),
-        lambda adj_transfer: launch(
-            _transfer_directions_adjoint,
-            normals.size,
-            inputs=[cells, as_chunks(adj_transfer)],
-            outputs=[as_chunks(transmittance.grad), normals.grad],
-            cost=2 * cost,
-        ),
-        result=empty(transmittance.shape, dtype=wp.float32, device=device),
-        variables=[transmittance, normals],
-    )
+    transfer = empty(transmittance.shape, dtype=wp.float32, device=device)
+    if transmittance.requires_grad or normals.requires_grad:
+        require_gradient(transfer)  # before it is seen as chunks
+    cost = _CELL_COST * len(directions)
+    launch(_transfer_directions, normals.size, inputs=inputs, outputs=[as_chunks(transfer)], cost=cost)
+    return transfer

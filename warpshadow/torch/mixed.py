@@ -132,13 +132,9 @@ class MixedRenderer(torch.nn.Module):
 
         Args:
             which: Scene of each image, from 0, whole numbers of shape [batch].
-            rotations: Of each body, [body, 3, 3] or [batch, body, 3, 3], for as many bodies as the scene with the most
-                has.
-            translations: Of each body [scene units], [body, 3] or [batch, body, 3].
-            scales: Of each body, [body] or [batch, body]; by default the scenes'.
+            rotations, translations, scales: As of a TorchRenderer, of as many bodies as the scene with the most has.
             moving: Bodies that the poses move, as of a TorchRenderer; a scene passes over those that it has not.
-            pivot: "center" for rotations about the middle of each body, as of a TorchRenderer; None for the origin of
-                its own space.
+            pivot: "center", or None, as of a TorchRenderer.
         Returns:
             For each scene the geometry of its images, None where it has none.
         Differentiable: rotations, translations, scales.

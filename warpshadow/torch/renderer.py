@@ -39,8 +39,7 @@ _ELSEWHERE = {
 }
 """Remedies for keywords that a call does not have."""
 
-REFLECTANCE = ("albedo", "textures", *GLOSS_ARGUMENTS)
-"""Arguments that bodies have, each its own."""
+REFLECTANCE = ("albedo", "textures", *GLOSS_ARGUMENTS)  # arguments that bodies have, each its own
 
 
 class LayerTensors(NamedTuple):
@@ -447,13 +446,8 @@ class TorchRenderer(torch.nn.Module):
         """Exchange the shape of one body at rest, as :meth:`warpshadow.Renderer.deformed` does.
 
         Args:
-            body: The body, its number or name.
-            positions: Its vertices in its own space, [vertex, 3] or [batch, vertex, 3].
-            centers: Its spheres' centers, [sphere, 3] or [batch, sphere, 3].
-            radii: Its spheres' radii, [sphere] or [batch, sphere]. An item None stays as it is in ``rest``; but its
-                spheres follow its vertices, both centers and radii, unless ``centers`` are given
-                (:mod:`warpshadow.stages.bound_spheres`).
-            rest: All bodies at rest, by default as their meshes are.
+            body, rest: As there.
+            positions, centers, radii: As there, [vertex, 3], [sphere, 3] and [sphere], each maybe with a batch before.
         Returns:
             All bodies at rest, for :meth:`placed`; tensors of their own, which may be written to.
         Differentiable: all.

@@ -11,7 +11,7 @@ import warp as wp
 from warpshadow.maths.spatial_sort import z_order_of_cells
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.pipeline.view import View
-from warpshadow.scene.scene import Bounces, Scene
+from warpshadow.scene.scene import Bounces, Scene, change_bodies
 from warpshadow.scene.visibility import AUTO, Visibility
 from warpshadow.stages.normals import vertex_normals
 
@@ -90,17 +90,13 @@ class PointSample:
 
     def _trace(self, receivers: str) -> np.ndarray:
         visibility = Visibility(method="ray-traced", samples=self._direction_count)
-        bodies = tuple(replace(body, receivers=receivers) for body in self._scene.bodies)
-        scene = replace(self._scene, bodies=bodies, visibility=visibility, supersampling=1, bounces=self._bounces)
-        return self.shading(scene)
+        scene = change_bodies(self._scene, "receivers", dict.fromkeys(range(len(self._scene.bodies)), receivers))
+        return self.shading(replace(scene, visibility=visibility, supersampling=1, bounces=self._bounces))
 
     def decided(self, scene: Scene) -> Scene:
         """A variant of the scene with the receivers that a renderer of the whole image chooses for "auto"."""
-        bodies = (
-            replace(body, receivers=chosen) if body.receivers == AUTO else body
-            for body, chosen in zip(scene.bodies, self._chosen, strict=True)
-        )
-        return replace(scene, bodies=tuple(bodies))
+        is_open = [body.receivers == AUTO for body in scene.bodies]
+        return change_bodies(scene, "receivers", {k: self._chosen[k] for k in np.flatnonzero(is_open).tolist()})
 
     def shading(self, scene: Scene) -> np.ndarray:
         """Shade the points, as white surfaces, with the visibility, spheres and receivers of a variant of the scene.

@@ -11,7 +11,7 @@ import os
 import sys
 import warnings
 import weakref
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -23,8 +23,8 @@ from warpshadow.device.progress import progress_bar
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.scene import toml_tables
 from warpshadow.scene.blockers import fitted_counts, fitted_meshes
-from warpshadow.scene.scene import SCENE_TYPES, Bounces, Scene, check_bounces
-from warpshadow.scene.visibility import AUTO, SPHERE_METHODS, Visibility
+from warpshadow.scene.scene import SCENE_TYPES, Bounces, Scene, change_bodies, check_bounces
+from warpshadow.scene.visibility import AUTO, METHOD_TRAITS, SPHERE_METHODS, Visibility
 from warpshadow.spheres import Spheres, fit_spheres, is_fitted
 from warpshadow.stages.visibility.zonal_logs import LOGS
 from warpshadow.tuning.point_sample import PointSample
@@ -42,9 +42,8 @@ Where none is accurate enough, the same holds of their errors; then the faster i
 """
 
 ERROR_STEP = 0.003  # errors that differ by less than this count as equal, too: nobody sees it
-COARSE_FACES_ERROR = (
-    0.005  # error of interpolation between a body's vertices from which on its pixels are tried as receivers
-)
+# error of interpolation between a body's vertices from which on its pixels are tried as receivers
+COARSE_FACES_ERROR = 0.005
 
 
 class Trial(NamedTuple):
@@ -100,12 +99,8 @@ class Tuning:
     def __str__(self) -> str:
         """The table, the units of its errors and times, and the meaning of its marks."""
         camera, samples = self.given.camera, self.given.supersampling
-        has_bounces = any(trial.scene.bounces for trial in self.trials)
-        sampled = (
-            ""
-            if has_bounces
-            else f"; but for those marked *, shadows timed on {TIMED_RECEIVERS} of its receivers, extrapolated to all"
-        )
+        sampled = f"; but for those marked *, shadows timed on {TIMED_RECEIVERS} of its receivers, extrapolated to all"
+        sampled *= not any(trial.scene.bounces for trial in self.trials)
         mark = "chosen" if self.is_reached else "nearest"
         return (
             "error: of the shading at points of the image, relative, against rays\n"
@@ -127,8 +122,7 @@ class Tuning:
     def toml(self) -> str:
         """The settings as lines of a scene file: [visibility], and changes of the bodies."""
         visibility = self.scene.visibility
-        keys = {"directional": ("method", "directions"), "log-sh": ("method", "order", "log")}
-        chosen = {key: getattr(visibility, key) for key in keys.get(str(visibility.method), ("method",))}
+        chosen = {key: getattr(visibility, key) for key in ("method", *_tuned_settings(visibility))}
         blocks = [toml_tables.block("[visibility]", chosen)]
         if self.scene.bounces != self.given.bounces:
             blocks.insert(0, toml_tables.block("[light]", {"bounces": self.scene.bounces}))
@@ -163,12 +157,11 @@ def describe(scene: Scene) -> str:
 
 
 def _method(visibility: Visibility) -> str:
-    details = {
-        "directional": f" {visibility.directions}",
-        "log-sh": f" {visibility.log} {visibility.order}",
-    }
-    method = str(visibility.method)
-    return method + details.get(method, "")
+    return " ".join(str(getattr(visibility, name)) for name in ("method", *_tuned_settings(visibility)))
+
+
+def _tuned_settings(visibility: Visibility) -> tuple[str, ...]:
+    return METHOD_TRAITS[visibility.method].tuned if visibility.method else ()
 
 
 def _bounces(scene: Scene) -> str:
@@ -240,12 +233,10 @@ def tune(
     scene = scene.with_method()
     sample = PointSample(scene, bounces=bounces, device=device, progress=progress)
     is_coarse = sample.interpolation_errors() > COARSE_FACES_ERROR
-    fine = [
-        body.receivers if receivers == own.receivers else receivers
-        for body, own, receivers in zip(
-            scene.bodies, sample.decided(scene).bodies, np.where(is_coarse, "pixel", "vertex").tolist(), strict=True
-        )
-    ]
+    pairs = zip(
+        scene.bodies, sample.decided(scene).bodies, np.where(is_coarse, "pixel", "vertex").tolist(), strict=True
+    )
+    fine = [body.receivers if receivers == own.receivers else receivers for body, own, receivers in pairs]
     counts: Sequence[Bounces] = (scene.bounces,)
     if bounces is not None:
         counts = (*BOUNCE_COUNTS, "all") if bounces == "all" else [count for count in BOUNCE_COUNTS if count <= bounces]
@@ -358,14 +349,11 @@ def _resolve(scene: Scene, device: wp.DeviceLike, progress: bool) -> Scene:
             return setting
     error, nearest = min(tried, key=lambda item: item[0])
     interpolation_error = _interpolation_error(scene, sample)
-    reason = (
-        ""
-        if interpolation_error < accepted_error
-        else f"; interpolation between vertices alone has {interpolation_error:.3f}: receivers = 'pixel'"
-    )
+    reason = f"; interpolation between vertices alone has {interpolation_error:.3f}: receivers = 'pixel'"
+    reason *= interpolation_error >= accepted_error
     check.warn(
         f"visibility: no setting of method = 'auto' reaches error = {accepted_error:g}; {describe(nearest)} "
-        f"comes nearest, with {error:.3f}{reason}",
+        f"comes nearest, with {error:.3f}{reason}"
     )
     return nearest
 
@@ -387,7 +375,8 @@ def _by_work(scene: Scene, sample: PointSample) -> Iterator[Scene]:
     }
     factor, maximum = 2, max(own.values(), default=SPHERE_COUNTS[-1])
     while factor * maximum <= SPHERE_COUNTS[-1] and _interpolation_error(scene, sample) < scene.visibility.error:
-        yield from _all_directions(_with_spheres(scene, {number: factor * count for number, count in own.items()}))
+        more = change_bodies(scene, "blockers", {number: factor * count for number, count in own.items()})
+        yield from _all_directions(more)
         factor *= 2
 
 
@@ -401,8 +390,7 @@ def _all_directions(scene: Scene) -> Iterator[Scene]:
 def _settings(scene: Scene, fine: Sequence[str], fits: bool, device: wp.DeviceLike) -> Iterator[Scene]:
     """Trials, a variant of the scene each: with its own receivers, and with fine ones."""
     for receivers in dict.fromkeys((_receivers(scene), tuple(fine))):
-        bodies = tuple(replace(body, receivers=item) for body, item in zip(scene.bodies, receivers, strict=True))
-        placed = replace(scene, bodies=bodies)
+        placed = change_bodies(scene, "receivers", dict(enumerate(receivers)))
         if not scene.bounces:
             yield replace(placed, visibility=scene.visibility.by("none"))
         for more in _sphere_variants(placed, fits, device):
@@ -418,15 +406,7 @@ def _sphere_variants(scene: Scene, fits: bool, device: wp.DeviceLike) -> Iterato
         meshes = (mesh for mesh, _ in fitted_meshes(scene, device=device).values())
         is_at_hand = fits or all(is_fitted(mesh, count, device=device) for mesh in meshes)
         if is_at_hand and set(own.values()) != {count}:
-            yield _with_spheres(scene, dict.fromkeys(own, count))
-
-
-def _with_spheres(scene: Scene, counts: Mapping[int, int]) -> Scene:
-    """Other numbers of spheres for some bodies."""
-    bodies = (
-        replace(body, blockers=counts[number]) if number in counts else body for number, body in enumerate(scene.bodies)
-    )
-    return replace(scene, bodies=tuple(bodies))
+            yield change_bodies(scene, "blockers", dict.fromkeys(own, count))
 
 
 def _directional(visibility: Visibility) -> Iterator[Visibility]:

@@ -16,9 +16,8 @@ from warpshadow.inverse.world import FittedScene, Setting, World
 from warpshadow.maths.directions import check_count, fibonacci
 from warpshadow.maths.sh import check_order
 
-_MIN_RADIANCE = (
-    1e-3  # light of cells starts no lower [radiance of the targets]: a logarithm has to come back from there
-)
+# light of cells starts no lower [radiance of the targets]: a logarithm has to come back from there
+_MIN_RADIANCE = 1e-3
 
 
 @dataclass(frozen=True)

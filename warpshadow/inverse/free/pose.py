@@ -19,11 +19,7 @@ from warpshadow.inverse.world import FittedScene, Setting, World
 from warpshadow.scene.scene import BodyLike, Scene
 from warpshadow.torch import rotation_matrices
 
-_NO_TURN = {
-    "axis-angle": (0.0, 0.0, 0.0),
-    "quaternion": (0.0, 0.0, 0.0, 1.0),
-    "6d": (1.0, 0.0, 0.0, 0.0, 1.0, 0.0),
-}
+_NO_TURN = {"axis-angle": (0.0, 0.0, 0.0), "quaternion": (0.0, 0.0, 0.0, 1.0), "6d": (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)}
 _TURNS = np.array(
     [sign * axis for axis in np.eye(3) for sign in (-1, 1)] + list(itertools.product((-1.0, 1.0), repeat=3))
 )

@@ -343,14 +343,7 @@ class SphereBounces:
     def cached_bounced_shading(
         self, points: LitPoints, projected_light: Any, light: Input, materials: Materials
     ) -> Node:
-        """The same for static points: their and the sources' visibility is cached, and so are form factors by rays.
-
-        Args:
-            points: The receivers, among bodies that stand where the scene has them.
-            projected_light: The light projected for the method.
-            light: The light, known.
-            materials: Reflectance of the bodies.
-        """
+        """The same for static points: their and the sources' visibility is cached, and so are form factors by rays."""
         sources, at_sources = self._cached_sources(points, materials)
         direct = points.cached(
             "direct", light, lambda: PortionedShading(self._method, points, projected_light, light, joined)
@@ -362,12 +355,7 @@ class SphereBounces:
         return self._still.add_bounces(direct, lit, points, materials)
 
     def cached_bounced_free_shading(self, direct: Node, points: LitPoints, light: Input, materials: Materials) -> Node:
-        """The same in free light.
-
-        Args:
-            direct: Node of the direct shading of the receivers, vec3 of shape [batch, receiver].
-            points, light, materials: As above.
-        """
+        """The same in free light, given a node of the direct shading of the receivers."""
         sources, at_sources = self._cached_sources(points, materials)
         transfers = points.cached("transfer", sources, lambda: self._method.transfers(at_sources, _OF_SOURCES))
         return self._still.add_free_bounces(direct, transfers, light, points, materials)

@@ -16,13 +16,7 @@ from warpshadow.pipeline.node import Node
 from warpshadow.pipeline.planes import ScenePlanes
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.albedo import mean_over_texels, mean_over_vertices
-from warpshadow.stages.bounces.patches import (
-    MAX_PATCHES,
-    SOURCES,
-    Patches,
-    find_patches,
-    find_plane_patches,
-)
+from warpshadow.stages.bounces.patches import MAX_PATCHES, SOURCES, Patches, find_patches, find_plane_patches
 from warpshadow.stages.bounces.radiosity import mean_over_sources
 from warpshadow.stages.receivers import Receivers, receivers_on_faces
 from warpshadow.stages.sparse import SparseMatrix, multiply

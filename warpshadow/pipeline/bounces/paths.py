@@ -17,9 +17,8 @@ from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.textures.pyramid import Textures
 
 _LIGHT_SAMPLES = 1024  # directions of each set from which hits draw light
-_MAX_PATH_BOUNCES = (
-    64  # most bounces of a path where it may have any number: in a closed room of albedo 0.9 one in 800 ends there
-)
+# most bounces of a path where it may have any number: in a closed room of albedo 0.9 one in 800 ends there
+_MAX_PATH_BOUNCES = 64
 
 _RAYS_OF_PATH = 2
 """Rays of direct light for each path, which varies about as much and takes 2.4 times as long with two bounces."""

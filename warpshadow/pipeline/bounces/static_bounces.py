@@ -174,8 +174,7 @@ class StaticBounces:
 
         def reflect_all(by_others: wp.array, radiosity: wp.array | None) -> wp.array:
             return reflect(
-                albedo,
-                by_others if radiosity is None else multiply(factors.within_bodies, radiosity, plus=by_others),
+                albedo, by_others if radiosity is None else multiply(factors.within_bodies, radiosity, plus=by_others)
             )
 
         arguments = self._bounces, light_of_others, reflect_all, senders.areas

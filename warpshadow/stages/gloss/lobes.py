@@ -24,14 +24,11 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.parallel import split_row
 
-MIN_ROUGHNESS = 0.1
-"""Roughness of the smoothest surface; maps of 128 rows have nothing sharper."""
+MIN_ROUGHNESS = 0.1  # roughness of the smoothest surface; maps of 128 rows have nothing sharper
 
-_MIN_COSINE = 0.02
-"""Cosine between a receiver's normal and its viewer, of those whose interpolated normal turns away."""
+_MIN_COSINE = 0.02  # cosine between a receiver's normal and its viewer, of those whose interpolated normal turns away
 
-_COST = 60.0
-"""Nanoseconds that a sample takes."""
+_COST = 60.0  # nanoseconds that a sample takes
 
 wp.set_module_options({"max_unroll": 1})
 

@@ -17,14 +17,12 @@ from warpshadow.device.launch import launch
 from warpshadow.device.parallel import split_row
 from warpshadow.maths import sh
 
-MAX_ROWS = 128
-"""Most rows of level 0."""
+MAX_ROWS = 128  # most rows of level 0
 
 _MIN_ROWS = 16
 _LEVELS = 7
 
-_COST = 60.0
-"""Nanoseconds that a lookup takes."""
+_COST = 60.0  # nanoseconds that a lookup takes
 
 wp.set_module_options({"max_unroll": 1})
 

@@ -21,14 +21,12 @@ from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.parallel import split_row
 
-DIELECTRIC_F0 = 0.04
-"""F₀ of all that is not metal: an index of refraction of 1.5."""
+DIELECTRIC_F0 = 0.04  # f₀ of all that is not metal: an index of refraction of 1.5
 
 MIN_BLOCKED_SHARE = 0.02
 """Part of the hemisphere below which it says little of blockers' radiance how much light they send."""
 
-_COST = 10.0
-"""Nanoseconds that a sample takes."""
+_COST = 10.0  # nanoseconds that a sample takes
 
 wp.set_module_options({"max_unroll": 1})
 

@@ -8,8 +8,7 @@ from warpshadow.device.lanes import lane_type, make_lane_functions, module_optio
 from warpshadow.device.launch import launch
 from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open
 
-_PACKET_COST = 2000.0
-"""Nanoseconds that a packet takes."""
+_PACKET_COST = 2000.0  # nanoseconds that a packet takes
 
 
 @functools.cache

@@ -18,14 +18,11 @@ from warpshadow.device.launch import launch
 from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import cell_radius
 
-KERNEL_RADIUS = 2.2
-"""Distance of a cell from which it no longer counts, in cell radii."""
+KERNEL_RADIUS = 2.2  # distance of a cell from which it no longer counts, in cell radii
 
-_TABLE_ROWS = 32
-"""Rows of the table of cells near directions, and its columns: an octahedron."""
+_TABLE_ROWS = 32  # rows of the table of cells near directions, and its columns: an octahedron
 
-_COST = 60.0
-"""Nanoseconds that a sample takes."""
+_COST = 60.0  # nanoseconds that a sample takes
 
 _NEGLIGIBLE = 1.0e-7
 

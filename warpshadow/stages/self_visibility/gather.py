@@ -26,7 +26,7 @@ from warpshadow.device.lanes import (
     use_vector_registers,
 )
 from warpshadow.device.launch import differentiable, launch
-from warpshadow.device.memory import as_items, empty, zeros
+from warpshadow.device.memory import as_items, empty, require_gradient
 from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.device.warp_sums import sum_over_warp
 from warpshadow.stages.self_visibility.lookup import ResamplingKernels, ResamplingWeights
@@ -327,42 +327,26 @@ def gather_self_transmittance(
     )
 
 
-@wp.kernel(enable_backward=False)
-def _add_products(
+@wp.kernel
+def _multiply(
     # in
     factors: wp.array3d(dtype=Chunk),
     values: wp.array3d(dtype=Chunk),
     # out
     products: wp.array3d(dtype=Chunk),
 ):
-    """A thread owns a receiver, to whose products it adds."""
+    """A thread owns a receiver."""
     batch, receiver = wp.tid()
     for chunk in range(products.shape[2]):
-        products[batch, receiver, chunk] = products[batch, receiver, chunk] + wp.cw_mul(
-            factors[batch, receiver, chunk], values[batch, receiver, chunk]
-        )
+        products[batch, receiver, chunk] = wp.cw_mul(factors[batch, receiver, chunk], values[batch, receiver, chunk])
 
 
 def multiply_transmittances(own: wp.array, others: wp.array) -> wp.array:
     """The product of two transmittances, float32 of shape [batch, receiver, direction]. Differentiable: both."""
     use_vector_registers(__name__, own.device)
-
-    def add_product(first: wp.array, second: wp.array, total: wp.array) -> None:
-        launch(
-            _add_products,
-            own.shape[:2],
-            inputs=[as_chunks(first), as_chunks(second)],
-            outputs=[as_chunks(total)],
-        )
-
-    def adjoint(adj: wp.array) -> None:
-        for factor, other in ((own, others), (others, own)):
-            if factor.requires_grad:
-                add_product(other, adj, factor.grad)
-
-    return differentiable(
-        lambda product: add_product(own, others, product),
-        adjoint,
-        result=zeros(own.shape, dtype=wp.float32, device=own.device),
-        variables=[own, others],
-    )
+    product = empty(own.shape, dtype=wp.float32, device=own.device)
+    if own.requires_grad or others.requires_grad:
+        require_gradient(product)  # before it is seen as chunks
+    inputs = [as_chunks(own), as_chunks(others)]
+    launch(_multiply, own.shape[:2], inputs=inputs, outputs=[as_chunks(product)])
+    return product

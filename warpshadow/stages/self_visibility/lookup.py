@@ -28,23 +28,16 @@ _MAX_RAYS = 32  # rays that a cell looks up on average at most; a wider one look
 _CELL_COST = 1600.0  # nanoseconds that a cell takes
 
 
-class ResamplingKernels(NamedTuple):
-    """Where each cell of directions looks.
+@wp.struct
+class ResamplingKernels:
+    """Where each cell of directions looks."""
 
-    Args:
-        directions: Unit vectors ω, vec3 of shape [direction].
-        reaches: cos h, float32 of shape [direction].
-        looks_at_rays: Whether it looks at rays, 1, or at coarse cells, 0: int32 of shape [direction].
-        rays, cells: Directions of rays and of coarse cells in the body's frame, vec3.
-        most: Lookups of a cell at most.
-    """
-
-    directions: wp.array
-    reaches: wp.array
-    looks_at_rays: wp.array
-    rays: wp.array
-    cells: wp.array
-    most: int
+    directions: wp.array(dtype=wp.vec3)  # ω [direction]
+    reaches: wp.array(dtype=wp.float32)  # cos h [direction]
+    looks_at_rays: wp.array(dtype=wp.int32)  # 1, or 0 for coarse cells [direction]
+    rays: wp.array(dtype=wp.vec3)  # directions of rays, and of coarse cells, in the body's frame
+    cells: wp.array(dtype=wp.vec3)
+    most: int  # lookups of a cell at most
 
 
 @cached_by_values
@@ -70,14 +63,13 @@ def find_resampling_kernels(
     rays = fibonacci(ray_count)
     cells = rays.reshape(cell_count, RUN, 3).sum(axis=1)
     cells /= np.linalg.norm(cells, axis=1, keepdims=True)
-    return ResamplingKernels(
-        constant(np.asarray(directions), wp.vec3, device),
-        constant(reaches, wp.float32, device),
-        constant(looks_at_rays.astype(np.int32), wp.int32, device),
-        constant(rays, wp.vec3, device),
-        constant(cells, wp.vec3, device),
-        int(1.4 * counts.max() + 8),
-    )
+    kernels = ResamplingKernels()
+    kernels.directions = constant(np.asarray(directions), wp.vec3, device)
+    kernels.reaches = constant(reaches, wp.float32, device)
+    kernels.looks_at_rays = constant(looks_at_rays.astype(np.int32), wp.int32, device)
+    kernels.rays, kernels.cells = constant(rays, wp.vec3, device), constant(cells, wp.vec3, device)
+    kernels.most = int(1.4 * counts.max() + 8)
+    return kernels
 
 
 class ResamplingWeights(NamedTuple):
@@ -94,19 +86,8 @@ class ResamplingWeights(NamedTuple):
     weights: wp.array
 
 
-@wp.struct
-class KernelArrays:
-    """Where cells look: :class:`ResamplingKernels` as kernels see them."""
-
-    directions: wp.array(dtype=wp.vec3)
-    reaches: wp.array(dtype=wp.float32)
-    looks_at_rays: wp.array(dtype=wp.int32)
-    rays: wp.array(dtype=wp.vec3)
-    cells: wp.array(dtype=wp.vec3)
-
-
 @wp.func
-def _look_from(kernels: KernelArrays, rotation: wp.mat33, direction: int):
+def _look_from(kernels: ResamplingKernels, rotation: wp.mat33, direction: int):
     """Find d·|Rᵀω|, d, cos h, and the directions among which a cell looks."""
     turned = wp.transpose(rotation) * kernels.directions[direction]
     candidates = kernels.cells
@@ -128,7 +109,7 @@ def _find_lookups(
     # in
     rotations: wp.array2d(dtype=wp.mat33),
     body: int,
-    kernels: KernelArrays,
+    kernels: ResamplingKernels,
     # out
     counts: wp.array2d(dtype=wp.int32),
     indices: wp.array3d(dtype=wp.int32),
@@ -160,7 +141,7 @@ def _find_lookups_adjoint(
     # in
     rotations: wp.array2d(dtype=wp.mat33),
     body: int,
-    kernels: KernelArrays,
+    kernels: ResamplingKernels,
     counts: wp.array2d(dtype=wp.int32),
     indices: wp.array3d(dtype=wp.int32),
     weights: wp.array3d(dtype=wp.float32),
@@ -203,9 +184,7 @@ def find_resampling_weights(rotations: wp.array, body: int, kernels: ResamplingK
     device = rotations.device
     counts = empty(shape, dtype=wp.int32, device=device)
     indices = empty((*shape, kernels.most), dtype=wp.int32, device=device)
-    arrays = KernelArrays()
-    arrays.directions, arrays.reaches, arrays.looks_at_rays, arrays.rays, arrays.cells = kernels[:5]
-    inputs = [rotations, body, arrays]
+    inputs = [rotations, body, kernels]
     weights = differentiable(
         lambda weights: launch(
             _find_lookups, shape[0] * shape[1], inputs=inputs, outputs=[counts, indices, weights], cost=_CELL_COST

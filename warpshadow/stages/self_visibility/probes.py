@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.sides import split_side
@@ -181,8 +181,8 @@ def _place_vertices(
 
 
 @wp.func
-def _find_piece(pieces: wp.array(dtype=wp.vec4i), face: int, barycentrics: wp.vec3):
-    """The corners of the piece of a face around a point, and the matrix from the face's barycentrics to its own."""
+def _descend(pieces: wp.array(dtype=wp.vec4i), face: int, barycentrics: wp.vec3):
+    """Corners of the piece of a face around a point, its barycentrics there, and M, from the face's to these."""
     piece = pieces[face]
     weights = barycentrics
     matrix = wp.identity(n=3, dtype=wp.float32)
@@ -205,7 +205,23 @@ def _find_piece(pieces: wp.array(dtype=wp.vec4i), face: int, barycentrics: wp.ve
     return wp.vec3i(piece[0], piece[1], piece[2]), weights, matrix
 
 
-@wp.kernel(enable_backward=False)
+@wp.func
+def _find_piece(pieces: wp.array(dtype=wp.vec4i), face: int, barycentrics: wp.vec3):
+    """Corners of the piece of a face around a point, and its barycentrics there."""
+    corners, weights, _matrix = _descend(pieces, face, barycentrics)
+    return corners, weights
+
+
+@wp.func_grad(_find_piece)
+def _find_piece_adjoint(
+    pieces: wp.array(dtype=wp.vec4i), face: int, barycentrics: wp.vec3, adj_corners: wp.vec3i, adj_weights: wp.vec3
+):
+    """On a piece M does not change:  b̄ = Mᵀ w̄."""
+    _corners, _weights, matrix = _descend(pieces, face, barycentrics)
+    wp.adjoint[barycentrics] += wp.transpose(matrix) * adj_weights
+
+
+@wp.kernel
 def _place_samples(
     # in
     sides: wp.array2d(dtype=wp.int32),
@@ -218,33 +234,13 @@ def _place_samples(
     rows: wp.array2d(dtype=wp.vec3i),
     weights: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a receiver at a sample's point; −1 for none."""
+    """A thread owns a receiver at a sample's point, −1 for none."""
     batch, receiver = wp.tid()
     face, is_back = split_side(wp.max(sides[batch, receiver], first_face), face_count)
-    corners, result, _matrix = _find_piece(pieces, face - first_face, barycentrics[batch, receiver])
+    corners, result = _find_piece(pieces, face - first_face, barycentrics[batch, receiver])
     shift = wp.where(is_back, probe_count, 0)
     rows[batch, receiver] = corners + wp.vec3i(shift, shift, shift)
     weights[batch, receiver] = result
-
-
-@wp.kernel(enable_backward=False)
-def _place_samples_adjoint(
-    # in
-    sides: wp.array2d(dtype=wp.int32),
-    barycentrics: wp.array2d(dtype=wp.vec3),
-    face_count: int,
-    first_face: int,
-    pieces: wp.array(dtype=wp.vec4i),
-    adj_weights: wp.array2d(dtype=wp.vec3),
-    # out
-    adj_barycentrics: wp.array2d(dtype=wp.vec3),
-):
-    """A thread owns a receiver: its weights are M b on a piece, so  b̄ += Mᵀ w̄."""
-    batch, receiver = wp.tid()
-    face, _is_back = split_side(wp.max(sides[batch, receiver], first_face), face_count)
-    _corners, _found, matrix = _find_piece(pieces, face - first_face, barycentrics[batch, receiver])
-    adj = wp.transpose(matrix) * adj_weights[batch, receiver]
-    adj_barycentrics[batch, receiver] = adj_barycentrics[batch, receiver] + adj
 
 
 class ProbeTable(NamedTuple):
@@ -275,17 +271,8 @@ class ProbeTable(NamedTuple):
         """Places of the samples' fragments: sides and barycentrics, [batch, receiver]. Differentiable: barycentrics."""
         batch_count, count = seen.face_ids.shape
         places = _empty_weights(batch_count, count, seen.face_ids.device)
-        inputs = [seen.face_ids, seen.barycentrics, self.face_count, self.first_face]
-
-        def place(weights: wp.array) -> None:
-            outputs = [places.rows, weights]
-            launch(_place_samples, weights.shape, inputs=[*inputs, self.probe_count, self.pieces], outputs=outputs)
-
-        def adjoint(adj: wp.array) -> None:
-            outputs = [seen.barycentrics.grad]
-            launch(_place_samples_adjoint, adj.shape, inputs=[*inputs, self.pieces, adj], outputs=outputs)
-
-        differentiable(place, adjoint, result=places.weights, variables=[seen.barycentrics])
+        inputs = [seen.face_ids, seen.barycentrics, self.face_count, self.first_face, self.probe_count, self.pieces]
+        launch(_place_samples, seen.face_ids.shape, inputs=inputs, outputs=list(places))
         return places
 
 

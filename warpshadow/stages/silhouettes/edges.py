@@ -2,18 +2,8 @@
 
 import warp as wp
 
-from warpshadow.stages.screen import (
-    ends_before,
-    neighbor,
-    orientation,
-    relative,
-    sample_center,
-)
-from warpshadow.stages.silhouettes.lines import (
-    FragmentArrays,
-    image_of,
-    line_between,
-)
+from warpshadow.stages.screen import ends_before, neighbor, orientation, relative, sample_center
+from warpshadow.stages.silhouettes.lines import FragmentArrays, image_of, line_between
 
 MAX_STEPS = 32
 
@@ -153,12 +143,7 @@ def edge_between(
 
 
 @wp.func
-def edge_of(
-    face: int,
-    corner: int,
-    faces: wp.array(dtype=wp.vec3i),
-    clip_positions: wp.array(dtype=wp.vec4),
-):
+def edge_of(face: int, corner: int, faces: wp.array(dtype=wp.vec3i), clip_positions: wp.array(dtype=wp.vec4)):
     """The edge opposite to a face's corner, in the order in which its line is positive on the face."""
     corners = faces[face]
     a = corners[(corner + 1) % 3]

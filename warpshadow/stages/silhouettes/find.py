@@ -16,15 +16,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import run_length, split_row, strip_count
 from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.screen import (
-    half_size,
-    has_neighbor,
-    neighbor,
-    orientation,
-    plane,
-    sample_center,
-    sense,
-)
+from warpshadow.stages.screen import half_size, has_neighbor, neighbor, orientation, plane, sample_center, sense
 from warpshadow.stages.silhouettes.areas import measure_areas
 from warpshadow.stages.silhouettes.edges import SNAP, edge_at, edge_between, is_crease, is_silhouette
 from warpshadow.stages.silhouettes.lines import (
@@ -39,8 +31,7 @@ from warpshadow.stages.silhouettes.lines import (
 wp.set_module_options({"max_unroll": 1})  # it compiles in 2.2 s instead of 3.1 s, and runs as fast
 
 
-MAX_SAMPLES = 2**31 - 1
-"""Samples of all images of a batch, which are numbered in int32."""
+MAX_SAMPLES = 2**31 - 1  # samples of all images of a batch, which are numbered in int32
 
 MIN_OPENING = 1e-4
 """Relative change of two surfaces' distance over a sample, below which rounding hides where they intersect."""

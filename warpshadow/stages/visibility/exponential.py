@@ -38,11 +38,7 @@ class Threshold(NamedTuple):
     limit: float
 
 
-THRESHOLDS = {
-    "quadratic": Threshold(1.0, 1.0),
-    "linear": Threshold(0.12, 1.0),
-    "optimal_linear": Threshold(0.12, 2.0),
-}
+THRESHOLDS = {"quadratic": Threshold(1.0, 1.0), "linear": Threshold(0.12, 1.0), "optimal_linear": Threshold(0.12, 2.0)}
 """Base approximations of the exponential. Beyond the limits, plain squaring explodes: for `quadratic` the error is
 3-fold at twice its limit and 200-fold at four times. At the defaults irradiance is within 0.1% (`quadratic`), 0.7%
 (`linear`) and 4% (`optimal_linear`, whose table of single caps fits a sum of many spheres badly) of the converged."""
@@ -437,6 +433,6 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
         if held:
             check.warn(
                 f"log-SH visibility of {held} of {batch_count * vertex_count} receivers is held back from rising above "
-                "1, since many spheres overlap; fewer spheres, or directional transmittance, are accurate",
+                "1, since many spheres overlap; fewer spheres, or directional transmittance, are accurate"
             )
     return visibility

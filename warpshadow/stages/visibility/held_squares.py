@@ -59,12 +59,7 @@ def make_square(order: int, lanes: int) -> wp.Function:
     hold, multiply = _make_hold(lanes), make_multiply(order, lanes)
 
     @wp.func
-    def square_held(
-        row: wp.array(dtype=Lane),
-        depth: Lane,
-        table: ProductTable,
-        square: wp.array(dtype=Lane),
-    ):
+    def square_held(row: wp.array(dtype=Lane), depth: Lane, table: ProductTable, square: wp.array(dtype=Lane)):
         multiply(row, row, table, square)
         share, _slope = hold(wp.cw_mul(depth, square[0] - row[0]) / UNIT)
         rest = Lane(1.0) - share

@@ -177,10 +177,7 @@ def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Ke
             adj_faded = wp.cw_mul(adj_amount, cone.sine2)
             adj_weight = wp.cw_mul(adj_faded, fade)
             adj_cone = Cone(
-                adj_axis,
-                wp.cw_mul(adj_cosine, amount),
-                wp.cw_mul(adj_amount, faded),
-                wp.cw_mul(adj_weight, seen.share),
+                adj_axis, wp.cw_mul(adj_cosine, amount), wp.cw_mul(adj_amount, faded), wp.cw_mul(adj_weight, seen.share)
             )
             adj_offset, adj_radius = cone_adjoint(seen.offset, seen.curvature, cone, adj_cone)
             adj_height = seen.curvature * wp.cw_mul(wp.cw_mul(adj_faded, cone.weight), fade_slope)

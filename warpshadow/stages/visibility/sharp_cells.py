@@ -45,11 +45,7 @@ class SharpCells(NamedTuple):
 
 
 def find_sharp_cells(
-    power: np.ndarray,
-    directions: np.ndarray,
-    spreads: np.ndarray,
-    softness: float = SOFTNESS,
-    widest: float = 1.0,
+    power: np.ndarray, directions: np.ndarray, spreads: np.ndarray, softness: float = SOFTNESS, widest: float = 1.0
 ) -> SharpCells | None:
     """Find the sharp cells of a light, at most the brightest 16; None where they have too little of it.
 
