@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import warp as wp
 
+from warpshadow.maths.outline import is_convex
 from warpshadow.stages.planes.grid import PlaneTexture
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 MAX_EDGES = 128
-"""Edges of an outline at most: beyond, the mesh takes the share of a footprint that it covers of its texels."""
+"""Edges of an outline at most: beyond, it is that of the rectangle, of which the mesh takes its share by texels."""
 
 _BESIDE = 0.002  # how much texels count in those beside them, which have it if nothing of their own is seen
 _MARGIN = 0.001  # margin of planes, in widths of the smallest texel
@@ -47,10 +48,10 @@ class PlaneGrid:
     first_level: int  # of the front; the back's follow, if it has any
     level_count: int
     sides: int
-    is_whole: int  # the mesh covers the rectangle
-    first_edge: int  # of its outline, where it does not
-    edge_count: int  # 0 where texels say how much the mesh covers
-    is_framed: int  # whether these are of holes in the rectangle, the border of which is as soft as its neighbors'
+    first_edge: int  # of the outline
+    edge_count: int
+    is_convex: int  # the outline
+    is_covered_by_texels: int  # the outline is the rectangle's, and texels say how much of it the mesh covers
     blocks: int
 
 
@@ -93,10 +94,8 @@ class PlaneBlockers:
         grids, covered, edges, pyramids, frames, texel_count = [], [], [np.empty((0, 4))], [], [], 0
         for body in bodies:
             grid, first_level, first_edge = body.grid, len(levels), sum(map(len, edges))
-            holes = None
-            if not grid.is_whole and len(grid.outline) <= MAX_EDGES:
-                holes = grid.holes()
-                edges.append((grid.outline if holes is None else holes).reshape(-1, 4))
+            is_exact = len(grid.outline) <= MAX_EDGES
+            edges.append((grid.outline if is_exact else grid.rectangle()).reshape(-1, 4))
             matrices = _halvings(*grid.covered.shape)
             for side in range(grid.sides):
                 for matrix, blurred, (height, width) in matrices:
@@ -107,9 +106,8 @@ class PlaneBlockers:
                     if patch_count:
                         first = body.first_patch + side * grid.covered.size
                         pyramids.append(_shifted(blurred.multiply(grid.covered.ravel()).tocsr(), first, patch_count))
-            edge_count = sum(map(len, edges)) - first_edge
-            is_framed = holes is not None
-            grids.append(_kernel_grid(body, first_level, len(matrices), first_edge, edge_count, is_framed))
+            grids.append(_kernel_grid(body, first_level, len(matrices), first_edge, edges[-1]))
+            grids[-1].is_covered_by_texels = int(not is_exact)
             frames.append(_frame_matrix(body, vertex_count))
         return PlaneBlockers(
             len(bodies),
@@ -179,7 +177,7 @@ def _shifted(matrix: csr_matrix, first: int, count: int) -> csr_matrix:
 
 
 def _kernel_grid(
-    body: PlaneBody, first_level: int, level_count: int, first_edge: int, edge_count: int, is_framed: bool
+    body: PlaneBody, first_level: int, level_count: int, first_edge: int, edges: np.ndarray
 ) -> PlaneGrid:
     grid, flat = body.grid, PlaneGrid()
     texels = np.array(grid.covered.shape[::-1]) / (grid.high - grid.low)
@@ -187,8 +185,8 @@ def _kernel_grid(
     flat.texels, flat.first = wp.vec2(*texels), wp.vec2(*(-grid.low * texels))
     flat.per_spread, flat.margin = 1 / grid.spread, _MARGIN * float(grid.texel_sizes().min())
     flat.first_level, flat.level_count, flat.sides = first_level, level_count, grid.sides
-    flat.is_whole, flat.blocks = int(grid.is_whole), int(body.blocks)
-    flat.first_edge, flat.edge_count, flat.is_framed = first_edge, edge_count, int(is_framed)
+    flat.first_edge, flat.edge_count = first_edge, len(edges)
+    flat.is_convex, flat.blocks = int(is_convex(edges.reshape(-1, 2, 2))), int(body.blocks)
     return flat
 
 
