@@ -157,12 +157,14 @@ def place_receiver(
         # below the plane the front fades, and the back takes over
         front = front_of(fronts, grid, place.at[2], batch, receiver, f)
         if f != scene.skip and wp.length_sq(place.normal) > 0.0:
-            for back in range(2):
-                weight = wp.where(back == 1, 1.0 - front, front)
-                if weight > 0.0:
-                    store[4 * plane_count + side_count] = wp.vec3(float(f), float(back), weight)
-                    _view_outline(scene, grid, load_side(scene, side_count, store), place, edges)
-                    side_count += 1
+            if front > 0.0:
+                store[4 * plane_count + side_count] = wp.vec3(float(f), 0.0, front)
+                _view_outline(scene, grid, load_side(scene, side_count, store), place, edges)
+                side_count += 1
+            if front < 1.0:
+                store[4 * plane_count + side_count] = wp.vec3(float(f), 1.0, 1.0 - front)
+                _view_outline(scene, grid, load_side(scene, side_count, store), place, edges)
+                side_count += 1
     return side_count
 
 
