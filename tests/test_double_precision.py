@@ -303,7 +303,7 @@ def holed_planes(double, device):
 def test_coverage_of_light_in_cells(name, double, request, check):
     planes, directions = request.getfixturevalue(name), double("maths.directions").fibonacci(16)
     find = double("stages.planes.partial_cells").coverage_of_light
-    samples = unit(directions[:, None] + 0.2 * random(4, 16, 4, 3))
+    samples = unit(directions[:, None] + 0.2 * random(4, 16, 8, 3))
     covered = np.random.default_rng(1).uniform(-0.1, 1.1, size=(1, 3, 16))
     given = (wp.vec3d, plane_receivers()[0]), (wp.float64, covered), (wp.vec3d, FRAMES)
     check(lambda p, c, f: find(p, c, f, planes, directions, samples), *given)

@@ -16,9 +16,9 @@ FLOAT32 = 2e-5
 
 
 def samples_of_cells():
-    """Four directions in a part of each cell."""
+    """Eight directions in a part of each cell."""
     rng = np.random.default_rng(3)
-    drawn = DIRECTIONS[:, None] + rng.normal(scale=0.05, size=(len(DIRECTIONS), 4, 3))
+    drawn = DIRECTIONS[:, None] + rng.normal(scale=0.05, size=(len(DIRECTIONS), 8, 3))
     drawn += 0.1 * rng.normal(size=(len(DIRECTIONS), 1, 3))
     return drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)
 
@@ -35,20 +35,20 @@ def test_cells_that_are_covered_in_part_are_so_as_where_their_light_is(names, sk
     options = {"horizon_normals": normals if is_facing else None, "skip": skip}
     covered = plane_coverage(points, frames, setting.planes, DIRECTIONS, **options)
     found = coverage_of_light(points, covered, frames, setting.planes, DIRECTIONS, samples, **options).numpy()
-    coverage, small = covered.numpy(), cell_radius(4 * len(DIRECTIONS))
+    coverage, small = covered.numpy(), cell_radius(8 * len(DIRECTIONS))
     each = plane_coverage(points, frames, setting.planes, samples.reshape(-1, 3), radius=small, **options).numpy()
-    mean = np.minimum(each.reshape(*found.shape, 4), 1).mean(axis=-1)
+    mean = np.minimum(each.reshape(*found.shape, 8), 1).mean(axis=-1)
     gate = np.clip(20 * np.minimum(coverage, 1 - coverage), 0, 1)
     np.testing.assert_allclose(found, coverage + gate * (mean - coverage), atol=FLOAT32)
     assert (np.abs(found - coverage) > 0.1).sum() > 3
 
 
-def test_directions_of_a_cell_are_four(device):
+def test_directions_of_a_cell_are_eight(device):
     setting = Setting(device)
     points, _, _, vertices, _ = setting.arrays()
     frames = setting.planes.frames(vertices)
     covered = plane_coverage(points, frames, setting.planes, DIRECTIONS)
-    with pytest.raises(ValueError, match=r"samples: got shape \(64, 3, 3\), expected \[64, 4, 3\]"):
+    with pytest.raises(ValueError, match=r"samples: got shape \(64, 3, 3\), expected \[64, 8, 3\]"):
         coverage_of_light(points, covered, frames, setting.planes, DIRECTIONS, samples_of_cells()[:, :3])
 
 
@@ -56,7 +56,7 @@ def behind_a_window(**visibility):
     """A wall whose light, of a bright sky above dark land, comes through a window in a wall without end."""
     land = np.full((32, 64, 3), 0.02)
     land[:16] = 1.0
-    flat = ws.plane(24.0, 24)
+    flat = ws.plane(98.0, 49)
     middles = flat.positions[flat.faces].mean(axis=1)
     holed = ws.Mesh(flat.positions, flat.faces[np.abs(middles[:, [0, 2]]).max(axis=1) > 1])
     window = ws.Body(holed, rotation=(-90, 0, 0), translation=(0, 0, 3), name="window")

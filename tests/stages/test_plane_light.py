@@ -144,7 +144,7 @@ def margin_of(grid):
     return 0.001 * grid.texel_sizes().min()
 
 
-def met_sides(point, omega, radius, frames, grids, radiosity, skip, fronts=None):
+def met_sides(point, omega, disc, radius, frames, grids, radiosity, skip, fronts=None):
     """Coverage, distance, its width, light and flat of each side that a cell meets."""
     sides = []
     for f, grid in enumerate(grids):
@@ -167,7 +167,7 @@ def met_sides(point, omega, radius, frames, grids, radiosity, skip, fronts=None)
             y = place + t * (axes @ omega)
             is_exact = len(grid.outline) <= prepared.MAX_EDGES
             at, toward = np.array([*place, t * mean]), np.array([*(axes @ omega), cosine])
-            share = side_weight * share_in_view(grid.outline if is_exact else grid.rectangle(), at, toward, radius)
+            share = side_weight * share_in_view(grid.outline if is_exact else grid.rectangle(), at, toward, disc)
             if not is_exact:
                 share *= fetched(grid.covered[..., None].astype(float), grid, y, mean, t, radius, halved)[0]
             light = np.zeros(3)
@@ -179,6 +179,15 @@ def met_sides(point, omega, radius, frames, grids, radiosity, skip, fronts=None)
     return sides
 
 
+def above_horizon(omega, normal, radius):
+    """Direction and radius of the largest disc in a cell that is above a horizon."""
+    cosine = normal @ omega
+    if not 0 < cosine < radius:
+        return omega, radius
+    shifted = omega + (radius - cosine) / 2 * (normal - cosine * omega)
+    return shifted / np.linalg.norm(shifted), (radius + cosine) / 2
+
+
 def twin_light(points, normals, transmittance, frames, grids, radiosity, directions, skip=None, fronts=None):
     """Of one instance, [receiver, 3]; radiosity is [side, row, column, 3] for each flat."""
     radius, result = cell_radius(len(directions)), np.zeros((len(points), 3))
@@ -188,7 +197,8 @@ def twin_light(points, normals, transmittance, frames, grids, radiosity, directi
             if weight == 0:
                 continue
             own = None if fronts is None else fronts[receiver]
-            sides = met_sides(point, omega, radius, frames, grids, radiosity, skip, own)
+            seen = (omega, radius) if skip is None else above_horizon(omega, normal, radius)
+            sides = met_sides(point, *seen, radius, frames, grids, radiosity, skip, own)
             sent, shares = np.zeros(3), 0.0
             for k, (own_h, t, width, light, _) in enumerate(sides):
                 unhidden = 1.0
@@ -209,7 +219,7 @@ def twin_passing(points, transmittance, frames, grids, blocks, directions, skip=
             if transmittance[receiver, q] == 0:
                 continue
             own = None if fronts is None else fronts[receiver]
-            for h, *_, f in met_sides(point, omega, radius, frames, grids, black, skip, own):
+            for h, *_, f in met_sides(point, omega, radius, radius, frames, grids, black, skip, own):
                 covered[receiver, q] += h * blocks[f]
     return transmittance * np.maximum(0, 1 - covered)
 
@@ -336,7 +346,8 @@ def test_white_flats_send_what_they_block(skip, device):
     radiosity.fill_(1.0)
     frames, planes = setting.planes.frames(vertices), setting.planes
     light = plane_light(points, normals, transmittance, frames, radiosity, planes, DIRECTIONS, skip=skip).numpy()
-    passing = passing_flats(points, transmittance, frames, planes, DIRECTIONS, skip=skip).numpy()
+    options = {"skip": skip, "horizon_normals": normals}
+    passing = passing_flats(points, transmittance, frames, planes, DIRECTIONS, **options).numpy()
     weights = 4 / len(DIRECTIONS) * np.maximum(setting.normals @ DIRECTIONS.T, 0)
     blocked = (weights * (setting.transmittance - passing)).sum(axis=2)
     assert blocked.max() > 0.1

@@ -106,7 +106,7 @@ class Directional(SphereMethod):
     def _samples(
         self, radiance: np.ndarray, power: np.ndarray, draw: Callable[[np.ndarray, int], np.ndarray]
     ) -> np.ndarray:
-        """Directions drawn from the light of each cell, [direction, 4, 3]; even ones in a dark cell."""
+        """Directions drawn from the light of each cell, [direction, 8, 3]; even ones in a dark cell."""
         drawn = draw_in_cells(np.ones_like(radiance), self._directions, np.arange(len(power)), SAMPLES)
         lit = np.flatnonzero(power > 0)
         drawn[lit] = draw(lit, SAMPLES)

@@ -22,7 +22,7 @@ from warpshadow.stages.planes.cells import (
     toward_side,
 )
 from warpshadow.stages.planes.prepared import PlaneGrid
-from warpshadow.stages.planes.sides import SIDE_ROWS, load_place, load_side, plane_share, store_place
+from warpshadow.stages.planes.sides import SIDE_ROWS, VisibleCell, load_place, load_side, plane_share, store_place
 
 _MIN_WEIGHT_SUM = wp.constant(1.0e-30)  # the least Σ s
 
@@ -45,7 +45,7 @@ def levels_of(grid: PlaneGrid, is_back: bool):
 @wp.func
 def hit_sides(
     scene: PlaneArrays,
-    direction: wp.vec3,
+    cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
     part: float,
     side_count: int,
@@ -61,11 +61,11 @@ def hit_sides(
         side = load_side(scene, i, store)
         grid = scene.grids[side.f]
         place = load_place(store, side.f)
-        share = plane_share(scene, grid, side, place, direction, edges)
+        share = plane_share(scene, grid, side, place, cell, edges)
         store[cells + 4 * i] = wp.vec3()
         if share > 0.0:
             footprint = find_footprint(
-                scene, on_side(grid, place, side.is_back), toward_side(place, side.is_back, direction)
+                scene, on_side(grid, place, side.is_back), toward_side(place, side.is_back, cell.direction)
             )
             covered = float(1.0)
             radiosity = wp.vec3()
@@ -90,7 +90,7 @@ def hit_sides(
 @wp.func
 def hit_sides_adjoint(
     scene: PlaneArrays,
-    direction: wp.vec3,
+    cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
     side_count: int,
     store: wp.array(dtype=wp.vec3),
@@ -134,17 +134,15 @@ def hit_sides_adjoint(
             if adj_spot[2] != 0.0:
                 adj_distance += adj_spot[2] / footprint.distance
             place = load_place(store, side.f)
-            toward = toward_side(place, side.is_back, direction)
+            toward = toward_side(place, side.is_back, cell.direction)
             adj_center = wp.vec2(adj_spot[0], adj_spot[1])
-            adj_at, adj_toward = find_footprint_adjoint(
-                scene, toward, footprint, adj_distance, adj_cosine, adj_center
-            )
+            adj_at, adj_toward = find_footprint_adjoint(scene, toward, footprint, adj_distance, adj_cosine, adj_center)
             adj_place = load_place(adj_store, side.f)
-            adj_place = side_adjoint(grid, place, side.is_back, direction, adj_at, adj_toward, adj_place)
+            adj_place = side_adjoint(grid, place, side.is_back, cell.direction, adj_at, adj_toward, adj_place)
             store_place(adj_store, side.f, adj_place)
             adj_share = adj_met[0] * stored[1]
             weighted = adj_share * side.weight
-            coverage_adjoint(edges, side.first_edge, grid.edge_count, direction, scene.radius, weighted)
+            coverage_adjoint(edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, weighted)
             adj_store[sides + i] = adj_store[sides + i] + wp.vec3(0.0, 0.0, adj_share * stored[0] / side.weight)
 
 

@@ -39,7 +39,13 @@ from warpshadow.stages.bounces.plane_hits import (
 from warpshadow.stages.cell_coverage import ViewedEdge
 from warpshadow.stages.planes.cells import PlaneArrays, check_planes, plane_arrays
 from warpshadow.stages.planes.prepared import PlaneBlockers
-from warpshadow.stages.planes.sides import SIDE_ROWS, place_receiver, place_receiver_adjoint, receiver_scratch
+from warpshadow.stages.planes.sides import (
+    SIDE_ROWS,
+    place_receiver,
+    place_receiver_adjoint,
+    receiver_scratch,
+    visible_cell,
+)
 
 _CELL_COST = 15.0  # mean time of a cell of a receiver [ns], over cells that hit a plane and cells that do not
 
@@ -76,7 +82,7 @@ def _light_receivers(
     total = wp.vec3()
     for q in range(directions.shape[0]):
         weight = wp.dot(normal, directions[q]) * transmittance[batch, receiver, q]
-        if hit_sides(scene, directions[q], sent, weight, side_count, store, edges):
+        if hit_sides(scene, visible_cell(scene, normal, directions[q]), sent, weight, side_count, store, edges):
             mean, _, covered = mean_light(cells, side_count, store)
             total += (weight * wp.min(covered, 1.0)) * mean
     light[batch, receiver] = (4.0 / float(directions.shape[0])) * total
@@ -120,7 +126,9 @@ def _light_receivers_adjoint(
     sent = texels[seen_texels]
     normal = normals[batch, receiver]
     cells = SIDE_ROWS * scene.grids.shape[0]
-    side_count = place_receiver(points[batch, receiver], frames[seen_frames], fronts, scene, batch, receiver, store, edges)
+    side_count = place_receiver(
+        points[batch, receiver], frames[seen_frames], fronts, scene, batch, receiver, store, edges
+    )
     for k in range(cells):
         adj_store[k] = wp.vec3()
     adj = (4.0 / float(directions.shape[0])) * adj_light[batch, receiver]
@@ -130,7 +138,8 @@ def _light_receivers_adjoint(
         cosine = wp.dot(normal, direction)
         passing = transmittance[batch, receiver, q]
         weight = cosine * passing
-        if hit_sides(scene, direction, sent, cosine, side_count, store, edges):
+        cell = visible_cell(scene, normal, direction)
+        if hit_sides(scene, cell, sent, cosine, side_count, store, edges):
             mean, weights, covered = mean_light(cells, side_count, store)
             value = wp.dot(adj, mean)
             total = wp.min(covered, 1.0) * value
@@ -150,9 +159,7 @@ def _light_receivers_adjoint(
             if adj_transmittance:
                 adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + cosine * total
             if passing > 0.0:
-                hit_sides_adjoint(
-                    scene, direction, sent, side_count, store, edges, adj_store, seen_texels, adj_texels
-                )
+                hit_sides_adjoint(scene, cell, sent, side_count, store, edges, adj_store, seen_texels, adj_texels)
     if adj_normals:
         adj_normals[batch, receiver] = adj_normals[batch, receiver] + adj_normal
     adj_point = place_receiver_adjoint(

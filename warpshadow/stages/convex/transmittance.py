@@ -2,8 +2,8 @@
 
     P_q = Π_bodies max(0, 1 − Σ_parts h_q)
 
-h is the share of cell q within the silhouette of a convex part (:mod:`warpshadow.stages.cell_coverage`): the edges between
-a face that a receiver sees and one that it does not.
+h is the share of cell q within the silhouette of a convex part (:mod:`warpshadow.stages.cell_coverage`), the edges
+between a face that a receiver sees and one that it does not.
 
 Parts of one body are beside each other, so they cover different parts of a cell; bodies are independent. Edges are
 exact, and so are thin parts: spheres bulge out of them.
@@ -294,9 +294,7 @@ def _pass_adjoint(
                                             point, corners[instance], planes[instance], parts, part, silhouettes[place]
                                         )
                                     direction = cells.directions[q]
-                                    coverage_adjoint(
-                                        silhouettes[place], 0, count, direction, radius, -adj / left
-                                    )
+                                    coverage_adjoint(silhouettes[place], 0, count, direction, radius, -adj / left)
                     adj_point += _silhouette_adjoint(silhouettes[place], wp.max(count, 0), instance, adj_corners)
     if adj_points:
         adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point

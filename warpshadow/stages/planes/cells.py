@@ -35,6 +35,7 @@ class PlaneArrays:
     level_scales: wp.array(dtype=wp.vec2)
     covered: wp.array(dtype=wp.vec3)
     edges: wp.array(dtype=wp.vec4)
+    edge_axes: wp.array(dtype=wp.vec2)
     skip: int  # the plane that the receivers are part of, -1 for none
     radius: float  # ρ
     spot_radius: float  # half the width of texels, for a unit of distance
@@ -63,7 +64,7 @@ def plane_arrays(planes: PlaneBlockers, radius: float, skip: int | None, *, tile
     """
     scene = PlaneArrays()
     scene.grids, scene.levels, scene.level_scales = planes.grids, planes.levels, planes.level_scales
-    scene.covered, scene.edges = planes.covered, planes.edges
+    scene.covered, scene.edges, scene.edge_axes = planes.covered, planes.edges, planes.edge_axes
     scene.skip, scene.radius = -1 if skip is None else skip, radius
     scene.spot_radius = scene.radius if tiles else 0.5 * scene.radius
     scene.per_radius = 1 / scene.radius

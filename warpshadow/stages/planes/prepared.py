@@ -67,6 +67,7 @@ class PlaneBlockers:
         level_scales: Its texels for one of the finest level, vec2 of shape [level].
         covered: Coverage of each texel by the mesh, in all three components, vec3 of shape [texel].
         edges: Begin and end of the edges of outlines, in the axes of their planes, vec4 of shape [edge].
+        edge_axes: Unit vectors along them, vec2 of shape [edge].
         texels_of_patches: Part of the area of each texel that patches have, and a little in the texels beside it,
             [texel, patch]; None where no patches are given.
         frames_of_vertices: Matrix that finds frames, [3 · plane, vertex].
@@ -80,6 +81,7 @@ class PlaneBlockers:
     level_scales: wp.array
     covered: wp.array
     edges: wp.array
+    edge_axes: wp.array
     texels_of_patches: SparseMatrix | None
     frames_of_vertices: SparseMatrix
     has_holes: bool
@@ -109,6 +111,8 @@ class PlaneBlockers:
             grids.append(_kernel_grid(body, first_level, len(matrices), first_edge, edges[-1]))
             grids[-1].is_covered_by_texels = int(not is_exact)
             frames.append(_frame_matrix(body, vertex_count))
+        outlines = np.concatenate(edges)
+        along = outlines[:, 2:] - outlines[:, :2]
         return PlaneBlockers(
             len(bodies),
             tuple(number for number, body in enumerate(bodies) if body.blocks),
@@ -116,7 +120,8 @@ class PlaneBlockers:
             wp.array(np.array(levels), dtype=wp.vec3i, device=device),
             wp.array(np.array(scales), dtype=wp.vec2, device=device),
             wp.array(np.repeat(np.concatenate(covered)[:, None], 3, axis=1), dtype=wp.vec3, device=device),
-            wp.array(np.concatenate(edges), dtype=wp.vec4, device=device),
+            wp.array(outlines, dtype=wp.vec4, device=device),
+            wp.array(along / np.linalg.norm(along, axis=1, keepdims=True), dtype=wp.vec2, device=device),
             SparseMatrix.of(vstack(pyramids), device=device) if patch_count else None,
             SparseMatrix.of(vstack(frames), device=device),
             any(body.blocks and not body.grid.is_whole for body in bodies),
@@ -176,9 +181,7 @@ def _shifted(matrix: csr_matrix, first: int, count: int) -> csr_matrix:
     return csr_matrix((matrix.data, matrix.indices + first, matrix.indptr), shape=(matrix.shape[0], count))
 
 
-def _kernel_grid(
-    body: PlaneBody, first_level: int, level_count: int, first_edge: int, edges: np.ndarray
-) -> PlaneGrid:
+def _kernel_grid(body: PlaneBody, first_level: int, level_count: int, first_edge: int, edges: np.ndarray) -> PlaneGrid:
     grid, flat = body.grid, PlaneGrid()
     texels = np.array(grid.covered.shape[::-1]) / (grid.high - grid.low)
     flat.least, flat.most = (wp.vec2(*corner) for corner in grid.corners())

@@ -83,29 +83,28 @@ def _down(place: ReceiverInPlane, side: PlaneSide):
 
 
 @wp.func
-def _ends_of(scene: PlaneArrays, grid: PlaneGrid, side: PlaneSide, e: int):
-    """Begin and end of an edge, so that the mesh is to its left from the side."""
-    ends = scene.edges[grid.first_edge + e]
-    return wp.where(side.is_back, ends, wp.vec4(ends[2], ends[3], ends[0], ends[1]))
-
-
-@wp.func
 def _view_outline(
     scene: PlaneArrays, grid: PlaneGrid, side: PlaneSide, place: ReceiverInPlane, edges: wp.array(dtype=ViewedEdge)
 ):
-    """Store the outline of a plane as a receiver over one side sees it; n = (a − x) × (b − a) / |b − a|."""
+    """Store the outline of a plane as a receiver over one side sees it; n = ±(a − x) × (b − a) / |b − a|.
+
+    Edges run so that the mesh is to their left as the receiver sees it: those of the front from b to a.
+    """
     at = on_side(grid, place, side.is_back)
     foot = at[2] * _down(place, side) - at[0] * place.along_u - at[1] * place.along_v
     for e in range(grid.edge_count):
-        ends = _ends_of(scene, grid, side, e)
-        edge = ViewedEdge()
-        edge.begin = foot + ends[0] * place.along_u + ends[1] * place.along_v
-        edge.end = foot + ends[2] * place.along_u + ends[3] * place.along_v
-        along = wp.normalize(wp.vec2(ends[2] - ends[0], ends[3] - ends[1]))
-        n = wp.cross(edge.begin, along[0] * place.along_u + along[1] * place.along_v)
-        edge.length = wp.length(n)
-        edge.normal = n / edge.length
-        edges[side.first_edge + e] = edge
+        ends = scene.edges[grid.first_edge + e]
+        axis = scene.edge_axes[grid.first_edge + e]
+        a = foot + ends[0] * place.along_u + ends[1] * place.along_v
+        b = foot + ends[2] * place.along_u + ends[3] * place.along_v
+        n = wp.cross(a, axis[0] * place.along_u + axis[1] * place.along_v)
+        length = wp.length(n)
+        k = side.first_edge + e
+        edges[k].normal = (wp.where(side.is_back, 1.0, -1.0) / length) * n
+        edges[k].begin = wp.where(side.is_back, a, b)
+        edges[k].end = wp.where(side.is_back, b, a)
+        edges[k].length = length
+        edges[k].adj_normal = wp.vec3()
 
 
 @wp.func
@@ -119,20 +118,22 @@ def _view_outline_adjoint(
 ):
     """Add to the gradient of the receiver relative to the plane."""
     at = on_side(grid, place, side.is_back)
+    sign = wp.where(side.is_back, 1.0, -1.0)
     adj_foot = wp.vec3()
     for e in range(grid.edge_count):
         edge = edges[side.first_edge + e]
-        ends = _ends_of(scene, grid, side, e)
-        along = wp.normalize(wp.vec2(ends[2] - ends[0], ends[3] - ends[1]))
-        adj_n = edge.adj_normal / edge.length
-        adj_begin = wp.cross(along[0] * place.along_u + along[1] * place.along_v, adj_n)
-        adj_along = wp.cross(adj_n, edge.begin)
-        adj_foot += adj_begin
-        adj_place.along_u = adj_place.along_u + (ends[0] - at[0]) * adj_begin + along[0] * adj_along
-        adj_place.along_v = adj_place.along_v + (ends[1] - at[1]) * adj_begin + along[1] * adj_along
-    down = _down(place, side)
-    adj_place.normal = adj_place.normal + (wp.where(side.is_back, 1.0, -1.0) * at[2]) * adj_foot
-    adj_at = wp.vec3(-wp.dot(adj_foot, place.along_u), -wp.dot(adj_foot, place.along_v), wp.dot(adj_foot, down))
+        ends = scene.edges[grid.first_edge + e]
+        axis = scene.edge_axes[grid.first_edge + e]
+        adj_n = (sign / edge.length) * edge.adj_normal
+        adj_a = wp.cross(axis[0] * place.along_u + axis[1] * place.along_v, adj_n)
+        adj_axis = wp.cross(adj_n, wp.where(side.is_back, edge.begin, edge.end))
+        adj_foot += adj_a
+        adj_place.along_u = adj_place.along_u + (ends[0] - at[0]) * adj_a + axis[0] * adj_axis
+        adj_place.along_v = adj_place.along_v + (ends[1] - at[1]) * adj_a + axis[1] * adj_axis
+    adj_place.normal = adj_place.normal + (sign * at[2]) * adj_foot
+    adj_at = wp.vec3(
+        -wp.dot(adj_foot, place.along_u), -wp.dot(adj_foot, place.along_v), sign * wp.dot(adj_foot, place.normal)
+    )
     return side_adjoint(grid, place, side.is_back, wp.vec3(), adj_at, wp.vec3(), adj_place)
 
 
@@ -201,21 +202,44 @@ def place_receiver_adjoint(
     return adj_point
 
 
+@wp.struct
+class VisibleCell:
+    """The part of a cell that a receiver sees."""
+
+    direction: wp.vec3
+    radius: float
+
+
+@wp.func
+def visible_cell(scene: PlaneArrays, normal: wp.vec3, direction: wp.vec3):
+    """The largest disc in a cell that is above the horizon of a receiver in a plane; the cell itself for others.
+
+    Below its horizon nothing covers the cell but the receiver's own plane, which is not asked.
+    """
+    cell = VisibleCell()
+    cell.direction = direction
+    cell.radius = scene.radius
+    cosine = wp.dot(normal, direction)
+    if scene.skip >= 0 and cosine > 0.0 and cosine < scene.radius:
+        cell.direction = wp.normalize(direction + (0.5 * (scene.radius - cosine)) * (normal - cosine * direction))
+        cell.radius = 0.5 * (scene.radius + cosine)
+    return cell
+
+
 @wp.func
 def plane_share(
     scene: PlaneArrays,
     grid: PlaneGrid,
     side: PlaneSide,
     place: ReceiverInPlane,
-    direction: wp.vec3,
+    cell: VisibleCell,
     edges: wp.array(dtype=ViewedEdge),
 ):
     """Share of a cell within the outline of a plane, as much of it as is seen of the side."""
     down = _down(place, side)
-    if wp.dot(down, direction) <= -scene.radius:
+    if wp.dot(down, cell.direction) <= -scene.radius:
         return 0.0
+    first, count = side.first_edge, grid.edge_count
     if grid.is_convex == 1:
-        return side.weight * convex_coverage(edges, side.first_edge, grid.edge_count, direction, scene.radius)
-    return side.weight * outline_coverage(
-        edges, side.first_edge, grid.edge_count, down, place.along_u, direction, scene.radius
-    )
+        return side.weight * convex_coverage(edges, first, count, cell.direction, cell.radius)
+    return side.weight * outline_coverage(edges, first, count, down, place.along_u, cell.direction, cell.radius)

@@ -39,6 +39,7 @@ from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 from warpshadow.stages.planes.sides import (
     SIDE_ROWS,
     PlaneSide,
+    VisibleCell,
     load_place,
     load_side,
     place_receiver,
@@ -46,6 +47,7 @@ from warpshadow.stages.planes.sides import (
     plane_share,
     receiver_scratch,
     store_place,
+    visible_cell,
 )
 
 _CELL_COST = 4.0  # mean time of a cell of a receiver [ns], over cells that hit a plane and cells that do not
@@ -67,15 +69,15 @@ def side_coverage(
     grid: PlaneGrid,
     side: PlaneSide,
     place: ReceiverInPlane,
-    direction: wp.vec3,
+    cell: VisibleCell,
     edges: wp.array(dtype=ViewedEdge),
 ):
     """Coverage of a cell by a side."""
     covered = PlaneCover()
     covered.part = 1.0
-    covered.outline = plane_share(scene, grid, side, place, direction, edges)
+    covered.outline = plane_share(scene, grid, side, place, cell, edges)
     if is_covered_by_texels(grid) and covered.outline > 0.0:
-        toward = toward_side(place, side.is_back, direction)
+        toward = toward_side(place, side.is_back, cell.direction)
         covered.footprint = find_footprint(scene, on_side(grid, place, side.is_back), toward)
         spot = find_spot(grid, scene, covered.footprint)
         covered.part = fetch(scene.covered, scene, grid.first_level, spot)[0]
@@ -88,20 +90,20 @@ def side_coverage_adjoint(
     grid: PlaneGrid,
     side: PlaneSide,
     place: ReceiverInPlane,
-    direction: wp.vec3,
+    cell: VisibleCell,
     adj: float,
     edges: wp.array(dtype=ViewedEdge),
     adj_place: ReceiverInPlane,
 ):
-    """Add to the gradients of the receiver relative to the plane, and of viewed edges; also that of the side's weight."""
+    """Add to the gradients of the receiver relative to the plane and of viewed edges; also that of the side's weight."""
     covered = PlaneCover()
     covered.part = 1.0
     adj_weight = float(0.0)
     if side.weight < 1.0 or is_covered_by_texels(grid):
-        covered = side_coverage(scene, grid, side, place, direction, edges)
+        covered = side_coverage(scene, grid, side, place, cell, edges)
         adj_weight = adj * covered.part * covered.outline / side.weight
     if is_covered_by_texels(grid) and covered.outline > 0.0:
-        toward = toward_side(place, side.is_back, direction)
+        toward = toward_side(place, side.is_back, cell.direction)
         footprint = covered.footprint
         adj_part = wp.vec3(adj * covered.outline, 0.0, 0.0)
         spot = find_spot(grid, scene, footprint)
@@ -117,9 +119,9 @@ def side_coverage_adjoint(
             -0.5 * footprint.per_cosine * adj_spot[2],
             wp.vec2(adj_spot[0], adj_spot[1]),
         )
-        adj_place = side_adjoint(grid, place, side.is_back, direction, adj_at, adj_toward, adj_place)
+        adj_place = side_adjoint(grid, place, side.is_back, cell.direction, adj_at, adj_toward, adj_place)
     weighted = adj * side.weight * covered.part
-    coverage_adjoint(edges, side.first_edge, grid.edge_count, direction, scene.radius, weighted)
+    coverage_adjoint(edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, weighted)
     return adj_place, adj_weight
 
 
@@ -173,7 +175,8 @@ def _cover(
             for q in range(directions.shape[0]):
                 direction = directions[q]
                 if is_above_horizon(normal, direction) and covered[q] < 1.0:
-                    by_side = side_coverage(scene, grid, side, in_plane, direction, edges)
+                    cell = visible_cell(scene, normal, direction)
+                    by_side = side_coverage(scene, grid, side, in_plane, cell, edges)
                     if by_side.outline > 0.0:
                         covered[q] = covered[q] + by_side.outline * by_side.part
 
@@ -221,8 +224,9 @@ def _cover_adjoint(
             for q in range(directions.shape[0]):
                 adj = adj_result[batch, receiver, q]
                 if adj != 0.0 and is_above_horizon(normal, directions[q]):
+                    cell = visible_cell(scene, normal, directions[q])
                     adj_place, adj_weight = side_coverage_adjoint(
-                        scene, grid, side, in_plane, directions[q], adj, edges, adj_place
+                        scene, grid, side, in_plane, cell, adj, edges, adj_place
                     )
                     adj_weights += adj_weight
         store_place(adj_store, side.f, adj_place)
