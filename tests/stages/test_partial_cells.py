@@ -37,8 +37,13 @@ def test_cells_that_are_covered_in_part_are_so_as_where_their_light_is(names, sk
     found = coverage_of_light(points, covered, frames, setting.planes, DIRECTIONS, samples, **options).numpy()
     coverage, small = covered.numpy(), cell_radius(8 * len(DIRECTIONS))
     each = plane_coverage(points, frames, setting.planes, samples.reshape(-1, 3), radius=small, **options).numpy()
-    mean = np.minimum(each.reshape(*found.shape, 8), 1).mean(axis=-1)
-    gate = np.clip(20 * np.minimum(coverage, 1 - coverage), 0, 1)
+    weights = np.ones((*found.shape, 8))
+    if is_facing:
+        cosines = np.einsum("brc,qsc->brqs", setting.normals, samples)
+        weights = np.maximum(cosines, 0) if skip is not None else cosines > 0
+    total = weights.sum(axis=-1)
+    mean = (np.minimum(each.reshape(weights.shape), 1) * weights).sum(axis=-1) / np.where(total > 0, total, 1)
+    gate = np.clip(20 * np.minimum(coverage, 1 - coverage), 0, 1) * (total > 0)
     np.testing.assert_allclose(found, coverage + gate * (mean - coverage), atol=FLOAT32)
     assert (np.abs(found - coverage) > 0.1).sum() > 3
 
@@ -76,5 +81,5 @@ def test_light_through_a_window_is_that_of_rays(monkeypatch):
             monkeypatch.setattr(directional, "coverage_of_light", lambda points, covered, *_, **options: covered)
         found = ws.Renderer(behind_a_window()).render()[..., 0].mean(axis=1)
         errors.append(np.abs(found - truth).mean() / truth.mean())
-    assert errors[0] < 0.065  # measured 0.053, and 0.080 by cells alone
+    assert errors[0] < 0.095  # measured 0.080, and 0.154 by cells alone
     assert errors[0] < 0.8 * errors[1]

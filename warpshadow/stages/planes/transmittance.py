@@ -95,7 +95,7 @@ def side_coverage_adjoint(
     edges: wp.array(dtype=ViewedEdge),
     adj_place: ReceiverInPlane,
 ):
-    """Add to the gradients of the receiver relative to the plane and of viewed edges; also that of the side's weight."""
+    """Add to the gradients of the receiver relative to the plane and of viewed edges; also that of the weight."""
     covered = PlaneCover()
     covered.part = 1.0
     adj_weight = float(0.0)
