@@ -12,7 +12,6 @@ import warp as wp
 
 import warpshadow
 from warpshadow.device import cuda_graph, lanes, parallel, progress
-from warpshadow.device.warp_internals import scalar_type
 
 warpshadow.quiet()
 
@@ -88,8 +87,9 @@ def poisoned_outputs(monkeypatch):
 
     def poisoned(*args, **kwargs):
         array = empty(*args, **kwargs)
-        is_real = scalar_type(array.dtype) in (wp.float32, wp.float64)
-        array.fill_(float("nan") if is_real else -1)
+        size = array.size * wp.types.type_size_in_bytes(array.dtype)
+        if size:  # all bits 1 are NaN or −1
+            wp.array(ptr=array.ptr, dtype=wp.uint8, shape=size, device=array.device).fill_(255)
         return array
 
     monkeypatch.setattr(wp, "empty", poisoned)

@@ -212,7 +212,7 @@ def test_seams_of_a_room_do_not_glow(receivers, bounces):
 @pytest.mark.parametrize("receivers", ["vertex", "pixel"])
 def test_a_closed_room_is_dark(receivers):
     image = ws.Renderer(room(6, receivers), progress=False).render()[..., 0]
-    assert image.mean() < 0.01 and image.max() < 0.03
+    assert image.max() < 1e-4  # outlines of planes that meet share a cell without a remainder
 
 
 def test_vertices_of_no_face_do_not_change_the_grids_of_other_bodies():

@@ -16,19 +16,17 @@ FLOAT32 = 2e-5
 
 
 def samples_of_cells():
-    """Four directions in a part of each cell, and four in all of it."""
+    """Eight directions in a part of each cell."""
     rng = np.random.default_rng(3)
-    drawn = [DIRECTIONS[:, None] + rng.normal(scale=scale, size=(len(DIRECTIONS), 4, 3)) for scale in (0.05, 0.1)]
-    drawn[0] += 0.1 * rng.normal(size=(len(DIRECTIONS), 1, 3))
-    drawn = np.concatenate(drawn, axis=1)
+    drawn = DIRECTIONS[:, None] + rng.normal(scale=0.05, size=(len(DIRECTIONS), 8, 3))
+    drawn += 0.1 * rng.normal(size=(len(DIRECTIONS), 1, 3))
     return drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)
 
 
 @pytest.mark.parametrize("skip", [None, 1])
 @pytest.mark.parametrize("is_facing", [False, True])
 @pytest.mark.parametrize("names", [("ground", "wall"), ("l",)])
-def test_coverage_is_moved_by_where_light_is_in_cells_that_are_covered_in_part(names, skip, is_facing, device):
-    """Of planes without holes against even directions, of others against the whole cell."""
+def test_cells_that_are_covered_in_part_are_so_as_where_their_light_is(names, skip, is_facing, device):
     setting = Setting(device, names=names, blocks=(True,) * len(names))
     skip = skip if len(names) > 1 else None
     points, normals, _, vertices, _ = setting.arrays()
@@ -37,14 +35,16 @@ def test_coverage_is_moved_by_where_light_is_in_cells_that_are_covered_in_part(n
     options = {"horizon_normals": normals if is_facing else None, "skip": skip}
     covered = plane_coverage(points, frames, setting.planes, DIRECTIONS, **options)
     found = coverage_of_light(points, covered, frames, setting.planes, DIRECTIONS, samples, **options).numpy()
-    coverage, means = covered.numpy(), []
-    small = cell_radius(4 * len(DIRECTIONS))
-    for drawn in (samples[:, :4], samples[:, 4:]):
-        each = plane_coverage(points, frames, setting.planes, drawn.reshape(-1, 3), radius=small, **options).numpy()
-        means.append(np.minimum(each.reshape(*found.shape, 4), 1).mean(axis=-1))
-    gate = np.clip(20 * np.minimum(coverage, 1 - coverage), 0, 1)
-    wanted = coverage + gate * (means[0] - (np.minimum(coverage, 1) if setting.planes.has_holes else means[1]))
-    np.testing.assert_allclose(found, np.where(gate > 0, np.clip(wanted, 0, 1), coverage), atol=FLOAT32)
+    coverage, small = covered.numpy(), cell_radius(8 * len(DIRECTIONS))
+    each = plane_coverage(points, frames, setting.planes, samples.reshape(-1, 3), radius=small, **options).numpy()
+    weights = np.ones((*found.shape, 8))
+    if is_facing:
+        cosines = np.einsum("brc,qsc->brqs", setting.normals, samples)
+        weights = np.maximum(cosines, 0) if skip is not None else cosines > 0
+    total = weights.sum(axis=-1)
+    mean = (np.minimum(each.reshape(weights.shape), 1) * weights).sum(axis=-1) / np.where(total > 0, total, 1)
+    gate = np.clip(20 * np.minimum(coverage, 1 - coverage), 0, 1) * (total > 0)
+    np.testing.assert_allclose(found, coverage + gate * (mean - coverage), atol=FLOAT32)
     assert (np.abs(found - coverage) > 0.1).sum() > 3
 
 
@@ -53,15 +53,15 @@ def test_directions_of_a_cell_are_eight(device):
     points, _, _, vertices, _ = setting.arrays()
     frames = setting.planes.frames(vertices)
     covered = plane_coverage(points, frames, setting.planes, DIRECTIONS)
-    with pytest.raises(ValueError, match=r"samples: got shape \(64, 4, 3\), expected \[64, 8, 3\]"):
-        coverage_of_light(points, covered, frames, setting.planes, DIRECTIONS, samples_of_cells()[:, :4])
+    with pytest.raises(ValueError, match=r"samples: got shape \(64, 3, 3\), expected \[64, 8, 3\]"):
+        coverage_of_light(points, covered, frames, setting.planes, DIRECTIONS, samples_of_cells()[:, :3])
 
 
 def behind_a_window(**visibility):
     """A wall whose light, of a bright sky above dark land, comes through a window in a wall without end."""
     land = np.full((32, 64, 3), 0.02)
     land[:16] = 1.0
-    flat = ws.plane(24.0, 24)
+    flat = ws.plane(98.0, 49)
     middles = flat.positions[flat.faces].mean(axis=1)
     holed = ws.Mesh(flat.positions, flat.faces[np.abs(middles[:, [0, 2]]).max(axis=1) > 1])
     window = ws.Body(holed, rotation=(-90, 0, 0), translation=(0, 0, 3), name="window")
@@ -81,5 +81,5 @@ def test_light_through_a_window_is_that_of_rays(monkeypatch):
             monkeypatch.setattr(directional, "coverage_of_light", lambda points, covered, *_, **options: covered)
         found = ws.Renderer(behind_a_window()).render()[..., 0].mean(axis=1)
         errors.append(np.abs(found - truth).mean() / truth.mean())
-    assert errors[0] < 0.065  # measured 0.053, and 0.080 by cells alone
+    assert errors[0] < 0.095  # measured 0.080, and 0.154 by cells alone
     assert errors[0] < 0.8 * errors[1]

@@ -63,9 +63,11 @@ def bilinear(image, x, y):
 
 def area_in_disc(a, b):
     """Area of the triangle of the middle of a disc of radius 1, a and b that the disc takes, by its pieces."""
-    across, along = a @ a - 1, b - a
-    half = (along @ a) ** 2 - (along @ along) * across
-    cuts = [(-along @ a + sign * np.sqrt(half)) / (along @ along) for sign in (-1, 1)] if half > 0 else []
+    along = b - a
+    length = np.linalg.norm(along)
+    distance = np.linalg.det([a, along]) / length if length else 1.0
+    half = np.sqrt(max(0, 1 - distance**2))
+    cuts = [(-along @ a / length + sign * half) / length for sign in (-1, 1)] if half > 0 else []
     ends = [a + t * along for t in (0, *np.clip(cuts, 0, 1), 1)]
     total = 0.0
     for p, q in zip(ends[:-1], ends[1:], strict=True):
@@ -74,11 +76,32 @@ def area_in_disc(a, b):
     return total
 
 
-def share_in_outline(outline, y, slope, size):
-    """Part of the ellipse of a footprint that an outline encloses; that of holes alone is negative."""
-    values, axes = np.linalg.eigh(np.eye(2) + np.outer(slope, slope))
-    edges = (outline - y) @ axes / np.sqrt(values) / size
-    return np.linalg.det(axes) * sum(area_in_disc(*edge) for edge in edges) / np.pi  # axes may mirror
+def ahead(corners, direction):
+    """The part of a polygon [corner, 3] that is in front of the origin."""
+    heights, result = corners @ direction - 1e-3 * np.abs(corners[:, 2]).max(), []
+    for k in range(len(corners)):
+        before, after, step = heights[k - 1], heights[k], corners[k] - corners[k - 1]
+        if before * after < 0:
+            result.append(corners[k - 1] + before / (before - after) * step)
+        if after >= 0:
+            result.append(corners[k])
+    return np.array(result)
+
+
+def share_in_view(outline, at, toward, radius):
+    """Part of a cell that an outline encloses, by signed triangles projected to the plane that touches the sphere."""
+    toward = toward / np.linalg.norm(toward)
+    axis = np.cross(toward, np.eye(3)[np.abs(toward).argmin()])
+    axes = np.stack([axis, np.cross(toward, axis)]) / np.linalg.norm(axis) / radius
+    total = 0.0
+    for a, b in outline:
+        corners = np.stack([outline[0, 0], a, b])
+        sign = np.sign(np.linalg.det(corners[1:] - corners[0]))
+        seen = ahead(np.column_stack([corners - at[:2], np.full(3, at[2])]), toward)
+        if sign and len(seen):
+            projected = seen @ axes.T / (seen @ toward)[:, None]
+            total += sign * abs(sum(map(area_in_disc, np.roll(projected, 1, axis=0), projected)))
+    return np.clip(total / np.pi, 0, 1)
 
 
 def around(texels):
@@ -121,7 +144,7 @@ def margin_of(grid):
     return 0.001 * grid.texel_sizes().min()
 
 
-def met_sides(point, omega, radius, frames, grids, radiosity, skip, fronts=None):
+def met_sides(point, omega, disc, radius, frames, grids, radiosity, skip, fronts=None):
     """Coverage, distance, its width, light and flat of each side that a cell meets."""
     sides = []
     for f, grid in enumerate(grids):
@@ -131,7 +154,6 @@ def met_sides(point, omega, radius, frames, grids, radiosity, skip, fronts=None)
         normal = np.cross(*axes)
         place = axes @ (point - origin) / scales
         height = normal @ (point - origin) / scales[0]
-        edges = [np.sign(e) * np.expm1(np.abs(e)) * grid.spread for e in (grid.low, grid.high)]
         margin = margin_of(grid)
         front = ramp(1 + 2 * height / margin) if fronts is None else fronts[f]
         for side, side_weight in ((1, front), (-1, 1 - front)):
@@ -143,14 +165,10 @@ def met_sides(point, omega, radius, frames, grids, radiosity, skip, fronts=None)
             rise = np.clip(side * height / margin, 0, 2)
             t = (margin * (1 + rise**2 / 4) + max(side * height - 2 * margin, 0)) / mean
             y = place + t * (axes @ omega)
-            extents = t * radius * np.sqrt(1 + (axes @ omega / mean) ** 2)
-            inside = ramp((edges[1] - y) / extents) - ramp((edges[0] - y) / extents)
-            share = side_weight * ramp(ratio) * inside.prod()
-            if not grid.is_whole and len(grid.outline) <= prepared.MAX_EDGES:
-                outline, within = (grid.outline, 0.0) if grid.holes() is None else (grid.holes(), inside.prod())
-                within += share_in_outline(outline, y, axes @ omega / mean, t * radius)
-                share = side_weight * ramp(ratio) * np.clip(within, 0, 1)
-            elif not grid.is_whole:
+            is_exact = len(grid.outline) <= prepared.MAX_EDGES
+            at, toward = np.array([*place, t * mean]), np.array([*(axes @ omega), cosine])
+            share = side_weight * share_in_view(grid.outline if is_exact else grid.rectangle(), at, toward, disc)
+            if not is_exact:
                 share *= fetched(grid.covered[..., None].astype(float), grid, y, mean, t, radius, halved)[0]
             light = np.zeros(3)
             if side == 1 or grid.sides == 2:
@@ -159,6 +177,15 @@ def met_sides(point, omega, radius, frames, grids, radiosity, skip, fronts=None)
                 light = share * fetched(image, grid, y, mean, t, radius, means)
             sides.append((share, t, t * radius / mean, light, f))
     return sides
+
+
+def above_horizon(omega, normal, radius):
+    """Direction and radius of the largest disc in a cell that is above a horizon."""
+    cosine = normal @ omega
+    if not 0 < cosine < radius:
+        return omega, radius
+    shifted = omega + (radius - cosine) / 2 * (normal - cosine * omega)
+    return shifted / np.linalg.norm(shifted), (radius + cosine) / 2
 
 
 def twin_light(points, normals, transmittance, frames, grids, radiosity, directions, skip=None, fronts=None):
@@ -170,7 +197,8 @@ def twin_light(points, normals, transmittance, frames, grids, radiosity, directi
             if weight == 0:
                 continue
             own = None if fronts is None else fronts[receiver]
-            sides = met_sides(point, omega, radius, frames, grids, radiosity, skip, own)
+            seen = (omega, radius) if skip is None else above_horizon(omega, normal, radius)
+            sides = met_sides(point, *seen, radius, frames, grids, radiosity, skip, own)
             sent, shares = np.zeros(3), 0.0
             for k, (own_h, t, width, light, _) in enumerate(sides):
                 unhidden = 1.0
@@ -191,7 +219,7 @@ def twin_passing(points, transmittance, frames, grids, blocks, directions, skip=
             if transmittance[receiver, q] == 0:
                 continue
             own = None if fronts is None else fronts[receiver]
-            for h, *_, f in met_sides(point, omega, radius, frames, grids, black, skip, own):
+            for h, *_, f in met_sides(point, omega, radius, radius, frames, grids, black, skip, own):
                 covered[receiver, q] += h * blocks[f]
     return transmittance * np.maximum(0, 1 - covered)
 
@@ -318,7 +346,8 @@ def test_white_flats_send_what_they_block(skip, device):
     radiosity.fill_(1.0)
     frames, planes = setting.planes.frames(vertices), setting.planes
     light = plane_light(points, normals, transmittance, frames, radiosity, planes, DIRECTIONS, skip=skip).numpy()
-    passing = passing_flats(points, transmittance, frames, planes, DIRECTIONS, skip=skip).numpy()
+    options = {"skip": skip, "horizon_normals": normals}
+    passing = passing_flats(points, transmittance, frames, planes, DIRECTIONS, **options).numpy()
     weights = 4 / len(DIRECTIONS) * np.maximum(setting.normals @ DIRECTIONS.T, 0)
     blocked = (weights * (setting.transmittance - passing)).sum(axis=2)
     assert blocked.max() > 0.1

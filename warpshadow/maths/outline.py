@@ -55,6 +55,14 @@ def _without_straight(points: np.ndarray, edges: np.ndarray) -> np.ndarray:
     return np.array([[begin, end] for begin, others in outgoing.items() for end in others], int).reshape(-1, 2)
 
 
+def is_convex(edges: np.ndarray) -> bool:
+    """Whether no corner of an outline, float64 of shape [edge, 2, 2], lies to the right of an edge."""
+    begins, lines = edges[:, 0], edges[:, 1] - edges[:, 0]
+    heights = _cross(lines[:, None], begins - begins[:, None])
+    size = np.ptp(edges, axis=(0, 1)).max(initial=0.0)
+    return bool((heights >= -_STRAIGHT * size * np.linalg.norm(lines, axis=1)[:, None]).all())
+
+
 def cut_outline(points: np.ndarray, edges: np.ndarray, maximum: int) -> list[np.ndarray] | None:
     """Cut what an outline encloses into convex polygons, by lines between its corners.
 

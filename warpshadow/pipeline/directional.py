@@ -106,11 +106,11 @@ class Directional(SphereMethod):
     def _samples(
         self, radiance: np.ndarray, power: np.ndarray, draw: Callable[[np.ndarray, int], np.ndarray]
     ) -> np.ndarray:
-        """Directions drawn from the light of each cell, and even ones in it, [direction, 8, 3]; the same if dark."""
-        even = draw_in_cells(np.ones_like(radiance), self._directions, np.arange(len(power)), SAMPLES)
-        drawn, lit = even.copy(), np.flatnonzero(power > 0)
+        """Directions drawn from the light of each cell, [direction, 8, 3]; even ones in a dark cell."""
+        drawn = draw_in_cells(np.ones_like(radiance), self._directions, np.arange(len(power)), SAMPLES)
+        lit = np.flatnonzero(power > 0)
         drawn[lit] = draw(lit, SAMPLES)
-        return np.concatenate([drawn, even], axis=1)
+        return drawn
 
     def _on_device(self, coefficients: np.ndarray) -> wp.array:
         return wp.array(coefficients[None], dtype=wp.vec3, device=self.merged_scene.device)

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import warp as wp
 
+from warpshadow.stages.cell_coverage import ViewedEdge, coverage_adjoint
 from warpshadow.stages.planes.cells import (
     PlaneArrays,
     PlaneFootprint,
-    ReceiverInPlane,
     fetch,
     fetch_adjoint,
     find_footprint,
     find_footprint_adjoint,
-    find_in_plane,
-    find_in_plane_adjoint,
     find_spot,
-    front_of,
-    front_of_adjoint,
     is_covered_by_texels,
     on_side,
     scatter,
@@ -26,94 +22,18 @@ from warpshadow.stages.planes.cells import (
     toward_side,
 )
 from warpshadow.stages.planes.prepared import PlaneGrid
+from warpshadow.stages.planes.sides import SIDE_ROWS, VisibleCell, load_place, load_side, plane_share, store_place
 
 _MIN_WEIGHT_SUM = wp.constant(1.0e-30)  # the least Σ s
 
 
-# Scratch of a receiver, vec3. Its position relative to each plane f, whose gradients have the same places:
-#     4 f        where it is along both axes, and its height
-#     4 f + 1    the axis u, of unit length; 4 f + 2 the axis v, and 4 f + 3 the normal
-# Sides i that it may meet, from ``4 flat_count`` on:
-#     i          the plane, 1 for its back, and which part of the side is there
-# The hit of a cell on each of these sides, from ``6 flat_count`` on:
+# Scratch of a receiver, vec3, follows that of its sides. The hit of a cell on each of these, from ``6 flat_count`` on:
 #     4 i        coverage, distance, and how much that varies over the cell
 #     4 i + 1    radiosity
-#     4 i + 2    coverage of the outline or the rectangle, the mesh's share of that by texels, and 1 / c′
+#     4 i + 2    coverage of the outline, the mesh's share of that by texels, and 1 / c′
 #     4 i + 3    place in the plane, and the transmittance of the sides in front of it
-SCRATCH_ROWS = 14
-
-
-@wp.func
-def place_receiver(
-    point: wp.vec3,
-    frames: wp.array(dtype=wp.vec3),
-    fronts: wp.array3d(dtype=wp.float32),
-    scene: PlaneArrays,
-    batch: int,
-    receiver: int,
-    store: wp.array(dtype=wp.vec3),
-):
-    """Store a receiver's position relative to each plane; return how many sides it may hit."""
-    plane_count = scene.grids.shape[0]
-    side_count = int(0)
-    for f in range(plane_count):
-        place = find_in_plane(point, frames, f)
-        store[4 * f] = place.at
-        store[4 * f + 1] = place.along_u
-        store[4 * f + 2] = place.along_v
-        store[4 * f + 3] = place.normal
-        # below the plane the front fades, and the back takes over
-        front = front_of(fronts, scene.grids[f], place.at[2], batch, receiver, f)
-        if f != scene.skip and wp.length_sq(place.normal) > 0.0:
-            if front > 0.0:
-                store[4 * plane_count + side_count] = wp.vec3(float(f), 0.0, front)
-                side_count += 1
-            if front < 1.0:
-                store[4 * plane_count + side_count] = wp.vec3(float(f), 1.0, 1.0 - front)
-                side_count += 1
-    return side_count
-
-
-@wp.func
-def _load_place(store: wp.array(dtype=wp.vec3), f: int):
-    """Words stored for a plane."""
-    place = ReceiverInPlane()
-    place.at = store[4 * f]
-    place.along_u = store[4 * f + 1]
-    place.along_v = store[4 * f + 2]
-    place.normal = store[4 * f + 3]
-    return place
-
-
-@wp.func
-def place_receiver_adjoint(
-    point: wp.vec3,
-    frames: wp.array(dtype=wp.vec3),
-    fronts: wp.array3d(dtype=wp.float32),
-    scene: PlaneArrays,
-    batch: int,
-    receiver: int,
-    side_count: int,
-    store: wp.array(dtype=wp.vec3),
-    adj_store: wp.array(dtype=wp.vec3),
-    instance: int,
-    adj_frames: wp.array2d(dtype=wp.vec3),
-    adj_fronts: wp.array3d(dtype=wp.float32),
-):
-    """Add to the gradients of the frames of an instance, and of fronts; returns that of the point."""
-    sides = 4 * scene.grids.shape[0]
-    for i in range(side_count):
-        side = store[sides + i]
-        f = int(side[0])
-        adj_front = wp.where(side[1] > 0.0, -1.0, 1.0) * adj_store[sides + i][2]
-        height = store[4 * f][2]
-        adj_height = front_of_adjoint(fronts, scene.grids[f], height, adj_front, batch, receiver, f, adj_fronts)
-        adj_store[4 * f] = adj_store[4 * f] + wp.vec3(0.0, 0.0, adj_height)
-    adj_point = wp.vec3()
-    for f in range(scene.grids.shape[0]):
-        place, adj = _load_place(store, f), _load_place(adj_store, f)
-        adj_point += find_in_plane_adjoint(point, frames, f, place, adj, instance, adj_frames)
-    return adj_point
+HIT_ROWS = SIDE_ROWS + 8
+"""Rows of scratch for each plane."""
 
 
 @wp.func
@@ -125,85 +45,79 @@ def levels_of(grid: PlaneGrid, is_back: bool):
 @wp.func
 def hit_sides(
     scene: PlaneArrays,
-    direction: wp.vec3,
+    cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
     part: float,
     side_count: int,
     store: wp.array(dtype=wp.vec3),
+    edges: wp.array(dtype=ViewedEdge),
 ):
     """Store which plane sides this cell hits; return whether any. No part meets nothing."""
     if part <= 0.0:
         return False
-    sides = 4 * scene.grids.shape[0]
-    cells = 6 * scene.grids.shape[0]
+    cells = SIDE_ROWS * scene.grids.shape[0]
     meets = bool(False)
     for i in range(side_count):
-        side = store[sides + i]
-        f = int(side[0])
-        is_back = side[1] > 0.0
-        place = _load_place(store, f)
-        toward = toward_side(place, is_back, direction)
+        side = load_side(scene, i, store)
+        grid = scene.grids[side.f]
+        place = load_place(store, side.f)
+        share = plane_share(scene, grid, side, place, cell, edges)
         store[cells + 4 * i] = wp.vec3()
-        if toward[2] > -scene.radius:
-            grid = scene.grids[f]
-            footprint = find_footprint(grid, scene, on_side(grid, place, is_back), toward, side[2])
-            if footprint.share > 0.0:
-                covered = float(1.0)
-                radiosity = wp.vec3()
-                sends = grid.sides == 2 or not is_back
-                if sends or is_covered_by_texels(grid):
-                    first_level = levels_of(grid, is_back)
-                    spot = find_spot(grid, scene, footprint)
-                    if is_covered_by_texels(grid):
-                        covered = fetch(scene.covered, scene, first_level, spot)[0]
-                    if sends:
-                        radiosity = fetch(texels, scene, first_level, spot)
-                meets = True
-                store[cells + 4 * i] = wp.vec3(
-                    footprint.share * covered,
-                    footprint.distance,
-                    footprint.distance * scene.radius * footprint.per_cosine,
-                )
-                store[cells + 4 * i + 1] = radiosity
-                store[cells + 4 * i + 2] = wp.vec3(footprint.share, covered, footprint.per_cosine)
-                store[cells + 4 * i + 3] = wp.vec3(footprint.center[0], footprint.center[1], 0.0)
+        if share > 0.0:
+            footprint = find_footprint(
+                scene, on_side(grid, place, side.is_back), toward_side(place, side.is_back, cell.direction)
+            )
+            covered = float(1.0)
+            radiosity = wp.vec3()
+            sends = grid.sides == 2 or not side.is_back
+            if sends or is_covered_by_texels(grid):
+                first_level = levels_of(grid, side.is_back)
+                spot = find_spot(grid, scene, footprint)
+                if is_covered_by_texels(grid):
+                    covered = fetch(scene.covered, scene, first_level, spot)[0]
+                if sends:
+                    radiosity = fetch(texels, scene, first_level, spot)
+            meets = True
+            store[cells + 4 * i] = wp.vec3(
+                share * covered, footprint.distance, footprint.distance * scene.radius * footprint.per_cosine
+            )
+            store[cells + 4 * i + 1] = radiosity
+            store[cells + 4 * i + 2] = wp.vec3(share, covered, footprint.per_cosine)
+            store[cells + 4 * i + 3] = wp.vec3(footprint.center[0], footprint.center[1], 0.0)
     return meets
 
 
 @wp.func
 def hit_sides_adjoint(
     scene: PlaneArrays,
-    direction: wp.vec3,
+    cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
     side_count: int,
     store: wp.array(dtype=wp.vec3),
+    edges: wp.array(dtype=ViewedEdge),
     adj_store: wp.array(dtype=wp.vec3),
     instance: int,
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
-    """Add to the gradients of a receiver relative to each plane, and to the texels' of an instance."""
+    """Add to the gradients of a receiver relative to each plane, of viewed edges, and of an instance's texels."""
     sides = 4 * scene.grids.shape[0]
-    cells = 6 * scene.grids.shape[0]
+    cells = SIDE_ROWS * scene.grids.shape[0]
     for i in range(side_count):
         if store[cells + 4 * i][0] > 0.0:
-            side = store[sides + i]
-            f = int(side[0])
-            is_back = side[1] > 0.0
-            grid = scene.grids[f]
+            side = load_side(scene, i, store)
+            grid = scene.grids[side.f]
             stored = store[cells + 4 * i + 2]
             spot_place = store[cells + 4 * i + 3]
             footprint = PlaneFootprint()
-            footprint.share = stored[0]
             footprint.distance = store[cells + 4 * i][1]
             footprint.per_cosine = stored[2]
             footprint.center = wp.vec2(spot_place[0], spot_place[1])
             adj_met = adj_store[cells + 4 * i]  # of coverage, distance, and t ρ / c′
             adj_light = adj_store[cells + 4 * i + 1]  # of radiosity
-            adj_share = adj_met[0] * stored[1]
             adj_spot = wp.vec3()
-            sends = grid.sides == 2 or not is_back
+            sends = grid.sides == 2 or not side.is_back
             if sends or is_covered_by_texels(grid):
-                first_level = levels_of(grid, is_back)
+                first_level = levels_of(grid, side.is_back)
                 spot = find_spot(grid, scene, footprint)
                 if is_covered_by_texels(grid):
                     adj_covered = wp.vec3(adj_met[0] * stored[0], 0.0, 0.0)
@@ -219,26 +133,17 @@ def hit_sides_adjoint(
             )
             if adj_spot[2] != 0.0:
                 adj_distance += adj_spot[2] / footprint.distance
-            place = _load_place(store, f)
-            toward = toward_side(place, is_back, direction)
-            adj_at, adj_toward, adj_front = find_footprint_adjoint(
-                grid,
-                scene,
-                toward,
-                side[2],
-                footprint,
-                adj_share,
-                adj_distance,
-                adj_cosine,
-                wp.vec2(adj_spot[0], adj_spot[1]),
-            )
-            before = _load_place(adj_store, f)
-            adj_place = side_adjoint(grid, place, is_back, direction, adj_at, adj_toward, before)
-            adj_store[sides + i] = adj_store[sides + i] + wp.vec3(0.0, 0.0, adj_front)
-            adj_store[4 * f] = adj_place.at
-            adj_store[4 * f + 1] = adj_place.along_u
-            adj_store[4 * f + 2] = adj_place.along_v
-            adj_store[4 * f + 3] = adj_place.normal
+            place = load_place(store, side.f)
+            toward = toward_side(place, side.is_back, cell.direction)
+            adj_center = wp.vec2(adj_spot[0], adj_spot[1])
+            adj_at, adj_toward = find_footprint_adjoint(scene, toward, footprint, adj_distance, adj_cosine, adj_center)
+            adj_place = load_place(adj_store, side.f)
+            adj_place = side_adjoint(grid, place, side.is_back, cell.direction, adj_at, adj_toward, adj_place)
+            store_place(adj_store, side.f, adj_place)
+            adj_share = adj_met[0] * stored[1]
+            weighted = adj_share * side.weight
+            coverage_adjoint(edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, weighted)
+            adj_store[sides + i] = adj_store[sides + i] + wp.vec3(0.0, 0.0, adj_share * stored[0] / side.weight)
 
 
 @wp.func

@@ -27,23 +27,25 @@ from warpshadow.device.batch import common_batch, expand, expand_rows, instance_
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty, zeros
-from warpshadow.device.parallel import Scratch, scratch_place, split_row
+from warpshadow.device.parallel import scratch_place, split_row
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.bounces.plane_hits import (
-    SCRATCH_ROWS,
+    HIT_ROWS,
     hit_sides,
     hit_sides_adjoint,
     mean_light,
-    place_receiver,
-    place_receiver_adjoint,
     side_transmittance_adjoint,
 )
-from warpshadow.stages.planes.cells import (
-    PlaneArrays,
-    check_planes,
-    plane_arrays,
-)
+from warpshadow.stages.cell_coverage import ViewedEdge
+from warpshadow.stages.planes.cells import PlaneArrays, check_planes, plane_arrays
 from warpshadow.stages.planes.prepared import PlaneBlockers
+from warpshadow.stages.planes.sides import (
+    SIDE_ROWS,
+    place_receiver,
+    place_receiver_adjoint,
+    receiver_scratch,
+    visible_cell,
+)
 
 _CELL_COST = 15.0  # mean time of a cell of a receiver [ns], over cells that hit a plane and cells that do not
 
@@ -63,22 +65,24 @@ def _light_receivers(
     directions: wp.array(dtype=wp.vec3),
     # scratch
     scratch: wp.array2d(dtype=wp.vec3),
+    viewed_edges: wp.array2d(dtype=ViewedEdge),
     # out
     light: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver."""
     row = first_row + wp.tid()
     batch, receiver = split_row(row, points.shape[1])
-    store = scratch[scratch_place(worker, row)]
+    place = scratch_place(worker, row)
+    store, edges = scratch[place], viewed_edges[place]
     sent = texels[instance_in(batch, texels.shape[0])]
     normal = normals[batch, receiver]
-    cells = 6 * scene.grids.shape[0]
+    cells = SIDE_ROWS * scene.grids.shape[0]
     placed = frames[instance_in(batch, frames.shape[0])]
-    side_count = place_receiver(points[batch, receiver], placed, fronts, scene, batch, receiver, store)
+    side_count = place_receiver(points[batch, receiver], placed, fronts, scene, batch, receiver, store, edges)
     total = wp.vec3()
     for q in range(directions.shape[0]):
         weight = wp.dot(normal, directions[q]) * transmittance[batch, receiver, q]
-        if hit_sides(scene, directions[q], sent, weight, side_count, store):
+        if hit_sides(scene, visible_cell(scene, normal, directions[q]), sent, weight, side_count, store, edges):
             mean, _, covered = mean_light(cells, side_count, store)
             total += (weight * wp.min(covered, 1.0)) * mean
     light[batch, receiver] = (4.0 / float(directions.shape[0])) * total
@@ -100,6 +104,7 @@ def _light_receivers_adjoint(
     adj_light: wp.array2d(dtype=wp.vec3),
     # scratch
     scratch: wp.array2d(dtype=wp.vec3),
+    viewed_edges: wp.array2d(dtype=ViewedEdge),
     adj_scratch: wp.array2d(dtype=wp.vec3),
     # out
     adj_points: wp.array2d(dtype=wp.vec3),
@@ -114,14 +119,16 @@ def _light_receivers_adjoint(
     row = first_row + wp.tid()
     batch, receiver = split_row(row, points.shape[1])
     place = scratch_place(worker, row)
-    store = scratch[place]
+    store, edges = scratch[place], viewed_edges[place]
     adj_store = adj_scratch[place]
     seen_frames = instance_in(batch, frames.shape[0])
     seen_texels = instance_in(batch, texels.shape[0])
     sent = texels[seen_texels]
     normal = normals[batch, receiver]
-    cells = 6 * scene.grids.shape[0]
-    side_count = place_receiver(points[batch, receiver], frames[seen_frames], fronts, scene, batch, receiver, store)
+    cells = SIDE_ROWS * scene.grids.shape[0]
+    side_count = place_receiver(
+        points[batch, receiver], frames[seen_frames], fronts, scene, batch, receiver, store, edges
+    )
     for k in range(cells):
         adj_store[k] = wp.vec3()
     adj = (4.0 / float(directions.shape[0])) * adj_light[batch, receiver]
@@ -131,7 +138,8 @@ def _light_receivers_adjoint(
         cosine = wp.dot(normal, direction)
         passing = transmittance[batch, receiver, q]
         weight = cosine * passing
-        if hit_sides(scene, direction, sent, cosine, side_count, store):
+        cell = visible_cell(scene, normal, direction)
+        if hit_sides(scene, cell, sent, cosine, side_count, store, edges):
             mean, weights, covered = mean_light(cells, side_count, store)
             value = wp.dot(adj, mean)
             total = wp.min(covered, 1.0) * value
@@ -151,7 +159,7 @@ def _light_receivers_adjoint(
             if adj_transmittance:
                 adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + cosine * total
             if passing > 0.0:
-                hit_sides_adjoint(scene, direction, sent, side_count, store, adj_store, seen_texels, adj_texels)
+                hit_sides_adjoint(scene, cell, sent, side_count, store, edges, adj_store, seen_texels, adj_texels)
     if adj_normals:
         adj_normals[batch, receiver] = adj_normals[batch, receiver] + adj_normal
     adj_point = place_receiver_adjoint(
@@ -163,6 +171,7 @@ def _light_receivers_adjoint(
         receiver,
         side_count,
         store,
+        edges,
         adj_store,
         seen_frames,
         adj_frames,
@@ -211,7 +220,7 @@ def plane_light(
     points, normals = (expand(array, instances) for array in (points, normals))
     transmittance = expand_rows(transmittance, instances)
     fronts = None if fronts is None else expand_rows(fronts, instances)
-    scratch = Scratch((SCRATCH_ROWS * planes.count,), wp.vec3)
+    scratch = receiver_scratch(planes, HIT_ROWS)
     variables = [points, normals, transmittance, frames, texels, fronts]
     scene, cells = (
         plane_arrays(planes, cell_radius(len(directions)), skip),
@@ -223,7 +232,7 @@ def plane_light(
             _light_receivers,
             points.size,
             inputs=inputs,
-            scratch=[scratch],
+            scratch=scratch,
             outputs=[light],
             cost=_CELL_COST * len(directions),
         ),
@@ -231,7 +240,7 @@ def plane_light(
             _light_receivers_adjoint,
             points.size,
             inputs=[*inputs, adj_light],
-            scratch=[scratch] * 2,
+            scratch=[*scratch, scratch[0]],
             outputs=[points.grad, normals.grad, transmittance.grad, None if fronts is None else fronts.grad],
             sums=[frames.grad, texels.grad],
             cost=2 * _CELL_COST * len(directions),

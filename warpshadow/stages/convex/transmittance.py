@@ -2,27 +2,8 @@
 
     P_q = Π_bodies max(0, 1 − Σ_parts h_q)
 
-h is the share of cell q, a disc of radius ρ = 2/√Q around its direction ω, that a convex part takes as a receiver x
-sees it. The part's silhouette are the edges between a face that x sees and one that it does not. The plane through x
-and an edge from a to b, n = (a − x) × (b − x) towards the part, cuts the plane that touches the sphere of directions at
-ω in a line. Its signed distance from ω, positive where the part is, and where along it the edge runs, from s₀ to s₁
-within the disc, are
-
-    d = m·ω / √(1 − (m·ω)²),  m = n / |n|,  s = (a − x)·t / (a − x)·ω,  t = ω × m / |ω × m|
-
-and the area of the disc inside the silhouette is that of the whole disc, if ω is inside, and a term for each edge that
-crosses the disc, what lies between the edge and the disc's border:
-
-    π ρ² h = π ρ² [ω inside] + ½ Σ_edges d (s₁ − s₀) − ρ² sign(d) atan2(|d| (s₁ − s₀), d² + s₀ s₁)
-
-The angles together are that of the product of complex numbers d² + s₀ s₁ − i d (s₁ − s₀), and a turn each time that it
-crosses the negative axis: one arc tangent for a cell, not one for an edge, saves 12 to 20% of the time.
-
-As a line moves by δ(s), the area grows by ∫ δ ds between s₀ and s₁, so with y the direction in the middle of it
-
-    ∂(π ρ² h) = Σ_edges (s₁ − s₀) / √(1 − (m·ω)²) ∂n·y / |n|
-
-Where a corner is nearer to ω than some 1e-6, rounding decides how its edges share the disc.
+h is the share of cell q within the silhouette of a convex part (:mod:`warpshadow.stages.cell_coverage`), the edges
+between a face that a receiver sees and one that it does not.
 
 Parts of one body are beside each other, so they cover different parts of a cell; bodies are independent. Edges are
 exact, and so are thin parts: spheres bulge out of them.
@@ -36,6 +17,7 @@ from warpshadow.device.batch import common_batch, expand, instance_in
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import Scratch, scratch_place, split_row
 from warpshadow.maths.directions import BUNDLE, cell_radius
+from warpshadow.stages.cell_coverage import ViewedEdge, convex_coverage, coverage_adjoint
 from warpshadow.stages.convex.prepared import ConvexArrays, ConvexBlockers, PlacedParts
 from warpshadow.stages.planes.transmittance import horizon_normal, is_above_horizon
 from warpshadow.stages.visibility.culling import DirectionCells, make_cells
@@ -53,16 +35,6 @@ _BOUND_MARGIN = wp.constant(1.001)
 _MIN_EDGE_SINE = wp.constant(1.0e-6)
 """Sine of the least angle under which a receiver sees an edge."""
 
-_LEAST = wp.constant(1.0e-12)
-"""The least distance of an edge from ω."""
-
-# Scratch of a receiver, vec3, for each edge of a part's silhouette:
-#     5 e        unit normal m of the plane through the receiver and the edge
-#     5 e + 1    the edge's begin and end relative to the receiver, in 5 e + 2
-#     5 e + 3    their numbers, and |n|
-#     5 e + 4    gradient of n
-_ROWS = 5
-
 
 @wp.func
 def _find_silhouette(
@@ -71,7 +43,7 @@ def _find_silhouette(
     planes: wp.array(dtype=wp.vec4),
     parts: ConvexArrays,
     part: int,
-    silhouette: wp.array(dtype=wp.vec3),
+    silhouette: wp.array(dtype=ViewedEdge),
 ):
     """Store a part's silhouette.
 
@@ -99,122 +71,32 @@ def _find_silhouette(
             n = wp.cross(a, b)
             length2 = wp.length_sq(n)
             if length2 > _MIN_EDGE_SINE * _MIN_EDGE_SINE * wp.length_sq(a) * wp.length_sq(b):
-                length = wp.sqrt(length2)
-                silhouette[_ROWS * count] = (1.0 / length) * n
-                silhouette[_ROWS * count + 1] = a
-                silhouette[_ROWS * count + 2] = b
-                silhouette[_ROWS * count + 3] = wp.vec3(float(begin), float(end), length)
-                silhouette[_ROWS * count + 4] = wp.vec3()
+                viewed = ViewedEdge()
+                viewed.length = wp.sqrt(length2)
+                viewed.normal = (1.0 / viewed.length) * n
+                viewed.begin = a
+                viewed.end = b
+                viewed.corners = wp.vec2i(begin, end)
+                silhouette[count] = viewed
                 count += 1
     return wp.where(count < 3, 0, count)  # fewer enclose nothing
 
 
-@wp.struct
-class Chord:
-    """Part of an edge that is seen within a cell, in the plane that touches the sphere of directions there."""
-
-    distance: float  # d, of the line from the middle of the cell
-    begin: float  # s₀
-    end: float  # s₁
-    along: wp.vec3  # t
-    scale: float  # 1/√(1 − (m·ω)²), of the angle between ω and the normal
-
-
-@wp.func
-def _along_line(end: wp.vec3, axis: wp.vec3, direction: wp.vec3, half: float, behind: float):
-    """Where an end of an edge lies on its line, up to the disc's border; ``behind`` if it is behind the receiver."""
-    ahead = wp.dot(end, direction)
-    if ahead <= 0.0:
-        return behind
-    aside = wp.dot(end, axis)
-    if ahead * half <= wp.abs(aside):
-        return wp.where(aside > 0.0, half, -half)
-    return aside / ahead
-
-
-@wp.func
-def _find_chord(silhouette: wp.array(dtype=wp.vec3), e: int, cosine: float, direction: wp.vec3, radius: float):
-    """Find the chord of an edge, m·ω = ``cosine``."""
-    chord = Chord()
-    chord.scale = 1.0 / wp.sqrt(wp.max(0.0, 1.0 - cosine * cosine))
-    chord.distance = cosine * chord.scale
-    half2 = radius * radius - chord.distance * chord.distance
-    a = silhouette[_ROWS * e + 1]
-    b = silhouette[_ROWS * e + 2]
-    if half2 > 0.0 and (wp.dot(a, direction) > 0.0 or wp.dot(b, direction) > 0.0):
-        half = wp.sqrt(half2)
-        chord.along = chord.scale * wp.cross(direction, silhouette[_ROWS * e])
-        chord.begin = _along_line(b, chord.along, direction, half, -half)
-        chord.end = _along_line(a, chord.along, direction, half, half)
-    return chord
-
-
-@wp.func
-def _share(silhouette: wp.array(dtype=wp.vec3), count: int, direction: wp.vec3, radius: float):
-    """Share of a cell that a silhouette takes."""
-    if count == 0:
-        return 0.0
-    limit = radius / wp.sqrt(1.0 + radius * radius)
-    nearest = limit
-    for e in range(count):
-        nearest = wp.min(nearest, wp.dot(silhouette[_ROWS * e], direction))
-        if nearest <= -limit:
-            return 0.0
-    if nearest >= limit:
-        return 1.0
-    area = float(0.0)
-    product = wp.vec2(1.0, 0.0)
-    turn_count = float(0.0)
-    for e in range(count):
-        cosine = wp.dot(silhouette[_ROWS * e], direction)
-        if cosine < limit:
-            chord = _find_chord(silhouette, e, cosine, direction, radius)
-            if chord.end > chord.begin:
-                length = chord.end - chord.begin
-                d = wp.where(cosine > 0.0, chord.distance, wp.min(chord.distance, -_LEAST))  # of 0, turns by +π
-                area += 0.5 * d * length
-                x, y = d * d + chord.begin * chord.end, d * length
-                scale = 1.0 / wp.max(wp.abs(x), wp.abs(y))
-                before = product[1]
-                product = scale * wp.vec2(product[0] * x + before * y, before * x - product[0] * y)
-                if y > 0.0 and before < 0.0 and product[1] >= 0.0:
-                    turn_count -= 1.0
-                if y < 0.0 and before >= 0.0 and product[1] < 0.0:
-                    turn_count += 1.0
-    area += 0.5 * radius * radius * (wp.atan2(product[1], product[0]) + 2.0 * wp.pi * turn_count)
-    return wp.clamp(wp.where(nearest > 0.0, 1.0, 0.0) + area / (wp.pi * radius * radius), 0.0, 1.0)
-
-
-@wp.func
-def _share_adjoint(silhouette: wp.array(dtype=wp.vec3), count: int, direction: wp.vec3, radius: float, adj: float):
-    """Add to the gradients of the normals of a silhouette."""
-    limit = radius / wp.sqrt(1.0 + radius * radius)
-    for e in range(count):
-        cosine = wp.dot(silhouette[_ROWS * e], direction)
-        if wp.abs(cosine) < limit:
-            chord = _find_chord(silhouette, e, cosine, direction, radius)
-            if chord.end > chord.begin:
-                foot = direction - (chord.distance * chord.scale) * (silhouette[_ROWS * e] - cosine * direction)
-                middle = foot + 0.5 * (chord.begin + chord.end) * chord.along
-                scale = adj * chord.scale * (chord.end - chord.begin) / (wp.pi * radius * radius)
-                silhouette[_ROWS * e + 4] = silhouette[_ROWS * e + 4] + scale * middle
-
-
 @wp.func
 def _silhouette_adjoint(
-    silhouette: wp.array(dtype=wp.vec3), count: int, instance: int, adj_corners: wp.array2d(dtype=wp.vec3)
+    silhouette: wp.array(dtype=ViewedEdge), count: int, instance: int, adj_corners: wp.array2d(dtype=wp.vec3)
 ):
     """Add to the gradients of corners; returns that of the receiver."""
     adj_point = wp.vec3()
     for e in range(count):
-        ends = silhouette[_ROWS * e + 3]
-        adj_n = silhouette[_ROWS * e + 4] / ends[2]
-        adj_a = wp.cross(silhouette[_ROWS * e + 2], adj_n)
-        adj_b = wp.cross(adj_n, silhouette[_ROWS * e + 1])
+        viewed = silhouette[e]
+        adj_n = viewed.adj_normal / viewed.length
+        adj_a = wp.cross(viewed.end, adj_n)
+        adj_b = wp.cross(adj_n, viewed.begin)
         adj_point -= adj_a + adj_b
         if adj_corners:
-            wp.atomic_add(adj_corners, instance, int(ends[0]), adj_a)
-            wp.atomic_add(adj_corners, instance, int(ends[1]), adj_b)
+            wp.atomic_add(adj_corners, instance, viewed.corners[0], adj_a)
+            wp.atomic_add(adj_corners, instance, viewed.corners[1], adj_b)
     return adj_point
 
 
@@ -267,7 +149,7 @@ def _add_coverage(
     body: int,
     cells: DirectionCells,
     radius: float,
-    silhouette: wp.array(dtype=wp.vec3),
+    silhouette: wp.array(dtype=ViewedEdge),
     coverage: wp.array(dtype=wp.float32),
 ):
     """Σ_parts h_q of a body; returns whether it covers something: else nothing is written."""
@@ -293,7 +175,7 @@ def _add_coverage(
                                 count = _find_silhouette(point, corners, planes, parts, part, silhouette)
                             share = float(1.0)
                             if count >= 0:
-                                share = _share(silhouette, count, direction, radius)
+                                share = convex_coverage(silhouette, 0, count, direction, radius)
                             coverage[q] = coverage[q] + share
     return covers
 
@@ -313,7 +195,7 @@ def _pass(
     radius: float,
     skip: int,
     # scratch
-    silhouettes: wp.array2d(dtype=wp.vec3),
+    silhouettes: wp.array2d(dtype=ViewedEdge),
     coverages: wp.array2d(dtype=wp.float32),
     # out
     passing: wp.array3d(dtype=wp.float32),
@@ -365,7 +247,7 @@ def _pass_adjoint(
     passing: wp.array3d(dtype=wp.float32),
     adj_passing: wp.array3d(dtype=wp.float32),
     # scratch
-    silhouettes: wp.array2d(dtype=wp.vec3),
+    silhouettes: wp.array2d(dtype=ViewedEdge),
     coverages: wp.array2d(dtype=wp.float32),
     # out
     adj_points: wp.array2d(dtype=wp.vec3),
@@ -412,7 +294,7 @@ def _pass_adjoint(
                                             point, corners[instance], planes[instance], parts, part, silhouettes[place]
                                         )
                                     direction = cells.directions[q]
-                                    _share_adjoint(silhouettes[place], count, direction, radius, -adj / left)
+                                    coverage_adjoint(silhouettes[place], 0, count, direction, radius, -adj / left)
                     adj_point += _silhouette_adjoint(silhouettes[place], wp.max(count, 0), instance, adj_corners)
     if adj_points:
         adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
@@ -452,7 +334,7 @@ def transmittance_past_parts(
     own_radius = cell_radius(len(directions)) if radius is None else radius
     cells = make_cells(directions, SOFTNESS, points.device)
     inputs = [points, horizon_normals, *placed, blockers.arrays, cells, own_radius, -1 if skip is None else skip]
-    scratch = [Scratch((_ROWS * blockers.edge_count,), wp.vec3), Scratch((len(directions),), wp.float32)]
+    scratch = [Scratch((blockers.edge_count,), ViewedEdge), Scratch((len(directions),), wp.float32)]
     cost = _PART_COST * placed.bounds.shape[1]
     passing = wp.empty((*points.shape, len(directions)), dtype=wp.float32, device=points.device)
     return differentiable(

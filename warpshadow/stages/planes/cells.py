@@ -8,15 +8,12 @@ distance d below the receiver:
                                               mean cosine of the part of the cell that is below the plane's horizon
     t = d / c′                                distance
     y = x + t ω                               where, in the plane
-    h = S(c/ρ) · Π_axes [S((y_most − y)/e) − S((y_least − y)/e)],  e = t ρ √(1 + (ω_axis / c′)²)
-                                              coverage: part of the cell that the rectangle takes
 
-S(z) is the smoothstep from 0 at −1 to 1 at 1, so h has no step at the horizon, or at the border. From a rectangle with
-holes their shares of the footprint are taken off the product, and of a mesh that is no rectangle the outline takes its
-place (:mod:`.outlines`); where edges are many, the product is multiplied with the mesh's share of the footprint, by
-texels. Radiosity is bilinear in two mip levels of the grid, which are blended so that their texels are as wide as the
-footprint is in the mean of both axes, 2 t ρ / √c′: twice the disc of the cell, as interpolation between means is, so
-that together cells see all texels alike. For a sun alone that is too wide: there texels are half as wide.
+The part of the cell that the plane takes, h, is that within its outline (:mod:`warpshadow.stages.cell_coverage`); where
+edges are many, that within its rectangle, multiplied with the mesh's share of the footprint, by texels. Radiosity is
+bilinear in two mip levels of the grid, which are blended so that their texels are as wide as the footprint is in the
+mean of both axes, 2 t ρ / √c′: twice the disc of the cell, as interpolation between means is, so that together cells
+see all texels alike. For a sun alone that is too wide: there texels are half as wide.
 
 No receiver is nearer to a side than a margin, so that t is not 0. Which side it is on, :mod:`.fronts` says; by height
 alone the front fades away and the back appears from the plane to a margin below it.
@@ -26,7 +23,6 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.stages.planes.outlines import find_ellipse, share_in_outline, share_in_outline_adjoint
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 
 
@@ -39,6 +35,7 @@ class PlaneArrays:
     level_scales: wp.array(dtype=wp.vec2)
     covered: wp.array(dtype=wp.vec3)
     edges: wp.array(dtype=wp.vec4)
+    edge_axes: wp.array(dtype=wp.vec2)
     skip: int  # the plane that the receivers are part of, -1 for none
     radius: float  # ρ
     spot_radius: float  # half the width of texels, for a unit of distance
@@ -67,7 +64,7 @@ def plane_arrays(planes: PlaneBlockers, radius: float, skip: int | None, *, tile
     """
     scene = PlaneArrays()
     scene.grids, scene.levels, scene.level_scales = planes.grids, planes.levels, planes.level_scales
-    scene.covered, scene.edges = planes.covered, planes.edges
+    scene.covered, scene.edges, scene.edge_axes = planes.covered, planes.edges, planes.edge_axes
     scene.skip, scene.radius = -1 if skip is None else skip, radius
     scene.spot_radius = scene.radius if tiles else 0.5 * scene.radius
     scene.per_radius = 1 / scene.radius
@@ -236,134 +233,55 @@ def side_adjoint(
     return adj
 
 
-# ---------------------------------------------------------------------------------------------------- coverage
+# ---------------------------------------------------------------------------------------------------- footprints
 
 
 @wp.struct
 class PlaneFootprint:
     """Footprint of a cell on a plane, for a receiver over one side."""
 
-    share: float  # part of the cell that the outline takes, or the rectangle
     distance: float  # [units of the body]
     per_cosine: float  # 1 / c′, the mean cosine of the part of the cell below the horizon
     center: wp.vec2  # in the plane
 
 
 @wp.func
-def _is_amid(grid: PlaneGrid, footprint: PlaneFootprint, radius: float):
-    """Whether a footprint is so far from the border that it does not matter."""
-    reach = footprint.distance * radius * footprint.per_cosine
-    nearest = wp.min(footprint.center - grid.least)
-    return wp.min(nearest, wp.min(grid.most - footprint.center)) > reach
-
-
-@wp.func
-def find_footprint(grid: PlaneGrid, scene: PlaneArrays, at: wp.vec3, toward: wp.vec3, side_weight: float):
+def find_footprint(scene: PlaneArrays, at: wp.vec3, toward: wp.vec3):
     """Find the footprint of a cell on a side.
 
     Args:
-        grid: The plane.
         scene: Has the radius of cells.
         at: Where the receiver is: along both axes, and its height above the side.
         toward: Direction of the cell along both axes, and its cosine, above −ρ.
-        side_weight: Part of the side that is there.
     """
     footprint = PlaneFootprint()
-    footprint.share = side_weight
     cosine = toward[2]
     if cosine < scene.radius:
-        ratio = cosine * scene.per_radius
-        u = 0.5 * ratio + 0.5
+        u = 0.5 * cosine * scene.per_radius + 0.5
         cosine = scene.radius * (1.0 / 3.0 + 2.0 / 3.0 * u * u * u)
-        footprint.share *= step(ratio)
     footprint.per_cosine = 1.0 / cosine
     footprint.distance = at[2] * footprint.per_cosine
     footprint.center = wp.vec2(at[0] + footprint.distance * toward[0], at[1] + footprint.distance * toward[1])
-    inside = float(1.0)
-    if not _is_amid(grid, footprint, scene.radius):
-        for axis in range(2):
-            slope = toward[axis] * footprint.per_cosine
-            extent = footprint.distance * scene.radius * wp.sqrt(1.0 + slope * slope)
-            to_most = (grid.most[axis] - footprint.center[axis]) / extent
-            to_least = (grid.least[axis] - footprint.center[axis]) / extent
-            if grid.edge_count == 0 or grid.is_framed == 1:
-                inside = inside * (step(to_most) - step(to_least))
-            elif to_most <= -1.0 or to_least >= 1.0:
-                inside = 0.0
-    if grid.edge_count > 0 and inside > 0.0 and footprint.share > 0.0:
-        ellipse = find_ellipse(
-            footprint.center,
-            footprint.per_cosine * wp.vec2(toward[0], toward[1]),
-            footprint.distance * scene.radius,
-        )
-        in_outline = share_in_outline(scene.edges, grid.first_edge, grid.edge_count, ellipse)
-        inside = wp.clamp(wp.where(grid.is_framed == 1, inside, 0.0) + in_outline, 0.0, 1.0)
-    footprint.share *= inside
     return footprint
 
 
 @wp.func
 def find_footprint_adjoint(
-    grid: PlaneGrid,
     scene: PlaneArrays,
     toward: wp.vec3,
-    side_weight: float,
     footprint: PlaneFootprint,
-    adj_share: float,
     adj_distance: float,
     adj_cosine: float,
     adj_center: wp.vec2,
 ):
-    """Gradients of ``at``, ``toward`` and ``side_weight``, given the footprint's and the mean cosine's, c′."""
-    radius = scene.radius
-    horizon = step(toward[2] * scene.per_radius)
-    inside = float(1.0)
-    adj_inside = adj_share * side_weight * horizon
-    adj_t = adj_distance
-    adj_c = adj_cosine
-    adj_x = adj_center[0]
-    adj_y = adj_center[1]
-    adj_toward = wp.vec3()
-    slope = wp.vec2(toward[0], toward[1]) * footprint.per_cosine
-    is_soft = (grid.edge_count == 0 or grid.is_framed == 1) and not _is_amid(grid, footprint, radius)
-    if grid.edge_count > 0:
-        ellipse = find_ellipse(footprint.center, slope, footprint.distance * radius)
-        inside = wp.where(grid.is_framed == 1, 1.0, 0.0)
-        inside += share_in_outline(scene.edges, grid.first_edge, grid.edge_count, ellipse)
-        adj = share_in_outline_adjoint(scene.edges, grid.first_edge, grid.edge_count, ellipse, adj_inside)
-        adj_x += adj.center[0]
-        adj_y += adj.center[1]
-        adj_t += adj.log_size / footprint.distance
-        adj_toward += footprint.per_cosine * wp.vec3(adj.slope[0], adj.slope[1], 0.0)
-        adj_c -= wp.dot(adj.slope, slope) * footprint.per_cosine
-    if is_soft:
-        stretch = wp.vec2(wp.sqrt(1.0 + slope[0] * slope[0]), wp.sqrt(1.0 + slope[1] * slope[1]))
-        extent = footprint.distance * radius * stretch
-        to_most = wp.cw_div(grid.most - footprint.center, extent)
-        to_least = wp.cw_div(grid.least - footprint.center, extent)
-        inside_x = step(to_most[0]) - step(to_least[0])
-        inside_y = step(to_most[1]) - step(to_least[1])
-        inside += inside_x * inside_y - 1.0
-        adj_insides = adj_inside * wp.vec2(inside_y, inside_x)
-        adj_to_most = wp.cw_div(wp.cw_mul(adj_insides, wp.vec2(step_slope(to_most[0]), step_slope(to_most[1]))), extent)
-        adj_to_least = wp.cw_div(
-            wp.cw_mul(adj_insides, wp.vec2(step_slope(to_least[0]), step_slope(to_least[1]))), extent
-        )
-        adj_x += adj_to_least[0] - adj_to_most[0]
-        adj_y += adj_to_least[1] - adj_to_most[1]
-        adj_extent = wp.cw_mul(adj_to_least, to_least) - wp.cw_mul(adj_to_most, to_most)
-        adj_t += radius * wp.dot(adj_extent, stretch)
-        adj_slope = (footprint.distance * radius) * wp.cw_div(wp.cw_mul(adj_extent, slope), stretch)
-        adj_toward += footprint.per_cosine * wp.vec3(adj_slope[0], adj_slope[1], 0.0)
-        adj_c -= wp.dot(adj_slope, slope) * footprint.per_cosine
-    adj_inside_share = adj_share * wp.clamp(inside, 0.0, 1.0)
-    adj_t += adj_x * toward[0] + adj_y * toward[1]
-    adj_c -= adj_t * footprint.distance * footprint.per_cosine
-    if toward[2] < radius:
+    """Gradients of ``at`` and ``toward``, given the footprint's and the mean cosine's, c′."""
+    adj_t = adj_distance + adj_center[0] * toward[0] + adj_center[1] * toward[1]
+    adj_c = adj_cosine - adj_t * footprint.distance * footprint.per_cosine
+    if toward[2] < scene.radius:
         u = 0.5 * toward[2] * scene.per_radius + 0.5
-        adj_c = adj_c * u * u + adj_inside_share * side_weight * step_slope(2.0 * u - 1.0) * scene.per_radius
-    adj_toward += wp.vec3(adj_x * footprint.distance, adj_y * footprint.distance, adj_c)
-    return wp.vec3(adj_x, adj_y, adj_t * footprint.per_cosine), adj_toward, adj_inside_share * horizon
+        adj_c = adj_c * u * u
+    adj_at = wp.vec3(adj_center[0], adj_center[1], adj_t * footprint.per_cosine)
+    return adj_at, wp.vec3(adj_center[0] * footprint.distance, adj_center[1] * footprint.distance, adj_c)
 
 
 # ---------------------------------------------------------------------------------------------------- radiosity
@@ -383,7 +301,7 @@ class TexelFootprint:
 @wp.func
 def is_covered_by_texels(grid: PlaneGrid):
     """Whether texels say how much of a footprint the mesh covers."""
-    return grid.is_whole == 0 and grid.edge_count == 0
+    return grid.is_covered_by_texels == 1
 
 
 @wp.func

@@ -43,13 +43,11 @@ class PlaneTexture(NamedTuple):
         area = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / 2
         return bool((self.covered == 1).all() and area > (1 - _WHOLE) * (high - low).prod())
 
-    def holes(self) -> np.ndarray | None:
-        """Edges of the outline but those of the rectangle, [edge, 2, 2]; None where not all of these are in it."""
-        corners = self.corners()
-        size = corners[1] - corners[0]
-        is_border = (np.abs(self.outline[:, :, None] - corners) < _WHOLE * size).all(axis=1).any(axis=(1, 2))
-        length = np.abs(np.diff(self.outline[is_border], axis=1)).sum()
-        return self.outline[~is_border] if abs(length - 2 * size.sum()) < _WHOLE * size.sum() else None
+    def rectangle(self) -> np.ndarray:
+        """Edges of the rectangle, as those of the outline, [4, 2, 2]."""
+        (left, below), (right, above) = self.corners()
+        corners = np.array([[left, below], [right, below], [right, above], [left, above]])
+        return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
 
     def corners(self) -> np.ndarray:
         """Corners of the rectangle in the plane, (a, b), float64 of shape [2, 2]."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import warp as wp
 
+from warpshadow.maths.outline import is_convex
 from warpshadow.stages.planes.grid import PlaneTexture
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 MAX_EDGES = 128
-"""Edges of an outline at most: beyond, the mesh takes the share of a footprint that it covers of its texels."""
+"""Edges of an outline at most: beyond, it is that of the rectangle, of which the mesh takes its share by texels."""
 
 _BESIDE = 0.002  # how much texels count in those beside them, which have it if nothing of their own is seen
 _MARGIN = 0.001  # margin of planes, in widths of the smallest texel
@@ -47,10 +48,10 @@ class PlaneGrid:
     first_level: int  # of the front; the back's follow, if it has any
     level_count: int
     sides: int
-    is_whole: int  # the mesh covers the rectangle
-    first_edge: int  # of its outline, where it does not
-    edge_count: int  # 0 where texels say how much the mesh covers
-    is_framed: int  # whether these are of holes in the rectangle, the border of which is as soft as its neighbors'
+    first_edge: int  # of the outline
+    edge_count: int
+    is_convex: int  # the outline
+    is_covered_by_texels: int  # the outline is the rectangle's, and texels say how much of it the mesh covers
     blocks: int
 
 
@@ -66,6 +67,7 @@ class PlaneBlockers:
         level_scales: Its texels for one of the finest level, vec2 of shape [level].
         covered: Coverage of each texel by the mesh, in all three components, vec3 of shape [texel].
         edges: Begin and end of the edges of outlines, in the axes of their planes, vec4 of shape [edge].
+        edge_axes: Unit vectors along them, vec2 of shape [edge].
         texels_of_patches: Part of the area of each texel that patches have, and a little in the texels beside it,
             [texel, patch]; None where no patches are given.
         frames_of_vertices: Matrix that finds frames, [3 · plane, vertex].
@@ -79,6 +81,7 @@ class PlaneBlockers:
     level_scales: wp.array
     covered: wp.array
     edges: wp.array
+    edge_axes: wp.array
     texels_of_patches: SparseMatrix | None
     frames_of_vertices: SparseMatrix
     has_holes: bool
@@ -93,10 +96,8 @@ class PlaneBlockers:
         grids, covered, edges, pyramids, frames, texel_count = [], [], [np.empty((0, 4))], [], [], 0
         for body in bodies:
             grid, first_level, first_edge = body.grid, len(levels), sum(map(len, edges))
-            holes = None
-            if not grid.is_whole and len(grid.outline) <= MAX_EDGES:
-                holes = grid.holes()
-                edges.append((grid.outline if holes is None else holes).reshape(-1, 4))
+            is_exact = len(grid.outline) <= MAX_EDGES
+            edges.append((grid.outline if is_exact else grid.rectangle()).reshape(-1, 4))
             matrices = _halvings(*grid.covered.shape)
             for side in range(grid.sides):
                 for matrix, blurred, (height, width) in matrices:
@@ -107,10 +108,11 @@ class PlaneBlockers:
                     if patch_count:
                         first = body.first_patch + side * grid.covered.size
                         pyramids.append(_shifted(blurred.multiply(grid.covered.ravel()).tocsr(), first, patch_count))
-            edge_count = sum(map(len, edges)) - first_edge
-            is_framed = holes is not None
-            grids.append(_kernel_grid(body, first_level, len(matrices), first_edge, edge_count, is_framed))
+            grids.append(_kernel_grid(body, first_level, len(matrices), first_edge, edges[-1]))
+            grids[-1].is_covered_by_texels = int(not is_exact)
             frames.append(_frame_matrix(body, vertex_count))
+        outlines = np.concatenate(edges)
+        along = outlines[:, 2:] - outlines[:, :2]
         return PlaneBlockers(
             len(bodies),
             tuple(number for number, body in enumerate(bodies) if body.blocks),
@@ -118,7 +120,8 @@ class PlaneBlockers:
             wp.array(np.array(levels), dtype=wp.vec3i, device=device),
             wp.array(np.array(scales), dtype=wp.vec2, device=device),
             wp.array(np.repeat(np.concatenate(covered)[:, None], 3, axis=1), dtype=wp.vec3, device=device),
-            wp.array(np.concatenate(edges), dtype=wp.vec4, device=device),
+            wp.array(outlines, dtype=wp.vec4, device=device),
+            wp.array(along / np.linalg.norm(along, axis=1, keepdims=True), dtype=wp.vec2, device=device),
             SparseMatrix.of(vstack(pyramids), device=device) if patch_count else None,
             SparseMatrix.of(vstack(frames), device=device),
             any(body.blocks and not body.grid.is_whole for body in bodies),
@@ -178,17 +181,15 @@ def _shifted(matrix: csr_matrix, first: int, count: int) -> csr_matrix:
     return csr_matrix((matrix.data, matrix.indices + first, matrix.indptr), shape=(matrix.shape[0], count))
 
 
-def _kernel_grid(
-    body: PlaneBody, first_level: int, level_count: int, first_edge: int, edge_count: int, is_framed: bool
-) -> PlaneGrid:
+def _kernel_grid(body: PlaneBody, first_level: int, level_count: int, first_edge: int, edges: np.ndarray) -> PlaneGrid:
     grid, flat = body.grid, PlaneGrid()
     texels = np.array(grid.covered.shape[::-1]) / (grid.high - grid.low)
     flat.least, flat.most = (wp.vec2(*corner) for corner in grid.corners())
     flat.texels, flat.first = wp.vec2(*texels), wp.vec2(*(-grid.low * texels))
     flat.per_spread, flat.margin = 1 / grid.spread, _MARGIN * float(grid.texel_sizes().min())
     flat.first_level, flat.level_count, flat.sides = first_level, level_count, grid.sides
-    flat.is_whole, flat.blocks = int(grid.is_whole), int(body.blocks)
-    flat.first_edge, flat.edge_count, flat.is_framed = first_edge, edge_count, int(is_framed)
+    flat.first_edge, flat.edge_count = first_edge, len(edges)
+    flat.is_convex, flat.blocks = int(is_convex(edges.reshape(-1, 2, 2))), int(body.blocks)
     return flat
 
 

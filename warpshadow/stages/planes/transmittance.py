@@ -2,8 +2,8 @@
 
     P_q = T_q max(0, 1 − Σ_k h_k),
 
-h_k the coverage of cell q by plane k (:mod:`.cells`), and T_q the transmittance past all else. Plane blockers that
-share a cell mostly meet in it, as walls do, and cover different parts of it.
+h_k the coverage of cell q by plane k, and T_q the transmittance past all else. Plane blockers that share a cell mostly
+meet in it, as walls do, and cover different parts of it.
 
 A large sphere in place of a ground is worse: on a cow over a ground the error of direct light is 0.7% of the image's
 mean by the plane, and 2.3% by the sphere.
@@ -16,8 +16,9 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, expand_rows, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import differentiable, launch
-from warpshadow.device.parallel import split_row
+from warpshadow.device.parallel import scratch_place, split_row
 from warpshadow.maths.directions import cell_radius
+from warpshadow.stages.cell_coverage import ViewedEdge, coverage_adjoint
 from warpshadow.stages.planes.cells import (
     PlaneArrays,
     PlaneFootprint,
@@ -27,11 +28,7 @@ from warpshadow.stages.planes.cells import (
     fetch_adjoint,
     find_footprint,
     find_footprint_adjoint,
-    find_in_plane,
-    find_in_plane_adjoint,
     find_spot,
-    front_of,
-    front_of_adjoint,
     is_covered_by_texels,
     on_side,
     plane_arrays,
@@ -39,6 +36,19 @@ from warpshadow.stages.planes.cells import (
     toward_side,
 )
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
+from warpshadow.stages.planes.sides import (
+    SIDE_ROWS,
+    PlaneSide,
+    VisibleCell,
+    load_place,
+    load_side,
+    place_receiver,
+    place_receiver_adjoint,
+    plane_share,
+    receiver_scratch,
+    store_place,
+    visible_cell,
+)
 
 _CELL_COST = 4.0  # mean time of a cell of a receiver [ns], over cells that hit a plane and cells that do not
 _PASS_COST = 0.4  # time of a cell that is only multiplied [ns]
@@ -48,97 +58,71 @@ _PASS_COST = 0.4  # time of a cell that is only multiplied [ns]
 class PlaneCover:
     """Coverage of a cell by a side."""
 
-    coverage: float
-    part: float  # of the footprint, that the mesh covers, by texels
-    footprint: PlaneFootprint
+    outline: float  # by its outline
+    part: float  # of that, that the mesh covers, by texels
+    footprint: PlaneFootprint  # of these texels
 
 
 @wp.func
-def cover(
-    scene: PlaneArrays, grid: PlaneGrid, place: ReceiverInPlane, is_back: bool, direction: wp.vec3, side_weight: float
+def side_coverage(
+    scene: PlaneArrays,
+    grid: PlaneGrid,
+    side: PlaneSide,
+    place: ReceiverInPlane,
+    cell: VisibleCell,
+    edges: wp.array(dtype=ViewedEdge),
 ):
-    """Coverage of a cell by a side of a plane, for the visible part of the cell."""
+    """Coverage of a cell by a side."""
     covered = PlaneCover()
-    cosine = wp.dot(direction, place.normal)
-    if side_weight > 0.0 and wp.where(is_back, cosine, -cosine) > -scene.radius:
-        covered.footprint = find_footprint(
-            grid, scene, on_side(grid, place, is_back), toward_side(place, is_back, direction), side_weight
-        )
-        covered.part = 1.0
-        if is_covered_by_texels(grid) and covered.footprint.share > 0.0:
-            spot = find_spot(grid, scene, covered.footprint)
-            covered.part = fetch(scene.covered, scene, grid.first_level, spot)[0]
-        covered.coverage = covered.footprint.share * covered.part
+    covered.part = 1.0
+    covered.outline = plane_share(scene, grid, side, place, cell, edges)
+    if is_covered_by_texels(grid) and covered.outline > 0.0:
+        toward = toward_side(place, side.is_back, cell.direction)
+        covered.footprint = find_footprint(scene, on_side(grid, place, side.is_back), toward)
+        spot = find_spot(grid, scene, covered.footprint)
+        covered.part = fetch(scene.covered, scene, grid.first_level, spot)[0]
     return covered
 
 
 @wp.func
-def cover_adjoint(
+def side_coverage_adjoint(
     scene: PlaneArrays,
     grid: PlaneGrid,
+    side: PlaneSide,
     place: ReceiverInPlane,
-    is_back: bool,
-    direction: wp.vec3,
-    side_weight: float,
-    covered: PlaneCover,
+    cell: VisibleCell,
     adj: float,
+    edges: wp.array(dtype=ViewedEdge),
     adj_place: ReceiverInPlane,
 ):
-    """Add to the gradients of the place, and of the presence."""
-    footprint = covered.footprint
-    adj_spot = wp.vec3()
-    if is_covered_by_texels(grid):
+    """Add to the gradients of the receiver relative to the plane and of viewed edges; also that of the weight."""
+    covered = PlaneCover()
+    covered.part = 1.0
+    adj_weight = float(0.0)
+    if side.weight < 1.0 or is_covered_by_texels(grid):
+        covered = side_coverage(scene, grid, side, place, cell, edges)
+        adj_weight = adj * covered.part * covered.outline / side.weight
+    if is_covered_by_texels(grid) and covered.outline > 0.0:
+        toward = toward_side(place, side.is_back, cell.direction)
+        footprint = covered.footprint
+        adj_part = wp.vec3(adj * covered.outline, 0.0, 0.0)
         spot = find_spot(grid, scene, footprint)
-        adj_part = wp.vec3(adj * footprint.share, 0.0, 0.0)
         adj_spot = fetch_adjoint(scene.covered, grid, scene, grid.first_level, footprint, spot, adj_part)
-    adj_distance = float(0.0)
-    if adj_spot[2] != 0.0:  # a footprint is as wide as t / √c′
-        adj_distance = adj_spot[2] / footprint.distance
-    adj_at, adj_toward, adj_side_weight = find_footprint_adjoint(
-        grid,
-        scene,
-        toward_side(place, is_back, direction),
-        side_weight,
-        footprint,
-        adj * covered.part,
-        adj_distance,
-        -0.5 * footprint.per_cosine * adj_spot[2],
-        wp.vec2(adj_spot[0], adj_spot[1]),
-    )
-    return side_adjoint(grid, place, is_back, direction, adj_at, adj_toward, adj_place), adj_side_weight
-
-
-@wp.func
-def add_sides(
-    part: float, scene: PlaneArrays, grid: PlaneGrid, place: ReceiverInPlane, direction: wp.vec3, front: float
-):
-    """Add the coverage of a cell by both sides of a plane, given the weight of its front."""
-    front_part = part + cover(scene, grid, place, False, direction, front).coverage
-    return front_part + cover(scene, grid, place, True, direction, 1.0 - front).coverage
-
-
-@wp.func
-def add_sides_adjoint(
-    scene: PlaneArrays,
-    grid: PlaneGrid,
-    place: ReceiverInPlane,
-    direction: wp.vec3,
-    front: float,
-    adj: float,
-    adj_place: ReceiverInPlane,
-    adj_front: float,
-):
-    """Add to the gradients of the place, and of the front weight."""
-    adj_weights = float(adj_front)
-    for side in range(2):
-        is_back, side_weight = side == 1, wp.where(side == 1, 1.0 - front, front)
-        covered = cover(scene, grid, place, is_back, direction, side_weight)
-        if covered.coverage > 0.0 and covered.coverage < 1.0:  # a cell that is covered wholly stays so
-            adj_place, adj_weight = cover_adjoint(
-                scene, grid, place, is_back, direction, side_weight, covered, adj, adj_place
-            )
-            adj_weights += wp.where(is_back, -adj_weight, adj_weight)
-    return adj_place, adj_weights
+        adj_distance = float(0.0)
+        if adj_spot[2] != 0.0:  # a footprint is as wide as t / √c′
+            adj_distance = adj_spot[2] / footprint.distance
+        adj_at, adj_toward = find_footprint_adjoint(
+            scene,
+            toward,
+            footprint,
+            adj_distance,
+            -0.5 * footprint.per_cosine * adj_spot[2],
+            wp.vec2(adj_spot[0], adj_spot[1]),
+        )
+        adj_place = side_adjoint(grid, place, side.is_back, cell.direction, adj_at, adj_toward, adj_place)
+    weighted = adj * side.weight * covered.part
+    coverage_adjoint(edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, weighted)
+    return adj_place, adj_weight
 
 
 @wp.func
@@ -156,83 +140,112 @@ def is_above_horizon(normal: wp.vec3, direction: wp.vec3):
 
 
 @wp.kernel(enable_backward=False)
-def _add_coverage(
+def _cover(
     first_row: int,
     worker: int,
     # in
     points: wp.array2d(dtype=wp.vec3),
     horizon_normals: wp.array2d(dtype=wp.vec3),
-    covered: wp.array3d(dtype=wp.float32),
     frames: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
     scene: PlaneArrays,
-    f: int,
     directions: wp.array(dtype=wp.vec3),
+    # scratch
+    scratch: wp.array2d(dtype=wp.vec3),
+    viewed_edges: wp.array2d(dtype=ViewedEdge),
     # out
     result: wp.array3d(dtype=wp.float32),
 ):
-    """A thread owns a receiver:  C_q + h of both sides of a plane."""
-    batch, receiver = split_row(first_row + wp.tid(), points.shape[1])
-    place = find_in_plane(points[batch, receiver], frames[instance_in(batch, frames.shape[0])], f)
-    exists = wp.length_sq(place.normal) > 0.0
-    grid = scene.grids[f]
-    front = front_of(fronts, grid, place.at[2], batch, receiver, f)
+    """A thread owns a receiver:  C_q = Σ_k h_k."""
+    row = first_row + wp.tid()
+    batch, receiver = split_row(row, points.shape[1])
+    place = scratch_place(worker, row)
+    store, edges = scratch[place], viewed_edges[place]
+    placed = frames[instance_in(batch, frames.shape[0])]
+    side_count = place_receiver(points[batch, receiver], placed, fronts, scene, batch, receiver, store, edges)
     normal = horizon_normal(horizon_normals, batch, receiver)
+    covered = result[batch, receiver]
     for q in range(directions.shape[0]):
-        direction = directions[q]
-        part = float(0.0)
-        if covered:
-            part = covered[batch, receiver, q]
-        if exists and part < 1.0 and is_above_horizon(normal, direction):
-            part = add_sides(part, scene, grid, place, direction, front)
-        result[batch, receiver, q] = part
+        covered[q] = 0.0
+    for i in range(side_count):
+        side = load_side(scene, i, store)
+        grid = scene.grids[side.f]
+        in_plane = load_place(store, side.f)
+        if grid.blocks == 1:
+            for q in range(directions.shape[0]):
+                direction = directions[q]
+                if is_above_horizon(normal, direction) and covered[q] < 1.0:
+                    cell = visible_cell(scene, normal, direction)
+                    by_side = side_coverage(scene, grid, side, in_plane, cell, edges)
+                    if by_side.outline > 0.0:
+                        covered[q] = covered[q] + by_side.outline * by_side.part
 
 
 @wp.kernel(enable_backward=False)
-def _add_coverage_adjoint(
+def _cover_adjoint(
     first_row: int,
     worker: int,
     # in
     points: wp.array2d(dtype=wp.vec3),
     horizon_normals: wp.array2d(dtype=wp.vec3),
-    covered: wp.array3d(dtype=wp.float32),
     frames: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
     scene: PlaneArrays,
-    f: int,
     directions: wp.array(dtype=wp.vec3),
     adj_result: wp.array3d(dtype=wp.float32),
+    # scratch
+    scratch: wp.array2d(dtype=wp.vec3),
+    viewed_edges: wp.array2d(dtype=ViewedEdge),
+    adj_scratch: wp.array2d(dtype=wp.vec3),
     # out
     adj_points: wp.array2d(dtype=wp.vec3),
-    adj_covered: wp.array3d(dtype=wp.float32),
     adj_fronts: wp.array3d(dtype=wp.float32),
     # sums
     adj_frames: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a receiver."""
-    batch, receiver = split_row(first_row + wp.tid(), points.shape[1])
+    """A thread owns a receiver; cells that are covered wholly are taken to have no gradient."""
+    row = first_row + wp.tid()
+    batch, receiver = split_row(row, points.shape[1])
+    place = scratch_place(worker, row)
+    store, edges, adj_store = scratch[place], viewed_edges[place], adj_scratch[place]
     instance = instance_in(batch, frames.shape[0])
     point = points[batch, receiver]
-    place = find_in_plane(point, frames[instance], f)
-    exists = wp.length_sq(place.normal) > 0.0
-    grid = scene.grids[f]
-    front = front_of(fronts, grid, place.at[2], batch, receiver, f)
+    side_count = place_receiver(point, frames[instance], fronts, scene, batch, receiver, store, edges)
     normal = horizon_normal(horizon_normals, batch, receiver)
-    adj_place = ReceiverInPlane()
-    adj_front = float(0.0)
-    for q in range(directions.shape[0]):
-        direction = directions[q]
-        adj = adj_result[batch, receiver, q]
-        part = float(0.0)
-        if covered:
-            part = covered[batch, receiver, q]
-        if exists and adj != 0.0 and part < 1.0 and is_above_horizon(normal, direction):
-            adj_place, adj_front = add_sides_adjoint(scene, grid, place, direction, front, adj, adj_place, adj_front)
-        if adj_covered:
-            adj_covered[batch, receiver, q] = adj_covered[batch, receiver, q] + adj
-    adj_height = front_of_adjoint(fronts, grid, place.at[2], adj_front, batch, receiver, f, adj_fronts)
-    adj_place.at = adj_place.at + wp.vec3(0.0, 0.0, adj_height)
-    adj_point = find_in_plane_adjoint(point, frames[instance], f, place, adj_place, instance, adj_frames)
+    for k in range(SIDE_ROWS * scene.grids.shape[0]):
+        adj_store[k] = wp.vec3()
+    for i in range(side_count):
+        side = load_side(scene, i, store)
+        grid = scene.grids[side.f]
+        in_plane = load_place(store, side.f)
+        adj_place = load_place(adj_store, side.f)
+        adj_weights = float(0.0)
+        if grid.blocks == 1:
+            for q in range(directions.shape[0]):
+                adj = adj_result[batch, receiver, q]
+                if adj != 0.0 and is_above_horizon(normal, directions[q]):
+                    cell = visible_cell(scene, normal, directions[q])
+                    adj_place, adj_weight = side_coverage_adjoint(
+                        scene, grid, side, in_plane, cell, adj, edges, adj_place
+                    )
+                    adj_weights += adj_weight
+        store_place(adj_store, side.f, adj_place)
+        adj_store[4 * scene.grids.shape[0] + i] = wp.vec3(0.0, 0.0, adj_weights)
+    adj_point = place_receiver_adjoint(
+        point,
+        frames[instance],
+        fronts,
+        scene,
+        batch,
+        receiver,
+        side_count,
+        store,
+        edges,
+        adj_store,
+        instance,
+        adj_frames,
+        adj_fronts,
+    )
     if adj_points:
         adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
 
@@ -288,7 +301,7 @@ def plane_coverage(
     fronts: wp.array | None = None,
     skip: int | None = None,
 ) -> wp.array | None:
-    """Coverage of cells by the planes that cast shadows, Σ_k h_k: values above 1 need not be complete.
+    """Coverage of cells by the planes that cast shadows, Σ_k h_k: values of 1 and more need not be complete.
 
     Args:
         points: Receivers [scene units], vec3 of shape [batch, receiver].
@@ -311,38 +324,24 @@ def plane_coverage(
     points, fronts = expand(points, count), None if fronts is None else expand_rows(fronts, count)
     own_radius = cell_radius(len(directions)) if radius is None else radius
     scene = plane_arrays(planes, own_radius, skip, tiles=radius is None)
-    cells, covered = constant(directions, wp.vec3, points.device), None
-    for f in planes.blocking:
-        if f != skip:
-            covered = _add(points, horizon_normals, covered, frames, fronts, scene, f, cells)
-    return covered
-
-
-def _add(
-    points: wp.array,
-    horizon_normals: wp.array | None,
-    covered: wp.array | None,
-    frames: wp.array,
-    fronts: wp.array | None,
-    scene: PlaneArrays,
-    f: int,
-    directions: wp.array,
-) -> wp.array:
-    """Coverage by one flat more. Differentiable: points, covered, frames, fronts."""
-    inputs = [points, horizon_normals, covered, frames, fronts, scene, f, directions]
-    cost = _CELL_COST * directions.size
+    if not set(planes.blocking) - {skip}:
+        return None
+    cells = constant(directions, wp.vec3, points.device)
+    inputs, cost = [points, horizon_normals, frames, fronts, scene, cells], _CELL_COST * cells.size * planes.count
+    scratch = receiver_scratch(planes)
     return differentiable(
-        lambda result: launch(_add_coverage, points.size, inputs=inputs, outputs=[result], cost=cost),
+        lambda result: launch(_cover, points.size, inputs=inputs, scratch=scratch, outputs=[result], cost=cost),
         lambda adj_result: launch(
-            _add_coverage_adjoint,
+            _cover_adjoint,
             points.size,
             inputs=[*inputs, adj_result],
-            outputs=[points.grad, *(None if array is None else array.grad for array in (covered, fronts))],
+            scratch=[*scratch, scratch[0]],
+            outputs=[points.grad, None if fronts is None else fronts.grad],
             sums=[frames.grad],
             cost=2 * cost,
         ),
-        result=wp.empty((*points.shape, directions.size), dtype=wp.float32, device=points.device),
-        variables=[points, covered, frames, fronts],
+        result=wp.empty((*points.shape, cells.size), dtype=wp.float32, device=points.device),
+        variables=[points, frames, fronts],
     )
 
 
