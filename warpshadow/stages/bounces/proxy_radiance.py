@@ -26,7 +26,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.stages.visibility.merging import MERGING, QUAD, merged_count
 
-_HIDDEN_WEIGHT = wp.constant(0.01)  # part of its area that a patch counts for where it shows none
+_HIDDEN_WEIGHT = wp.constant(1.0e-4)  # part of its area that a patch counts for where it shows none
 
 _BLACK_SPHERE_WEIGHT = 0.25
 """Part of its area that a convex body shows on average: the weight of spheres without patches, which are black."""
