@@ -39,7 +39,6 @@ from warpshadow.stages.planes.cells import step
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 from warpshadow.stages.sparse import SparseMatrix
 
-
 _HIDDEN = wp.constant(0.1)  # β, by which parts count that their own body hides
 
 
