@@ -21,8 +21,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow import check
-from warpshadow.pipeline.bounces.covered import covered_bodies
 from warpshadow.pipeline.bounces.gathering import (
     ALL_FLAT,
     CellTransmittance,
@@ -254,8 +252,6 @@ class SphereBounces:
 
     def __init__(self, method: SphereMethod):
         self._method, self._count = method, method.merged_scene.scene.bounces
-        if remarks := covered_bodies(method.merged_scene.scene):
-            check.warn("; ".join(remarks))
         self._patches = ScenePatches(method.merged_scene)
         self._self_form_factors = SelfFormFactors(method.self_visibility, self._patches, progress=method.progress)
         self._proxies: dict[Senders, Proxies] = {}

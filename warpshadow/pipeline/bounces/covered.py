@@ -1,56 +1,75 @@
-"""Covered bodies: slabs right behind flat bodies, as a table below its cloth, which take the light of these.
+"""Covered patches: those that lie right behind a flat body, which other bodies see, as a table's below its cloth."""
 
-Spheres and convex parts block a cell before flat bodies do. Where a slab lies right behind a flat body, receivers
-before both see the slab's covered side, which is dark, in place of the flat body: pieces on a board of chess, a plane
-over a slab, lose 5 to 10% of their light.
-"""
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from warpshadow.maths.plane import plane_normal
-from warpshadow.scene.scene import Scene
+from warpshadow.pipeline.bounces.patches import Senders
 
-_NEAR = 0.05  # how far behind a flat body covered sides lie, at most, in units of its size
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+_NEAR = 0.25  # how far behind a flat body covered patches lie, at most, in radii of their proxies
 _FACING = 0.9  # cosine between their normals and its own, at least
-_COVERED = 0.25  # their area in units of the flat body's, at least
+_COVERED = 0.25  # part of its area behind which such patches lie, at least
+_HIDDEN = 0.5  # part of the area of a covered patch that it hides, at least
 _REACH = 0.01  # how far bodies reach out before it that may see it, in units of its size
 
 
-def covered_bodies(scene: Scene) -> list[str]:
-    """Say which bodies lie right behind flat bodies that others see; a sentence for each."""
-    meshes = [body.world_mesh() for body in scene.bodies]
-    corners = [mesh.positions.astype(np.float64)[mesh.surface.faces] for mesh in meshes]
-    normals = [plane_normal(faces) if mesh.is_flat else None for mesh, faces in zip(meshes, corners, strict=True)]
-    solids = [number for number, normal in enumerate(normals) if normal is None and len(corners[number])]
-    remarks = []
-    for flat, plane in enumerate(normals):
-        for facing in () if plane is None else (plane, -plane):
-            seeing = [k for k in solids if _highest(corners[k], corners[flat], facing) > _REACH]
-            remarks += [
-                f"body {solid} ({scene.bodies[solid].called!r}) lies right behind body {flat} "
-                f"({scene.bodies[flat].called!r}), which is flat, and hides the light that this one reflects; "
-                'ws.render and method = "ray-traced" have it, and one mesh of both has it, too'
-                for solid in solids
-                if seeing not in ([], [solid]) and _covered_part(corners[solid], corners[flat], facing) > _COVERED
-            ]
-    return remarks
+class Covers(NamedTuple):
+    """Texels before covered patches."""
+
+    before: csr_matrix  # their weights, [patch, patch]
+    distances: np.ndarray  # how far they are from the patches' proxies, 0 for patches that nothing covers, [patch]
 
 
-def _highest(corners: np.ndarray, flat: np.ndarray, normal: np.ndarray) -> float:
-    """How far faces [face, 3, 3] reach out before a flat body, in units of its size."""
-    points = flat.reshape(-1, 3)
-    return float((corners @ normal).max() - (points @ normal).mean()) / float(np.linalg.norm(np.ptp(points, axis=0)))
+def find_covers(senders: Senders, depths: np.ndarray) -> Covers | None:
+    """Find the patches that flat bodies cover where the scene has them; None without any.
 
+    Args:
+        senders: All patches.
+        depths: How far below its patch each proxy is, in radii, shape [patch].
+    """
+    from scipy.sparse import csr_matrix
+    from scipy.spatial import cKDTree
 
-def _covered_part(corners: np.ndarray, flat: np.ndarray, normal: np.ndarray) -> float:
-    """Area of the faces right behind a flat body that face it, in units of its rectangle's area."""
-    points = flat.reshape(-1, 3)
-    side = points[1] - points[0]
-    axes = np.stack([side, np.cross(normal, side)]) / np.linalg.norm(side)
-    low, high = (points @ axes.T).min(axis=0), (points @ axes.T).max(axis=0)
-    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
-    middles, sizes = corners.mean(axis=1), np.linalg.norm(areas, axis=1)
-    depths = (points @ normal).mean() - middles @ normal
-    is_covered = (depths > 0) & (depths < _NEAR * np.linalg.norm(np.ptp(points, axis=0)))
-    is_covered &= ((middles @ axes.T > low) & (middles @ axes.T < high)).all(axis=1)
-    return float(sizes[is_covered & (areas @ normal > _FACING * sizes)].sum() / np.prod(high - low))
+    bodies, is_flat = senders.merged_scene.scene.bodies, senders.merged_scene.is_flat
+    placed = [(bodies[number], item) for number, item in zip(senders.bodies, senders.patches, strict=True)]
+    normals = np.concatenate([item.normals @ body.rotation_matrix().T for body, item in placed])
+    centers = np.concatenate(
+        [body.scale * item.centers @ body.rotation_matrix().T + body.translation for body, item in placed]
+    )
+    radii = np.sqrt(senders.areas / 2)
+    is_solid = ~is_flat[senders.body_of_patch]
+    weights = np.zeros((0, 3))
+    for number, first, end in zip(senders.bodies, senders.first[:-1], senders.first[1:], strict=True):
+        texels = first + np.flatnonzero(senders.areas[first:end] > 0)
+        for facing in np.unique(normals[texels].round(4), axis=0) if is_flat[number] else ():
+            side = texels[normals[texels] @ facing > 0]
+            points = centers[side]
+            heights = (centers - points[0]) @ facing
+            chosen = np.flatnonzero(
+                is_solid & (heights < 0) & (heights > -_NEAR * radii) & (normals @ facing > _FACING)
+            )
+            seeing = senders.body_of_patch[is_solid & (heights > _REACH * np.linalg.norm(np.ptp(points, axis=0)))]
+            chosen = chosen[[np.any(seeing != body) for body in senders.body_of_patch[chosen]]]
+            if not len(chosen):
+                continue
+            gaps, nearest = cKDTree(centers[chosen]).query(points)
+            is_before = gaps < 1.5 * radii[chosen][nearest]
+            if senders.areas[side[is_before]].sum() < _COVERED * senders.areas[side].sum():
+                continue
+            rows, columns = chosen[nearest[is_before]], side[is_before]
+            covered = np.bincount(rows, senders.areas[columns], len(radii)) > _HIDDEN * senders.areas
+            rows, columns = rows[covered[rows]], columns[covered[rows]]
+            weights = np.concatenate([weights, np.stack([rows, columns, senders.areas[columns]], axis=1)])
+    if not len(weights):
+        return None
+    rows, columns = weights[:, :2].astype(int).T
+    totals = np.bincount(rows, weights[:, 2], len(radii))
+    before = csr_matrix((weights[:, 2] / totals[rows], (rows, columns)), shape=(len(radii), len(radii)))
+    proxies = centers - (depths * radii)[:, None] * normals
+    gaps = np.linalg.norm(proxies - before @ proxies, axis=1)
+    return Covers(before, np.where(totals > 0, np.maximum(gaps, radii), 0).astype(np.float32))
