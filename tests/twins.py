@@ -241,8 +241,8 @@ def find_proxy_radiance(radiosity, shown, areas, patches):
     table = np.zeros((len(patches), shown.shape[1], 4))
     for row, own in zip(table, patches, strict=True):
         share = areas[own] / areas[own].sum()
-        row[:, 3] = share @ (shown[own] + 0.01) if len(own) else 0.25
-        row[:, :3] = np.einsum("p,pq,pc->qc", share, shown[own] + 0.01, radiosity[own])
+        row[:, 3] = share @ (shown[own] + 1e-4) if len(own) else 0.25
+        row[:, :3] = np.einsum("p,pq,pc->qc", share, shown[own] + 1e-4, radiosity[own])
     return table
 
 

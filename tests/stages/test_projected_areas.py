@@ -14,6 +14,7 @@ pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 ROUNDING = 2e-6
 ADJOINT = 2e-5  # relative L2
 DIRECTIONS = fibonacci(32)
+HIDDEN = 0.1
 SPHERES = np.int32([0, 1, 1, 0, -1, 1, 0])
 
 
@@ -39,7 +40,9 @@ def twin_turned(points, normals, radii, fronts, frames, grids, blocks):
 
 def twin_shown(normals, passing, matrix):
     opposite = [np.argmin(np.linalg.norm(DIRECTIONS + omega, axis=1)) for omega in DIRECTIONS]
-    return np.einsum("ps,sq,sq->pq", matrix, np.maximum(normals @ -DIRECTIONS.T, 0), passing[:, opposite])
+    return np.einsum(
+        "ps,sq,sq->pq", matrix, np.maximum(normals @ -DIRECTIONS.T, 0), HIDDEN + (1 - HIDDEN) * passing[:, opposite]
+    )
 
 
 def differences(function, values, number, weights):

@@ -16,6 +16,7 @@ import warp as wp
 from warpshadow.device.batch import common_batch, concatenate, cut, expand, expand_rows
 from warpshadow.device.constants import constant
 from warpshadow.maths.directions import fibonacci
+from warpshadow.pipeline.bounces.covered import find_covers
 from warpshadow.pipeline.bounces.patches import Senders
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.by_spheres import SphereMethod
@@ -24,6 +25,7 @@ from warpshadow.pipeline.groups import Group, GroupVisibility, nonplanar_bodies
 from warpshadow.pipeline.lighting import joined
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.scene.visibility import Visibility
+from warpshadow.stages.bounces.covers import cover
 from warpshadow.stages.bounces.plane_light import plane_light
 from warpshadow.stages.bounces.plane_texels import find_texels
 from warpshadow.stages.bounces.projected_areas import find_projected_areas, turn_from_planes
@@ -34,6 +36,7 @@ from warpshadow.stages.bounces.sphere_light import sphere_light
 from warpshadow.stages.planes.fronts import NearestBlockers, find_fronts
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneBody
 from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.sparse import SparseMatrix
 from warpshadow.stages.visibility.directional import transmittance
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 
@@ -157,6 +160,14 @@ class Proxies:
         """Nonplanar bodies that send no light: their blocker spheres are their proxies."""
         return [body for body in self.nonplanar_bodies if body not in self.senders.bodies]
 
+    @functools.cached_property
+    def covers(self) -> tuple[SparseMatrix, np.ndarray] | None:
+        """Texels before the patches that flat bodies cover, and how far away they are; None without any."""
+        covers = find_covers(self.senders, self._depths)
+        if covers is None:
+            return None
+        return SparseMatrix.of(covers.before, device=self.merged_scene.device), covers.distances
+
     def span_of(self, body: int | None) -> tuple[int, int]:
         """Where the proxies of a body begin and end."""
         first = self.senders.first
@@ -223,6 +234,8 @@ class Proxies:
             numbers, points, device = self.blocker_of_source, sources.points, normals.device
             of_sources = NearestBlockers(centers, radii, constant(numbers, wp.int32, device))
             fronts = find_fronts(points, normals, None, of_sources, frames, planes.all)
+            if self.covers is not None:
+                numbers = np.where(self.covers[1][senders.patch_of_source] > 0, np.int32(-1), numbers)
             normals = turn_from_planes(points, normals, radii, numbers, fronts, frames, planes.all)
         rows = [
             wp.full_like(portion.transmittance_spheres, 1.0, requires_grad=False)
@@ -272,10 +285,10 @@ class OutgoingRadiance:
     @functools.cached_property
     def proxy_radiance(self) -> wp.array:
         """Light that proxies of patches send towards cells, vec4 of shape [batch, node, cell]."""
-        proxies = self.proxies
-        return find_proxy_radiance(
-            self.radiosity, self.projected_patches.areas, self.senders.areas, *proxies.patches_of_clusters
-        )
+        proxies, radiosity, patches = self.proxies, self.radiosity, self.projected_patches
+        if proxies.covers is not None:
+            radiosity = cover(radiosity, cut(patches.centers, 0, radiosity.shape[1]), *proxies.covers)
+        return find_proxy_radiance(radiosity, patches.areas, self.senders.areas, *proxies.patches_of_clusters)
 
     @functools.cached_property
     def texels(self) -> wp.array:

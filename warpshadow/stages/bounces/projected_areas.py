@@ -2,10 +2,13 @@
 
 Towards a receiver that sees a patch in direction ω, its sources s with weights w show
 
-    g_p(ω) = Σ_s w_ps max(−n′_s·ω, 0) T_s(−ω)
+    g_p(ω) = Σ_s w_ps max(−n′_s·ω, 0) (β + (1 − β) T_s(−ω)),  β = 0.1
 
 parts of its area. T_s is the body's self-transmittance in the cell that contains −ω. Other bodies do not count: the
 receiver's self-transmittance covers them, and one of them may be where the receiver is.
+
+Parts that their own body hides still count for β: a receiver in a cavity of that body is nearer than what hides them,
+and sees nothing else. By β = 0 a third of what a ball in an open box saw of the box was its outside.
 
 Plane blockers cannot count as T, since a receiver on a ground is behind the ground in each direction from which it is
 lit. But receivers above a ground hardly see patches that face it and are near it. The bottom of a sphere of radius r,
@@ -35,6 +38,8 @@ from warpshadow.maths.directions import check_directions
 from warpshadow.stages.planes.cells import step
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 from warpshadow.stages.sparse import SparseMatrix
+
+_HIDDEN = wp.constant(0.1)  # β, by which parts count that their own body hides
 
 
 @wp.func
@@ -147,11 +152,8 @@ def _project(
     for k in range(starts[patch], starts[patch + 1]):
         normal = normals[instance_in(batch, normals.shape[0]), sources[k]]
         cosine = wp.max(-wp.dot(normal, directions[direction]), 0.0)
-        total += (
-            weights[k]
-            * cosine
-            * transmittance[instance_in(batch, transmittance.shape[0]), sources[k], opposite[direction]]
-        )
+        passing = transmittance[instance_in(batch, transmittance.shape[0]), sources[k], opposite[direction]]
+        total += weights[k] * cosine * (_HIDDEN + (1.0 - _HIDDEN) * passing)
     projected_areas[batch, patch, direction] = total
 
 

@@ -3,11 +3,12 @@
 Each patch p has a sphere of its own; several share one only where spheres are merged. Towards a receiver that sees the
 sphere in direction ω, its patches send
 
-    E_j(ω) = Σ_p A_p (g_p + 0.01) B_p / Σ_p A_p (g_p + 0.01)
+    E_j(ω) = Σ_p A_p (g_p + ε) B_p / Σ_p A_p (g_p + ε),  ε = 0.0001
 
 the mean of their radiosities B by the area that they show: g_p is that of a unit (:mod:`.projected_areas`). Patches
-that face away, or are hidden, count for a hundredth of their area: where none shows itself the mean is still one, so it
-is smooth, and nothing is divided by zero.
+that face away count for ε of their area: where none shows itself the mean is still one, so it is smooth, and nothing is
+divided by zero. The sunlit top of a slab is brighter than its bottom by more than a hundred times: by ε = 0.01 it shone
+through, and the floor of a car park below was 19% too bright.
 
 Through a cell a receiver sees a mean over the spheres in it (:mod:`warpshadow.stages.bounces.sphere_light`).
 There, too, patches should count by the area that they show: the spheres on the far side of a body show none. So
@@ -26,7 +27,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.stages.visibility.merging import MERGING, QUAD, merged_count
 
-_HIDDEN_WEIGHT = wp.constant(0.01)  # part of its area that a patch counts for where it shows none
+_AVERTED = wp.constant(1.0e-4)  # ε, the part of its area that a patch counts for where it shows none
 
 _BLACK_SPHERE_WEIGHT = 0.25
 """Part of its area that a convex body shows on average: the weight of spheres without patches, which are black."""
@@ -78,7 +79,7 @@ def _tabulate(
     open = float(weight_if_black[node])
     for k in range(starts[node], starts[node + 1]):
         patch = numbers[k]
-        part = shares[k] * (areas_of_instance[patch, direction] + _HIDDEN_WEIGHT)
+        part = shares[k] * (areas_of_instance[patch, direction] + _AVERTED)
         light += part * sent[patch]
         open += part
     proxy_radiance[batch, node, direction] = wp.vec4(light[0], light[1], light[2], open)
@@ -102,7 +103,7 @@ def find_proxy_radiance(
         areas: Of patches [scene units²], not negative, float32 of shape [patch].
         starts, numbers: Patches of each node, from :func:`patches_of_clusters`.
     Returns:
-        Σ A (g + 0.01) B / Σ A and Σ A (g + 0.01) / Σ A, vec4 of shape [batch, node, direction].
+        Σ A (g + ε) B / Σ A and Σ A (g + ε) / Σ A, vec4 of shape [batch, node, direction].
     Differentiable: radiosity, projected_areas.
     """
     batch_count = common_batch({"radiosity": radiosity, "projected_areas": projected_areas})
