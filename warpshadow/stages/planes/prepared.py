@@ -112,7 +112,7 @@ class PlaneBlockers:
             grids[-1].is_covered_by_texels = int(not is_exact)
             frames.append(_frame_matrix(body, vertex_count))
         outlines = np.concatenate(edges)
-        along = outlines[:, 2:] - outlines[:, :2]
+        vectors = outlines[:, 2:] - outlines[:, :2]
         return PlaneBlockers(
             len(bodies),
             tuple(number for number, body in enumerate(bodies) if body.blocks),
@@ -121,7 +121,7 @@ class PlaneBlockers:
             wp.array(np.array(scales), dtype=wp.vec2, device=device),
             wp.array(np.repeat(np.concatenate(covered)[:, None], 3, axis=1), dtype=wp.vec3, device=device),
             wp.array(outlines, dtype=wp.vec4, device=device),
-            wp.array(along / np.linalg.norm(along, axis=1, keepdims=True), dtype=wp.vec2, device=device),
+            wp.array(vectors / np.linalg.norm(vectors, axis=1, keepdims=True), dtype=wp.vec2, device=device),
             SparseMatrix.of(vstack(pyramids), device=device) if patch_count else None,
             SparseMatrix.of(vstack(frames), device=device),
             any(body.blocks and not body.grid.is_whole for body in bodies),
