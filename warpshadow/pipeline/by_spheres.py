@@ -30,6 +30,7 @@ from warpshadow.pipeline.planes import ScenePlanes
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.self_visibility import SelfVisibility
 from warpshadow.pipeline.static import StaticBodies, VertexRows
+from warpshadow.spheres import Spheres
 from warpshadow.stages.shading import shade
 
 
@@ -68,7 +69,7 @@ class SphereMethod(Method):
     @functools.cached_property
     def self_visibility(self) -> SelfVisibility:
         """The bodies' shadows on themselves, from rays."""
-        return SelfVisibility(self.merged_scene, self.samples_receive, progress=self.progress)
+        return SelfVisibility(self.merged_scene, self.samples_receive(), progress=self.progress)
 
     def blocker_kinds(self, geometry: Geometry | None, rotations: Input | None) -> BlockerKinds:
         """Choose the kind of blocker that each body of a geometry is; the scene's geometry by default.
@@ -83,7 +84,25 @@ class SphereMethod(Method):
         count = len(self.merged_scene.scene.bodies)
         why = tuple(self.self_visibility.why_spheres(body, geometry) for body in range(count))
         traced = tuple(body for body, reason in enumerate(why) if not reason)
-        return BlockerKinds(traced, rotations, why, planes, self.convex_blockers(traced))
+        bulging = tuple(body for body in range(count) if why[body] and self._bulges(body, geometry))
+        return BlockerKinds(traced, rotations, why, planes, self.convex_blockers(traced), bulging)
+
+    def _bulges(self, number: int, geometry: Geometry | None) -> bool:
+        """Whether spheres that take the place of a body's mesh in a geometry bulge out of it between its vertices.
+
+        They do out of sheets, and out of bodies of several convex parts. Where receivers were chosen, not asked for,
+        they are at vertices then. By pixel and at vertices, in 64² pixels, gradients to free vertices are off by 80 and
+        9% on an arched cloth, 162 and 15% on a table of five boxes, 40 and 19% on a wall of four; and these bodies are
+        39 and 23%, 7 and 1%, 6 and 1% too dark. Images of rounder bodies are nearer to rays by pixel.
+        """
+        scene, body = self.merged_scene, self.merged_scene.scene.bodies[number]
+        if geometry is None or not (body.casts_shadow and scene.has_chosen_receivers[number]) or body.is_glossy:
+            return False
+        if number not in geometry.deformed and self.self_visibility.why_spheres(number, None):
+            return False  # its spheres block its light in the scene, too
+        if body.mesh.is_flat:
+            return isinstance(body.blockers, Spheres)  # else it is one sphere
+        return not body.mesh.surface.is_closed or len(body.mesh.convex_parts) > 1
 
     def convex_blockers(self, traced: tuple[int, ...]) -> tuple[int, ...]:
         """Choose the bodies with traced self-visibility that block other bodies' light as convex parts."""

@@ -13,7 +13,7 @@ its grounds and walls, where shadows' edges show most. pipeline/README.md has th
 """
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -188,13 +188,22 @@ def _has_sun(scene: Scene) -> bool:
     return find_sharp_cells(cells.radiance @ LUMINANCE, cells.spots, cells.spreads) is not None
 
 
-def receiver_notes(scene: Scene, choices: Sequence[ReceiverChoice]) -> list[str]:
-    """Describe the choice for each body that leaves it open, a line each."""
-    return [
-        f"Body {number} ({body.called!r}) has receivers at {_WHERE[choice.receivers]}: {_reason(choice)}."
-        for number, (body, choice) in enumerate(zip(scene.bodies, choices, strict=True))
-        if body.receivers == AUTO and choice.size is not None
-    ]
+def receiver_notes(scene: Scene, choices: Sequence[ReceiverChoice], bulging: Collection[int] = ()) -> list[str]:
+    """Describe the choice for each body that leaves it open, a line each.
+
+    Args:
+        scene: The scene as it was given.
+        choices: The choices for its bodies.
+        bulging: Bodies out of which their spheres bulge: :class:`.BlockerKinds`.
+    """
+    notes = []
+    for number, (body, choice) in enumerate(zip(scene.bodies, choices, strict=True)):
+        if body.receivers == AUTO and choice.size is not None:
+            where, why = _WHERE[choice.receivers], _reason(choice)
+            if number in bulging:
+                where, why = _WHERE["vertex"], "spheres block its light, and bulge out of it between vertices"
+            notes.append(f"Body {number} ({body.called!r}) has receivers at {where}: {why}.")
+    return notes
 
 
 def _reason(choice: ReceiverChoice) -> str:
