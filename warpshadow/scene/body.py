@@ -301,7 +301,14 @@ class Body:
             )
         foot = check.array("foot", foot, (3,))
         low, high = (corner.astype(np.float64) for corner in self.mesh.bounds)
-        scale = self.scale if size is None else check.positive("size", size) / (high - low).max()
+        if size is None:
+            scale = self.scale
+        elif extent := (high - low).max():
+            scale = check.positive("size", size) / extent
+        else:
+            raise ValueError(
+                f"size: got {size:g} for a mesh ({self.called!r}) whose vertices coincide, expected one that has a size"
+            )
         points = self.mesh.world_points().astype(np.float64) @ self.rotation_matrix().T
         bottom = self.rotation_matrix() @ (low + high) / 2
         bottom[1] = points[:, 1].min()

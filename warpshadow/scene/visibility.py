@@ -53,7 +53,7 @@ GLOSS_METHODS = ("directional", "none", "ray-traced", AUTO)
 
 
 @check.frozen
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Visibility:
     """How visibility is computed. A setting that the method does not read is refused unless it is the default.
 
