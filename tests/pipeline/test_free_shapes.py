@@ -74,6 +74,12 @@ def test_the_gradient_to_a_sheets_vertices_is_that_of_differences():
     assert (change.grad - differences).norm() < OF_SHEET * differences.norm()
 
 
+def test_a_sheet_whose_own_spheres_shadow_it_receives_at_vertices_when_it_is_rigid_too():
+    with torch.no_grad():
+        images = [renderer_of(sheet(receivers=where, self_shadows="spheres"))() for where in ("auto", "vertex")]
+    torch.testing.assert_close(*images, rtol=1e-5, atol=1e-5)
+
+
 def test_explain_says_that_a_sheet_of_free_shape_receives_at_vertices():
     renderer = renderer_of(sheet())
     poses, rest = renderer.scene_poses(), renderer.deformed(0, torch.tensor(sheet().mesh.positions))

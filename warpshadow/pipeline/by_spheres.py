@@ -90,19 +90,21 @@ class SphereMethod(Method):
     def _bulges(self, number: int, geometry: Geometry | None) -> bool:
         """Whether spheres that take the place of a body's mesh in a geometry bulge out of it between its vertices.
 
-        They do out of sheets, and out of bodies of several convex parts. Where receivers were chosen, not asked for,
-        they are at vertices then. By pixel and at vertices, in 64² pixels, gradients to free vertices are off by 80 and
-        9% on an arched cloth, 162 and 15% on a table of five boxes, 40 and 19% on a wall of four; and these bodies are
-        39 and 23%, 7 and 1%, 6 and 1% too dark. Images of rounder bodies are nearer to rays by pixel.
+        They do out of sheets, and out of bodies of several convex parts whose shape is free. Where receivers were
+        chosen, not asked for, they are at vertices then. By pixel and at vertices, in 64² pixels, gradients to free
+        vertices are off by 80 and 9% on an arched cloth, 162 and 15% on a table of five boxes, 40 and 19% on a wall of
+        four; and these bodies are 39 and 23%, 7 and 1%, 6 and 1% too dark. Images of rounder bodies are nearer to rays
+        by pixel.
         """
         scene, body = self.merged_scene, self.merged_scene.scene.bodies[number]
-        if geometry is None or not (body.casts_shadow and scene.has_chosen_receivers[number]) or body.is_glossy:
+        if body.is_glossy or not (body.casts_shadow and scene.has_chosen_receivers[number]):
             return False
-        if number not in geometry.deformed and self.self_visibility.why_spheres(number, None):
-            return False  # its spheres block its light in the scene, too
+        is_free = geometry is not None and (
+            number in geometry.deformed or not self.self_visibility.why_spheres(number, None)
+        )
         if body.mesh.is_flat:
-            return isinstance(body.blockers, Spheres)  # else it is one sphere
-        return not body.mesh.surface.is_closed or len(body.mesh.convex_parts) > 1
+            return is_free and isinstance(body.blockers, Spheres)  # else it is one sphere
+        return not body.mesh.surface.is_closed or (is_free and len(body.mesh.convex_parts) > 1)
 
     def convex_blockers(self, traced: tuple[int, ...]) -> tuple[int, ...]:
         """Choose the bodies with traced self-visibility that block other bodies' light as convex parts."""
