@@ -30,7 +30,6 @@ from warpshadow.pipeline.planes import ScenePlanes
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.self_visibility import SelfVisibility
 from warpshadow.pipeline.static import StaticBodies, VertexRows
-from warpshadow.spheres import Spheres
 from warpshadow.stages.shading import shade
 
 
@@ -84,27 +83,24 @@ class SphereMethod(Method):
         count = len(self.merged_scene.scene.bodies)
         why = tuple(self.self_visibility.why_spheres(body, geometry) for body in range(count))
         traced = tuple(body for body, reason in enumerate(why) if not reason)
-        bulging = tuple(body for body in range(count) if why[body] and self._bulges(body, geometry))
+        bulging = tuple(body for body, reason in enumerate(why) if reason and self._can_bulge[body])
         return BlockerKinds(traced, rotations, why, planes, self.convex_blockers(traced), bulging)
 
-    def _bulges(self, number: int, geometry: Geometry | None) -> bool:
-        """Whether spheres that take the place of a body's mesh in a geometry bulge out of it between its vertices.
+    @functools.cached_property
+    def _can_bulge(self) -> list[bool]:
+        """Whether each body is thin, so that its spheres bulge out of it, and its receivers were chosen, not asked for.
 
-        They do out of sheets, and out of bodies of several convex parts whose shape is free. Where receivers were
-        chosen, not asked for, they are at vertices then. By pixel and at vertices, in 64² pixels, gradients to free
-        vertices are off by 80 and 9% on an arched cloth, 162 and 15% on a table of five boxes, 40 and 19% on a wall of
-        four; and these bodies are 39 and 23%, 7 and 1%, 6 and 1% too dark. Images of rounder bodies are nearer to rays
+        They are at vertices where its spheres block its own light. By pixel and at vertices, in 64² pixels, gradients
+        to free vertices are off by 80 and 9% on an arched cloth, 162 and 15% on a table of five boxes, 40 and 19% on a
+        wall of four; and these bodies are 39 and 23%, 7 and 1%, 6 and 1% too dark. Images of others are nearer to rays
         by pixel.
         """
-        scene, body = self.merged_scene, self.merged_scene.scene.bodies[number]
-        if body.is_glossy or not (body.casts_shadow and scene.has_chosen_receivers[number]):
-            return False
-        is_free = geometry is not None and (
-            number in geometry.deformed or not self.self_visibility.why_spheres(number, None)
-        )
-        if body.mesh.is_flat:
-            return is_free and isinstance(body.blockers, Spheres)  # else it is one sphere
-        return not body.mesh.surface.is_closed or (is_free and len(body.mesh.convex_parts) > 1)
+        return [
+            is_chosen and body.casts_shadow and not body.is_glossy and body.is_thin
+            for is_chosen, body in zip(
+                self.merged_scene.has_chosen_receivers.tolist(), self.merged_scene.scene.bodies, strict=True
+            )
+        ]
 
     def convex_blockers(self, traced: tuple[int, ...]) -> tuple[int, ...]:
         """Choose the bodies with traced self-visibility that block other bodies' light as convex parts."""

@@ -150,7 +150,7 @@ def for_picture(scene: Scene) -> Scene:
     whose making a picture would wait for, and the picture does not depend on what the cache holds. Bodies with spheres
     or ``self_shadows`` of their own name "directional", which has them.
 
-    By other methods flat bodies that leave their receivers open are shaded by pixel.
+    By other methods flat bodies that leave their receivers open are shaded by pixel, unless spheres bulge out of them.
 
     Interpolation between the vertices of a ground makes shadows' edges jagged. Under a sun so are all other bodies,
     and where their shadows on themselves are "traced", a sun's are found by "rays", as nobody asks for a gradient:
@@ -168,7 +168,12 @@ def for_picture(scene: Scene) -> Scene:
     visibility, has_sun = scene.visibility, _has_sun(scene)
     if has_sun and visibility.self_shadows == "traced":
         scene = dataclasses.replace(scene, visibility=dataclasses.replace(visibility, self_shadows="rays"))
-    by_pixel = [body.receivers == AUTO and (has_sun or body.mesh.is_flat) for body in scene.bodies]
+    by_pixel = [
+        body.receivers == AUTO
+        and (has_sun or body.mesh.is_flat)
+        and not ((body.self_shadows or visibility.self_shadows) == "spheres" and body.is_thin)
+        for body in scene.bodies
+    ]
     if not any(by_pixel):
         return scene
     bodies = (

@@ -180,6 +180,16 @@ class Body:
         """Whether a method that knows convex parts takes these for what blocks the light of others."""
         return isinstance(self.blockers, str) and bool(self.mesh.convex_parts)
 
+    @property
+    def is_thin(self) -> bool:
+        """Whether its spheres bulge out of its mesh between vertices: of sheets, and bodies of several convex parts.
+
+        Not of flat bodies for which one sphere stands in.
+        """
+        if self.mesh.is_flat:
+            return isinstance(self.blockers, Spheres)
+        return not self.mesh.surface.is_closed or len(self.mesh.convex_parts) > 1
+
     def _read_mesh(self) -> None:
         """Load the mesh from its file or from trimesh, and its surface where none is given."""
         mesh, material = self.mesh, Material()
