@@ -58,6 +58,13 @@ def test_standing_names_the_argument_it_refuses(name, options):
         ws.Body(ws.icosphere()).on_ground(**options)
 
 
+def test_a_mesh_whose_vertices_coincide_is_not_scaled():
+    point = ws.Body(ws.Mesh(np.ones((3, 3)), [[0, 1, 2]]), name="point")
+    with pytest.raises(ValueError, match=r"size: got 2 for a mesh \('point'\) whose vertices coincide"):
+        point.on_ground(size=2)
+    assert np.array_equal(point.on_ground().translation, [-1, -1, -1])
+
+
 def test_the_world_points_of_a_body_are_those_of_its_mesh_in_the_world():
     body = ws.Body(ws.icosphere(0.7, 2), rotation=(10, 200, 40), translation=(5, 6, 7), scale=2.0)
     np.testing.assert_allclose(body.world_points(), body.world_mesh().positions, rtol=1e-6)

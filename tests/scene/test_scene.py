@@ -556,6 +556,13 @@ def test_a_setting_that_a_method_does_not_read_is_refused_with_those_that_do(met
     assert getattr(ws.Visibility(method, **{name: default}), name) == default
 
 
+def test_settings_of_visibility_are_compared_by_their_values():
+    assert ws.Visibility() == ws.Visibility()
+    assert len({ws.Visibility("log-sh", order=4), ws.Visibility("log-sh", order=4)}) == 1
+    assert ws.Visibility("log-sh", order=4) != ws.Visibility("log-sh", order=5)
+    assert ws.Visibility() != ws.Visibility("directional")
+
+
 def test_another_method_takes_along_the_settings_that_it_reads():
     directional = ws.Visibility(directions=64, softness=0.5, merging=0.25)
     with pytest.raises(ValueError, match=r"^directions: got 64, which 'log-sh' does not read.*\.by\('log-sh'\)"):

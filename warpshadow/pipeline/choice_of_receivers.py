@@ -13,7 +13,7 @@ its grounds and walls, where shadows' edges show most. pipeline/README.md has th
 """
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -145,7 +145,7 @@ def for_picture(scene: Scene) -> Scene:
     whose making a picture would wait for, and the picture does not depend on what the cache holds. Bodies with spheres
     or ``self_shadows`` of their own name "directional", which has them.
 
-    By other methods flat bodies that leave their receivers open are shaded by pixel.
+    By other methods flat bodies that leave their receivers open are shaded by pixel, unless spheres bulge out of them.
 
     Interpolation between the vertices of a ground makes shadows' edges jagged. Under a sun so are all other bodies,
     and where their shadows on themselves are "traced", a sun's are found by "rays", as nobody asks for a gradient:
@@ -163,7 +163,12 @@ def for_picture(scene: Scene) -> Scene:
     visibility, has_sun = scene.visibility, _has_sun(scene)
     if has_sun and visibility.self_shadows == "traced":
         scene = dataclasses.replace(scene, visibility=dataclasses.replace(visibility, self_shadows="rays"))
-    by_pixel = [body.receivers == AUTO and (has_sun or body.mesh.is_flat) for body in scene.bodies]
+    by_pixel = [
+        body.receivers == AUTO
+        and (has_sun or body.mesh.is_flat)
+        and not ((body.self_shadows or visibility.self_shadows) == "spheres" and body.is_thin)
+        for body in scene.bodies
+    ]
     return change_bodies(scene, "receivers", dict.fromkeys(np.flatnonzero(by_pixel).tolist(), "pixel"))
 
 
@@ -177,13 +182,22 @@ def _has_sun(scene: Scene) -> bool:
     return find_sharp_cells(cells.radiance @ LUMINANCE, cells.spots, cells.spreads) is not None
 
 
-def receiver_notes(scene: Scene, choices: Sequence[ReceiverChoice]) -> list[str]:
-    """Describe the choice for each body that leaves it open, a line each."""
-    return [
-        f"Body {number} ({body.called!r}) has receivers at {_WHERE[choice.receivers]}: {_reason(choice)}."
-        for number, (body, choice) in enumerate(zip(scene.bodies, choices, strict=True))
-        if body.receivers == AUTO and choice.size is not None
-    ]
+def receiver_notes(scene: Scene, choices: Sequence[ReceiverChoice], bulging: Collection[int] = ()) -> list[str]:
+    """Describe the choice for each body that leaves it open, a line each.
+
+    Args:
+        scene: The scene as it was given.
+        choices: The choices for its bodies.
+        bulging: Bodies out of which their spheres bulge: :class:`.BlockerKinds`.
+    """
+    notes = []
+    for number, (body, choice) in enumerate(zip(scene.bodies, choices, strict=True)):
+        if body.receivers == AUTO and choice.size is not None:
+            where, why = _WHERE[choice.receivers], _reason(choice)
+            if number in bulging:
+                where, why = _WHERE["vertex"], "spheres block its light, and bulge out of it between vertices"
+            notes.append(f"Body {number} ({body.called!r}) has receivers at {where}: {why}.")
+    return notes
 
 
 def _reason(choice: ReceiverChoice) -> str:

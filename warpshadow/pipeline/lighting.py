@@ -47,6 +47,7 @@ class BlockerKinds(NamedTuple):
     why_spheres: tuple[str, ...] = ()  # of each body, why it blocks its own light by spheres; empty for the traced
     planes: tuple[int, ...] = ()  # bodies that block all light as the planes in which they lie
     convex: tuple[int, ...] = ()  # traced ones that block the light of others by the convex parts that they consist of
+    bulging: tuple[int, ...] = ()  # bodies out of which spheres bulge: they receive at vertices, whatever was chosen
 
 
 ONLY_SPHERES = BlockerKinds()  # all bodies block by their spheres
@@ -190,10 +191,11 @@ class Method:
         """
         return ONLY_SPHERES
 
-    @functools.cached_property
-    def samples_receive(self) -> np.ndarray:
-        """Bodies on which samples are receivers, bool of shape [body]."""
-        return np.array([self.lights_samples or body.receivers != "vertex" for body in self.merged_scene.scene.bodies])
+    def samples_receive(self, blocker_kinds: BlockerKinds = ONLY_SPHERES) -> np.ndarray:
+        """Bodies on which samples are receivers while bodies block in some ways, bool of shape [body]."""
+        by_vertex = [body.receivers == "vertex" for body in self.merged_scene.scene.bodies]
+        is_bulging = np.isin(np.arange(len(by_vertex)), blocker_kinds.bulging)
+        return ~(np.array(by_vertex) | is_bulging) | self.lights_samples
 
     @functools.cached_property
     def is_adaptive(self) -> np.ndarray:
@@ -201,10 +203,9 @@ class Method:
         adaptive = np.array([body.receivers == "adaptive" for body in self.merged_scene.scene.bodies])
         return adaptive & self.merged_scene.is_flat & (not self.lights_samples)
 
-    @functools.cached_property
-    def can_receive(self) -> np.ndarray:
+    def can_receive(self, blocker_kinds: BlockerKinds) -> np.ndarray:
         """Vertices that may be receivers, and vertices whose backs may be, bool of shape [2, vertex]."""
-        body_of_vertex, receives = self.merged_scene.body_of_vertex, ~self.samples_receive
+        body_of_vertex, receives = self.merged_scene.body_of_vertex, ~self.samples_receive(blocker_kinds)
         return np.stack([receives[body_of_vertex], (receives & self.merged_scene.is_two_sided)[body_of_vertex]])
 
     def separate_bodies(self, blocker_kinds: BlockerKinds) -> np.ndarray | None:
@@ -217,11 +218,11 @@ class Method:
 
     def numbering(self, blocker_kinds: BlockerKinds, has_backs: bool) -> Numbering:
         """Number all vertices, or all with their backs; the first call makes both, so that a capture finds them."""
-        key = blocker_kinds.traced, blocker_kinds.planes
+        key = blocker_kinds.traced, blocker_kinds.planes, blocker_kinds.bulging
         if key not in self._numberings:
             faces, can_receive, separate_bodies = (
                 self.merged_scene.faces,
-                self.can_receive,
+                self.can_receive(blocker_kinds),
                 self.separate_bodies(blocker_kinds),
             )
             bodies = None if separate_bodies is None else separate_bodies[self.merged_scene.body_of_vertex]

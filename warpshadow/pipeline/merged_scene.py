@@ -14,7 +14,7 @@ from warpshadow.device.memory import empty
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.maths.spatial_sort import z_order
 from warpshadow.pipeline.geometry import CENTER, Geometry, Pivot, as_geometry, splice
-from warpshadow.scene.blockers import scene_blockers
+from warpshadow.scene.blockers import free_shape_remark, scene_blockers
 from warpshadow.scene.scene import BodyLike, Scene
 from warpshadow.scene.visibility import AUTO, SPHERE_METHODS
 from warpshadow.spheres import MANY, Spheres
@@ -32,15 +32,19 @@ class MergedScene:
         faces: Indices of vertices, vec3i of shape [face]; the faces of a body wind alike.
         uvs: Texture coordinates, vec2 of shape [1, uv].
         uv_faces: Indices of uvs, vec3i of shape [face].
+        has_chosen_receivers: Bodies whose receivers were chosen for them, see :meth:`with_settings`, bool of shape
+            [body].
         first_vertex, first_face: Where each body begins, and the end of the last, NumPy of shape [body + 1].
     """
 
     def __init__(self, scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False):
         self.scene = scene.with_method()
         self.device = wp.get_device(device)
+        self.has_chosen_receivers = np.zeros(len(scene.bodies), bool)
         self._progress = progress
         self._faces_of: dict[tuple[int, int], wp.array] = {}
         self._bindings: dict[int, SphereBinding] = {}  # by bodies
+        self._warned_of_shapes: set[int] = set()
         self._take_spheres: Callable[[], list[Spheres]] | None = None
         meshes = [body.mesh for body in scene.bodies]
         uvs = [np.zeros((1, 2), np.float32) if mesh.uvs is None else mesh.uvs for mesh in meshes]
@@ -57,6 +61,8 @@ class MergedScene:
         """The same bodies with other settings, such as receivers; both share the arrays that are made already."""
         other = copy.copy(self)
         other.scene = scene
+        pairs = zip(self.scene.bodies, scene.bodies, strict=True)
+        other.has_chosen_receivers = np.array([original.receivers != body.receivers for original, body in pairs])
         return other
 
     @functools.cached_property
@@ -362,6 +368,10 @@ class MergedScene:
         number = self.scene.body_number(body)
         if positions is not None and self.is_flat[number] and self.scene.bounces:
             self._refuse_other_vertices(number)
+        if positions is not None and number not in self._warned_of_shapes:
+            self._warned_of_shapes.add(number)
+            if remark := free_shape_remark(self.scene, number):
+                check.warn(remark)
         rest = self.rest if rest is None else as_geometry("rest", rest)
         first_vertex, first_sphere = self.first_vertex[number : number + 2], self.first_sphere[number : number + 2]
         if positions is not None and centers is None and len(self._spheres[number]):

@@ -478,7 +478,8 @@ class SceneRenderer:
             view = self._views.view(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
         image = view.preview().image(light, self._given_materials(albedo, textures, gloss))
         is_host = self.device.is_cpu or self.clock.waits
-        notes = [*receiver_notes(self._given_scene, self._choices), *bounce_notes(self.scene.bounces)]
+        of_receivers = receiver_notes(self._given_scene, self._choices, view.blocker_kinds.bulging)
+        notes = [*of_receivers, *bounce_notes(self.scene.bounces)]
         return Explanation(
             image, self._views.call(view), self.clock.timings, is_host=is_host, hidden=hidden, notes=notes
         )

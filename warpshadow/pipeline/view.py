@@ -71,6 +71,7 @@ class View(LitPoints):
     ):
         self.given = vertices, spheres, cameras, static, blocker_kinds
         self._separate_bodies = method.separate_bodies(blocker_kinds)
+        self._samples_receive = method.samples_receive(blocker_kinds)
         self.cameras = cameras
         self._camera, self._supersampling, self._pose_count = camera, method.merged_scene.scene.supersampling, counts[0]
         self._size = self._supersampling * camera.width, self._supersampling * camera.height
@@ -106,7 +107,7 @@ class View(LitPoints):
         else:
             normals = Node("normals", static.with_moving_normals, vertices, static.normals, items=corners)
         # receivers at vertices move with these alone; receivers at samples move with the samples' fragments, too
-        seen = sides if method.samples_receive.any() else detached(sides)
+        seen = sides if self._samples_receive.any() else detached(sides)
         item_text = functools.partial(receiver_text, self)
         arguments = [vertices, normals, seen, detached(silhouettes)]
         if method.is_adaptive.any():
@@ -126,7 +127,7 @@ class View(LitPoints):
         """Receivers at the vertices that are seen, or at all where that cannot be read without waiting."""
         merged_scene, method, quadtree = self.merged_scene, self.method, None
         has_backs = fragments.sides is not None
-        keeps_vertex, wants_samples = method.can_receive[: 1 + has_backs], method.samples_receive
+        keeps_vertex, wants_samples = method.can_receive(self.blocker_kinds)[: 1 + has_backs], self._samples_receive
         on_static_body = None if self.static is None else self.static.has_vertex
         separate_bodies = self._separate_bodies
         bodies = None if separate_bodies is None else separate_bodies[merged_scene.body_of_vertex]
@@ -139,7 +140,7 @@ class View(LitPoints):
             numbering = number_receivers(
                 merged_scene.faces, keeps_vertex, on_static_body, merged_scene.vertex_order, bodies
             )
-            if spheres is not None and (is_adaptive := method.is_adaptive & ~by_rows).any():
+            if spheres is not None and (is_adaptive := method.is_adaptive & wants_samples).any():
                 from warpshadow.pipeline.adaptive import find_squares
 
                 seen = positions, normals, fragments, spheres
@@ -332,10 +333,10 @@ class View(LitPoints):
         """How many receivers may move and how many are static; "up to " where they are not found yet."""
         if self.receivers_node.value_if_known(self.call) is not None:
             return super().counts()
-        can_receive, static = self.method.can_receive, 0
+        can_receive, static = self.method.can_receive(self.blocker_kinds), 0
         if self.static is not None:
             static = int((can_receive & self.static.has_vertex).sum())
-        samples = self._sample_count * self.method.samples_receive.any()
+        samples = self._sample_count * self._samples_receive.any()
         return "up to ", int(self._pose_count * (can_receive.sum() - static) + samples), static
 
     def _samples(self) -> str:

@@ -98,6 +98,25 @@ def _solid_behind(scene: Scene, number: int, device: wp.DeviceLike) -> Mesh | No
     return solid_behind(body.mesh, others, device=device)
 
 
+def free_shape_remark(scene: Scene, number: int) -> str:
+    """Say of a body that its spheres are few for a free shape, and how it gets others; empty if they are not."""
+    body = scene.bodies[number]
+    if scene.visibility.with_method().method not in SPHERE_METHODS or not body.casts_shadow:
+        return ""
+    called = f"body {number} ({body.called!r})"
+    if _ground_spheres(scene)[number] is not None:
+        return (
+            f"{called} is flat, and one sphere behind it blocks light in its place, whatever its shape becomes; "
+            "blockers = fit_spheres(mesh, 64).spheres follow its vertices"
+        )
+    if body.mesh.surface.is_closed or not _takes_parts(scene, body):
+        return ""
+    return (
+        f"{called} is a sheet: while its shape is free {SPHERES_BESIDE_PARTS} spheres block its light in place of its "
+        'convex parts, and darken it; self_shadows = "spheres" fits as many as blockers = "auto" finds'
+    )
+
+
 def _takes_parts(scene: Scene, body: Body) -> bool:
     """Whether a body blocks light as convex parts, so that its spheres do not."""
     visibility = scene.visibility.with_method()

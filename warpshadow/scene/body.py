@@ -178,6 +178,16 @@ class Body:
         """Whether a method that knows convex parts takes these for what blocks the light of others."""
         return isinstance(self.blockers, str) and bool(self.mesh.convex_parts)
 
+    @property
+    def is_thin(self) -> bool:
+        """Whether its spheres bulge out of its mesh between vertices: of sheets, and bodies of several convex parts.
+
+        Not of flat bodies for which one sphere stands in.
+        """
+        if self.mesh.is_flat:
+            return isinstance(self.blockers, Spheres)
+        return not self.mesh.surface.is_closed or len(self.mesh.convex_parts) > 1
+
     def _read_mesh(self) -> None:
         """Load the mesh from its file or from trimesh, and its surface where none is given."""
         mesh, material = self.mesh, Material()
@@ -299,7 +309,14 @@ class Body:
             )
         foot = check.array("foot", foot, (3,))
         low, high = (corner.astype(np.float64) for corner in self.mesh.bounds)
-        scale = self.scale if size is None else check.positive("size", size) / (high - low).max()
+        if size is None:
+            scale = self.scale
+        elif extent := (high - low).max():
+            scale = check.positive("size", size) / extent
+        else:
+            raise ValueError(
+                f"size: got {size:g} for a mesh ({self.called!r}) whose vertices coincide, expected one that has a size"
+            )
         points = self.mesh.world_points().astype(np.float64) @ self.rotation_matrix().T
         bottom = self.rotation_matrix() @ (low + high) / 2
         bottom[1] = points[:, 1].min()

@@ -65,7 +65,7 @@ _INDEPENDENT_RAYS = 1024  # rays unless ``samples`` says how many, where each re
 
 
 @check.frozen
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Visibility:
     """How visibility is computed. A setting that the method does not read is refused unless it is the default.
 

@@ -98,11 +98,13 @@ def _transmittance(
     method: SphereMethod, group: Group, bodies: list[int], spheres: tuple[wp.array, wp.array], directions: np.ndarray
 ) -> wp.array | None:
     """Transmittance of the spheres of some bodies, [batch, receiver, cell]; None without any."""
-    blocking = method.merged_scene.spheres_of(bodies, spheres)
-    if not (blocking[1].shape[1] and group.points.size):
+    centers, radii = method.merged_scene.spheres_of(bodies, spheres)
+    if not (radii.shape[1] and group.points.size):
         return None
+    count = common_batch({"points": group.points, "spheres": radii})  # cameras may see one geometry at other points
+    points, normals, centers, radii = (expand(array, count) for array in (group.points, group.normals, centers, radii))
     softness, merging = method.visibility.softness, method.visibility.merging
-    return transmittance(group.points, group.normals, *blocking, directions, softness=softness, merging=merging)
+    return transmittance(points, normals, centers, radii, directions, softness=softness, merging=merging)
 
 
 class SenderPlanes(NamedTuple):
