@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from warpshadow.assets.color import LUMINANCE
-from warpshadow.assets.image import ImageError, write_image
+from warpshadow.assets.image import ImageError, exr_bytes, write_image
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.sky import synthetic_sky
 from warpshadow.maths import sh
@@ -104,10 +104,15 @@ def test_a_map_keeps_a_read_only_float32_copy():
         environment.radiance[0] = 0
 
 
+def unchecked_exr(pixels):
+    """An .exr file of other programs, which may hold NaN."""
+    return exr_bytes(dict(zip("RGB", np.moveaxis(pixels, 2, 0), strict=True)))
+
+
 def test_a_bad_file_is_refused_with_its_path_unless_repaired(tmp_path):
     path = tmp_path / "bad.exr"
     bad = {(0, 0, 0): np.nan, (7, 15, 1): np.inf, (3, 4, 2): -5, (3, 5, 2): np.nan}
-    write_image(path, with_places(bad))
+    path.write_bytes(unchecked_exr(with_places(bad)))
     with pytest.raises(ImageError, match="bad.exr: radiance: got 4 NaN, Inf or negative values"):
         EnvironmentMap.read(path)
     np.testing.assert_array_equal(
@@ -123,14 +128,14 @@ def test_neighbors_wrap_around_and_fill_from_the_rim(tmp_path):
     expected = pixels.copy()
     pixels[0, 0], expected[0, 0] = np.nan, (2 * 0 + 3 * 1) / 5
     pixels[3:6, 6:11], expected[4, 8] = np.nan, 4  # by symmetry; the block takes two rounds to fill
-    write_image(tmp_path / "a.exr", pixels)
+    (tmp_path / "a.exr").write_bytes(unchecked_exr(pixels))
     repaired = EnvironmentMap.read(tmp_path / "a.exr", sanitize="neighbors").radiance
     np.testing.assert_allclose(repaired[[0, 4], [0, 8]], expected[[0, 4], [0, 8]], rtol=1e-6)
     np.testing.assert_array_equal(repaired[np.isfinite(pixels)], pixels[np.isfinite(pixels)])
 
 
 def test_neighbors_cannot_repair_a_channel_without_a_good_value(tmp_path):
-    write_image(tmp_path / "a.exr", np.full((2, 4, 3), np.nan))
+    (tmp_path / "a.exr").write_bytes(unchecked_exr(np.full((2, 4, 3), np.nan)))
     with pytest.raises(ImageError, match="a.exr: .*no good value"):
         EnvironmentMap.read(tmp_path / "a.exr", sanitize="neighbors")
 

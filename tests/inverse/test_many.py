@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 
 import warpshadow as ws
 from warpshadow import inverse
+from warpshadow.assets.image import exr_bytes
 from warpshadow.cli import app
 from warpshadow.device.cluster import run_on_ray
 from warpshadow.inverse import checkpoint, many
@@ -77,7 +78,7 @@ def photos(tmp_path_factory):
         (folder / "true.toml").write_text(SCENE.replace("[0, 0.8, 0]", f"[{0.1 + 0.02 * number}, 0.8, 0]"))
         image = ws.render(ws.load_scene(folder / "true.toml"))
         ws.write_image(folder / name / "photo.exr", image)
-    ws.write_image(folder / "NaN" / "nan.exr", np.full_like(image, np.nan))
+    (folder / "NaN" / "nan.exr").write_bytes(exr_bytes(dict.fromkeys("RGBA", np.full(image.shape[:2], np.nan))))
     ws.write_image(folder / "size" / "wide.exr", np.zeros((16, 24, 4), np.float32))
     return folder
 
