@@ -18,8 +18,7 @@ from warpshadow.stages.ray_tracing import trace_visibility
 DEPTH = 1 / 16
 """How far the solid reaches beyond the mesh, over the longest side of its bounds.
 
-Land of 5000 faces with rocks and trees on it takes 1024 spheres with 1/40, 256 with 1/16, 64 with 1/8, and its image is
-4.0, 4.1 and 4.4% off; as a sheet, with 1024, 8.6%."""
+The deeper it is, the fewer and larger are the spheres that fill it, and the coarser is its front."""
 
 _POINTS = 1024  # of meshes, from which rays tell which bodies lie before the field, and which behind
 
