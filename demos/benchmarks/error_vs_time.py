@@ -205,7 +205,7 @@ def better_than(default: Measured, others: Sequence[Measured]) -> list[Measured]
 
 def load_scenes(data: Path | None, wanted: Sequence[str]) -> dict[str, ws.Scene]:
     """Scenes of THREE by their meshes and maps, and of all kinds by name."""
-    three = dict(zip(THREE, three_scenes(data).items(), strict=True))
+    three = dict(zip(THREE, three_scenes(data).items(), strict=True)) if set(wanted) & set(THREE) else {}
     return dict(three[name] if name in three else (name, SCENES[name](Sources(data), SIZE)) for name in wanted)
 
 

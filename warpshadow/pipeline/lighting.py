@@ -181,6 +181,7 @@ class Method:
         self.visibility = merged_scene.scene.visibility
         self.light = Input("light", merged_scene.scene.light)
         self._numberings: dict[tuple[tuple[int, ...], ...], list[Numbering]] = {}
+        self._can_receive: dict[tuple[int, ...], np.ndarray] = {}  # by the bodies out of which spheres bulge
 
     def blocker_kinds(self, geometry: Geometry | None, rotations: Input | None) -> BlockerKinds:
         """Choose the kind of blocker that each body of a geometry is; the scene's geometry by default.
@@ -205,8 +206,12 @@ class Method:
 
     def can_receive(self, blocker_kinds: BlockerKinds) -> np.ndarray:
         """Vertices that may be receivers, and vertices whose backs may be, bool of shape [2, vertex]."""
-        body_of_vertex, receives = self.merged_scene.body_of_vertex, ~self.samples_receive(blocker_kinds)
-        return np.stack([receives[body_of_vertex], (receives & self.merged_scene.is_two_sided)[body_of_vertex]])
+        key = blocker_kinds.bulging
+        if key not in self._can_receive:
+            body_of_vertex, receives = self.merged_scene.body_of_vertex, ~self.samples_receive(blocker_kinds)
+            backs = (receives & self.merged_scene.is_two_sided)[body_of_vertex]
+            self._can_receive[key] = np.stack([receives[body_of_vertex], backs])
+        return self._can_receive[key]
 
     def separate_bodies(self, blocker_kinds: BlockerKinds) -> np.ndarray | None:
         """Number of each body whose receivers form a group, −1 for others, shape [body]; None where all share one."""

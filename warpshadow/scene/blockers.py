@@ -1,6 +1,7 @@
 """Blockers: the spheres that stand in for the bodies of a scene."""
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -87,14 +88,8 @@ def _solid_behind(scene: Scene, number: int, device: wp.DeviceLike) -> Mesh | No
     body = scene.bodies[number]
     if _takes_parts(scene, body) or body.mesh.surface.is_closed:
         return None
-    to_own = body.rotation_matrix().T
-    others = [
-        other.world_mesh().transformed(
-            rotation=to_own, translation=-to_own @ body.translation / body.scale, scale=1 / body.scale
-        )
-        for other in scene.bodies
-        if other is not body
-    ]
+    to_own = _into_own_space(body)
+    others = [other.world_mesh().transformed(**to_own) for other in scene.bodies if other is not body]
     return solid_behind(body.mesh, others, device=device)
 
 
@@ -159,10 +154,13 @@ def _given_spheres(body: Body, ground: Spheres | None) -> Spheres:
         return body.blockers
     if ground is None:
         return Spheres.concatenate([])
+    return ground.transformed(**_into_own_space(body))
+
+
+def _into_own_space(body: Body) -> dict[str, Any]:
+    """Arguments of ``transformed`` that take meshes or spheres from the scene into the space of a body."""
     inverse = body.rotation_matrix().T
-    return ground.transformed(
-        rotation=inverse, translation=-inverse @ body.translation / body.scale, scale=1 / body.scale
-    )
+    return {"rotation": inverse, "translation": -inverse @ body.translation / body.scale, "scale": 1 / body.scale}
 
 
 def _ground_sphere(mesh: Mesh, others: list[np.ndarray]) -> Spheres | None:

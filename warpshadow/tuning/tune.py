@@ -402,8 +402,8 @@ def _sphere_variants(scene: Scene, fits: bool, device: wp.DeviceLike) -> Iterato
     """The scene with its own spheres, and with other numbers of them for all bodies."""
     yield scene
     own = fitted_counts(scene)
+    meshes = [] if fits else [mesh for mesh, _ in fitted_meshes(scene, device=device).values()]
     for count in SPHERE_COUNTS if own else ():
-        meshes = (mesh for mesh, _ in fitted_meshes(scene, device=device).values())
         is_at_hand = fits or all(is_fitted(mesh, count, device=device) for mesh in meshes)
         if is_at_hand and set(own.values()) != {count}:
             yield change_bodies(scene, "blockers", dict.fromkeys(own, count))

@@ -263,7 +263,8 @@ def coverage_of_light(
         samples: Eight directions drawn from the light of each cell, NumPy of shape [direction, 8, 3].
     Returns:
         Float32 of shape [batch, receiver, direction].
-    Differentiable: points, covered, frames, fronts. Not: facing, which decides by steps.
+    Differentiable: points, covered, frames, fronts. Not: horizon_normals, which decide by steps,
+    and how much directions count for receivers in a plane.
     """
     check.shape("samples", samples.shape, (len(directions), SAMPLES, 3))
     check_planes(planes, points, frames, directions, skip)

@@ -317,7 +317,8 @@ def plane_coverage(
     Returns:
         Float32 of shape [batch, receiver, direction], 1 or more where nothing passes; None where no flat casts a
         shadow on them.
-    Differentiable: points, frames, fronts. Not: facing, which decides by steps.
+    Differentiable: points, frames, fronts. Not: horizon_normals, which decide by steps,
+    and how much receivers in a plane see of a cell.
     """
     check_planes(planes, points, frames, directions, skip)
     count = common_batch({"points": points, "frames": frames, "fronts": fronts})
