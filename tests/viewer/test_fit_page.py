@@ -112,13 +112,22 @@ def iterations(page):
     return max((int(count) for note in said for count in re.findall(r"iteration (\d+) · loss", note)), default=0)
 
 
-def test_a_page_shows_pictures_losses_and_candidates_and_the_fit_is_as_without_it(viewer, page):
-    running = Running(viewer)
-    page.until(lambda message: "stage 1 of 2" in str(message))
-    page.until(lambda message: "<polyline" in str(message))
+@pytest.fixture
+def waiting(viewer, page, tmp_path):
+    """A fit that waits after its first iteration, since Pause was pressed before it began."""
+    press(page, "Pause")
+    page.until(lambda message: "Go on" in str(message))
+    running = Running(viewer, checkpoint=tmp_path / "fit", checkpoint_seconds=1e9)
+    page.until(lambda message: "waits · stage 1 of 2 · iteration 1 " in str(message))
+    return running
+
+
+def test_a_page_shows_pictures_losses_and_candidates_and_the_fit_is_as_without_it(page, waiting):
     page.until(lambda message: "least loss" in str(message))
+    press(page, "Pause")  # the button as it was called at first
     page.until(lambda message: "finished after 24 iterations" in str(message))
-    assert_same(running.ended(), unwatched())
+    page.until(lambda message: "<polyline" in str(message))
+    assert_same(waiting.ended(), unwatched())
     image = np.asarray(Image.open(io.BytesIO(pictures(page)[-1])).convert("RGB")).astype(float)
     assert image.shape == (12 * 16, 3 * 16 * 16, 3)
     target, found, difference = np.split(image, 3, axis=1)
@@ -146,16 +155,6 @@ def test_a_browser_shows_pictures_losses_and_candidates_and_its_buttons_are_pres
         assert page.get_by_role("button", name="Stop").is_disabled()
         assert page.locator("polyline").count() == 3  # of two candidates, and of the second stage
     assert_same(running.ended(), unwatched())
-
-
-@pytest.fixture
-def waiting(viewer, page, tmp_path):
-    """A fit that waits after its first iteration, since Pause was pressed before it began."""
-    press(page, "Pause")
-    page.until(lambda message: "Go on" in str(message))
-    running = Running(viewer, checkpoint=tmp_path / "fit", checkpoint_seconds=1e9)
-    page.until(lambda message: "waits · stage 1 of 2 · iteration 1 " in str(message))
-    return running
 
 
 def test_pause_keeps_a_fit_until_it_is_to_go_on(page, waiting):
@@ -193,7 +192,7 @@ def test_a_closed_page_stops_nothing(viewer, page, waiting):
     page.close()
     other = viewer_state(viewer)
     press(other, "Go on")  # what the new page was told
-    other.until(lambda message: "stage 2 of 2" in str(message))
+    other.until(lambda message: "finished after 24 iterations" in str(message))
     other.close()
     assert_same(waiting.ended(), unwatched())
 
@@ -220,12 +219,13 @@ def test_an_error_in_the_view_is_shown_and_leaves_the_fit_running(viewer, page, 
 
 def test_an_error_that_is_over_is_not_shown_any_more(viewer, page, monkeypatch):
     working = watch.pictures
-    calls = []
+    calls, seen = [], threading.Event()
 
     def broken_once(fit):
         calls.append(fit)
         if len(calls) == 1:
             raise RuntimeError("once")
+        assert seen.wait(PATIENCE)  # the page is sent only the newest of two messages that follow close on each other
         return working(fit)
 
     monkeypatch.setattr(watch, "pictures", broken_once)
@@ -233,6 +233,7 @@ def test_an_error_that_is_over_is_not_shown_any_more(viewer, page, monkeypatch):
         running = Running(viewer)
         page.until(lambda message: "RuntimeError: once" in str(message))
         since = len(page.heard)
+        seen.set()
         page.until(lambda message: message.get("updates") == {"content": ""}, since)
         running.ended()
 
