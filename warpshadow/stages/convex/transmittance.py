@@ -139,7 +139,7 @@ def _reaches(bound: PartBound, axis: wp.vec3, half_angle: wp.vec2):
 
 
 @wp.func
-def _add_coverage(
+def _cover(
     point: wp.vec3,
     normal: wp.vec3,
     corners: wp.array(dtype=wp.vec3),
@@ -149,11 +149,13 @@ def _add_coverage(
     body: int,
     cells: DirectionCells,
     radius: float,
+    passing: wp.array(dtype=wp.float32),
     silhouette: wp.array(dtype=ViewedEdge),
     coverage: wp.array(dtype=wp.float32),
+    covered: wp.array(dtype=wp.int32),
 ):
-    """Σ_parts h_q of a body; returns whether it covers something: else nothing is written."""
-    covers = bool(False)
+    """Σ_parts h_q of a body, in cells through which something passes; returns how many it covers, and lists them."""
+    covered_count = int(0)
     for part in range(parts.first_part[body], parts.first_part[body + 1]):
         bound = _find_bound(point, normal, bounds[part], radius)
         if bound.is_seen:
@@ -164,20 +166,21 @@ def _add_coverage(
                         direction = cells.directions[q]
                         if (
                             wp.dot(bound.axis, direction) > bound.cosine
-                            and (not covers or coverage[q] < 1.0)
+                            and passing[q] > 0.0
+                            and coverage[q] < 1.0
                             and is_above_horizon(normal, direction)
                         ):
-                            if not covers:
-                                for k in range(cells.directions.shape[0]):
-                                    coverage[k] = 0.0
-                                covers = True
                             if count == _UNKNOWN_COUNT:
                                 count = _find_silhouette(point, corners, planes, parts, part, silhouette)
                             share = float(1.0)
                             if count >= 0:
                                 share = convex_coverage(silhouette, 0, count, direction, radius)
-                            coverage[q] = coverage[q] + share
-    return covers
+                            if share > 0.0:
+                                if coverage[q] == 0.0:
+                                    covered[covered_count] = q
+                                    covered_count += 1
+                                coverage[q] = coverage[q] + share
+    return covered_count
 
 
 @wp.kernel(enable_backward=False)
@@ -197,6 +200,7 @@ def _pass(
     # scratch
     silhouettes: wp.array2d(dtype=ViewedEdge),
     coverages: wp.array2d(dtype=wp.float32),
+    covered: wp.array2d(dtype=wp.int32),
     # out
     passing: wp.array3d(dtype=wp.float32),
 ):
@@ -208,11 +212,10 @@ def _pass(
     normal = horizon_normal(horizon_normals, batch, receiver)
     for q in range(cells.directions.shape[0]):
         passing[batch, receiver, q] = 1.0
+        coverages[place, q] = 0.0
     for body in range(parts.first_part.shape[0] - 1):
-        if (
-            body != skip
-            and parts.blocks[body] == 1
-            and _add_coverage(
+        if body != skip and parts.blocks[body] == 1:
+            covered_count = _cover(
                 points[batch, receiver],
                 normal,
                 corners[instance],
@@ -222,12 +225,15 @@ def _pass(
                 body,
                 cells,
                 radius,
+                passing[batch, receiver],
                 silhouettes[place],
                 coverages[place],
+                covered[place],
             )
-        ):
-            for q in range(cells.directions.shape[0]):
+            for k in range(covered_count):
+                q = covered[place, k]
                 passing[batch, receiver, q] = passing[batch, receiver, q] * wp.max(0.0, 1.0 - coverages[place, q])
+                coverages[place, q] = 0.0
 
 
 @wp.kernel(enable_backward=False)
@@ -249,6 +255,7 @@ def _pass_adjoint(
     # scratch
     silhouettes: wp.array2d(dtype=ViewedEdge),
     coverages: wp.array2d(dtype=wp.float32),
+    covered: wp.array2d(dtype=wp.int32),
     # out
     adj_points: wp.array2d(dtype=wp.vec3),
     # sums
@@ -261,11 +268,11 @@ def _pass_adjoint(
     instance = instance_in(batch, corners.shape[0])
     point, normal = points[batch, receiver], horizon_normal(horizon_normals, batch, receiver)
     adj_point = wp.vec3()
+    for q in range(cells.directions.shape[0]):
+        coverages[place, q] = 0.0
     for body in range(parts.first_part.shape[0] - 1):
-        if (
-            body != skip
-            and parts.blocks[body] == 1
-            and _add_coverage(
+        if body != skip and parts.blocks[body] == 1:
+            covered_count = _cover(
                 point,
                 normal,
                 corners[instance],
@@ -275,27 +282,29 @@ def _pass_adjoint(
                 body,
                 cells,
                 radius,
+                passing[batch, receiver],
                 silhouettes[place],
                 coverages[place],
+                covered[place],
             )
-        ):
             for part in range(parts.first_part[body], parts.first_part[body + 1]):
                 bound = _find_bound(point, normal, bounds[instance, part], radius)
-                if bound.is_seen:
+                if bound.is_seen and covered_count > 0:
                     count = int(_UNKNOWN_COUNT)
-                    for bundle in range(cells.axes.shape[0]):
-                        if _reaches(bound, cells.axes[bundle], cells.half_angles[bundle]):
-                            for q in range(bundle * BUNDLE, (bundle + 1) * BUNDLE):
-                                left = 1.0 - coverages[place, q]
-                                adj = adj_passing[batch, receiver, q] * passing[batch, receiver, q]
-                                if adj != 0.0 and left > 0.0 and left < 1.0:
-                                    if count == _UNKNOWN_COUNT:
-                                        count = _find_silhouette(
-                                            point, corners[instance], planes[instance], parts, part, silhouettes[place]
-                                        )
-                                    direction = cells.directions[q]
-                                    coverage_adjoint(silhouettes[place], 0, count, direction, radius, -adj / left)
+                    for k in range(covered_count):
+                        q = covered[place, k]
+                        direction = cells.directions[q]
+                        left = 1.0 - coverages[place, q]
+                        adj = adj_passing[batch, receiver, q] * passing[batch, receiver, q]
+                        if adj != 0.0 and left > 0.0 and wp.dot(bound.axis, direction) > bound.cosine:
+                            if count == _UNKNOWN_COUNT:
+                                count = _find_silhouette(
+                                    point, corners[instance], planes[instance], parts, part, silhouettes[place]
+                                )
+                            coverage_adjoint(silhouettes[place], 0, count, direction, radius, -adj / left)
                     adj_point += _silhouette_adjoint(silhouettes[place], wp.max(count, 0), instance, adj_corners)
+            for k in range(covered_count):
+                coverages[place, covered[place, k]] = 0.0
     if adj_points:
         adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
 
@@ -334,7 +343,8 @@ def transmittance_past_parts(
     own_radius = cell_radius(len(directions)) if radius is None else radius
     cells = make_cells(directions, SOFTNESS, points.device)
     inputs = [points, horizon_normals, *placed, blockers.arrays, cells, own_radius, -1 if skip is None else skip]
-    scratch = [Scratch((blockers.edge_count,), ViewedEdge), Scratch((len(directions),), wp.float32)]
+    by_cell = (len(directions),)
+    scratch = [Scratch((blockers.edge_count,), ViewedEdge), Scratch(by_cell, wp.float32), Scratch(by_cell, wp.int32)]
     cost = _PART_COST * placed.bounds.shape[1]
     passing = wp.empty((*points.shape, len(directions)), dtype=wp.float32, device=points.device)
     return differentiable(
