@@ -41,6 +41,17 @@ class ViewedEdge:
     adj_normal: wp.vec3  # gradient of n, times its length
 
 
+@wp.func
+def viewed_edge(begin: wp.vec3, end: wp.vec3, n: wp.vec3):
+    """An edge between two points relative to the receiver, by a normal of any length but 0 towards the shape."""
+    edge = ViewedEdge()
+    edge.length = wp.length(n)
+    edge.normal = (1.0 / edge.length) * n
+    edge.begin = begin
+    edge.end = end
+    return edge
+
+
 @wp.struct
 class Chord:
     """Part of an edge that is seen within a cell, in the plane that touches the sphere of directions there."""

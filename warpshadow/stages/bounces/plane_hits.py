@@ -100,7 +100,6 @@ def hit_sides_adjoint(
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
     """Add to the gradients of a receiver relative to each plane, of viewed edges, and of an instance's texels."""
-    sides = 4 * scene.grids.shape[0]
     cells = SIDE_ROWS * scene.grids.shape[0]
     for i in range(side_count):
         if store[cells + 4 * i][0] > 0.0:
@@ -143,7 +142,7 @@ def hit_sides_adjoint(
             adj_share = adj_met[0] * stored[1]
             weighted = adj_share * side.weight
             coverage_adjoint(edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, weighted)
-            adj_store[sides + i] = adj_store[sides + i] + wp.vec3(0.0, 0.0, adj_share * stored[0] / side.weight)
+            adj_store[side.row] = adj_store[side.row] + wp.vec3(0.0, 0.0, adj_share * stored[0] / side.weight)
 
 
 @wp.func

@@ -16,7 +16,7 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, expand_rows, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import differentiable, launch
-from warpshadow.device.parallel import scratch_place, split_row
+from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.cell_coverage import ViewedEdge, coverage_adjoint
 from warpshadow.stages.planes.cells import (
@@ -93,15 +93,15 @@ def side_coverage_adjoint(
     cell: VisibleCell,
     adj: float,
     edges: wp.array(dtype=ViewedEdge),
-    adj_place: ReceiverInPlane,
+    adj_store: wp.array(dtype=wp.vec3),
 ):
-    """Add to the gradients of the receiver relative to the plane and of viewed edges; also that of the weight."""
+    """Add to the gradients of the receiver relative to the plane, of the side's weight, and of viewed edges."""
     covered = PlaneCover()
     covered.part = 1.0
-    adj_weight = float(0.0)
     if side.weight < 1.0 or is_covered_by_texels(grid):
         covered = side_coverage(scene, grid, side, place, cell, edges)
         adj_weight = adj * covered.part * covered.outline / side.weight
+        adj_store[side.row] = adj_store[side.row] + wp.vec3(0.0, 0.0, adj_weight)
     if is_covered_by_texels(grid) and covered.outline > 0.0:
         toward = toward_side(place, side.is_back, cell.direction)
         footprint = covered.footprint
@@ -119,10 +119,11 @@ def side_coverage_adjoint(
             -0.5 * footprint.per_cosine * adj_spot[2],
             wp.vec2(adj_spot[0], adj_spot[1]),
         )
+        adj_place = load_place(adj_store, side.f)
         adj_place = side_adjoint(grid, place, side.is_back, cell.direction, adj_at, adj_toward, adj_place)
+        store_place(adj_store, side.f, adj_place)
     weighted = adj * side.weight * covered.part
     coverage_adjoint(edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, weighted)
-    return adj_place, adj_weight
 
 
 @wp.func
@@ -157,12 +158,10 @@ def _cover(
     result: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a receiver:  C_q = Σ_k h_k."""
-    row = first_row + wp.tid()
-    batch, receiver = split_row(row, points.shape[1])
-    place = scratch_place(worker, row)
-    store, edges = scratch[place], viewed_edges[place]
-    placed = frames[instance_in(batch, frames.shape[0])]
-    side_count = place_receiver(points[batch, receiver], placed, fronts, scene, batch, receiver, store, edges)
+    batch, receiver, scratch_row, side_count = place_receiver(
+        first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
+    )
+    store, edges = scratch[scratch_row], viewed_edges[scratch_row]
     normal = horizon_normal(horizon_normals, batch, receiver)
     covered = result[batch, receiver]
     for q in range(directions.shape[0]):
@@ -204,13 +203,10 @@ def _cover_adjoint(
     adj_frames: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver; cells that are covered wholly are taken to have no gradient."""
-    row = first_row + wp.tid()
-    batch, receiver = split_row(row, points.shape[1])
-    place = scratch_place(worker, row)
-    store, edges, adj_store = scratch[place], viewed_edges[place], adj_scratch[place]
-    instance = instance_in(batch, frames.shape[0])
-    point = points[batch, receiver]
-    side_count = place_receiver(point, frames[instance], fronts, scene, batch, receiver, store, edges)
+    batch, receiver, scratch_row, side_count = place_receiver(
+        first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
+    )
+    store, edges, adj_store = scratch[scratch_row], viewed_edges[scratch_row], adj_scratch[scratch_row]
     normal = horizon_normal(horizon_normals, batch, receiver)
     for k in range(SIDE_ROWS * scene.grids.shape[0]):
         adj_store[k] = wp.vec3()
@@ -218,36 +214,27 @@ def _cover_adjoint(
         side = load_side(scene, i, store)
         grid = scene.grids[side.f]
         in_plane = load_place(store, side.f)
-        adj_place = load_place(adj_store, side.f)
-        adj_weights = float(0.0)
         if grid.blocks == 1:
             for q in range(directions.shape[0]):
                 adj = adj_result[batch, receiver, q]
                 if adj != 0.0 and is_above_horizon(normal, directions[q]):
                     cell = visible_cell(scene, normal, directions[q])
-                    adj_place, adj_weight = side_coverage_adjoint(
-                        scene, grid, side, in_plane, cell, adj, edges, adj_place
-                    )
-                    adj_weights += adj_weight
-        store_place(adj_store, side.f, adj_place)
-        adj_store[4 * scene.grids.shape[0] + i] = wp.vec3(0.0, 0.0, adj_weights)
-    adj_point = place_receiver_adjoint(
-        point,
-        frames[instance],
-        fronts,
-        scene,
+                    side_coverage_adjoint(scene, grid, side, in_plane, cell, adj, edges, adj_store)
+    place_receiver_adjoint(
         batch,
         receiver,
         side_count,
+        points,
+        frames,
+        fronts,
+        scene,
         store,
         edges,
         adj_store,
-        instance,
-        adj_frames,
+        adj_points,
         adj_fronts,
+        adj_frames,
     )
-    if adj_points:
-        adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
 
 
 @wp.kernel(enable_backward=False)
