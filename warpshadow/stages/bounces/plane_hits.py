@@ -17,8 +17,7 @@ from warpshadow.stages.planes.cells import (
     on_side,
     scatter,
     side_adjoint,
-    step,
-    step_slope,
+    smoothstep_slope,
     toward_side,
 )
 from warpshadow.stages.planes.prepared import PlaneGrid
@@ -159,7 +158,7 @@ def side_transmittance(i: int, excluded: int, cells: int, side_count: int, store
     for j in range(side_count):
         other = store[cells + 4 * j]
         if j != i and j != excluded and other[0] > 0.0:
-            part *= 1.0 - other[0] * step(_nearness(footprint, other))
+            part *= 1.0 - other[0] * wp.smoothstep(-1.0, 1.0, _nearness(footprint, other))
     return part
 
 
@@ -197,9 +196,9 @@ def side_transmittance_adjoint(
         if j != i and other[0] > 0.0:
             adj_factor = adj_part * side_transmittance(i, j, cells, side_count, store)
             nearness = _nearness(footprint, other)
-            adj_near = -adj_factor * other[0] * step_slope(nearness) / (footprint[2] + other[2] + 1.0e-20)
+            adj_near = -adj_factor * other[0] * smoothstep_slope(nearness) / (footprint[2] + other[2] + 1.0e-20)
             adj_width = -adj_near * nearness
             adj_store[cells + 4 * i] = adj_store[cells + 4 * i] + wp.vec3(0.0, adj_near, adj_width)
             adj_store[cells + 4 * j] = adj_store[cells + 4 * j] + wp.vec3(
-                -adj_factor * step(nearness), -adj_near, adj_width
+                -adj_factor * wp.smoothstep(-1.0, 1.0, nearness), -adj_near, adj_width
             )

@@ -90,8 +90,7 @@ def _sum_near(
             cell = neighbors[texel, k]
             near = wp.max(wp.dot(direction, cells[cell]) - reach_cosine, 0.0)
             weight = near * near + _NEGLIGIBLE
-            rise = wp.clamp(0.5 + 0.5 * per_radius * wp.dot(normal, cells[cell]), 0.0, 1.0)
-            above = rise * rise * (3.0 - 2.0 * rise) + _NEGLIGIBLE
+            above = wp.smoothstep(-1.0, 1.0, per_radius * wp.dot(normal, cells[cell])) + _NEGLIGIBLE
             total += weight * wp.vec2(wp.min(row[receiver, cell], above), above)
         sums[batch, receiver, i] = total
 

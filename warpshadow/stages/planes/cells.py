@@ -72,15 +72,8 @@ def plane_arrays(planes: PlaneBlockers, radius: float, skip: int | None, *, tile
 
 
 @wp.func
-def step(z: float):
-    """The smoothstep from 0 at −1 to 1 at 1."""
-    u = wp.clamp(0.5 * z + 0.5, 0.0, 1.0)
-    return u * u * (3.0 - 2.0 * u)
-
-
-@wp.func
-def step_slope(z: float):
-    """Its derivative."""
+def smoothstep_slope(z: float):
+    """Derivative of the smoothstep from 0 at −1 to 1 at 1."""
     u = wp.clamp(0.5 * z + 0.5, 0.0, 1.0)
     return 3.0 * u * (1.0 - u)
 
@@ -182,13 +175,13 @@ def front_of_adjoint(
 @wp.func
 def front_weight(grid: PlaneGrid, height: float):
     """Part of the front that a receiver sees; of the back it sees the rest."""
-    return step(1.0 + 2.0 * height / grid.margin)
+    return wp.smoothstep(-1.0, 1.0, 1.0 + 2.0 * height / grid.margin)
 
 
 @wp.func
 def front_weight_slope(grid: PlaneGrid, height: float):
     """Its derivative."""
-    return step_slope(1.0 + 2.0 * height / grid.margin) * 2.0 / grid.margin
+    return smoothstep_slope(1.0 + 2.0 * height / grid.margin) * 2.0 / grid.margin
 
 
 @wp.func
