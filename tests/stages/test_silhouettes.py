@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import warpshadow as ws
-from warpshadow.assets.topology import edge_neighbors
+from warpshadow.maths.adjacency import edge_neighbors
 from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.project import to_clip
 from warpshadow.stages.rasterization import rasterize

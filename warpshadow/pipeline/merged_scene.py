@@ -88,7 +88,7 @@ class MergedScene:
 
     @functools.cached_property
     def edges(self) -> wp.array:
-        """Face across each edge, vec3i of shape [face]: :func:`warpshadow.assets.topology.edge_neighbors`."""
+        """Face across each edge, vec3i of shape [face]: :func:`warpshadow.maths.adjacency.edge_neighbors`."""
         parts = [body.mesh.surface.neighbors for body in self.scene.bodies]
         moved = [
             np.where(part < 0, part, part + first) for part, first in zip(parts, self.first_face[:-1], strict=True)

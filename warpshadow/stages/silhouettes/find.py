@@ -297,7 +297,7 @@ def find_silhouettes(
 
     Args:
         faces: The rasterized faces, vec3i of shape [face].
-        neighbors: :func:`warpshadow.assets.topology.edge_neighbors` of the faces, vec3i of shape [face].
+        neighbors: :func:`warpshadow.maths.adjacency.edge_neighbors` of the faces, vec3i of shape [face].
         clip_positions: Vertices in clip space, vec4 of shape [batch, vertex].
         bodies: Number of each face's body, int32 of shape [face]. Intersections are looked for between different ones;
             without it there are none, and where bodies intersect they have no gradient.
