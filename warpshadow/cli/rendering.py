@@ -15,8 +15,8 @@ import warp as wp
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.picture import SUFFIXES, Picture
 from warpshadow.assets.video import VIDEO_SUFFIXES, check_video, write_video
-from warpshadow.cli import mesh_options
 from warpshadow.cli.console import Device, Quiet, app, check_output, clear_errors, device_of, note
+from warpshadow.cli.mesh_options import MeshOptions, SceneOrMesh, count_of_bounces, load, with_mesh_options
 from warpshadow.scene.scene import Scene
 from warpshadow.scene.visibility import AUTO, METHOD_TRAITS
 
@@ -38,8 +38,9 @@ class _Render(typer.core.TyperCommand):
 
 
 @app.command(cls=_Render)
+@with_mesh_options
 def render(
-    scene: mesh_options.SceneOrMesh,
+    scene: SceneOrMesh,
     output: Annotated[
         Path,
         typer.Option(
@@ -49,11 +50,7 @@ def render(
             "--turntable or --camera-path a video: .mp4, .gif, .webp.",
         ),
     ],
-    up: mesh_options.Up = None,
-    size: mesh_options.Size = None,
-    light: mesh_options.Light = None,
-    direction: mesh_options.Direction = None,
-    light_rotation: mesh_options.LightRotation = None,
+    mesh_options: MeshOptions,
     png: Annotated[
         Optional[Path],
         typer.Option(help="Beside an .exr, also write a picture: .png, or .jpg.", rich_help_panel=_PICTURES),
@@ -129,7 +126,7 @@ def render(
         typer.Option(
             help="How often light bounces, 0 to 16 or all.",
             rich_help_panel=_METHOD,
-            parser=mesh_options.count_of_bounces,
+            parser=count_of_bounces,
             metavar="INTEGER|all",
         ),
     ] = None,
@@ -176,7 +173,7 @@ def render(
             raise ValueError(f"--{error}{others}") from error
         arguments: dict[str, Any] = {"method": method, "samples": samples, "bounces": bounces}
         arguments = {name: value for name, value in arguments.items() if value is not None}
-        parsed = mesh_options.load(scene, is_quiet, up, size, light, direction, light_rotation, **arguments)
+        parsed = load(scene, mesh_options, is_quiet, **arguments)
         where = device_of(device)
         loaded = parsed
         if parsed.visibility.method == AUTO:
