@@ -150,7 +150,7 @@ def test_exposure_and_place_are_found_in_a_photograph(truth, tmp_path, rng):
 
     found = load_fit(tmp_path / "fit.toml").run().found
     ball = found.scene.bodies[BALL]
-    middle = ball.translation + ball.scale * ball.rotation_matrix() @ np.mean(ball.mesh.bounds, axis=0)
+    middle = ball.to_world(np.mean(ball.mesh.bounds, axis=0))
     assert np.linalg.norm(middle - (0, RADIUS, 0)) < 0.02 * 2 * RADIUS
     assert found.exposures[0] == pytest.approx(EXPOSURE, rel=0.03)
 

@@ -221,7 +221,7 @@ def test_a_body_turns_about_its_middle_and_grows_from_there(scene, rotation):
     values["pose[0]"]["log_scale"] += math.log(1.5)
     found = problem.found(values, setting).scene.bodies[BALL]
     middle = setting.middle(BALL)
-    before, after = (body.scale * body.rotation_matrix() @ middle + body.translation for body in (aside, found))
+    before, after = (body.to_world(middle) for body in (aside, found))
     assert np.abs(found.rotation - aside.rotation).max() > 10 and found.scale == pytest.approx(1.2)
     assert np.allclose(after, before, atol=1e-6)
 

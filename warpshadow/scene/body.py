@@ -324,8 +324,15 @@ class Body:
 
     def world_points(self) -> np.ndarray:
         """The vertices that faces refer to, where they are in the world [scene units], float64 of shape [point, 3]."""
-        points = self.mesh.world_points().astype(np.float64)
+        return self.to_world(self.mesh.world_points().astype(np.float64))
+
+    def to_world(self, points: np.ndarray) -> np.ndarray:
+        """Take points of the body's own space to the world, float64 of shape [..., 3]."""
         return self.scale * points @ self.rotation_matrix().T + self.translation
+
+    def from_world(self, points: np.ndarray) -> np.ndarray:
+        """Take points of the world to the body's own space, float64 of shape [..., 3]."""
+        return (points - self.translation) @ self.rotation_matrix() / self.scale
 
     def world_mesh(self) -> Mesh:
         """The mesh in world space."""
