@@ -456,11 +456,9 @@ def test_faces_that_wind_against_their_neighbors_are_turned_over_with_their_uvs(
 
 def test_a_strip_with_one_side_stays_as_it_is():
     angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    supersampling = np.stack(
-        [np.cos(angle / 2) * np.cos(angle), np.sin(angle / 2), np.cos(angle / 2) * np.sin(angle)], -1
-    )
+    half_width = np.stack([np.cos(angle / 2) * np.cos(angle), np.sin(angle / 2), np.cos(angle / 2) * np.sin(angle)], -1)
     middle = 3 * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], -1)
-    positions = np.concatenate([middle - supersampling, middle + supersampling])
+    positions = np.concatenate([middle - half_width, middle + half_width])
     low, high = np.arange(24), np.arange(24) + 24
     next_low, next_high = np.append(low[1:], high[0]), np.append(high[1:], low[0])
     faces = np.concatenate([np.stack([low, next_low, high], -1), np.stack([next_low, next_high, high], -1)])

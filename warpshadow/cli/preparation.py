@@ -115,11 +115,11 @@ def cache(
 
     with clear_errors():
         typer.echo(cache_folder())
-        for kind, what in KINDS.items():
-            remark = cached_files(kind)
-            typer.echo(f"  {what:40}{_size(remark)}")
+        for kind, contents in KINDS.items():
+            files = cached_files(kind)
+            typer.echo(f"  {contents:40}{_size(files)}")
             if clear:
-                for file in remark:
+                for file in files:
                     file.unlink(missing_ok=True)  # another process may clear, too
         wp.init()
         kernels = Path(wp.config.kernel_cache_dir)

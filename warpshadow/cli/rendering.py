@@ -192,14 +192,14 @@ def render(
         renderer = SceneRenderer(loaded, device=where, progress=True)
         image = renderer.render()
         seconds = time.perf_counter() - start
-        messages = f"{loaded.visibility.method}, {image.shape[1]} × {image.shape[0]}, {seconds:.2f} s"
+        summary = f"{loaded.visibility.method}, {image.shape[1]} × {image.shape[0]}, {seconds:.2f} s"
         if output.suffix.lower() == ".exr":
             write_image(output, image, layers=renderer.layers().channels() if layers else None)
-            note(f"{output}: {messages}", is_quiet)
+            note(f"{output}: {summary}", is_quiet)
         for file in (item for item in (output, png) if item is not None and item.suffix.lower() != ".exr"):
             picture = Picture(image, exposure=exposure, tone=tone, background=_behind(loaded, background))
             write_image(file, picture)
-            note(f"{file}: {f'{messages}, ' * (file == output)}exposure {picture.exposure:+.2f} stops", is_quiet)
+            note(f"{file}: {f'{summary}, ' * (file == output)}exposure {picture.exposure:+.2f} stops", is_quiet)
 
 
 def _behind(scene: Scene, background: str) -> str | np.ndarray | None:
