@@ -223,7 +223,7 @@ def test_points_that_are_compared_with_rays_are_on_the_side_that_is_seen():
             sky[16:] = 0.25
             scene, expected = replace(scene, light=ws.EnvironmentMap(sky)), 0.25
         sample = PointSample(scene, count=16, direction_count=1024)
-        for shading in (sample.truth, sample.interpolated_truth, sample.shading(scene)):
+        for shading in (sample.reference, sample.interpolated_reference, sample.shading(scene)):
             assert np.abs(shading - expected).max() < 0.03
 
 

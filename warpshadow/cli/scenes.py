@@ -116,8 +116,8 @@ def tune(
     bounces: Annotated[
         Any,
         typer.Option(
-            help="How often light bounces in the truth, such as 12; then 0 to 4 bounces are tried, which takes some "
-            "five to ten minutes in place of one.",
+            help="How often light bounces in the reference, such as 12; then 0 to 4 bounces are tried, which takes "
+            "some five to ten minutes in place of one.",
             parser=count_of_bounces,
             metavar="INTEGER|all",
         ),

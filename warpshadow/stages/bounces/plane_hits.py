@@ -12,7 +12,7 @@ from warpshadow.stages.planes.cells import (
     fetch_adjoint,
     find_footprint,
     find_footprint_adjoint,
-    find_spot,
+    find_mip_footprint,
     is_covered_by_texels,
     on_side,
     scatter,
@@ -71,11 +71,11 @@ def hit_sides(
             sends = grid.sides == 2 or not side.is_back
             if sends or is_covered_by_texels(grid):
                 first_level = levels_of(grid, side.is_back)
-                spot = find_spot(grid, scene, footprint)
+                mip = find_mip_footprint(grid, scene, footprint)
                 if is_covered_by_texels(grid):
-                    covered = fetch(scene.covered, scene, first_level, spot)[0]
+                    covered = fetch(scene.covered, scene, first_level, mip)[0]
                 if sends:
-                    radiosity = fetch(texels, scene, first_level, spot)
+                    radiosity = fetch(texels, scene, first_level, mip)
             meets = True
             store[cells + 4 * i] = wp.vec3(
                 share * covered, footprint.distance, footprint.distance * scene.radius * footprint.per_cosine
@@ -105,35 +105,35 @@ def hit_sides_adjoint(
             side = load_side(scene, i, store)
             grid = scene.grids[side.f]
             stored = store[cells + 4 * i + 2]
-            spot_place = store[cells + 4 * i + 3]
+            center = store[cells + 4 * i + 3]
             footprint = PlaneFootprint()
             footprint.distance = store[cells + 4 * i][1]
             footprint.per_cosine = stored[2]
-            footprint.center = wp.vec2(spot_place[0], spot_place[1])
+            footprint.center = wp.vec2(center[0], center[1])
             adj_met = adj_store[cells + 4 * i]  # of coverage, distance, and t ρ / c′
             adj_light = adj_store[cells + 4 * i + 1]  # of radiosity
-            adj_spot = wp.vec3()
+            adj_mip = wp.vec3()
             sends = grid.sides == 2 or not side.is_back
             if sends or is_covered_by_texels(grid):
                 first_level = levels_of(grid, side.is_back)
-                spot = find_spot(grid, scene, footprint)
+                mip = find_mip_footprint(grid, scene, footprint)
                 if is_covered_by_texels(grid):
                     adj_covered = wp.vec3(adj_met[0] * stored[0], 0.0, 0.0)
-                    adj_spot += fetch_adjoint(scene.covered, grid, scene, first_level, footprint, spot, adj_covered)
+                    adj_mip += fetch_adjoint(scene.covered, grid, scene, first_level, footprint, mip, adj_covered)
                 if sends:
-                    adj_spot += fetch_adjoint(texels, grid, scene, first_level, footprint, spot, adj_light)
+                    adj_mip += fetch_adjoint(texels, grid, scene, first_level, footprint, mip, adj_light)
                     if adj_texels:
-                        scatter(adj_texels[instance], scene, first_level, spot, adj_light)
+                        scatter(adj_texels[instance], scene, first_level, mip, adj_light)
             # a footprint is as wide as t / √c′
             adj_distance = adj_met[1] + adj_met[2] * scene.radius * footprint.per_cosine
             adj_cosine = -footprint.per_cosine * (
-                adj_met[2] * scene.radius * footprint.distance * footprint.per_cosine + 0.5 * adj_spot[2]
+                adj_met[2] * scene.radius * footprint.distance * footprint.per_cosine + 0.5 * adj_mip[2]
             )
-            if adj_spot[2] != 0.0:
-                adj_distance += adj_spot[2] / footprint.distance
+            if adj_mip[2] != 0.0:
+                adj_distance += adj_mip[2] / footprint.distance
             place = load_place(store, side.f)
             toward = toward_side(place, side.is_back, cell.direction)
-            adj_center = wp.vec2(adj_spot[0], adj_spot[1])
+            adj_center = wp.vec2(adj_mip[0], adj_mip[1])
             adj_at, adj_toward = find_footprint_adjoint(scene, toward, footprint, adj_distance, adj_cosine, adj_center)
             adj_place = load_place(adj_store, side.f)
             adj_place = side_adjoint(grid, place, side.is_back, cell.direction, adj_at, adj_toward, adj_place)

@@ -28,7 +28,7 @@ from warpshadow.stages.planes.cells import (
     fetch_adjoint,
     find_footprint,
     find_footprint_adjoint,
-    find_spot,
+    find_mip_footprint,
     is_covered_by_texels,
     on_side,
     plane_arrays,
@@ -79,8 +79,8 @@ def side_coverage(
     if is_covered_by_texels(grid) and covered.outline > 0.0:
         toward = toward_side(place, side.is_back, cell.direction)
         covered.footprint = find_footprint(scene, on_side(grid, place, side.is_back), toward)
-        spot = find_spot(grid, scene, covered.footprint)
-        covered.part = fetch(scene.covered, scene, grid.first_level, spot)[0]
+        mip = find_mip_footprint(grid, scene, covered.footprint)
+        covered.part = fetch(scene.covered, scene, grid.first_level, mip)[0]
     return covered
 
 
@@ -106,18 +106,18 @@ def side_coverage_adjoint(
         toward = toward_side(place, side.is_back, cell.direction)
         footprint = covered.footprint
         adj_part = wp.vec3(adj * covered.outline, 0.0, 0.0)
-        spot = find_spot(grid, scene, footprint)
-        adj_spot = fetch_adjoint(scene.covered, grid, scene, grid.first_level, footprint, spot, adj_part)
+        mip = find_mip_footprint(grid, scene, footprint)
+        adj_mip = fetch_adjoint(scene.covered, grid, scene, grid.first_level, footprint, mip, adj_part)
         adj_distance = float(0.0)
-        if adj_spot[2] != 0.0:  # a footprint is as wide as t / √c′
-            adj_distance = adj_spot[2] / footprint.distance
+        if adj_mip[2] != 0.0:  # a footprint is as wide as t / √c′
+            adj_distance = adj_mip[2] / footprint.distance
         adj_at, adj_toward = find_footprint_adjoint(
             scene,
             toward,
             footprint,
             adj_distance,
-            -0.5 * footprint.per_cosine * adj_spot[2],
-            wp.vec2(adj_spot[0], adj_spot[1]),
+            -0.5 * footprint.per_cosine * adj_mip[2],
+            wp.vec2(adj_mip[0], adj_mip[1]),
         )
         adj_place = load_place(adj_store, side.f)
         adj_place = side_adjoint(grid, place, side.is_back, cell.direction, adj_at, adj_toward, adj_place)
