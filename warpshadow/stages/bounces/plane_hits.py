@@ -10,18 +10,21 @@ from warpshadow.stages.planes.cells import (
     PlaneFootprint,
     fetch,
     fetch_adjoint,
-    find_footprint,
-    find_footprint_adjoint,
     find_mip_footprint,
     is_covered_by_texels,
-    on_side,
     scatter,
-    side_adjoint,
     smoothstep_slope,
-    toward_side,
 )
 from warpshadow.stages.planes.prepared import PlaneGrid
-from warpshadow.stages.planes.sides import SIDE_ROWS, VisibleCell, load_place, load_side, plane_share, store_place
+from warpshadow.stages.planes.sides import (
+    SIDE_ROWS,
+    VisibleCell,
+    footprint_on_side,
+    footprint_on_side_adjoint,
+    load_place,
+    load_side,
+    plane_share,
+)
 
 _MIN_WEIGHT_SUM = wp.constant(1.0e-30)  # the least Σ s
 
@@ -63,9 +66,7 @@ def hit_sides(
         share = plane_share(scene, grid, side, place, cell, edges)
         store[cells + 4 * i] = wp.vec3()
         if share > 0.0:
-            footprint = find_footprint(
-                scene, on_side(grid, place, side.is_back), toward_side(place, side.is_back, cell.direction)
-            )
+            footprint = footprint_on_side(scene, grid, side, place, cell.direction)
             covered = float(1.0)
             radiosity = wp.vec3()
             sends = grid.sides == 2 or not side.is_back
@@ -124,20 +125,10 @@ def hit_sides_adjoint(
                     adj_mip += fetch_adjoint(texels, grid, scene, first_level, footprint, mip, adj_light)
                     if adj_texels:
                         scatter(adj_texels[instance], scene, first_level, mip, adj_light)
-            # a footprint is as wide as t / √c′
-            adj_distance = adj_met[1] + adj_met[2] * scene.radius * footprint.per_cosine
-            adj_cosine = -footprint.per_cosine * (
-                adj_met[2] * scene.radius * footprint.distance * footprint.per_cosine + 0.5 * adj_mip[2]
-            )
-            if adj_mip[2] != 0.0:
-                adj_distance += adj_mip[2] / footprint.distance
             place = load_place(store, side.f)
-            toward = toward_side(place, side.is_back, cell.direction)
-            adj_center = wp.vec2(adj_mip[0], adj_mip[1])
-            adj_at, adj_toward = find_footprint_adjoint(scene, toward, footprint, adj_distance, adj_cosine, adj_center)
-            adj_place = load_place(adj_store, side.f)
-            adj_place = side_adjoint(grid, place, side.is_back, cell.direction, adj_at, adj_toward, adj_place)
-            store_place(adj_store, side.f, adj_place)
+            footprint_on_side_adjoint(
+                scene, grid, side, place, cell.direction, footprint, adj_mip, adj_met[1], adj_met[2], adj_store
+            )
             adj_share = adj_met[0] * stored[1]
             weighted = adj_share * side.weight
             coverage_adjoint(edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, weighted)

@@ -7,13 +7,17 @@ from warpshadow.device.parallel import Scratch, scratch_place, split_row
 from warpshadow.stages.cell_coverage import ViewedEdge, convex_coverage, outline_coverage, viewed_edge
 from warpshadow.stages.planes.cells import (
     PlaneArrays,
+    PlaneFootprint,
     ReceiverInPlane,
+    find_footprint,
+    find_footprint_adjoint,
     find_in_plane,
     find_in_plane_adjoint,
     front_of,
     front_of_adjoint,
     on_side,
     side_adjoint,
+    toward_side,
 )
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 
@@ -245,6 +249,41 @@ def visible_cell(scene: PlaneArrays, normal: wp.vec3, direction: wp.vec3):
         cell.direction = wp.normalize(direction + (0.5 * (scene.radius - cosine)) * (normal - cosine * direction))
         cell.radius = 0.5 * (scene.radius + cosine)
     return cell
+
+
+@wp.func
+def footprint_on_side(scene: PlaneArrays, grid: PlaneGrid, side: PlaneSide, place: ReceiverInPlane, direction: wp.vec3):
+    """Find the footprint of a cell on a side."""
+    return find_footprint(scene, on_side(grid, place, side.is_back), toward_side(place, side.is_back, direction))
+
+
+@wp.func
+def footprint_on_side_adjoint(
+    scene: PlaneArrays,
+    grid: PlaneGrid,
+    side: PlaneSide,
+    place: ReceiverInPlane,
+    direction: wp.vec3,
+    footprint: PlaneFootprint,
+    adj_mip: wp.vec3,
+    adj_distance: float,
+    adj_radius: float,
+    adj_store: wp.array(dtype=wp.vec3),
+):
+    """Add to the gradients of the receiver relative to the plane.
+
+    Given are those of :func:`.cells.fetch`, of the distance t, and of the radius t ρ / c′ of the footprint.
+    """
+    adj_cosine = -footprint.per_cosine * (
+        adj_radius * scene.radius * footprint.distance * footprint.per_cosine + 0.5 * adj_mip[2]
+    )
+    adj_t = adj_distance + adj_radius * scene.radius * footprint.per_cosine
+    if adj_mip[2] != 0.0:  # texels are as wide as t / √c′
+        adj_t += adj_mip[2] / footprint.distance
+    toward, adj_center = toward_side(place, side.is_back, direction), wp.vec2(adj_mip[0], adj_mip[1])
+    adj_at, adj_toward = find_footprint_adjoint(scene, toward, footprint, adj_t, adj_cosine, adj_center)
+    adj_place = load_place(adj_store, side.f)
+    store_place(adj_store, side.f, side_adjoint(grid, place, side.is_back, direction, adj_at, adj_toward, adj_place))
 
 
 @wp.func

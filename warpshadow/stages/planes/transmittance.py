@@ -26,27 +26,23 @@ from warpshadow.stages.planes.cells import (
     check_planes,
     fetch,
     fetch_adjoint,
-    find_footprint,
-    find_footprint_adjoint,
     find_mip_footprint,
     is_covered_by_texels,
-    on_side,
     plane_arrays,
-    side_adjoint,
-    toward_side,
 )
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 from warpshadow.stages.planes.sides import (
     SIDE_ROWS,
     PlaneSide,
     VisibleCell,
+    footprint_on_side,
+    footprint_on_side_adjoint,
     load_place,
     load_side,
     place_receiver,
     place_receiver_adjoint,
     plane_share,
     receiver_scratch,
-    store_place,
     visible_cell,
 )
 
@@ -77,8 +73,7 @@ def side_coverage(
     covered.part = 1.0
     covered.outline = plane_share(scene, grid, side, place, cell, edges)
     if is_covered_by_texels(grid) and covered.outline > 0.0:
-        toward = toward_side(place, side.is_back, cell.direction)
-        covered.footprint = find_footprint(scene, on_side(grid, place, side.is_back), toward)
+        covered.footprint = footprint_on_side(scene, grid, side, place, cell.direction)
         mip = find_mip_footprint(grid, scene, covered.footprint)
         covered.part = fetch(scene.covered, scene, grid.first_level, mip)[0]
     return covered
@@ -103,25 +98,11 @@ def side_coverage_adjoint(
         adj_weight = adj * covered.part * covered.outline / side.weight
         adj_store[side.row] = adj_store[side.row] + wp.vec3(0.0, 0.0, adj_weight)
     if is_covered_by_texels(grid) and covered.outline > 0.0:
-        toward = toward_side(place, side.is_back, cell.direction)
         footprint = covered.footprint
         adj_part = wp.vec3(adj * covered.outline, 0.0, 0.0)
         mip = find_mip_footprint(grid, scene, footprint)
         adj_mip = fetch_adjoint(scene.covered, grid, scene, grid.first_level, footprint, mip, adj_part)
-        adj_distance = float(0.0)
-        if adj_mip[2] != 0.0:  # a footprint is as wide as t / √c′
-            adj_distance = adj_mip[2] / footprint.distance
-        adj_at, adj_toward = find_footprint_adjoint(
-            scene,
-            toward,
-            footprint,
-            adj_distance,
-            -0.5 * footprint.per_cosine * adj_mip[2],
-            wp.vec2(adj_mip[0], adj_mip[1]),
-        )
-        adj_place = load_place(adj_store, side.f)
-        adj_place = side_adjoint(grid, place, side.is_back, cell.direction, adj_at, adj_toward, adj_place)
-        store_place(adj_store, side.f, adj_place)
+        footprint_on_side_adjoint(scene, grid, side, place, cell.direction, footprint, adj_mip, 0.0, 0.0, adj_store)
     weighted = adj * side.weight * covered.part
     coverage_adjoint(edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, weighted)
 
