@@ -37,7 +37,7 @@ class _Nothing:
         return "nothing"
 
 
-NOTHING = _Nothing()  # stands for a missing argument, so that its check says what is expected
+NOTHING = _Nothing()  # a missing argument, so that its check names the accepted values
 
 
 def choice(name: str, value: object, choices: Iterable[object]) -> None:
@@ -60,10 +60,10 @@ def known_keys(where: str, keys: Iterable[str], known: Iterable[str]) -> None:
 
 
 def keywords(**instead: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Make the TypeError of a function for an unknown, missing or superfluous argument say what to write.
+    """Make the TypeError of a function for an unknown, missing or superfluous argument name the remedy.
 
     Args:
-        instead: What to write in place of keywords that are likely mistakes, other keywords are compared with the
+        instead: Remedies for keywords that are likely mistakes, other keywords are compared with the
             arguments' names; and for arguments that are missing.
     """
 

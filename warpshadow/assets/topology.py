@@ -106,7 +106,7 @@ def rounds_edges(surface: MeshTopology, positions: np.ndarray) -> bool:
     """Whether many sharp edges have faces that share vertices, and so normals.
 
     Those of a piece are many if edges of more than 50° are longer in all than the diagonal of its bounds, and ten times
-    as long as those of 20° to 50°. In organic meshes, where angles of all sizes occur, they are at most 2.6 times as
+    as long as edges of 20° to 50°. In organic meshes, where angles of all sizes occur, they are at most 2.6 times as
     long (bunny, cow, monkey, man). In voxels, whose steps normals round on purpose, they are longer than 25 diagonals.
     Such pieces, as many boxes are, have most of the sharp edges, longer in all than the diagonal of the mesh.
     """
@@ -136,7 +136,7 @@ def rounds_edges(surface: MeshTopology, positions: np.ndarray) -> bool:
 def draws_lines(surface: MeshTopology, positions: np.ndarray) -> bool:
     """Whether lines run over a smooth surface: faces at edges that bend by 1° to 30° have vertices of their own.
 
-    Not where those at most such edges have: then the mesh is faceted on purpose.
+    Not where most such edges do: then the mesh is faceted on purpose.
     """
     return 0 < _parted_share(surface, positions, 1.0, CREASE) <= 0.5
 
@@ -213,8 +213,8 @@ class MeshTopology(NamedTuple):
     neighbors: np.ndarray
     """Face across each edge, :func:`edge_neighbors` of vertices by their places, int32 of shape [face, 3]."""
     is_closed: bool
-    """Whether no face shows its back to those outside: two or more share each edge, half of them run along it either
-    way, and pieces look outward.
+    """Whether no face shows its back to an outside viewer: two or more share each edge, half of them run along it
+    either way, and pieces look outward.
 
     A shell that is hollow inside does not count as closed: it costs a launch more, and gets the same image.
     """

@@ -129,8 +129,8 @@ class NormalMatrix:
     def _directions(self) -> np.ndarray:
         """Directions in which the numbers may move, [number, direction].
 
-        Of the numbers of a quaternion or of two columns those that turn the body by a radian about each axis, and none
-        along which they change and it does not, such as a quaternion's length.
+        Of the numbers of a quaternion or of two columns the changes that turn the body by a radian about each axis, and
+        none along which they change and it does not, such as a quaternion's length.
         """
         directions = np.eye(len(self.places))
         for free in self.problem.free:
@@ -180,7 +180,7 @@ class NormalMatrix:
     def _residuals(self) -> np.ndarray:
         """Differences, weighted so that their squares have the loss's gradient, [view, height, width, channel].
 
-        The weights of reweighted least squares are those at the first call: at the result.
+        The weights of reweighted least squares are the first call's: at the result.
         """
         model, loss = self.model, self.problem.loss
         world = model.world(self.values)

@@ -8,7 +8,7 @@ _NOT_MANIFOLD = -2
 
 
 def edges_of(triangles: np.ndarray) -> np.ndarray:
-    """Edges of triangles, those from each first corner first, shape [3 triangle, 2]."""
+    """Edges of triangles, all from first corners first, shape [3 triangle, 2]."""
     return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
 
 

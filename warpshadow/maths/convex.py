@@ -44,7 +44,7 @@ def find_convex_parts(positions: np.ndarray, faces: np.ndarray) -> list[ConvexPa
     """Find the convex parts of which a mesh consists.
 
     Args:
-        positions: Vertices, shape [vertex, 3]; those at one place count as one.
+        positions: Vertices, shape [vertex, 3]; vertices at one place count as one.
         faces: Triangles that wind alike, shape [face, 3].
 
     Returns:
@@ -211,7 +211,7 @@ def _prisms_along(
 
 
 def _prism(top: np.ndarray, bottom: np.ndarray) -> ConvexPart:
-    """A prism, given the corners of its top, counterclockwise from above, and those below them."""
+    """A prism, given the corners of its top, counterclockwise from above, and the corners below them."""
     count = len(top)
     begin, third = np.arange(count), count // 3
     end = np.roll(begin, -1)
@@ -231,5 +231,5 @@ def _bulge(points: np.ndarray, begin: np.ndarray, end: np.ndarray) -> float:
 
 
 def _renumbered(edges: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Edges whose corners are numbers among those in use."""
+    """Edges whose corners are numbers among the used ones."""
     return np.concatenate([np.searchsorted(used, edges[:, :2]), edges[:, 2:]], axis=1)

@@ -38,7 +38,7 @@ def find_panels(points: np.ndarray, triangles: np.ndarray, tolerance: float, max
 
     Args:
         points: Vertices, float64 of shape [vertex, 3].
-        triangles: Triangles, shape [triangle, 3]; those without area do not count.
+        triangles: Triangles, shape [triangle, 3]; slivers without area do not count.
         tolerance: Thickness and mean gap of a panel at most [units of points].
         maximum: Number of panels at most.
 
@@ -131,7 +131,7 @@ def _joined(points: np.ndarray, regions: list[np.ndarray], tolerance: float) -> 
 
 
 def _outline(points: np.ndarray, region: np.ndarray, tolerance: float) -> np.ndarray:
-    """Corners around a region, but for those that stand out by less than the tolerance."""
+    """Corners around a region, but for corners that stand out by less than the tolerance."""
     from scipy.spatial import ConvexHull
 
     used = np.unique(region)

@@ -231,7 +231,7 @@ class MergedScene:
         Differentiable: poses, rest, pivot.
         """
         rest = self.rest if rest is None else as_geometry("rest", rest)
-        if poses is None:  # the scene's stand where they do, whatever they turn about
+        if poses is None:  # the scene's poses are the same for any pivot
             poses, pivot = self.poses, None
         check.shape("poses", poses.scales.shape, ("batch", len(self.scene.bodies)))
         if pivot is not None:

@@ -460,7 +460,7 @@ class SceneRenderer:
         geometry: Geometry[wp.array] | None = None,
         clip_matrices: wp.array | None = None,
     ) -> Explanation:
-        """List the stages that the next call computes, those it skips, and why.
+        """List the stages that the next call computes and skips, and why.
 
         Args:
             light, albedo, textures, gloss: As for :meth:`draw`.

@@ -8,7 +8,7 @@ s₁ within the disc, are
     d = m·ω / √(1 − (m·ω)²),  m = n / |n|,  s = (a − x)·t / (a − x)·ω,  t = ω × m / |ω × m|
 
 and the area of the disc inside the outline is that of the whole disc, as often as the outline winds around ω, and a
-term for each edge that crosses the disc, what lies between the edge and the disc's border:
+term for each edge that crosses the disc, the area between the edge and the disc's border:
 
     π ρ² h = π ρ² w + ½ Σ_edges d (s₁ − s₀) − ρ² sign(d) atan2(|d| (s₁ − s₀), d² + s₀ s₁)
 

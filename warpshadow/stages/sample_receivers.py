@@ -287,7 +287,7 @@ def _find_means(
                 count += 1
         mean = total / float(count)
         if points:
-            # the mean point of all faces that share, or what is nearest to it on one of them
+            # the mean point of all faces that share, or the point nearest to it on one of them
             middle = wp.vec3()
             shared = int(0)
             for i in range(supersampling * supersampling):

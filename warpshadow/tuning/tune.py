@@ -99,7 +99,7 @@ class Tuning:
     def __str__(self) -> str:
         """The table, the units of its errors and times, and the meaning of its marks."""
         camera, samples = self.given.camera, self.given.supersampling
-        sampled = f"; but for those marked *, shadows timed on {TIMED_RECEIVERS} of its receivers, extrapolated to all"
+        sampled = f"; but for times marked *, shadows timed on {TIMED_RECEIVERS} of its receivers, extrapolated to all"
         sampled *= not any(trial.scene.bounces for trial in self.trials)
         mark = "chosen" if self.is_reached else "nearest"
         return (

@@ -91,7 +91,7 @@ class ViewerApp:
         return replace(viewer_state, method="ray-traced", sampling="shared") if by_rays else viewer_state
 
     def _note(self, text: str) -> None:
-        """Say on all pages what is being prepared; paint again when all is."""
+        """Name on all pages the work under way; paint again when all is done."""
         for page in list(self._pages.values()):
             page.note(f"by rays until all is prepared: {text}" if text else "")
         if not text:
@@ -180,7 +180,7 @@ class _ViserPage:
             self._write(f'<b style="color:#f66">{html.escape(self._message)}</b>' if message else "")
 
     def note(self, text: str) -> None:
-        """Show what is being prepared; empty where nothing is."""
+        """Show the work under way; empty for none."""
         self._prepared = text
         self._write(self._content)
 

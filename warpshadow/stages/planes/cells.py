@@ -60,7 +60,7 @@ def check_planes(
 def plane_arrays(planes: PlaneBlockers, radius: float, skip: int | None, *, tiles: bool = True) -> PlaneArrays:
     """Plane blockers as seen in cells of a radius [rad] by receivers that are part of one, or of none.
 
-    Where cells do not tile the sphere, as those of a sun alone, texels are half as wide.
+    Where cells do not tile the sphere, as a sun's alone, texels are half as wide.
     """
     scene = PlaneArrays()
     scene.grids, scene.levels, scene.level_scales = planes.grids, planes.levels, planes.level_scales

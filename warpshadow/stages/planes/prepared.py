@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 MAX_EDGES = 128
 """Edges of an outline at most: beyond, it is that of the rectangle, of which the mesh takes its share by texels."""
 
-_BESIDE = 0.002  # how much texels count in those beside them, which have it if nothing of their own is seen
+_BESIDE = 0.002  # how much texels count in their neighbors, which have their light if nothing of their own is seen
 _MARGIN = 0.001  # margin of planes, in widths of the smallest texel
 
 

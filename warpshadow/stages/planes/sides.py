@@ -51,7 +51,7 @@ class PlaneSide:
 
 @wp.func
 def load_side(scene: PlaneArrays, i: int, store: wp.array(dtype=wp.vec3)):
-    """Side i of those that a receiver sees."""
+    """Load side i of the sides that a receiver sees."""
     side = PlaneSide()
     side.row = 4 * scene.grids.shape[0] + i
     stored = store[side.row]
@@ -95,7 +95,7 @@ def _view_outline(
 ):
     """Store the outline of a plane as a receiver over one side sees it; n = ±(a − x) × (b − a) / |b − a|.
 
-    Edges run so that the mesh is to their left as the receiver sees it: those of the front from b to a.
+    Edges run so that the mesh is to their left as the receiver sees it: the front's from b to a.
     """
     at = on_side(grid, place, side.is_back)
     foot = at[2] * _down(place, side) - at[0] * place.along_u - at[1] * place.along_v
@@ -272,7 +272,7 @@ def footprint_on_side_adjoint(
 ):
     """Add to the gradients of the receiver relative to the plane.
 
-    Given are those of :func:`.cells.fetch`, of the distance t, and of the radius t ρ / c′ of the footprint.
+    Given are the gradients of :func:`.cells.fetch`, of the distance t, and of the radius t ρ / c′ of the footprint.
     """
     adj_cosine = -footprint.per_cosine * (
         adj_radius * scene.radius * footprint.distance * footprint.per_cosine + 0.5 * adj_mip[2]

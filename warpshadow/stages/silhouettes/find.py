@@ -232,7 +232,7 @@ def _count_entries(
     entries: wp.array(dtype=wp.int32),
     counts: wp.array(dtype=wp.int32),
 ):
-    """A thread owns ``run`` samples after one another: the number of each among those that have an entry, else −1."""
+    """A thread owns ``run`` samples after one another: the number of each among samples that have an entry, else −1."""
     thread = first_row + wp.tid()
     count = int(0)
     for sample in range(thread * run, wp.min((thread + 1) * run, entries.shape[0])):
@@ -259,7 +259,7 @@ def _make_entries(
     edges: wp.array2d(dtype=wp.vec2i),
     entries: wp.array(dtype=wp.int32),
 ):
-    """A thread owns ``run`` samples after one another, whose entries begin where those of the run before end.
+    """A thread owns ``run`` samples after one another, whose entries begin where the run before ends.
 
     If that is not known, the number of the sample is the number of its entry.
     """
