@@ -59,7 +59,7 @@ class Chord:
     distance: float  # d, of the line from the middle of the cell
     begin: float  # s₀
     end: float  # s₁
-    along: wp.vec3  # t
+    tangent: wp.vec3  # t
     scale: float  # 1/√(1 − (m·ω)²), of the angle between ω and the normal
 
 
@@ -86,9 +86,9 @@ def _find_chord(edges: wp.array(dtype=ViewedEdge), e: int, cosine: float, direct
     b = edges[e].end
     if half2 > 0.0 and (wp.dot(a, direction) > 0.0 or wp.dot(b, direction) > 0.0):
         half = wp.sqrt(half2)
-        chord.along = chord.scale * wp.cross(direction, edges[e].normal)
-        chord.begin = _along_line(b, chord.along, direction, half, -half)
-        chord.end = _along_line(a, chord.along, direction, half, half)
+        chord.tangent = chord.scale * wp.cross(direction, edges[e].normal)
+        chord.begin = _along_line(b, chord.tangent, direction, half, -half)
+        chord.end = _along_line(a, chord.tangent, direction, half, half)
     return chord
 
 
@@ -176,6 +176,6 @@ def coverage_adjoint(
             chord = _find_chord(edges, e, cosine, direction, radius)
             if chord.end > chord.begin:
                 foot = direction - (chord.distance * chord.scale) * (normal - cosine * direction)
-                middle = foot + 0.5 * (chord.begin + chord.end) * chord.along
+                middle = foot + 0.5 * (chord.begin + chord.end) * chord.tangent
                 scale = adj * chord.scale * (chord.end - chord.begin) / (wp.pi * radius * radius)
                 edges[e].adj_normal = edges[e].adj_normal + scale * middle

@@ -29,7 +29,7 @@ from warpshadow.stages.planes.sides import (
 _MIN_WEIGHT_SUM = wp.constant(1.0e-30)  # the least Σ s
 
 
-# Scratch of a receiver, vec3, follows that of its sides. The hit of a cell on each of these, from ``6 flat_count`` on:
+# Scratch of a receiver, vec3, follows that of its sides. The hit of a cell on each of these, from ``6 plane_count`` on:
 #     4 i        coverage, distance, and how much that varies over the cell
 #     4 i + 1    radiosity
 #     4 i + 2    coverage of the outline, the mesh's share of that by texels, and 1 / c′

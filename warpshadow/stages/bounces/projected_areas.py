@@ -82,8 +82,8 @@ def _turn_from_planes(
                 x = wp.dot(offset, u) / wp.length(u)
                 y = wp.dot(offset, v) / wp.length(v)
                 # the plane's units are its scale in the scene's
-                within = _part_within(x, grid.least[0] * wp.length(u), grid.most[0] * wp.length(u), radius)
-                within *= _part_within(y, grid.least[1] * wp.length(v), grid.most[1] * wp.length(v), radius)
+                within = _part_within(x, grid.minimum[0] * wp.length(u), grid.maximum[0] * wp.length(u), radius)
+                within *= _part_within(y, grid.minimum[1] * wp.length(v), grid.maximum[1] * wp.length(v), radius)
                 result += within / (1.0 + height * height) * away * up
     turned[batch, source] = result
 

@@ -24,7 +24,7 @@ from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 # Scratch of a receiver, vec3. Its position relative to each plane f, whose gradients have the same places:
 #     4 f        where it is along both axes, and its height
 #     4 f + 1    the axis u, of unit length; 4 f + 2 the axis v, and 4 f + 3 the normal
-# Sides i that it may meet, from ``4 flat_count`` on:
+# Sides i that it may meet, from ``4 plane_count`` on:
 #     i          the plane, 1 for its back, and which part of the side is there
 SIDE_ROWS = wp.constant(6)
 """Rows of scratch for each plane."""

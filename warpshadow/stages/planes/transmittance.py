@@ -283,7 +283,7 @@ def plane_coverage(
             [batch, receiver, plane]; by default their heights decide.
         skip: Number of the plane that the receivers are part of, which blocks none of their light; None for none.
     Returns:
-        Float32 of shape [batch, receiver, direction], 1 or more where nothing passes; None where no flat casts a
+        Float32 of shape [batch, receiver, direction], 1 or more where nothing passes; None where no plane casts a
         shadow on them.
     Differentiable: points, frames, fronts. Not: horizon_normals, which decide by steps,
     and how much receivers in a plane see of a cell.
