@@ -175,7 +175,7 @@ class Body:
 
     @property
     def blocks_as_parts(self) -> bool:
-        """Whether a method that knows convex parts takes these as blockers of others' light."""
+        """Whether a method that knows convex parts takes these for what blocks the light of others."""
         return isinstance(self.blockers, str) and bool(self.mesh.convex_parts)
 
     @property

@@ -13,7 +13,6 @@ import warp as wp
 
 from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.topology import welded
-from warpshadow.maths.adjacency import edges_of
 from warpshadow.stages.ray_tracing import trace_visibility
 
 DEPTH = 1 / 16
@@ -92,7 +91,7 @@ def _closed(mesh: Mesh, front: tuple[float, float, float]) -> Mesh:
     heights = points.astype(np.float64) @ axis
     level = heights.min() - DEPTH * np.ptp(points, axis=0).max()
     bottom = points - np.outer(heights - level, axis)
-    edges = edges_of(faces)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     places, codes = len(points), edges @ [len(points), 1]
     rim = edges[~np.isin(codes, edges @ [1, len(points)])]
     a, b = rim.T
