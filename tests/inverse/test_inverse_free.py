@@ -37,6 +37,8 @@ DIFFERENCE = 5e-3
 BALL, GROUND = 0, 1
 VIEWS = 2
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 
 def lump() -> ws.Body:
     """A body whose outline and shadow show how it is turned; no part of its pose is trivial."""
@@ -58,15 +60,6 @@ def lump() -> ws.Body:
 def camera(view: int = 0) -> ws.Camera:
     eye = (0, 3, 4.5) if view == 0 else (2.5, 3, 3.5)
     return ws.Camera.look_at(eye, (0, 0.4, 0), size=(32, 24))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Tensors this small gain nothing from threads, which wait for each other where cores are shared."""
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(count)
 
 
 @pytest.fixture(scope="module")

@@ -37,16 +37,7 @@ RAY_NOISE = 0.02
 
 UNIT_SPHERE = ws.Spheres([[0, 0, 0]], [1.0])
 
-pytestmark = pytest.mark.usefixtures("poisoned_outputs")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Tensors this small gain nothing from threads, which wait for each other where cores are shared."""
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(count)
+pytestmark = pytest.mark.usefixtures("one_thread", "poisoned_outputs")
 
 
 def scene_of(method: str = "directional", *, still_blocks: bool = True, size: int = 24, **options) -> ws.Scene:

@@ -33,16 +33,7 @@ SMOOTH = 1e-2
 # Differences of points of faces that are as large as samples, against mean slopes over samples; measured 2.0e-2.
 SLOPES = 4e-2
 
-pytestmark = pytest.mark.usefixtures("poisoned_outputs")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Tensors this small gain nothing from threads, which wait for each other where cores are shared."""
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(count)
+pytestmark = pytest.mark.usefixtures("one_thread", "poisoned_outputs")
 
 
 # ---------------------------------------------------------------------------------------------- scenes
