@@ -42,8 +42,6 @@ def write_result(result: Result, folder: AnyPath) -> list[Path]:
 class Report:
     """The result of a fit beside its start, at the targets' own size and the scene's own softness.
 
-    Args:
-        result: The result.
     Attributes:
         before, after: Images of the views, [view, height, width, 4].
         loss_before, loss_after: With regularizers.

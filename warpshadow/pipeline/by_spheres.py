@@ -219,7 +219,6 @@ class PortionedShading(Node):
     So without a gradient transfer vectors of all receivers are in memory at once only where light is free.
 
     Args:
-        method: The method.
         points: The receivers.
         projected_light: The light projected for the method.
         light: Known or free light; None where it is not given yet: portions end with transfer vectors.

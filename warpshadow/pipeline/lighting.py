@@ -187,7 +187,6 @@ class Method:
         """Choose the kind of blocker that each body of a geometry is; the scene's geometry by default.
 
         Args:
-            geometry: The geometry.
             rotations: Of its bodies; None where nobody knows on which body a receiver is.
         """
         return ONLY_SPHERES

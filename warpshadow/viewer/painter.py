@@ -88,7 +88,6 @@ class Painter:
         Args:
             viewer_state: The viewer state.
             page: From where.
-            quality: Its quality.
             depth: Whether distances are asked for, too.
         """
         start = time.perf_counter()
