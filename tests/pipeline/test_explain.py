@@ -645,7 +645,7 @@ def test_rays_are_traced_once(monkeypatch):
 def test_the_explanation_is_a_table_of_stages_with_times_and_reasons():
     renderer = SceneRenderer(scene_of())
     call, variables, explain = texture_fit(renderer)
-    assert "nothing is kept yet" in str(explain())
+    assert "nothing is cached yet" in str(explain())
     with wp.Tape() as tape:
         image = call()
     tape.backward(grads={image: wp.full(image.shape, wp.vec4(1.0), dtype=wp.vec4)})

@@ -27,7 +27,7 @@ def spheres(
     device: Device = "cpu",
     is_quiet: Quiet = False,
 ) -> None:
-    """Fit spheres to a mesh and report how well they stand in for it; the fit is kept for later renders."""
+    """Fit spheres to a mesh and report how well they stand in for it; the fit is cached for later renders."""
     from warpshadow.assets.mesh_files import load_mesh
     from warpshadow.spheres import check_matplotlib, fit_spheres, plot_spheres
 
@@ -110,7 +110,7 @@ def cache(
     ] = False,
     is_quiet: Quiet = False,
 ) -> None:
-    """Print where spheres, shadows and kernels are kept, and how large that is."""
+    """Print where spheres, shadows and kernels are cached, and how large that is."""
     from warpshadow.assets.cache import KINDS, cache_folder, cached_files
 
     with clear_errors():

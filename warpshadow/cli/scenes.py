@@ -123,7 +123,7 @@ def tune(
         ),
     ] = None,
     fit: Annotated[
-        bool, typer.Option(help="Also fit 16 to 512 spheres a body, some 20 s in all; they are kept for later.")
+        bool, typer.Option(help="Also fit 16 to 512 spheres a body, some 20 s in all; they are cached for later.")
     ] = False,
     mesh_options: MeshOptions = NO_OPTIONS,
     device: Device = "cpu",

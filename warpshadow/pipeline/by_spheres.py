@@ -402,7 +402,7 @@ def _static_shadows(method: SphereMethod, points: LitPoints, light: Input | None
     static = points.static
     if static is None or not static.spheres[1].shape[1]:
         bouncing = bool(method.merged_scene.scene.bounces)
-        why = "light bounces: nothing of static bodies is kept" if bouncing else "no static body has blockers"
+        why = "light bounces: nothing of static bodies is cached" if bouncing else "no static body has blockers"
         return Node("static shadows", None, idle=why)
     rows = method.cached_rows(static, light, points.blocker_kinds)
 

@@ -346,7 +346,7 @@ class View(LitPoints):
         count, static = int(self.merged_scene.first_vertex[-1]), 0
         if self.static is not None:
             static = int(self.static.has_vertex.sum())
-        return f"{count - static:,} vertices, {static:,} kept" if static else f"{count:,} vertices"
+        return f"{count - static:,} vertices, {static:,} cached" if static else f"{count:,} vertices"
 
     def emptiness(self) -> str | None:
         """Say of the first image that shows nothing of the scene why; None if there is none."""

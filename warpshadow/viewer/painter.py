@@ -30,7 +30,7 @@ from warpshadow.viewer.state import ERROR, ViewerState
 
 _BACKGROUND = 0.05  # linear gray behind uncovered pixels
 _COARSE_MAP = 64  # rows of the light while something moves: it is turned in a millisecond then
-_RENDERERS, _SIZES = 6, 8  # that are kept
+_RENDERERS, _SIZES = 6, 8  # that are cached
 _HORIZON = 100.0  # a flat body goes to the horizon that is so many times as large as all bodies that are not flat
 _FAR = 160.0  # depth of uncovered pixels [page units]; viser knows none beyond 167
 _RAYS = 256  # of a pixel, that an error is told against
@@ -204,7 +204,7 @@ class RecentCache(Generic[Value]):
     """The last values, by key.
 
     Args:
-        count: How many are kept.
+        count: How many are cached.
     """
 
     def __init__(self, count: int):
@@ -212,7 +212,7 @@ class RecentCache(Generic[Value]):
         self._cached: OrderedDict[Hashable, Value] = OrderedDict()
 
     def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
-        """The value of a key, made if it is not kept."""
+        """The value of a key, made if it is not cached."""
         if key not in self._cached:
             self._cached[key] = make()
         self._cached.move_to_end(key)
