@@ -109,10 +109,10 @@ def frozen(kind: type[T]) -> type[T]:
     """Make a frozen dataclass say how to make a changed one, where something is assigned to a field."""
 
     def refuse(self: T, name: str, value: object) -> None:
-        own = kind.__name__
-        remedy = f"a {own} has no such field, and does not change"
+        label = kind.__name__
+        remedy = f"a {label} has no such field, and does not change"
         if name in getattr(kind, "__dataclass_fields__", ()):
-            remedy = f"that of a {own} does not change; dataclasses.replace({own.lower()}, {name}=…) makes another"
+            remedy = f"that of a {label} does not change; dataclasses.replace({label.lower()}, {name}=…) makes another"
         raise dataclasses.FrozenInstanceError(f"{name}: {remedy}")
 
     setattr(kind, "__setattr__", refuse)  # noqa: B010  (to types, it is no method)

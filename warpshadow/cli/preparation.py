@@ -68,11 +68,11 @@ def _judgement(report: FitReport) -> str:
     """The meaning of a fit's errors for images."""
     from warpshadow.spheres.enough import MAX_SPHERES, RAGGED_ERROR
 
-    own = "the error on the surface counts where the body deforms, else it traces its shadow on itself"
+    hint = "the error on the surface counts where the body deforms, else it traces its shadow on itself"
     if report.shadow_error <= RAGGED_ERROR:
-        return f"the shadow on the ground is whole, as its error is below {RAGGED_ERROR:.0%}; {own}"
+        return f"the shadow on the ground is whole, as its error is below {RAGGED_ERROR:.0%}; {hint}"
     more = f"--count {2 * report.sphere_count}" if report.sphere_count < MAX_SPHERES else 'method = "ray-traced"'
-    return f"the shadow on the ground has holes, as its error is above {RAGGED_ERROR:.0%}; {more} may mend them; {own}"
+    return f"the shadow on the ground has holes, as its error is above {RAGGED_ERROR:.0%}; {more} may mend them; {hint}"
 
 
 @app.command()

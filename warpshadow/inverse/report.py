@@ -74,7 +74,7 @@ class Report:
             write_image(folder / "light.exr", map_of(scene.light).astype(np.float32))
             written.append(folder / "light.exr")
         values: dict[str, Any] = {
-            f"{name}.{key}": item.cpu().numpy() for name, own in result.values.items() for key, item in own.items()
+            f"{name}.{key}": item.cpu().numpy() for name, parts in result.values.items() for key, item in parts.items()
         }
         with files.atomic_write(folder / "parameters.npz") as unfinished:
             np.savez(unfinished, **values)

@@ -156,14 +156,14 @@ def _make_project_adjoint(lanes: int) -> wp.Kernel:
         for lane in range(lanes):
             i = block * lanes + lane
             edge = edges[i, sphere]
-            own = sums[i, sphere]
+            gradient = sums[i, sphere]
             factor = -6.0 * edge[2]
-            x[lane] = factor * own[0]
-            y[lane] = factor * own[1]
-            z[lane] = factor * own[2]
-            sum_[lane] = factor * own[3]
-            sum_t[lane] = factor * own[4]
-            adj_opacity[lane] = -own[5]
+            x[lane] = factor * gradient[0]
+            y[lane] = factor * gradient[1]
+            z[lane] = factor * gradient[2]
+            sum_[lane] = factor * gradient[3]
+            sum_t[lane] = factor * gradient[4]
+            adj_opacity[lane] = -gradient[5]
             slope[lane] = edge[1]
         adj_offset, adj_radius, _ = sphere_adjoint(
             seen, sine, low, cos_width, sin_width, slope, adj_opacity, sum_, sum_t, Vectors(x, y, z)
@@ -296,10 +296,10 @@ def _transmit_adjoint(
     """Each thread owns a sphere as one receiver sees it."""
     row, sphere = wp.tid()
     i = first_row + row
-    own = _Sums()
+    gradient = _Sums()
     if reached[i, sphere] != 0 and edges[i, sphere][2] > 0.0:
-        own = _edge_sums(axes[i, sphere], edges[i, sphere], reached[i, sphere], directions, upstream, i)
-    sums[i, sphere] = own
+        gradient = _edge_sums(axes[i, sphere], edges[i, sphere], reached[i, sphere], directions, upstream, i)
+    sums[i, sphere] = gradient
 
 
 class _View(NamedTuple):

@@ -173,11 +173,11 @@ def places_of_receivers(
         A point on whose face each receiver lies, shape [receiver]; where on it, shape [receiver, 3]; and the receivers
         of each point, shape [point, 3].
     """
-    own = np.flatnonzero(is_own)
+    themselves = np.flatnonzero(is_own)
     unique, places, corners = np.unique(vertices[~is_own], return_index=True, return_inverse=True)
     # a vertex lies on the face of a point of which it is a corner
-    points = np.concatenate([np.flatnonzero(~is_own)[places // 3], own])
-    weights = np.concatenate([np.eye(3, dtype=np.float32)[places % 3], barycentrics[own]])
+    points = np.concatenate([np.flatnonzero(~is_own)[places // 3], themselves])
+    weights = np.concatenate([np.eye(3, dtype=np.float32)[places % 3], barycentrics[themselves]])
     receivers = np.repeat(len(unique) + np.cumsum(is_own)[:, None] - 1, 3, axis=1)
     receivers[~is_own] = corners.reshape(-1, 3)
     return points, weights, receivers
