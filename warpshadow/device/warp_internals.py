@@ -49,12 +49,12 @@ def current_tape() -> wp.Tape | None:
 @contextlib.contextmanager
 def own_tape(tape: wp.Tape | None) -> Iterator[None]:
     """Record this thread's launches on a tape that other threads do not see; None for no recording."""
-    own = _Runtime.tape.own
-    own.append(tape)
+    thread_tapes = _Runtime.tape.own
+    thread_tapes.append(tape)
     try:
         yield
     finally:
-        own.pop()
+        thread_tapes.pop()
 
 
 if "inline" not in inspect.signature(wp.func).parameters:  # Warp 1.17, whose compiler decides on its own
