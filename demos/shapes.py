@@ -309,9 +309,9 @@ def knot(sections: tuple[int, int] = (160, 20)) -> ws.Mesh:
 
         along = line(t + 1e-4) - line(t - 1e-4)
         side = np.cross(along, line(t))
-        supersampling = np.cross(side, along)
-        side, supersampling = (each / np.linalg.norm(each, axis=-1, keepdims=True) for each in (side, supersampling))
-        return (line(t) + 0.2 * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * supersampling)).T
+        height = np.cross(side, along)
+        side, height = (each / np.linalg.norm(each, axis=-1, keepdims=True) for each in (side, height))
+        return (line(t) + 0.2 * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * height)).T
 
     return sheet("knot", point, *sections)
 

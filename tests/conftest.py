@@ -74,6 +74,17 @@ def shared_data() -> Path:
     return SHARED_DATA
 
 
+@pytest.fixture(scope="module")
+def one_thread():
+    """Small tensors gain nothing from threads, which wait for each other where cores are shared; and sums differ."""
+    import torch
+
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(count)
+
+
 @pytest.fixture
 def verified_tape(monkeypatch):
     """Let Warp report arrays that a tape sees overwritten. Kernels compile anew for it, so only tape tests ask."""

@@ -1012,7 +1012,7 @@ def test_an_interrupt_says_how_much_of_a_fit_is_kept(scene, tmp_path, monkeypatc
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr("warpshadow.spheres.fit.measure", interrupt)
     result = run("render", scene, "-o", tmp_path / "out.exr")
-    kept = "320 of 320 steps of the fit are kept, and the next call goes on from there"
+    kept = "320 of 320 steps of the fit are cached, and the next call goes on from there"
     assert (result.exit_code, result.stdout, result.stderr) == (130, "", f"interrupted; {kept}\n")
 
 

@@ -495,7 +495,7 @@ def test_upright_silhouettes(double, device, check):
     clip_positions = np.hstack([depths * (2 * corners / SIZE - 1), np.full((4, 1), 0.1), depths])[None]
     sides = np.int32([[0, 1, 2], [0, 2, 3]])
     faces = put(sides, wp.vec3i, device)
-    neighbors = put(double("assets.topology").edge_neighbors(sides), wp.vec3i, device)
+    neighbors = put(double("maths.adjacency").edge_neighbors(sides), wp.vec3i, device)
 
     def smooth(image, clip_positions):
         fragments = double("stages.rasterization").rasterize(clip_positions, faces, *SIZE)

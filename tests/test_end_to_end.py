@@ -23,14 +23,7 @@ SUMS = {"rtol": 1e-4, "atol": 1e-4}
 
 METHODS = ("directional", "log-sh", "none")
 
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Tensors this small gain nothing from threads, which wait for each other where cores are shared."""
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(count)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def blob() -> ws.Body:

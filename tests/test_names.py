@@ -23,6 +23,7 @@ BANNED = {
     *("presence", "receiver_words", "solid_bodies", "READ_BY", "MEANT", "GLOSSY", "BOUNCING"),
     *("Assembly", "Flats", "Narrow", "Own", "Seen", "StandIns"),
     *("DirectLightPart", "PartVisibility", "PartwiseShading", "PART_SIZE", "rooms", "with_self_light"),
+    *("find_spot", "pull", "pulled", "pulls", "spot", "spot_place", "TexelFootprint", "torque", "truth"),
 }
 FIRST_WORDS = ("What ", "Those ", "That which ", "Whatever ")
 

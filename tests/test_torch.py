@@ -23,6 +23,8 @@ DIFFERENCE = 1e-4
 
 WHITE = (1.0, 1.0, 1.0)
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 
 def small_scene(method: str = "directional", *, size: int = 12, supersampling: int = 2, **options) -> ws.Scene:
     ball = ws.Body(
@@ -47,15 +49,6 @@ def random(*shape: int, device: str = "cpu", seed: int = 0, low: float = 0.1) ->
 
 def torch_device(device: str) -> str:
     return "cpu" if device == "cpu" else device
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Tensors this small gain nothing from threads, which wait for each other where cores are shared."""
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(count)
 
 
 @pytest.fixture(scope="module")

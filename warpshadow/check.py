@@ -37,7 +37,7 @@ class _Nothing:
         return "nothing"
 
 
-NOTHING = _Nothing()  # stands for a missing argument, so that its check says what is expected
+NOTHING = _Nothing()  # a missing argument, so that its check names the accepted values
 
 
 def choice(name: str, value: object, choices: Iterable[object]) -> None:
@@ -60,10 +60,10 @@ def known_keys(where: str, keys: Iterable[str], known: Iterable[str]) -> None:
 
 
 def keywords(**instead: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Make the TypeError of a function for an unknown, missing or superfluous argument say what to write.
+    """Make the TypeError of a function for an unknown, missing or superfluous argument name the remedy.
 
     Args:
-        instead: What to write in place of keywords that are likely mistakes, other keywords are compared with the
+        instead: Remedies for keywords that are likely mistakes, other keywords are compared with the
             arguments' names; and for arguments that are missing.
     """
 
@@ -109,10 +109,10 @@ def frozen(kind: type[T]) -> type[T]:
     """Make a frozen dataclass say how to make a changed one, where something is assigned to a field."""
 
     def refuse(self: T, name: str, value: object) -> None:
-        own = kind.__name__
-        remedy = f"a {own} has no such field, and does not change"
+        label = kind.__name__
+        remedy = f"a {label} has no such field, and does not change"
         if name in getattr(kind, "__dataclass_fields__", ()):
-            remedy = f"that of a {own} does not change; dataclasses.replace({own.lower()}, {name}=…) makes another"
+            remedy = f"that of a {label} does not change; dataclasses.replace({label.lower()}, {name}=…) makes another"
         raise dataclasses.FrozenInstanceError(f"{name}: {remedy}")
 
     setattr(kind, "__setattr__", refuse)  # noqa: B010  (to types, it is no method)

@@ -65,7 +65,7 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
     },
     **{f"_make_copy {dtype.__name__}": partial(batch._make_copy, dtype) for dtype in (wp.float32, wp.vec3)},
     **{make.__name__: partial(make, LANES) for make in (sphere_light._make_light, sphere_light._make_light_adjoint)},
-    **{make.__name__: partial(make, LANES) for make in (refine._make_project, refine._make_pull)},
+    **{make.__name__: partial(make, LANES) for make in (refine._make_project, refine._make_project_adjoint)},
     **{make.__name__: partial(make, LANES) for make in (gather._make_gather, gather._make_gather_adjoint)},
     "trace._make_trace": trace._make_trace,
     "sun_cells._make_trace": sun_cells._make_trace,

@@ -116,8 +116,8 @@ def test_where_no_body_is_a_camera_sees_the_light(rng):
     top = light.radiance[0].reshape(-1, 3)
     for color in demo.backdrop(up, light).reshape(-1, 3):
         assert (np.abs(top - color).max(axis=1) == 0).any()
-    supersampling = ws.Camera.look_at((0, 0, 0), light.directions()[5, 7], fov_y=0.1, size=(1, 1))
-    np.testing.assert_array_equal(demo.backdrop(supersampling, light)[0, 0], light.radiance[5, 7])
+    aside = ws.Camera.look_at((0, 0, 0), light.directions()[5, 7], fov_y=0.1, size=(1, 1))
+    np.testing.assert_array_equal(demo.backdrop(aside, light)[0, 0], light.radiance[5, 7])
 
 
 # ---------------------------------------------------------------------------------------------- the recipe
@@ -150,7 +150,7 @@ def test_exposure_and_place_are_found_in_a_photograph(truth, tmp_path, rng):
 
     found = load_fit(tmp_path / "fit.toml").run().found
     ball = found.scene.bodies[BALL]
-    middle = ball.translation + ball.scale * ball.rotation_matrix() @ np.mean(ball.mesh.bounds, axis=0)
+    middle = ball.to_world(np.mean(ball.mesh.bounds, axis=0))
     assert np.linalg.norm(middle - (0, RADIUS, 0)) < 0.02 * 2 * RADIUS
     assert found.exposures[0] == pytest.approx(EXPOSURE, rel=0.03)
 

@@ -68,13 +68,13 @@ def with_quick_spheres(kind):
 def spheres_within(mesh, count=64):
     """Spheres behind points of a mesh that are drawn in proportion to area."""
     corners = mesh.positions[mesh.faces].astype(float)
-    supersampling = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(supersampling, axis=1)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normals, axis=1)
     rng = np.random.default_rng(0)
     faces = rng.choice(len(area), count, p=area / area.sum())
     points = np.einsum("sk,skc->sc", rng.dirichlet([1, 1, 1], count), corners[faces])
     radius = 0.04 * np.ptp(mesh.positions, axis=0).max()
-    return ws.Spheres(points - radius * supersampling[faces] / area[faces, None], np.full(count, radius))
+    return ws.Spheres(points - radius * normals[faces] / area[faces, None], np.full(count, radius))
 
 
 def noisy(reference, deviation):

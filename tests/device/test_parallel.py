@@ -11,10 +11,10 @@ import twins
 import warp as wp
 
 from warpshadow.assets.primitives import icosphere
-from warpshadow.assets.topology import edge_neighbors
 from warpshadow.device import parallel
 from warpshadow.device.launch import launch
 from warpshadow.device.parallel import Scratch, scratch_place
+from warpshadow.maths.adjacency import edge_neighbors
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.normals import vertex_normals

@@ -39,6 +39,8 @@ from warpshadow.inverse.model import Model
 from warpshadow.inverse.schedule import check_stages, deformation_stages, pose_stages
 from warpshadow.torch import rotation_matrices
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 
 def small_scene(*, size: tuple[int, int] = (24, 24)) -> ws.Scene:
     ball = ws.Body(
@@ -68,15 +70,6 @@ def small_problem(*free, scene: ws.Scene | None = None, **options) -> Problem:
 
 
 STAGES = (Stage(4, 0.02, scale=0.5, softness=1.0), Stage(3, 0.01))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Tensors this small gain nothing from threads; and sums of several threads are not those of one."""
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(count)
 
 
 @pytest.fixture(scope="module")

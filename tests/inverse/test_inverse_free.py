@@ -37,6 +37,8 @@ DIFFERENCE = 5e-3
 BALL, GROUND = 0, 1
 VIEWS = 2
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 
 def lump() -> ws.Body:
     """A body whose outline and shadow show how it is turned; no part of its pose is trivial."""
@@ -58,15 +60,6 @@ def lump() -> ws.Body:
 def camera(view: int = 0) -> ws.Camera:
     eye = (0, 3, 4.5) if view == 0 else (2.5, 3, 3.5)
     return ws.Camera.look_at(eye, (0, 0.4, 0), size=(32, 24))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Tensors this small gain nothing from threads, which wait for each other where cores are shared."""
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(count)
 
 
 @pytest.fixture(scope="module")
@@ -221,7 +214,7 @@ def test_a_body_turns_about_its_middle_and_grows_from_there(scene, rotation):
     values["pose[0]"]["log_scale"] += math.log(1.5)
     found = problem.found(values, setting).scene.bodies[BALL]
     middle = setting.middle(BALL)
-    before, after = (body.scale * body.rotation_matrix() @ middle + body.translation for body in (aside, found))
+    before, after = (body.to_world(middle) for body in (aside, found))
     assert np.abs(found.rotation - aside.rotation).max() > 10 and found.scale == pytest.approx(1.2)
     assert np.allclose(after, before, atol=1e-6)
 

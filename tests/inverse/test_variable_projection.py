@@ -103,9 +103,9 @@ def test_saturated_pixels_are_a_lower_bound_of_the_light():
     clipped = np.minimum(image / (0.6 * image.max()), 1)
     totals = []
     for target in (Target(clipped, saturation=1.0), Target(clipped)):
-        item = dataclasses.replace(problem, targets=[target])
-        own = item.start(setting)
-        ProjectedModel(item, setting, SOLVED).loss(own)
+        one_problem = dataclasses.replace(problem, targets=[target])
+        own = one_problem.start(setting)
+        ProjectedModel(one_problem, setting, SOLVED).loss(own)
         totals.append(float(own["light"]["log_radiance"].exp().sum()))
     assert totals[0] > totals[1] * 1.02
 

@@ -37,16 +37,7 @@ RAY_NOISE = 0.02
 
 UNIT_SPHERE = ws.Spheres([[0, 0, 0]], [1.0])
 
-pytestmark = pytest.mark.usefixtures("poisoned_outputs")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Tensors this small gain nothing from threads, which wait for each other where cores are shared."""
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(count)
+pytestmark = pytest.mark.usefixtures("one_thread", "poisoned_outputs")
 
 
 def scene_of(method: str = "directional", *, still_blocks: bool = True, size: int = 24, **options) -> ws.Scene:
@@ -654,7 +645,7 @@ def test_rays_are_traced_once(monkeypatch):
 def test_the_explanation_is_a_table_of_stages_with_times_and_reasons():
     renderer = SceneRenderer(scene_of())
     call, variables, explain = texture_fit(renderer)
-    assert "nothing is kept yet" in str(explain())
+    assert "nothing is cached yet" in str(explain())
     with wp.Tape() as tape:
         image = call()
     tape.backward(grads={image: wp.full(image.shape, wp.vec4(1.0), dtype=wp.vec4)})

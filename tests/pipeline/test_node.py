@@ -170,7 +170,7 @@ def test_each_node_says_why_it_runs_or_does_not(clock):
         "clip positions": (True, "cameras changed since the last call"),
         "sides": (False, "every body is closed"),
         "silhouettes": (True, "cameras changed since the last call"),
-        "normals": (True, "nothing is kept yet"),
+        "normals": (True, "nothing is cached yet"),
         "image": (True, "cameras changed since the last call"),
     }
     assert list(explanation.stages)[0] == "clip positions" and explanation["clip positions"].items == "4 vertices"

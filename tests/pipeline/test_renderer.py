@@ -143,7 +143,7 @@ def test_a_body_without_blockers_casts_no_shadow_by_any_method(device, method, b
         scene = scene_of(method, *bodies, samples=64)
         renderer = SceneRenderer(scene, device=device)
         moved = renderer.view(renderer.placed(moving=[0]))
-        results.append((renderer.render(), renderer.draw(view=moved).numpy(), PointSample(scene, count=99).truth))
+        results.append((renderer.render(), renderer.draw(view=moved).numpy(), PointSample(scene, count=99).reference))
     for without, with_canopy in zip(*results, strict=True):
         np.testing.assert_array_equal(with_canopy, without)
 

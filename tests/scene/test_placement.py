@@ -48,7 +48,7 @@ def test_a_body_that_is_turned_before_it_stands_has_the_same_size_and_place():
     middle = np.mean(mesh.bounds, axis=0)
     for body in (straight, turned):
         assert body.scale == 2.5
-        stands = body.scale * body.rotation_matrix() @ middle + body.translation
+        stands = body.to_world(middle)
         np.testing.assert_allclose(stands, (3, 1.25, 1), atol=1e-12)
 
 

@@ -523,7 +523,7 @@ def test_a_fit_goes_on_where_an_interrupt_left_it_to_the_same_bits(tmp_path, mon
     whole = fit("whole").spheres
     assert len(steps) == 120  # of two short fits, and the descent
     limit[0] = stop
-    with pytest.raises(KeyboardInterrupt, match=f"^{kept} of the fit are kept"):
+    with pytest.raises(KeyboardInterrupt, match=f"^{kept} of the fit are cached"):
         fit("interrupted")
     (part,) = cached_files("spheres")
     assert part.name.endswith(".part.npz")

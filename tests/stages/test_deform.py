@@ -109,11 +109,11 @@ def test_rotations_and_their_gradients_do_not_depend_on_the_length_of_parameters
 
 @pytest.mark.parametrize("angle", [1e-5, 1e-3])
 def test_nearly_parallel_columns_are_a_rotation_with_a_gradient(angle, device):
-    x, supersampling = np.array([0.6, 0.0, 0.8]), np.array([0.0, 1.0, 0.0])
-    array = put([[[*x, *(x + angle * supersampling)]]], Vec6, device)
+    x, y = np.array([0.6, 0.0, 0.8]), np.array([0.0, 1.0, 0.0])
+    array = put([[[*x, *(x + angle * y)]]], Vec6, device)
     with wp.Tape() as tape:
         rotations = rotation_matrices(array)
-    expected = np.stack([x, supersampling, np.cross(x, supersampling)], axis=-1)
+    expected = np.stack([x, y, np.cross(x, y)], axis=-1)
     # the columns are rounded to 6e-8, which is that much more of the angle between them
     np.testing.assert_allclose(rotations.numpy()[0, 0], expected, atol=2e-7 / angle)
     rotations.grad.assign(np.ones((1, 1, 3, 3), np.float32))

@@ -54,9 +54,9 @@ def test_a_quads_sphere_covers_what_its_spheres_do_on_average(spread, measured, 
         extent = np.abs(own).max() + 1
         areas = []
         for _ in range(20):
-            supersampling = np.linalg.qr(rng.normal(size=(3, 2)))[0]
+            image_plane = np.linalg.qr(rng.normal(size=(3, 2)))[0]
             places = rng.uniform(-extent, extent, size=(2000, 2))
-            inside = np.linalg.norm(places[:, None] - own @ supersampling, axis=-1) < sizes
+            inside = np.linalg.norm(places[:, None] - own @ image_plane, axis=-1) < sizes
             areas.append(4 * extent**2 * inside.any(axis=1).mean())
         ratios.append(np.pi * radius**2 / np.mean(areas))
     assert abs(np.mean(ratios) - measured) < 0.03

@@ -152,13 +152,13 @@ class Twin:
     def meet(self, points: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nearest face of each ray, -1 for none, and barycentrics."""
         a, b, c = np.moveaxis(self.corners, 1, 0)
-        supersampling = np.cross(b - a, c - a)
-        slope = directions @ supersampling.T
-        t = ((a * supersampling).sum(axis=1) - points @ supersampling.T) / np.where(slope == 0, 1e-30, slope)
+        normals = np.cross(b - a, c - a)
+        slope = directions @ normals.T
+        t = ((a * normals).sum(axis=1) - points @ normals.T) / np.where(slope == 0, 1e-30, slope)
         reached = points[:, None] + t[..., None] * directions[:, None]
-        size = (supersampling**2).sum(axis=1)
-        v = (np.cross(reached - a, c - a) * supersampling).sum(axis=-1) / size
-        w = (np.cross(b - a, reached - a) * supersampling).sum(axis=-1) / size
+        size = (normals**2).sum(axis=1)
+        v = (np.cross(reached - a, c - a) * normals).sum(axis=-1) / size
+        w = (np.cross(b - a, reached - a) * normals).sum(axis=-1) / size
         t = np.where((t > 1e-9) & (v >= 0) & (w >= 0) & (v + w <= 1), t, np.inf)
         face = t.argmin(axis=1)
         each = np.arange(len(points))
@@ -203,10 +203,10 @@ class Twin:
             met = face >= 0
             face, weights, directions = face[met], weights[met], directions[met]
             points = np.einsum("rk,rkc->rc", weights, self.corners[face])
-            supersampling = np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])[
+            face_normals = np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])[
                 face
             ]
-            normals = supersampling / np.linalg.norm(supersampling, axis=1, keepdims=True)
+            normals = face_normals / np.linalg.norm(face_normals, axis=1, keepdims=True)
             normals *= -np.sign((normals * directions).sum(axis=1, keepdims=True))
             reflected = reflected[met] * self.albedo(face, weights)
             total += (reflected * self.direct(points + 1e-7 * normals, normals)).sum(axis=0) / count

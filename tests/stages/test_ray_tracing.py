@@ -66,14 +66,14 @@ def moeller_trumbore(mesh: Mesh, points: np.ndarray, directions: np.ndarray) -> 
     """Whether rays meet any face, float64: bool of shape [point, direction]."""
     corners = mesh.positions[mesh.faces].astype(np.float64)
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    supersampling = np.cross(directions[:, None], second[None])  # [direction, face, 3]
-    determinant = (supersampling * first).sum(axis=-1)
+    directions_by_second = np.cross(directions[:, None], second[None])  # [direction, face, 3]
+    determinant = (directions_by_second * first).sum(axis=-1)
     from_corner = points[:, None] - corners[None, :, 0]  # [point, face, 3]
-    u = np.einsum("pfi,dfi->pdf", from_corner, supersampling) / determinant
+    u = np.einsum("pfi,dfi->pdf", from_corner, directions_by_second) / determinant
     sideways = np.cross(from_corner, first)
     v = np.einsum("pfi,di->pdf", sideways, directions) / determinant
-    along = (sideways * second).sum(axis=-1)[:, None] / determinant
-    return ((u > 0) & (v > 0) & (u + v < 1) & (along > 0)).any(axis=-1)
+    distance = (sideways * second).sum(axis=-1)[:, None] / determinant
+    return ((u > 0) & (v > 0) & (u + v < 1) & (distance > 0)).any(axis=-1)
 
 
 def test_moeller_and_trumbore_find_the_same_rays_blocked(device):

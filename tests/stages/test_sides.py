@@ -33,16 +33,7 @@ SMOOTH = 1e-2
 # Differences of points of faces that are as large as samples, against mean slopes over samples; measured 2.0e-2.
 SLOPES = 4e-2
 
-pytestmark = pytest.mark.usefixtures("poisoned_outputs")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Tensors this small gain nothing from threads, which wait for each other where cores are shared."""
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(count)
+pytestmark = pytest.mark.usefixtures("one_thread", "poisoned_outputs")
 
 
 # ---------------------------------------------------------------------------------------------- scenes
@@ -223,7 +214,7 @@ def test_points_that_are_compared_with_rays_are_on_the_side_that_is_seen():
             sky[16:] = 0.25
             scene, expected = replace(scene, light=ws.EnvironmentMap(sky)), 0.25
         sample = PointSample(scene, count=16, direction_count=1024)
-        for shading in (sample.truth, sample.interpolated_truth, sample.shading(scene)):
+        for shading in (sample.reference, sample.interpolated_reference, sample.shading(scene)):
             assert np.abs(shading - expected).max() < 0.03
 
 
@@ -456,11 +447,9 @@ def test_faces_that_wind_against_their_neighbors_are_turned_over_with_their_uvs(
 
 def test_a_strip_with_one_side_stays_as_it_is():
     angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    supersampling = np.stack(
-        [np.cos(angle / 2) * np.cos(angle), np.sin(angle / 2), np.cos(angle / 2) * np.sin(angle)], -1
-    )
+    half_width = np.stack([np.cos(angle / 2) * np.cos(angle), np.sin(angle / 2), np.cos(angle / 2) * np.sin(angle)], -1)
     middle = 3 * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], -1)
-    positions = np.concatenate([middle - supersampling, middle + supersampling])
+    positions = np.concatenate([middle - half_width, middle + half_width])
     low, high = np.arange(24), np.arange(24) + 24
     next_low, next_high = np.append(low[1:], high[0]), np.append(high[1:], low[0])
     faces = np.concatenate([np.stack([low, next_low, high], -1), np.stack([next_low, next_high, high], -1)])

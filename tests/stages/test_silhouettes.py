@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import warpshadow as ws
-from warpshadow.assets.topology import edge_neighbors
+from warpshadow.maths.adjacency import edge_neighbors
 from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.project import to_clip
 from warpshadow.stages.rasterization import rasterize
@@ -235,10 +235,10 @@ def test_the_edges_found_are_the_outline_of_a_convex_body(device):
     pixels = CAMERA.project(positions)
     sides = np.diff(pixels[mesh.faces], axis=1)
     is_front = np.linalg.det(sides) > 0
-    supersampling = edge_neighbors(mesh.faces)
+    neighbors = edge_neighbors(mesh.faces)
     outline = [
         (mesh.faces[face, (k + 1) % 3], mesh.faces[face, (k + 2) % 3])
-        for face, k in np.argwhere(is_front[:, None] & ~is_front[supersampling])
+        for face, k in np.argwhere(is_front[:, None] & ~is_front[neighbors])
     ]
     seen, expected = mask(found)[0], {}
     for pixel in range(CAMERA.width * CAMERA.height):
@@ -466,11 +466,11 @@ def test_nothing_seen_has_no_silhouettes(device):
 
 def test_edges_know_their_neighbors_by_position():
     faces = np.array([[0, 1, 2], [2, 1, 3], [4, 5, 6], [1, 3, 7], [7, 8, 9], [7, 8, 10], [7, 8, 11]])
-    supersampling = edge_neighbors(faces)
-    assert supersampling[0].tolist() == [1, -1, -1]  # edge 1-2 is opposite to corner 0
-    assert supersampling[1].tolist() == [3, -1, 0]
-    assert supersampling[2].tolist() == [-1, -1, -1]
-    assert [row[2] for row in supersampling[4:].tolist()] == [-2, -2, -2]  # three faces meet at 7-8
+    neighbors = edge_neighbors(faces)
+    assert neighbors[0].tolist() == [1, -1, -1]  # edge 1-2 is opposite to corner 0
+    assert neighbors[1].tolist() == [3, -1, 0]
+    assert neighbors[2].tolist() == [-1, -1, -1]
+    assert [row[2] for row in neighbors[4:].tolist()] == [-2, -2, -2]  # three faces meet at 7-8
 
 
 def test_vertices_at_one_place_count_as_one_when_asked():
@@ -484,8 +484,8 @@ def test_vertices_at_one_place_count_as_one_when_asked():
 def test_a_face_without_area_between_two_others_does_not_part_them():
     """As at the pole of a sphere of longitudes and latitudes, whose rows of vertices meet there."""
     positions = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0]])
-    supersampling = edge_neighbors(np.array([[0, 1, 2], [1, 3, 2], [2, 3, 4]]), positions)
-    assert supersampling.tolist() == [[2, -1, -1], [-1, -1, -1], [-1, -1, 0]]
+    neighbors = edge_neighbors(np.array([[0, 1, 2], [1, 3, 2], [2, 3, 4]]), positions)
+    assert neighbors.tolist() == [[2, -1, -1], [-1, -1, -1], [-1, -1, 0]]
 
 
 # ------------------------------------------------------------------------------------------------------- coverage

@@ -6,7 +6,7 @@ import warp as wp
 from test_silhouettes import through_plane
 
 import warpshadow as ws
-from warpshadow.assets.topology import edge_neighbors
+from warpshadow.maths.adjacency import edge_neighbors
 from warpshadow.stages.film import sample_radiance
 from warpshadow.stages.project import to_clip
 from warpshadow.stages.rasterization import rasterize

@@ -33,8 +33,8 @@ def sample():
 
 def test_the_same_seed_draws_the_same_points_and_another_does_not(sample):
     again, other = (PointSample(make_scene(), count=600, direction_count=1024, seed=seed) for seed in (0, 1))
-    np.testing.assert_array_equal(again.truth, sample.truth)
-    assert other.truth.shape == sample.truth.shape
+    np.testing.assert_array_equal(again.reference, sample.reference)
+    assert other.reference.shape == sample.reference.shape
     assert not np.array_equal(other.receivers(["pixel"] * 2).points, sample.receivers(["pixel"] * 2).points)
 
 
@@ -90,7 +90,7 @@ def test_rays_have_no_error_at_points_and_that_of_interpolation_at_vertices(samp
     traced = variant(make_scene(supersampling=1), "pixel", method="ray-traced", samples=1024)
     assert sample.error(sample.shading(traced)) < 1e-6
     of_bodies = sample.interpolation_errors()
-    whole = sample.error(sample.interpolated_truth)
+    whole = sample.error(sample.interpolated_reference)
     assert np.linalg.norm(of_bodies) == pytest.approx(whole, rel=1e-5)
     assert of_bodies[1] > of_bodies[0] > 0  # the ground is coarser
 

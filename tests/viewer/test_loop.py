@@ -200,7 +200,7 @@ def test_nothing_is_refined_while_another_page_moves(loop, painter):
     while time.monotonic() - begun < 6 * REST:
         loop.look_from("moving", camera(time.monotonic() - begun))
         time.sleep(REST / 20)
-        is_steady = time.monotonic() - loop._last_asked < REST / 2
+        is_steady = time.monotonic() - loop._last_request < REST / 2
         if not is_steady:
             pytest.skip("the machine is too busy to move steadily")
     assert all(quality.is_moving for _, _, quality, _ in painter.asked)

@@ -22,8 +22,8 @@ def test_each_descent_is_a_line_in_the_color_of_its_stage_one_after_another():
     drawn = lines(loss_plot([[[1.0, 0.5], [2.0]], [[0.1, 0.01, 0.001]]]))
     assert [color for _, color in drawn] == [COLORS[0], COLORS[0], COLORS[1]]
     assert [len(points) for points, _ in drawn] == [2, 1, 3]
-    supersampling = [x for points, _ in drawn for x, _ in points]
-    assert supersampling == sorted(supersampling) and len(set(supersampling)) == 6
+    columns = [x for points, _ in drawn for x, _ in points]
+    assert columns == sorted(columns) and len(set(columns)) == 6
 
 
 def test_equal_factors_are_equal_heights():

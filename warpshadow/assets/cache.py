@@ -30,7 +30,7 @@ _OWN_NAME = re.compile(r"[0-9a-f]{32,}(\.part)?\.npz|\.[0-9a-f]{12}\.unfinished\
 
 
 def cache_folder() -> Path:
-    """Where all is kept: WARPSHADOW_CACHE_DIR, or the platform's folder for caches."""
+    """The folder of the cache: WARPSHADOW_CACHE_DIR, or the platform's folder for caches."""
     from platformdirs import user_cache_path
 
     override = os.environ.get("WARPSHADOW_CACHE_DIR")
@@ -38,7 +38,7 @@ def cache_folder() -> Path:
 
 
 def cache_path(kind: Kind, key: str) -> Path:
-    """Where something is kept."""
+    """File of a cached item."""
     return cache_folder() / kind / f"{key}.npz"
 
 
@@ -82,7 +82,7 @@ class Unfinished:
         except OSError as problem:
             check.warn(f"the unfinished {what} could not be cached in {self._path.parent} ({problem})")
             return ""
-        return f"{self._done} of the {what} are kept, and the next call goes on from there"
+        return f"{self._done} of the {what} are cached, and the next call goes on from there"
 
     def remove(self) -> None:
         """Remove the partial result of an interrupted call, since the work is done."""
@@ -110,10 +110,10 @@ def load_or_compute(
         path: From :func:`cache_path`.
         read: Makes it of the arrays in the file.
         make: Makes it anew, from where an interrupt left it.
-        arrays: The arrays that are kept of it.
+        arrays: The arrays of it that are cached.
         what: Noun for warnings, such as "fit".
     Raises:
-        KeyboardInterrupt: at an interrupt; it says how much is kept.
+        KeyboardInterrupt: at an interrupt; it says how much is cached.
     """
     with contextlib.ExitStack() as held:
         if not path.exists():

@@ -22,7 +22,7 @@ class CellLight(NamedTuple):
     Args:
         radiance: Mean radiance, L_q = Q/4π ∫_cell L dω, so that Σ_q (4π/Q) L_q = ∫ L dω; float32 [direction, 3].
         directions: Mean directions, weighted with luminance; float32 [direction, 3].
-        spots: Mean directions, weighted with the square of luminance: of a sun, where it is, whatever sky is around
+        spots: Mean directions, weighted with the square of luminance: of a sun, where it is, for any sky around
             it; float32 [direction, 3].
         spreads: Half-angles of the evenly bright caps whose mean vectors with that weight are as long: 0 for a point,
             about 2/√Q for an even cell [radians]; float32 [direction]. None, as spots, where light is soft.
@@ -53,7 +53,7 @@ def gather_cells(radiance: np.ndarray, directions: np.ndarray) -> CellLight:
 
 
 def _means(moment: np.ndarray, total: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean directions [direction, 3], and lengths of the mean vectors; of dark cells those of even ones."""
+    """Mean directions [direction, 3], and lengths of the mean vectors; dark cells' as for even light."""
     length = np.linalg.norm(moment, axis=1)
     lit = length > 0
     mean = np.where(lit[:, None], moment / np.where(lit, length, 1)[:, None], directions)

@@ -1,4 +1,4 @@
-"""Known light in spherical harmonics, and what kinds of known light have in common."""
+"""Known light in spherical harmonics, and known light of any kind by one function."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ INTEGER_SUFFIXES = (*SUFFIXES, ".tif", ".tiff")  # suffixes of files of integers
 
 
 class ImageError(ValueError):
-    """A picture, or an image file, that cannot be used; the message says what was found and what is accepted."""
+    """A picture, or an image file, that cannot be used; the message says its fault and names the accepted kinds."""
 
 
 def read_image(
@@ -314,7 +314,7 @@ def _open(path: Path) -> Any:
     bits = set(picture.tag_v2.get(_BITS_PER_SAMPLE, ())) if picture.format == "TIFF" else set()
     if bits - {1, 8, 16}:
         raise ImageError(f"got {max(bits)} bits for each color, expected 8 or 16")
-    picture.filename = ""  # else Pillow maps gray TIFF files into memory, and garbles those that are to be turned
+    picture.filename = ""  # else Pillow maps gray TIFF files into memory, and garbles files that are to be turned
     return picture
 
 

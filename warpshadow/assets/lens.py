@@ -1,4 +1,4 @@
-"""Lenses: images of a pinhole from those of a lens with distortion, by OpenCV's five coefficients."""
+"""Lenses: images of a pinhole from images of a lens with distortion, by OpenCV's five coefficients."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def undistorted(pixels: np.ndarray, camera: Camera, coefficients: np.ndarray) ->
 
     Args:
         pixels: Linear, shape [height, width, channel], bilinear between pixel centers.
-        camera: Its intrinsics are those of the calibration, its size that of the image.
+        camera: It has the intrinsics of the calibration and the size of the image.
         coefficients: k1, k2, p1, p2, k3.
     """
     from scipy.ndimage import map_coordinates

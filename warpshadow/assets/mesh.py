@@ -124,7 +124,7 @@ class Mesh:
     if not TYPE_CHECKING:  # to which it would hide names that there are not
 
         def __getattr__(self, name: str) -> Any:
-            """Say what other libraries' names are here."""
+            """Map names of other libraries to ours."""
             hint = {"vertices": "positions", "verts": "positions", "triangles": "faces"}.get(name)
             raise AttributeError(f"a Mesh has no {name!r}{hint and f' (write {hint})' or ''}")
 
@@ -226,7 +226,7 @@ class Mesh:
         """Join the vertices at one place, so that normals are smooth across them; a seam of uvs stays one of uvs alone.
 
         Exporters split vertices along such seams, and each part has normals of its own: lines run over the surface.
-        Vertices of two colors stay apart, and those at sharp edges of boxes and the like, if they are. Vertices keep
+        Vertices of two colors stay apart, and vertices at sharp edges of boxes and the like, if they are. Vertices keep
         their numbers: faces refer to the first at each place.
         """
         colors = [] if self.colors is None else [self.colors]
@@ -317,7 +317,7 @@ class BaseColor(NamedTuple):
 
 
 class Gloss(NamedTuple):
-    """glTF's roughness and metallic of a surface; and what a message says of them."""
+    """glTF's roughness and metallic of a surface; and a remark on them for messages."""
 
     roughness: float
     metallic: float

@@ -224,8 +224,8 @@ def _stl_fault(content: bytes) -> str:
 def _merged(part: MeshPart) -> MeshPart:
     """Weld vertices of the same place and color, where every face has three of its own.
 
-    Sharp edges keep two where they are many, as of boxes. Where angles of all sizes occur, normals round them, as those
-    of the same mesh in other files without normals.
+    Sharp edges keep two where they are many, as of boxes. Where angles of all sizes occur, normals round them, as
+    in files of the same mesh without normals.
     """
     vertex_attributes = [] if part.colors is None else [part.colors]
     is_first = is_listed_first(part.positions, part.faces)  # edges of the others would have too many faces
@@ -275,7 +275,7 @@ def _trimesh_part(shape, of_file: bool, factors: Factors) -> MeshPart:
         welded = join_at_places(positions, checked, *vertex_attributes)
     elif uvs is None:
         return part
-    else:  # those of meshes that were changed differ a little at seams
+    else:  # normals of meshes that were changed differ a little at seams
         stored = [] if normals is None else [normals if of_file else joined_normals(positions, normals)]
         welded = weld(faces, positions, *vertex_attributes, *stored)
     lost = len(np.unique(faces)) - len(np.unique(welded))
@@ -283,7 +283,7 @@ def _trimesh_part(shape, of_file: bool, factors: Factors) -> MeshPart:
 
 
 def _stored_normals(shape: trimesh.Trimesh) -> np.ndarray | None:
-    """Normals of vertices that are not those that trimesh computes of the faces; None where it has no such ones."""
+    """Normals of vertices, if they differ from trimesh's own, which it computes of the faces; else None."""
     import trimesh
 
     if "vertex_normals" not in shape._cache:

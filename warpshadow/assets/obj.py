@@ -21,7 +21,7 @@ class ObjItems(NamedTuple):
     colors: np.ndarray  # sRGB of the vertices that have one, [color, 3]
     uvs: np.ndarray  # [uv, 2]
     corners: np.ndarray  # vertices of the corners of all faces, [corner]
-    uv_corners: np.ndarray  # uvs of those that have one
+    uv_corners: np.ndarray  # uvs of corners that have one
     corner_counts: np.ndarray  # [face]
     libraries: list[str]  # files of materials
     materials: set[str]  # of faces; "" where they have none

@@ -1,4 +1,4 @@
-"""PLY files: what trimesh leaves of them, and whether they are cut off."""
+"""PLY files: properties that trimesh does not read, and whether files are cut off."""
 
 import numpy as np
 

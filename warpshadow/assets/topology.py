@@ -1,4 +1,4 @@
-"""Topology: neighbors across edges, pieces that wind alike, and whether they are closed."""
+"""Topology: pieces of a mesh that wind alike, whether they are closed, and their sharp edges."""
 
 from __future__ import annotations
 
@@ -6,52 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from warpshadow import check
+from warpshadow.maths.adjacency import edge_neighbors, number_places
 from warpshadow.maths.components import connected_components
 
-_NOT_MANIFOLD = -2
-
 CREASE = 30.0  # edges whose faces bend by more are sharp [degrees]
-
-
-def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np.ndarray:
-    """Find the face on the other side of each edge.
-
-    Args:
-        faces: Indices of positions, shape [face, 3]: faces are joined where edges share positions, whatever the uvs.
-        positions: Vertices, shape [vertex, 3]; when given, vertices at the same place count as one, as a mesh needs
-            whose faces have vertices of their own.
-    Returns:
-        Face across the edges opposite to corners 0, 1 and 2, int32 of shape [face, 3]; −1 at a border, −2 where more
-        than two faces meet. Both are silhouettes from everywhere. A face with two corners at one place is passed over
-        and has no neighbors itself.
-    """
-    check.shape("faces", faces.shape, ("face", 3))
-    faces = faces.astype(np.int64) if positions is None else number_places(positions)[faces]
-    neighbor = np.full(faces.shape, -1, np.int32)
-    proper = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
-    ends = np.sort(np.stack([np.roll(faces[proper], -1, axis=1), np.roll(faces[proper], -2, axis=1)], axis=-1), axis=-1)
-    first, last = ends.reshape(-1, 2).T
-    lines, owner = first * (faces.max(initial=0) + 1) + last, np.repeat(proper, 3)
-    order = np.argsort(lines)
-    is_next = np.zeros(len(lines) + 2, bool)  # of the same edge as the one before
-    is_next[1:-2] = lines[order[1:]] == lines[order[:-1]]
-    result = np.full(len(lines), -1, np.int32)
-    result[order[is_next[:-2] | is_next[1:-1]]] = _NOT_MANIFOLD
-    pair = np.flatnonzero(~is_next[:-2] & is_next[1:-1] & ~is_next[2:])
-    one, other = order[pair], order[pair + 1]
-    result[one], result[other] = owner[other], owner[one]
-    neighbor[proper] = result.reshape(-1, 3)
-    return neighbor
-
-
-def number_places(positions: np.ndarray) -> np.ndarray:
-    """Number the distinct positions of vertices, or rows of any width: equal ones share a number, shape [vertex]."""
-    permutation = np.lexsort(positions.T)
-    is_new = (np.diff(positions[permutation], axis=0) != 0).any(axis=1)
-    places = np.zeros(len(positions), np.int64)
-    places[permutation[1:]] = np.cumsum(is_new)
-    return places
 
 
 def welded(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -148,7 +106,7 @@ def rounds_edges(surface: MeshTopology, positions: np.ndarray) -> bool:
     """Whether many sharp edges have faces that share vertices, and so normals.
 
     Those of a piece are many if edges of more than 50° are longer in all than the diagonal of its bounds, and ten times
-    as long as those of 20° to 50°. In organic meshes, where angles of all sizes occur, they are at most 2.6 times as
+    as long as edges of 20° to 50°. In organic meshes, where angles of all sizes occur, they are at most 2.6 times as
     long (bunny, cow, monkey, man). In voxels, whose steps normals round on purpose, they are longer than 25 diagonals.
     Such pieces, as many boxes are, have most of the sharp edges, longer in all than the diagonal of the mesh.
     """
@@ -178,7 +136,7 @@ def rounds_edges(surface: MeshTopology, positions: np.ndarray) -> bool:
 def draws_lines(surface: MeshTopology, positions: np.ndarray) -> bool:
     """Whether lines run over a smooth surface: faces at edges that bend by 1° to 30° have vertices of their own.
 
-    Not where those at most such edges have: then the mesh is faceted on purpose.
+    Not where most such edges do: then the mesh is faceted on purpose.
     """
     return 0 < _parted_share(surface, positions, 1.0, CREASE) <= 0.5
 
@@ -255,8 +213,8 @@ class MeshTopology(NamedTuple):
     neighbors: np.ndarray
     """Face across each edge, :func:`edge_neighbors` of vertices by their places, int32 of shape [face, 3]."""
     is_closed: bool
-    """Whether no face shows its back to those outside: two or more share each edge, half of them run along it either
-    way, and pieces look outward.
+    """Whether no face shows its back to an outside viewer: two or more share each edge, half of them run along it
+    either way, and pieces look outward.
 
     A shell that is hollow inside does not count as closed: it costs a launch more, and gets the same image.
     """

@@ -8,7 +8,7 @@ import numpy as np
 
 from warpshadow import check
 from warpshadow.assets.mesh import Mesh, MeshError
-from warpshadow.assets.topology import edge_neighbors
+from warpshadow.maths.adjacency import edge_neighbors
 
 
 def unwrap(mesh: Mesh, *, size: int = 1024, padding: int = 4) -> Mesh:

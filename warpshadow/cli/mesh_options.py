@@ -1,8 +1,11 @@
 """Options of meshes that are given in place of scene files: their default scene."""
 
+import functools
+import inspect
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Optional
+from typing import Annotated, Any, Literal, NamedTuple, Optional
 
 import typer
 
@@ -19,13 +22,6 @@ SceneOrMesh = Annotated[
 
 OF_MESHES = "Options of a mesh, which scene files have as keys"
 
-Up = Annotated[
-    Optional[Literal["y", "z"]],
-    typer.Option(
-        help="Axis that points up; without it, it is guessed by how the mesh stands.", rich_help_panel=OF_MESHES
-    ),
-]
-
 
 def _two_numbers(size: tuple[str, str] | None) -> tuple[str, str] | None:
     """Refuse a size that is not two numbers, such as one number and the next option."""
@@ -35,61 +31,77 @@ def _two_numbers(size: tuple[str, str] | None) -> tuple[str, str] | None:
     return size
 
 
-Size = Annotated[
-    Optional[tuple[str, str]],
-    typer.Option(
-        help="Width and height of the image, in pixels; without it 512 512.",
-        rich_help_panel=OF_MESHES,
-        metavar="WIDTH HEIGHT",
-        callback=_two_numbers,
-    ),
-]
+class MeshOptions(NamedTuple):
+    """Options of a mesh that is given in place of a scene file."""
 
-Light = Annotated[
-    Optional[Path],
-    typer.Option(help="File of an environment map, .exr or .hdr, in place of a sky.", rich_help_panel=OF_MESHES),
-]
+    up: Annotated[
+        Optional[Literal["y", "z"]],
+        typer.Option(
+            help="Axis that points up; without it, it is guessed by how the mesh stands.", rich_help_panel=OF_MESHES
+        ),
+    ] = None
+    size: Annotated[
+        Optional[tuple[str, str]],
+        typer.Option(
+            help="Width and height of the image, in pixels; without it 512 512.",
+            rich_help_panel=OF_MESHES,
+            metavar="WIDTH HEIGHT",
+            callback=_two_numbers,
+        ),
+    ] = None
+    light: Annotated[
+        Optional[Path],
+        typer.Option(help="File of an environment map, .exr or .hdr, in place of a sky.", rich_help_panel=OF_MESHES),
+    ] = None
+    direction: Annotated[
+        Optional[tuple[float, float, float]],
+        typer.Option(
+            help="Where the camera stands, seen from the mesh's middle, y up; without it 0.3 0.4 0.9; from behind it "
+            "is 0.3 0.4 -0.9.",
+            rich_help_panel=OF_MESHES,
+            metavar="X Y Z",
+        ),
+    ] = None
+    light_rotation: Annotated[
+        Optional[float],
+        typer.Option(
+            help="Turn the light, counterclockwise seen from above, in degrees.",
+            metavar="DEGREES",
+            rich_help_panel=OF_MESHES,
+        ),
+    ] = None
 
-Direction = Annotated[
-    Optional[tuple[float, float, float]],
-    typer.Option(
-        help="Where the camera stands, seen from the mesh's middle, y up; without it 0.3 0.4 0.9; from behind it is "
-        "0.3 0.4 -0.9.",
-        rich_help_panel=OF_MESHES,
-        metavar="X Y Z",
-    ),
-]
 
-LightRotation = Annotated[
-    Optional[float],
-    typer.Option(
-        help="Turn the light, counterclockwise seen from above, in degrees.",
-        metavar="DEGREES",
-        rich_help_panel=OF_MESHES,
-    ),
-]
+NO_OPTIONS = MeshOptions()
+
+
+def with_mesh_options(command: Callable[..., None], *, without: str = "") -> Callable[..., None]:
+    """Put the options of meshes, but for one, into a command's signature, which takes them as ``mesh_options``."""
+    options = {name: item for name, item in inspect.signature(MeshOptions).parameters.items() if name != without}
+    parameters: list[inspect.Parameter] = []
+    for name, parameter in inspect.signature(command).parameters.items():
+        parameters += options.values() if name == "mesh_options" else [parameter]
+
+    @functools.wraps(command)
+    def run(**values: Any) -> None:
+        command(mesh_options=MeshOptions(**{name: values.pop(name) for name in options}), **values)
+
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return run
 
 
 _KEYS_OF_SCENES = {
-    "--up": "[[body]] rotation",
-    "--size": "[camera] size",
-    "--light": "[light]",
-    "--direction": '[camera] direction, beside framing = "auto", or eye and target',
-    "--light-rotation": "[light] rotation",
+    "up": "[[body]] rotation",
+    "size": "[camera] size",
+    "light": "[light]",
+    "direction": '[camera] direction, beside framing = "auto", or eye and target',
+    "light_rotation": "[light] rotation",
 }
-"""Keys that scene files have in place of the options of meshes, in the order of these."""
+"""Keys that scene files have in place of the options of meshes."""
 
 
-def load(
-    file: Path,
-    is_quiet: bool,
-    up: str | None,
-    size: tuple[str, str] | None,
-    light: Path | None,
-    direction: tuple[float, float, float] | None,
-    light_rotation: float | None,
-    **settings: Any,
-) -> Scene:
+def load(file: Path, options: MeshOptions, is_quiet: bool, **settings: Any) -> Scene:
     """The scene of a file, or the default one of a mesh's file; of that a note says which way is up."""
     from warpshadow.assets.mesh_files import MESH_SUFFIXES
     from warpshadow.scene.body import Body
@@ -101,20 +113,22 @@ def load(
         expected = f".toml for a scene file, or a mesh's: {', '.join(MESH_SUFFIXES)}"
         raise ValueError(f"{file}: got extension {file.suffix!r}, expected {expected}")
     if file.suffix.lower() not in MESH_SUFFIXES:
-        options = up, size, light, direction, light_rotation
-        for (option, key), value in zip(_KEYS_OF_SCENES.items(), options, strict=True):
+        for name, value in options._asdict().items():
             if value is not None:
                 shown = " ".join(map(str, value)) if isinstance(value, tuple) else value
+                option, key = f"--{name.replace('_', '-')}", _KEYS_OF_SCENES[name]
                 raise ValueError(f"{option}: got {shown} with {file}, expected a mesh; scene files have {key}")
         return load_scene(file, **settings)
     body = Body(file)
+    up: str | None = options.up
     if up is None:
         guess = guess_up(body.mesh, file.suffix.lower())
         up = guess.axis
         note(f"{file}: {up} is taken to be up ({guess.reason}); --up {'zy'['yz'.index(up)]} says otherwise", is_quiet)
-    width, height = map(int, size or ("512", "512"))
-    scene = default_scene(body, up=up, size=(width, height), light=light, direction=direction or DIRECTION)
-    turned = turned_light(scene.light, light_rotation or 0.0, 1.0)
+    width, height = map(int, options.size or ("512", "512"))
+    direction = options.direction or DIRECTION
+    scene = default_scene(body, up=up, size=(width, height), light=options.light, direction=direction)
+    turned = turned_light(scene.light, options.light_rotation or 0.0, 1.0)
     bounces = settings.pop("bounces", scene.bounces)
     return replace(scene, light=turned, visibility=Visibility.of(settings), bounces=bounces)
 

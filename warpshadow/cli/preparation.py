@@ -27,7 +27,7 @@ def spheres(
     device: Device = "cpu",
     is_quiet: Quiet = False,
 ) -> None:
-    """Fit spheres to a mesh and report how well they stand in for it; the fit is kept for later renders."""
+    """Fit spheres to a mesh and report how well they stand in for it; the fit is cached for later renders."""
     from warpshadow.assets.mesh_files import load_mesh
     from warpshadow.spheres import check_matplotlib, fit_spheres, plot_spheres
 
@@ -68,11 +68,11 @@ def _judgement(report: FitReport) -> str:
     """The meaning of a fit's errors for images."""
     from warpshadow.spheres.enough import MAX_SPHERES, RAGGED_ERROR
 
-    own = "the error on the surface counts where the body deforms, else it traces its shadow on itself"
+    hint = "the error on the surface counts where the body deforms, else it traces its shadow on itself"
     if report.shadow_error <= RAGGED_ERROR:
-        return f"the shadow on the ground is whole, as its error is below {RAGGED_ERROR:.0%}; {own}"
+        return f"the shadow on the ground is whole, as its error is below {RAGGED_ERROR:.0%}; {hint}"
     more = f"--count {2 * report.sphere_count}" if report.sphere_count < MAX_SPHERES else 'method = "ray-traced"'
-    return f"the shadow on the ground has holes, as its error is above {RAGGED_ERROR:.0%}; {more} may mend them; {own}"
+    return f"the shadow on the ground has holes, as its error is above {RAGGED_ERROR:.0%}; {more} may mend them; {hint}"
 
 
 @app.command()
@@ -110,16 +110,16 @@ def cache(
     ] = False,
     is_quiet: Quiet = False,
 ) -> None:
-    """Print where spheres, shadows and kernels are kept, and how large that is."""
+    """Print where spheres, shadows and kernels are cached, and how large that is."""
     from warpshadow.assets.cache import KINDS, cache_folder, cached_files
 
     with clear_errors():
         typer.echo(cache_folder())
-        for kind, what in KINDS.items():
-            remark = cached_files(kind)
-            typer.echo(f"  {what:40}{_size(remark)}")
+        for kind, contents in KINDS.items():
+            files = cached_files(kind)
+            typer.echo(f"  {contents:40}{_size(files)}")
             if clear:
-                for file in remark:
+                for file in files:
                     file.unlink(missing_ok=True)  # another process may clear, too
         wp.init()
         kernels = Path(wp.config.kernel_cache_dir)

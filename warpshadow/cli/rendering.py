@@ -15,8 +15,8 @@ import warp as wp
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.picture import SUFFIXES, Picture
 from warpshadow.assets.video import VIDEO_SUFFIXES, check_video, write_video
-from warpshadow.cli import mesh_options
 from warpshadow.cli.console import Device, Quiet, app, check_output, clear_errors, device_of, note
+from warpshadow.cli.mesh_options import MeshOptions, SceneOrMesh, count_of_bounces, load, with_mesh_options
 from warpshadow.scene.scene import Scene
 from warpshadow.scene.visibility import AUTO, METHOD_TRAITS
 
@@ -38,8 +38,9 @@ class _Render(typer.core.TyperCommand):
 
 
 @app.command(cls=_Render)
+@with_mesh_options
 def render(
-    scene: mesh_options.SceneOrMesh,
+    scene: SceneOrMesh,
     output: Annotated[
         Path,
         typer.Option(
@@ -49,11 +50,7 @@ def render(
             "--turntable or --camera-path a video: .mp4, .gif, .webp.",
         ),
     ],
-    up: mesh_options.Up = None,
-    size: mesh_options.Size = None,
-    light: mesh_options.Light = None,
-    direction: mesh_options.Direction = None,
-    light_rotation: mesh_options.LightRotation = None,
+    mesh_options: MeshOptions,
     png: Annotated[
         Optional[Path],
         typer.Option(help="Beside an .exr, also write a picture: .png, or .jpg.", rich_help_panel=_PICTURES),
@@ -129,7 +126,7 @@ def render(
         typer.Option(
             help="How often light bounces, 0 to 16 or all.",
             rich_help_panel=_METHOD,
-            parser=mesh_options.count_of_bounces,
+            parser=count_of_bounces,
             metavar="INTEGER|all",
         ),
     ] = None,
@@ -176,7 +173,7 @@ def render(
             raise ValueError(f"--{error}{others}") from error
         arguments: dict[str, Any] = {"method": method, "samples": samples, "bounces": bounces}
         arguments = {name: value for name, value in arguments.items() if value is not None}
-        parsed = mesh_options.load(scene, is_quiet, up, size, light, direction, light_rotation, **arguments)
+        parsed = load(scene, mesh_options, is_quiet, **arguments)
         where = device_of(device)
         loaded = parsed
         if parsed.visibility.method == AUTO:
@@ -195,14 +192,14 @@ def render(
         renderer = SceneRenderer(loaded, device=where, progress=True)
         image = renderer.render()
         seconds = time.perf_counter() - start
-        messages = f"{loaded.visibility.method}, {image.shape[1]} × {image.shape[0]}, {seconds:.2f} s"
+        summary = f"{loaded.visibility.method}, {image.shape[1]} × {image.shape[0]}, {seconds:.2f} s"
         if output.suffix.lower() == ".exr":
             write_image(output, image, layers=renderer.layers().channels() if layers else None)
-            note(f"{output}: {messages}", is_quiet)
+            note(f"{output}: {summary}", is_quiet)
         for file in (item for item in (output, png) if item is not None and item.suffix.lower() != ".exr"):
             picture = Picture(image, exposure=exposure, tone=tone, background=_behind(loaded, background))
             write_image(file, picture)
-            note(f"{file}: {f'{messages}, ' * (file == output)}exposure {picture.exposure:+.2f} stops", is_quiet)
+            note(f"{file}: {f'{summary}, ' * (file == output)}exposure {picture.exposure:+.2f} stops", is_quiet)
 
 
 def _behind(scene: Scene, background: str) -> str | np.ndarray | None:

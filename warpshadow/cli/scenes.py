@@ -1,6 +1,7 @@
 """Scenes: write one to begin with, put it into a photograph, view it, tune its settings."""
 
 import contextlib
+import functools
 import os
 import sys
 import time
@@ -11,8 +12,8 @@ import typer
 
 from warpshadow.assets.camera import DIRECTION
 from warpshadow.assets.picture import SUFFIXES
-from warpshadow.cli import mesh_options
 from warpshadow.cli.console import Device, Quiet, app, check_output, clear_errors, device_of, note
+from warpshadow.cli.mesh_options import NO_OPTIONS, MeshOptions, SceneOrMesh, count_of_bounces, load, with_mesh_options
 from warpshadow.viewer import HOST, PORT, serve
 
 if TYPE_CHECKING:
@@ -20,16 +21,13 @@ if TYPE_CHECKING:
 
 
 @app.command()
+@with_mesh_options
 def scene(
     mesh: Annotated[
         Optional[Path], typer.Argument(help="Mesh: .obj, .ply, .stl, .glb, .usd; without one, Warp's bunny.")
     ] = None,
     output: Annotated[Path, typer.Option("-o", "--output", help="Scene file to write, .toml.")] = Path("scene.toml"),
-    up: mesh_options.Up = None,
-    size: mesh_options.Size = None,
-    light: mesh_options.Light = None,
-    direction: mesh_options.Direction = None,
-    light_rotation: mesh_options.LightRotation = None,
+    mesh_options: MeshOptions = NO_OPTIONS,
     is_quiet: Quiet = False,
 ) -> None:
     """Write a scene file of a mesh on a ground under a sky, to be edited, rendered and viewed.
@@ -43,9 +41,9 @@ def scene(
         if mesh is None:
             mesh = write_bunny(output.parent)
             note(f"{mesh}: Warp's bunny", is_quiet)
-        loaded = mesh_options.load(mesh, is_quiet, up, size, light, direction, light_rotation)
-        seen_from, turned_by = direction or DIRECTION, light_rotation or 0.0
-        write_starter(output, mesh, loaded, light=light, direction=seen_from, rotation=turned_by)
+        loaded = load(mesh, mesh_options, is_quiet)
+        direction, rotation = mesh_options.direction or DIRECTION, mesh_options.light_rotation or 0.0
+        write_starter(output, mesh, loaded, light=mesh_options.light, direction=direction, rotation=rotation)
         note(f"{output}: warpshadow view {output} shows it", is_quiet)
 
 
@@ -82,12 +80,10 @@ def insert(
 
 
 @app.command()
+@functools.partial(with_mesh_options, without="size")
 def view(
-    scene: mesh_options.SceneOrMesh,
-    up: mesh_options.Up = None,
-    light: mesh_options.Light = None,
-    direction: mesh_options.Direction = None,
-    light_rotation: mesh_options.LightRotation = None,
+    scene: SceneOrMesh,
+    mesh_options: MeshOptions = NO_OPTIONS,
     host: Annotated[
         str, typer.Option(help="Address to serve at; by default for this machine alone, 0.0.0.0 is for everybody.")
     ] = HOST,
@@ -98,7 +94,7 @@ def view(
 ) -> None:
     """Show a scene, or a mesh on a ground under a sky, in the browser, to be turned with the mouse, until Ctrl+C."""
     with clear_errors():
-        loaded = mesh_options.load(scene, is_quiet, up, None, light, direction, light_rotation)
+        loaded = load(scene, mesh_options, is_quiet)
         file = scene if scene.suffix.lower() == ".toml" else None
         viewer = serve(loaded, host=host, port=port, device=device_of(device), path=file)
         with contextlib.suppress(KeyboardInterrupt):  # from the first moment that a page can be seen
@@ -110,8 +106,9 @@ def view(
 
 
 @app.command()
+@with_mesh_options
 def tune(
-    scene: mesh_options.SceneOrMesh,
+    scene: SceneOrMesh,
     error: Annotated[Optional[float], typer.Option(help="Largest relative error of shading, such as 0.03.")] = None,
     ms: Annotated[
         Optional[float], typer.Option(help="In place of --error: longest time of an image, in milliseconds.")
@@ -119,20 +116,16 @@ def tune(
     bounces: Annotated[
         Any,
         typer.Option(
-            help="How often light bounces in the truth, such as 12; then 0 to 4 bounces are tried, which takes some "
-            "five to ten minutes in place of one.",
-            parser=mesh_options.count_of_bounces,
+            help="How often light bounces in the reference, such as 12; then 0 to 4 bounces are tried, which takes "
+            "some five to ten minutes in place of one.",
+            parser=count_of_bounces,
             metavar="INTEGER|all",
         ),
     ] = None,
     fit: Annotated[
-        bool, typer.Option(help="Also fit 16 to 512 spheres a body, some 20 s in all; they are kept for later.")
+        bool, typer.Option(help="Also fit 16 to 512 spheres a body, some 20 s in all; they are cached for later.")
     ] = False,
-    up: mesh_options.Up = None,
-    size: mesh_options.Size = None,
-    light: mesh_options.Light = None,
-    direction: mesh_options.Direction = None,
-    light_rotation: mesh_options.LightRotation = None,
+    mesh_options: MeshOptions = NO_OPTIONS,
     device: Device = "cpu",
     is_quiet: Quiet = False,
 ) -> None:
@@ -147,7 +140,7 @@ def tune(
     with clear_errors():
         if (error is None) == (ms is None):
             raise ValueError(f"--error, --ms: got {'neither' if error is None else 'both'}, expected one of them")
-        loaded = mesh_options.load(scene, is_quiet, up, size, light, direction, light_rotation)
+        loaded = load(scene, mesh_options, is_quiet)
         where = device_of(device)
         tuning = tune_scene(
             loaded, error=error, milliseconds=ms, bounces=bounces, fits=fit, device=where, progress=True

@@ -29,7 +29,7 @@ _MAP_SUFFIXES = (".exr", ".hdr", ".pic")
 
 _KEPT_BODIES = 64
 _KEPT_MAPS = 16  # how many files a process keeps in memory; it reads others again when a scene has them
-_SAID_FAULTS = 10  # files that an error names at most
+_LISTED_FAULTS = 10  # files that an error names at most
 
 
 class SplitAssets(NamedTuple):
@@ -205,7 +205,7 @@ def _hashes(
                 faults.append(str(fault).replace(f"{path}: mesh: {path}: ", f"{path}: "))
             bar.update()
     if faults:
-        more = f"\nand {len(faults) - _SAID_FAULTS} more" * (len(faults) > _SAID_FAULTS)
-        messages = "\n".join(faults[:_SAID_FAULTS])
-        raise RecipeError(f"{what}: got {len(faults)} of {len(paths)} that cannot be used:\n{messages}{more}")
+        more = f"\nand {len(faults) - _LISTED_FAULTS} more" * (len(faults) > _LISTED_FAULTS)
+        listed = "\n".join(faults[:_LISTED_FAULTS])
+        raise RecipeError(f"{what}: got {len(faults)} of {len(paths)} that cannot be used:\n{listed}{more}")
     return hashes

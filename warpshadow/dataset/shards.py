@@ -75,13 +75,13 @@ def write_shards(
         _prepare_folder(folder, describe(data_set))
         missing = [shard for shard in shards if not (folder / shard.name).exists()]
         numbers = [number for shard in missing for number in shard.numbers]
-        rendered, messages = _render_all(data_set, numbers, _worker_count(data_set, workers)), set[str]()
+        rendered, warned = _render_all(data_set, numbers, _worker_count(data_set, workers)), set[str]()
         with contextlib.closing(rendered), progress_bar(len(numbers), "rendering", "image", shows=progress) as bar:
             for shard in missing:
                 with _new_archive(folder / shard.name) as archive:
                     for number in shard.numbers:
                         sample, remarks = next(rendered)
-                        _warn_once(remarks, number, messages)
+                        _warn_once(remarks, number, warned)
                         _add(archive, number, sample)
                         bar.update()
     return [folder / shard.name for shard in shards]
@@ -110,13 +110,13 @@ def _render(data_set: DataSet, number: int) -> _Rendered:
     return _Rendered(files, [str(item.message) for item in caught])
 
 
-def _warn_once(remarks: list[str], number: int, messages: set[str]) -> None:
+def _warn_once(remarks: list[str], number: int, warned: set[str]) -> None:
     """Give each warning once for all images, ignoring names and numbers."""
     for remark in remarks:
         kinds = {re.sub(r"'[^']*'|[\d.]+", "", part) for part in remark.split("; ")}
-        if not kinds <= messages:
+        if not kinds <= warned:
             check.warn(f"image {number}: {remark}")
-        messages.update(kinds)
+        warned.update(kinds)
 
 
 def _render_all(data_set: DataSet, numbers: Sequence[int], workers: int) -> Generator[_Rendered, None, None]:

@@ -109,11 +109,11 @@ def compiler_flags(lanes: int) -> str:
     Loops over lanes that fit a register are not unrolled, nor are loops over bands, of which there are 8 at most.
     Elsewhere Warp's own flags unroll them: with registers of 128 bits they are up to twice as fast.
     """
-    own, bits = _own_flags(), register_bits()
-    if _HOST_FLAG not in own.split():
-        return own  # for any CPU of the kind
+    flags, bits = _own_flags(), register_bits()
+    if _HOST_FLAG not in flags.split():
+        return flags  # for any CPU of the kind
     is_whole = lanes * _FLOAT_BITS <= bits and bits >= 8 * _FLOAT_BITS
-    base, loops = (_HOST_FLAG, _WHOLE_LOOPS) if is_whole else (own, ())
+    base, loops = (_HOST_FLAG, _WHOLE_LOOPS) if is_whole else (flags, ())
     return _accepted_flags(base, (*loops, f"-mprefer-vector-width={bits}"))
 
 

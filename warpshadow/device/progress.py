@@ -1,7 +1,7 @@
 """Progress: bars in terminals and notebooks, from a second on; elsewhere a line every ten seconds.
 
 One wait has one bar or line. Work within it, such as the compilation of kernels, is named there, too. Lines tell of a
-call of a renderer that lasts ten seconds by itself: those of a loop of shorter calls would say nothing.
+call of a renderer that lasts ten seconds by itself: bars of a loop of shorter calls would say nothing.
 """
 
 from __future__ import annotations

@@ -49,12 +49,12 @@ def current_tape() -> wp.Tape | None:
 @contextlib.contextmanager
 def own_tape(tape: wp.Tape | None) -> Iterator[None]:
     """Record this thread's launches on a tape that other threads do not see; None for no recording."""
-    own = _Runtime.tape.own
-    own.append(tape)
+    thread_tapes = _Runtime.tape.own
+    thread_tapes.append(tape)
     try:
         yield
     finally:
-        own.pop()
+        thread_tapes.pop()
 
 
 if "inline" not in inspect.signature(wp.func).parameters:  # Warp 1.17, whose compiler decides on its own
@@ -161,14 +161,14 @@ def bound_kernel(
         adjoints = [ctypes.byref(other) for other in others]
 
         def run_plainly(dim: Sequence[int], *first: Any, holds: Any = (arguments, gradients)) -> None:
-            own = values
+            copied = values
             if first:
-                own = type(values).from_buffer_copy(values)
+                copied = type(values).from_buffer_copy(values)
                 for (name, _), value in zip(names, first, strict=False):
-                    setattr(own, name, value)
+                    setattr(copied, name, value)
             if 0 not in dim:
                 hooks, bounds = _cpu_hooks(kernel, loaded, device), _cpu_bounds(tuple(dim), kernel.adj.kernel_dim)
-                (hooks.backward if adjoints else hooks.forward)(bounds, ctypes.byref(own), *adjoints)
+                (hooks.backward if adjoints else hooks.forward)(bounds, ctypes.byref(copied), *adjoints)
 
         return run_plainly
 
@@ -225,10 +225,10 @@ def new_array(shape: int | Sequence[int], dtype: type, device: wp.Device) -> wp.
     if size and not pointer:
         raise MemoryError(f"got no memory for an array of {size:,} bytes")
     array = object.__new__(wp.array)
-    own = array.__dict__
-    own.update(attributes)
-    own["ptr"], own["ctype"] = pointer, _types.array_t.from_buffer_copy(descriptor)
-    own["ctype"].data = pointer or 0
+    fields = array.__dict__
+    fields.update(attributes)
+    fields["ptr"], fields["ctype"] = pointer, _types.array_t.from_buffer_copy(descriptor)
+    fields["ctype"].data = pointer or 0
     return array
 
 
@@ -236,11 +236,11 @@ def array_at(pointer: int, shape: Sequence[int], dtype: type, *, owner: Any) -> 
     """Make a contiguous CPU array of memory that belongs to another, an array or anything else that holds it."""
     attributes, descriptor, _ = _cpu_array(tuple(shape), dtype)
     array = object.__new__(wp.array)
-    own = array.__dict__
-    own.update(attributes)
-    own["ptr"], own["ctype"], own["deleter"] = pointer, _types.array_t.from_buffer_copy(descriptor), None
-    own["ctype"].data = pointer
-    own["_ref" if isinstance(owner, wp.array) else "owner"] = owner
+    fields = array.__dict__
+    fields.update(attributes)
+    fields["ptr"], fields["ctype"], fields["deleter"] = pointer, _types.array_t.from_buffer_copy(descriptor), None
+    fields["ctype"].data = pointer
+    fields["_ref" if isinstance(owner, wp.array) else "owner"] = owner
     return array
 
 

@@ -153,7 +153,7 @@ def pack(task: object, dumps: Dumps = pickle.dumps) -> bytes:
     try:
         return dumps(task)
     except Exception as error:
-        raise PackError(f"the task cannot be pickled ({_said(error)})") from error
+        raise PackError(f"the task cannot be pickled ({_described(error)})") from error
 
 
 def answer(
@@ -170,7 +170,7 @@ def answer(
     try:
         return dumps((result, None))
     except caught as error:
-        return pickle.dumps((None, PackError(f"the result cannot be pickled ({_said(error)})")))
+        return pickle.dumps((None, PackError(f"the result cannot be pickled ({_described(error)})")))
 
 
 def unpack(answered: bytes) -> tuple[Any, Exception | None]:
@@ -178,7 +178,7 @@ def unpack(answered: bytes) -> tuple[Any, Exception | None]:
     try:
         return pickle.loads(answered)
     except Exception as error:
-        return None, PackError(f"the result cannot be unpickled ({_said(error)})")
+        return None, PackError(f"the result cannot be unpickled ({_described(error)})")
 
 
 def _sendable(error: BaseException) -> Exception:
@@ -186,11 +186,11 @@ def _sendable(error: BaseException) -> Exception:
     try:
         str(pickle.loads(pickle.dumps(error)))
     except Exception:
-        return RuntimeError(_said(error))
-    return error if isinstance(error, Exception) else RuntimeError(_said(error))
+        return RuntimeError(_described(error))
+    return error if isinstance(error, Exception) else RuntimeError(_described(error))
 
 
-def _said(error: BaseException) -> str:
+def _described(error: BaseException) -> str:
     """Type and message of an error, on a line."""
     return " ".join("".join(traceback.format_exception_only(error)).split())
 

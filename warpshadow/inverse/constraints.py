@@ -1,9 +1,9 @@
-"""Constraints of a pose: what is known of it besides the images.
+"""Constraints of a pose: knowledge of it besides the images.
 
 A pose has six degrees of freedom: a turn, as an axis-angle vector, and a shift of the body's middle. A constraint
 leaves each of them a subspace, and the values of a fit are coordinates in it, so that no step can violate it. A body
 that stands on a plane keeps three: it turns about the plane's normal and slides, and its height follows from its lowest
-vertex; what is fixed of its middle stays, and so it moves onto the plane along the other coordinates.
+vertex; fixed coordinates of its middle stay, and so it moves onto the plane along the other coordinates.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ def stable_rotation(mesh: Mesh, rotation: np.ndarray, normal: np.ndarray) -> np.
     """The rotation nearest to one in which a body rests on a plane without tipping over.
 
     A body rests on a triangle of its convex hull if the hull's centroid projects into it [Goldberg et al. 1999, "Part
-    pose statistics"]. Of these triangles the body is turned onto that which needs the least turn.
+    pose statistics"]. The body is turned onto the triangle that needs the least turn.
 
     Args:
         mesh: Of the body.

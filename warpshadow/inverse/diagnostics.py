@@ -46,7 +46,7 @@ def unseen_share(model: Model, images: torch.Tensor) -> float:
 
 
 def exposure_gaps(model: Model, images: torch.Tensor) -> dict[int, float]:
-    """Stops by which targets are brighter than images, for those views where that explains most of the residual."""
+    """Stops by which targets are brighter than images, for the views where that explains most of the residual."""
     gaps = {}
     for view, (image, target, weight) in enumerate(zip(images, model.targets, model.weights, strict=True)):
         weight = weight[..., None].expand(*weight.shape, 3)

@@ -86,7 +86,8 @@ class Loss:
         return width / self.alpha * ((squares / width + 1) ** (self.alpha / 2) - 1)
 
     def pixel_weights(self, x: torch.Tensor) -> torch.Tensor:
-        """Weights w for which Σ w x² has the gradient of the costs: those of iteratively reweighted least squares.
+        """Weights w for which Σ w x² has the gradient of the costs: the weights of iteratively reweighted least
+        squares.
 
         They tell which pixels a fit believes: about 0 where a redescending loss takes a pixel for an occluder's.
 

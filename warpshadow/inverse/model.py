@@ -26,7 +26,6 @@ class Model:
     """Images of a problem at a stage's size, and their loss against the targets.
 
     Args:
-        problem: The problem.
         setting: Of the problem.
         stage: Sets size and softness.
     """

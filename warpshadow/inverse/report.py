@@ -42,8 +42,6 @@ def write_result(result: Result, folder: AnyPath) -> list[Path]:
 class Report:
     """The result of a fit beside its start, at the targets' own size and the scene's own softness.
 
-    Args:
-        result: The result.
     Attributes:
         before, after: Images of the views, [view, height, width, 4].
         loss_before, loss_after: With regularizers.
@@ -76,7 +74,7 @@ class Report:
             write_image(folder / "light.exr", map_of(scene.light).astype(np.float32))
             written.append(folder / "light.exr")
         values: dict[str, Any] = {
-            f"{name}.{key}": item.cpu().numpy() for name, own in result.values.items() for key, item in own.items()
+            f"{name}.{key}": item.cpu().numpy() for name, parts in result.values.items() for key, item in parts.items()
         }
         with files.atomic_write(folder / "parameters.npz") as unfinished:
             np.savez(unfinished, **values)

@@ -106,7 +106,7 @@ class NormalMatrix:
 
     def __init__(self, problem: Problem, setting: Setting, values: Mapping[str, Values]):
         self.problem, self.setting = problem, setting
-        self.values = {name: {key: t.detach().clone() for key, t in own.items()} for name, own in values.items()}
+        self.values = {name: {key: t.detach().clone() for key, t in parts.items()} for name, parts in values.items()}
         stage = small_stage(problem)
         has_light = any(isinstance(free, Light) for free in problem.free)
         self.model = (ProjectedModel if has_light else Model)(problem, setting, stage)
@@ -129,8 +129,8 @@ class NormalMatrix:
     def _directions(self) -> np.ndarray:
         """Directions in which the numbers may move, [number, direction].
 
-        Of the numbers of a quaternion or of two columns those that turn the body by a radian about each axis, and none
-        along which they change and it does not, such as a quaternion's length.
+        Of the numbers of a quaternion or of two columns the changes that turn the body by a radian about each axis, and
+        none along which they change and it does not, such as a quaternion's length.
         """
         directions = np.eye(len(self.places))
         for free in self.problem.free:
@@ -143,7 +143,7 @@ class NormalMatrix:
 
     def moved(self, step: np.ndarray) -> dict[str, Values]:
         """The values, their numbers moved by a step, [number]."""
-        values = {name: {key: t.clone() for key, t in own.items()} for name, own in self.values.items()}
+        values = {name: {key: t.clone() for key, t in parts.items()} for name, parts in self.values.items()}
         for (name, key, number), part in zip(self.places, step.tolist(), strict=True):
             values[name][key].view(-1)[number] += part
         return values
@@ -166,13 +166,13 @@ class NormalMatrix:
         slopes = np.zeros((6, len(rows)))
         for column, index in enumerate(rows):
             name, key, number = self.places[index]
-            own = self.values[name]
+            parts = self.values[name]
             ends = []
             for step in (_STEP, -_STEP):
-                own[key].view(-1)[number] += step
+                parts[key].view(-1)[number] += step
                 rotation, middle, _ = self.posed(free)
                 ends.append((rotation.double().numpy(force=True), middle.double().numpy(force=True)))
-                own[key].view(-1)[number] -= step
+                parts[key].view(-1)[number] -= step
             turn = (ends[0][0] @ ends[1][0].T - ends[1][0] @ ends[0][0].T) / 2  # of small turns
             slopes[:, column] = [*(ends[0][1] - ends[1][1]), turn[2, 1], turn[0, 2], turn[1, 0]]
         return slopes / (2 * _STEP)
@@ -180,7 +180,7 @@ class NormalMatrix:
     def _residuals(self) -> np.ndarray:
         """Differences, weighted so that their squares have the loss's gradient, [view, height, width, channel].
 
-        The weights of reweighted least squares are those at the first call: at the result.
+        The weights of reweighted least squares are the first call's: at the result.
         """
         model, loss = self.model, self.problem.loss
         world = model.world(self.values)
@@ -249,7 +249,7 @@ class NormalMatrix:
     def _prior_slopes(self) -> np.ndarray:
         """Derivatives of the regularizers of poses, planes and offsets by the numbers, [number]."""
         leaves = {
-            name: {key: t.clone().requires_grad_() for key, t in own.items()} for name, own in self.values.items()
+            name: {key: t.clone().requires_grad_() for key, t in parts.items()} for name, parts in self.values.items()
         }
         total = torch.zeros(())
         for free in self.problem.free:
@@ -341,8 +341,8 @@ def _few_number_entries(values: Mapping[str, Values]) -> list[tuple[str, str, in
     """Name, key and index of the numbers of parameters that have few."""
     return [
         (name, key, number)
-        for name, own in values.items()
-        for key, tensor in own.items()
+        for name, parts in values.items()
+        for key, tensor in parts.items()
         if name != Light.key and tensor.numel() <= MAX_UNCERTAIN_NUMBERS
         for number in range(tensor.numel())
     ]

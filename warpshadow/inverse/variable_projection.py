@@ -7,7 +7,7 @@ For known geometry and reflectance images are linear in the light, I = A L. The 
 has the gradient of the loss at that light held fixed, since the loss does not change with it there. So a pose descends
 through lights that explain as much as they can, and a light found at a wrong pose cannot confirm it.
 
-The light is a sum of cells that are never negative: those of a map; or, for spherical harmonics, their projections, so
+The light is a sum of cells that are never negative: pixels of a map; or, for spherical harmonics, their projections, so
 that it is the projection of a light that is nowhere negative. Least squares with that bound are solved by their normal
 equations; other losses by reweighting them.
 """

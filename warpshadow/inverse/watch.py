@@ -57,7 +57,6 @@ class Watch:
         """Show how far a fit is, wait while it is to pause, and say whether it goes on.
 
         Args:
-            fit: The fit.
             save: Writes a checkpoint.
         """
         page = self._page

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from warpshadow.maths.adjacency import edges_of
 from warpshadow.maths.components import connected_components
 from warpshadow.maths.outline import cut_outline, find_outline
 from warpshadow.maths.panels import MAX_PANELS, TOLERANCES, find_panels
@@ -43,7 +44,7 @@ def find_convex_parts(positions: np.ndarray, faces: np.ndarray) -> list[ConvexPa
     """Find the convex parts of which a mesh consists.
 
     Args:
-        positions: Vertices, shape [vertex, 3]; those at one place count as one.
+        positions: Vertices, shape [vertex, 3]; vertices at one place count as one.
         faces: Triangles that wind alike, shape [face, 3].
 
     Returns:
@@ -93,21 +94,16 @@ def _find_panels(points: np.ndarray, sheets: list[np.ndarray]) -> list[np.ndarra
 
 def _pieces(triangles: np.ndarray) -> np.ndarray:
     """Number of the piece of each triangle; where pieces share an edge, triangles next to each other go together."""
-    edges, count = np.sort(_edges(triangles), axis=1), len(triangles)
+    edges, count = np.sort(edges_of(triangles), axis=1), len(triangles)
     _, edge, counts = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
     order = np.lexsort((np.arange(len(edges)) % count, edge.reshape(-1)))
     pairs = order[np.repeat(counts % 2 == 0, counts)].reshape(-1, 2) % count
     return connected_components(pairs[:, 0], pairs[:, 1], count)
 
 
-def _edges(triangles: np.ndarray) -> np.ndarray:
-    """Edges of triangles, those from each first corner first, shape [3 triangle, 2]."""
-    return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-
-
 def _is_open(triangles: np.ndarray) -> bool:
     """Whether triangles have a border."""
-    _, counts = np.unique(np.sort(_edges(triangles), axis=1), axis=0, return_counts=True)
+    _, counts = np.unique(np.sort(edges_of(triangles), axis=1), axis=0, return_counts=True)
     return bool((counts % 2).any())
 
 
@@ -125,7 +121,7 @@ def _solid(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
     """The convex solid that triangles enclose; None where they enclose none."""
     if len(triangles) > _MAX_TRIANGLES:
         return None
-    edges, count = _edges(triangles), len(triangles)
+    edges, count = edges_of(triangles), len(triangles)
     triangle_at = {(a, b): number % count for number, (a, b) in enumerate(edges.tolist())}
     if len(triangle_at) != len(edges) or not all((b, a) in triangle_at for a, b in triangle_at):
         return None
@@ -215,7 +211,7 @@ def _prisms_along(
 
 
 def _prism(top: np.ndarray, bottom: np.ndarray) -> ConvexPart:
-    """A prism, given the corners of its top, counterclockwise from above, and those below them."""
+    """A prism, given the corners of its top, counterclockwise from above, and the corners below them."""
     count = len(top)
     begin, third = np.arange(count), count // 3
     end = np.roll(begin, -1)
@@ -235,5 +231,5 @@ def _bulge(points: np.ndarray, begin: np.ndarray, end: np.ndarray) -> float:
 
 
 def _renumbered(edges: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Edges whose corners are numbers among those in use."""
+    """Edges whose corners are numbers among the used ones."""
     return np.concatenate([np.searchsorted(used, edges[:, :2]), edges[:, 2:]], axis=1)

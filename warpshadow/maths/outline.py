@@ -64,7 +64,7 @@ def is_convex(edges: np.ndarray) -> bool:
 
 
 def cut_outline(points: np.ndarray, edges: np.ndarray, maximum: int) -> list[np.ndarray] | None:
-    """Cut what an outline encloses into convex polygons, by lines between its corners.
+    """Cut the inside of an outline into convex polygons, by lines between its corners.
 
     Each line begins at a reflex corner. It goes to one from which on that is reflex no more, to another reflex one if
     it can be, else to the nearest. Lines that no corner needs any more are left out [Hertel and Mehlhorn 1983].

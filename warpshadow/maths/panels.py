@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from warpshadow.maths.adjacency import edge_neighbors
 from warpshadow.maths.components import connected_components
 from warpshadow.maths.outline import cut_outline, find_outline
 from warpshadow.maths.plane import is_flat
@@ -37,7 +38,7 @@ def find_panels(points: np.ndarray, triangles: np.ndarray, tolerance: float, max
 
     Args:
         points: Vertices, float64 of shape [vertex, 3].
-        triangles: Triangles, shape [triangle, 3]; those without area do not count.
+        triangles: Triangles, shape [triangle, 3]; slivers without area do not count.
         tolerance: Thickness and mean gap of a panel at most [units of points].
         maximum: Number of panels at most.
 
@@ -66,18 +67,17 @@ def find_panels(points: np.ndarray, triangles: np.ndarray, tolerance: float, max
 
 
 def _smooth_regions(points: np.ndarray, triangles: np.ndarray) -> list[np.ndarray]:
-    """Regions between creases, of triangles that have an area."""
+    """Regions between creases, of triangles that have an area; edges of more than two triangles are creases."""
     corners = points[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)
     has_area = lengths > 1e-10 * np.ptp(corners, axis=(0, 1)).max() ** 2
-    triangles, normals, count = triangles[has_area], normals[has_area] / lengths[has_area, None], has_area.sum()
-    edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
-    order = np.lexsort(edges.T)
-    is_same = (edges[order[1:]] == edges[order[:-1]]).all(axis=1)
-    pairs = np.stack([order[1:], order[:-1]])[:, is_same] % count
-    pairs = pairs[:, np.abs((normals[pairs[0]] * normals[pairs[1]]).sum(axis=1)) > _CREASE]
-    region = connected_components(pairs[0], pairs[1], count)
+    triangles, normals = triangles[has_area], normals[has_area] / lengths[has_area, None]
+    neighbors = edge_neighbors(triangles)
+    triangle, edge = np.nonzero(neighbors >= 0)
+    neighbor = neighbors[triangle, edge]
+    is_smooth = np.abs((normals[triangle] * normals[neighbor]).sum(axis=1)) > _CREASE
+    region = connected_components(triangle[is_smooth], neighbor[is_smooth], len(triangles))
     return [triangles[region == number] for number in range(region.max(initial=-1) + 1)]
 
 
@@ -131,7 +131,7 @@ def _joined(points: np.ndarray, regions: list[np.ndarray], tolerance: float) -> 
 
 
 def _outline(points: np.ndarray, region: np.ndarray, tolerance: float) -> np.ndarray:
-    """Corners around a region, but for those that stand out by less than the tolerance."""
+    """Corners around a region, but for corners that stand out by less than the tolerance."""
     from scipy.spatial import ConvexHull
 
     used = np.unique(region)

@@ -219,7 +219,6 @@ class PortionedShading(Node):
     So without a gradient transfer vectors of all receivers are in memory at once only where light is free.
 
     Args:
-        method: The method.
         points: The receivers.
         projected_light: The light projected for the method.
         light: Known or free light; None where it is not given yet: portions end with transfer vectors.
@@ -403,7 +402,7 @@ def _static_shadows(method: SphereMethod, points: LitPoints, light: Input | None
     static = points.static
     if static is None or not static.spheres[1].shape[1]:
         bouncing = bool(method.merged_scene.scene.bounces)
-        why = "light bounces: nothing of static bodies is kept" if bouncing else "no static body has blockers"
+        why = "light bounces: nothing of static bodies is cached" if bouncing else "no static body has blockers"
         return Node("static shadows", None, idle=why)
     rows = method.cached_rows(static, light, points.blocker_kinds)
 

@@ -324,7 +324,7 @@ class Directional(SphereMethod):
     def blocked_radiance(
         self, points: LitPoints, diffuse: Node, light: Input, view: LitPoints, choose: Callable[[Node], Node]
     ) -> Node:
-        """Mean radiance of what blocks the light of points, by their light with bounces and without."""
+        """Mean radiance of the blockers of points, by their light with bounces and without."""
         cells, projected_light = self._lobe_cells(points, light)
         free = light if isinstance(light.value(), wp.array) else None
         return Node("light of blockers", self._blocked, cells, points.receivers_node, projected_light, diffuse, free)

@@ -140,7 +140,7 @@ def _decision(node: Node, call: Call, reason: Decision) -> Decision:
         return Decision(True, f"a gradient to {_names(varying)} is asked for")
     if news := [source.news for source in node.sources if source.news]:
         return Decision(True, _listed(dict.fromkeys(news)))
-    return Decision(True, "nothing is kept yet") if node.caches else reason
+    return Decision(True, "nothing is cached yet") if node.caches else reason
 
 
 def _stage(node: Node, forward: Decision) -> StageReport:

@@ -33,7 +33,6 @@ class GlossyPoints(LitPoints):
     """The receivers of a view on bodies that shine.
 
     Args:
-        view: The view.
         cameras: Clip matrices of its cameras, or one for all.
     """
 

@@ -118,7 +118,7 @@ class Blockers(NamedTuple):
     self_visibility: SelfVisibility
     merging: float
     positions: wp.array  # of all vertices, vec3 [batch, vertex]
-    spheres: tuple[wp.array, wp.array]  # centers and radii of all spheres, those that do not block among them
+    spheres: tuple[wp.array, wp.array]  # centers and radii of all spheres, blocking or not
     frames: wp.array | None  # where bodies are that block as planes, vec3 [batch, 3 · plane]; None without any
     placed: PlacedParts | None  # where convex parts are; None without any
 
@@ -129,7 +129,7 @@ class Blockers(NamedTuple):
         ]
 
     def spheres_of(self, bodies: Iterable[int]) -> tuple[wp.array, wp.array]:
-        """Centers and radii of the spheres of bodies, of those that block by them."""
+        """Centers and radii of the spheres of bodies that block by spheres."""
         return self.merged_scene.spheres_of(self.sphere_blockers(bodies), self.spheres)
 
     @property
@@ -180,7 +180,7 @@ def find_groups(
     Args:
         points: Of which they are the receivers.
         receivers: All of them.
-        blockers: What is around them.
+        blockers: Their surroundings.
         self_lookups: Self-visibility of receivers, by body.
         cached_rows: Cached transmittance past static bodies, for receivers on them.
         static_normals: Normals of all vertices of static bodies; None where any may move.

@@ -47,7 +47,7 @@ class LayerArrays(NamedTuple):
     depth: wp.array  # float32
     normals: wp.array  # vec3
     bodies: wp.array  # int32
-    masks: list[wp.array]  # vec4: those of four bodies each; 0 where there are fewer
+    masks: list[wp.array]  # vec4: four bodies' each; 0 where there are fewer
 
 
 @wp.kernel

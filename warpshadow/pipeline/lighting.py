@@ -47,7 +47,7 @@ class BlockerKinds(NamedTuple):
     why_spheres: tuple[str, ...] = ()  # of each body, why it blocks its own light by spheres; empty for the traced
     planes: tuple[int, ...] = ()  # bodies that block all light as the planes in which they lie
     convex: tuple[int, ...] = ()  # traced ones that block the light of others by the convex parts that they consist of
-    bulging: tuple[int, ...] = ()  # bodies out of which spheres bulge: they receive at vertices, whatever was chosen
+    bulging: tuple[int, ...] = ()  # bodies out of which spheres bulge: they receive at vertices, for any choice
 
 
 ONLY_SPHERES = BlockerKinds()  # all bodies block by their spheres
@@ -187,7 +187,6 @@ class Method:
         """Choose the kind of blocker that each body of a geometry is; the scene's geometry by default.
 
         Args:
-            geometry: The geometry.
             rotations: Of its bodies; None where nobody knows on which body a receiver is.
         """
         return ONLY_SPHERES
@@ -283,7 +282,7 @@ class Method:
     def blocked_radiance(
         self, points: LitPoints, diffuse: Node, light: Input, view: LitPoints, choose: Callable[[Node], Node]
     ) -> Node:
-        """Mean radiance of what blocks the light of points, where light bounces, vec3 of shape [batch, receiver].
+        """Mean radiance of the blockers of points, where light bounces, vec3 of shape [batch, receiver].
 
         Args:
             points, light: As for :meth:`lobe_transmittance`.

@@ -88,7 +88,7 @@ class MergedScene:
 
     @functools.cached_property
     def edges(self) -> wp.array:
-        """Face across each edge, vec3i of shape [face]: :func:`warpshadow.assets.topology.edge_neighbors`."""
+        """Face across each edge, vec3i of shape [face]: :func:`warpshadow.maths.adjacency.edge_neighbors`."""
         parts = [body.mesh.surface.neighbors for body in self.scene.bodies]
         moved = [
             np.where(part < 0, part, part + first) for part, first in zip(parts, self.first_face[:-1], strict=True)
@@ -231,7 +231,7 @@ class MergedScene:
         Differentiable: poses, rest, pivot.
         """
         rest = self.rest if rest is None else as_geometry("rest", rest)
-        if poses is None:  # the scene's stand where they do, whatever they turn about
+        if poses is None:  # the scene's poses are the same for any pivot
             poses, pivot = self.poses, None
         check.shape("poses", poses.scales.shape, ("batch", len(self.scene.bodies)))
         if pivot is not None:
@@ -248,17 +248,17 @@ class MergedScene:
             )
         bodies = {*numbers, *rest.moving}
         vertices, spheres = self.runs(self.first_vertex, bodies), self.runs(self.first_sphere, bodies)
-        own = self.scene_geometry
+        static = self.scene_geometry
         if turned is not None:
-            assert own.rotations is not None
+            assert static.rotations is not None
             every, given_rotations = self.runs(np.arange(len(self.scene.bodies) + 1), bodies), turned
-            turned = splice(own.rotations, every, lambda a, b: given_rotations[:, a:b])
+            turned = splice(static.rotations, every, lambda a, b: given_rotations[:, a:b])
         return Geometry(
             splice(
-                own.positions, vertices, lambda a, b: poses.points(rest.positions[:, a:b], self._vertex_bodies[a:b])
+                static.positions, vertices, lambda a, b: poses.points(rest.positions[:, a:b], self._vertex_bodies[a:b])
             ),
-            splice(own.centers, spheres, lambda a, b: poses.points(rest.centers[:, a:b], self._sphere_bodies[a:b])),
-            splice(own.radii, spheres, lambda a, b: poses.radii(rest.radii[:, a:b], self._sphere_bodies[a:b])),
+            splice(static.centers, spheres, lambda a, b: poses.points(rest.centers[:, a:b], self._sphere_bodies[a:b])),
+            splice(static.radii, spheres, lambda a, b: poses.radii(rest.radii[:, a:b], self._sphere_bodies[a:b])),
             moving=tuple(bodies),
             rotations=turned,
             deformed=rest.deformed,
@@ -375,10 +375,10 @@ class MergedScene:
         rest = self.rest if rest is None else as_geometry("rest", rest)
         first_vertex, first_sphere = self.first_vertex[number : number + 2], self.first_sphere[number : number + 2]
         if positions is not None and centers is None and len(self._spheres[number]):
-            own_vertices, own_spheres = slice(*first_vertex.tolist()), slice(*first_sphere.tolist())
-            check.shape("positions", positions.shape, ("batch", own_vertices.stop - own_vertices.start))
-            own = rest.positions[:, own_vertices], rest.centers[:, own_spheres], rest.radii[:, own_spheres]
-            centers, moved_radii = self._sphere_binding(number).moved(positions, *own)
+            vertices, spheres = slice(*first_vertex.tolist()), slice(*first_sphere.tolist())
+            check.shape("positions", positions.shape, ("batch", vertices.stop - vertices.start))
+            at_rest = rest.positions[:, vertices], rest.centers[:, spheres], rest.radii[:, spheres]
+            centers, moved_radii = self._sphere_binding(number).moved(positions, *at_rest)
             radii = moved_radii if radii is None else radii
         return Geometry(
             _spliced("positions", rest.positions, positions, first_vertex),
@@ -439,8 +439,8 @@ class MergedScene:
         """Faces of consecutive bodies, given where their vertices begin and end: vec3i, indices from ``first`` on."""
         if (first, end) not in self._faces_of:
             faces = self.faces.numpy()
-            own = faces[(faces[:, 0] >= first) & (faces[:, 0] < end)] - first
-            self._faces_of[first, end] = self._array(own, wp.vec3i)
+            of_bodies = faces[(faces[:, 0] >= first) & (faces[:, 0] < end)] - first
+            self._faces_of[first, end] = self._array(of_bodies, wp.vec3i)
         return self._faces_of[first, end]
 
     @functools.cached_property

@@ -29,7 +29,7 @@ class Input:
     """
 
     def __init__(self, name: str, value: Any, *, news: str = ""):
-        self.name, self.news, self.given, self._value = name, news, value, value
+        self.name, self.news, self.original, self._value = name, news, value, value
         self.requires_grad = False
         for item in value if isinstance(value, (tuple, list)) else [value]:
             self.requires_grad |= getattr(item, "requires_grad", False)
@@ -79,7 +79,7 @@ def _is_same(new_value: Any, last: Input) -> bool:
         return isinstance(value, np.ndarray) and np.array_equal(new_value, value)
     if not arrays:
         return new_value is value
-    return all(map(_is_same_array, arrays, _arrays(last.given) or arrays, _arrays(value)))
+    return all(map(_is_same_array, arrays, _arrays(last.original) or arrays, _arrays(value)))
 
 
 def _is_same_array(array: wp.array, before: wp.array, copy: wp.array) -> bool:

@@ -49,12 +49,7 @@ class ScenePlanes:
     def others(self, number: int) -> list[np.ndarray]:
         """Vertices of each other body where the scene has it, in a body's frame."""
         bodies = self._merged_scene.scene.bodies
-        plane_body = bodies[number]
-        return [
-            (body.world_points() - plane_body.translation) @ plane_body.rotation_matrix() / plane_body.scale
-            for other, body in enumerate(bodies)
-            if other != number
-        ]
+        return [bodies[number].from_world(body.world_points()) for other, body in enumerate(bodies) if other != number]
 
     def blockers(self, bodies: tuple[int, ...], blocking_bodies: tuple[int, ...]) -> PlaneBlockers:
         """Plane blockers of some flat bodies, which send no light; ``blocking_bodies`` cast shadows."""

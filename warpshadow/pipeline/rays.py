@@ -41,9 +41,9 @@ class Rays(Method):
     def known_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
         """Shading of points in known light, towards which rays are drawn.
 
-        By what the scene's bodies reflect, light bounces along paths, without a gradient; by reflectance that a call
-        gives, and where receivers share directions, since few paths have grain, it bounces between patches, whose form
-        factors rays find once.
+        By the reflectance of the scene's bodies light bounces along paths, without a gradient; by reflectance that a
+        call gives, and where receivers share directions, since few paths have grain, it bounces between patches, whose
+        form factors rays find once.
         """
         meshes = self._blockers(points, points.receivers_node)
 
@@ -112,7 +112,7 @@ class Rays(Method):
     def blocked_radiance(
         self, points: LitPoints, diffuse: Node, light: Input, view: LitPoints, choose: Callable[[Node], Node]
     ) -> Node:
-        """Mean radiance of what blocks the light of points, by their light with bounces and without."""
+        """Mean radiance of the blockers of points, by their light with bounces and without."""
         if isinstance(light.value(), wp.array):
             direct = super().free_shading(view, light, view.materials)
         else:
@@ -137,7 +137,7 @@ class Rays(Method):
         return node
 
     def _blockers(self, points: LitPoints, receivers: Node) -> Node:
-        """Node of what rays in known light meet: trees of all vertices, or meshes for each instance of receivers."""
+        """Node of the blockers of rays in known light: trees of all vertices, or meshes of the receivers' instances."""
         if self.shares_directions:
             return self._trees_around(points, "visibility")
         return self._meshes(points) if receivers is points.receivers_node else self._meshes_for(points, receivers)
@@ -148,7 +148,7 @@ class Rays(Method):
         return points.cached("trees", points.vertices, lambda: Node(name, self._trees, points.vertices, items=items))
 
     def _trees(self, positions: wp.array) -> list[FaceTree]:
-        """Hierarchies of what casts shadows, for packets of rays."""
+        """Hierarchies of the blockers, for packets of rays."""
         merged_scene = self.merged_scene
         faces = merged_scene.faces.numpy()[np.isin(merged_scene.body_of_face, merged_scene.casting)]
         return [build_face_tree(item, faces, merged_scene.device) for item in positions.numpy()]

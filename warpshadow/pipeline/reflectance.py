@@ -43,7 +43,7 @@ class Materials:
     Args:
         merged_scene: The bodies.
         inputs: Arrays of each body, by name: "albedo", vec3 of shape [batch, 1] or [batch, vertex]; "textures", vec3 of
-            shape [batch, height, width], None without one; and where a body shines, those of GLOSS_ARGUMENTS, float32
+            shape [batch, height, width], None without one; and where a body shines, its GLOSS_ARGUMENTS, float32
             of shape [batch, 1] or [batch, vertex].
     Attributes:
         albedo, textures, roughness: These inputs; None where no body shines.

@@ -364,7 +364,7 @@ class SceneRenderer:
             light: As for :meth:`draw`.
             albedo: As for :meth:`draw`; a catcher's matters where light bounces.
             textures, gloss: As for :meth:`draw`.
-            geometry: As for :meth:`view`; but bodies that do not move have no kept rows.
+            geometry: As for :meth:`view`; but static bodies have no cached rows.
             clip_matrices: As for :meth:`view`. Batches of 1 serve every instance of the others.
         Returns:
             Linear RGB, vec3 of shape [batch, height, width]; vec4 with coverage, without a photograph.
@@ -460,7 +460,7 @@ class SceneRenderer:
         geometry: Geometry[wp.array] | None = None,
         clip_matrices: wp.array | None = None,
     ) -> Explanation:
-        """List the stages that the next call computes, those it skips, and why.
+        """List the stages that the next call computes and skips, and why.
 
         Args:
             light, albedo, textures, gloss: As for :meth:`draw`.

@@ -95,7 +95,7 @@ class SceneViews:
                 static = StaticBodies(self._merged_scene, geometry)
         arguments = vertices, spheres, cameras, static, self._blocker_kinds(geometry, last)
         for view in self.last:
-            if view is not None and view.given == arguments:
+            if view is not None and view.dependencies == arguments:
                 return view
         if clip_matrices is not None:
             check_clip_space(clip_matrices)

@@ -67,8 +67,8 @@ class StaticBodies:
             return True
         starts = self._merged_scene.first_vertex, self._merged_scene.first_sphere, self._merged_scene.first_sphere
         return all(
-            (array.numpy()[:, first:end] == own.numpy()[:, first:end]).all()
-            for array, own, start in zip(
+            (array.numpy()[:, first:end] == static.numpy()[:, first:end]).all()
+            for array, static, start in zip(
                 geometry.arrays().values(), self._geometry.arrays().values(), starts, strict=True
             )
             for first, end in self._merged_scene.runs(start, self.bodies)

@@ -50,7 +50,7 @@ class View(LitPoints):
         counts: Number of geometries, and of images.
         is_static: As for :class:`LitPoints`.
     Attributes:
-        given: Vertices, spheres, cameras, static bodies, and how all block light.
+        dependencies: Vertices, spheres, cameras, static bodies, and how all block light.
         clip_positions, fragments_node, silhouettes, receivers_node: Nodes of the visible surfaces.
     """
 
@@ -69,7 +69,7 @@ class View(LitPoints):
         counts: tuple[int, int],
         is_static: bool = False,
     ):
-        self.given = vertices, spheres, cameras, static, blocker_kinds
+        self.dependencies = vertices, spheres, cameras, static, blocker_kinds
         self._separate_bodies = method.separate_bodies(blocker_kinds)
         self._samples_receive = method.samples_receive(blocker_kinds)
         self.cameras = cameras
@@ -274,20 +274,20 @@ class View(LitPoints):
         body_light, inverse_light, base_factor = (
             Node("", operator.itemgetter(part), ratio, caches=False) for part in range(3)
         )
-        is_moving = self.clip_positions.requires_grad
         parts = (
             self._glossy(shading, light, materials, body_light)
             if materials.roughness
             else self._radiance(shading, body_light)
         )
-        films = [self._averaged(item, is_moving=is_moving) for item in (parts, self._radiance(shading, inverse_light))]
+        surfaces = parts, self._radiance(shading, inverse_light)
+        films = [self._averaged(samples, is_moving=self._is_moving) for samples in surfaces]
         films.append(self._averaged(base_factor))
         if photograph is None:
             return Node("photograph", over_nothing, *films, caches=False)
         return Node("photograph", compose, photograph, *films, caches=False)
 
     def white(self, light: Light | None, materials: Materials) -> Node:
-        """Light received by the samples, and coverage, vec4 of shape [batch, height · across, width · across].
+        """Light received by the samples, and coverage, vec4 of shape [batch, sample row, sample column].
 
         Materials matter where light bounces.
         """
@@ -304,7 +304,7 @@ class View(LitPoints):
     def _radiance(self, shading: Node, reflectance: Node) -> Node:
         """Node of the samples."""
         samples_of = functools.partial(Node, "radiance", items=self._samples, caches=False)
-        if self.clip_positions.requires_grad:
+        if self._is_moving:
             moving = self.silhouettes, self.clip_positions
             return samples_of(_moving_radiance, self.receivers_node, shading, reflectance, *moving)
         return samples_of(_radiance, self.receivers_node, shading, reflectance)
@@ -346,7 +346,7 @@ class View(LitPoints):
         count, static = int(self.merged_scene.first_vertex[-1]), 0
         if self.static is not None:
             static = int(self.static.has_vertex.sum())
-        return f"{count - static:,} vertices, {static:,} kept" if static else f"{count:,} vertices"
+        return f"{count - static:,} vertices, {static:,} cached" if static else f"{count:,} vertices"
 
     def emptiness(self) -> str | None:
         """Say of the first image that shows nothing of the scene why; None if there is none."""

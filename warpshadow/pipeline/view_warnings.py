@@ -1,4 +1,4 @@
-"""Warnings about what a view shows: nothing, a misplaced body, or faces too coarse for receivers at vertices."""
+"""Warnings about a view: it shows nothing, a body is misplaced, or faces are too coarse for receivers at vertices."""
 
 from collections.abc import Sequence
 

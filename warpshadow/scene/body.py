@@ -42,7 +42,7 @@ class Body:
 
     A point p of the mesh is at R(s p) + t. The world is right-handed with y up; a rotation turns about the origin of
     the mesh, counter-clockwise seen from the tip of its axis. Surfaces are diffuse, or shine
-    (``roughness``). Colors are linear RGB: ``srgb_to_linear`` converts those that color pickers show.
+    (``roughness``). Colors are linear RGB: ``srgb_to_linear`` converts the colors that color pickers show.
 
     A path, relative to the current folder, stands for its file, as in scene files.
 
@@ -84,12 +84,12 @@ class Body:
             other bodies to the light without them. In the image of :func:`warpshadow.render` its shadow is coverage
             alone. ``draw``, torch's renderer, fits and the viewer show it as any other body.
         roughness: glTF's, in [0, 1], one number or one for each vertex [vertex], or an .npy file of them: the surface
-            shines by a GGX lobe of width α = roughness². None, the default, is what the mesh's file says, if that is
+            shines by a GGX lobe of width α = roughness². None, the default, is the mesh's file's roughness, if that is
             glTF and neither ``albedo`` nor ``texture`` is given, and else a diffuse surface. Below 0.1 it is shown as
             0.1. Such a body has receivers at pixels; all methods but "log-sh" show it. It reflects other bodies
             where light bounces; with ``bounces=0`` they are black in it, so metals want bounces.
         metallic: Likewise, how much of it is metal, which reflects its albedo and has no diffuse light; by default 0.
-        specular: Likewise, strength of the reflection of what is not metal, of which 1, the default, is 4% straight on.
+        specular: Likewise, strength of the reflection of all but metal, of which 1, the default, is 4% straight on.
     """
 
     mesh: Mesh
@@ -324,8 +324,15 @@ class Body:
 
     def world_points(self) -> np.ndarray:
         """The vertices that faces refer to, where they are in the world [scene units], float64 of shape [point, 3]."""
-        points = self.mesh.world_points().astype(np.float64)
+        return self.to_world(self.mesh.world_points().astype(np.float64))
+
+    def to_world(self, points: np.ndarray) -> np.ndarray:
+        """Take points of the body's own space to the world, float64 of shape [..., 3]."""
         return self.scale * points @ self.rotation_matrix().T + self.translation
+
+    def from_world(self, points: np.ndarray) -> np.ndarray:
+        """Take points of the world to the body's own space, float64 of shape [..., 3]."""
+        return (points - self.translation) @ self.rotation_matrix() / self.scale
 
     def world_mesh(self) -> Mesh:
         """The mesh in world space."""

@@ -80,7 +80,7 @@ def enclosures(scene: Scene, cameras: Iterable[Camera]) -> list[str]:
     for camera in cameras:
         for number, body in enumerate(scene.bodies):
             low, high = body.mesh.bounds
-            eye = (camera.eye - body.translation) @ body.rotation_matrix() / body.scale  # in the body's space
+            eye = body.from_world(camera.eye)
             if (low < eye).all() and (eye < high).all() and _winding_number(body.mesh, eye) > 0.5:
                 place = ", ".join(f"{coordinate:.3g}" for coordinate in camera.eye)
                 return [

@@ -59,7 +59,7 @@ def write_starter(
         scene: Its :func:`warpshadow.default_scene`.
         light: File of the environment map that lights it, if not the sky.
         direction: From the mesh's middle to the camera.
-        rotation: By what the light is turned [degrees about +y].
+        rotation: Angle by which the light is turned [degrees about +y].
     Raises:
         FileExistsError: where the file is there, and differs: it may have been edited.
     """

@@ -93,7 +93,7 @@ class Visibility:
         sampling: Where the rays of "ray-traced" go: "independent", drawn from the light for each receiver, so that
             errors are noise, and go away as rays become many; or "shared", in directions that all receivers have in
             common, each for a part of the light: few rays are enough and there is no grain, but an edge of a shadow
-            has steps, of at most what a ray brings. Stills have these.
+            has steps, of one ray's light at most. Stills have these.
         error: Largest relative error of shading that "auto" is to accept.
     """
 

@@ -1,4 +1,4 @@
-"""The stages of a fit in order, the search for a wanted error, and fits kept on disk."""
+"""The stages of a fit in order, the search for a wanted error, and fits cached on disk."""
 
 from __future__ import annotations
 

@@ -120,14 +120,14 @@ def _make_project(lanes: int) -> wp.Kernel:
 
 
 @functools.cache
-def _make_pull(lanes: int) -> wp.Kernel:
+def _make_project_adjoint(lanes: int) -> wp.Kernel:
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
     see, sphere_adjoint = _make_see(lanes), make_sphere_adjoint(lanes)
     fn = make_lane_functions(lanes)
     sqrt, total = fn.sqrt, fn.total
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
-    def pull(
+    def project_adjoint(
         first_row: int,
         worker: int,
         # in
@@ -138,7 +138,7 @@ def _make_pull(lanes: int) -> wp.Kernel:
         edges: wp.array2d(dtype=wp.vec3),
         sums: wp.array2d(dtype=_Sums),
         # out
-        by_balls: wp.array2d(dtype=wp.vec4),
+        adj_balls: wp.array2d(dtype=wp.vec4),
     ):
         """A thread owns a block of receivers and a sphere, and sums up the gradients of all of the block."""
         row, sphere = wp.tid()
@@ -151,43 +151,43 @@ def _make_pull(lanes: int) -> wp.Kernel:
         z = Lane()
         sum_ = Lane()
         sum_t = Lane()
-        by_opacity = Lane()
+        adj_opacity = Lane()
         slope = Lane()
         for lane in range(lanes):
             i = block * lanes + lane
             edge = edges[i, sphere]
-            own = sums[i, sphere]
+            gradient = sums[i, sphere]
             factor = -6.0 * edge[2]
-            x[lane] = factor * own[0]
-            y[lane] = factor * own[1]
-            z[lane] = factor * own[2]
-            sum_[lane] = factor * own[3]
-            sum_t[lane] = factor * own[4]
-            by_opacity[lane] = -own[5]
+            x[lane] = factor * gradient[0]
+            y[lane] = factor * gradient[1]
+            z[lane] = factor * gradient[2]
+            sum_[lane] = factor * gradient[3]
+            sum_t[lane] = factor * gradient[4]
+            adj_opacity[lane] = -gradient[5]
             slope[lane] = edge[1]
-        by_offset, by_radius, _ = sphere_adjoint(
-            seen, sine, low, cos_width, sin_width, slope, by_opacity, sum_, sum_t, Vectors(x, y, z)
+        adj_offset, adj_radius, _ = sphere_adjoint(
+            seen, sine, low, cos_width, sin_width, slope, adj_opacity, sum_, sum_t, Vectors(x, y, z)
         )
-        by_balls[block, sphere] = wp.vec4(
+        adj_balls[block, sphere] = wp.vec4(
             total(
-                wp.cw_mul(places[3, block], by_offset.x)
-                + wp.cw_mul(places[6, block], by_offset.y)
-                + wp.cw_mul(places[9, block], by_offset.z)
+                wp.cw_mul(places[3, block], adj_offset.x)
+                + wp.cw_mul(places[6, block], adj_offset.y)
+                + wp.cw_mul(places[9, block], adj_offset.z)
             ),
             total(
-                wp.cw_mul(places[4, block], by_offset.x)
-                + wp.cw_mul(places[7, block], by_offset.y)
-                + wp.cw_mul(places[10, block], by_offset.z)
+                wp.cw_mul(places[4, block], adj_offset.x)
+                + wp.cw_mul(places[7, block], adj_offset.y)
+                + wp.cw_mul(places[10, block], adj_offset.z)
             ),
             total(
-                wp.cw_mul(places[5, block], by_offset.x)
-                + wp.cw_mul(places[8, block], by_offset.y)
-                + wp.cw_mul(places[11, block], by_offset.z)
+                wp.cw_mul(places[5, block], adj_offset.x)
+                + wp.cw_mul(places[8, block], adj_offset.y)
+                + wp.cw_mul(places[11, block], adj_offset.z)
             ),
-            total(by_radius),
+            total(adj_radius),
         )
 
-    return pull
+    return project_adjoint
 
 
 # ------------------------------------------------------------------------------------------------- transmittance
@@ -296,10 +296,10 @@ def _transmit_adjoint(
     """Each thread owns a sphere as one receiver sees it."""
     row, sphere = wp.tid()
     i = first_row + row
-    own = _Sums()
+    gradient = _Sums()
     if reached[i, sphere] != 0 and edges[i, sphere][2] > 0.0:
-        own = _edge_sums(axes[i, sphere], edges[i, sphere], reached[i, sphere], directions, upstream, i)
-    sums[i, sphere] = own
+        gradient = _edge_sums(axes[i, sphere], edges[i, sphere], reached[i, sphere], directions, upstream, i)
+    sums[i, sphere] = gradient
 
 
 class _View(NamedTuple):
@@ -389,20 +389,20 @@ class Refinement:
         transmittance = self._see_through(view)
         upstream = np.zeros_like(transmittance)
         passing = transmittance[: len(chosen)]
-        loss, by_transmittance = self._loss(passing, chosen)
-        upstream[: len(chosen)] = by_transmittance * passing
-        by_logs = wp.array(upstream.reshape(len(upstream), -1, FIT_BUNDLE), dtype=_Bundle, device=self.device)
+        loss, adj_transmittance = self._loss(passing, chosen)
+        upstream[: len(chosen)] = adj_transmittance * passing
+        adj_logs = wp.array(upstream.reshape(len(upstream), -1, FIT_BUNDLE), dtype=_Bundle, device=self.device)
         sums = empty(view.axes.shape, dtype=_Sums, device=self.device)
-        inputs = [view.axes, view.edges, view.reached, self.directions, by_logs]
+        inputs = [view.axes, view.edges, view.reached, self.directions, adj_logs]
         cost = 2 * _PAIR_COST * len(self.receivers.directions)
         launch(_transmit_adjoint, sums.shape, inputs=inputs, outputs=[sums], cost=cost)
         # every block of receivers has a gradient of its own: sums in a fixed order give the same bits on every run
         shape = view.places.shape[1], len(spheres)
-        by_balls = empty(shape, dtype=wp.vec4, device=self.device)
+        adj_balls = empty(shape, dtype=wp.vec4, device=self.device)
         inputs = [view.places, view.balls, np.cos(width), np.sin(width), view.edges, sums]
         lanes = lane_count(self.device)
-        launch(_make_pull(lanes), shape, inputs=inputs, outputs=[by_balls], cost=2 * _SPHERE_COST * lanes)
-        gradient = by_balls.numpy().sum(axis=0, dtype=np.float64)
+        launch(_make_project_adjoint(lanes), shape, inputs=inputs, outputs=[adj_balls], cost=2 * _SPHERE_COST * lanes)
+        gradient = adj_balls.numpy().sum(axis=0, dtype=np.float64)
         gradient[:, 3] *= spheres[:, 3]
         return loss, gradient
 

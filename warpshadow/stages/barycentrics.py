@@ -53,12 +53,12 @@ def _weights_adjoint(a: wp.vec4, b: wp.vec4, c: wp.vec4, ray: wp.vec2, adj_weigh
             adj_a = wp.where(sign * spanned[0] < 0.0, 0.0, scale * (adj_weights[0] - mean))
             adj_b = wp.where(sign * spanned[1] < 0.0, 0.0, scale * (adj_weights[1] - mean))
             adj_c = wp.where(sign * spanned[2] < 0.0, 0.0, scale * (adj_weights[2] - mean))
-            by_a = wp.vec3(adj_c * at_b[1] - adj_b * at_c[1], adj_b * at_c[0] - adj_c * at_b[0], 0.0)
-            by_b = wp.vec3(adj_a * at_c[1] - adj_c * at_a[1], adj_c * at_a[0] - adj_a * at_c[0], 0.0)
-            by_c = wp.vec3(adj_b * at_a[1] - adj_a * at_b[1], adj_a * at_b[0] - adj_b * at_a[0], 0.0)
-            wp.adjoint[a] += relative_adjoint(ray, by_a)
-            wp.adjoint[b] += relative_adjoint(ray, by_b)
-            wp.adjoint[c] += relative_adjoint(ray, by_c)
+            adj_at_a = wp.vec3(adj_c * at_b[1] - adj_b * at_c[1], adj_b * at_c[0] - adj_c * at_b[0], 0.0)
+            adj_at_b = wp.vec3(adj_a * at_c[1] - adj_c * at_a[1], adj_c * at_a[0] - adj_a * at_c[0], 0.0)
+            adj_at_c = wp.vec3(adj_b * at_a[1] - adj_a * at_b[1], adj_a * at_b[0] - adj_b * at_a[0], 0.0)
+            wp.adjoint[a] += relative_adjoint(ray, adj_at_a)
+            wp.adjoint[b] += relative_adjoint(ray, adj_at_b)
+            wp.adjoint[c] += relative_adjoint(ray, adj_at_c)
 
 
 @wp.kernel

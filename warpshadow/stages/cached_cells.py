@@ -119,7 +119,7 @@ def _add_rows(
 
 
 def add_rows(cached: CachedRows, sums: wp.array, channel: int = 0) -> None:
-    """Add the kept sums over static bodies to sums over moving bodies, in place.
+    """Add the cached sums over static bodies to sums over moving bodies, in place.
 
     No adjoint is needed: a constant leaves the gradient as it is.
 

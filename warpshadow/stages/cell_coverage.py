@@ -8,7 +8,7 @@ s₁ within the disc, are
     d = m·ω / √(1 − (m·ω)²),  m = n / |n|,  s = (a − x)·t / (a − x)·ω,  t = ω × m / |ω × m|
 
 and the area of the disc inside the outline is that of the whole disc, as often as the outline winds around ω, and a
-term for each edge that crosses the disc, what lies between the edge and the disc's border:
+term for each edge that crosses the disc, the area between the edge and the disc's border:
 
     π ρ² h = π ρ² w + ½ Σ_edges d (s₁ − s₀) − ρ² sign(d) atan2(|d| (s₁ − s₀), d² + s₀ s₁)
 
@@ -41,6 +41,17 @@ class ViewedEdge:
     adj_normal: wp.vec3  # gradient of n, times its length
 
 
+@wp.func
+def viewed_edge(begin: wp.vec3, end: wp.vec3, n: wp.vec3):
+    """An edge between two points relative to the receiver, by a normal of any length but 0 towards the shape."""
+    edge = ViewedEdge()
+    edge.length = wp.length(n)
+    edge.normal = (1.0 / edge.length) * n
+    edge.begin = begin
+    edge.end = end
+    return edge
+
+
 @wp.struct
 class Chord:
     """Part of an edge that is seen within a cell, in the plane that touches the sphere of directions there."""
@@ -48,7 +59,7 @@ class Chord:
     distance: float  # d, of the line from the middle of the cell
     begin: float  # s₀
     end: float  # s₁
-    along: wp.vec3  # t
+    tangent: wp.vec3  # t
     scale: float  # 1/√(1 − (m·ω)²), of the angle between ω and the normal
 
 
@@ -75,9 +86,9 @@ def _find_chord(edges: wp.array(dtype=ViewedEdge), e: int, cosine: float, direct
     b = edges[e].end
     if half2 > 0.0 and (wp.dot(a, direction) > 0.0 or wp.dot(b, direction) > 0.0):
         half = wp.sqrt(half2)
-        chord.along = chord.scale * wp.cross(direction, edges[e].normal)
-        chord.begin = _along_line(b, chord.along, direction, half, -half)
-        chord.end = _along_line(a, chord.along, direction, half, half)
+        chord.tangent = chord.scale * wp.cross(direction, edges[e].normal)
+        chord.begin = _along_line(b, chord.tangent, direction, half, -half)
+        chord.end = _along_line(a, chord.tangent, direction, half, half)
     return chord
 
 
@@ -165,6 +176,6 @@ def coverage_adjoint(
             chord = _find_chord(edges, e, cosine, direction, radius)
             if chord.end > chord.begin:
                 foot = direction - (chord.distance * chord.scale) * (normal - cosine * direction)
-                middle = foot + 0.5 * (chord.begin + chord.end) * chord.along
+                middle = foot + 0.5 * (chord.begin + chord.end) * chord.tangent
                 scale = adj * chord.scale * (chord.end - chord.begin) / (wp.pi * radius * radius)
                 edges[e].adj_normal = edges[e].adj_normal + scale * middle

@@ -85,17 +85,18 @@ def cut_map(
 
     This is the median cut of Debevec [2005, "A median cut algorithm for light probe sampling"], for any count, through
     pixels where they are large. A direction is the mean of its rectangle's light, and stands for all of it: so
-    receivers that see a whole rectangle get exactly its light, whatever their normal, and those on whose horizon it
+    receivers that see a whole rectangle get exactly its light, for any normal, and receivers on whose horizon it
     lies get too little: so the first cut is along the horizon of level ground.
 
-    Importance is luminance, to which even light adds a tenth. But suns, what is :data:`_SUN_BRIGHTNESS` times as bright
+    Importance is luminance, to which even light adds a tenth. But suns, pixels :data:`_SUN_BRIGHTNESS` times as bright
     as all is on average, have :data:`_SUN_SHARE` of it at most: their many directions would be close to each other.
 
     Args:
         radiance: Linear RGB, shape [height, 2·height, 3]; negative lobes of a band-limited map are welcome.
         count: Number of directions, a multiple of 16; runs of 16 and of 4 are close to each other.
-        find_shares: Finds, given directions, what share of receivers' light comes from each, shape [direction]. Where
-            given, importance, but for that of suns, goes to what receivers see, in a second cut: to a room's window.
+        find_shares: Finds, given directions, the share of receivers' light that comes from each, shape [direction].
+            Where given, importance, but for suns', goes to directions that receivers see, in a second cut: to a room's
+            window.
     """
     radiance = _of_size(np.asarray(radiance, np.float64))
     height, width, _ = radiance.shape

@@ -25,7 +25,7 @@ _LEAF = 4  # faces of a leaf at most
 _SLACK = 2.0**-20
 """How far leaves reach beyond their faces, as a part of their largest coordinate: points lie on faces to rounding.
 
-Of the largest of all faces it would be too far: those of an infinite ground reach 10⁵ times as far as what is on it."""
+Of the largest of all faces it would be too far: an infinite ground's reach 10⁵ times as far as the bodies on it."""
 
 
 @wp.struct

@@ -219,7 +219,7 @@ def _shares(
 
 
 @wp.func
-def _along(start: wp.vec3, end: wp.vec3, point: wp.vec3):
+def _nearest_on_edge(start: wp.vec3, end: wp.vec3, point: wp.vec3):
     """How far along an edge the point on it is that is nearest to a point, from 0 to 1."""
     step = end - start
     return wp.clamp(wp.dot(point - start, step) / wp.max(wp.length_sq(step), 1.0e-37), 0.0, 1.0)
@@ -239,7 +239,7 @@ def _nearest(point: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
         for k in range(3):
             start = corners[k]
             end = corners[(k + 1) % 3]
-            part = _along(start, end, point)
+            part = _nearest_on_edge(start, end, point)
             distance = wp.length_sq(start + part * (end - start) - point)
             if distance < nearest:
                 nearest = distance
@@ -287,7 +287,7 @@ def _find_means(
                 count += 1
         mean = total / float(count)
         if points:
-            # the mean point of all faces that share, or what is nearest to it on one of them
+            # the mean point of all faces that share, or the point nearest to it on one of them
             middle = wp.vec3()
             shared = int(0)
             for i in range(supersampling * supersampling):

@@ -103,9 +103,9 @@ def make_rotated_zonal_adjoint(order: int, lanes: int) -> wp.Function:
                 odd = Lane(0.0)
                 if m > 0:
                     odd = adj_coefficients[center - m]
-                surrounding = wp.cw_mul(even, cosine) + wp.cw_mul(odd, sine)
-                adj_zonal[band] = adj_zonal[band] + wp.cw_mul(legendre, surrounding)
-                adj_z += wp.cw_mul(zonal[band], wp.cw_mul(slope, surrounding))
+                adj_m = wp.cw_mul(even, cosine) + wp.cw_mul(odd, sine)
+                adj_zonal[band] = adj_zonal[band] + wp.cw_mul(legendre, adj_m)
+                adj_z += wp.cw_mul(zonal[band], wp.cw_mul(slope, adj_m))
                 weight = float(m) * wp.cw_mul(zonal[band], legendre)
                 adj_x += wp.cw_mul(weight, wp.cw_mul(even, cosine_below) + wp.cw_mul(odd, sine_below))
                 adj_y += wp.cw_mul(weight, wp.cw_mul(odd, cosine_below) - wp.cw_mul(even, sine_below))

@@ -73,7 +73,7 @@ def _make_trace() -> wp.Kernel:
     return shares;
     """)
     def interpolate(a: int, b: int, c: int, d: int, weights: wp.vec4) -> Lane:  # type: ignore[empty-body]
-        """Share of corners that each ray escapes at, of those that know."""
+        """Share of corners that each ray escapes at, among corners that know."""
         ...
 
     @wp.kernel(module="unique", module_options=module_options(PACKET), enable_backward=False)
@@ -98,8 +98,8 @@ def _make_trace() -> wp.Kernel:
     ):
         """A thread owns a chosen receiver: it traces the rays that its corners leave open.
 
-        Where there is room, it tells the rays of each packet that escape, in the low half of a word, and that meet
-        something, in the high half; and what it gets from each direction.
+        Where there is room, it stores which rays of each packet escape, in the low half of a word, and which meet
+        something, in the high half; and its light from each direction.
         """
         row = first_row + wp.tid()
         receiver = row
@@ -162,7 +162,7 @@ def find_shares(tree: FaceTree, points: wp.array, normals: wp.array, samples: Li
     """Find what share of receivers' light comes from each direction, on average over receivers, dim and bright ones.
 
     Args:
-        tree: What blocks the light.
+        tree: The blockers.
         points: Receiver positions [scene units], vec3 of shape [receiver]; a few stand for all.
         normals: Unit normals, vec3 of shape [receiver].
         samples: As for :func:`trace_shared`.
@@ -207,7 +207,7 @@ def trace_shared(
     """Trace the shading of receivers: the radiance of a white surface in direct light.
 
     Args:
-        tree: What blocks the light.
+        tree: The blockers.
         points: Receiver positions [scene units], vec3 of shape [receiver].
         normals: Unit normals, vec3 of shape [receiver].
         samples: One set of directions, a multiple of 16, each run of 16 close to each other.

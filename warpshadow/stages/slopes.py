@@ -62,7 +62,7 @@ def _slope_of_face(values: wp.vec3, corners: wp.vec3i, center: wp.vec2, clip_pos
 
 
 @wp.kernel(enable_backward=False)
-def _pull(
+def _add_slopes(
     first_row: int,
     worker: int,
     # in
@@ -147,9 +147,9 @@ def _pull(
                     )
                 weights = fragments.barycentrics[at]
                 depth = wp.dot(weights, wp.vec3(clip[corners[0]][3], clip[corners[1]][3], clip[corners[2]][3]))
-                pull = relative_adjoint(center, wp.vec3(-slope[0], -slope[1], 0.0)) / depth
-                if wp.isfinite(pull):
-                    add_to_corners(adj_clip_positions[view], corners, weights, pull)
+                adj_clip = relative_adjoint(center, wp.vec3(-slope[0], -slope[1], 0.0)) / depth
+                if wp.isfinite(adj_clip):
+                    add_to_corners(adj_clip_positions[view], corners, weights, adj_clip)
 
 
 def moving_radiance(
@@ -188,7 +188,7 @@ def moving_radiance(
         light = interpolate(fragments, faces, detached(shading))
         run = run_length(samples.device, samples.shape[2])
         launch(
-            _pull,
+            _add_slopes,
             light[0].size // run,
             cost=_COST * run * samples.shape[0],
             inputs=[

@@ -1,4 +1,4 @@
-"""Transfer vectors by rays: what a mesh lets through of light in a basis, exactly but for sampling."""
+"""Transfer vectors by rays: the transmittance of a mesh for light in a basis, exact but for sampling."""
 
 import functools
 from collections.abc import Callable

@@ -301,10 +301,10 @@ def transfer_chunk_adjoint(
     weighted = weight * adj
     wp.adjoint[transmittance] += wp.cw_mul(weighted, wp.max(cosine, Chunk(0.0)))
     is_up = wp.min(wp.max(cosine * 1.0e30, Chunk(0.0)), Chunk(1.0))
-    pull = wp.cw_mul(wp.cw_mul(weighted, transmittance), is_up)
-    wp.adjoint[nx] += wp.cw_mul(pull, x)
-    wp.adjoint[ny] += wp.cw_mul(pull, y)
-    wp.adjoint[nz] += wp.cw_mul(pull, z)
+    adj_cosine = wp.cw_mul(wp.cw_mul(weighted, transmittance), is_up)
+    wp.adjoint[nx] += wp.cw_mul(adj_cosine, x)
+    wp.adjoint[ny] += wp.cw_mul(adj_cosine, y)
+    wp.adjoint[nz] += wp.cw_mul(adj_cosine, z)
 
 
 def cell_inputs(transmittance: wp.array, normals: wp.array, directions: np.ndarray) -> list[Any]:

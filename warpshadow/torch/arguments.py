@@ -44,14 +44,14 @@ class Arguments:
         shape: tuple[int | str, ...],
         meaning: str = "",
         *,
-        messages: str | None = None,
+        message_name: str | None = None,
     ) -> Slot:
         """Add a tensor of items of a Warp dtype, of a shape with or without a batch dimension before it.
 
-        Messages about it call it ``messages``, by default its name.
+        Messages about it call it ``message_name``, by default its name.
         """
         shape = (*shape, *item_shape(dtype))
-        _check_tensor(messages or name, tensor, self.device, shape, meaning)
+        _check_tensor(message_name or name, tensor, self.device, shape, meaning)
         has_batch = tensor.ndim > len(shape)
         self._has_batch |= has_batch
         self.names.append(name)

@@ -149,9 +149,9 @@ class TorchRenderer(torch.nn.Module):
 
     def set_extra_state(self, state: torch.Tensor) -> None:
         """Raise ValueError unless a ``state_dict`` is of a renderer whose tensors mean the same."""
-        stored, expected_state = (bytes(item.tolist()).decode() for item in (state, self.get_extra_state()))
-        if stored != expected_state:
-            raise ValueError(f"state_dict: got that of a TorchRenderer with {stored}, expected {expected_state}")
+        stored, expected = (bytes(item.tolist()).decode() for item in (state, self.get_extra_state()))
+        if stored != expected:
+            raise ValueError(f"state_dict: got that of a TorchRenderer with {stored}, expected {expected}")
 
     @uncompiled
     @check.keywords(**_ELSEWHERE)
@@ -193,7 +193,7 @@ class TorchRenderer(torch.nn.Module):
             and where no light bounces to albedo and textures, may be differentiated again, in all of these;
             others raise NotImplementedError then.
         """
-        stored, inputs = self._checked_inputs(
+        arguments, inputs = self._checked_inputs(
             light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular)
         )
 
@@ -202,8 +202,8 @@ class TorchRenderer(torch.nn.Module):
             return self.warp.draw(**inputs, view=self.warp.view(*seen))
 
         is_affine = {"light": True, "albedo": not self.scene.bounces, "textures": not self.scene.bounces}
-        affine = [name for name in stored.names if is_affine.get(name.partition("[")[0])]
-        return stored.apply(draw, inputs, affine=affine)
+        affine = [name for name in arguments.names if is_affine.get(name.partition("[")[0])]
+        return arguments.apply(draw, inputs, affine=affine)
 
     @uncompiled
     @one_at_a_time
@@ -218,14 +218,14 @@ class TorchRenderer(torch.nn.Module):
             have no gradient for another that comes in front of it; masks and coverage have that of silhouettes, as
             images have.
         """
-        stored, inputs = self._checked_inputs(None, geometry, clip_matrices)
+        arguments, inputs = self._checked_inputs(None, geometry, clip_matrices)
 
         def find(inputs: dict[str, Any]) -> tuple[wp.array, ...]:
             view = self.warp.view(inputs["geometry"], inputs["clip_matrices"])
             result = self.warp.layer_arrays(view)
             return (*result[:3], *result.masks)
 
-        depth, normals, bodies, *quartets = stored.apply(find, inputs)
+        depth, normals, bodies, *quartets = arguments.apply(find, inputs)
         masks = torch.cat(quartets, dim=-1)[..., : len(self.scene.bodies)]
         return LayerTensors(depth, normals, bodies, masks.movedim(-1, -3))
 
@@ -256,13 +256,13 @@ class TorchRenderer(torch.nn.Module):
             ValueError: where no body of the scene is a catcher.
         Differentiable: all, as :meth:`forward` is; both the light with and that without the other bodies are.
         """
-        stored, inputs = self._checked_inputs(
+        arguments, inputs = self._checked_inputs(
             light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular)
         )
         camera = self.cameras[0]
         size = camera.height, camera.width
-        inputs["photograph"] = stored.add("photograph", photograph, wp.vec3, size, "linear RGB")
-        return stored.apply(lambda inputs: self.warp.insert(**inputs), inputs)
+        inputs["photograph"] = arguments.add("photograph", photograph, wp.vec3, size, "linear RGB")
+        return arguments.apply(lambda inputs: self.warp.insert(**inputs), inputs)
 
     @uncompiled
     @one_at_a_time
@@ -279,10 +279,10 @@ class TorchRenderer(torch.nn.Module):
         specular: PerBody[torch.Tensor] | None = None,
     ) -> Explanation:
         """List the stages that a call with the same arguments computes and skips, as :meth:`Renderer.explain` does."""
-        stored, inputs = self._checked_inputs(
+        arguments, inputs = self._checked_inputs(
             light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular)
         )
-        return self.warp.explain(**stored.filled(inputs))
+        return self.warp.explain(**arguments.filled(inputs))
 
     def _checked_inputs(
         self,
@@ -298,7 +298,7 @@ class TorchRenderer(torch.nn.Module):
             of_bodies: Of the call, in the order of REFLECTANCE.
         """
         has_cameras = self.warp.has_camera_batch and clip_matrices is None
-        stored = Arguments(self.device, cameras=self.cameras if has_cameras else None)
+        arguments = Arguments(self.device, cameras=self.cameras if has_cameras else None)
         inputs: dict[str, Any] = {"light": light, "geometry": None, "clip_matrices": None}
         if isinstance(light, torch.Tensor):
             what = describe_coefficients(self.basis, light.shape[-2] if light.ndim > 1 else 0)
@@ -307,22 +307,22 @@ class TorchRenderer(torch.nn.Module):
                     "; of a map [height, width, 3] that is known, light=EnvironmentMap(map.numpy()); its coefficients "
                     "are torch.as_tensor(renderer.basis.coefficients(EnvironmentMap(map.numpy())), dtype=torch.float32)"
                 )
-            inputs["light"] = stored.add("light", light, wp.vec3, (self.basis.size,), what)
+            inputs["light"] = arguments.add("light", light, wp.vec3, (self.basis.size,), what)
         elif isinstance(light, np.ndarray):  # which a renderer takes for known light
             raise ValueError("light: got ndarray, expected a tensor of torch.float32: torch.as_tensor makes one")
         if geometry is not None:
-            inputs["geometry"] = stored.add_geometry("geometry", geometry, self.warp.rest())
+            inputs["geometry"] = arguments.add_geometry("geometry", geometry, self.warp.rest())
         if clip_matrices is not None:
-            inputs["clip_matrices"] = stored.add("clip_matrices", clip_matrices, wp.mat44, ())
+            inputs["clip_matrices"] = arguments.add("clip_matrices", clip_matrices, wp.mat44, ())
         for name, values in zip(REFLECTANCE, of_bodies, strict=False):
             slots: list[Slot | None] = [None] * len(self.scene.bodies)
             for number, tensor in enumerate(self.scene.per_body(values, name)):
                 if tensor is not None:
-                    messages = self._item_name(name, values, number)
+                    message_name = self._item_name(name, values, number)
                     of_body = self._body_rows(name, number, tensor)
-                    slots[number] = stored.add(f"{name}[{number}]", *of_body, messages=messages)
+                    slots[number] = arguments.add(f"{name}[{number}]", *of_body, message_name=message_name)
             (inputs.setdefault("gloss", {}) if name in GLOSS_ARGUMENTS else inputs)[name] = slots
-        return stored, inputs
+        return arguments, inputs
 
     def _body_rows(
         self, name: str, number: int, tensor: torch.Tensor
@@ -338,9 +338,9 @@ class TorchRenderer(torch.nn.Module):
         counts = shape[: len(shape) - len(item)][-1:]
         return tensor, dtype, counts if counts in ((), (1,)) else (self.scene.bodies[number].mesh.vertex_count,), ""
 
-    def _item_name(self, argument: str, stored: PerBody[torch.Tensor] | None, number: int) -> str:
+    def _item_name(self, argument: str, values: PerBody[torch.Tensor] | None, number: int) -> str:
         """Name of an item for a body in messages: by the name of the body where that was given."""
-        keys = stored if isinstance(stored, Mapping) else ()
+        keys = values if isinstance(values, Mapping) else ()
         return f"{argument}[{next((repr(key) for key in keys if self.scene.body_number(key) == number), number)}]"
 
     @uncompiled
@@ -379,25 +379,25 @@ class TorchRenderer(torch.nn.Module):
         """
         count = len(self.scene.bodies)
         scales = self.scene_poses()[2] if scales is None else scales
-        stored = Arguments(self.device)
+        arguments = Arguments(self.device)
         remedy = "matrices of all bodies; rotation_matrices(…) makes them of axis-angle vectors and quaternions"
         inputs: dict[str, Any] = {
             "poses": [
-                stored.add("rotations", rotations, wp.mat33, (count,), remedy),
-                stored.add("translations", translations, wp.vec3, (count,)),
-                stored.add("scales", scales, wp.float32, (count,)),
+                arguments.add("rotations", rotations, wp.mat33, (count,), remedy),
+                arguments.add("translations", translations, wp.vec3, (count,)),
+                arguments.add("scales", scales, wp.float32, (count,)),
             ],
             "pivot": pivot,
         }
         if isinstance(pivot, torch.Tensor):
-            inputs["pivot"] = stored.add("pivot", pivot, wp.vec3, (count,), "a point of each body's own space")
-        stored.expand()
-        inputs["rest"] = None if rest is None else stored.add_geometry("rest", rest, self.warp.rest())
+            inputs["pivot"] = arguments.add("pivot", pivot, wp.vec3, (count,), "a point of each body's own space")
+        arguments.expand()
+        inputs["rest"] = None if rest is None else arguments.add_geometry("rest", rest, self.warp.rest())
 
         def place(inputs: dict[str, Any]) -> Geometry[wp.array]:
             return self.warp.placed(Poses(*inputs["poses"]), inputs["rest"], moving=moving, pivot=inputs["pivot"])
 
-        return stored.apply_geometry(place, inputs)
+        return arguments.apply_geometry(place, inputs)
 
     @uncompiled
     def scene_poses(
@@ -453,13 +453,13 @@ class TorchRenderer(torch.nn.Module):
         Differentiable: all.
         """
         parts = {"positions": positions, "centers": centers, "radii": radii}
-        stored = Arguments(self.device)
+        arguments = Arguments(self.device)
         inputs: dict[str, Any] = {
-            name: None if tensor is None else stored.add(name, tensor, GEOMETRY_DTYPES[name], ("item",))
+            name: None if tensor is None else arguments.add(name, tensor, GEOMETRY_DTYPES[name], ("item",))
             for name, tensor in parts.items()
         }
-        inputs["rest"] = None if rest is None else stored.add_geometry("rest", rest, self.warp.rest())
-        return stored.apply_geometry(lambda inputs: self.warp.deformed(body, **inputs), inputs)
+        inputs["rest"] = None if rest is None else arguments.add_geometry("rest", rest, self.warp.rest())
+        return arguments.apply_geometry(lambda inputs: self.warp.deformed(body, **inputs), inputs)
 
     @uncompiled
     def deformation_graph(self, body: BodyLike, *, count: int = 4) -> DeformationGraph:
@@ -484,11 +484,11 @@ class TorchRenderer(torch.nn.Module):
         Differentiable: all, so focal lengths and the principal point, too.
         """
         camera = self.cameras[0]
-        stored = Arguments(self.device)
+        arguments = Arguments(self.device)
         inputs = {
-            "intrinsics": stored.add("intrinsics", intrinsics, wp.mat33, ()),
-            "rotations": stored.add("rotations", rotations, wp.mat33, ()),
-            "translations": stored.add("translations", translations, wp.vec3, ()),
+            "intrinsics": arguments.add("intrinsics", intrinsics, wp.mat33, ()),
+            "rotations": arguments.add("rotations", rotations, wp.mat33, ()),
+            "translations": arguments.add("translations", translations, wp.vec3, ()),
         }
         options: dict[str, Any] = {"size": (camera.width, camera.height), "near": camera.near}
-        return stored.apply(lambda inputs: compose_clip_matrices(**inputs, **options), inputs)
+        return arguments.apply(lambda inputs: compose_clip_matrices(**inputs, **options), inputs)

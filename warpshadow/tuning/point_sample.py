@@ -37,7 +37,7 @@ class PointSample:
         scene: The scene; its method is not looked at.
         count: Number of points; fewer where the camera sees fewer.
         direction_count: Rays of each point, drawn in proportion to light.
-        bounces: How often light bounces in the truth, by default as in the scene.
+        bounces: How often light bounces in the reference, by default as in the scene.
         seed: Of the choice of points.
     Attributes:
         bodies: Body of each point, shape [point].
@@ -75,16 +75,16 @@ class PointSample:
         self.bodies = stage.merged_scene.body_of_face[face_ids.ravel()[chosen]]
         self._scene = scene
         self._chosen = [body.receivers for body in stage.scene.bodies]
-        if not self.truth.any():
+        if not self.reference.any():
             raise ValueError("light: none falls on what the camera sees, so nothing can be compared")
 
     @functools.cached_property
-    def truth(self) -> np.ndarray:
+    def reference(self) -> np.ndarray:
         """Shading by rays, each point a receiver, of shape [point, 3]."""
         return self._trace("pixel")
 
     @functools.cached_property
-    def interpolated_truth(self) -> np.ndarray:
+    def interpolated_reference(self) -> np.ndarray:
         """Shading by rays at the corners of faces, interpolated, of shape [point, 3]."""
         return self._trace("vertex")
 
@@ -136,13 +136,13 @@ class PointSample:
 
     def error(self, shading: np.ndarray) -> float:
         """Relative L2 error ‖B − B_mesh‖ / ‖B_mesh‖ of shading [point, 3] against rays."""
-        return float(np.linalg.norm(shading - self.truth) / np.linalg.norm(self.truth))
+        return float(np.linalg.norm(shading - self.reference) / np.linalg.norm(self.reference))
 
     def interpolation_errors(self) -> np.ndarray:
         """Share of the error that interpolation between vertices adds, for each body, of shape [body]."""
-        squares = ((self.interpolated_truth - self.truth) ** 2).sum(axis=1)
+        squares = ((self.interpolated_reference - self.reference) ** 2).sum(axis=1)
         sums = np.bincount(self.bodies, squares, minlength=len(self._scene.bodies))
-        return np.sqrt(sums) / np.linalg.norm(self.truth)
+        return np.sqrt(sums) / np.linalg.norm(self.reference)
 
 
 def seen_on_faces(view: View, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -173,11 +173,11 @@ def places_of_receivers(
         A point on whose face each receiver lies, shape [receiver]; where on it, shape [receiver, 3]; and the receivers
         of each point, shape [point, 3].
     """
-    own = np.flatnonzero(is_own)
+    themselves = np.flatnonzero(is_own)
     unique, places, corners = np.unique(vertices[~is_own], return_index=True, return_inverse=True)
     # a vertex lies on the face of a point of which it is a corner
-    points = np.concatenate([np.flatnonzero(~is_own)[places // 3], own])
-    weights = np.concatenate([np.eye(3, dtype=np.float32)[places % 3], barycentrics[own]])
+    points = np.concatenate([np.flatnonzero(~is_own)[places // 3], themselves])
+    weights = np.concatenate([np.eye(3, dtype=np.float32)[places % 3], barycentrics[themselves]])
     receivers = np.repeat(len(unique) + np.cumsum(is_own)[:, None] - 1, 3, axis=1)
     receivers[~is_own] = corners.reshape(-1, 3)
     return points, weights, receivers

@@ -91,7 +91,7 @@ class Tuning:
 
     @property
     def untried_counts(self) -> tuple[int, ...]:
-        """Numbers of spheres that were not tried, since no fit of them is kept: ``fits=True`` makes them."""
+        """Numbers of spheres that were not tried, since no fit of them is cached: ``fits=True`` makes them."""
         own = fitted_counts(self.given)
         tried = {trial.scene.bodies[number].blockers for trial in self.trials for number in own}
         return tuple(count for count in SPHERE_COUNTS if own and count not in tried)
@@ -99,7 +99,7 @@ class Tuning:
     def __str__(self) -> str:
         """The table, the units of its errors and times, and the meaning of its marks."""
         camera, samples = self.given.camera, self.given.supersampling
-        sampled = f"; but for those marked *, shadows timed on {TIMED_RECEIVERS} of its receivers, extrapolated to all"
+        sampled = f"; but for times marked *, shadows timed on {TIMED_RECEIVERS} of its receivers, extrapolated to all"
         sampled *= not any(trial.scene.bounces for trial in self.trials)
         mark = "chosen" if self.is_reached else "nearest"
         return (
@@ -209,7 +209,7 @@ def tune(
         bounces: How often light bounces in the reference, such as 12 or "all": then 0, 1, 2 and 4 bounces are tried,
             too, as far as there are so many, and "all". By default the scene's, which are not varied.
         fits: Whether to fit as many spheres as are tried, which takes some 20 s a body. Otherwise only the scene's own
-            number is, and others where fits are kept already.
+            number is, and others where fits are cached already.
         progress: Show progress, and all errors before anything is timed.
     Returns:
         The choice, and all trials. If no setting reaches the target, it is the nearest.

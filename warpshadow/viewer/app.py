@@ -91,7 +91,7 @@ class ViewerApp:
         return replace(viewer_state, method="ray-traced", sampling="shared") if by_rays else viewer_state
 
     def _note(self, text: str) -> None:
-        """Say on all pages what is being prepared; paint again when all is."""
+        """Name on all pages the work under way; paint again when all is done."""
         for page in list(self._pages.values()):
             page.note(f"by rays until all is prepared: {text}" if text else "")
         if not text:
@@ -154,24 +154,24 @@ class _ViserPage:
     def __init__(self, client: viser.ClientHandle):
         self._client = client
         self._asking = ThreadPoolExecutor(1)
-        self._taken: Future[None] | None = None
+        self._receipt: Future[None] | None = None
         self._status = client.gui.add_html("", order=-1.0)
         self._last_status, self._message, self._prepared, self._content = 0.0, "", "", ""
 
     def send(self, frame: Frame, delay: float) -> None:
         """Begin to send a picture."""
         quality = _MOVING_JPEG if frame.quality.is_moving else _RESTING_JPEG
-        asked_at = time.monotonic() - delay
+        request_time = time.monotonic() - delay
         self._client.scene.set_background_image(frame.rgb, format="jpeg", jpeg_quality=quality, depth=frame.depth)
         self._client.flush()
         with contextlib.suppress(RuntimeError):  # it was closed in the meantime
-            self._taken = self._asking.submit(self._ask, frame, asked_at)
+            self._receipt = self._asking.submit(self._ask, frame, request_time)
 
     def wait(self) -> None:
         """Return when the page has taken the last picture, or after some seconds."""
-        if self._taken is not None:
+        if self._receipt is not None:
             with contextlib.suppress(CancelledError):  # it was closed
-                self._taken.result()
+                self._receipt.result()
 
     def fail(self, message: str | None) -> None:
         """Show an error, or clear it."""
@@ -180,7 +180,7 @@ class _ViserPage:
             self._write(f'<b style="color:#f66">{html.escape(self._message)}</b>' if message else "")
 
     def note(self, text: str) -> None:
-        """Show what is being prepared; empty where nothing is."""
+        """Show the work under way; empty for none."""
         self._prepared = text
         self._write(self._content)
 
@@ -188,14 +188,16 @@ class _ViserPage:
         """Ask nothing more."""
         self._asking.shutdown(wait=False, cancel_futures=True)
 
-    def _ask(self, frame: Frame, asked_at: float) -> None:
+    def _ask(self, frame: Frame, request_time: float) -> None:
         with contextlib.suppress(RuntimeError, TimeoutError):  # RuntimeError: gone, or its storage is blocked
             self._client.local_storage.get_item("taken", timeout=_PICTURE_TIMEOUT)
         now = time.monotonic()
         if not self._message and (now - self._last_status > _STATUS_SECONDS or not frame.quality.is_moving):
             self._last_status = now
             height, width, _ = frame.rgb.shape
-            delay = f"{1e3 * (now - asked_at):.0f} ms from mouse to picture" if frame.quality.is_moving else "at rest"
+            delay = (
+                f"{1e3 * (now - request_time):.0f} ms from mouse to picture" if frame.quality.is_moving else "at rest"
+            )
             error = "" if frame.error is None else f"<br>error against rays {frame.error:.2%}"
             self._write(f"{delay}<br>{width} × {height}, {frame.cells}, {1e3 * frame.seconds:.0f} ms{error}")
 

@@ -99,9 +99,9 @@ class FitPage:
             has_begun = number < len(least_losses) and np.isfinite(least_losses[number])
             style = f"color:{color}" if has_begun and least_losses[number] == min(least_losses) else ""
             is_present = number == len(least_losses) - 1
-            messages = f"{least_losses[number]:.3e}" if has_begun else "waits"
+            loss_text = f"{least_losses[number]:.3e}" if has_begun else "waits"
             rows.append(
-                f'<tr style="{style}"><td>{"▸" if is_present else ""}</td><td>{number + 1}</td><td>{messages}</td>'
+                f'<tr style="{style}"><td>{"▸" if is_present else ""}</td><td>{number + 1}</td><td>{loss_text}</td>'
             )
         head = "<tr><td></td><td>candidate</td><td>least loss</td></tr>"
         self._candidates.content = _padded(f"<table>{head}{''.join(rows)}</table>") if rows else ""
@@ -119,9 +119,9 @@ class FitPage:
 
     def fail(self, message: str | None) -> None:
         """Show an error in the view; None clears it."""
-        messages = _padded(f'<b style="color:#f66">{html.escape(message)}</b>') if message else ""
-        if messages != self._failure.content:
-            self._failure.content = messages
+        content = _padded(f'<b style="color:#f66">{html.escape(message)}</b>') if message else ""
+        if content != self._failure.content:
+            self._failure.content = content
 
     def end(self, note: str) -> None:
         """Show how the fit ended, to be seen as long as browsers stay open."""

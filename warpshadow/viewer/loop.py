@@ -58,24 +58,24 @@ class Loop:
         self.depth = False
         self._paint, self._rest = paint, rest
         self._painting = threading.Lock()
-        self._asked = threading.Condition()  # guards the attributes below
+        self._changed = threading.Condition()  # guards the attributes below
         self._clients: dict[Hashable, _Client] = {}
-        self._last_asked = 0.0
+        self._last_request = 0.0
 
     def join(self, name: Hashable, page: Page) -> None:
         """Let a page in; it is sent nothing until it says where it looks from."""
         client = _Client(page)
-        with self._asked:
+        with self._changed:
             self._clients[name] = client
         threading.Thread(target=self._serve, args=(client,), name=f"page {name}", daemon=True).start()
 
     def leave(self, name: Hashable) -> None:
         """Let a page go."""
-        with self._asked:
+        with self._changed:
             client = self._clients.pop(name, None)
             if client is not None:
                 client.is_open = False
-            self._asked.notify_all()
+            self._changed.notify_all()
 
     def close(self) -> None:
         """Let all pages go."""
@@ -84,7 +84,7 @@ class Loop:
 
     def look_from(self, name: Hashable, camera: PageCamera) -> None:
         """A page looks from somewhere else."""
-        with self._asked:
+        with self._changed:
             client = self._clients.get(name)
             if client is not None and camera != client.camera:
                 client.camera = camera
@@ -102,7 +102,7 @@ class Loop:
 
     def update(self, change: Callable[[ViewerState], ViewerState]) -> ViewerState:
         """Send all pages a function of the current state, with no other change between."""
-        with self._asked:
+        with self._changed:
             viewer_state = change(self.viewer_state)
             if viewer_state != self.viewer_state:
                 self.viewer_state = viewer_state
@@ -111,35 +111,35 @@ class Loop:
 
     def again(self, *, depth: bool | None = None) -> None:
         """Paint again for all pages, with or without depth."""
-        with self._asked:
+        with self._changed:
             self.depth = self.depth if depth is None else depth
             self._ask(*self._clients.values())
 
     def camera_of(self, name: Hashable) -> PageCamera | None:
         """From where a page looks; None where it is gone, or has not said."""
-        with self._asked:
+        with self._changed:
             client = self._clients.get(name)
             return None if client is None else client.camera
 
     @property
     def is_content(self) -> bool:
         """Whether all pages have their best pictures, or the reason why they have none."""
-        with self._asked:
-            return all(client.is_content and client.asked is None for client in self._clients.values())
+        with self._changed:
+            return all(client.is_content and client.request_time is None for client in self._clients.values())
 
     def _ask(self, *clients: _Client) -> None:
-        self._last_asked = time.monotonic()
+        self._last_request = time.monotonic()
         for client in clients:
-            if client.asked is None:  # a delay counts from the oldest request that a picture answers
-                client.asked = self._last_asked
-        self._asked.notify_all()
+            if client.request_time is None:  # a delay counts from the oldest request that a picture answers
+                client.request_time = self._last_request
+        self._changed.notify_all()
 
     # ------------------------------------------------------------------------------------------ the thread of a page
 
     def _serve(self, client: _Client) -> None:
         frame_rate, last = FrameRate(), None
         while (job := self._next(client, frame_rate, last)) is not None:
-            camera, quality, asked_at = job
+            camera, quality, request_time = job
             try:
                 with self._painting:
                     start = time.monotonic()
@@ -155,30 +155,30 @@ class Loop:
             client.page.fail(None)
             client.page.wait()
             if client.is_open:
-                client.page.send(frame, time.monotonic() - asked_at)
+                client.page.send(frame, time.monotonic() - request_time)
             last = camera, quality, seconds
 
     def _next(
         self, client: _Client, frame_rate: FrameRate, last: tuple[PageCamera, Quality, float] | None
     ) -> tuple[PageCamera, Quality, float] | None:
         """Wait for the next request to paint, and return it with its time. None where the page is gone."""
-        with self._asked:
+        with self._changed:
             while client.is_open:
-                if client.asked is not None and client.camera is not None:
-                    asked_at, client.asked, client.is_content = client.asked, None, False
-                    return client.camera, frame_rate.moving(), asked_at
+                if client.request_time is not None and client.camera is not None:
+                    request_time, client.request_time, client.is_content = client.request_time, None, False
+                    return client.camera, frame_rate.moving(), request_time
                 better = None
                 if last is not None:
                     camera, quality, seconds = last
                     better = frame_rate.better(quality, seconds, camera.width * camera.height)
                 client.is_content = better is None
                 if better is None:
-                    self._asked.wait()
+                    self._changed.wait()
                     continue
-                left = self._last_asked + self._rest - time.monotonic()
+                left = self._last_request + self._rest - time.monotonic()
                 if left <= 0:
                     return camera, better, time.monotonic()
-                self._asked.wait(left)
+                self._changed.wait(left)
         return None
 
 
@@ -188,6 +188,6 @@ class _Client:
     def __init__(self, page: Page):
         self.page = page
         self.camera: PageCamera | None = None
-        self.asked: float | None = None  # when; None where that is answered
+        self.request_time: float | None = None  # when; None where that is answered
         self.is_content = False  # whether it has the best picture of the latest that it asked for
         self.is_open = True

@@ -21,7 +21,7 @@ def loss_plot(stages: Sequence[Sequence[Sequence[float]]]) -> str:
     Returns:
         An <svg>; nothing where there is no loss to draw.
     """
-    runs = [(stage, run) for stage, own in enumerate(stages) for run in own]
+    runs = [(stage, run) for stage, descents in enumerate(stages) for run in descents]
     count = sum(len(run) for _, run in runs)
     logs = [math.log10(loss) for _, run in runs for loss in run if 0 < loss < math.inf]
     if not logs:

@@ -30,7 +30,7 @@ from warpshadow.viewer.state import ERROR, ViewerState
 
 _BACKGROUND = 0.05  # linear gray behind uncovered pixels
 _COARSE_MAP = 64  # rows of the light while something moves: it is turned in a millisecond then
-_RENDERERS, _SIZES = 6, 8  # that are kept
+_RENDERERS, _SIZES = 6, 8  # that are cached
 _HORIZON = 100.0  # a flat body goes to the horizon that is so many times as large as all bodies that are not flat
 _FAR = 160.0  # depth of uncovered pixels [page units]; viser knows none beyond 167
 _RAYS = 256  # of a pixel, that an error is told against
@@ -88,18 +88,17 @@ class Painter:
         Args:
             viewer_state: The viewer state.
             page: From where.
-            quality: Its quality.
             depth: Whether distances are asked for, too.
         """
         start = time.perf_counter()
         renderer, view, camera, image = self._drawn(viewer_state, page, quality)
         error = None
         if viewer_state.shows == ERROR and not quality.is_moving:
-            truth = self.image(
+            reference = self.image(
                 replace(viewer_state, method="ray-traced", sampling="independent"), page, replace(quality, rays=_RAYS)
             )
-            error = relative_error(image, truth)
-            rgb = error_picture(image, truth)
+            error = relative_error(image, reference)
+            rgb = error_picture(image, reference)
         else:
             rgb = picture(image, viewer_state.stops, behind=self._behind(viewer_state, camera, quality))
         depths = None
@@ -205,7 +204,7 @@ class RecentCache(Generic[Value]):
     """The last values, by key.
 
     Args:
-        count: How many are kept.
+        count: How many are cached.
     """
 
     def __init__(self, count: int):
@@ -213,7 +212,7 @@ class RecentCache(Generic[Value]):
         self._cached: OrderedDict[Hashable, Value] = OrderedDict()
 
     def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
-        """The value of a key, made if it is not kept."""
+        """The value of a key, made if it is not cached."""
         if key not in self._cached:
             self._cached[key] = make()
         self._cached.move_to_end(key)
@@ -266,25 +265,27 @@ def picture(image: np.ndarray, stops: float, behind: np.ndarray) -> np.ndarray:
 _SRGB = np.round(255 * linear_to_srgb(np.linspace(0, 1, 4096) ** 2)).astype(np.uint8)
 
 
-def relative_error(image: np.ndarray, truth: np.ndarray) -> float | None:
+def relative_error(image: np.ndarray, reference: np.ndarray) -> float | None:
     """Relative L2 error of color over pixels that are wholly covered in both; None where there is none."""
-    covered = (image[..., 3] == 1) & (truth[..., 3] == 1)
-    size = np.linalg.norm(truth[covered, :3])
-    return float(np.linalg.norm((image - truth)[covered, :3]) / size) if size > 0 else None
+    covered = (image[..., 3] == 1) & (reference[..., 3] == 1)
+    size = np.linalg.norm(reference[covered, :3])
+    return float(np.linalg.norm((image - reference)[covered, :3]) / size) if size > 0 else None
 
 
-def error_picture(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """How far an image is from the truth, a fifth of its mean as full red (too bright) or blue (too dark).
+def error_picture(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """How far an image is from the reference, a fifth of its mean as full red (too bright) or blue (too dark).
 
     Args:
         image: Linear RGB and coverage, shape [height, width, 4].
-        truth: Likewise.
+        reference: Likewise.
     Returns:
         uint8 of shape [height, width, 3].
     """
-    covered = truth[truth[..., 3] > 0, :3]
+    covered = reference[reference[..., 3] > 0, :3]
     mean = float(covered.mean()) if len(covered) else 0.0
-    excess = np.clip((image - truth)[..., :3].mean(axis=-1) / (0.2 * mean), -1, 1) if mean > 0 else 0 * image[..., 0]
+    excess = (
+        np.clip((image - reference)[..., :3].mean(axis=-1) / (0.2 * mean), -1, 1) if mean > 0 else 0 * image[..., 0]
+    )
     white = np.ones_like(excess)
     red, blue = np.minimum(white, 1 + excess), np.minimum(white, 1 - excess)
     return (255 * np.stack([red, np.minimum(red, blue), blue], axis=-1)).round().astype(np.uint8)

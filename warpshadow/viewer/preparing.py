@@ -1,7 +1,7 @@
 """Preparing in another process: spheres, tables and kernels of a scene, while pages see it by rays.
 
 The process fills the caches on disk, from which this one reads. Should this one end before, the other is interrupted,
-and keeps what it has so far.
+and keeps its results so far.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from warpshadow.viewer.state import ViewerState
 
 _NOTE_INTERVAL = 1.0  # time between two notes of how far it is
 _PIXELS = 128**2  # of the images that the process renders, for all that they need
-_STOP_TIMEOUT = 40.0  # time that the process has to write what it has, after this one ended [s]
+_STOP_TIMEOUT = 40.0  # time that the process has to write its results, after this one ended [s]
 
 
 _QUALITIES = (

@@ -51,7 +51,7 @@ class _Gloss(FreeOfBody):
         world.gloss[self.key][self.number] = values["value"]
 
     def project(self, values: Values) -> None:
-        """Numbers are in [0, 1]; roughness is at least what is shown."""
+        """Numbers are in [0, 1]; roughness is at least the lowest that is shown."""
         values["value"].clamp_(MIN_ROUGHNESS if self.key == "roughness" else 0, 1)
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:

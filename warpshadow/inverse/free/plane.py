@@ -34,7 +34,7 @@ class Plane(FreeOfBody):
         points: Points that lie on it, such as of a calibration pattern or a depth camera, [point, 3], three or more:
             it starts at the nearest plane.
         deviation: Standard deviation of their distances from it [scene units].
-        carries: Further bodies that move with it, beside those that a free pose stands on it: numbers or names.
+        carries: Further bodies that move with it, beside bodies that a free pose stands on it: numbers or names.
     """
 
     key: ClassVar[str] = "plane"
@@ -76,7 +76,7 @@ class Plane(FreeOfBody):
             raise ValueError(f"carries: got {self.number}, the plane itself; expected bodies that stand on it")
 
     def _moving(self) -> list[int]:
-        """The bodies that move: itself, and those that it carries."""
+        """The bodies that move: itself, and all that it carries."""
         return [self.number, *(body for body in self.carries if isinstance(body, int))]
 
     def _start(self, setting: Setting) -> tuple[np.ndarray, np.ndarray, float]:
@@ -155,7 +155,8 @@ class Plane(FreeOfBody):
 
 
 def with_planes_last(free: Sequence[Free]) -> tuple[Free, ...]:
-    """Free parameters of bodies' numbers in the order in which they move bodies; planes carry those that stand on them.
+    """Free parameters of bodies' numbers in the order in which they move bodies; planes carry bodies that stand on
+    them.
 
     Raises:
         ValueError: for a prior of the distance of a body whose plane moves, and for a plane whose pose is free, too.

@@ -196,8 +196,7 @@ class Pose(FreeOfBody):
 
     def _start_middle(self, setting: Setting) -> np.ndarray:
         """Where the body's middle is at the start, in the world."""
-        body = setting.scene.bodies[self.number]
-        return body.scale * body.rotation_matrix() @ setting.middle(self.number) + body.translation
+        return setting.scene.bodies[self.number].to_world(setting.middle(self.number))
 
     def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
         """Squared distances from the priors, in standard deviations."""

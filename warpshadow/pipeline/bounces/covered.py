@@ -38,9 +38,7 @@ def find_covers(senders: Senders, depths: np.ndarray) -> Covers | None:
     bodies, is_flat = senders.merged_scene.scene.bodies, senders.merged_scene.is_flat
     placed = [(bodies[number], item) for number, item in zip(senders.bodies, senders.patches, strict=True)]
     normals = np.concatenate([item.normals @ body.rotation_matrix().T for body, item in placed])
-    centers = np.concatenate(
-        [body.scale * item.centers @ body.rotation_matrix().T + body.translation for body, item in placed]
-    )
+    centers = np.concatenate([body.to_world(item.centers) for body, item in placed])
     radii = np.sqrt(senders.areas / 2)
     is_solid = ~is_flat[senders.body_of_patch]
     weights = np.zeros((0, 3))

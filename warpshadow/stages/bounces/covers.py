@@ -19,7 +19,6 @@ from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.stages.planes.cells import step
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
 
@@ -41,7 +40,7 @@ def _cover(
     if distances[patch] > 0.0:
         placed = instance_in(batch, centers.shape[0])
         distance = wp.length(centers[placed, patch] - centers_before[placed, patch])
-        part = step(3.0 - 2.0 * distance / distances[patch])
+        part = wp.smoothstep(-1.0, 1.0, 3.0 - 2.0 * distance / distances[patch])
         result = own + part * (radiosity_before[instance_in(batch, radiosity.shape[0]), patch] - own)
     sent[batch, patch] = result
 

@@ -10,24 +10,26 @@ from warpshadow.stages.planes.cells import (
     PlaneFootprint,
     fetch,
     fetch_adjoint,
-    find_footprint,
-    find_footprint_adjoint,
-    find_spot,
+    find_mip_footprint,
     is_covered_by_texels,
-    on_side,
     scatter,
-    side_adjoint,
-    step,
-    step_slope,
-    toward_side,
+    smoothstep_slope,
 )
 from warpshadow.stages.planes.prepared import PlaneGrid
-from warpshadow.stages.planes.sides import SIDE_ROWS, VisibleCell, load_place, load_side, plane_share, store_place
+from warpshadow.stages.planes.sides import (
+    SIDE_ROWS,
+    VisibleCell,
+    footprint_on_side,
+    footprint_on_side_adjoint,
+    load_place,
+    load_side,
+    plane_share,
+)
 
 _MIN_WEIGHT_SUM = wp.constant(1.0e-30)  # the least Σ s
 
 
-# Scratch of a receiver, vec3, follows that of its sides. The hit of a cell on each of these, from ``6 flat_count`` on:
+# Scratch of a receiver, vec3, follows that of its sides. The hit of a cell on each of these, from ``6 plane_count`` on:
 #     4 i        coverage, distance, and how much that varies over the cell
 #     4 i + 1    radiosity
 #     4 i + 2    coverage of the outline, the mesh's share of that by texels, and 1 / c′
@@ -64,19 +66,17 @@ def hit_sides(
         share = plane_share(scene, grid, side, place, cell, edges)
         store[cells + 4 * i] = wp.vec3()
         if share > 0.0:
-            footprint = find_footprint(
-                scene, on_side(grid, place, side.is_back), toward_side(place, side.is_back, cell.direction)
-            )
+            footprint = footprint_on_side(scene, grid, side, place, cell.direction)
             covered = float(1.0)
             radiosity = wp.vec3()
             sends = grid.sides == 2 or not side.is_back
             if sends or is_covered_by_texels(grid):
                 first_level = levels_of(grid, side.is_back)
-                spot = find_spot(grid, scene, footprint)
+                mip = find_mip_footprint(grid, scene, footprint)
                 if is_covered_by_texels(grid):
-                    covered = fetch(scene.covered, scene, first_level, spot)[0]
+                    covered = fetch(scene.covered, scene, first_level, mip)[0]
                 if sends:
-                    radiosity = fetch(texels, scene, first_level, spot)
+                    radiosity = fetch(texels, scene, first_level, mip)
             meets = True
             store[cells + 4 * i] = wp.vec3(
                 share * covered, footprint.distance, footprint.distance * scene.radius * footprint.per_cosine
@@ -100,50 +100,39 @@ def hit_sides_adjoint(
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
     """Add to the gradients of a receiver relative to each plane, of viewed edges, and of an instance's texels."""
-    sides = 4 * scene.grids.shape[0]
     cells = SIDE_ROWS * scene.grids.shape[0]
     for i in range(side_count):
         if store[cells + 4 * i][0] > 0.0:
             side = load_side(scene, i, store)
             grid = scene.grids[side.f]
             stored = store[cells + 4 * i + 2]
-            spot_place = store[cells + 4 * i + 3]
+            center = store[cells + 4 * i + 3]
             footprint = PlaneFootprint()
             footprint.distance = store[cells + 4 * i][1]
             footprint.per_cosine = stored[2]
-            footprint.center = wp.vec2(spot_place[0], spot_place[1])
+            footprint.center = wp.vec2(center[0], center[1])
             adj_met = adj_store[cells + 4 * i]  # of coverage, distance, and t ρ / c′
             adj_light = adj_store[cells + 4 * i + 1]  # of radiosity
-            adj_spot = wp.vec3()
+            adj_mip = wp.vec3()
             sends = grid.sides == 2 or not side.is_back
             if sends or is_covered_by_texels(grid):
                 first_level = levels_of(grid, side.is_back)
-                spot = find_spot(grid, scene, footprint)
+                mip = find_mip_footprint(grid, scene, footprint)
                 if is_covered_by_texels(grid):
                     adj_covered = wp.vec3(adj_met[0] * stored[0], 0.0, 0.0)
-                    adj_spot += fetch_adjoint(scene.covered, grid, scene, first_level, footprint, spot, adj_covered)
+                    adj_mip += fetch_adjoint(scene.covered, grid, scene, first_level, footprint, mip, adj_covered)
                 if sends:
-                    adj_spot += fetch_adjoint(texels, grid, scene, first_level, footprint, spot, adj_light)
+                    adj_mip += fetch_adjoint(texels, grid, scene, first_level, footprint, mip, adj_light)
                     if adj_texels:
-                        scatter(adj_texels[instance], scene, first_level, spot, adj_light)
-            # a footprint is as wide as t / √c′
-            adj_distance = adj_met[1] + adj_met[2] * scene.radius * footprint.per_cosine
-            adj_cosine = -footprint.per_cosine * (
-                adj_met[2] * scene.radius * footprint.distance * footprint.per_cosine + 0.5 * adj_spot[2]
-            )
-            if adj_spot[2] != 0.0:
-                adj_distance += adj_spot[2] / footprint.distance
+                        scatter(adj_texels[instance], scene, first_level, mip, adj_light)
             place = load_place(store, side.f)
-            toward = toward_side(place, side.is_back, cell.direction)
-            adj_center = wp.vec2(adj_spot[0], adj_spot[1])
-            adj_at, adj_toward = find_footprint_adjoint(scene, toward, footprint, adj_distance, adj_cosine, adj_center)
-            adj_place = load_place(adj_store, side.f)
-            adj_place = side_adjoint(grid, place, side.is_back, cell.direction, adj_at, adj_toward, adj_place)
-            store_place(adj_store, side.f, adj_place)
+            footprint_on_side_adjoint(
+                scene, grid, side, place, cell.direction, footprint, adj_mip, adj_met[1], adj_met[2], adj_store
+            )
             adj_share = adj_met[0] * stored[1]
             weighted = adj_share * side.weight
             coverage_adjoint(edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, weighted)
-            adj_store[sides + i] = adj_store[sides + i] + wp.vec3(0.0, 0.0, adj_share * stored[0] / side.weight)
+            adj_store[side.row] = adj_store[side.row] + wp.vec3(0.0, 0.0, adj_share * stored[0] / side.weight)
 
 
 @wp.func
@@ -160,7 +149,7 @@ def side_transmittance(i: int, excluded: int, cells: int, side_count: int, store
     for j in range(side_count):
         other = store[cells + 4 * j]
         if j != i and j != excluded and other[0] > 0.0:
-            part *= 1.0 - other[0] * step(_nearness(footprint, other))
+            part *= 1.0 - other[0] * wp.smoothstep(-1.0, 1.0, _nearness(footprint, other))
     return part
 
 
@@ -198,9 +187,9 @@ def side_transmittance_adjoint(
         if j != i and other[0] > 0.0:
             adj_factor = adj_part * side_transmittance(i, j, cells, side_count, store)
             nearness = _nearness(footprint, other)
-            adj_near = -adj_factor * other[0] * step_slope(nearness) / (footprint[2] + other[2] + 1.0e-20)
+            adj_near = -adj_factor * other[0] * smoothstep_slope(nearness) / (footprint[2] + other[2] + 1.0e-20)
             adj_width = -adj_near * nearness
             adj_store[cells + 4 * i] = adj_store[cells + 4 * i] + wp.vec3(0.0, adj_near, adj_width)
             adj_store[cells + 4 * j] = adj_store[cells + 4 * j] + wp.vec3(
-                -adj_factor * step(nearness), -adj_near, adj_width
+                -adj_factor * wp.smoothstep(-1.0, 1.0, nearness), -adj_near, adj_width
             )

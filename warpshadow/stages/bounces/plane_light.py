@@ -27,7 +27,6 @@ from warpshadow.device.batch import common_batch, expand, expand_rows, instance_
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty, zeros
-from warpshadow.device.parallel import scratch_place, split_row
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.bounces.plane_hits import (
     HIT_ROWS,
@@ -70,15 +69,13 @@ def _light_receivers(
     light: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver."""
-    row = first_row + wp.tid()
-    batch, receiver = split_row(row, points.shape[1])
-    place = scratch_place(worker, row)
-    store, edges = scratch[place], viewed_edges[place]
+    batch, receiver, scratch_row, side_count = place_receiver(
+        first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
+    )
+    store, edges = scratch[scratch_row], viewed_edges[scratch_row]
     sent = texels[instance_in(batch, texels.shape[0])]
     normal = normals[batch, receiver]
     cells = SIDE_ROWS * scene.grids.shape[0]
-    placed = frames[instance_in(batch, frames.shape[0])]
-    side_count = place_receiver(points[batch, receiver], placed, fronts, scene, batch, receiver, store, edges)
     total = wp.vec3()
     for q in range(directions.shape[0]):
         weight = wp.dot(normal, directions[q]) * transmittance[batch, receiver, q]
@@ -116,19 +113,14 @@ def _light_receivers_adjoint(
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver."""
-    row = first_row + wp.tid()
-    batch, receiver = split_row(row, points.shape[1])
-    place = scratch_place(worker, row)
-    store, edges = scratch[place], viewed_edges[place]
-    adj_store = adj_scratch[place]
-    seen_frames = instance_in(batch, frames.shape[0])
+    batch, receiver, scratch_row, side_count = place_receiver(
+        first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
+    )
+    store, edges, adj_store = scratch[scratch_row], viewed_edges[scratch_row], adj_scratch[scratch_row]
     seen_texels = instance_in(batch, texels.shape[0])
     sent = texels[seen_texels]
     normal = normals[batch, receiver]
     cells = SIDE_ROWS * scene.grids.shape[0]
-    side_count = place_receiver(
-        points[batch, receiver], frames[seen_frames], fronts, scene, batch, receiver, store, edges
-    )
     for k in range(cells):
         adj_store[k] = wp.vec3()
     adj = (4.0 / float(directions.shape[0])) * adj_light[batch, receiver]
@@ -162,23 +154,21 @@ def _light_receivers_adjoint(
                 hit_sides_adjoint(scene, cell, sent, side_count, store, edges, adj_store, seen_texels, adj_texels)
     if adj_normals:
         adj_normals[batch, receiver] = adj_normals[batch, receiver] + adj_normal
-    adj_point = place_receiver_adjoint(
-        points[batch, receiver],
-        frames[seen_frames],
-        fronts,
-        scene,
+    place_receiver_adjoint(
         batch,
         receiver,
         side_count,
+        points,
+        frames,
+        fronts,
+        scene,
         store,
         edges,
         adj_store,
-        seen_frames,
-        adj_frames,
+        adj_points,
         adj_fronts,
+        adj_frames,
     )
-    if adj_points:
-        adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
 
 
 def plane_light(

@@ -17,9 +17,8 @@ so the part of a normal that points into a plane with normal N fades,
 
     n′ = n + c max(−n·N, 0) N,  c = f r² / (d² + r²) · Π_axes [S((y_most − y) / r) − S((y_least − y) / r)]
 
-which is about 1 − d / (d + r), but smooth where bodies lie: S is the smoothstep of
-:mod:`warpshadow.stages.planes.cells`, y where the source is along the plane, and f the part of the front that it sees;
-so it is for the back, with −N.
+which is about 1 − d / (d + r), but smooth where bodies lie: S is the smoothstep from 0 at −1 to 1 at 1, y
+where the source is along the plane, and f the part of the front that it sees; so it is for the back, with −N.
 
 Measured with a ground and two bounces, images against all bounces by a path tracer, relative RMSE: a machine part that
 lies on the ground 7.8% by normals alone, 7.6% with T, 5.5% with T and n′; a cow 2.1%, 2.0% and 1.8%; a man of thin
@@ -35,7 +34,6 @@ from warpshadow.device.constants import cached_by_values, constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.directions import check_directions
-from warpshadow.stages.planes.cells import step
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 from warpshadow.stages.sparse import SparseMatrix
 
@@ -45,7 +43,8 @@ _HIDDEN = wp.constant(0.1)  # β, by which parts count that their own body hides
 @wp.func
 def _part_within(place: float, minimum: float, maximum: float, reach: float):
     """Part of an interval around a place that lies between two others."""
-    return step((maximum - place) / reach) - step((minimum - place) / reach)
+    before, behind = (minimum - place) / reach, (maximum - place) / reach
+    return wp.smoothstep(-1.0, 1.0, behind) - wp.smoothstep(-1.0, 1.0, before)
 
 
 @wp.kernel
@@ -83,8 +82,8 @@ def _turn_from_planes(
                 x = wp.dot(offset, u) / wp.length(u)
                 y = wp.dot(offset, v) / wp.length(v)
                 # the plane's units are its scale in the scene's
-                within = _part_within(x, grid.least[0] * wp.length(u), grid.most[0] * wp.length(u), radius)
-                within *= _part_within(y, grid.least[1] * wp.length(v), grid.most[1] * wp.length(v), radius)
+                within = _part_within(x, grid.minimum[0] * wp.length(u), grid.maximum[0] * wp.length(u), radius)
+                within *= _part_within(y, grid.minimum[1] * wp.length(v), grid.maximum[1] * wp.length(v), radius)
                 result += within / (1.0 + height * height) * away * up
     turned[batch, source] = result
 

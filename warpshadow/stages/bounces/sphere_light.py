@@ -76,7 +76,7 @@ def _task_type(lanes: int) -> Any:
         reached_bundles: wp.array2d(dtype=wp.int32)  # bundles that a run, and then a quad, may reach
         blocked: wp.array(dtype=Lane)  # [direction] F − T; for the adjoint its product with the factor of R
         sums: wp.array(dtype=Lane)  # [direction · sum] of R
-        pulls: wp.array(dtype=Lane)  # [direction] the adjoint of the light · R
+        adj_cells: wp.array(dtype=Lane)  # [direction] the adjoint of the light · R
         adj_light: Vectors
         proxy_radiance: wp.array2d(dtype=wp.vec4)  # [node, direction]
         adj_radiance: wp.array2d(dtype=wp.vec4)
@@ -127,7 +127,7 @@ def _make_begin(lanes: int) -> wp.Function:
         task.reached_bundles = reached_bundles[place]
         task.ends = reached_bundles[place, 2]
         task.blocked = scratch[place, 0]
-        task.pulls = scratch[place, 1]
+        task.adj_cells = scratch[place, 1]
         task.sums = sums[wp.where(inputs.stores_sums, item, place)]
         task.proxy_radiance = inputs.proxy_radiance[instance_in(batch, inputs.proxy_radiance.shape[0])]
         size = float(TINY_RADIUS)
@@ -267,11 +267,11 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
     def visit(receivers: ReceiverLanes, seen: SphereView, count: int, task: LightTask):
         """The adjoint of the sphere's cone and weight.
 
-        With f = 4/Q max(n·ω, 0) (F − T) / Σ w a S, and the pull of a unit of w a, v = f (Ī·L − S Ī·R): ā = w v,  w̄ = Σ
+        With f = 4/Q max(n·ω, 0) (F − T) / Σ w a S, and v = f (Ī·L − S Ī·R), the gradient of w a: ā = w v,  w̄ = Σ
         a v,  L̄ = f w a Ī,  S̄ = −f w a Ī·R and with y = d / size:  w̄ → d̄ = −4 w̄ w √w y / size,  r̄ = −4 w̄ w √w r /
         (4 size)²;  ā as for the transmittance.
         """
-        pull = SphereAdjoint()
+        adj_sphere = SphereAdjoint()
         cone = seen.cone
         cells = task.cells
         sine = sqrt(cone.sine2)
@@ -297,10 +297,10 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                         if is_any_above(t, 0.0):
                             is_any_met = True
                             weighted = wp.cw_mul(weight, task.blocked[bundle * BUNDLE + i])
-                            pulled = task.pulls[bundle * BUNDLE + i]
+                            adj_cell = task.adj_cells[bundle * BUNDLE + i]
                             sent = task.proxy_radiance[seen.node, at * BUNDLE + i]
                             light = dot_direction(wp.vec3(sent[0], sent[1], sent[2]), task.adj_light)
-                            adj_blocked = wp.cw_mul(weighted, light - sent[3] * pulled)
+                            adj_blocked = wp.cw_mul(weighted, light - sent[3] * adj_cell)
                             adj_opacity += wp.cw_mul(adj_blocked, step)
                             rise = wp.cw_mul(t, Lane(1.0) - t)
                             adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_blocked, opacity), rise)
@@ -315,7 +315,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                                     total(wp.cw_mul(share, task.adj_light.x)),
                                     total(wp.cw_mul(share, task.adj_light.y)),
                                     total(wp.cw_mul(share, task.adj_light.z)),
-                                    -total(wp.cw_mul(share, pulled)),
+                                    -total(wp.cw_mul(share, adj_cell)),
                                 )
                                 wp.atomic_add(task.adj_radiance, seen.node, at * BUNDLE + i, adj_sent)
             if is_any_met:
@@ -325,11 +325,11 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                 )
                 # w̄ w = Σ a v w = Ā A
                 nearer = (-4.0 * task.inverse_size) * wp.cw_mul(wp.cw_mul(adj_opacity, opacity), near)
-                pull.is_any = True
-                pull.weight = adj_weight
-                pull.offset = add(adj_offset, scale(nearer, scale(Lane(task.inverse_size), seen.offset)))
-                pull.radius = adj_radius + (CORE2 * task.inverse_size / seen.curvature) * nearer
-        return pull
+                adj_sphere.is_any = True
+                adj_sphere.weight = adj_weight
+                adj_sphere.offset = add(adj_offset, scale(nearer, scale(Lane(task.inverse_size), seen.offset)))
+                adj_sphere.radius = adj_radius + (CORE2 * task.inverse_size / seen.curvature) * nearer
+        return adj_sphere
 
     traverse = make_traversal(make_cull(True, LightTask, lanes), visit, LightTask, True, lanes)
 
@@ -366,7 +366,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         task.adj_light = load(adj_light[batch], block)
         if adj_radiance:
             task.adj_radiance = adj_radiance[instance_in(batch, inputs.proxy_radiance.shape[0])]
-        turned = Vectors()
+        adj_normal = Vectors()
         for bundle in range(task.ends.shape[0]):
             if task.ends[bundle] > 0:
                 for i in range(BUNDLE):
@@ -375,15 +375,15 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                     omega = task.cells.directions[direction]
                     inverse = wp.cw_div(Lane(1.0), wp.max(task.sums[place * SUMS + 3], Lane(LEAST)))
                     mean = Vectors(task.sums[place * SUMS], task.sums[place * SUMS + 1], task.sums[place * SUMS + 2])
-                    pulled = wp.cw_mul(inverse, dot(task.adj_light, mean))
+                    adj_cell = wp.cw_mul(inverse, dot(task.adj_light, mean))
                     cosine = dot_direction(omega, receivers.normals)
                     is_up = wp.min(wp.max(1.0e30 * cosine, Lane(0.0)), Lane(1.0))
-                    adj_cosine = inputs.factor * wp.cw_mul(is_up, wp.cw_mul(task.blocked[place], pulled))
-                    turned.x += omega[0] * adj_cosine
-                    turned.y += omega[1] * adj_cosine
-                    turned.z += omega[2] * adj_cosine
+                    adj_cosine = inputs.factor * wp.cw_mul(is_up, wp.cw_mul(task.blocked[place], adj_cell))
+                    adj_normal.x += omega[0] * adj_cosine
+                    adj_normal.y += omega[1] * adj_cosine
+                    adj_normal.z += omega[2] * adj_cosine
                     facing = inputs.factor * wp.max(cosine, Lane(0.0))
-                    adj_blocked = wp.cw_mul(facing, pulled)
+                    adj_blocked = wp.cw_mul(facing, adj_cell)
                     for lane in range(wp.min(lanes, inputs.traversed.points.shape[1] - block * lanes)):
                         vertex = block * lanes + lane
                         if adj_transmittance:
@@ -396,12 +396,12 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                                 adj_unblocked[serving, vertex, direction] + adj_blocked[lane]
                             )
                     task.blocked[place] = wp.cw_mul(wp.cw_mul(facing, task.blocked[place]), inverse)
-                    task.pulls[place] = pulled
+                    task.adj_cells[place] = adj_cell
         adj = traverse(receivers, batch, inputs.traversed.spheres, Gradients(adj_centers, adj_radii, adj_extents), task)
         if adj_points:
             add_vectors(adj.points, block, adj_points[batch])
         if adj_normals:
-            add_vectors(turned, block, adj_normals[batch])
+            add_vectors(adj_normal, block, adj_normals[batch])
 
     return add_light_adjoint
 

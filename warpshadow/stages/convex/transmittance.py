@@ -17,7 +17,7 @@ from warpshadow.device.batch import common_batch, expand, instance_in
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import Scratch, scratch_place, split_row
 from warpshadow.maths.directions import BUNDLE, cell_radius
-from warpshadow.stages.cell_coverage import ViewedEdge, convex_coverage, coverage_adjoint
+from warpshadow.stages.cell_coverage import ViewedEdge, convex_coverage, coverage_adjoint, viewed_edge
 from warpshadow.stages.convex.prepared import ConvexArrays, ConvexBlockers, PlacedParts
 from warpshadow.stages.planes.transmittance import horizon_normal, is_above_horizon
 from warpshadow.stages.visibility.culling import DirectionCells, make_cells
@@ -69,13 +69,8 @@ def _find_silhouette(
             a = corners[begin] - point
             b = corners[end] - point
             n = wp.cross(a, b)
-            length2 = wp.length_sq(n)
-            if length2 > _MIN_EDGE_SINE * _MIN_EDGE_SINE * wp.length_sq(a) * wp.length_sq(b):
-                viewed = ViewedEdge()
-                viewed.length = wp.sqrt(length2)
-                viewed.normal = (1.0 / viewed.length) * n
-                viewed.begin = a
-                viewed.end = b
+            if wp.length_sq(n) > _MIN_EDGE_SINE * _MIN_EDGE_SINE * wp.length_sq(a) * wp.length_sq(b):
+                viewed = viewed_edge(a, b, n)
                 viewed.corners = wp.vec2i(begin, end)
                 silhouette[count] = viewed
                 count += 1

@@ -38,7 +38,7 @@ def with_rows(radiance: np.ndarray, rows: int) -> np.ndarray:
     bounds = np.arange(rows + 1) * height / rows
     cosines = np.cos(np.pi * np.arange(height + 1) / height)
 
-    def along(values: np.ndarray, edges: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    def integrals(values: np.ndarray, edges: np.ndarray, sizes: np.ndarray) -> np.ndarray:
         """Integrals of a piecewise constant function between edges, over the first axis."""
         total = np.concatenate([np.zeros_like(values[:1]), np.cumsum(values * sizes[:, None, None], axis=0)])
         whole = np.minimum(edges.astype(int), len(values) - 1)
@@ -46,9 +46,9 @@ def with_rows(radiance: np.ndarray, rows: int) -> np.ndarray:
 
     sizes = -np.diff(cosines)
     ones = np.ones((height, 1, 1))
-    by_rows = along(radiance.astype(np.float64), bounds, sizes) / along(ones, bounds, sizes)
+    by_rows = integrals(radiance.astype(np.float64), bounds, sizes) / integrals(ones, bounds, sizes)
     columns = np.arange(2 * rows + 1) * height / rows
-    turned = along(by_rows.swapaxes(0, 1), columns, np.ones(2 * height)) * (rows / height)
+    turned = integrals(by_rows.swapaxes(0, 1), columns, np.ones(2 * height)) * (rows / height)
     return turned.swapaxes(0, 1)
 
 

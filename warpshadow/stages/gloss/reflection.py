@@ -1,7 +1,7 @@
 """Reflection: the light of a lobe and diffuse light, as glTF mixes them for metals and for all else.
 
 With G = Σ w (T L + (1 − T) R) and G' = Σ w' (T L + (1 − T) R) over the samples of a lobe, T their transmittance and R
-the radiance of what blocks them, diffuse light E, metallic m, specular s and F₀ = 0.04, a surface of albedo a reflects
+the radiance of their blockers, diffuse light E, metallic m, specular s and F₀ = 0.04, a surface of albedo a reflects
 a A + C:
 
     A = (1 − m) (E − s (F₀ E + (1 − F₀) E')) + m (G − G'),

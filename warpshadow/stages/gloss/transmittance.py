@@ -3,7 +3,7 @@
     T(l) = Σ_q k_q min(T_q, H_q) / Σ_q k_q H_q,   k_q = max(l·ω_q − cos 2.2ρ, 0)² + ε,   H_q = s(n·ω_q / ρ),
 
 over the cells near l, ρ their radius and s the smoothstep from 0 at −1 to 1 at 1: the part of a cell that is above the
-receiver's horizon. Of a ball, T_q is H_q: it blocks nothing of what is above.
+receiver's horizon. Of a ball, T_q is H_q: it blocks nothing above its horizon.
 """
 
 import functools
@@ -90,8 +90,7 @@ def _sum_near(
             cell = neighbors[texel, k]
             near = wp.max(wp.dot(direction, cells[cell]) - reach_cosine, 0.0)
             weight = near * near + _NEGLIGIBLE
-            rise = wp.clamp(0.5 + 0.5 * per_radius * wp.dot(normal, cells[cell]), 0.0, 1.0)
-            above = rise * rise * (3.0 - 2.0 * rise) + _NEGLIGIBLE
+            above = wp.smoothstep(-1.0, 1.0, per_radius * wp.dot(normal, cells[cell])) + _NEGLIGIBLE
             total += weight * wp.vec2(wp.min(row[receiver, cell], above), above)
         sums[batch, receiver, i] = total
 

@@ -38,7 +38,7 @@ class PlaneArrays:
     edge_axes: wp.array(dtype=wp.vec2)
     skip: int  # the plane that the receivers are part of, -1 for none
     radius: float  # ρ
-    spot_radius: float  # half the width of texels, for a unit of distance
+    texel_radius: float  # half the width of texels, for a unit of distance
     per_radius: float
 
 
@@ -60,27 +60,20 @@ def check_planes(
 def plane_arrays(planes: PlaneBlockers, radius: float, skip: int | None, *, tiles: bool = True) -> PlaneArrays:
     """Plane blockers as seen in cells of a radius [rad] by receivers that are part of one, or of none.
 
-    Where cells do not tile the sphere, as those of a sun alone, texels are half as wide.
+    Where cells do not tile the sphere, as a sun's alone, texels are half as wide.
     """
     scene = PlaneArrays()
     scene.grids, scene.levels, scene.level_scales = planes.grids, planes.levels, planes.level_scales
     scene.covered, scene.edges, scene.edge_axes = planes.covered, planes.edges, planes.edge_axes
     scene.skip, scene.radius = -1 if skip is None else skip, radius
-    scene.spot_radius = scene.radius if tiles else 0.5 * scene.radius
+    scene.texel_radius = scene.radius if tiles else 0.5 * scene.radius
     scene.per_radius = 1 / scene.radius
     return scene
 
 
 @wp.func
-def step(z: float):
-    """The smoothstep from 0 at −1 to 1 at 1."""
-    u = wp.clamp(0.5 * z + 0.5, 0.0, 1.0)
-    return u * u * (3.0 - 2.0 * u)
-
-
-@wp.func
-def step_slope(z: float):
-    """Its derivative."""
+def smoothstep_slope(z: float):
+    """Derivative of the smoothstep from 0 at −1 to 1 at 1."""
     u = wp.clamp(0.5 * z + 0.5, 0.0, 1.0)
     return 3.0 * u * (1.0 - u)
 
@@ -182,13 +175,13 @@ def front_of_adjoint(
 @wp.func
 def front_weight(grid: PlaneGrid, height: float):
     """Part of the front that a receiver sees; of the back it sees the rest."""
-    return step(1.0 + 2.0 * height / grid.margin)
+    return wp.smoothstep(-1.0, 1.0, 1.0 + 2.0 * height / grid.margin)
 
 
 @wp.func
 def front_weight_slope(grid: PlaneGrid, height: float):
     """Its derivative."""
-    return step_slope(1.0 + 2.0 * height / grid.margin) * 2.0 / grid.margin
+    return smoothstep_slope(1.0 + 2.0 * height / grid.margin) * 2.0 / grid.margin
 
 
 @wp.func
@@ -288,7 +281,7 @@ def find_footprint_adjoint(
 
 
 @wp.struct
-class TexelFootprint:
+class MipFootprint:
     """Where on a grid a footprint lies, and how large it is there."""
 
     texel: wp.vec2  # in texels of the finest level, from its corner
@@ -305,27 +298,27 @@ def is_covered_by_texels(grid: PlaneGrid):
 
 
 @wp.func
-def find_spot(grid: PlaneGrid, scene: PlaneArrays, footprint: PlaneFootprint):
-    """Find the spot of a footprint."""
-    spot = TexelFootprint()
+def find_mip_footprint(grid: PlaneGrid, scene: PlaneArrays, footprint: PlaneFootprint):
+    """Find where in the mip levels of a grid a footprint lies."""
+    mip = MipFootprint()
     x = footprint.center[0] * grid.per_spread
     y = footprint.center[1] * grid.per_spread
     size_x = 1.0 + wp.abs(x)
     size_y = 1.0 + wp.abs(y)
-    spot.texel = grid.first + wp.vec2(
+    mip.texel = grid.first + wp.vec2(
         wp.sign(x) * wp.log(size_x) * grid.texels[0], wp.sign(y) * wp.log(size_y) * grid.texels[1]
     )
-    spot.slopes = grid.per_spread * wp.vec2(grid.texels[0] / size_x, grid.texels[1] / size_y)
+    mip.slopes = grid.per_spread * wp.vec2(grid.texels[0] / size_x, grid.texels[1] / size_y)
     width = (
-        2.0 * footprint.distance * scene.spot_radius * wp.sqrt(spot.slopes[0] * spot.slopes[1] * footprint.per_cosine)
+        2.0 * footprint.distance * scene.texel_radius * wp.sqrt(mip.slopes[0] * mip.slopes[1] * footprint.per_cosine)
     )
-    while spot.level < grid.level_count - 1 and width >= 2.0:
-        spot.level = spot.level + 1
+    while mip.level < grid.level_count - 1 and width >= 2.0:
+        mip.level = mip.level + 1
         width *= 0.5
-    if width > 1.0 and spot.level < grid.level_count - 1:
-        spot.part = width - 1.0
-        spot.part_slope = width
-    return spot
+    if width > 1.0 and mip.level < grid.level_count - 1:
+        mip.part = width - 1.0
+        mip.part_slope = width
+    return mip
 
 
 @wp.func
@@ -336,7 +329,7 @@ def _log_slope(z: float):
 
 @wp.struct
 class _Corners:
-    """Four texels of a level around a spot, and where it lies between them."""
+    """Four texels of a level around a footprint, and where it lies between them."""
 
     above: int  # the left one above
     below: int
@@ -390,12 +383,12 @@ def _slopes_between(texels: wp.array(dtype=wp.vec3), corners: _Corners, adj: wp.
 
 
 @wp.func
-def fetch(texels: wp.array(dtype=wp.vec3), scene: PlaneArrays, first_level: int, spot: TexelFootprint):
+def fetch(texels: wp.array(dtype=wp.vec3), scene: PlaneArrays, first_level: int, mip: MipFootprint):
     """Mean over a footprint, in the mip levels from ``first_level`` on."""
-    value = _between(texels, _find_corners(scene, first_level + spot.level, spot.texel))
-    if spot.part > 0.0:
-        coarse = _between(texels, _find_corners(scene, first_level + spot.level + 1, spot.texel))
-        value = (1.0 - spot.part) * value + spot.part * coarse
+    value = _between(texels, _find_corners(scene, first_level + mip.level, mip.texel))
+    if mip.part > 0.0:
+        coarse = _between(texels, _find_corners(scene, first_level + mip.level + 1, mip.texel))
+        value = (1.0 - mip.part) * value + mip.part * coarse
     return value
 
 
@@ -406,19 +399,19 @@ def fetch_adjoint(
     scene: PlaneArrays,
     first_level: int,
     footprint: PlaneFootprint,
-    spot: TexelFootprint,
+    mip: MipFootprint,
     adj: wp.vec3,
 ):
     """Gradients of the place, and of the logarithm of t / √c′, as which the footprint is wide."""
-    fine = _find_corners(scene, first_level + spot.level, spot.texel)
+    fine = _find_corners(scene, first_level + mip.level, mip.texel)
     slopes = _slopes_between(texels, fine, adj)
     adj_log = float(0.0)
-    if spot.part > 0.0:
-        coarse = _find_corners(scene, first_level + spot.level + 1, spot.texel)
-        slopes = (1.0 - spot.part) * slopes + spot.part * _slopes_between(texels, coarse, adj)
-        adj_log = spot.part_slope * wp.dot(adj, _between(texels, coarse) - _between(texels, fine))
-    adj_x = slopes[0] * spot.slopes[0]
-    adj_y = slopes[1] * spot.slopes[1]
+    if mip.part > 0.0:
+        coarse = _find_corners(scene, first_level + mip.level + 1, mip.texel)
+        slopes = (1.0 - mip.part) * slopes + mip.part * _slopes_between(texels, coarse, adj)
+        adj_log = mip.part_slope * wp.dot(adj, _between(texels, coarse) - _between(texels, fine))
+    adj_x = slopes[0] * mip.slopes[0]
+    adj_y = slopes[1] * mip.slopes[1]
     if adj_log != 0.0:
         adj_x += adj_log * grid.per_spread * _log_slope(footprint.center[0] * grid.per_spread)
         adj_y += adj_log * grid.per_spread * _log_slope(footprint.center[1] * grid.per_spread)
@@ -426,18 +419,16 @@ def fetch_adjoint(
 
 
 @wp.func
-def scatter(
-    adj_texels: wp.array(dtype=wp.vec3), scene: PlaneArrays, first_level: int, spot: TexelFootprint, adj: wp.vec3
-):
+def scatter(adj_texels: wp.array(dtype=wp.vec3), scene: PlaneArrays, first_level: int, mip: MipFootprint, adj: wp.vec3):
     """Add to the gradients of texels: the adjoint of :func:`fetch` by its values."""
-    part = 1.0 - spot.part
+    part = 1.0 - mip.part
     for coarser in range(2):
         if part > 0.0:
-            c = _find_corners(scene, first_level + spot.level + coarser, spot.texel)
+            c = _find_corners(scene, first_level + mip.level + coarser, mip.texel)
             above = (part * (1.0 - c.t)) * adj
             below = (part * c.t) * adj
             wp.atomic_add(adj_texels, c.above, (1.0 - c.s) * above)
             wp.atomic_add(adj_texels, c.above + c.right, c.s * above)
             wp.atomic_add(adj_texels, c.below, (1.0 - c.s) * below)
             wp.atomic_add(adj_texels, c.below + c.right, c.s * below)
-        part = spot.part
+        part = mip.part

@@ -6,7 +6,7 @@ of normal n, on a body that reaches from height l to height u over a plane with 
 
     front = S(b + (1 − b²) n·N + 2 h / m),  b = (u + l) / max(u − l, m), from −1 to 1
 
-S is the smoothstep of :mod:`.cells`, and m the margin of the plane, a thousandth of a texel. So
+S is the smoothstep from 0 at −1 to 1 at 1, and m the margin of the plane, a thousandth of a texel. So
 
 - a body wholly in front of the plane (b = 1) has all its receivers in front, one wholly behind it (b = −1) all behind;
 - a body that the plane cuts has its receivers where their heights are;
@@ -42,7 +42,6 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
-from warpshadow.stages.planes.cells import step
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 
 _FRONT_RADIUS_RATIO = wp.constant(1.25)
@@ -160,7 +159,7 @@ def _find_fronts(
         if radius > _MIN_BLOCKER_RADIUS:
             middle = _height(centers[instance_in(batch, centers.shape[0]), number], frames, instance, f)
             if _FRONT_RADIUS_RATIO * wp.abs(height + middle) < radius:
-                front = step(_FRONT_RADIUS_RATIO * (height + middle) / radius)
+                front = wp.smoothstep(-1.0, 1.0, _FRONT_RADIUS_RATIO * (height + middle) / radius)
             else:
                 front = wp.where(height + middle > 0.0, 1.0, 0.0)
         elif wp.abs(height) < 2.0 * grids[f].margin:
@@ -169,7 +168,9 @@ def _find_fronts(
                 leaning = leanings[instance_in(batch, leanings.shape[0]), f]
             up = wp.normalize(wp.cross(axis_u, frames[instance, 3 * f + 2]))
             facing = wp.dot(normals[instance_in(batch, normals.shape[0]), receiver], up)
-            front = step(leaning + (1.0 - leaning * leaning) * facing + _over_margin(height, grids[f].margin))
+            front = wp.smoothstep(
+                -1.0, 1.0, leaning + (1.0 - leaning * leaning) * facing + _over_margin(height, grids[f].margin)
+            )
         else:
             front = wp.where(height > 0.0, 1.0, 0.0)
     fronts[batch, receiver, f] = front

@@ -44,7 +44,7 @@ class PlaneTexture(NamedTuple):
         return bool((self.covered == 1).all() and area > (1 - _WHOLE) * (high - low).prod())
 
     def rectangle(self) -> np.ndarray:
-        """Edges of the rectangle, as those of the outline, [4, 2, 2]."""
+        """Edges of the rectangle, as the outline's are, [4, 2, 2]."""
         (left, below), (right, above) = self.corners()
         corners = np.array([[left, below], [right, below], [right, above], [left, above]])
         return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)

@@ -18,11 +18,10 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.batch import common_batch, expand, expand_rows, instance_in
+from warpshadow.device.batch import common_batch, expand, expand_rows
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
-from warpshadow.device.parallel import scratch_place, split_row
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.cell_coverage import ViewedEdge
 from warpshadow.stages.planes.cells import PlaneArrays, check_planes, plane_arrays
@@ -34,7 +33,6 @@ from warpshadow.stages.planes.sides import (
     place_receiver,
     place_receiver_adjoint,
     receiver_scratch,
-    store_place,
     visible_cell,
 )
 from warpshadow.stages.planes.transmittance import (
@@ -139,12 +137,10 @@ def _sample_light(
     result: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a receiver."""
-    row = first_row + wp.tid()
-    batch, receiver = split_row(row, points.shape[1])
-    place = scratch_place(worker, row)
-    store, edges = scratch[place], viewed_edges[place]
-    placed = frames[instance_in(batch, frames.shape[0])]
-    side_count = place_receiver(points[batch, receiver], placed, fronts, scene, batch, receiver, store, edges)
+    batch, receiver, scratch_row, side_count = place_receiver(
+        first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
+    )
+    store, edges = scratch[scratch_row], viewed_edges[scratch_row]
     normal = horizon_normal(horizon_normals, batch, receiver)
     for q in range(samples.shape[0]):
         coverage = covered[batch, receiver, q]
@@ -181,13 +177,10 @@ def _sample_light_adjoint(
     adj_frames: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver; a direction that is covered wholly has no gradient."""
-    row = first_row + wp.tid()
-    batch, receiver = split_row(row, points.shape[1])
-    instance = instance_in(batch, frames.shape[0])
-    place = scratch_place(worker, row)
-    store, edges, adj_store = scratch[place], viewed_edges[place], adj_scratch[place]
-    point = points[batch, receiver]
-    side_count = place_receiver(point, frames[instance], fronts, scene, batch, receiver, store, edges)
+    batch, receiver, scratch_row, side_count = place_receiver(
+        first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
+    )
+    store, edges, adj_store = scratch[scratch_row], viewed_edges[scratch_row], adj_scratch[scratch_row]
     normal = horizon_normal(horizon_normals, batch, receiver)
     for k in range(SIDE_ROWS * scene.grids.shape[0]):
         adj_store[k] = wp.vec3()
@@ -209,38 +202,25 @@ def _sample_light_adjoint(
                         side = load_side(scene, i, store)
                         grid = scene.grids[side.f]
                         if grid.blocks == 1:
-                            adj_place, adj_weight = side_coverage_adjoint(
-                                scene,
-                                grid,
-                                side,
-                                load_place(store, side.f),
-                                cell,
-                                adj_part,
-                                edges,
-                                load_place(adj_store, side.f),
-                            )
-                            store_place(adj_store, side.f, adj_place)
-                            k = 4 * scene.grids.shape[0] + i
-                            adj_store[k] = adj_store[k] + wp.vec3(0.0, 0.0, adj_weight)
+                            in_plane = load_place(store, side.f)
+                            side_coverage_adjoint(scene, grid, side, in_plane, cell, adj_part, edges, adj_store)
         if adj_covered:
             adj_covered[batch, receiver, q] = adj_covered[batch, receiver, q] + slope * adj
-    adj_point = place_receiver_adjoint(
-        point,
-        frames[instance],
-        fronts,
-        scene,
+    place_receiver_adjoint(
         batch,
         receiver,
         side_count,
+        points,
+        frames,
+        fronts,
+        scene,
         store,
         edges,
         adj_store,
-        instance,
-        adj_frames,
+        adj_points,
         adj_fronts,
+        adj_frames,
     )
-    if adj_points:
-        adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
 
 
 def coverage_of_light(

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 MAX_EDGES = 128
 """Edges of an outline at most: beyond, it is that of the rectangle, of which the mesh takes its share by texels."""
 
-_BESIDE = 0.002  # how much texels count in those beside them, which have it if nothing of their own is seen
+_BESIDE = 0.002  # how much texels count in their neighbors, which have their light if nothing of their own is seen
 _MARGIN = 0.001  # margin of planes, in widths of the smallest texel
 
 
@@ -39,8 +39,8 @@ class PlaneBody(NamedTuple):
 class PlaneGrid:
     """A grid as kernels read it."""
 
-    least: wp.vec2  # corners of the rectangle [units of the body]
-    most: wp.vec2
+    minimum: wp.vec2  # corners of the rectangle [units of the body]
+    maximum: wp.vec2
     texels: wp.vec2  # texels of the finest level for a unit of squeezed coordinates
     first: wp.vec2  # texel at the origin
     per_spread: float
@@ -131,7 +131,7 @@ class PlaneBlockers:
         """Where planes are: origin, and both axes, each as long as the body's scale.
 
         Args:
-            positions: Vertices of all bodies [scene units], vec3 of shape [batch, vertex]. Three of each flat count, so
+            positions: Vertices of all bodies [scene units], vec3 of shape [batch, vertex]. Three of each body count, so
                 bodies must be moved and scaled only, not bent.
         Returns:
             vec3 of shape [batch, 3 · plane].
@@ -182,19 +182,19 @@ def _shifted(matrix: csr_matrix, first: int, count: int) -> csr_matrix:
 
 
 def _kernel_grid(body: PlaneBody, first_level: int, level_count: int, first_edge: int, edges: np.ndarray) -> PlaneGrid:
-    grid, flat = body.grid, PlaneGrid()
+    grid, kernel_grid = body.grid, PlaneGrid()
     texels = np.array(grid.covered.shape[::-1]) / (grid.high - grid.low)
-    flat.least, flat.most = (wp.vec2(*corner) for corner in grid.corners())
-    flat.texels, flat.first = wp.vec2(*texels), wp.vec2(*(-grid.low * texels))
-    flat.per_spread, flat.margin = 1 / grid.spread, _MARGIN * float(grid.texel_sizes().min())
-    flat.first_level, flat.level_count, flat.sides = first_level, level_count, grid.sides
-    flat.first_edge, flat.edge_count = first_edge, len(edges)
-    flat.is_convex, flat.blocks = int(is_convex(edges.reshape(-1, 2, 2))), int(body.blocks)
-    return flat
+    kernel_grid.minimum, kernel_grid.maximum = (wp.vec2(*corner) for corner in grid.corners())
+    kernel_grid.texels, kernel_grid.first = wp.vec2(*texels), wp.vec2(*(-grid.low * texels))
+    kernel_grid.per_spread, kernel_grid.margin = 1 / grid.spread, _MARGIN * float(grid.texel_sizes().min())
+    kernel_grid.first_level, kernel_grid.level_count, kernel_grid.sides = first_level, level_count, grid.sides
+    kernel_grid.first_edge, kernel_grid.edge_count = first_edge, len(edges)
+    kernel_grid.is_convex, kernel_grid.blocks = int(is_convex(edges.reshape(-1, 2, 2))), int(body.blocks)
+    return kernel_grid
 
 
 def _frame_matrix(body: PlaneBody, vertex_count: int) -> csr_matrix:
-    """Rows that combine three vertices, far apart, to a flat's origin and axes."""
+    """Rows that combine three vertices, far apart, to a plane's origin and axes."""
     from scipy.sparse import csr_matrix
 
     vertices = np.unique(body.faces)

@@ -2,24 +2,29 @@
 
 import warp as wp
 
-from warpshadow.device.parallel import Scratch
-from warpshadow.stages.cell_coverage import ViewedEdge, convex_coverage, outline_coverage
+from warpshadow.device.batch import instance_in
+from warpshadow.device.parallel import Scratch, scratch_place, split_row
+from warpshadow.stages.cell_coverage import ViewedEdge, convex_coverage, outline_coverage, viewed_edge
 from warpshadow.stages.planes.cells import (
     PlaneArrays,
+    PlaneFootprint,
     ReceiverInPlane,
+    find_footprint,
+    find_footprint_adjoint,
     find_in_plane,
     find_in_plane_adjoint,
     front_of,
     front_of_adjoint,
     on_side,
     side_adjoint,
+    toward_side,
 )
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 
 # Scratch of a receiver, vec3. Its position relative to each plane f, whose gradients have the same places:
 #     4 f        where it is along both axes, and its height
 #     4 f + 1    the axis u, of unit length; 4 f + 2 the axis v, and 4 f + 3 the normal
-# Sides i that it may meet, from ``4 flat_count`` on:
+# Sides i that it may meet, from ``4 plane_count`` on:
 #     i          the plane, 1 for its back, and which part of the side is there
 SIDE_ROWS = wp.constant(6)
 """Rows of scratch for each plane."""
@@ -37,6 +42,7 @@ def receiver_scratch(planes: PlaneBlockers, rows: int = SIDE_ROWS) -> list[Scrat
 class PlaneSide:
     """A side of a plane, as it is stored for a receiver."""
 
+    row: int  # of scratch
     f: int  # number of the plane
     is_back: wp.bool
     weight: float  # part of the side that is there
@@ -45,12 +51,13 @@ class PlaneSide:
 
 @wp.func
 def load_side(scene: PlaneArrays, i: int, store: wp.array(dtype=wp.vec3)):
-    """Side i of those that a receiver sees."""
-    row = store[4 * scene.grids.shape[0] + i]
+    """Load side i of the sides that a receiver sees."""
     side = PlaneSide()
-    side.f = int(row[0])
-    side.is_back = row[1] > 0.0
-    side.weight = row[2]
+    side.row = 4 * scene.grids.shape[0] + i
+    stored = store[side.row]
+    side.f = int(stored[0])
+    side.is_back = stored[1] > 0.0
+    side.weight = stored[2]
     grid = scene.grids[side.f]
     side.first_edge = _VIEWS * grid.first_edge + wp.where(side.is_back, grid.edge_count, 0)
     return side
@@ -88,7 +95,7 @@ def _view_outline(
 ):
     """Store the outline of a plane as a receiver over one side sees it; n = ±(a − x) × (b − a) / |b − a|.
 
-    Edges run so that the mesh is to their left as the receiver sees it: those of the front from b to a.
+    Edges run so that the mesh is to their left as the receiver sees it: the front's from b to a.
     """
     at = on_side(grid, place, side.is_back)
     foot = at[2] * _down(place, side) - at[0] * place.along_u - at[1] * place.along_v
@@ -98,13 +105,9 @@ def _view_outline(
         a = foot + ends[0] * place.along_u + ends[1] * place.along_v
         b = foot + ends[2] * place.along_u + ends[3] * place.along_v
         n = wp.cross(a, axis[0] * place.along_u + axis[1] * place.along_v)
-        length = wp.length(n)
-        k = side.first_edge + e
-        edges[k].normal = (wp.where(side.is_back, 1.0, -1.0) / length) * n
-        edges[k].begin = wp.where(side.is_back, a, b)
-        edges[k].end = wp.where(side.is_back, b, a)
-        edges[k].length = length
-        edges[k].adj_normal = wp.vec3()
+        edges[side.first_edge + e] = viewed_edge(
+            wp.where(side.is_back, a, b), wp.where(side.is_back, b, a), wp.where(side.is_back, 1.0, -1.0) * n
+        )
 
 
 @wp.func
@@ -138,68 +141,90 @@ def _view_outline_adjoint(
 
 
 @wp.func
-def place_receiver(
-    point: wp.vec3,
-    frames: wp.array(dtype=wp.vec3),
-    fronts: wp.array3d(dtype=wp.float32),
+def _add_side(
     scene: PlaneArrays,
-    batch: int,
-    receiver: int,
+    f: int,
+    is_back: float,
+    weight: float,
+    side_count: int,
+    place: ReceiverInPlane,
     store: wp.array(dtype=wp.vec3),
     edges: wp.array(dtype=ViewedEdge),
 ):
-    """Store a receiver's position relative to each plane; return how many sides it may hit."""
-    plane_count = scene.grids.shape[0]
+    """Store a side with its outline if some of it is there; returns how many sides are stored."""
+    if weight <= 0.0:
+        return side_count
+    store[4 * scene.grids.shape[0] + side_count] = wp.vec3(float(f), is_back, weight)
+    _view_outline(scene, scene.grids[f], load_side(scene, side_count, store), place, edges)
+    return side_count + 1
+
+
+@wp.func
+def place_receiver(
+    row: int,
+    worker: int,
+    points: wp.array2d(dtype=wp.vec3),
+    frames: wp.array2d(dtype=wp.vec3),
+    fronts: wp.array3d(dtype=wp.float32),
+    scene: PlaneArrays,
+    scratch: wp.array2d(dtype=wp.vec3),
+    viewed_edges: wp.array2d(dtype=ViewedEdge),
+):
+    """Store a receiver's position relative to each plane, and the sides that it may hit.
+
+    Returns its instance and number, its place in scratch memory, and how many sides are stored.
+    """
+    batch, receiver = split_row(row, points.shape[1])
+    scratch_row = scratch_place(worker, row)
+    store, edges = scratch[scratch_row], viewed_edges[scratch_row]
+    instance = instance_in(batch, frames.shape[0])
     side_count = int(0)
-    for f in range(plane_count):
-        place = find_in_plane(point, frames, f)
+    for f in range(scene.grids.shape[0]):
+        place = find_in_plane(points[batch, receiver], frames[instance], f)
         store_place(store, f, place)
-        grid = scene.grids[f]
-        # below the plane the front fades, and the back takes over
-        front = front_of(fronts, grid, place.at[2], batch, receiver, f)
         if f != scene.skip and wp.length_sq(place.normal) > 0.0:
-            if front > 0.0:
-                store[4 * plane_count + side_count] = wp.vec3(float(f), 0.0, front)
-                _view_outline(scene, grid, load_side(scene, side_count, store), place, edges)
-                side_count += 1
-            if front < 1.0:
-                store[4 * plane_count + side_count] = wp.vec3(float(f), 1.0, 1.0 - front)
-                _view_outline(scene, grid, load_side(scene, side_count, store), place, edges)
-                side_count += 1
-    return side_count
+            # below the plane the front fades, and the back takes over
+            front = front_of(fronts, scene.grids[f], place.at[2], batch, receiver, f)
+            side_count = _add_side(scene, f, 0.0, front, side_count, place, store, edges)
+            side_count = _add_side(scene, f, 1.0, 1.0 - front, side_count, place, store, edges)
+    return batch, receiver, scratch_row, side_count
 
 
 @wp.func
 def place_receiver_adjoint(
-    point: wp.vec3,
-    frames: wp.array(dtype=wp.vec3),
-    fronts: wp.array3d(dtype=wp.float32),
-    scene: PlaneArrays,
     batch: int,
     receiver: int,
     side_count: int,
+    points: wp.array2d(dtype=wp.vec3),
+    frames: wp.array2d(dtype=wp.vec3),
+    fronts: wp.array3d(dtype=wp.float32),
+    scene: PlaneArrays,
     store: wp.array(dtype=wp.vec3),
     edges: wp.array(dtype=ViewedEdge),
     adj_store: wp.array(dtype=wp.vec3),
-    instance: int,
-    adj_frames: wp.array2d(dtype=wp.vec3),
+    adj_points: wp.array2d(dtype=wp.vec3),
     adj_fronts: wp.array3d(dtype=wp.float32),
+    adj_frames: wp.array2d(dtype=wp.vec3),
 ):
-    """Add to the gradients of the frames of an instance, and of fronts; returns that of the point."""
+    """Add to the gradients of points, fronts and frames."""
     for i in range(side_count):
         side = load_side(scene, i, store)
         grid = scene.grids[side.f]
         place = load_place(store, side.f)
         adj = _view_outline_adjoint(scene, grid, side, place, edges, load_place(adj_store, side.f))
-        adj_front = wp.where(side.is_back, -1.0, 1.0) * adj_store[4 * scene.grids.shape[0] + i][2]
+        adj_front = wp.where(side.is_back, -1.0, 1.0) * adj_store[side.row][2]
         adj_height = front_of_adjoint(fronts, grid, place.at[2], adj_front, batch, receiver, side.f, adj_fronts)
         adj.at = adj.at + wp.vec3(0.0, 0.0, adj_height)
         store_place(adj_store, side.f, adj)
+    instance = instance_in(batch, frames.shape[0])
     adj_point = wp.vec3()
     for f in range(scene.grids.shape[0]):
-        place = load_place(store, f)
-        adj_point += find_in_plane_adjoint(point, frames, f, place, load_place(adj_store, f), instance, adj_frames)
-    return adj_point
+        place, adj = load_place(store, f), load_place(adj_store, f)
+        adj_point += find_in_plane_adjoint(
+            points[batch, receiver], frames[instance], f, place, adj, instance, adj_frames
+        )
+    if adj_points:
+        adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
 
 
 @wp.struct
@@ -224,6 +249,41 @@ def visible_cell(scene: PlaneArrays, normal: wp.vec3, direction: wp.vec3):
         cell.direction = wp.normalize(direction + (0.5 * (scene.radius - cosine)) * (normal - cosine * direction))
         cell.radius = 0.5 * (scene.radius + cosine)
     return cell
+
+
+@wp.func
+def footprint_on_side(scene: PlaneArrays, grid: PlaneGrid, side: PlaneSide, place: ReceiverInPlane, direction: wp.vec3):
+    """Find the footprint of a cell on a side."""
+    return find_footprint(scene, on_side(grid, place, side.is_back), toward_side(place, side.is_back, direction))
+
+
+@wp.func
+def footprint_on_side_adjoint(
+    scene: PlaneArrays,
+    grid: PlaneGrid,
+    side: PlaneSide,
+    place: ReceiverInPlane,
+    direction: wp.vec3,
+    footprint: PlaneFootprint,
+    adj_mip: wp.vec3,
+    adj_distance: float,
+    adj_radius: float,
+    adj_store: wp.array(dtype=wp.vec3),
+):
+    """Add to the gradients of the receiver relative to the plane.
+
+    Given are the gradients of :func:`.cells.fetch`, of the distance t, and of the radius t ρ / c′ of the footprint.
+    """
+    adj_cosine = -footprint.per_cosine * (
+        adj_radius * scene.radius * footprint.distance * footprint.per_cosine + 0.5 * adj_mip[2]
+    )
+    adj_t = adj_distance + adj_radius * scene.radius * footprint.per_cosine
+    if adj_mip[2] != 0.0:  # texels are as wide as t / √c′
+        adj_t += adj_mip[2] / footprint.distance
+    toward, adj_center = toward_side(place, side.is_back, direction), wp.vec2(adj_mip[0], adj_mip[1])
+    adj_at, adj_toward = find_footprint_adjoint(scene, toward, footprint, adj_t, adj_cosine, adj_center)
+    adj_place = load_place(adj_store, side.f)
+    store_place(adj_store, side.f, side_adjoint(grid, place, side.is_back, direction, adj_at, adj_toward, adj_place))
 
 
 @wp.func

@@ -16,7 +16,7 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, expand_rows, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import differentiable, launch
-from warpshadow.device.parallel import scratch_place, split_row
+from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.cell_coverage import ViewedEdge, coverage_adjoint
 from warpshadow.stages.planes.cells import (
@@ -26,27 +26,23 @@ from warpshadow.stages.planes.cells import (
     check_planes,
     fetch,
     fetch_adjoint,
-    find_footprint,
-    find_footprint_adjoint,
-    find_spot,
+    find_mip_footprint,
     is_covered_by_texels,
-    on_side,
     plane_arrays,
-    side_adjoint,
-    toward_side,
 )
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 from warpshadow.stages.planes.sides import (
     SIDE_ROWS,
     PlaneSide,
     VisibleCell,
+    footprint_on_side,
+    footprint_on_side_adjoint,
     load_place,
     load_side,
     place_receiver,
     place_receiver_adjoint,
     plane_share,
     receiver_scratch,
-    store_place,
     visible_cell,
 )
 
@@ -77,10 +73,9 @@ def side_coverage(
     covered.part = 1.0
     covered.outline = plane_share(scene, grid, side, place, cell, edges)
     if is_covered_by_texels(grid) and covered.outline > 0.0:
-        toward = toward_side(place, side.is_back, cell.direction)
-        covered.footprint = find_footprint(scene, on_side(grid, place, side.is_back), toward)
-        spot = find_spot(grid, scene, covered.footprint)
-        covered.part = fetch(scene.covered, scene, grid.first_level, spot)[0]
+        covered.footprint = footprint_on_side(scene, grid, side, place, cell.direction)
+        mip = find_mip_footprint(grid, scene, covered.footprint)
+        covered.part = fetch(scene.covered, scene, grid.first_level, mip)[0]
     return covered
 
 
@@ -93,36 +88,23 @@ def side_coverage_adjoint(
     cell: VisibleCell,
     adj: float,
     edges: wp.array(dtype=ViewedEdge),
-    adj_place: ReceiverInPlane,
+    adj_store: wp.array(dtype=wp.vec3),
 ):
-    """Add to the gradients of the receiver relative to the plane and of viewed edges; also that of the weight."""
+    """Add to the gradients of the receiver relative to the plane, of the side's weight, and of viewed edges."""
     covered = PlaneCover()
     covered.part = 1.0
-    adj_weight = float(0.0)
     if side.weight < 1.0 or is_covered_by_texels(grid):
         covered = side_coverage(scene, grid, side, place, cell, edges)
         adj_weight = adj * covered.part * covered.outline / side.weight
+        adj_store[side.row] = adj_store[side.row] + wp.vec3(0.0, 0.0, adj_weight)
     if is_covered_by_texels(grid) and covered.outline > 0.0:
-        toward = toward_side(place, side.is_back, cell.direction)
         footprint = covered.footprint
         adj_part = wp.vec3(adj * covered.outline, 0.0, 0.0)
-        spot = find_spot(grid, scene, footprint)
-        adj_spot = fetch_adjoint(scene.covered, grid, scene, grid.first_level, footprint, spot, adj_part)
-        adj_distance = float(0.0)
-        if adj_spot[2] != 0.0:  # a footprint is as wide as t / √c′
-            adj_distance = adj_spot[2] / footprint.distance
-        adj_at, adj_toward = find_footprint_adjoint(
-            scene,
-            toward,
-            footprint,
-            adj_distance,
-            -0.5 * footprint.per_cosine * adj_spot[2],
-            wp.vec2(adj_spot[0], adj_spot[1]),
-        )
-        adj_place = side_adjoint(grid, place, side.is_back, cell.direction, adj_at, adj_toward, adj_place)
+        mip = find_mip_footprint(grid, scene, footprint)
+        adj_mip = fetch_adjoint(scene.covered, grid, scene, grid.first_level, footprint, mip, adj_part)
+        footprint_on_side_adjoint(scene, grid, side, place, cell.direction, footprint, adj_mip, 0.0, 0.0, adj_store)
     weighted = adj * side.weight * covered.part
     coverage_adjoint(edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, weighted)
-    return adj_place, adj_weight
 
 
 @wp.func
@@ -157,12 +139,10 @@ def _cover(
     result: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a receiver:  C_q = Σ_k h_k."""
-    row = first_row + wp.tid()
-    batch, receiver = split_row(row, points.shape[1])
-    place = scratch_place(worker, row)
-    store, edges = scratch[place], viewed_edges[place]
-    placed = frames[instance_in(batch, frames.shape[0])]
-    side_count = place_receiver(points[batch, receiver], placed, fronts, scene, batch, receiver, store, edges)
+    batch, receiver, scratch_row, side_count = place_receiver(
+        first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
+    )
+    store, edges = scratch[scratch_row], viewed_edges[scratch_row]
     normal = horizon_normal(horizon_normals, batch, receiver)
     covered = result[batch, receiver]
     for q in range(directions.shape[0]):
@@ -204,13 +184,10 @@ def _cover_adjoint(
     adj_frames: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver; cells that are covered wholly are taken to have no gradient."""
-    row = first_row + wp.tid()
-    batch, receiver = split_row(row, points.shape[1])
-    place = scratch_place(worker, row)
-    store, edges, adj_store = scratch[place], viewed_edges[place], adj_scratch[place]
-    instance = instance_in(batch, frames.shape[0])
-    point = points[batch, receiver]
-    side_count = place_receiver(point, frames[instance], fronts, scene, batch, receiver, store, edges)
+    batch, receiver, scratch_row, side_count = place_receiver(
+        first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
+    )
+    store, edges, adj_store = scratch[scratch_row], viewed_edges[scratch_row], adj_scratch[scratch_row]
     normal = horizon_normal(horizon_normals, batch, receiver)
     for k in range(SIDE_ROWS * scene.grids.shape[0]):
         adj_store[k] = wp.vec3()
@@ -218,36 +195,27 @@ def _cover_adjoint(
         side = load_side(scene, i, store)
         grid = scene.grids[side.f]
         in_plane = load_place(store, side.f)
-        adj_place = load_place(adj_store, side.f)
-        adj_weights = float(0.0)
         if grid.blocks == 1:
             for q in range(directions.shape[0]):
                 adj = adj_result[batch, receiver, q]
                 if adj != 0.0 and is_above_horizon(normal, directions[q]):
                     cell = visible_cell(scene, normal, directions[q])
-                    adj_place, adj_weight = side_coverage_adjoint(
-                        scene, grid, side, in_plane, cell, adj, edges, adj_place
-                    )
-                    adj_weights += adj_weight
-        store_place(adj_store, side.f, adj_place)
-        adj_store[4 * scene.grids.shape[0] + i] = wp.vec3(0.0, 0.0, adj_weights)
-    adj_point = place_receiver_adjoint(
-        point,
-        frames[instance],
-        fronts,
-        scene,
+                    side_coverage_adjoint(scene, grid, side, in_plane, cell, adj, edges, adj_store)
+    place_receiver_adjoint(
         batch,
         receiver,
         side_count,
+        points,
+        frames,
+        fronts,
+        scene,
         store,
         edges,
         adj_store,
-        instance,
-        adj_frames,
+        adj_points,
         adj_fronts,
+        adj_frames,
     )
-    if adj_points:
-        adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
 
 
 @wp.kernel(enable_backward=False)
@@ -315,7 +283,7 @@ def plane_coverage(
             [batch, receiver, plane]; by default their heights decide.
         skip: Number of the plane that the receivers are part of, which blocks none of their light; None for none.
     Returns:
-        Float32 of shape [batch, receiver, direction], 1 or more where nothing passes; None where no flat casts a
+        Float32 of shape [batch, receiver, direction], 1 or more where nothing passes; None where no plane casts a
         shadow on them.
     Differentiable: points, frames, fronts. Not: horizon_normals, which decide by steps,
     and how much receivers in a plane see of a cell.

@@ -247,9 +247,9 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
                         adj_weight = float(0.0)
                         for corner in range(3):
                             if corner < probes.corner_count:
-                                pull = wp.cw_mul(adj, look(probes.rows[corner], of_rays, indices[k], inputs))
-                                adj_place[corner] += weights[k] * pull
-                                adj_weight += total(wp.cw_mul(probes.weights[corner], pull))
+                                adj_look = wp.cw_mul(adj, look(probes.rows[corner], of_rays, indices[k], inputs))
+                                adj_place[corner] += weights[k] * adj_look
+                                adj_weight += total(wp.cw_mul(probes.weights[corner], adj_look))
                         if adj_all_weights:
                             if wp.static(lanes == 1):
                                 adj_weight = sum_over_warp(

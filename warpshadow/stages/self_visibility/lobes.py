@@ -184,19 +184,19 @@ def _turn_lobes_adjoint(
     adj_turned: wp.array3d(dtype=wp.float32),
     # out
     adj_places: wp.array2d(dtype=wp.vec3),
-    torques: wp.array(dtype=wp.vec3),
+    adj_turns: wp.array(dtype=wp.vec3),
 ):
     """A thread owns a receiver:  δ̄_a += K̄ᵀ G_a K,  b̄_j += L_jᵀ Dᵀ K̄."""
     batch, receiver = split_row(first_row + wp.tid(), adj_turned.shape[1])
     turn = instance_in(batch, turns.shape[0])
-    if torques:
-        torque = wp.vec3()
+    if adj_turns:
+        adj_turn = wp.vec3()
         for k in range(bands * bands):
             spun = wp.vec3()
             for t in range(generators_first[k], generators_first[k + 1]):
                 spun += turned[batch, receiver, generators_index[t]] * generators[t]
-            torque += adj_turned[batch, receiver, k] * spun
-        wp.atomic_add(torques, turn, torque)
+            adj_turn += adj_turned[batch, receiver, k] * spun
+        wp.atomic_add(adj_turns, turn, adj_turn)
     if adj_places:
         row = rows[instance_in(batch, rows.shape[0]), receiver]
         adj_share = wp.vec3()
@@ -212,9 +212,9 @@ def _turn_lobes_adjoint(
 
 
 @wp.kernel(enable_backward=False)
-def _add_torques(
+def _add_turns(
     # in
-    torques: wp.array(dtype=wp.vec3),
+    adj_turns: wp.array(dtype=wp.vec3),
     rotations: wp.array2d(dtype=wp.mat33),
     body: int,
     # out
@@ -222,7 +222,7 @@ def _add_torques(
 ):
     """A thread owns an instance. dR = [δ]× R, so R̄ = ½ [δ̄]× R."""
     batch = wp.tid()
-    adj = 0.5 * wp.skew(torques[batch]) * rotations[batch, body]
+    adj = 0.5 * wp.skew(adj_turns[batch]) * rotations[batch, body]
     adj_rotations[batch, body] = adj_rotations[batch, body] + adj
 
 
@@ -272,19 +272,19 @@ def self_visibility_lobes(
             constant(values, dtype, device)
             for values, dtype in ((first, wp.int32), (index, wp.int32), (vectors, wp.vec3))
         )
-        torques = None
+        adj_turns = None
         if rotations.requires_grad:
-            torques = zeros(len(rotations), dtype=wp.vec3, device=device)
+            adj_turns = zeros(len(rotations), dtype=wp.vec3, device=device)
         launch(
             _turn_lobes_adjoint,
             shape[0] * shape[1],
             inputs=[lobes, places.rows, turns, bands, result, *generators, adj],
             outputs=[places.weights.grad],
-            sums=[torques],
+            sums=[adj_turns],
             cost=2 * cost,
         )
-        if torques is not None:
-            inputs = [torques, rotations, body]
-            launch(_add_torques, len(rotations), inputs=inputs, outputs=[rotations.grad])
+        if adj_turns is not None:
+            inputs = [adj_turns, rotations, body]
+            launch(_add_turns, len(rotations), inputs=inputs, outputs=[rotations.grad])
 
     return differentiable(forward, adjoint, result=result, variables=[places.weights, rotations])

@@ -106,9 +106,9 @@ def _measure_adjoint(
             across_a = relative(clip[edge[0]], center)[1 - axis]
             across_b = relative(clip[edge[1]], center)[1 - axis]
             spread = wp.where(axis == 0, -line[0], line[1])
-            pull = adj_place * relative_adjoint(center, line / line[axis])
-            wp.atomic_add(adj_clip_positions, batch, edge[0], (across_b / spread) * pull)
-            wp.atomic_add(adj_clip_positions, batch, edge[1], (-across_a / spread) * pull)
+            adj_clip = adj_place * relative_adjoint(center, line / line[axis])
+            wp.atomic_add(adj_clip_positions, batch, edge[0], (across_b / spread) * adj_clip)
+            wp.atomic_add(adj_clip_positions, batch, edge[1], (-across_a / spread) * adj_clip)
         else:
             for end in range(2):
                 at = sample
@@ -119,9 +119,9 @@ def _measure_adjoint(
                 corners = fragments.faces[fragments.face_ids[at]]
                 ray = sample_center(at, fragments.width, fragments.height)
                 normal = plane(corners, ray, clip)
-                pull = sign * adj_place * (normal[2] / line[axis]) * relative_adjoint(ray, normal)
+                adj_clip = sign * adj_place * (normal[2] / line[axis]) * relative_adjoint(ray, normal)
                 for k in range(3):
-                    wp.atomic_add(adj_clip_positions, batch, corners[k], fragments.barycentrics[at][k] * pull)
+                    wp.atomic_add(adj_clip_positions, batch, corners[k], fragments.barycentrics[at][k] * adj_clip)
 
 
 def measure_areas(samples: wp.array, edges: wp.array, entries: wp.array, arrays: FragmentArrays) -> wp.array:

@@ -178,7 +178,7 @@ def edge_at(
         b = clip[corners[(corner + 2) % 3]]
         volume = orientation(clip[corners[0]], clip[corners[1]], clip[corners[2]])
         is_crease = not is_silhouette(face, other, a, b, volume, fragments.faces, neighbors, clip)
-        # of the two samples that which the edge's line does not bound has the edge of the face beyond
+        # the sample that the edge's line does not bound has the edge of the face beyond
         if is_crease and ends_before(line_between(fragments, sample, direction, edge), direction) == is_neighbor:
             edge = edge_of(other, _corner_before(face, other, neighbors), fragments.faces, clip)
     return edge

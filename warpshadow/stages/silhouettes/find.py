@@ -232,7 +232,7 @@ def _count_entries(
     entries: wp.array(dtype=wp.int32),
     counts: wp.array(dtype=wp.int32),
 ):
-    """A thread owns ``run`` samples after one another: the number of each among those that have an entry, else −1."""
+    """A thread owns ``run`` samples after one another: the number of each among samples that have an entry, else −1."""
     thread = first_row + wp.tid()
     count = int(0)
     for sample in range(thread * run, wp.min((thread + 1) * run, entries.shape[0])):
@@ -259,7 +259,7 @@ def _make_entries(
     edges: wp.array2d(dtype=wp.vec2i),
     entries: wp.array(dtype=wp.int32),
 ):
-    """A thread owns ``run`` samples after one another, whose entries begin where those of the run before end.
+    """A thread owns ``run`` samples after one another, whose entries begin where the run before ends.
 
     If that is not known, the number of the sample is the number of its entry.
     """
@@ -297,7 +297,7 @@ def find_silhouettes(
 
     Args:
         faces: The rasterized faces, vec3i of shape [face].
-        neighbors: :func:`warpshadow.assets.topology.edge_neighbors` of the faces, vec3i of shape [face].
+        neighbors: :func:`warpshadow.maths.adjacency.edge_neighbors` of the faces, vec3i of shape [face].
         clip_positions: Vertices in clip space, vec4 of shape [batch, vertex].
         bodies: Number of each face's body, int32 of shape [face]. Intersections are looked for between different ones;
             without it there are none, and where bodies intersect they have no gradient.

@@ -189,7 +189,6 @@ def find_footprints(
         uv_faces: Indices of uvs, vec3i of shape [face]; faces without a texture are not read.
             Any batch may be 1 and then serves every instance.
         texture_of_face: Texture on each face, -1 for none, int32 of shape [face].
-        textures: The textures.
     Returns:
         Footprints.
     Differentiable: clip_positions, barycentrics of the fragments, uvs; the width and the direction of a footprint

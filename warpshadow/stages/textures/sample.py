@@ -342,7 +342,6 @@ def sample_albedo(
     Args:
         faces: Vertex indices, vec3i of shape [face].
         vertex_albedo: Reflectance of the vertices, vec3 of shape [batch, vertex]; not seen on textured faces.
-        textures: The textures.
         footprints: Of the samples, from :func:`warpshadow.stages.textures.footprint.find_footprints`, with textures of
             these sizes. Any batch may be 1 and then serves every instance.
     Returns:
@@ -416,7 +415,6 @@ def add_to_texels(adj_texels: wp.array, textures: Textures, footprints: Footprin
 
     Args:
         adj_texels: Gradients of the texels, to which it adds, vec3 of shape [batch, texel].
-        textures: The textures.
         footprints: Of the samples.
         adj_albedo: Gradients of the samples' reflectance, vec3 of shape [batch, height, width].
     """

@@ -189,7 +189,7 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
 
         With a the share of a cell that it blocks, ā_i = −T̄ T / (1 − a_i).
         """
-        pull = SphereAdjoint()
+        adj_sphere = SphereAdjoint()
         cone = seen.cone
         cells = task.cells
         sine = sqrt(cone.sine2)
@@ -226,11 +226,11 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
                 adj_offset, adj_radius, adj_weight = sphere_adjoint(
                     seen, sine, cap.cosine, cells.cos_width, cells.sin_width, slope, adj_opacity, sum_, sum_t, sum_omega
                 )
-                pull.is_any = True
-                pull.offset = adj_offset
-                pull.radius = adj_radius
-                pull.weight = adj_weight
-        return pull
+                adj_sphere.is_any = True
+                adj_sphere.offset = adj_offset
+                adj_sphere.radius = adj_radius
+                adj_sphere.weight = adj_weight
+        return adj_sphere
 
     traverse = make_traversal(make_cull(has_horizon, TransmittanceTask, lanes), visit, TransmittanceTask, True, lanes)
 

@@ -295,7 +295,7 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
         for back in range(maximum):
             step = maximum - 1 - back
             is_due = wp.min(wp.max(count - Lane(float(step)), Lane(0.0)), Lane(1.0))
-            _along, change = square_held_adjoint(powers[batch, block, step + 1], depth, table, adj_row, product)
+            _, change = square_held_adjoint(powers[batch, block, step + 1], depth, table, adj_row, product)
             adj_depth += wp.cw_mul(is_due, change)
             for i in range(wp.static(order**2)):
                 adj_row[i] = adj_row[i] + wp.cw_mul(is_due, product[i] - adj_row[i])

@@ -151,7 +151,7 @@ def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Ke
         With z_l = a h_l(c), a = s² w and h from the table:  ā = Σ z̄_l h_l,  c̄ = a Σ z̄_l h_l',  s̄² = ā w,  w̄ = ā
         s², and with w = w_cone w_horizon(n·d/r):  n̄ = d w̄_h w_h'/r,  d̄ += n w̄_h w_h'/r,  r̄ −= n·d/r w̄_h w_h'/r
         """
-        pull = SphereAdjoint()
+        adj_sphere = SphereAdjoint()
         cone = seen.cone
         height = Lane(0.0)
         fade = Lane(1.0)
@@ -181,12 +181,12 @@ def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Ke
             )
             adj_offset, adj_radius = cone_adjoint(seen.offset, seen.curvature, cone, adj_cone)
             adj_height = seen.curvature * wp.cw_mul(wp.cw_mul(adj_faded, cone.weight), fade_slope)
-            pull.is_any = True
-            pull.offset = add(adj_offset, scale(adj_height, receivers.normals))
-            pull.radius = adj_radius - wp.cw_mul(adj_height, height)
-            pull.weight = adj_weight
-            pull.normals = scale(adj_height, seen.offset)
-        return pull
+            adj_sphere.is_any = True
+            adj_sphere.offset = add(adj_offset, scale(adj_height, receivers.normals))
+            adj_sphere.radius = adj_radius - wp.cw_mul(adj_height, height)
+            adj_sphere.weight = adj_weight
+            adj_sphere.normals = scale(adj_height, seen.offset)
+        return adj_sphere
 
     traverse = make_traversal(_make_cull(order, has_horizon, lanes), visit, LogTask, True, lanes)
 

@@ -278,12 +278,12 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
                             seen.cone.weight = wp.cw_mul(near, share)
                             seen.share = share
                             if wp.static(is_adjoint):
-                                pull = visit(receivers, seen, count, task)
-                                if pull.is_any:
-                                    adj_share += sign * wp.cw_mul(pull.weight, near)
-                                    adj.points = subtract(adj.points, pull.offset)
-                                    adj.normals = add(adj.normals, pull.normals)
-                                    add_to_node(pull.offset, pull.radius, batch, node, gradients)
+                                adj_sphere = visit(receivers, seen, count, task)
+                                if adj_sphere.is_any:
+                                    adj_share += sign * wp.cw_mul(adj_sphere.weight, near)
+                                    adj.points = subtract(adj.points, adj_sphere.offset)
+                                    adj.normals = add(adj.normals, adj_sphere.normals)
+                                    add_to_node(adj_sphere.offset, adj_sphere.radius, batch, node, gradients)
                             else:
                                 visit(receivers, seen, count, task)
                     if wp.static(is_adjoint):

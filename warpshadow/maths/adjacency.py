@@ -1,0 +1,52 @@
+"""Adjacency of triangles: their edges, which of them share one, and which vertices are at one place."""
+
+import numpy as np
+
+from warpshadow import check
+
+_NOT_MANIFOLD = -2
+
+
+def edges_of(triangles: np.ndarray) -> np.ndarray:
+    """Edges of triangles, all from first corners first, shape [3 triangle, 2]."""
+    return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+
+
+def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np.ndarray:
+    """Find the face on the other side of each edge.
+
+    Args:
+        faces: Indices of positions, shape [face, 3]: faces are joined where edges share positions, whatever the uvs.
+        positions: Vertices, shape [vertex, 3]; when given, vertices at the same place count as one, as a mesh needs
+            whose faces have vertices of their own.
+    Returns:
+        Face across the edges opposite to corners 0, 1 and 2, int32 of shape [face, 3]; −1 at a border, −2 where more
+        than two faces meet. Both are silhouettes from everywhere. A face with two corners at one place is passed over
+        and has no neighbors itself.
+    """
+    check.shape("faces", faces.shape, ("face", 3))
+    faces = faces.astype(np.int64) if positions is None else number_places(positions)[faces]
+    neighbor = np.full(faces.shape, -1, np.int32)
+    proper = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
+    ends = np.sort(np.stack([np.roll(faces[proper], -1, axis=1), np.roll(faces[proper], -2, axis=1)], axis=-1), axis=-1)
+    first, last = ends.reshape(-1, 2).T
+    lines, owner = first * (faces.max(initial=0) + 1) + last, np.repeat(proper, 3)
+    order = np.argsort(lines)
+    is_next = np.zeros(len(lines) + 2, bool)  # of the same edge as the one before
+    is_next[1:-2] = lines[order[1:]] == lines[order[:-1]]
+    result = np.full(len(lines), -1, np.int32)
+    result[order[is_next[:-2] | is_next[1:-1]]] = _NOT_MANIFOLD
+    pair = np.flatnonzero(~is_next[:-2] & is_next[1:-1] & ~is_next[2:])
+    one, other = order[pair], order[pair + 1]
+    result[one], result[other] = owner[other], owner[one]
+    neighbor[proper] = result.reshape(-1, 3)
+    return neighbor
+
+
+def number_places(positions: np.ndarray) -> np.ndarray:
+    """Number the distinct positions of vertices, or rows of any width: equal ones share a number, shape [vertex]."""
+    permutation = np.lexsort(positions.T)
+    is_new = (np.diff(positions[permutation], axis=0) != 0).any(axis=1)
+    places = np.zeros(len(positions), np.int64)
+    places[permutation[1:]] = np.cumsum(is_new)
+    return places
