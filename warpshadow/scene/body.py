@@ -174,11 +174,6 @@ class Body:
         return bool(len(self.blockers) if isinstance(self.blockers, Spheres) else self.blockers)
 
     @property
-    def blocks_as_parts(self) -> bool:
-        """Whether a method that knows convex parts takes these for what blocks the light of others."""
-        return isinstance(self.blockers, str) and bool(self.mesh.convex_parts)
-
-    @property
     def is_thin(self) -> bool:
         """Whether its spheres bulge out of its mesh between vertices: of sheets, and bodies of several convex parts.
 
@@ -332,6 +327,11 @@ class Body:
         return self.mesh.transformed(
             rotation=self.rotation_matrix(), translation=np.array(self.translation), scale=self.scale
         )
+
+    def into_own_space(self) -> dict[str, Any]:
+        """Arguments of ``transformed`` that take meshes or spheres from the world into its own space."""
+        inverse = self.rotation_matrix().T
+        return {"rotation": inverse, "translation": -inverse @ self.translation / self.scale, "scale": 1 / self.scale}
 
 
 def _colors(mesh: Mesh | MeshSource) -> npt.ArrayLike:
