@@ -57,7 +57,7 @@ a shadow on a side is seen at its ends or not at all, and few faces of few pixel
 and cylinders of 100 pixels each the worst one was 33% too dark at vertices, and the image off by 11.2% in place of 7.0%
 (0.54 s of CPU time for an image of moved bodies, and 0.66 s)."""
 
-UNEVEN = 0.1
+UNEVEN = 0.06
 """Error of light that is interpolated between vertices, relative L2, from which a body is shaded by pixel. It foretells
 the error of the body's pixels: in 128² pixels of scenes of demos/kinds.py, kept, direct light,
 
