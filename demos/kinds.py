@@ -316,7 +316,9 @@ def land(sources: Sources, size: int) -> ws.Scene:
     bodies = [
         body(shapes.dunes(), GOLD),
         standing(shipped_mesh("bear"), WHITE, on(0.75, 0.3), 0.9, rotation=(0, -50, 0)),
-        body(joined("wall", [box((0.5, 0.7, 0.18), (x, shapes.dune(x, -0.9), -0.9)) for x in (-2, -1.5, -1, -0.5)]), GRAY),
+        body(
+            joined("wall", [box((0.5, 0.7, 0.18), (x, shapes.dune(x, -0.9), -0.9)) for x in (-2, -1.5, -1, -0.5)]), GRAY
+        ),
         standing(joined("stone", ball(0.3)), BLUE, on(-1.4, 0.9, 0.2), 0.6),
         body(shapes.bottle(), GREEN, on(-0.45, 1.5, -0.12), rotation=(0, 40, -80), scale=0.6),
         body(joined("post", rod((0, 0, 0), (0, 1, 0), 0.05)), WOOD, on(0.05, 0.7)),

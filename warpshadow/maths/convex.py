@@ -81,9 +81,7 @@ def find_convex_parts(
     return [part._replace(corners=first[part.corners]) for part in parts]
 
 
-def _find_panels(
-    points: np.ndarray, sheets: list[np.ndarray], tolerances: Sequence[float]
-) -> list[np.ndarray] | None:
+def _find_panels(points: np.ndarray, sheets: list[np.ndarray], tolerances: Sequence[float]) -> list[np.ndarray] | None:
     """Cut sheets into panels, as flat ones as there may be."""
     size = np.ptp(points, axis=0).max()
     for tolerance in tolerances:

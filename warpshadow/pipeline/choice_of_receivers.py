@@ -58,19 +58,19 @@ and cylinders of 100 pixels each the worst one was 33% too dark at vertices, and
 (0.54 s of CPU time for an image of moved bodies, and 0.66 s)."""
 
 UNEVEN = 0.06
-"""Error of light that is interpolated between vertices, relative L2, from which a body is shaded by pixel. It foretells
-the error of the body's pixels: in 128² pixels of scenes of demos/kinds.py, kept, direct light,
+"""Error of light that is interpolated between vertices, relative L2, from which a body is shaded by pixel.
 
-        body (scene)         foretold    at vertices    by pixel
-        bear (cage)          29%         17.0%          12.8%
-        stone, 7 (pile)      27%         15.3%           3.4%
-        tent (tent)          13%         11.4%           5.5%
-        bear (bowl)          12%          7.4%           4.6%
-        stone, 11 (pile)     11%          5.8%           0.7%
-        ring, 2 (pile)        9%          6.9%           5.5%
-        ball (tent)           8%          4.4%           4.9%
-        bowl (bowl)           4%          2.7%           3.2%
-        bunny (deformed)      4%          3.4%           3.0%
+Images of scenes of demos/kinds.py, kept, 128², direct light, at vertices and by pixel, and CPU time of a moved one:
+
+    body, and its error foretold       at vertices       by pixel
+    stone in the pile, 25%             2.9%, 127 ms      1.8%, 146 ms
+    small bear, 19%                    3.7%,  26 ms      2.2%,  31 ms
+    bracket, 18%                       2.9%,  57 ms      1.9%,  98 ms
+    bear in the bowl, 12%              3.1%,  40 ms      2.6%,  52 ms
+    dunes of the land, 7%              5.5%, 107 ms      4.0%, 234 ms
+    bowl, 4%                           2.6%,  53 ms      2.6%,  74 ms
+
+Smooth bodies alone on a ground, such as bunnies, have 2 to 4%.
 """
 
 _LONG_SHARE = 0.05  # share of a body's pixels that its longest faces show …
@@ -155,8 +155,8 @@ def with_receivers(scene: Scene, choices: Sequence[ReceiverChoice]) -> Scene:
 def for_picture(scene: Scene) -> Scene:
     """The scene, for a picture that is made once: by rays, where it names neither a method nor what these replace.
 
-    All receivers share their directions, as many as ``samples`` says, 512 by default: of 23 scenes of demos/kinds.py
-    (128², direct light) such pictures have a mean error of 1.5%, at worst 2.5%. They need no spheres and no tables,
+    All receivers share their directions, as many as ``samples`` says, 512 by default: of 24 scenes of demos/kinds.py
+    (128², direct light) such pictures have a mean error of 1.5%, at worst 2.6%. They need no spheres and no tables,
     whose making a picture would wait for, and the picture does not depend on what the cache holds. Bodies with spheres
     or ``self_shadows`` of their own name "directional", which has them.
 

@@ -1,6 +1,8 @@
 """Land: height fields, which are open meshes, whose rim is closed behind them, so that a solid stands in for them.
 
 Spheres in a sheet bulge out of both sides. Where nobody sees one side, they may lie behind it, as deep as they like.
+The image of the land of demos/kinds.py, 128², kept, direct light, is 4.0% off, with spheres in the sheet 6.5%, and with
+panels, of which it takes 37, 8.5%.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from warpshadow.stages.ray_tracing import trace_visibility
 DEPTH = 1 / 16
 """How far the solid reaches beyond the mesh, over the longest side of its bounds.
 
-The deeper it is, the fewer and larger are the spheres that fill it, and the coarser is its front."""
+The deeper it is, the fewer and larger are the spheres that fill it, and the coarser is its front: that land is 6.1% off
+with 1/4, and 4.2% with 1/32."""
 
 _POINTS = 1024  # of meshes, from which rays tell which bodies lie before the field, and which behind
 
@@ -30,7 +33,6 @@ So do rocks and water in land; a ground that a tent stands on does not."""
 _UPWARD = 0.5  # cosine of the angle to +y up to which land leans
 
 
-@functools.lru_cache(64)
 def solid_behind(body: Body, others: tuple[Body, ...]) -> Mesh | None:
     """Close a body that is land behind.
 
@@ -43,6 +45,12 @@ def solid_behind(body: Body, others: tuple[Body, ...]) -> Mesh | None:
         closed or flat, faces look to both sides of any plane or lie above each other; others stand on both sides, as of
         a tent, or on none; or the side on which they stand does not look up, as under a roof, past which light comes.
     """
+    return None if body.mesh.surface.is_closed or body.mesh.is_flat else _solid_behind(body, others)
+
+
+@functools.lru_cache(16)
+def _solid_behind(body: Body, others: tuple[Body, ...]) -> Mesh | None:
+    """The solid behind an open, bent body, if it is land."""
     mesh, to_own = body.mesh, body.into_own_space()
     axis = _axis(mesh, to_own["rotation"][:, 1])
     if axis is None or _overlap(mesh, mesh, axis):
@@ -53,9 +61,7 @@ def solid_behind(body: Body, others: tuple[Body, ...]) -> Mesh | None:
 
 
 def _axis(mesh: Mesh, up: np.ndarray) -> np.ndarray | None:
-    """Mean normal of an open, bent mesh, turned to face up; None if it is level, or if some face looks against it."""
-    if mesh.surface.is_closed or mesh.is_flat:
-        return None
+    """Mean normal of a mesh, turned to look up; None if it hardly does, or if some face looks against it."""
     corners = mesh.positions[mesh.surface.faces].astype(np.float64)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     mean = normals.sum(axis=0)
