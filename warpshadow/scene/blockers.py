@@ -10,7 +10,7 @@ from warpshadow.device.progress import ANNOUNCED_SECONDS, announce
 from warpshadow.maths.convex import ConvexPart
 from warpshadow.maths.plane import plane_normal
 from warpshadow.maths.solid_angle import solid_angles
-from warpshadow.scene.body import Body
+from warpshadow.scene.body import Body, into_own_space
 from warpshadow.scene.height_fields import solid_behind
 from warpshadow.scene.scene import Scene
 from warpshadow.scene.visibility import SPHERE_METHODS
@@ -85,8 +85,8 @@ def fitted_counts(scene: Scene) -> dict[int, int | str]:
         Numbers of the bodies, from 0, and how many spheres each takes, or "auto".
     """
     grounds, parts = _ground_spheres(scene), blocking_parts(scene)
-    wanted = [SPHERES_BESIDE_PARTS if number in parts else _wanted(body) for number, body in enumerate(scene.bodies)]
-    return {number: count for number, count in enumerate(wanted) if count and grounds[number] is None}
+    counts = [SPHERES_BESIDE_PARTS if number in parts else _wanted(body) for number, body in enumerate(scene.bodies)]
+    return {number: count for number, count in enumerate(counts) if count and grounds[number] is None}
 
 
 def fitted_meshes(scene: Scene) -> dict[int, tuple[Mesh, int | str]]:
@@ -161,7 +161,7 @@ def _given_spheres(body: Body, ground: Spheres | None) -> Spheres:
         return body.blockers
     if ground is None:
         return Spheres.concatenate([])
-    return ground.transformed(**body.into_own_space())
+    return ground.transformed(**into_own_space(body))
 
 
 def _ground_sphere(mesh: Mesh, others: list[np.ndarray]) -> Spheres | None:

@@ -329,11 +329,6 @@ class Body:
             rotation=self.rotation_matrix(), translation=np.array(self.translation), scale=self.scale
         )
 
-    def into_own_space(self) -> dict[str, Any]:
-        """Arguments of ``transformed`` that take meshes or spheres from the world into its own space."""
-        inverse = self.rotation_matrix().T
-        return {"rotation": inverse, "translation": -inverse @ self.translation / self.scale, "scale": 1 / self.scale}
-
 
 def _colors(mesh: Mesh | MeshSource) -> npt.ArrayLike:
     """The colors of a mesh, one where all are the same, or gray."""
@@ -363,3 +358,9 @@ def _css_color_hint(color: str) -> str:
     except ValueError:
         return ""
     return f": that color is ({', '.join(f'{value:.4g}' for value in linear)})"
+
+
+def into_own_space(body: Body) -> dict[str, Any]:
+    """Arguments of ``transformed`` that take meshes or spheres from the world into the space of a body."""
+    inverse = body.rotation_matrix().T
+    return {"rotation": inverse, "translation": -inverse @ body.translation / body.scale, "scale": 1 / body.scale}

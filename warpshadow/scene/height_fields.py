@@ -14,7 +14,7 @@ import warp as wp
 
 from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.topology import welded
-from warpshadow.scene.body import Body
+from warpshadow.scene.body import Body, into_own_space
 from warpshadow.stages.ray_tracing import trace_visibility
 
 DEPTH = 1 / 16
@@ -51,7 +51,7 @@ def solid_behind(body: Body, others: tuple[Body, ...]) -> Mesh | None:
 @functools.lru_cache(16)
 def _solid_behind(body: Body, others: tuple[Body, ...]) -> Mesh | None:
     """The solid behind an open, bent body, if it is land."""
-    mesh, to_own = body.mesh, body.into_own_space()
+    mesh, to_own = body.mesh, into_own_space(body)
     axis = _axis(mesh, to_own["rotation"][:, 1])
     if axis is None or _overlap(mesh, mesh, axis):
         return None
