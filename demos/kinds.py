@@ -307,6 +307,25 @@ def tent(sources: Sources, size: int) -> ws.Scene:
     return seen([*bodies, ground()], ws.synthetic_sky((0.7, 0.7, 0.5)), size, (1.4, 1.8, 4.8), (0.1, 0.55, 0))
 
 
+def land(sources: Sources, size: int) -> ws.Scene:
+    """Things that stand, lie and stick in dunes: there is no level ground."""
+
+    def on(x: float, z: float, sunk: float = 0.04) -> Point:
+        return x, float(shapes.dune(x, z)) - sunk, z
+
+    bodies = [
+        body(shapes.dunes(), GOLD),
+        standing(shipped_mesh("bear"), WHITE, on(0.75, 0.3), 0.9, rotation=(0, -50, 0)),
+        body(
+            joined("wall", [box((0.5, 0.7, 0.18), (x, shapes.dune(x, -0.9), -0.9)) for x in (-2, -1.5, -1, -0.5)]), GRAY
+        ),
+        standing(joined("stone", ball(0.3)), BLUE, on(-1.4, 0.9, 0.2), 0.6),
+        body(shapes.bottle(), GREEN, on(-0.45, 1.5, -0.12), rotation=(0, 40, -80), scale=0.6),
+        body(joined("post", rod((0, 0, 0), (0, 1, 0), 0.05)), WOOD, on(0.05, 0.7)),
+    ]
+    return seen(bodies, ws.synthetic_sky(LOW_SUN), size, (1.2, 2.4, 4.8), (-0.1, 0.1, 0.1))
+
+
 def letters(sources: Sources, size: int) -> ws.Scene:
     slope = 22
     bodies = []
@@ -360,7 +379,7 @@ SCENES: dict[str, Kind] = {
         table, open_room, closed_room, chair_wheel_fence, shelf, nested_boxes, corner, cage,
         bowl, cups, textured,
         city, stairs, spiral, bracket,
-        scan, over_ball, deformed, tree, tent, letters, pile, thousand_to_one,
+        scan, over_ball, deformed, tree, tent, land, letters, pile, thousand_to_one,
     )
 }  # fmt: skip
 """All scenes by their names."""

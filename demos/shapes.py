@@ -279,6 +279,22 @@ def tent() -> ws.Mesh:
     return sheet("tent", point, 32, 32)
 
 
+def dune(x: npt.ArrayLike, z: npt.ArrayLike) -> np.ndarray:
+    """Height of the dunes of :func:`dunes`: two ridges that bend, and ripples."""
+    across = np.asarray(x) + 0.4 * np.sin(0.9 * np.asarray(z))
+    return 0.3 * np.sin(2.1 * across) + 0.05 * np.sin(5 * across + 3 * np.asarray(z))
+
+
+def dunes(size: float = 6.0) -> ws.Mesh:
+    """Open land of low relief."""
+
+    def point(u: np.ndarray, v: np.ndarray) -> npt.ArrayLike:
+        x, z = size * (u - 0.5), size * (0.5 - v)
+        return x, dune(x, z), z
+
+    return sheet("dunes", point, 56, 56)
+
+
 _LETTERS = {
     "W": [((0.12, 0.9), (-0.36, 0.45), -10), ((0.12, 0.9), (0.36, 0.45), 10)]
     + [((0.12, 0.66), (-0.13, 0.33), 20), ((0.12, 0.66), (0.13, 0.33), -20)],

@@ -32,6 +32,7 @@ from warpshadow.assets.topology import (
 )
 from warpshadow.check import AnyPath
 from warpshadow.maths.convex import ConvexPart, find_convex_parts
+from warpshadow.maths.panels import FLAT
 from warpshadow.maths.plane import plane_normal
 
 
@@ -175,6 +176,11 @@ class Mesh:
     def convex_parts(self) -> list[ConvexPart]:
         """The convex solids and panels of cloth of which it consists; empty where it has anything else."""
         return find_convex_parts(self.positions, self.surface.faces) or []
+
+    @functools.cached_property
+    def flat_parts(self) -> list[ConvexPart]:
+        """The convex solids and flat panels of which it consists; empty where it has anything else."""
+        return find_convex_parts(self.positions, self.surface.faces, tolerances=(FLAT,)) or []
 
     def transformed(
         self,

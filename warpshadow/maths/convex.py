@@ -4,6 +4,7 @@ other pieces are cut, such as a thick wall with a window, and panels of its shee
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -40,12 +41,16 @@ class ConvexPart(NamedTuple):
     """Where each edge begins and ends, numbers among the corners, and the faces to its left and right, [edge, 4]."""
 
 
-def find_convex_parts(positions: np.ndarray, faces: np.ndarray) -> list[ConvexPart] | None:
+def find_convex_parts(
+    positions: np.ndarray, faces: np.ndarray, tolerances: Sequence[float] = TOLERANCES
+) -> list[ConvexPart] | None:
     """Find the convex parts of which a mesh consists.
 
     Args:
         positions: Vertices, shape [vertex, 3]; vertices at one place count as one.
         faces: Triangles that wind alike, shape [face, 3].
+        tolerances: Thickness and mean gap of a panel at most, over the size of the mesh: the first with which there are
+            few enough.
 
     Returns:
         The parts, which may touch and overlap: for each closed piece of the mesh a solid, or the prisms into which it
@@ -70,17 +75,17 @@ def find_convex_parts(positions: np.ndarray, faces: np.ndarray) -> list[ConvexPa
         if prisms is None:
             return None
         solids += prisms
-    panels = _find_panels(points, sheets)
+    panels = _find_panels(points, sheets, tolerances)
     if panels is None:
         return None
     parts = [*solids, *map(_panel, panels)]
     return [part._replace(corners=first[part.corners]) for part in parts]
 
 
-def _find_panels(points: np.ndarray, sheets: list[np.ndarray]) -> list[np.ndarray] | None:
+def _find_panels(points: np.ndarray, sheets: list[np.ndarray], tolerances: Sequence[float]) -> list[np.ndarray] | None:
     """Cut sheets into panels, as flat ones as there may be."""
     size = np.ptp(points, axis=0).max()
-    for tolerance in TOLERANCES:
+    for tolerance in tolerances:
         panels: list[np.ndarray] = []
         for sheet in sheets:
             more = find_panels(points, sheet, tolerance * size, MAX_PANELS - len(panels))

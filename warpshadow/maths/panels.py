@@ -17,6 +17,8 @@ off, in 1.5 times the time. With spheres it was 10.2% off. With 0.04 light comes
 shell.
 """
 
+FLAT = 1e-3  # the same for flat panels, which shade nothing that lies on the mesh
+
 MAX_PANELS = 64
 """Panels of a mesh at most: beyond, spheres are faster.
 

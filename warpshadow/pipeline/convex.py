@@ -14,6 +14,7 @@ import warp as wp
 
 from warpshadow.maths.convex import ConvexPart
 from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.scene.blockers import blocking_parts
 from warpshadow.stages.convex.prepared import ConvexBlockers, ConvexBody, PlacedParts
 from warpshadow.stages.convex.transmittance import transmittance_past_parts
 
@@ -53,12 +54,10 @@ class SceneConvexParts:
 
     @functools.cached_property
     def parts(self) -> dict[int, list[ConvexPart]]:
-        """The parts of each body that consists of some and casts shadows, unless spheres of the user's own block."""
-        return {
-            number: body.mesh.convex_parts
-            for number, body in enumerate(self._merged_scene.scene.bodies)
-            if body.blocks_as_parts and not self._merged_scene.is_flat[number]
-        }
+        """The parts of each body that blocks as some: see :func:`.blocking_parts`. Flat bodies block as planes."""
+        is_flat = self._merged_scene.is_flat
+        parts = blocking_parts(self._merged_scene.scene)
+        return {number: parts[number] for number in parts if not is_flat[number]}
 
     def blockers(self, bodies: tuple[int, ...], blocking_bodies: tuple[int, ...]) -> ConvexBlockers:
         """Convex blockers of some of these bodies; ``blocking_bodies`` cast shadows."""

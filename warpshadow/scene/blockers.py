@@ -1,16 +1,16 @@
 """Blockers: the spheres that stand in for the bodies of a scene."""
 
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warpshadow.assets.mesh import Mesh
 from warpshadow.device.progress import ANNOUNCED_SECONDS, announce
+from warpshadow.maths.convex import ConvexPart
 from warpshadow.maths.plane import plane_normal
 from warpshadow.maths.solid_angle import solid_angles
-from warpshadow.scene.body import Body
+from warpshadow.scene.body import Body, into_own_space
 from warpshadow.scene.height_fields import solid_behind
 from warpshadow.scene.scene import Scene
 from warpshadow.scene.visibility import SPHERE_METHODS
@@ -33,10 +33,10 @@ def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: boo
     """
     if scene.visibility.with_method().method not in SPHERE_METHODS:
         return [Spheres.concatenate([])] * len(scene.bodies)
-    fits = fitted_meshes(scene, device=device)
+    fits, parts = fitted_meshes(scene), blocking_parts(scene)
     _announce(fits.values(), device, progress)
     return [
-        fit_spheres(*fits[number], device=device, progress=progress, warns=not _takes_parts(scene, body)).spheres
+        fit_spheres(*fits[number], device=device, progress=progress, warns=number not in parts).spheres
         if number in fits
         else _given_spheres(body, ground)
         for number, (body, ground) in enumerate(zip(scene.bodies, _ground_spheres(scene), strict=True))
@@ -59,38 +59,52 @@ def blocking_planes(scene: Scene) -> tuple[int, ...]:
     )
 
 
+def blocking_parts(scene: Scene) -> dict[int, list[ConvexPart]]:
+    """Find the convex parts as which bodies block the light of others, in place of their spheres, by their numbers.
+
+    By method "directional" these are those of all bodies that consist of some, unless how many spheres they have, or
+    that these block their own light, was asked for. Panels are chords of what bends. Over land these would stand before
+    it, and shade what lies between; so a body with a solid behind it (:mod:`.scene.height_fields`) has panels only
+    where it is flat, such as the walls of a room.
+    """
+    visibility = scene.visibility.with_method()
+    if visibility.method != "directional":
+        return {}
+    result = {}
+    for number, body in enumerate(scene.bodies):
+        if isinstance(body.blockers, str) and (body.self_shadows or visibility.self_shadows) != "spheres":
+            mesh = body.mesh
+            result[number] = mesh.convex_parts if _solid_behind(scene, number) is None else mesh.flat_parts
+    return {number: parts for number, parts in result.items() if parts}
+
+
 def fitted_counts(scene: Scene) -> dict[int, int | str]:
     """Find the bodies to which spheres are fitted: neither grounds, nor bodies with spheres of their own.
 
     Returns:
         Numbers of the bodies, from 0, and how many spheres each takes, or "auto".
     """
-    grounds, result = _ground_spheres(scene), {}
-    for number, body in enumerate(scene.bodies):
-        if (count := _wanted(body)) and grounds[number] is None:
-            result[number] = SPHERES_BESIDE_PARTS if _takes_parts(scene, body) else count
+    grounds, parts = _ground_spheres(scene), blocking_parts(scene)
+    counts = [SPHERES_BESIDE_PARTS if number in parts else _wanted(body) for number, body in enumerate(scene.bodies)]
+    return {number: count for number, count in enumerate(counts) if count and grounds[number] is None}
+
+
+def fitted_meshes(scene: Scene) -> dict[int, tuple[Mesh, int | str]]:
+    """Find the meshes to which spheres are fitted, and how many, by the number of the body: see :func:`fitted_counts`.
+
+    A mesh is the body's own, or the solid behind it where it is land and no convex parts.
+    """
+    parts, result = blocking_parts(scene), {}
+    for number, count in fitted_counts(scene).items():
+        solid = None if number in parts else _solid_behind(scene, number)
+        result[number] = scene.bodies[number].mesh if solid is None else solid, count
     return result
 
 
-def fitted_meshes(scene: Scene, *, device: wp.DeviceLike = "cpu") -> dict[int, tuple[Mesh, int | str]]:
-    """Find the meshes to which spheres are fitted, and how many, by the number of the body: see :func:`fitted_counts`.
-
-    A mesh is the body's own, or the solid behind it where it is a height field.
-    """
-    counts = fitted_counts(scene)
-    return {
-        number: (_solid_behind(scene, number, device) or scene.bodies[number].mesh, counts[number]) for number in counts
-    }
-
-
-def _solid_behind(scene: Scene, number: int, device: wp.DeviceLike) -> Mesh | None:
-    """The solid behind a body that is a height field, in its own space; None if it is none."""
+def _solid_behind(scene: Scene, number: int) -> Mesh | None:
+    """The solid behind a body that is land, in its own space; None if it is none."""
     body = scene.bodies[number]
-    if _takes_parts(scene, body) or body.mesh.surface.is_closed:
-        return None
-    to_own = _into_own_space(body)
-    others = [other.world_mesh().transformed(**to_own) for other in scene.bodies if other is not body]
-    return solid_behind(body.mesh, others, device=device)
+    return solid_behind(body, tuple(other for other in scene.bodies if other is not body))
 
 
 def free_shape_remark(scene: Scene, number: int) -> str:
@@ -104,19 +118,12 @@ def free_shape_remark(scene: Scene, number: int) -> str:
             f"{called} is flat, and one sphere behind it blocks light in its place, whatever its shape becomes; "
             "blockers = fit_spheres(mesh, 64).spheres follow its vertices"
         )
-    if body.mesh.surface.is_closed or not _takes_parts(scene, body):
+    if body.mesh.surface.is_closed or number not in blocking_parts(scene):
         return ""
     return (
         f"{called} is a sheet: while its shape is free {SPHERES_BESIDE_PARTS} spheres block its light in place of its "
         'convex parts, and darken it; self_shadows = "spheres" fits as many as blockers = "auto" finds'
     )
-
-
-def _takes_parts(scene: Scene, body: Body) -> bool:
-    """Whether a body blocks light as convex parts, so that its spheres do not."""
-    visibility = scene.visibility.with_method()
-    is_traced = (body.self_shadows or visibility.self_shadows) != "spheres"
-    return visibility.method == "directional" and is_traced and body.blocks_as_parts
 
 
 def _announce(fits: Iterable[tuple[Mesh, int | str]], device: wp.DeviceLike, progress: bool) -> None:
@@ -154,13 +161,7 @@ def _given_spheres(body: Body, ground: Spheres | None) -> Spheres:
         return body.blockers
     if ground is None:
         return Spheres.concatenate([])
-    return ground.transformed(**_into_own_space(body))
-
-
-def _into_own_space(body: Body) -> dict[str, Any]:
-    """Arguments of ``transformed`` that take meshes or spheres from the scene into the space of a body."""
-    inverse = body.rotation_matrix().T
-    return {"rotation": inverse, "translation": -inverse @ body.translation / body.scale, "scale": 1 / body.scale}
+    return ground.transformed(**into_own_space(body))
 
 
 def _ground_sphere(mesh: Mesh, others: list[np.ndarray]) -> Spheres | None:

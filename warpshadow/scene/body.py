@@ -73,8 +73,9 @@ class Body:
             leaves it to each renderer: flat bodies of faces of more than 2 pixels are adaptive, with directional
             visibility on a CPU. Else it is by pixel where its cameras see faces of more than 16 pixels on average, or
             5% of the body's pixels show faces longer than 16 pixels (in images larger than 256 × 256, 1/4096 of the
-            pixels, at most 400, and four times the root of that). Pictures that are made once, as by
-            :func:`warpshadow.render`, show flat bodies by pixel, and under a sun all.
+            pixels, at most 400, and four times the root of that), or where light that is interpolated between its
+            vertices is off by more than 6%. Pictures that are made once, as by :func:`warpshadow.render`, show flat
+            bodies by pixel, and under a sun all.
         self_shadows: How it casts shadows on itself, "traced", by "rays" or by its "spheres", as for
             :class:`Visibility`; None for the scene's setting.
         name: Its name for lookups; None for that of its mesh, so of the mesh's file. :attr:`called` is the one that
@@ -172,11 +173,6 @@ class Body:
     def casts_shadow(self) -> bool:
         """Whether the body blocks light."""
         return bool(len(self.blockers) if isinstance(self.blockers, Spheres) else self.blockers)
-
-    @property
-    def blocks_as_parts(self) -> bool:
-        """Whether a method that knows convex parts takes these for what blocks the light of others."""
-        return isinstance(self.blockers, str) and bool(self.mesh.convex_parts)
 
     @property
     def is_thin(self) -> bool:
@@ -369,3 +365,9 @@ def _css_color_hint(color: str) -> str:
     except ValueError:
         return ""
     return f": that color is ({', '.join(f'{value:.4g}' for value in linear)})"
+
+
+def into_own_space(body: Body) -> dict[str, Any]:
+    """Arguments of ``transformed`` that take meshes or spheres from the world into the space of a body."""
+    inverse = body.rotation_matrix().T
+    return {"rotation": inverse, "translation": -inverse @ body.translation / body.scale, "scale": 1 / body.scale}

@@ -371,7 +371,7 @@ def _by_work(scene: Scene, sample: PointSample) -> Iterator[Scene]:
     yield from _all_directions(scene)
     own = {
         number: len(fit_spheres(mesh, device=sample.device).spheres) if count == AUTO else int(count)
-        for number, (mesh, count) in fitted_meshes(scene, device=sample.device).items()
+        for number, (mesh, count) in fitted_meshes(scene).items()
     }
     factor, maximum = 2, max(own.values(), default=SPHERE_COUNTS[-1])
     while factor * maximum <= SPHERE_COUNTS[-1] and _interpolation_error(scene, sample) < scene.visibility.error:
@@ -402,7 +402,7 @@ def _sphere_variants(scene: Scene, fits: bool, device: wp.DeviceLike) -> Iterato
     """The scene with its own spheres, and with other numbers of them for all bodies."""
     yield scene
     own = fitted_counts(scene)
-    meshes = [] if fits else [mesh for mesh, _ in fitted_meshes(scene, device=device).values()]
+    meshes = [] if fits else [mesh for mesh, _ in fitted_meshes(scene).values()]
     for count in SPHERE_COUNTS if own else ():
         is_at_hand = fits or all(is_fitted(mesh, count, device=device) for mesh in meshes)
         if is_at_hand and set(own.values()) != {count}:

@@ -47,7 +47,7 @@ def is_prepared(painter: Painter, *, device: wp.DeviceLike = "cpu") -> bool:
     scene = painter.scene
     if scene.visibility.method not in SPHERE_METHODS:
         return True
-    fits = fitted_meshes(scene, device=device).values()
+    fits = fitted_meshes(scene).values()
     has_spheres = all(is_fitted(mesh, count, device=device) for mesh, count in fits)
     return has_spheres and all(painter.has_tables(ViewerState.of(scene), quality) for quality in _QUALITIES)
 

@@ -1,4 +1,4 @@
-"""Openness between the vertices of faces, by which bodies get their receivers."""
+"""How far light is off between the vertices of faces, by which bodies get their receivers."""
 
 import dataclasses
 
@@ -41,7 +41,7 @@ def test_bodies_whose_vertices_are_in_others_are_shaded_by_pixel():
 
 def test_it_says_why():
     notes = " ".join(ws.Renderer(scene_of()).explain().notes)
-    assert "between its vertices the openness to light is off by" in notes
+    assert "between its vertices light is off by" in notes
 
 
 @pytest.mark.parametrize(("options", "method"), [({"receivers": "vertex"}, "directional"), ({}, "none")])
@@ -61,3 +61,37 @@ def test_their_light_is_that_of_rays():
         image = ws.Renderer(dataclasses.replace(scene, bodies=bodies)).render()
         errors.append(np.abs(image - truth)[shows].mean())
     assert errors[0] < 0.7 * errors[1]
+
+
+def waves(**options):
+    """A body of waves that are high enough for a low sun to leave their backs dark."""
+    grid = ws.plane(4.0, 48)
+    mesh = ws.Mesh(grid.positions + np.outer(0.25 * np.cos(5 * grid.positions[:, 0]), (0, 1, 0)), grid.faces)
+    camera = ws.Camera.look_at((0, 4, 5), (0, 0, 0), fov_y=45, size=(64, 64))
+    return ws.Scene([ws.Body(mesh), ws.Body(ws.icosphere(0.3, 3), translation=(0, 1, 0))], camera=camera, **options)
+
+
+@pytest.mark.parametrize(("sun", "expected"), [((1, 0.2, 0), "pixel"), ((0, 1, 0), "vertex")], ids=["low", "high"])
+def test_shadows_that_cross_faces_are_seen_by_pixel(sun, expected):
+    body, _ = chosen(waves(light=ws.synthetic_sky(sun)))
+    assert body.receivers == expected and not body.size.exceeds(16)
+
+
+def test_free_light_is_taken_as_even():
+    scene = waves(light=ws.synthetic_sky((1, 0.2, 0)))
+    free, _ = choose_receivers(MergedScene(scene), [scene.camera], is_light_free=True)
+    even, _ = chosen(waves(light=ws.EnvironmentMap.constant()))
+    assert free.unevenness == even.unevenness < UNEVEN
+    assert 3 * even.unevenness < chosen(scene)[0].unevenness
+
+
+def test_sheets_are_lit_on_the_side_that_is_seen():
+    scene = waves(light=ws.synthetic_sky((1, 0.2, 0)))
+    body, *others = scene.bodies
+    flipped = dataclasses.replace(body, mesh=dataclasses.replace(body.mesh, faces=body.mesh.faces[:, ::-1]))
+    over = dataclasses.replace(scene, bodies=[flipped, *others])
+    assert chosen(over)[0].unevenness == pytest.approx(chosen(scene)[0].unevenness, rel=1e-5)
+
+
+def test_no_light_is_even():
+    assert chosen(waves(light=ws.EnvironmentMap.constant(0.0)))[0].unevenness == 0

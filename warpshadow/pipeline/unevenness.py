@@ -1,0 +1,94 @@
+"""How far light that is interpolated between the vertices of faces is off the light at their middles.
+
+A face from a vertex in a crease, or inside another body, to one in the open is dark at one end, and one that a shadow's
+edge crosses is gray, however short it is in the image. Where much of a body's light is on such faces, light at its
+vertices does not tell the light on it.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from warpshadow.assets.camera import Camera
+from warpshadow.assets.color import LUMINANCE
+from warpshadow.assets.harmonic_light import HarmonicLight
+from warpshadow.assets.light import EnvironmentMap
+from warpshadow.maths.directions import fibonacci
+from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.ray_tracing import trace_visibility
+
+_CELLS = 128  # of directions; the default of "directional", which has them already
+_RAYS = 64  # from a point, to cells by their light
+_FACES = 256  # of a body that are looked at, at most
+
+
+def light_unevenness(
+    merged_scene: MergedScene,
+    positions: np.ndarray,
+    images: Sequence[tuple[Camera, np.ndarray, np.ndarray]],
+    bodies: Sequence[int],
+    light: EnvironmentMap | HarmonicLight,
+) -> np.ndarray:
+    """Error of direct light on bodies that is interpolated between their vertices, over their pixels, relative L2.
+
+    Args:
+        merged_scene: All bodies.
+        positions: Vertices of all [scene units], float32 of shape [vertex, 3].
+        images: Of each its camera, the faces that it shows, and their pixels, [face]; some are looked at, the same
+            each time.
+        bodies: Bodies to look at.
+        light: Their light.
+    Returns:
+        Of each of these bodies, shape [body]; 0 where no image shows it.
+    """
+    device, result = merged_scene.device, np.zeros(len(bodies))
+    eyes = np.concatenate([np.tile(camera.eye, (len(seen), 1)) for camera, seen, _ in images])
+    seen, counts = (np.concatenate([image[item] for image in images]) for item in (1, 2))
+    of_body = [np.flatnonzero(merged_scene.body_of_face[seen] == body) for body in bodies]
+    chosen = [rows[:: -(-len(rows) // _FACES)] if len(rows) else rows for rows in of_body]
+    rows = np.concatenate(chosen)
+    if not merged_scene.casting or not len(rows):
+        return result
+    vertices = wp.array(positions, dtype=wp.vec3, device=device)
+    mesh = merged_scene.casting_mesh(vertices)
+    normals = vertex_normals(vertices.reshape((1, -1)), merged_scene.faces).numpy()[0]
+    corners = merged_scene.faces.numpy()[seen[rows]]
+    points, facing = (_with_middles(values[corners]) for values in (positions, normals))
+    is_behind = ((eyes[rows] - points[:, 3]) * facing[:, 3]).sum(axis=1) < 0
+    is_behind &= merged_scene.is_two_sided[merged_scene.body_of_face[seen[rows]]]
+    facing *= np.where(is_behind, -1, 1)[:, None, None] / np.linalg.norm(facing, axis=2, keepdims=True).clip(1e-30)
+    received = _irradiance(mesh, points, facing, light, device)
+    at_middles, errors = received[:, 3], received[:, :3].mean(axis=1) - received[:, 3]
+    first = 0
+    for number, part in enumerate(chosen):
+        items, weights = slice(first, first + len(part)), counts[part]
+        power, first = (weights * at_middles[items] ** 2).sum(), first + len(part)
+        if power > 0:
+            result[number] = np.sqrt((weights * errors[items] ** 2).sum() / power)
+    return result
+
+
+def _with_middles(corners: np.ndarray) -> np.ndarray:
+    """Values at the corners of faces, [face, 3, 3], and at their middles, [face, 4, 3]."""
+    return np.concatenate([corners, corners.mean(axis=1, keepdims=True)], axis=1)
+
+
+def _irradiance(
+    mesh: wp.Mesh | None,
+    points: np.ndarray,
+    normals: np.ndarray,
+    light: EnvironmentMap | HarmonicLight,
+    device: wp.Device,
+) -> np.ndarray:
+    """Luminance of the light that reaches points, [face, point], of rays that are shared out by the light of cells."""
+    cells = light.cells(fibonacci(_CELLS))
+    power = np.cumsum(np.maximum(cells.radiance @ LUMINANCE, 0))
+    chosen, counts = np.unique(np.searchsorted(power, power[-1] * (np.arange(_RAYS) + 0.5) / _RAYS), return_counts=True)
+    directions = (cells.directions if cells.spots is None else cells.spots)[chosen]
+    at, facing = (wp.array(values.reshape(1, -1, 3), dtype=wp.vec3, device=device) for values in (points, normals))
+    visibility = trace_visibility(mesh, at, facing, wp.array(directions, dtype=wp.vec3, device=device)).numpy()
+    shaded = visibility.reshape(*points.shape[:2], -1) * np.maximum(normals @ directions.T, 0)
+    result: np.ndarray = shaded @ (power[-1] / _RAYS * counts)
+    return result
