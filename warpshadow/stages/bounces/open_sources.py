@@ -28,6 +28,7 @@ from warpshadow.device.memory import empty
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
 _HIDDEN = wp.constant(0.01)  # ε, by which sources count of a patch that is buried wholly
+_BURIED = wp.constant(0.1)  # openness of a patch that counts half
 
 
 @wp.kernel
@@ -111,11 +112,25 @@ def _share(
     shares[batch, source] = wp.cw_div(openness[batch, source], means[batch, patch_of_source[source]])
 
 
+@wp.kernel
+def _weigh(
+    # in
+    openness: wp.array2d(dtype=wp.vec3),
+    # out
+    weights: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a patch of an instance: how much it counts among others."""
+    batch, patch = wp.tid()
+    ratio = openness[batch, patch][0] / _BURIED
+    power = ratio * ratio * ratio * ratio
+    weights[batch, patch] = wp.vec3(power / (power + 1.0))
+
+
 class Openness(NamedTuple):
     """How open sources and patches are."""
 
     shares: wp.array  # f, how much each source counts in its patch, vec3 of shape [batch, source]
-    of_patches: wp.array  # Σ_s w_ps o_s, vec3 of shape [batch, patch]
+    weights: wp.array  # of patches among others, by their openness, in three channels, vec3 of shape [batch, patch]
 
 
 def open_shares(openness: wp.array, mean: SparseMatrix, patch_of_source: np.ndarray) -> Openness:
@@ -134,4 +149,6 @@ def open_shares(openness: wp.array, mean: SparseMatrix, patch_of_source: np.ndar
     shares = empty(openness.shape, dtype=wp.vec3, device=openness.device)
     of_patches = multiply(mean, openness)
     launch(_share, shares.shape, inputs=[openness, of_patches, owners], outputs=[shares])
-    return Openness(shares, of_patches)
+    weights = empty(of_patches.shape, dtype=wp.vec3, device=openness.device)
+    launch(_weigh, weights.shape, inputs=[of_patches], outputs=[weights])
+    return Openness(shares, weights)

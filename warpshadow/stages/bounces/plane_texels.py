@@ -15,33 +15,11 @@ it; so it is 4% too dark, and 10% too bright.
 
 import warp as wp
 
-from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
+from warpshadow.stages.bounces.radiosity import reflect
 from warpshadow.stages.planes.prepared import PlaneBlockers
 from warpshadow.stages.sparse import multiply
-
-_BURIED = wp.constant(0.1)  # openness of a patch that counts half
-
-
-@wp.kernel
-def _weigh(
-    # in
-    radiosity: wp.array2d(dtype=wp.vec3),
-    openness: wp.array2d(dtype=wp.vec3),
-    # out
-    weights: wp.array2d(dtype=wp.vec3),
-    weighted: wp.array2d(dtype=wp.vec3),
-):
-    """A thread owns a patch of an instance."""
-    batch, patch = wp.tid()
-    weight = float(1.0)
-    if openness:
-        ratio = openness[instance_in(batch, openness.shape[0]), patch][0] / _BURIED
-        power = ratio * ratio * ratio * ratio
-        weight = power / (power + 1.0)
-    weights[batch, patch] = wp.vec3(weight)
-    weighted[batch, patch] = weight * radiosity[instance_in(batch, radiosity.shape[0]), patch]
 
 
 @wp.kernel
@@ -61,7 +39,7 @@ def _divide(
     texels[batch, texel] = mean
 
 
-def find_texels(radiosity: wp.array, openness: wp.array | None, planes: PlaneBlockers) -> wp.array:
+def find_texels(radiosity: wp.array, open_weights: wp.array, planes: PlaneBlockers) -> wp.array:
     """Find the radiosity of texels in all mip levels of planes.
 
     Args:
@@ -74,10 +52,8 @@ def find_texels(radiosity: wp.array, openness: wp.array | None, planes: PlaneBlo
     Differentiable: radiosity, openness.
     """
     assert planes.texels_of_patches is not None
-    shape = common_batch({"radiosity": radiosity, "openness": openness}), radiosity.shape[1]
-    weights, weighted = (empty(shape, dtype=wp.vec3, device=radiosity.device) for _ in range(2))
-    launch(_weigh, shape, inputs=[radiosity, openness], outputs=[weights, weighted])
-    sums, totals = (multiply(planes.texels_of_patches, values) for values in (weighted, weights))
+    weighted = reflect(open_weights, radiosity)
+    sums, totals = (multiply(planes.texels_of_patches, values) for values in (weighted, open_weights))
     texels = empty(sums.shape, dtype=wp.vec3, device=radiosity.device)
     launch(_divide, sums.shape, inputs=[sums, totals], outputs=[texels])
     return texels

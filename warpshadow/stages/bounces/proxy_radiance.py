@@ -64,6 +64,7 @@ def _tabulate(
     # in
     radiosity: wp.array2d(dtype=wp.vec3),
     projected_areas: wp.array3d(dtype=wp.float32),
+    open_weights: wp.array2d(dtype=wp.vec3),
     starts: wp.array(dtype=wp.int32),
     numbers: wp.array(dtype=wp.int32),
     shares: wp.array(dtype=wp.float32),
@@ -75,11 +76,12 @@ def _tabulate(
     batch, node, direction = wp.tid()
     sent = radiosity[instance_in(batch, radiosity.shape[0])]
     areas_of_instance = projected_areas[instance_in(batch, projected_areas.shape[0])]
+    weights = open_weights[instance_in(batch, open_weights.shape[0])]
     light = wp.vec3()
     open = float(weight_if_black[node])
     for k in range(starts[node], starts[node + 1]):
         patch = numbers[k]
-        part = shares[k] * (areas_of_instance[patch, direction] + _AVERTED)
+        part = shares[k] * (weights[patch][0] * areas_of_instance[patch, direction] + _AVERTED)
         light += part * sent[patch]
         open += part
     proxy_radiance[batch, node, direction] = wp.vec4(light[0], light[1], light[2], open)
@@ -88,6 +90,7 @@ def _tabulate(
 def find_proxy_radiance(
     radiosity: wp.array,
     projected_areas: wp.array,
+    open_weights: wp.array,
     areas: np.ndarray,
     starts: np.ndarray,
     numbers: np.ndarray,
@@ -106,7 +109,8 @@ def find_proxy_radiance(
         Σ A (g + ε) B / Σ A and Σ A (g + ε) / Σ A, vec4 of shape [batch, node, direction].
     Differentiable: radiosity, projected_areas.
     """
-    batch_count = common_batch({"radiosity": radiosity, "projected_areas": projected_areas})
+    arrays = {"radiosity": radiosity, "projected_areas": projected_areas, "open_weights": open_weights}
+    batch_count = common_batch(arrays)
     patch_count = len(areas)
     check.shape("radiosity", radiosity.shape, (radiosity.shape[0], patch_count))
     check.shape("projected_areas", projected_areas.shape, (projected_areas.shape[0], patch_count, "direction"))
@@ -123,5 +127,5 @@ def find_proxy_radiance(
     floats = [shares, np.where(totals > 0, 0.0, _BLACK_SPHERE_WEIGHT)]
     tables = [*integers, *(constant(values.astype(np.float32), wp.float32, device) for values in floats)]
     proxy_radiance = empty((batch_count, len(starts) - 1, projected_areas.shape[2]), dtype=wp.vec4, device=device)
-    launch(_tabulate, proxy_radiance.shape, inputs=[radiosity, projected_areas, *tables], outputs=[proxy_radiance])
+    launch(_tabulate, proxy_radiance.shape, inputs=[*arrays.values(), *tables], outputs=[proxy_radiance])
     return proxy_radiance
