@@ -360,8 +360,11 @@ class Gathering:
         assert planes is not None
         skip = planes.number.get(group.body)
         points, fronts = group.lifted_points_and_fronts(outgoing.frames, planes.all, skip)
+        # Cells look to where the light of the sky is, above horizons; light of planes is found around their middles. A
+        # ball on a ground lost 4% of the ground's light by the former.
+        middles = fibonacci(len(cells.directions))
         arguments = points, group.normals, cells.transmittance_spheres, outgoing.frames, outgoing.texels, planes.all
-        return plane_light(*arguments, cells.directions, fronts=fronts, skip=skip)
+        return plane_light(*arguments, middles, fronts=fronts, skip=skip)
 
     def _from_spheres(self, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
         if not any(body != group.body and not self._is_flat[body] for body in outgoing.senders.bodies):
