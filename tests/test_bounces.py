@@ -213,11 +213,11 @@ def test_all_bounces_are_those_that_many_come_to(is_cached):
 
 
 def test_a_white_room_in_a_white_furnace_is_white():
-    """Measured 0.4% too dark, at worst 2.5%, in corners; by walls that send less than they block 14%, and 21%."""
+    """Measured 0.2% too dark, at worst 3.0%, in corners; by walls that send less than they block 14%, and 21%."""
     scene = dataclasses.replace(open_room(1.0, receivers="vertex"), bounces="all")
     shading = ws.Renderer(scene, progress=False).shade().numpy()
-    assert shading.mean() == pytest.approx(1, abs=0.005)
-    assert abs(shading - 1).max() < 0.03
+    assert shading.mean() == pytest.approx(1, abs=0.003)
+    assert abs(shading - 1).max() < 0.033
 
 
 def test_a_black_body_hides_what_is_behind_it():

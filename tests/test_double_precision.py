@@ -218,9 +218,10 @@ def test_log_visibility_of_spheres_that_merge(double, device, check, quad):
 def test_radiance_of_proxies(double, device, check):
     nodes = np.int32([0, 2, 3, 3]), np.int32([0, 1, 2])
     check(
-        lambda b, g: double("stages.bounces.proxy_radiance").find_proxy_radiance(b, g, np.ones(3), *nodes),
+        lambda b, g, v: double("stages.bounces.proxy_radiance").find_proxy_radiance(b, g, v, np.ones(3), *nodes),
         (wp.vec3d, random(0, 2, 3, 3)),
         (wp.float64, random(1, 2, 3, 5) ** 2),
+        (wp.vec3d, random(2, 2, 3, 3) ** 2),
     )
 
 
@@ -356,7 +357,8 @@ def test_how_much_sources_count(double, device, check):
 
     def shown(albedo, light, normals, past_self, past_all):
         openness = sources.find_openness(normals, past_self, past_all, directions)
-        return radiosity.patch_radiosity(albedo, light, mean, sources.open_shares(openness, mean, owners).shares)
+        shares, weights = sources.open_shares(openness, mean, owners)
+        return radiosity.reflect(weights, radiosity.patch_radiosity(albedo, light, mean, shares))
 
     colors = (wp.vec3d, random(2, 1, 3, 3)), (wp.vec3d, random(3, 2, 3, 3))
     check(shown, *colors, (wp.vec3d, unit(random(4, 1, 3, 3))), (wp.float64, past_self), (wp.float64, past_self**2))

@@ -236,13 +236,13 @@ def blocked_shares(points, centers, radii, directions, softness=0.35):
     return 1 - np.stack(alone, axis=1)
 
 
-def find_proxy_radiance(radiosity, shown, areas, patches):
+def find_proxy_radiance(radiosity, shown, weights, areas, patches):
     """Light and area that the patches of spheres show, [sphere, direction, 4]; ``patches`` lists those of a sphere."""
-    table = np.zeros((len(patches), shown.shape[1], 4))
+    table, sent = np.zeros((len(patches), shown.shape[1], 4)), weights[:, :1] * shown + 1e-4
     for row, own in zip(table, patches, strict=True):
         share = areas[own] / areas[own].sum()
-        row[:, 3] = share @ (shown[own] + 1e-4) if len(own) else 0.25
-        row[:, :3] = np.einsum("p,pq,pc->qc", share, shown[own] + 1e-4, radiosity[own])
+        row[:, 3] = share @ sent[own] if len(own) else 0.25
+        row[:, :3] = np.einsum("p,pq,pc->qc", share, sent[own], radiosity[own])
     return table
 
 

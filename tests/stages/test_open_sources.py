@@ -15,25 +15,41 @@ PATCHES, WEIGHTS = np.array([0, 0, 2, 2, 2]), np.array([0.4, 0.6, 0.5, 0.2, 0.3]
 UP = np.array([0.0, 1.0, 0.0])
 
 
-def twin(normals, past_self, past_all):
+def sums(normals, *transmittances):
     cosines = 4 / len(DIRECTIONS) * np.maximum(normals @ DIRECTIONS.T, 0)
-    openness = ((cosines * past_all).sum(axis=1) + HIDDEN) / ((cosines * past_self).sum(axis=1) + HIDDEN)
-    sums = np.bincount(PATCHES, WEIGHTS * openness)
-    return np.repeat((openness / sums[PATCHES])[:, None], 3, axis=1)
+    return [(cosines * passing).sum(axis=1) + HIDDEN for passing in transmittances]
+
+
+def twin_shares(normals, past_self, past_all):
+    (openness,) = sums(normals, past_all)
+    return np.repeat((openness / np.bincount(PATCHES, WEIGHTS * openness)[PATCHES])[:, None], 3, axis=1)
+
+
+def twin_weights(normals, past_self, past_all):
+    of_self, of_all = (np.bincount(PATCHES, WEIGHTS * each) for each in sums(normals, past_self, past_all))
+    ratio = np.divide(of_all, of_self, out=np.zeros(3), where=of_self > 0)
+    return np.repeat((ratio**4 / (ratio**4 + 0.1**4))[:, None], 3, axis=1)
+
+
+def find(normals, past_self, past_all, device):
+    mean = mean_over_sources(PATCHES, WEIGHTS, 3, device=device)
+    return open_shares(find_openness(normals, past_self, past_all, DIRECTIONS), mean, PATCHES)
 
 
 def shares(normals, past_self, past_all, device):
-    mean = mean_over_sources(PATCHES, WEIGHTS, 3, device=device)
-    return open_shares(find_openness(normals, past_self, past_all, DIRECTIONS), mean, PATCHES).shares
+    return find(normals, past_self, past_all, device).shares
 
 
-def test_shares_of_sources_are_those_of_the_twin(device):
+@pytest.mark.parametrize(("name", "twin"), [("shares", twin_shares), ("weights", twin_weights)])
+def test_shares_of_sources_and_weights_of_patches_are_those_of_the_twin(name, twin, device):
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(5, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     past_self = rng.random((5, 32))
-    values = [normals, past_self, past_self * rng.random((5, 32))]
-    compare(lambda *arrays: shares(*arrays, device), twin, values, (wp.vec3, wp.float32, wp.float32), device)
+    values = [normals, past_self, 0.3 * past_self * rng.random((5, 32))]
+    compare(
+        lambda *arrays: getattr(find(*arrays, device), name), twin, values, (wp.vec3, wp.float32, wp.float32), device
+    )
 
 
 @pytest.mark.parametrize("has_self", [True, False])

@@ -23,7 +23,8 @@ DIRECTIONS = fibonacci(64)
 
 
 def plane_light(points, normals, transmittance, frames, radiosity, planes, directions, **options):
-    texels = find_texels(radiosity, None, planes)
+    ones = wp.full((1, radiosity.shape[1]), wp.vec3(1.0), dtype=wp.vec3, device=radiosity.device)
+    texels = find_texels(radiosity, ones, planes)
     return light_of_texels(points, normals, transmittance, frames, texels, planes, directions, **options)
 
 

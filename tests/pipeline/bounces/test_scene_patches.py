@@ -112,7 +112,8 @@ def test_patches_of_bodies_of_different_scale_count_by_their_areas_in_the_scene(
     starts, numbers = np.int32([0, senders.first[2]]), np.arange(senders.first[2], dtype=np.int32)
     radiosity = np.repeat([1.0, 0.0, 0.0], np.diff(senders.first))[None, :, None].repeat(3, axis=2)
     shown = wp.full((1, len(senders.areas), 4), 0.25, wp.float32)
-    sent = find_proxy_radiance(wp.array(radiosity, dtype=wp.vec3), shown, senders.areas, starts, numbers).numpy()[0, 0]
+    arrays = wp.array(radiosity, dtype=wp.vec3), shown, wp.full(shown.shape[:2], wp.vec3(1.0), wp.vec3)
+    sent = find_proxy_radiance(*arrays, senders.areas, starts, numbers).numpy()[0, 0]
     np.testing.assert_allclose(sent[:, 0] / sent[:, 3], expected[0] / (expected[0] + expected[1]), rtol=1e-5)
 
 

@@ -183,7 +183,7 @@ class Radiosity(Node):
         )
 
         def sent(radiosity: wp.array) -> OutgoingRadiance:
-            return OutgoingRadiance(self._proxies, radiosity, projected_patches, frames, openness.of_patches)
+            return OutgoingRadiance(self._proxies, radiosity, projected_patches, frames, openness.weights)
 
         def radiosity_by_others(radiosity: wp.array | None) -> wp.array:
             """Radiosity of patches by light from the sky and from other bodies."""

@@ -265,7 +265,7 @@ class OutgoingRadiance:
         radiosity: Of the patches, vec3 of shape [batch, patch].
         projected_patches: The patches as receivers see them.
         frames: Where flat bodies are, vec3 of shape [batch, 3 · plane].
-        openness: Of the patches, vec3 of shape [batch, patch].
+        open_weights: Of the patches by their openness, vec3 of shape [batch, patch].
     """
 
     def __init__(
@@ -274,10 +274,10 @@ class OutgoingRadiance:
         radiosity: wp.array,
         projected_patches: ProjectedPatches,
         frames: wp.array,
-        openness: wp.array,
+        open_weights: wp.array,
     ):
         self.proxies, self.senders, self.radiosity = proxies, proxies.senders, radiosity
-        self.projected_patches, self.frames, self.openness = projected_patches, frames, openness
+        self.projected_patches, self.frames, self.open_weights = projected_patches, frames, open_weights
 
     def of_body(self, body: int) -> wp.array:
         """Radiosity of the patches of a body, vec3 of shape [batch, patch]."""
@@ -290,13 +290,15 @@ class OutgoingRadiance:
         proxies, radiosity, patches = self.proxies, self.radiosity, self.projected_patches
         if proxies.covers is not None:
             radiosity = cover(radiosity, cut(patches.centers, 0, radiosity.shape[1]), *proxies.covers)
-        return find_proxy_radiance(radiosity, patches.areas, self.senders.areas, *proxies.patches_of_clusters)
+        return find_proxy_radiance(
+            radiosity, patches.areas, self.open_weights, self.senders.areas, *proxies.patches_of_clusters
+        )
 
     @functools.cached_property
     def texels(self) -> wp.array:
         """Radiosity of the flat bodies, vec3 of shape [batch, texel]."""
         assert self.proxies.planes is not None
-        return find_texels(self.radiosity, self.openness, self.proxies.planes.all)
+        return find_texels(self.radiosity, self.open_weights, self.proxies.planes.all)
 
 
 class Gathering:
@@ -358,8 +360,11 @@ class Gathering:
         assert planes is not None
         skip = planes.number.get(group.body)
         points, fronts = group.lifted_points_and_fronts(outgoing.frames, planes.all, skip)
+        # Cells look to where the light of the sky is, above horizons; light of planes is found around their middles. A
+        # ball on a ground lost 4% of the ground's light by the former.
+        middles = fibonacci(len(cells.directions))
         arguments = points, group.normals, cells.transmittance_spheres, outgoing.frames, outgoing.texels, planes.all
-        return plane_light(*arguments, cells.directions, fronts=fronts, skip=skip)
+        return plane_light(*arguments, middles, fronts=fronts, skip=skip)
 
     def _from_spheres(self, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
         if not any(body != group.body and not self._is_flat[body] for body in outgoing.senders.bodies):

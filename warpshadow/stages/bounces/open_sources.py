@@ -1,16 +1,22 @@
-"""Open sources: how much each source counts in its patch, so that what other bodies bury does not darken the rest.
+"""Open sources: how much each source counts in its patch, and each patch among others, by how open they are.
 
-Where bodies touch or stick in each other, sources of a patch may lie inside another body. These are black, and nobody
-sees them. So a source s of patch p counts by how open the hemisphere is that other bodies leave it,
+Where bodies touch or stick in each other, sources of a patch may lie inside another body, and those of a book's side
+between other books. These are dark, and few see them. So a source s of patch p counts by how open it is,
 
-    o_s = (⟨T⟩ + ε) / (⟨T_self⟩ + ε),  ⟨T⟩ = 4/Q Σ_q max(n·ω_q, 0) T_q
+    o_s = ⟨T⟩ + ε,  ⟨T⟩ = 4/Q Σ_q max(n·ω_q, 0) T_q
     f_s = o_s / Σ_r w_pr o_r
 
-with T the transmittance past all bodies but planes, T_self that past its own, and w the weights of sources in their
-patch: the light of a patch is Σ_s w_ps f_s L_s. Seen from outside, parts of a patch count just by how open they are.
+with T the transmittance past all bodies but planes, and w the weights of sources in their patch: the light of a patch
+is Σ_s w_ps f_s L_s. Seen from outside, parts of a patch count just by how open they are.
 
-Without it, in a pile of bodies that stick in each other direct light on the patches of a ball was 19% too dark, and in
-a shelf full of books that on the shelf 14%.
+A patch that other bodies bury wholly counts hardly at all beside others, in a texel of a plane or among the proxies
+that a receiver sees through a cell, by the part of what its own body leaves open that others leave open, too:
+
+    v_p = r⁴ / (r⁴ + 0.1⁴),  r_p = Σ_s w_ps (⟨T⟩_s + ε) / Σ_s w_ps (⟨T_self⟩_s + ε)
+
+Without f, in a pile of bodies that stick in each other direct light on the patches of a ball was 19% too dark, and in
+a shelf full of books that on the shelf 14%; with ⟨T⟩ / ⟨T_self⟩ for ⟨T⟩ a row of books is 2% darker. Without v among
+proxies five bricks that stick in each other send the ground around them 11% too little light, with it 0.3% too much.
 """
 
 from __future__ import annotations
@@ -28,6 +34,7 @@ from warpshadow.device.memory import empty
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
 _HIDDEN = wp.constant(0.01)  # ε, by which sources count of a patch that is buried wholly
+_BURIED = wp.constant(0.1)  # r of a patch that counts half
 
 
 @wp.kernel
@@ -38,40 +45,27 @@ def _sum_open(
     transmittance_spheres: wp.array3d(dtype=wp.float32),
     directions: wp.array(dtype=wp.vec3),
     # out
-    sums: wp.array2d(dtype=wp.vec2),
+    openness: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a source of an instance: ⟨T⟩ and ⟨T_self⟩, linear in both as Warp's adjoint needs it."""
     batch, source = wp.tid()
     normal = normals[instance_in(batch, normals.shape[0]), source]
     of_spheres = instance_in(batch, transmittance_spheres.shape[0])
     factor = 4.0 / float(directions.shape[0])
-    total = wp.vec2()
+    total = wp.vec3(_HIDDEN, _HIDDEN, 0.0)
     for q in range(directions.shape[0]):
         cosine = factor * wp.max(wp.dot(normal, directions[q]), 0.0)
         of_self = float(1.0)
         if transmittance_self:
             of_self = transmittance_self[instance_in(batch, transmittance_self.shape[0]), source, q]
-        total += cosine * wp.vec2(transmittance_spheres[of_spheres, source, q], of_self)
-    sums[batch, source] = total
-
-
-@wp.kernel
-def _divide(
-    # in
-    sums: wp.array2d(dtype=wp.vec2),
-    # out
-    openness: wp.array2d(dtype=wp.vec3),
-):
-    """A thread owns a source of an instance: o, in three channels."""
-    batch, source = wp.tid()
-    part = sums[batch, source]
-    openness[batch, source] = wp.vec3((part[0] + _HIDDEN) / (part[1] + _HIDDEN))
+        total += cosine * wp.vec3(transmittance_spheres[of_spheres, source, q], of_self, 0.0)
+    openness[batch, source] = total
 
 
 def find_openness(
     normals: wp.array, transmittance_self: wp.array | None, transmittance_spheres: wp.array, directions: np.ndarray
 ) -> wp.array:
-    """Part of what a body leaves open of the hemispheres of its sources that other bodies leave open, too.
+    """How open the hemispheres of sources are past all bodies, and past their own.
 
     Args:
         normals: Of the sources, vec3 of shape [batch, source].
@@ -79,7 +73,7 @@ def find_openness(
         transmittance_spheres: T, of the same shape. Any batch may be 1.
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
     Returns:
-        o, in three equal channels, vec3 of shape [batch, source].
+        ⟨T⟩ + ε, ⟨T_self⟩ + ε and 0, vec3 of shape [batch, source].
     Differentiable: normals, transmittance_self, transmittance_spheres.
     """
     shape = "batch", normals.shape[1], len(directions)
@@ -90,10 +84,9 @@ def find_openness(
         arrays["transmittance_self"] = transmittance_self
     count, device = common_batch(arrays), normals.device
     cells = constant(np.asarray(directions, np.float32), wp.vec3, device)
-    sums = empty((count, normals.shape[1]), dtype=wp.vec2, device=device)
-    openness = empty(sums.shape, dtype=wp.vec3, device=device)
-    launch(_sum_open, sums.shape, inputs=[normals, transmittance_self, transmittance_spheres, cells], outputs=[sums])
-    launch(_divide, sums.shape, inputs=[sums], outputs=[openness])
+    openness = empty((count, normals.shape[1]), dtype=wp.vec3, device=device)
+    inputs = [normals, transmittance_self, transmittance_spheres, cells]
+    launch(_sum_open, openness.shape, inputs=inputs, outputs=[openness])
     return openness
 
 
@@ -106,32 +99,50 @@ def _share(
     # out
     shares: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a source of an instance."""
+    """A thread owns a source of an instance: f, in three channels."""
     batch, source = wp.tid()
-    shares[batch, source] = wp.cw_div(openness[batch, source], means[batch, patch_of_source[source]])
+    shares[batch, source] = wp.vec3(openness[batch, source][0] / means[batch, patch_of_source[source]][0])
+
+
+@wp.kernel
+def _weigh(
+    # in
+    means: wp.array2d(dtype=wp.vec3),
+    # out
+    weights: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a patch of an instance: v, in three channels, 0 for a patch without sources."""
+    batch, patch = wp.tid()
+    mean = means[batch, patch]
+    weight = float(0.0)
+    if mean[1] > 0.0:
+        ratio = mean[0] / (_BURIED * mean[1])
+        power = ratio * ratio * ratio * ratio
+        weight = power / (power + 1.0)
+    weights[batch, patch] = wp.vec3(weight)
 
 
 class Openness(NamedTuple):
-    """How open sources and patches are."""
+    """How much sources and patches count by how open they are, in three equal channels."""
 
-    shares: wp.array  # f, how much each source counts in its patch, vec3 of shape [batch, source]
-    of_patches: wp.array  # Σ_s w_ps o_s, vec3 of shape [batch, patch]
+    shares: wp.array  # f, of sources in their patches, vec3 of shape [batch, source]
+    weights: wp.array  # v, of patches among others, vec3 of shape [batch, patch]
 
 
 def open_shares(openness: wp.array, mean: SparseMatrix, patch_of_source: np.ndarray) -> Openness:
-    """How much sources count in their patches, by their openness: 1 on average.
+    """How much sources count in their patches, 1 on average, and patches among others.
 
     Args:
-        openness: o, positive, vec3 of shape [batch, source].
+        openness: Of the sources, from :func:`find_openness`, vec3 of shape [batch, source].
         mean: The weights w, [patch, source], from :func:`.radiosity.mean_over_sources`.
         patch_of_source: The patch of each source, shape [source].
-    Returns:
-        f, and the openness of patches.
     Differentiable: openness.
     """
     check.shape("patch_of_source", patch_of_source.shape, (openness.shape[1],))
     owners = constant(np.asarray(patch_of_source, np.int32), wp.int32, openness.device)
+    means = multiply(mean, openness)
     shares = empty(openness.shape, dtype=wp.vec3, device=openness.device)
-    of_patches = multiply(mean, openness)
-    launch(_share, shares.shape, inputs=[openness, of_patches, owners], outputs=[shares])
-    return Openness(shares, of_patches)
+    weights = empty(means.shape, dtype=wp.vec3, device=openness.device)
+    launch(_share, shares.shape, inputs=[openness, means, owners], outputs=[shares])
+    launch(_weigh, weights.shape, inputs=[means], outputs=[weights])
+    return Openness(shares, weights)

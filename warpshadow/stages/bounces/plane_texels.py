@@ -4,10 +4,10 @@ Under a box that stands on a ground patches of the ground are not seen, but betw
 radiosity is interpolated. So in each texel the mean counts patches by whether they are open, and texels beside it a
 little [normalized convolution: Knutsson and Westin 1993]:
 
-    B = Σ_p k_p w_p B_p / Σ_p k_p w_p,  w = o⁴ / (o⁴ + 0.1⁴)
+    B = Σ_p k_p v_p B_p / Σ_p k_p v_p
 
-with o the openness of a patch (:mod:`.open_sources`), and k its share of the mesh in the texel, or 0.002 of that in a
-texel beside it. A texel of buried patches alone has the light of those beside it, others hardly any of it.
+with v the weight of a patch by its openness (:mod:`.open_sources`), and k its share of the mesh in the texel, or 0.002
+of that in a texel beside it. A texel of buried patches alone has the light of those beside it, others hardly any of it.
 
 Without it the foot of a thick wall in the sun was 10% too dark with all bounces, and 35% too bright with the sun behind
 it; so it is 4% too dark, and 10% too bright.
@@ -15,33 +15,12 @@ it; so it is 4% too dark, and 10% too bright.
 
 import warp as wp
 
-from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.batch import instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
+from warpshadow.stages.bounces.radiosity import reflect
 from warpshadow.stages.planes.prepared import PlaneBlockers
 from warpshadow.stages.sparse import multiply
-
-_BURIED = wp.constant(0.1)  # openness of a patch that counts half
-
-
-@wp.kernel
-def _weigh(
-    # in
-    radiosity: wp.array2d(dtype=wp.vec3),
-    openness: wp.array2d(dtype=wp.vec3),
-    # out
-    weights: wp.array2d(dtype=wp.vec3),
-    weighted: wp.array2d(dtype=wp.vec3),
-):
-    """A thread owns a patch of an instance."""
-    batch, patch = wp.tid()
-    weight = float(1.0)
-    if openness:
-        ratio = openness[instance_in(batch, openness.shape[0]), patch][0] / _BURIED
-        power = ratio * ratio * ratio * ratio
-        weight = power / (power + 1.0)
-    weights[batch, patch] = wp.vec3(weight)
-    weighted[batch, patch] = weight * radiosity[instance_in(batch, radiosity.shape[0]), patch]
 
 
 @wp.kernel
@@ -54,30 +33,27 @@ def _divide(
 ):
     """A thread owns a texel of an instance; one far off the mesh is black."""
     batch, texel = wp.tid()
-    weight = weights[batch, texel][0]
+    weight = weights[instance_in(batch, weights.shape[0]), texel][0]
     mean = wp.vec3()
     if weight > 0.0:
         mean = sums[batch, texel] / weight
     texels[batch, texel] = mean
 
 
-def find_texels(radiosity: wp.array, openness: wp.array | None, planes: PlaneBlockers) -> wp.array:
+def find_texels(radiosity: wp.array, open_weights: wp.array, planes: PlaneBlockers) -> wp.array:
     """Find the radiosity of texels in all mip levels of planes.
 
     Args:
         radiosity: Of the patches of all bodies, vec3 of shape [batch, patch].
-        openness: o of each patch, in three equal channels, vec3 of shape [batch, patch]; None for 1. Either batch may
-            be 1.
+        open_weights: v of each patch, in three equal channels, vec3 of shape [batch, patch]. Either batch may be 1.
         planes: The planes.
     Returns:
         vec3 of shape [batch, texel].
-    Differentiable: radiosity, openness.
+    Differentiable: radiosity, open_weights.
     """
     assert planes.texels_of_patches is not None
-    shape = common_batch({"radiosity": radiosity, "openness": openness}), radiosity.shape[1]
-    weights, weighted = (empty(shape, dtype=wp.vec3, device=radiosity.device) for _ in range(2))
-    launch(_weigh, shape, inputs=[radiosity, openness], outputs=[weights, weighted])
-    sums, totals = (multiply(planes.texels_of_patches, values) for values in (weighted, weights))
+    weighted = reflect(open_weights, radiosity)
+    sums, totals = (multiply(planes.texels_of_patches, values) for values in (weighted, open_weights))
     texels = empty(sums.shape, dtype=wp.vec3, device=radiosity.device)
     launch(_divide, sums.shape, inputs=[sums, totals], outputs=[texels])
     return texels

@@ -3,9 +3,10 @@
 Each patch p has a sphere of its own; several share one only where spheres are merged. Towards a receiver that sees the
 sphere in direction ω, its patches send
 
-    E_j(ω) = Σ_p A_p (g_p + ε) B_p / Σ_p A_p (g_p + ε),  ε = 0.0001
+    E_j(ω) = Σ_p A_p (v_p g_p + ε) B_p / Σ_p A_p (v_p g_p + ε),  ε = 0.0001
 
-the mean of their radiosities B by the area that they show: g_p is that of a unit (:mod:`.projected_areas`). Patches
+the mean of their radiosities B by the area that they show: g_p is that of a unit (:mod:`.projected_areas`), and v_p
+makes patches count that other bodies do not bury (:mod:`.open_sources`). Patches
 that face away count for ε of their area: where none shows itself the mean is still one, so it is smooth, and nothing is
 divided by zero. The sunlit top of a slab is brighter than its bottom by more than a hundred times: by ε = 0.01 it shone
 through, and the floor of a car park below was 19% too bright.
@@ -64,6 +65,7 @@ def _tabulate(
     # in
     radiosity: wp.array2d(dtype=wp.vec3),
     projected_areas: wp.array3d(dtype=wp.float32),
+    open_weights: wp.array2d(dtype=wp.vec3),
     starts: wp.array(dtype=wp.int32),
     numbers: wp.array(dtype=wp.int32),
     shares: wp.array(dtype=wp.float32),
@@ -75,11 +77,12 @@ def _tabulate(
     batch, node, direction = wp.tid()
     sent = radiosity[instance_in(batch, radiosity.shape[0])]
     areas_of_instance = projected_areas[instance_in(batch, projected_areas.shape[0])]
+    weights = open_weights[instance_in(batch, open_weights.shape[0])]
     light = wp.vec3()
     open = float(weight_if_black[node])
     for k in range(starts[node], starts[node + 1]):
         patch = numbers[k]
-        part = shares[k] * (areas_of_instance[patch, direction] + _AVERTED)
+        part = shares[k] * (weights[patch][0] * areas_of_instance[patch, direction] + _AVERTED)
         light += part * sent[patch]
         open += part
     proxy_radiance[batch, node, direction] = wp.vec4(light[0], light[1], light[2], open)
@@ -88,6 +91,7 @@ def _tabulate(
 def find_proxy_radiance(
     radiosity: wp.array,
     projected_areas: wp.array,
+    open_weights: wp.array,
     areas: np.ndarray,
     starts: np.ndarray,
     numbers: np.ndarray,
@@ -100,16 +104,20 @@ def find_proxy_radiance(
         radiosity: Of patches: white under a radiance of 1 has 1, vec3 of shape [batch, patch].
         projected_areas: g of each patch towards each cell, float32 of shape [batch, patch, direction], from
             :func:`.projected_areas.find_projected_areas`.
+        open_weights: v of each patch, in three equal channels, vec3 of shape [batch, patch], from
+            :func:`.open_sources.open_shares`.
         areas: Of patches [scene units²], not negative, float32 of shape [patch].
         starts, numbers: Patches of each node, from :func:`patches_of_clusters`.
     Returns:
-        Σ A (g + ε) B / Σ A and Σ A (g + ε) / Σ A, vec4 of shape [batch, node, direction].
-    Differentiable: radiosity, projected_areas.
+        Σ A (v g + ε) B / Σ A and Σ A (v g + ε) / Σ A, vec4 of shape [batch, node, direction].
+    Differentiable: radiosity, projected_areas, open_weights.
     """
-    batch_count = common_batch({"radiosity": radiosity, "projected_areas": projected_areas})
+    arrays = {"radiosity": radiosity, "projected_areas": projected_areas, "open_weights": open_weights}
+    batch_count = common_batch(arrays)
     patch_count = len(areas)
     check.shape("radiosity", radiosity.shape, (radiosity.shape[0], patch_count))
     check.shape("projected_areas", projected_areas.shape, (projected_areas.shape[0], patch_count, "direction"))
+    check.shape("open_weights", open_weights.shape, (open_weights.shape[0], patch_count))
     check.finite("areas", np.asarray(areas), minimum=0.0)
     if starts[0] != 0 or (np.diff(starts) < 0).any() or starts[-1] != len(numbers):
         raise ValueError(f"starts: got {np.asarray(starts)!r}, expected 0 to the {len(numbers)} numbers, rising")
@@ -123,5 +131,5 @@ def find_proxy_radiance(
     floats = [shares, np.where(totals > 0, 0.0, _BLACK_SPHERE_WEIGHT)]
     tables = [*integers, *(constant(values.astype(np.float32), wp.float32, device) for values in floats)]
     proxy_radiance = empty((batch_count, len(starts) - 1, projected_areas.shape[2]), dtype=wp.vec4, device=device)
-    launch(_tabulate, proxy_radiance.shape, inputs=[radiosity, projected_areas, *tables], outputs=[proxy_radiance])
+    launch(_tabulate, proxy_radiance.shape, inputs=[*arrays.values(), *tables], outputs=[proxy_radiance])
     return proxy_radiance
