@@ -9,7 +9,7 @@ from warpshadow.maths import directions as cells
 from warpshadow.maths import sh
 from warpshadow.stages.transfer import directional_transfer, sh_transfer
 from warpshadow.stages.visibility import directional, exponential, log_sh
-from warpshadow.stages.visibility.sharp_cells import overwrite_sharp_cells
+from warpshadow.stages.visibility.sharp_cells import blend_sharp_cells
 
 # Relative L2 of a whole gradient: float32 kernels against float64 differences. Measured 3e-6 to 2e-4.
 ADJOINT = 1e-3
@@ -101,7 +101,7 @@ def test_the_adjoint_past_narrow_cells_is_that_of_the_twin(scene, device):
 
     def narrowed(points, *spheres):
         passing = directional.transmittance(points, None, *spheres, directions)
-        return overwrite_sharp_cells(
+        return blend_sharp_cells(
             passing, directional.transmittance(points, None, *spheres, sharp, softness=0.2), places
         )
 

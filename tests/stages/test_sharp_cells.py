@@ -8,7 +8,7 @@ from warpshadow import Body, Camera, EnvironmentMap, Mesh, Renderer, Scene, Sphe
 from warpshadow.device.tape import recorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.stages.poses import Poses
-from warpshadow.stages.visibility.sharp_cells import WIDEST_PAST_PLANES, find_sharp_cells, overwrite_sharp_cells
+from warpshadow.stages.visibility.sharp_cells import WIDEST_PAST_PLANES, find_sharp_cells, blend_sharp_cells
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -73,7 +73,7 @@ def test_narrow_cells_take_the_place_of_what_they_had(device, verified_tape):
     places[[3, 20, 31]] = 0, 5, 5
     arrays = [wp.array(values, device=device, requires_grad=True) for values in (passing, sharp_cells)]
     with recorded() as tape:
-        result = overwrite_sharp_cells(*arrays, places)
+        result = blend_sharp_cells(*arrays, places)
     is_narrow = places >= 0
     expected = passing.copy()
     expected[..., is_narrow] = sharp_cells[..., places[is_narrow]]

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import Basis, CellBasis
-from warpshadow.assets.cells import draw_in_cells
+from warpshadow.assets.cells import draw_in_cells, share_near
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.harmonic_light import as_light
 from warpshadow.device.tape import unrecorded
@@ -49,7 +49,7 @@ from warpshadow.stages.visibility.sharp_cells import (
     WIDEST_PAST_PLANES,
     SharpCells,
     find_sharp_cells,
-    overwrite_sharp_cells,
+    blend_sharp_cells,
 )
 
 
@@ -62,6 +62,7 @@ class ProjectedCells(NamedTuple):
     spreads: np.ndarray | None = None  # half-angles of where known light comes from in its cells [direction]
     sharp_cells: SharpCells | None = None  # cells that a sun is in, where spheres block it
     sharp_cells_past_planes: SharpCells | None = None  # and where planes do
+    spot_shares: np.ndarray | None = None  # share of the light of sharp cells that their spot has [direction]
     samples: np.ndarray | None = None  # directions drawn from known light in its cells, and even ones [direction, 8, 3]
     sun: SunCells | None = None  # the brightest cells, where bodies want rays to them
 
@@ -98,10 +99,13 @@ class Directional(SphereMethod):
         draw = functools.partial(draw_in_cells, known.radiance, self._directions)
         sun = find_sun_cells(power, draw) if self.self_visibility.wants_rays else None
         sharp_cells = find(), find(WIDEST_PAST_PLANES)
+        spot_shares = np.ones(len(power))
+        if sharp_cells[1] is not None:
+            sharp = np.flatnonzero(sharp_cells[1].places >= 0)
+            spot_shares[sharp] = share_near(known.radiance, self._directions, sharp, cells.spots, 2 * cells.spreads)
         samples = self._samples(known.radiance, power, draw) if self.plane_blockers else None
-        return ProjectedCells(
-            cells.directions, self._on_device(cells.radiance), cells.spots, cells.spreads, *sharp_cells, samples, sun
-        )
+        spots = cells.spots, cells.spreads, *sharp_cells, spot_shares
+        return ProjectedCells(cells.directions, self._on_device(cells.radiance), *spots, samples, sun)
 
     def _samples(
         self, radiance: np.ndarray, power: np.ndarray, draw: Callable[[np.ndarray, int], np.ndarray]
@@ -157,8 +161,11 @@ class Directional(SphereMethod):
             return transmittance
         directions, places, _ = projected_light.sharp_cells_past_planes
         radius = self._edge_radius(projected_light.sharp_cells_past_planes)
-        return overwrite_sharp_cells(
-            transmittance, parts.transmittance(points, horizon_normals, directions, radius), places
+        return blend_sharp_cells(
+            transmittance,
+            parts.transmittance(points, horizon_normals, directions, radius),
+            places,
+            projected_light.spot_shares,
         )
 
     def _edge_radius(self, sharp_cells: SharpCells) -> float:
@@ -175,7 +182,8 @@ class Directional(SphereMethod):
         if projected_light.sharp_cells is None:
             return transmittance
         directions, places, scale = projected_light.sharp_cells
-        return overwrite_sharp_cells(transmittance, block(directions, **scales(scale)), places)
+        sharp = block(directions, **scales(scale))
+        return blend_sharp_cells(transmittance, sharp, places, projected_light.spot_shares)
 
     def _scales(self, scale: float) -> dict[str, Any]:
         """Settings in radii of cells, of radii that are so much smaller."""
@@ -213,7 +221,7 @@ class Directional(SphereMethod):
             directions, places, _ = projected_light.sharp_cells_past_planes
             sharp_coverage = cover(directions, radius=self._edge_radius(projected_light.sharp_cells_past_planes))
             assert sharp_coverage is not None
-            covered = overwrite_sharp_cells(covered, sharp_coverage, places)
+            covered = blend_sharp_cells(covered, sharp_coverage, places, projected_light.spot_shares)
         return visibility._replace(
             transmittance_total=transmittance_past_planes(transmittance_spheres, covered),
             transmittance_spheres=transmittance_spheres,
@@ -235,7 +243,7 @@ class Directional(SphereMethod):
             )
         assert group.body is not None
         of_sun = trace_sun_cells(rays[0], group.probe_weights, rays[1], group.body, projected_light.sun)
-        return overwrite_sharp_cells(transmittance_self, of_sun, projected_light.sun.places)
+        return blend_sharp_cells(transmittance_self, of_sun, projected_light.sun.places)
 
     def transfer(self, visibility: GroupVisibility, group: Group, projected_light: ProjectedCells) -> wp.array:
         """Transfer vectors; the transmittance as it is where cached cells hold known light."""

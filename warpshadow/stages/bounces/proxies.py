@@ -22,7 +22,26 @@ from warpshadow.device.memory import empty
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
-DEPTH, DEPTH_OF_SHEETS = 0.5, -0.25  # how far below its patch a center is, in radii
+_DEPTH, _DEPTH_OF_SHEETS = 0.5, -0.25  # how far below its patch a center is, in radii
+_OPPOSITE = -0.5  # cosine between the normals of patches on opposite sides of a body, at most
+
+
+def find_depths(centers: np.ndarray, normals: np.ndarray, areas: np.ndarray) -> np.ndarray:
+    """Find how far below each patch of a body its proxy is, in radii: less where the body is thinner than that radius.
+
+    Args:
+        centers, normals, areas: Of the patches [units of the body], shapes [patch, 3], [patch, 3] and [patch].
+    Returns:
+        float32 of shape [patch].
+    """
+    radii = np.sqrt(areas / 2)
+    offsets = centers[None] - centers[:, None]
+    below = -(normals[:, None] * offsets).sum(axis=2)
+    beside = np.sqrt(np.maximum((offsets**2).sum(axis=2) - below**2, 0))
+    is_opposite = (normals @ normals.T < _OPPOSITE) & (beside < radii[:, None]) & (below > -0.1 * radii[:, None])
+    thickness = np.where(is_opposite, np.maximum(below, 0), np.inf).min(axis=1, initial=np.inf)
+    parts = np.minimum(thickness / np.maximum(2 * radii, 1e-30), 1)
+    return (_DEPTH_OF_SHEETS + (_DEPTH - _DEPTH_OF_SHEETS) * parts).astype(np.float32)
 
 
 @wp.kernel
