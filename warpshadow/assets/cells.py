@@ -132,29 +132,25 @@ def draw_in_cells(radiance: np.ndarray, directions: np.ndarray, cells: np.ndarra
     return drawn
 
 
-def share_near(
+def without_spots(
     radiance: np.ndarray, directions: np.ndarray, cells: np.ndarray, spots: np.ndarray, angles: np.ndarray
 ) -> np.ndarray:
-    """Find the share of the luminance of some cells around directions that comes from near a spot.
+    """Make a map without the light near a spot in each of some cells around directions.
 
     Args:
         radiance, directions: As for :func:`gather_cells`.
         cells: Numbers of the cells.
         spots: Directions of the spots of all cells, unit vectors [direction, 3].
         angles: How far from its spot light is near [radians], [direction].
-    Returns:
-        Shape [cell]; 1 for dark cells.
     """
-    height, split = len(radiance), _split(len(radiance), len(directions))
-    owners = _cells_of_pixels(height * split, np.asarray(directions).astype(np.float32).tobytes())
+    owners = _cells_of_pixels(len(radiance), np.asarray(directions).astype(np.float32).tobytes())
     rows, columns = np.nonzero(np.isin(np.arange(len(directions)), cells)[owners])
     owner = owners[rows, columns]
-    luminance = np.abs(radiance[rows // split, columns // split] @ LUMINANCE)
-    luminance *= sh.pixel_solid_angles(height * split)[rows]
-    towards = sh.equirectangular_directions(height * split)[rows, columns]
+    towards = sh.equirectangular_directions(len(radiance))[rows, columns]
     is_near = (towards * spots[owner]).sum(axis=1) >= np.cos(angles[owner])
-    total, near = (np.bincount(owner, luminance * part, len(directions))[cells] for part in (1, is_near))
-    return np.where(total > 0, near / np.where(total > 0, total, 1), 1)
+    result = np.array(radiance)
+    result[rows[is_near], columns[is_near]] = 0
+    return result
 
 
 def _split(height: int, count: int) -> int:
