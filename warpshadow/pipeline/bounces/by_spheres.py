@@ -310,8 +310,11 @@ class SphereBounces:
         """Sources among the bodies among which points are."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
 
-        def project(sources: Receivers, visibility: list[PortionVisibility], *arguments: Any) -> ProjectedPatches:
-            return proxies.projected_patches(sources, [portion.cells for portion in visibility], *arguments)
+        def project(
+            sources: Receivers, visibility: list[PortionVisibility], openness: Openness, *arguments: Any
+        ) -> ProjectedPatches:
+            cells = [portion.cells for portion in visibility]
+            return proxies.projected_patches(sources, cells, openness.of_patches, *arguments)
 
         make = functools.partial(Node, "sources", senders.sources, points.vertices, points.normals)
         sources = points.cached("sources", senders, lambda: make(items=_source_text(senders)))
@@ -319,10 +322,9 @@ class SphereBounces:
             self._at(sources, points, points.materials, proxies.blocker_of_source), where=_OF_SOURCES
         )
         frames = Node("", planes.all.frames if planes else lambda _: None, points.vertices)
-        projected_patches = Node("", project, sources, visibility, spheres, frames)
-        return PatchSampleNodes(
-            visibility, frames, projected_patches, Node("", functools.partial(_openness, senders), visibility)
-        )
+        openness = Node("", functools.partial(_openness, senders), visibility)
+        projected_patches = Node("", project, sources, visibility, openness, spheres, frames)
+        return PatchSampleNodes(visibility, frames, projected_patches, openness)
 
     def _radiosity(
         self, sources: PatchSampleNodes, projected_light: Node, proxies: Proxies, materials: Materials

@@ -218,6 +218,7 @@ class Proxies:
         self,
         sources: Receivers,
         cells: list[CellTransmittance],
+        openness: wp.array,
         spheres: tuple[wp.array, wp.array],
         frames: wp.array | None,
     ) -> ProjectedPatches:
@@ -226,6 +227,7 @@ class Proxies:
         Args:
             sources: Where they are lit.
             cells: Transmittance of the sources, in portions.
+            openness: Of the patches, vec3 of shape [batch, patch].
             spheres: Centers and radii of all spheres.
             frames: Where flat bodies are.
         """
@@ -252,7 +254,7 @@ class Proxies:
             others = self.merged_scene.spheres_of(self.black_bodies, spheres)
             counts = [len(senders.areas), others[1].shape[1]]
             placed = tuple(concatenate(pair, counts) for pair in zip(placed, others, strict=True))
-        areas = find_projected_areas(normals, transmittance, senders.mean, directions)
+        areas = find_projected_areas(normals, transmittance, senders.mean, directions, openness)
         return ProjectedPatches(areas, *placed, find_clusters(*placed, self.merging))
 
 

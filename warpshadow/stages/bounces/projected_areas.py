@@ -2,7 +2,7 @@
 
 Towards a receiver that sees a patch in direction ω, its sources s with weights w show
 
-    g_p(ω) = Σ_s w_ps max(−n′_s·ω, 0) (β + (1 − β) T_s(−ω)),  β = 0.1
+    g_p(ω) = W(o_p) Σ_s w_ps max(−n′_s·ω, 0) (β + (1 − β) T_s(−ω)),  β = 0.1
 
 parts of its area. T_s is the body's self-transmittance in the cell that contains −ω. Other bodies do not count: the
 receiver's self-transmittance covers them, and one of them may be where the receiver is.
@@ -35,6 +35,7 @@ from warpshadow.device.constants import cached_by_values, constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.directions import check_directions
+from warpshadow.stages.bounces.open_sources import open_weight
 from warpshadow.stages.planes.cells import step
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 from warpshadow.stages.sparse import SparseMatrix
@@ -138,6 +139,7 @@ def _project(
     # in
     normals: wp.array2d(dtype=wp.vec3),
     transmittance: wp.array3d(dtype=wp.float32),
+    openness: wp.array2d(dtype=wp.vec3),
     starts: wp.array(dtype=wp.int32),
     sources: wp.array(dtype=wp.int32),
     weights: wp.array(dtype=wp.float32),
@@ -154,7 +156,10 @@ def _project(
         cosine = wp.max(-wp.dot(normal, directions[direction]), 0.0)
         passing = transmittance[instance_in(batch, transmittance.shape[0]), sources[k], opposite[direction]]
         total += weights[k] * cosine * (_HIDDEN + (1.0 - _HIDDEN) * passing)
-    projected_areas[batch, patch, direction] = total
+    weight = float(1.0)
+    if openness:
+        weight = open_weight(openness[instance_in(batch, openness.shape[0]), patch][0])
+    projected_areas[batch, patch, direction] = weight * total
 
 
 @cached_by_values
@@ -166,7 +171,11 @@ def _cells_and_opposites(directions: np.ndarray, device: wp.Device) -> tuple[wp.
 
 
 def find_projected_areas(
-    normals: wp.array, transmittance: wp.array, mean: SparseMatrix, directions: np.ndarray
+    normals: wp.array,
+    transmittance: wp.array,
+    mean: SparseMatrix,
+    directions: np.ndarray,
+    openness: wp.array | None = None,
 ) -> wp.array:
     """Projected areas of patches towards cells, for :func:`.proxy_radiance.find_proxy_radiance`.
 
@@ -175,17 +184,21 @@ def find_projected_areas(
         transmittance: T, self-transmittance of each source, float32 of shape [batch, source, direction].
         mean: The matrix w, [patch, source], from :func:`.radiosity.mean_over_sources`.
         directions: Unit vectors ω of the cells, from a receiver towards the patch, NumPy of shape [direction, 3].
+        openness: o of each patch, in three equal channels, vec3 of shape [batch, patch]; None for 1.
     Returns:
         g, float32 of shape [batch, patch, direction]. Any batch may be 1.
-    Differentiable: normals, transmittance.
+    Differentiable: normals, transmittance, openness.
     """
     cells = _cells_and_opposites(directions, normals.device)
     check.shape("normals", normals.shape, ("batch", mean.shape[1]))
     check.shape("passing", transmittance.shape, ("batch", mean.shape[1], len(directions)))
-    count = common_batch({"normals": normals, "passing": transmittance})
+    count = common_batch({"normals": normals, "passing": transmittance, "openness": openness})
     device = normals.device
     projected_areas = empty((count, mean.shape[0], len(directions)), dtype=wp.float32, device=device)
     launch(
-        _project, projected_areas.shape, inputs=[normals, transmittance, *mean.rows, *cells], outputs=[projected_areas]
+        _project,
+        projected_areas.shape,
+        inputs=[normals, transmittance, openness, *mean.rows, *cells],
+        outputs=[projected_areas],
     )
     return projected_areas
