@@ -28,15 +28,6 @@ from warpshadow.device.memory import empty
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
 _HIDDEN = wp.constant(0.01)  # ε, by which sources count of a patch that is buried wholly
-_BURIED = wp.constant(0.1)  # openness of a patch that counts half
-
-
-@wp.func
-def open_weight(openness: float):
-    """W, how much a patch counts among others: o⁴ / (o⁴ + 0.1⁴)."""
-    ratio = openness / _BURIED
-    power = ratio * ratio * ratio * ratio
-    return power / (power + 1.0)
 
 
 @wp.kernel

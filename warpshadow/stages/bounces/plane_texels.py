@@ -18,9 +18,11 @@ import warp as wp
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.stages.bounces.open_sources import open_weight
 from warpshadow.stages.planes.prepared import PlaneBlockers
 from warpshadow.stages.sparse import multiply
+
+_BURIED = wp.constant(0.1)  # openness of a patch that counts half
+
 
 @wp.kernel
 def _weigh(
@@ -35,7 +37,9 @@ def _weigh(
     batch, patch = wp.tid()
     weight = float(1.0)
     if openness:
-        weight = open_weight(openness[instance_in(batch, openness.shape[0]), patch][0])
+        ratio = openness[instance_in(batch, openness.shape[0]), patch][0] / _BURIED
+        power = ratio * ratio * ratio * ratio
+        weight = power / (power + 1.0)
     weights[batch, patch] = wp.vec3(weight)
     weighted[batch, patch] = weight * radiosity[instance_in(batch, radiosity.shape[0]), patch]
 

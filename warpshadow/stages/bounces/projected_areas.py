@@ -2,10 +2,12 @@
 
 Towards a receiver that sees a patch in direction ω, its sources s with weights w show
 
-    g_p(ω) = W(o_p) Σ_s w_ps max(−n′_s·ω, 0) (β + (1 − β) T_s(−ω)),  β = 0.1
+    g_p(ω) = o_p Σ_s w_ps max(−n′_s·ω, 0) (β + (1 − β) T_s(−ω)),  β = 0.1
 
-parts of its area. T_s is the body's self-transmittance in the cell that contains −ω. Other bodies do not count: the
-receiver's self-transmittance covers them, and one of them may be where the receiver is.
+parts of its area. T_s is the body's self-transmittance in the cell that contains −ω. Other bodies do not count there,
+since one of them may be where the receiver is, but on average: o is how open the patch is (:mod:`.open_sources`). The
+tops of cupboards under a counter, which are dark, took light from what the counter sends; so a kitchen is 5.8% off with
+all bounces in place of 6.1%, a pile of stones 3.1% in place of 3.5%, and nested boxes 2.4% in place of 2.7%.
 
 Parts that their own body hides still count for β: a receiver in a cavity of that body is nearer than what hides them,
 and sees nothing else. By β = 0 a third of what a ball in an open box saw of the box was its outside.
@@ -35,7 +37,6 @@ from warpshadow.device.constants import cached_by_values, constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.directions import check_directions
-from warpshadow.stages.bounces.open_sources import open_weight
 from warpshadow.stages.planes.cells import step
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 from warpshadow.stages.sparse import SparseMatrix
@@ -158,7 +159,7 @@ def _project(
         total += weights[k] * cosine * (_HIDDEN + (1.0 - _HIDDEN) * passing)
     weight = float(1.0)
     if openness:
-        weight = open_weight(openness[instance_in(batch, openness.shape[0]), patch][0])
+        weight = openness[instance_in(batch, openness.shape[0]), patch][0]
     projected_areas[batch, patch, direction] = weight * total
 
 
