@@ -66,23 +66,26 @@ def test_in_many_cells_a_sun_is_as_any_light():
     assert narrow_of(map_with_discs((SUN, 2000.0)), 2048)[1] is None
 
 
-def test_narrow_cells_take_the_place_of_what_they_had(device, verified_tape):
+@pytest.mark.parametrize("share", [1.0, 0.75])
+def test_narrow_cells_are_blended_with_what_they_had(share, device, verified_tape):
     rng = np.random.default_rng(0)
     passing, sharp_cells = (rng.uniform(size=(2, 5, count)).astype(np.float32) for count in (32, CHUNK))
     places = np.full(32, -1, np.int32)
     places[[3, 20, 31]] = 0, 5, 5
     arrays = [wp.array(values, device=device, requires_grad=True) for values in (passing, sharp_cells)]
     with recorded() as tape:
-        result = blend_sharp_cells(*arrays, places)
+        result = blend_sharp_cells(*arrays, places, np.full(32, share))
     is_narrow = places >= 0
     expected = passing.copy()
-    expected[..., is_narrow] = sharp_cells[..., places[is_narrow]]
-    np.testing.assert_array_equal(result.numpy(), expected)
+    expected[..., is_narrow] *= 1 - share
+    expected[..., is_narrow] += share * sharp_cells[..., places[is_narrow]]
+    np.testing.assert_allclose(result.numpy(), expected, rtol=1e-6)
+    assert (arrays[0] is result) == (share == 1)  # the adjoint of the rest needs what it was
     weights = rng.normal(size=expected.shape).astype(np.float32)
     tape.backward(grads={result: wp.array(weights, device=device)})
     adj_sharp = np.zeros_like(sharp_cells)
-    adj_sharp[..., 0], adj_sharp[..., 5] = weights[..., 3], weights[..., 20] + weights[..., 31]
-    np.testing.assert_allclose(arrays[0].grad.numpy(), weights * ~is_narrow)
+    adj_sharp[..., 0], adj_sharp[..., 5] = share * weights[..., 3], share * (weights[..., 20] + weights[..., 31])
+    np.testing.assert_allclose(arrays[0].grad.numpy(), weights * np.where(is_narrow, 1 - share, 1), rtol=1e-6)
     np.testing.assert_allclose(arrays[1].grad.numpy(), adj_sharp, rtol=1e-6)
 
 
