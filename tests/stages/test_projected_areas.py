@@ -38,11 +38,10 @@ def twin_turned(points, normals, radii, fronts, frames, grids, blocks):
     return turned
 
 
-def twin_shown(normals, passing, matrix):
+def twin_shown(normals, passing, openness, matrix):
     opposite = [np.argmin(np.linalg.norm(DIRECTIONS + omega, axis=1)) for omega in DIRECTIONS]
-    return np.einsum(
-        "ps,sq,sq->pq", matrix, np.maximum(normals @ -DIRECTIONS.T, 0), HIDDEN + (1 - HIDDEN) * passing[:, opposite]
-    )
+    shown = np.maximum(normals @ -DIRECTIONS.T, 0) * (HIDDEN + (1 - HIDDEN) * passing[:, opposite])
+    return openness[:, :1] * (matrix @ shown)
 
 
 def differences(function, values, number, weights):
@@ -95,10 +94,10 @@ def test_what_is_shown_is_that_of_the_twin(device):
     matrix[owners, np.arange(5)] = weights
     mean = mean_over_sources(owners, weights, 3, device=device)
     compare(
-        lambda n, t: find_projected_areas(n, t, mean, DIRECTIONS),
-        lambda n, t: twin_shown(n, t, matrix),
-        [normals, rng.random((5, 32))],
-        (wp.vec3, wp.float32),
+        lambda n, t, o: find_projected_areas(n, t, mean, DIRECTIONS, o),
+        lambda n, t, o: twin_shown(n, t, o, matrix),
+        [normals, rng.random((5, 32)), rng.random((3, 3))],
+        (wp.vec3, wp.float32, wp.vec3),
         device,
     )
 
@@ -132,7 +131,8 @@ def test_one_instance_serves_all(counts, device):
     arrays = wp.array(normals, dtype=wp.vec3, device=device), wp.array(passing, dtype=wp.float32, device=device)
     got = find_projected_areas(*arrays, mean, DIRECTIONS).numpy()
     for batch in range(2):
-        expected = twin_shown(normals[batch % counts[0]], passing[batch % counts[1]], np.array([[0.5, 0.5]]))
+        given = normals[batch % counts[0]], passing[batch % counts[1]], np.ones((1, 3))
+        expected = twin_shown(*given, np.array([[0.5, 0.5]]))
         np.testing.assert_allclose(got[batch], expected, atol=ROUNDING)
 
 

@@ -48,10 +48,9 @@ from warpshadow.stages.visibility import directional
 from warpshadow.stages.visibility.sharp_cells import (
     WIDEST_PAST_PLANES,
     SharpCells,
-    find_sharp_cells,
     blend_sharp_cells,
+    find_sharp_cells,
 )
-
 
 _NEAR_SPOT = 2.0  # half-angles of a spot within which light is its own: of the pixels at a sun's edge, too
 

@@ -149,18 +149,18 @@ def _project(
     # out
     projected_areas: wp.array3d(dtype=wp.float32),
 ):
-    """A thread owns a patch of an instance and a direction."""
+    """A thread owns a patch of an instance and a direction; its sum is linear in all, as Warp's adjoint needs it."""
     batch, patch, direction = wp.tid()
+    open = float(1.0)
+    if openness:
+        open = openness[instance_in(batch, openness.shape[0]), patch][0]
     total = float(0.0)
     for k in range(starts[patch], starts[patch + 1]):
         normal = normals[instance_in(batch, normals.shape[0]), sources[k]]
         cosine = wp.max(-wp.dot(normal, directions[direction]), 0.0)
         passing = transmittance[instance_in(batch, transmittance.shape[0]), sources[k], opposite[direction]]
-        total += weights[k] * cosine * (_HIDDEN + (1.0 - _HIDDEN) * passing)
-    weight = float(1.0)
-    if openness:
-        weight = openness[instance_in(batch, openness.shape[0]), patch][0]
-    projected_areas[batch, patch, direction] = weight * total
+        total += open * weights[k] * cosine * (_HIDDEN + (1.0 - _HIDDEN) * passing)
+    projected_areas[batch, patch, direction] = total
 
 
 @cached_by_values
