@@ -107,24 +107,33 @@ class Directional(SphereMethod):
         draw = functools.partial(draw_in_cells, known.radiance, self._directions)
         sun = find_sun_cells(power, draw) if self.self_visibility.wants_rays else None
         sharp_cells = find(), find(WIDEST_PAST_PLANES)
-        directions, spot_shares, rest = cells.directions, np.ones(len(power)), known.radiance
+        rest, rest_light, directions, spot_shares = known.radiance, cells, cells.directions, np.ones(len(power))
         if sharp_cells[0] is not None:
             is_sharp = sharp_cells[0].places >= 0
             split = np.flatnonzero(is_sharp), cells.spots, _NEAR_SPOT * cells.spreads
             rest = without_spots(known.radiance, self._directions, *split)
-            around = gather_cells(rest, self._directions)
-            directions = np.where(is_sharp[:, None], around.directions, directions)
-            spot_shares[is_sharp] = 1 - (around.radiance @ LUMINANCE)[is_sharp] / power[is_sharp]
-        samples = self._samples(rest) if self.plane_blockers else None
-        lit = self._on_device(cells.radiance), cells.directions
-        spots = cells.spots, cells.spreads, *sharp_cells, spot_shares
-        return ProjectedCells(directions, *lit, *spots, samples, sun)
+            rest_light = gather_cells(rest, self._directions)
+            directions = np.where(is_sharp[:, None], rest_light.directions, directions)
+            spot_shares[is_sharp] = 1 - (rest_light.radiance @ LUMINANCE)[is_sharp] / power[is_sharp]
+        samples = self._samples(rest, rest_light.radiance) if self.plane_blockers else None
+        coefficients = self._on_device(cells.radiance)
+        return ProjectedCells(
+            directions,
+            coefficients,
+            cells.directions,
+            cells.spots,
+            cells.spreads,
+            *sharp_cells,
+            spot_shares=spot_shares,
+            samples=samples,
+            sun=sun,
+        )
 
-    def _samples(self, radiance: np.ndarray) -> np.ndarray:
-        """Directions drawn from the light of each cell, [direction, 8, 3]; even ones in a dark cell."""
+    def _samples(self, radiance: np.ndarray, of_cells: np.ndarray) -> np.ndarray:
+        """Directions drawn from the light of a map in each cell, [direction, 8, 3]; even ones in a dark cell."""
         numbers = np.arange(len(self._directions))
         drawn = draw_in_cells(np.ones_like(radiance), self._directions, numbers, SAMPLES)
-        lit = np.flatnonzero(gather_cells(radiance, self._directions).radiance @ LUMINANCE > 0)
+        lit = np.flatnonzero(of_cells @ LUMINANCE > 0)
         drawn[lit] = draw_in_cells(radiance, self._directions, lit, SAMPLES)
         return drawn
 

@@ -39,11 +39,11 @@ def find_depths(centers: np.ndarray, normals: np.ndarray, areas: np.ndarray) -> 
     """
     radii = np.sqrt(areas / 2)
     offsets = centers[None] - centers[:, None]
-    below = -(normals[:, None] * offsets).sum(axis=2)
-    beside = np.sqrt(np.maximum((offsets**2).sum(axis=2) - below**2, 0))
+    heights_below = -(normals[:, None] * offsets).sum(axis=2)
+    lateral_distances = np.sqrt(np.maximum((offsets**2).sum(axis=2) - heights_below**2, 0))
     is_opposite = normals @ normals.T < _OPPOSITE
-    is_opposite &= (beside < np.maximum(radii[:, None], radii)) & (below > -_ABOVE * radii[:, None])
-    thickness = np.where(is_opposite, np.maximum(below, 0), np.inf).min(axis=1, initial=np.inf)
+    is_opposite &= (lateral_distances < np.maximum(radii[:, None], radii)) & (heights_below > -_ABOVE * radii[:, None])
+    thickness = np.where(is_opposite, np.maximum(heights_below, 0), np.inf).min(axis=1, initial=np.inf)
     parts = np.minimum(thickness / np.maximum(2 * radii, 1e-30), 1)
     return (_DEPTH_OF_SHEETS + (_DEPTH - _DEPTH_OF_SHEETS) * parts).astype(np.float32)
 
