@@ -5,10 +5,11 @@ import pytest
 import warp as wp
 
 from warpshadow import Body, Camera, EnvironmentMap, Mesh, Renderer, Scene, Spheres, Visibility, plane
+from warpshadow.assets.cells import gather_cells, without_spots
 from warpshadow.device.tape import recorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.stages.poses import Poses
-from warpshadow.stages.visibility.sharp_cells import WIDEST_PAST_PLANES, find_sharp_cells, overwrite_sharp_cells
+from warpshadow.stages.visibility.sharp_cells import WIDEST_PAST_PLANES, blend_sharp_cells, find_sharp_cells
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -62,27 +63,60 @@ def test_a_sun_of_5_degrees_is_narrow_where_planes_block_it_alone():
     assert narrow_of(EnvironmentMap.constant(1.0), widest=WIDEST_PAST_PLANES)[1] is None
 
 
+def test_without_its_spot_a_cell_has_the_light_around_it():
+    light, directions = map_with_discs((SUN, 2000.0)), fibonacci(CELLS)
+    cells, sharp_cells = narrow_of(light)
+    found = np.flatnonzero(sharp_cells.places >= 0)
+    rest = without_spots(light.radiance, directions, found, cells.spots, 2 * cells.spreads)
+    assert rest.max() == np.float32(0.2)
+    around = gather_cells(rest, directions)
+    np.testing.assert_array_equal(np.delete(around.radiance, found, 0), np.delete(cells.radiance, found, 0))
+    cap = (1 - np.cos(2 * cells.spreads[found])) * CELLS / 2  # its share of a cell; two suns' caps may reach out of it
+    assert (around.radiance[found, 0] < 0.21).all()
+    assert (around.radiance[found, 0] > 0.2 * (0.75 - cap)).all()
+
+
+def test_where_a_wall_hides_a_sun_the_sky_beside_it_is_seen():
+    """A bright ring around the sun: the wall hides the sun and half of the ring, which all is in one cell."""
+    sun = min(fibonacci(CELLS), key=lambda towards: abs(towards[1] - 0.6))
+    light = map_with_discs((sun, 20.0), sky=0.0, half_angle=np.radians(8)).radiance
+    light = EnvironmentMap(light + map_with_discs((sun, 1000.0), sky=0.0).radiance)
+    level = np.array([sun[0], 0, sun[2]]) / np.hypot(sun[0], sun[2])
+    top = 3 * np.tan(np.arcsin(sun[1]) + np.radians(2.5))
+    across = np.cross([0, 1, 0], level)
+    corners = [3 * level + s * 20 * across + [0, height, 0] for s, height in ((-1, 0), (1, 0), (1, top), (-1, top))]
+    wall = Body(Mesh(np.array(corners), [[0, 1, 2], [0, 2, 3]]), name="wall")
+    camera = Camera.look_at((0, 2, 0.01), (0, 0, 0), fov_y=3, size=(4, 4))
+    bodies = [Body(plane(20.0, 1), name="ground"), wall]
+    kept = Renderer(Scene(bodies, light, camera, visibility=Visibility(directions=CELLS)), progress=False).render()
+    rays = Scene(bodies, light, camera, visibility=Visibility("ray-traced", samples=4096))
+    assert kept[..., 0].mean() == pytest.approx(Renderer(rays, progress=False).render()[..., 0].mean(), rel=0.3)
+
+
 def test_in_many_cells_a_sun_is_as_any_light():
     assert narrow_of(map_with_discs((SUN, 2000.0)), 2048)[1] is None
 
 
-def test_narrow_cells_take_the_place_of_what_they_had(device, verified_tape):
+@pytest.mark.parametrize("share", [1.0, 0.75])
+def test_narrow_cells_are_blended_with_what_they_had(share, device, verified_tape):
     rng = np.random.default_rng(0)
     passing, sharp_cells = (rng.uniform(size=(2, 5, count)).astype(np.float32) for count in (32, CHUNK))
     places = np.full(32, -1, np.int32)
     places[[3, 20, 31]] = 0, 5, 5
     arrays = [wp.array(values, device=device, requires_grad=True) for values in (passing, sharp_cells)]
     with recorded() as tape:
-        result = overwrite_sharp_cells(*arrays, places)
+        result = blend_sharp_cells(*arrays, places, np.full(32, share))
     is_narrow = places >= 0
     expected = passing.copy()
-    expected[..., is_narrow] = sharp_cells[..., places[is_narrow]]
-    np.testing.assert_array_equal(result.numpy(), expected)
+    expected[..., is_narrow] *= 1 - share
+    expected[..., is_narrow] += share * sharp_cells[..., places[is_narrow]]
+    np.testing.assert_allclose(result.numpy(), expected, rtol=1e-6)
+    assert (arrays[0] is result) == (share == 1)  # the adjoint of the rest needs what it was
     weights = rng.normal(size=expected.shape).astype(np.float32)
     tape.backward(grads={result: wp.array(weights, device=device)})
     adj_sharp = np.zeros_like(sharp_cells)
-    adj_sharp[..., 0], adj_sharp[..., 5] = weights[..., 3], weights[..., 20] + weights[..., 31]
-    np.testing.assert_allclose(arrays[0].grad.numpy(), weights * ~is_narrow)
+    adj_sharp[..., 0], adj_sharp[..., 5] = share * weights[..., 3], share * (weights[..., 20] + weights[..., 31])
+    np.testing.assert_allclose(arrays[0].grad.numpy(), weights * np.where(is_narrow, 1 - share, 1), rtol=1e-6)
     np.testing.assert_allclose(arrays[1].grad.numpy(), adj_sharp, rtol=1e-6)
 
 

@@ -132,6 +132,27 @@ def draw_in_cells(radiance: np.ndarray, directions: np.ndarray, cells: np.ndarra
     return drawn
 
 
+def without_spots(
+    radiance: np.ndarray, directions: np.ndarray, cells: np.ndarray, spots: np.ndarray, angles: np.ndarray
+) -> np.ndarray:
+    """Make a map without the light near a spot in each of some cells around directions.
+
+    Args:
+        radiance, directions: As for :func:`gather_cells`.
+        cells: Numbers of the cells.
+        spots: Directions of the spots of all cells, unit vectors [direction, 3].
+        angles: How far from its spot light is near [radians], [direction].
+    """
+    owners = _cells_of_pixels(len(radiance), np.asarray(directions).astype(np.float32).tobytes())
+    rows, columns = np.nonzero(np.isin(np.arange(len(directions)), cells)[owners])
+    owner = owners[rows, columns]
+    towards = sh.equirectangular_directions(len(radiance))[rows, columns]
+    is_near = (towards * spots[owner]).sum(axis=1) >= np.cos(angles[owner])
+    result = np.array(radiance)
+    result[rows[is_near], columns[is_near]] = 0
+    return result
+
+
 def _split(height: int, count: int) -> int:
     """Pieces that rows of a map are split into: an eighth of a cell's angular radius 2/√Q."""
     return int(np.ceil(4 * np.pi * np.sqrt(count) / height))

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import Basis, CellBasis
-from warpshadow.assets.cells import draw_in_cells
+from warpshadow.assets.cells import draw_in_cells, gather_cells, without_spots
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.harmonic_light import as_light
 from warpshadow.device.tape import unrecorded
@@ -48,22 +48,31 @@ from warpshadow.stages.visibility import directional
 from warpshadow.stages.visibility.sharp_cells import (
     WIDEST_PAST_PLANES,
     SharpCells,
+    blend_sharp_cells,
     find_sharp_cells,
-    overwrite_sharp_cells,
 )
+
+_NEAR_SPOT = 2.0  # half-angles of a spot within which light is its own: of the pixels at a sun's edge, too
 
 
 class ProjectedCells(NamedTuple):
     """Light in cells."""
 
-    directions: np.ndarray  # [direction, 3]
+    directions: np.ndarray  # [direction, 3]: to light of the cells, past the spots of sharp ones
     coefficients: wp.array | None = None  # of known light, vec3 of shape [1, direction]
+    mean_directions: np.ndarray | None = None  # to all known light of the cells, by which it falls in [direction, 3]
     spots: np.ndarray | None = None  # where the brightest part of known light is in its cells [direction, 3]
     spreads: np.ndarray | None = None  # half-angles of where known light comes from in its cells [direction]
     sharp_cells: SharpCells | None = None  # cells that a sun is in, where spheres block it
     sharp_cells_past_planes: SharpCells | None = None  # and where planes do
+    spot_shares: np.ndarray | None = None  # share of the light of sharp cells that their spot has [direction]
     samples: np.ndarray | None = None  # directions drawn from known light in its cells, and even ones [direction, 8, 3]
     sun: SunCells | None = None  # the brightest cells, where bodies want rays to them
+
+    @property
+    def facing(self) -> np.ndarray:
+        """Directions by whose cosine light falls in, [direction, 3]."""
+        return self.directions if self.mean_directions is None else self.mean_directions
 
 
 class SharpestCells(NamedTuple):
@@ -92,24 +101,40 @@ class Directional(SphereMethod):
         known = as_light(light)
         cells = known.cells(self._directions)
         if cells.spots is None or cells.spreads is None:
-            return ProjectedCells(cells.directions, self._on_device(cells.radiance))
+            return ProjectedCells(cells.directions, self._on_device(cells.radiance), cells.directions)
         power, softness = cells.radiance @ LUMINANCE, self.visibility.softness
         find = functools.partial(find_sharp_cells, power, cells.spots, cells.spreads, softness)
         draw = functools.partial(draw_in_cells, known.radiance, self._directions)
         sun = find_sun_cells(power, draw) if self.self_visibility.wants_rays else None
         sharp_cells = find(), find(WIDEST_PAST_PLANES)
-        samples = self._samples(known.radiance, power, draw) if self.plane_blockers else None
+        rest, rest_light, directions, spot_shares = known.radiance, cells, cells.directions, np.ones(len(power))
+        if sharp_cells[0] is not None:
+            is_sharp = sharp_cells[0].places >= 0
+            split = np.flatnonzero(is_sharp), cells.spots, _NEAR_SPOT * cells.spreads
+            rest = without_spots(known.radiance, self._directions, *split)
+            rest_light = gather_cells(rest, self._directions)
+            directions = np.where(is_sharp[:, None], rest_light.directions, directions)
+            spot_shares[is_sharp] = 1 - (rest_light.radiance @ LUMINANCE)[is_sharp] / power[is_sharp]
+        samples = self._samples(rest, rest_light.radiance) if self.plane_blockers else None
+        coefficients = self._on_device(cells.radiance)
         return ProjectedCells(
-            cells.directions, self._on_device(cells.radiance), cells.spots, cells.spreads, *sharp_cells, samples, sun
+            directions,
+            coefficients,
+            cells.directions,
+            cells.spots,
+            cells.spreads,
+            *sharp_cells,
+            spot_shares=spot_shares,
+            samples=samples,
+            sun=sun,
         )
 
-    def _samples(
-        self, radiance: np.ndarray, power: np.ndarray, draw: Callable[[np.ndarray, int], np.ndarray]
-    ) -> np.ndarray:
-        """Directions drawn from the light of each cell, [direction, 8, 3]; even ones in a dark cell."""
-        drawn = draw_in_cells(np.ones_like(radiance), self._directions, np.arange(len(power)), SAMPLES)
-        lit = np.flatnonzero(power > 0)
-        drawn[lit] = draw(lit, SAMPLES)
+    def _samples(self, radiance: np.ndarray, of_cells: np.ndarray) -> np.ndarray:
+        """Directions drawn from the light of a map in each cell, [direction, 8, 3]; even ones in a dark cell."""
+        numbers = np.arange(len(self._directions))
+        drawn = draw_in_cells(np.ones_like(radiance), self._directions, numbers, SAMPLES)
+        lit = np.flatnonzero(of_cells @ LUMINANCE > 0)
+        drawn[lit] = draw_in_cells(radiance, self._directions, lit, SAMPLES)
         return drawn
 
     def _on_device(self, coefficients: np.ndarray) -> wp.array:
@@ -157,8 +182,11 @@ class Directional(SphereMethod):
             return transmittance
         directions, places, _ = projected_light.sharp_cells_past_planes
         radius = self._edge_radius(projected_light.sharp_cells_past_planes)
-        return overwrite_sharp_cells(
-            transmittance, parts.transmittance(points, horizon_normals, directions, radius), places
+        return blend_sharp_cells(
+            transmittance,
+            parts.transmittance(points, horizon_normals, directions, radius),
+            places,
+            projected_light.spot_shares,
         )
 
     def _edge_radius(self, sharp_cells: SharpCells) -> float:
@@ -175,7 +203,8 @@ class Directional(SphereMethod):
         if projected_light.sharp_cells is None:
             return transmittance
         directions, places, scale = projected_light.sharp_cells
-        return overwrite_sharp_cells(transmittance, block(directions, **scales(scale)), places)
+        sharp = block(directions, **scales(scale))
+        return blend_sharp_cells(transmittance, sharp, places, projected_light.spot_shares)
 
     def _scales(self, scale: float) -> dict[str, Any]:
         """Settings in radii of cells, of radii that are so much smaller."""
@@ -213,7 +242,7 @@ class Directional(SphereMethod):
             directions, places, _ = projected_light.sharp_cells_past_planes
             sharp_coverage = cover(directions, radius=self._edge_radius(projected_light.sharp_cells_past_planes))
             assert sharp_coverage is not None
-            covered = overwrite_sharp_cells(covered, sharp_coverage, places)
+            covered = blend_sharp_cells(covered, sharp_coverage, places, projected_light.spot_shares)
         return visibility._replace(
             transmittance_total=transmittance_past_planes(transmittance_spheres, covered),
             transmittance_spheres=transmittance_spheres,
@@ -235,13 +264,13 @@ class Directional(SphereMethod):
             )
         assert group.body is not None
         of_sun = trace_sun_cells(rays[0], group.probe_weights, rays[1], group.body, projected_light.sun)
-        return overwrite_sharp_cells(transmittance_self, of_sun, projected_light.sun.places)
+        return blend_sharp_cells(transmittance_self, of_sun, projected_light.sun.places)
 
     def transfer(self, visibility: GroupVisibility, group: Group, projected_light: ProjectedCells) -> wp.array:
         """Transfer vectors; the transmittance as it is where cached cells hold known light."""
         assert visibility.transmittance_total is not None
         if group.cached_rows is None:
-            return directional_transfer(visibility.transmittance_total, group.normals, projected_light.directions)
+            return directional_transfer(visibility.transmittance_total, group.normals, projected_light.facing)
         if _has_light(group.cached_rows):
             return visibility.transmittance_total
         return cell_transfer(visibility.transmittance_total, group.cached_rows)
@@ -259,7 +288,7 @@ class Directional(SphereMethod):
         if group.cached_rows is not None:
             return self.shade_transfer(self.transfer(visibility, group, projected_light), group, projected_light)
         assert visibility.transmittance_total is not None and projected_light.coefficients is not None
-        cells = projected_light.directions, projected_light.coefficients
+        cells = projected_light.facing, projected_light.coefficients
         return shade_cells(visibility.transmittance_total, group.normals, *cells, maximum=LARGEST_COEFFICIENT)
 
     @functools.cached_property
@@ -340,7 +369,7 @@ class Directional(SphereMethod):
         if not diffuse.size:
             return diffuse
         count = len(projected_light.directions)
-        transfer = directional_transfer(_joined_cells(cells, count), receivers.normals, projected_light.directions)
+        transfer = directional_transfer(_joined_cells(cells, count), receivers.normals, projected_light.facing)
         light = projected_light.coefficients if free is None else change_basis(free, self.native_from_basis)
         assert light is not None
         even = wp.full((1, count), wp.vec3(1.0), dtype=wp.vec3, device=diffuse.device)

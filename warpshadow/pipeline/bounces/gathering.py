@@ -29,7 +29,7 @@ from warpshadow.stages.bounces.covers import cover
 from warpshadow.stages.bounces.plane_light import plane_light
 from warpshadow.stages.bounces.plane_texels import find_texels
 from warpshadow.stages.bounces.projected_areas import find_projected_areas, turn_from_planes
-from warpshadow.stages.bounces.proxies import DEPTH, DEPTH_OF_SHEETS, place_proxies
+from warpshadow.stages.bounces.proxies import find_depths, place_proxies
 from warpshadow.stages.bounces.proxy_radiance import find_proxy_radiance, patches_of_clusters
 from warpshadow.stages.bounces.self_light import self_light
 from warpshadow.stages.bounces.sphere_light import sphere_light
@@ -207,8 +207,7 @@ class Proxies:
     @functools.cached_property
     def _depths(self) -> np.ndarray:
         """How far below each patch its proxy is, in radii."""
-        depths = [DEPTH_OF_SHEETS if self.merged_scene.is_two_sided[body] else DEPTH for body in self.senders.bodies]
-        return np.repeat(np.array(depths, np.float32), np.diff(self.senders.first))
+        return np.concatenate([find_depths(item.centers, item.normals, item.areas) for item in self.senders.patches])
 
     @functools.cached_property
     def blocker_of_source(self) -> np.ndarray:

@@ -5,6 +5,8 @@ patch, so that neighbors overlap, bulging out of the body by ρ/2. As bodies gro
 sphere that blocks light beside it. Of a sheet, whose other side has patches of its own, centers are ρ/4 above: a
 receiver is nearer to the patches that it sees than to those behind them. If they were below, too, the sunlit outside of
 a tent shone through: its image with all bounces is 6.8% off so, 3.9% with centers in the sheet, and 3.6% with these.
+So it is with walls and boards that are thinner than their proxies: with a thickness h ≤ 2ρ centers are 3h/8 − ρ/4
+below. A kitchen with a wall of h = 0.4 ρ to a city in the sun is 7.1% off with ρ/2, and 6.1% with these.
 
 If the spheres that block light stood in for the patches around them, the foot of a ball would be lit by the ball's
 whole side, where it sees the little below, which is dark: at 0.2, 0.4 and 0.6 radii from the contact of a ball with a
@@ -22,7 +24,28 @@ from warpshadow.device.memory import empty
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
-DEPTH, DEPTH_OF_SHEETS = 0.5, -0.25  # how far below its patch a center is, in radii
+_DEPTH, _DEPTH_OF_SHEETS = 0.5, -0.25  # how far below its patch a center is, in radii
+_OPPOSITE = -0.5  # cosine between the normals of patches on opposite sides of a body, at most
+_ABOVE = 0.1  # how far above a patch the other side may lie, in radii: patches of bent sheets are not flat
+
+
+def find_depths(centers: np.ndarray, normals: np.ndarray, areas: np.ndarray) -> np.ndarray:
+    """Find how far below each patch of a body its proxy is, in radii: less where the body is thinner than the proxy.
+
+    Args:
+        centers, normals, areas: Of the patches [units of the body], shapes [patch, 3], [patch, 3] and [patch].
+    Returns:
+        float32 of shape [patch].
+    """
+    radii = np.sqrt(areas / 2)
+    offsets = centers[None] - centers[:, None]
+    heights_below = -(normals[:, None] * offsets).sum(axis=2)
+    lateral_distances = np.sqrt(np.maximum((offsets**2).sum(axis=2) - heights_below**2, 0))
+    is_opposite = normals @ normals.T < _OPPOSITE
+    is_opposite &= (lateral_distances < np.maximum(radii[:, None], radii)) & (heights_below > -_ABOVE * radii[:, None])
+    thickness = np.where(is_opposite, np.maximum(heights_below, 0), np.inf).min(axis=1, initial=np.inf)
+    parts = np.minimum(thickness / np.maximum(2 * radii, 1e-30), 1)
+    return (_DEPTH_OF_SHEETS + (_DEPTH - _DEPTH_OF_SHEETS) * parts).astype(np.float32)
 
 
 @wp.kernel
