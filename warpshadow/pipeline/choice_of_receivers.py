@@ -181,7 +181,7 @@ def for_picture(scene: Scene) -> Scene:
     by_pixel = [
         body.receivers == AUTO
         and (has_sun or body.mesh.is_flat)
-        and not ((body.self_shadows or visibility.self_shadows) == "spheres" and body.is_thin)
+        and not (body.self_shadows_in(visibility) == "spheres" and body.is_thin)
         for body in scene.bodies
     ]
     return change_bodies(scene, "receivers", dict.fromkeys(np.flatnonzero(by_pixel).tolist(), "pixel"))

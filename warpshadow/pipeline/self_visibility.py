@@ -126,7 +126,7 @@ class SelfVisibility:
     def _how(self, body: int) -> str:
         """The kind of shadow that a body casts on itself: one of SELF_SHADOWS."""
         scene = self._merged_scene.scene
-        return scene.bodies[body].self_shadows or scene.visibility.self_shadows
+        return scene.bodies[body].self_shadows_in(scene.visibility)
 
     # ------------------------------------------------------------------------------------------ where
 

@@ -72,7 +72,7 @@ def blocking_parts(scene: Scene) -> dict[int, list[ConvexPart]]:
         return {}
     result = {}
     for number, body in enumerate(scene.bodies):
-        if isinstance(body.blockers, str) and (body.self_shadows or visibility.self_shadows) != "spheres":
+        if isinstance(body.blockers, str) and body.self_shadows_in(visibility) != "spheres":
             mesh = body.mesh
             result[number] = mesh.convex_parts if _solid_behind(scene, number) is None else mesh.flat_parts
     return {number: parts for number, parts in result.items() if parts}

@@ -18,7 +18,7 @@ from warpshadow.assets.mesh_files import Material, MeshSource, is_of_trimesh, lo
 from warpshadow.assets.topology import CREASE
 from warpshadow.check import AnyPath
 from warpshadow.scene.rotation import rotation_matrix, rotation_vector
-from warpshadow.scene.visibility import AUTO, SELF_SHADOWS
+from warpshadow.scene.visibility import AUTO, SELF_SHADOWS, Visibility
 from warpshadow.spheres import Spheres
 
 RECEIVERS = (AUTO, "vertex", "pixel", "adaptive")
@@ -173,6 +173,10 @@ class Body:
     def casts_shadow(self) -> bool:
         """Whether the body blocks light."""
         return bool(len(self.blockers) if isinstance(self.blockers, Spheres) else self.blockers)
+
+    def self_shadows_in(self, visibility: Visibility) -> str:
+        """How it casts shadows on itself: by its own setting, or else by a scene's."""
+        return self.self_shadows or visibility.self_shadows
 
     @property
     def is_thin(self) -> bool:

@@ -6,7 +6,7 @@ sphere that blocks light beside it. Of a sheet, whose other side has patches of 
 receiver is nearer to the patches that it sees than to those behind them. If they were below, too, the sunlit outside of
 a tent shone through: its image with all bounces is 6.8% off so, 3.9% with centers in the sheet, and 3.6% with these.
 So it is with walls and boards that are thinner than their proxies: with a thickness h ≤ 2ρ centers are 3h/8 − ρ/4
-below. A kitchen with a wall of h = 0.4 ρ to a city in the sun is 7.1% off with ρ/2, and 6.1% with these.
+below. With ρ/2 the proxies of both sides change places, and a sunlit wall glows on its inside.
 
 If the spheres that block light stood in for the patches around them, the foot of a ball would be lit by the ball's
 whole side, where it sees the little below, which is dark: at 0.2, 0.4 and 0.6 radii from the contact of a ball with a
