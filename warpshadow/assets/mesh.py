@@ -317,11 +317,11 @@ class BaseColor(NamedTuple):
 
 
 class Gloss(NamedTuple):
-    """glTF's roughness and metallic of a surface; and what a message says of them."""
+    """glTF's roughness and metallic of a surface, factors of the green and blue of an image of Pillow's, if it has one."""
 
     roughness: float
     metallic: float
-    remark: str = ""
+    image: Any = None
 
 
 DIFFUSE = Gloss(1.0, 0.0)  # a surface that does not shine

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import functools
 import operator
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
-from warpshadow.device.batch import concatenate, cut
+from warpshadow.device.batch import concatenate, cut, rows
 from warpshadow.device.constants import constant
 from warpshadow.pipeline.lighting import Light, LitPoints, change_basis, receiver_text
 from warpshadow.pipeline.node import Input, Node, detached
@@ -25,6 +26,14 @@ from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sample_receivers import Span
+from warpshadow.stages.sides import front_faces
+from warpshadow.stages.textures.footprint import find_footprints
+from warpshadow.stages.textures.numbers import as_colors, as_numbers
+from warpshadow.stages.textures.pyramid import Textures
+from warpshadow.stages.textures.sample import sample_albedo
+
+if TYPE_CHECKING:
+    from warpshadow.pipeline.view import View
 
 _CELL_ROWS = 64  # rows of the map of free light in cells: each pixel has the light of the nearest cell
 
@@ -37,10 +46,12 @@ class GlossyPoints(LitPoints):
         cameras: Clip matrices of its cameras, or one for all.
     """
 
-    def __init__(self, view: LitPoints, cameras: Input):
+    def __init__(self, view: View, cameras: Input):
         glossy = view.merged_scene.is_glossy
-        self._all_receivers, self._cameras = view.receivers_node, cameras
         receivers = Node("", functools.partial(_glossy_receivers, glossy), view.receivers_node)
+        self._all_receivers, self._cameras = view.receivers_node, cameras
+        self._clip_positions, self._image_size = view.clip_positions, view.image_size
+        self._fragments = Node("", self._fragments_of, receivers)
         arguments = view.method, view.materials, view.vertices, view.spheres, receivers, view.call
         super().__init__(*arguments, normals=view.normals, blocker_kinds=view.blocker_kinds, is_static=view.is_static)
         self._numbers = Node("", functools.partial(_numbers, glossy), detached(view.receivers_node))
@@ -83,17 +94,35 @@ class GlossyPoints(LitPoints):
 
     def _values(self, materials: Materials, name: str) -> Node:
         """Roughness or the like at the receivers, float32 of shape [batch, receiver]."""
-        return Node("", self._interpolate, self.receivers_node, materials.of_vertices(name))
+        inputs, textures = (self._fragments, materials.of_vertices(name)), materials.textures_of[name]
+        if not textures.images:
+            return Node("", self._interpolate, *inputs)
+        sample = functools.partial(self._sample, textures.texture_of_face)
+        return Node("", sample, *inputs, self._clip_positions, textures.pyramids)
 
-    def _interpolate(self, receivers: Receivers, values: wp.array) -> wp.array:
-        faces, seen = self.merged_scene.faces, receivers.seen
-        assert seen is not None
-        if not seen.face_ids.size:
-            return wp.empty((1, 0), dtype=wp.float32, device=faces.device)
-        sides = constant(np.tile(faces.numpy(), (2, 1)), wp.vec3i, faces.device)
-        rows = Fragments(*(array.reshape((len(array), 1, -1)) for array in (seen.face_ids, seen.barycentrics)))
-        result = interpolate(rows, sides, values)
-        return result.reshape((len(result), -1))
+    def _fragments_of(self, receivers: Receivers) -> Fragments:
+        """The faces that the receivers lie on, [batch, 1, receiver]. Differentiable: barycentrics."""
+        assert receivers.seen is not None
+        faces = front_faces(receivers.seen.face_ids, self.merged_scene.faces.size)
+        return Fragments(*(array.reshape((len(array), 1, -1)) for array in (faces, receivers.seen.barycentrics)))
+
+    def _interpolate(self, fragments: Fragments, values: wp.array) -> wp.array:
+        """Numbers of the receivers, from those of all vertices."""
+        if not fragments.face_ids.size:
+            return wp.empty((1, 0), dtype=wp.float32, device=values.device)
+        return rows(interpolate(fragments, self.merged_scene.faces, values))
+
+    def _sample(
+        self, texture_of_face: wp.array, fragments: Fragments, values: wp.array, clip: wp.array, textures: Textures
+    ) -> wp.array:
+        """Numbers of the receivers, from textures and, on bodies without one, from those of all vertices."""
+        if not fragments.face_ids.size:
+            return wp.empty((1, 0), dtype=wp.float32, device=values.device)
+        merged_scene = self.merged_scene
+        seen = fragments, merged_scene.faces
+        maps = merged_scene.uvs, merged_scene.uv_faces, texture_of_face
+        footprints = find_footprints(*seen, clip, *maps, textures, self._image_size)
+        return as_numbers(sample_albedo(*seen, as_colors(values), textures, footprints))
 
     def _prefiltered(self, light: Input) -> Node:
         """Node of the texels of light, vec3 of shape [batch, texel]."""
