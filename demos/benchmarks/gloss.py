@@ -1,7 +1,7 @@
 """Images of bodies that shine against Mitsuba's, by roughness, of metal and plastic.
 
     python demos/benchmarks/gloss.py [--data FOLDER] [--size 96] [--bounces 0|1|…] [--picture gloss.png]
-    python demos/benchmarks/gloss.py --textured [--surface gltf|principled] [--data FOLDER] [--size 96] [--bounces 0|1|…]
+    python demos/benchmarks/gloss.py --textured [--surface gltf|principled] [--data FOLDER] [--bounces 0|1|…]
     python demos/benchmarks/gloss.py --loops [--data FOLDER] [--size 96] [--bounces 0|1|…]
 
 FOLDER has meshes/ and envmaps/, as for demos/benchmarks/accuracy.py. Mitsuba renders the same surface
@@ -64,7 +64,7 @@ def glossy(scene: ws.Scene, roughness: float, kind: str) -> ws.Scene:
 
 
 def textured(scene: ws.Scene) -> tuple[ws.Scene, ws.Scene]:
-    """The scene with stripes of roughness and patches of metal on its first body; and with their means in their place."""
+    """The scene with stripes of roughness and patches of metal on its first body; and with their means instead."""
     body = scene.bodies[0]
     mesh = body.mesh if body.mesh.uvs is not None else ws.unwrap(body.mesh)
     v, u = (np.mgrid[:256, :256] + 0.5) / 256

@@ -20,9 +20,18 @@ def test_a_body_without_roughness_is_diffuse():
     [
         ({"roughness": 1.2}, "roughness: got 1 values out of range"),
         ({"roughness": "matte"}, "roughness: got 'matte', expected a number from 0 to 1"),
-        ({"roughness": np.zeros(7)}, r"roughness: got shape \(7,\), expected a number from 0 to 1, one for each of the 42"),
-        ({"roughness": np.zeros((7, 7, 1))}, r"roughness: got shape \(7, 7, 1\), expected .* or a texture \[height, width"),
-        ({"roughness": 0.5, "metallic": np.zeros((4, 4))}, r"metallic: got a texture, \(4, 4\), but mesh .* has no uvs"),
+        (
+            {"roughness": np.zeros(7)},
+            r"roughness: got shape \(7,\), expected a number from 0 to 1, one for each of the 42",
+        ),
+        (
+            {"roughness": np.zeros((7, 7, 1))},
+            r"roughness: got shape \(7, 7, 1\), expected .* or a texture \[height, width",
+        ),
+        (
+            {"roughness": 0.5, "metallic": np.zeros((4, 4))},
+            r"metallic: got a texture, \(4, 4\), but mesh .* has no uvs",
+        ),
         ({"metallic": 1.0}, "metallic: got 1.0 without roughness, expected roughness, too"),
         ({"roughness": 0.5, "receivers": "vertex"}, "receivers: got 'vertex' beside roughness"),
     ],

@@ -60,16 +60,15 @@ def gloss_of(material) -> Gloss | None:
     image = getattr(material, "metallicRoughnessTexture", None)
     if image is None and roughness is None and metallic is None:
         return None
-    defaults = 1.0, 0.0 if image is None else 1.0
-    factors = [default if factor is None else factor for factor, default in zip((roughness, metallic), defaults)]
-    return Gloss(*np.clip(factors, 0.0, 1.0).tolist(), image)
+    default_metallic = 0.0 if image is None else 1.0
+    factors = 1.0 if roughness is None else roughness, default_metallic if metallic is None else metallic
+    roughness, metallic = np.clip(factors, 0.0, 1.0).tolist()
+    return Gloss(roughness, metallic, image)
 
 
 def gloss_texels(gloss: Gloss) -> tuple[np.ndarray, np.ndarray]:
     """Roughness and metallic of a surface, float32 of shape [1] each, or [height, width] where they vary."""
     codes = np.zeros((1, 1, 3)) + 255 if gloss.image is None else np.asarray(gloss.image.convert("RGB"))
-    textures = (codes[..., 1] / 255 * gloss.roughness, codes[..., 2] / 255 * gloss.metallic)
-    roughness, metallic = (
-        (texels if np.ptp(texels) else texels[0, :1]).astype(np.float32) for texels in textures
-    )
+    textures = codes[..., 1] / 255 * gloss.roughness, codes[..., 2] / 255 * gloss.metallic
+    roughness, metallic = ((texels if np.ptp(texels) else texels[0, :1]).astype(np.float32) for texels in textures)
     return roughness, metallic

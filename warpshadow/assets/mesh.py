@@ -317,7 +317,7 @@ class BaseColor(NamedTuple):
 
 
 class Gloss(NamedTuple):
-    """glTF's roughness and metallic of a surface, factors of the green and blue of an image of Pillow's, if it has one."""
+    """glTF's roughness and metallic of a surface: factors, of green and blue of an image of Pillow's, if any."""
 
     roughness: float
     metallic: float

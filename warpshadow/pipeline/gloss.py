@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import operator
-from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -32,9 +31,6 @@ from warpshadow.stages.textures.numbers import as_colors, as_numbers
 from warpshadow.stages.textures.pyramid import Textures
 from warpshadow.stages.textures.sample import sample_albedo
 
-if TYPE_CHECKING:
-    from warpshadow.pipeline.view import View
-
 _CELL_ROWS = 64  # rows of the map of free light in cells: each pixel has the light of the nearest cell
 
 
@@ -44,13 +40,15 @@ class GlossyPoints(LitPoints):
     Args:
         view: The view.
         cameras: Clip matrices of its cameras, or one for all.
+        clip_positions: Node of the vertices in their clip space.
+        image_size: Height and width of its images.
     """
 
-    def __init__(self, view: View, cameras: Input):
+    def __init__(self, view: LitPoints, cameras: Input, clip_positions: Node, image_size: tuple[int, int]):
         glossy = view.merged_scene.is_glossy
         receivers = Node("", functools.partial(_glossy_receivers, glossy), view.receivers_node)
         self._all_receivers, self._cameras = view.receivers_node, cameras
-        self._clip_positions, self._image_size = view.clip_positions, view.image_size
+        self._clip_positions, self._image_size = clip_positions, image_size
         self._fragments = Node("", self._fragments_of, receivers)
         arguments = view.method, view.materials, view.vertices, view.spheres, receivers, view.call
         super().__init__(*arguments, normals=view.normals, blocker_kinds=view.blocker_kinds, is_static=view.is_static)

@@ -237,15 +237,11 @@ class View(LitPoints):
         """Node of the samples where bodies shine: of light in the surface's color, and of light that has its own."""
         from warpshadow.pipeline.gloss import GlossyPoints
 
-        points = self.cached("gloss", None, lambda: GlossyPoints(self, self.cameras))
+        arguments = self.cameras, self.clip_positions, (self._camera.height, self._camera.width)
+        points = self.cached("gloss", None, lambda: GlossyPoints(self, *arguments))
         colored, white = points.mixed(self, shading, light, materials)
         parts = self._radiance(colored, reflectance), self._radiance(white, self._white_reflectance)
         return Node("radiance", _sum_moving if self._is_moving else sum_radiance, *parts, caches=False)
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """Height and width of the images."""
-        return self._camera.height, self._camera.width
 
     @property
     def _is_moving(self) -> bool:

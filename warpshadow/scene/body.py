@@ -84,10 +84,11 @@ class Body:
             other bodies to the light without them. In the image of :func:`warpshadow.render` its shadow is coverage
             alone. ``draw``, torch's renderer, fits and the viewer show it as any other body.
         roughness: glTF's, in [0, 1], one number, one for each vertex [vertex], or a texture [height, width], which
-            needs uvs; or an .npy file of them: the surface shines by a GGX lobe of width α = roughness². None, the default, is what the mesh's file says, if that is
-            glTF and neither ``albedo`` nor ``texture`` is given, and else a diffuse surface. Below 0.1 it is shown as
-            0.1. Such a body has receivers at pixels; all methods but "log-sh" show it. It reflects other bodies
-            where light bounces; with ``bounces=0`` they are black in it, so metals want bounces.
+            needs uvs, or an .npy file of them: the surface shines by a GGX lobe of width α = roughness². None, the
+            default, is what the mesh's file says, if that is glTF and neither ``albedo`` nor ``texture`` is given, and
+            else a diffuse surface. Below 0.1 it is shown as 0.1. Such a body has receivers at pixels; all methods but
+            "log-sh" show it. It reflects other bodies where light bounces; with ``bounces=0`` they are black in it, so
+            metals want bounces.
         metallic: Likewise, how much of it is metal, which reflects its albedo and has no diffuse light; by default 0.
         specular: Likewise, strength of the reflection of what is not metal, of which 1, the default, is 4% straight on.
     """
@@ -296,7 +297,11 @@ class Body:
         """
         mesh = self.mesh.creased(angle)
         values: dict[str, Any] = {name: getattr(self, name) for name in GLOSS_ARGUMENTS}
-        of_vertices = {name: array[mesh.origins] for name, array in values.items() if np.shape(array) == self.mesh.positions.shape[:1]}
+        of_vertices = {
+            name: array[mesh.origins]
+            for name, array in values.items()
+            if np.shape(array) == self.mesh.positions.shape[:1]
+        }
         colors = self.albedo if self.albedo.ndim == 1 else self.albedo[mesh.origins]
         return replace(self, mesh=mesh, albedo=colors, **of_vertices)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -29,12 +29,12 @@ def _one_color(body: Body) -> np.ndarray:
     return np.atleast_2d(body.albedo).mean(axis=0)
 
 
-def checked_size(size: object) -> tuple[int, int]:
+def checked_size(size: Any) -> tuple[int, int]:
     """Height and width of a texture [texels]."""
     is_pair = isinstance(size, (tuple, list, np.ndarray)) and len(size) == 2
     if not is_pair or not all(check.is_integer(count) and count > 0 for count in size):
         raise ValueError(f"size: got {size!r}, expected height and width in whole texels, (256, 256)")
-    return tuple(size)
+    return size[0], size[1]
 
 
 def check_uvs(number: int, scene: Scene) -> None:
@@ -46,7 +46,9 @@ def check_uvs(number: int, scene: Scene) -> None:
 def resized(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     """An image [height, width, channel] of another height and width."""
     mode = "area" if size[0] <= image.shape[0] else "bilinear"
-    return torch.nn.functional.interpolate(image.permute(2, 0, 1)[None], size, mode=mode)[0].permute(1, 2, 0).contiguous()
+    return (
+        torch.nn.functional.interpolate(image.permute(2, 0, 1)[None], size, mode=mode)[0].permute(1, 2, 0).contiguous()
+    )
 
 
 def variation(texels: torch.Tensor) -> torch.Tensor:
