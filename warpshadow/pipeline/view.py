@@ -237,7 +237,7 @@ class View(LitPoints):
         """Node of the samples where bodies shine: of light in the surface's color, and of light that has its own."""
         from warpshadow.pipeline.gloss import GlossyPoints
 
-        arguments = self.cameras, self.clip_positions, (self._camera.height, self._camera.width)
+        arguments = self.cameras, self.fragments_node, self.clip_positions
         points = self.cached("gloss", None, lambda: GlossyPoints(self, *arguments))
         colored, white = points.mixed(self, shading, light, materials)
         parts = self._radiance(colored, reflectance), self._radiance(white, self._white_reflectance)

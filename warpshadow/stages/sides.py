@@ -39,27 +39,6 @@ def split_sides(numbers: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray
     return numbers - count * is_back, is_back
 
 
-@wp.kernel(enable_backward=False)
-def _find_faces(
-    # in
-    sides: wp.array2d(dtype=wp.int32),
-    face_count: int,
-    # out
-    face_ids: wp.array2d(dtype=wp.int32),
-):
-    """A thread owns a side."""
-    view, item = wp.tid()
-    face, _ = split_side(sides[view, item], face_count)
-    face_ids[view, item] = face
-
-
-def front_faces(sides: wp.array, face_count: int) -> wp.array:
-    """The faces of sides, from whichever side they are seen; −1 stays. Int32 of shape [view, item], as sides are."""
-    face_ids = empty(sides.shape, dtype=wp.int32, device=sides.device)
-    launch(_find_faces, sides.shape, inputs=[sides, face_count], outputs=[face_ids])
-    return face_ids
-
-
 @wp.func
 def _eye(clip_matrix: wp.mat44):
     """Where a camera is: the point whose x, y and w in clip space are zero."""

@@ -130,7 +130,6 @@ def _find_footprints(
     levels: wp.array2d(dtype=wp.vec3i),
     image_width: int,
     image_height: int,
-    pixel: wp.vec2,
     batch_count: int,
     # out
     texture_ids: wp.array(dtype=wp.int32),
@@ -163,10 +162,6 @@ def _find_footprints(
         row = sample // image_width
         ray = center(sample - row * image_width, row, image_width, image_height)
         step = wp.vec2(2.0 / float(image_width), 2.0 / float(image_height))
-        if pixel[0] > 0.0:
-            point = weights[0] * a + weights[1] * b + weights[2] * c
-            ray = wp.vec2(point[0], point[1]) / point[3]
-            step = pixel
         derivatives = _uv_derivatives(a, b, c, uv_a - uv, uv_b - uv, uv_c - uv, ray, step)
         sample_uvs[thread] = uv
         probes[thread] = _probes(derivatives, float(levels[texture, 0][1]), float(levels[texture, 0][2]))
@@ -180,7 +175,6 @@ def find_footprints(
     uv_faces: wp.array,
     texture_of_face: wp.array,
     textures: Textures,
-    image_size: tuple[int, int] | None = None,
 ) -> Footprints:
     """Find the place of each sample in its texture, and its footprint there.
 
@@ -196,7 +190,6 @@ def find_footprints(
             Any batch may be 1 and then serves every instance.
         texture_of_face: Texture on each face, -1 for none, int32 of shape [face].
         textures: The textures.
-        image_size: Height and width of the image, where fragments are not its samples but points that its pixels see.
     Returns:
         Footprints.
     Differentiable: clip_positions, barycentrics of the fragments, uvs; the width and the direction of a footprint
@@ -224,7 +217,6 @@ def find_footprints(
             textures.levels,
             width,
             height,
-            wp.vec2() if image_size is None else wp.vec2(2.0 / image_size[1], 2.0 / image_size[0]),
             batch_count,
         ],
         outputs=[texture_ids, sample_uvs, probes],
