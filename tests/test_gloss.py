@@ -9,6 +9,7 @@ import twins
 
 import warpshadow as ws
 from warpshadow import inverse
+from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
 # Interpolation between texels is linear piece by piece, and steps of differences go over some. Measured 0.1 to 1.2%.
@@ -112,6 +113,14 @@ def test_stills_and_kept_renderers_show_the_same_gloss(metallic):
     body = dataclasses.replace(BALL, metallic=metallic)
     kept, still = ws.Renderer(scene_of(body, GROUND, POST)).render(), ws.render(scene_of(body, GROUND, POST))
     assert np.linalg.norm(kept - still) < 0.06 * np.linalg.norm(still)
+
+
+def test_in_stills_samples_of_different_faces_of_a_body_that_shines_share_no_receiver():
+    """Their normals differ by more than a lobe is wide; those of the diffuse post share."""
+    merged_scene = MergedScene(scene_of(BALL, POST))
+    ball, post = np.split(merged_scene.smooth_pieces.numpy(), merged_scene.first_face[1:-1])
+    assert len(np.unique(ball)) == len(BALL.mesh.faces) and len(np.unique(post)) == 1
+    assert not np.isin(post, ball).any()
 
 
 @pytest.mark.parametrize("name", ["roughness", "metallic", "specular"])

@@ -165,13 +165,14 @@ def main() -> None:
     sheet, by = [], "mitsuba" if arguments.surface == "gltf" else arguments.surface
     print(f"{'body':16}{'roughness':10}{'kind':9}" + "".join(f"{name:>8} body    time" for name in arguments.methods))
     for name, plain in scenes(arguments.data, arguments.size, arguments.bodies).items():
+        plain = dataclasses.replace(plain, bounces=arguments.bounces)
         for label, truth, shown_scene in cases(plain, has_textures=arguments.textured):
-            truth, shown_scene = (dataclasses.replace(each, bounces=arguments.bounces) for each in (truth, shown_scene))
             reference = Request(truth, by, arguments.bounces, arguments.samples, arguments.references).reference()
             row, line = [reference.mean], f"{name:16}{label}"
             for method in arguments.methods:
                 shown, seconds = image(shown_scene, method)
-                errors[method].append(reference.error(shown))
+                if shown_scene is truth:
+                    errors[method].append(reference.error(shown))
                 line += f"{reference.error(shown):8.1%}{body_error(reference, shown):6.1%}{seconds:6.2f} s"
                 row.append(shown)
             sheet.append(np.concatenate(row, axis=0))

@@ -108,9 +108,7 @@ class GlossyPoints(LitPoints):
         fragments = Fragments(*(array.reshape((len(array), 1, -1)) for array in (seen.face_ids, seen.barycentrics)))
         return rows(interpolate(fragments, sides, values))
 
-    def _sample(
-        self, fragments: Fragments, values: wp.array, textures: Textures, footprints: Footprints
-    ) -> wp.array:
+    def _sample(self, fragments: Fragments, values: wp.array, textures: Textures, footprints: Footprints) -> wp.array:
         """Numbers of the view's samples: of textures and, on bodies without one, of vertices."""
         return as_numbers(sample_albedo(fragments, self.merged_scene.faces, as_colors(values), textures, footprints))
 
