@@ -96,5 +96,7 @@ def surface(body: ws.Body, kind: str = "gltf") -> dict[str, Any]:
     if kind == "gltf":
         register()
         return {"type": "gltf", "color": color_of(body), **textures}
+    if values["specular"].size > 1:
+        raise ValueError("Mitsuba: got specular values of a body, expected one, which is all that principled takes")
     textures["specular"] = 0.5 * float(values["specular"][0])  # 4% straight on
     return {"type": "principled", "base_color": color_of(body), **textures}
