@@ -3,7 +3,12 @@
 import functools
 from typing import Any
 
+import numpy as np
+
 import warpshadow as ws
+from warpshadow.scene.body import GLOSS_ARGUMENTS
+
+NAMES = ("color", *GLOSS_ARGUMENTS)
 
 
 @functools.cache
@@ -17,62 +22,81 @@ def register() -> None:
 
         def __init__(self, props: Any):
             mi.BSDF.__init__(self, props)
-            self.color = mi.Color3f(*(props[channel] for channel in "rgb"))
-            self.alpha = max(props["roughness"], 0.1) ** 2
-            self.metallic, self.specular = props["metallic"], props["specular"]
+            self.color, self.roughness, self.metallic, self.specular = (props[name] for name in NAMES)
             self.m_flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
             self.m_components = [self.m_flags]
 
-        def _mirrors(self) -> Any:
-            return mi.MicrofacetDistribution(mi.MicrofacetType.GGX, self.alpha, True)
+        def _width(self, si: Any, active: Any) -> Any:
+            return dr.maximum(self.roughness.eval_1(si, active), 0.1) ** 2
 
-        def _eval_pdf(self, wi: Any, wo: Any, active: Any) -> tuple[Any, Any]:
+        def _mirrors(self, si: Any, active: Any) -> Any:
+            return mi.MicrofacetDistribution(mi.MicrofacetType.GGX, self._width(si, active), True)
+
+        def _eval_pdf(self, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
             """The surface's reflection times the cosine, and the density of its samples."""
+            wi, color = si.wi, self.color.eval(si, active)
+            metallic, specular = self.metallic.eval_1(si, active), self.specular.eval_1(si, active)
             mu, cosine = mi.Frame3f.cos_theta(wi), mi.Frame3f.cos_theta(wo)
             active &= (mu > 0) & (cosine > 0)
             mirror = dr.normalize(wi + wo)
-            square = self.alpha**2
+            square = self._width(si, active) ** 2
             density = square / (dr.pi * ((mirror.z**2) * (square - 1) + 1) ** 2)
             slants = [dr.sqrt(x * x * (1 - square) + square) for x in (mu, cosine)]
             lobe = density * 0.5 / (cosine * slants[0] + mu * slants[1])
             grazing = dr.clip(1 - dr.dot(wi, mirror), 0, 1) ** 5
-            fresnel = self.specular * (0.04 + 0.96 * grazing)
-            metal = (self.color + (1 - self.color) * grazing) * lobe
-            rest = (1 - fresnel) * self.color / dr.pi + fresnel * lobe
-            value = (self.metallic * metal + (1 - self.metallic) * rest) * cosine
-            pdf = 0.5 * cosine / dr.pi + 0.5 * self._mirrors().pdf(wi, mirror) / (4 * dr.dot(wi, mirror))
+            fresnel = specular * (0.04 + 0.96 * grazing)
+            metal = (color + (1 - color) * grazing) * lobe
+            rest = (1 - fresnel) * color / dr.pi + fresnel * lobe
+            value = (metallic * metal + (1 - metallic) * rest) * cosine
+            pdf = 0.5 * cosine / dr.pi + 0.5 * self._mirrors(si, active).pdf(wi, mirror) / (4 * dr.dot(wi, mirror))
             return dr.select(active, value, 0), dr.select(active, pdf, 0)
 
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any) -> tuple[Any, Any]:
             """Draw a direction from the cosine, or from mirrors that are seen."""
-            mirror, _ = self._mirrors().sample(si.wi, sample2)
+            mirror, _ = self._mirrors(si, active).sample(si.wi, sample2)
             wo = dr.select(sample1 < 0.5, mi.warp.square_to_cosine_hemisphere(sample2), mi.reflect(si.wi, mirror))
-            value, pdf = self._eval_pdf(si.wi, wo, active)
+            value, pdf = self._eval_pdf(si, wo, active)
             result = dr.zeros(mi.BSDFSample3f)
             result.wo, result.pdf, result.eta = wo, pdf, 1.0
             result.sampled_type, result.sampled_component = mi.UInt32(+self.m_flags), mi.UInt32(0)
             return result, dr.select(pdf > 0, value / pdf, 0)
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
-            return self._eval_pdf(si.wi, wo, active)[0]
+            return self._eval_pdf(si, wo, active)[0]
 
         def pdf(self, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
-            return self._eval_pdf(si.wi, wo, active)[1]
+            return self._eval_pdf(si, wo, active)[1]
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
-            return self._eval_pdf(si.wi, wo, active)
+            return self._eval_pdf(si, wo, active)
 
     mi.register_bsdf("gltf", MetallicRoughness)
 
 
-def surface(body: ws.Body) -> dict[str, Any]:
-    """The surface of a body that shines, of one color and one roughness."""
-    register()
-    values = {"roughness": 1.0, "metallic": 0.0, "specular": 1.0}
-    for name in values:
-        given = getattr(body, name)
-        if given is not None:
-            if given.size > 1:
-                raise ValueError(f"Mitsuba: got {name} for each vertex, expected one number")
-            values[name] = float(given[0])
-    return {"type": "gltf", **dict(zip("rgb", body.albedo.tolist(), strict=True)), **values}
+def texture(name: str, values: np.ndarray, channels: int = 1) -> dict[str, Any]:
+    """Mitsuba's texture of a property of a body, one value or an image of linear values."""
+    import mitsuba as mi
+
+    if values.size != channels and values.ndim < 2 + (channels > 1):
+        raise ValueError(f"Mitsuba: got {name} for each vertex, expected one or a texture")
+    size = values.shape[:2] if values.size > channels else (1, 1)
+    return {"type": "bitmap", "bitmap": mi.Bitmap(np.array(values).reshape(*size, channels)), "raw": True}
+
+
+def color_of(body: ws.Body) -> dict[str, Any]:
+    """Mitsuba's texture of the reflectance of a body."""
+    return texture("albedo", body.albedo if body.texture is None else body.texture, 3)
+
+
+def surface(body: ws.Body, kind: str = "gltf") -> dict[str, Any]:
+    """The surface of a body that shines: the library's, or Mitsuba's "principled", which differs a little."""
+    values = dict.fromkeys(GLOSS_ARGUMENTS, np.ones(1, np.float32)) | {"metallic": np.zeros(1, np.float32)}
+    values |= {name: given for name in values if (given := getattr(body, name)) is not None}
+    textures = {name: texture(name, each) for name, each in values.items()}
+    if kind == "gltf":
+        register()
+        return {"type": "gltf", "color": color_of(body), **textures}
+    if values["specular"].size > 1:
+        raise ValueError("Mitsuba: got specular values of a body, expected one, which is all that principled takes")
+    textures["specular"] = 0.5 * float(values["specular"][0])  # 4% straight on
+    return {"type": "principled", "base_color": color_of(body), **textures}

@@ -4,6 +4,7 @@ A reference is rendered twice, by other rays. Their mean stands for the truth, a
 """
 
 import dataclasses
+import functools
 import hashlib
 import os
 from collections.abc import Callable
@@ -98,7 +99,7 @@ class Request:
 
     Args:
         scene: The scene; its visibility, supersampling and bounces do not count.
-        by: "rays", of the library, or "mitsuba".
+        by: "rays", of the library, or "mitsuba", or "principled": Mitsuba with its own surface of bodies that shine.
         bounces: How often light bounces.
         samples: Rays, or paths, of a pixel; half of them in each image.
         folder: Where references stay.
@@ -176,7 +177,7 @@ def shown_bodies(scene: ws.Scene) -> dict[str, np.ndarray]:
     return {"body": (counts.argmax(axis=0) - 1).astype(np.int16), "is_whole": counts.max(axis=0) == _ACROSS**2}
 
 
-def by_mitsuba(scene: ws.Scene, samples: int) -> np.ndarray:
+def by_mitsuba(scene: ws.Scene, samples: int, gloss: str = "gltf") -> np.ndarray:
     """Two images by Mitsuba's path integrator, [2, height, width, 4]."""
     import mitsuba as mi
 
@@ -185,7 +186,7 @@ def by_mitsuba(scene: ws.Scene, samples: int) -> np.ndarray:
     enlarged = max(1, _MAP_ROWS // len(scene.light.radiance))
     light = ws.EnvironmentMap(scene.light.radiance.repeat(enlarged, axis=0).repeat(enlarged, axis=1))
     integrator = {"type": "path", "max_depth": scene.bounces + 2, "rr_depth": 1000}
-    tracer = RayTracer(dataclasses.replace(scene, light=light), integrator)
+    tracer = RayTracer(dataclasses.replace(scene, light=light), integrator, gloss)
     passes = max(1, samples // _PASS)
     size = min(samples, _PASS)
     images = [
@@ -197,4 +198,8 @@ def by_mitsuba(scene: ws.Scene, samples: int) -> np.ndarray:
     return np.stack([np.dstack([image[..., :3], coverage]) for image in images]).astype(np.float32)
 
 
-_MAKERS: dict[str, Callable[[ws.Scene, int], np.ndarray]] = {"rays": by_rays, "mitsuba": by_mitsuba}
+_MAKERS: dict[str, Callable[[ws.Scene, int], np.ndarray]] = {
+    "rays": by_rays,
+    "mitsuba": by_mitsuba,
+    "principled": functools.partial(by_mitsuba, gloss="principled"),
+}

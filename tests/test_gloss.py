@@ -9,6 +9,7 @@ import twins
 
 import warpshadow as ws
 from warpshadow import inverse
+from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
 # Interpolation between texels is linear piece by piece, and steps of differences go over some. Measured 0.1 to 1.2%.
@@ -114,6 +115,14 @@ def test_stills_and_kept_renderers_show_the_same_gloss(metallic):
     assert np.linalg.norm(kept - still) < 0.06 * np.linalg.norm(still)
 
 
+def test_in_stills_samples_of_different_faces_of_a_body_that_shines_share_no_receiver():
+    """Their normals differ by more than a lobe is wide; those of the diffuse post share."""
+    merged_scene = MergedScene(scene_of(BALL, POST))
+    ball, post = np.split(merged_scene.smooth_pieces.numpy(), merged_scene.first_face[1:-1])
+    assert len(np.unique(ball)) == len(BALL.mesh.faces) and len(np.unique(post)) == 1
+    assert not np.isin(post, ball).any()
+
+
 @pytest.mark.parametrize("name", ["roughness", "metallic", "specular"])
 def test_gradients_to_gloss(name):
     renderer, image = TorchRenderer(scene_of(), progress=False), weights()
@@ -133,6 +142,97 @@ def test_a_metal_reflects_the_ground_where_light_bounces(render):
     scene = dataclasses.replace(scene_of(metal, ground), light=ws.EnvironmentMap.constant(1.0), camera=NEAR)
     direct, bounced = (render(dataclasses.replace(scene, bounces=count))[..., :3].mean() for count in (0, "all"))
     assert direct < 0.9 and 0.95 < bounced < 1.03
+
+
+TILES = dataclasses.replace(GROUND, roughness=0.4, metallic=0.6)
+"""A ground with uvs that shines."""
+
+
+def texels(height, width, low=0.3):
+    return torch.tensor(np.random.default_rng(0).uniform(low, 0.7, (height, width))).float()
+
+
+@pytest.mark.parametrize("name", ["roughness", "metallic", "specular"])
+def test_gradients_to_textures_of_gloss(name):
+    """Beside a ball of one number; texels are smaller and larger than pixels."""
+    renderer, image = TorchRenderer(scene_of(BALL, TILES, POST), progress=False), weights()
+    others = {"roughness": texels(64, 64), "metallic": texels(4, 3), "specular": texels(2, 3)}
+
+    def loss(value):
+        given = {key: {"ground": texture} for key, texture in (others | {name: value}).items()}
+        return (renderer(**given) * image).sum()
+
+    gradient, difference = slopes(loss, texels(2, 4, low=0.4), 3e-3)
+    assert np.linalg.norm(gradient - difference) < SMOOTH * np.linalg.norm(difference)
+
+
+def test_gradients_to_a_pose_go_through_footprints_in_textures_of_gloss():
+    camera = ws.Camera.look_at((0.3, 1.6, 2.6), (0.4, 0, 0.5), fov_y=14, size=(32, 32))
+    renderer = TorchRenderer(dataclasses.replace(scene_of(BALL, TILES, POST), camera=camera), progress=False)
+    given, image = {name: {"ground": texels(40, 40)} for name in ("roughness", "metallic")}, weights()
+    rotations, translations, scales = renderer.scene_poses()
+
+    def loss(value):
+        shifts = torch.cat([torch.zeros(1, 3), value, torch.zeros(1, 3)])
+        return (renderer(geometry=renderer.placed(rotations, translations + shifts, scales), **given) * image).sum()
+
+    gradient, difference = slopes(loss, torch.zeros(1, 3), 1e-3)
+    assert np.linalg.norm(gradient - difference) < SMOOTH * np.linalg.norm(difference)
+
+
+def test_an_even_texture_of_gloss_shows_what_a_number_does():
+    numbers = {"roughness": 0.4, "metallic": 0.6, "specular": 0.5}
+    textures = {name: np.full((2 + 3 * len(name), 5), value) for name, value in numbers.items()}
+    images = [
+        ws.Renderer(scene_of(BALL, dataclasses.replace(GROUND, **values), POST)).render()
+        for values in (numbers, textures)
+    ]
+    np.testing.assert_allclose(*images, atol=2e-6)
+
+
+def test_textures_of_gloss_that_a_call_gives_show_as_those_of_a_scene():
+    """Also in a batch, and where an image is as wide as its body has vertices."""
+    values = texels(7, GROUND.mesh.vertex_count)
+    scene = scene_of(BALL, dataclasses.replace(TILES, roughness=values.numpy()), POST)
+    expected = torch.tensor(ws.Renderer(scene).render())
+    renderer = TorchRenderer(scene_of(BALL, TILES, POST), progress=False)
+    batch = renderer(roughness={"ground": torch.stack([values, 0 * values + 0.9])})
+    torch.testing.assert_close(batch[0], expected, atol=2e-6, rtol=1e-5)
+    assert (batch[1] - expected).abs().max() > 0.01
+    part = values[:, :40].contiguous()
+    torch.testing.assert_close(renderer(roughness={"ground": part}), renderer(roughness={"ground": part[None]})[0])
+
+
+def test_a_texture_of_gloss_needs_uvs():
+    with pytest.raises(ValueError, match=r"roughness\['ball'\]: got shape"):
+        TorchRenderer(scene_of(), progress=False)(roughness={"ball": texels(3, 5)})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"body": "ball", "size": (2, 2)}, "whose mesh has no uvs"),
+        ({"body": "ground", "size": 3}, "size: got 3, expected height and width"),
+        ({"body": "ground", "per_vertex": True, "size": (2, 2)}, "per_vertex: got it beside size"),
+        ({"body": "ground", "smoothness": 1.0}, "smoothness: got it without size"),
+        ({"body": "ground", "per_vertex": True}, "whose metallic is a texture, expected size"),
+    ],
+)
+def test_textures_of_gloss_that_cannot_be_free_are_refused(arguments, message):
+    scene = scene_of(BALL, dataclasses.replace(TILES, metallic=np.zeros((2, 3))))
+    with pytest.raises(ValueError, match=message):
+        inverse.Problem(scene, inverse.Target(np.zeros((32, 32, 4))), [inverse.Metallic(**arguments)])
+
+
+@pytest.mark.slow
+def test_a_fit_recovers_a_texture_of_metal():
+    truth = torch.tensor([[0.0, 1.0], [1.0, 0.0]])
+    scene = scene_of(BALL, TILES, POST)
+    renderer = TorchRenderer(scene, progress=False)
+    target = inverse.Target(renderer(metallic={"ground": truth}).numpy())
+    problem = inverse.Problem(scene, target, [inverse.Metallic("ground", size=(2, 2))])
+    fitted = inverse.fit(problem, inverse.Stage(30), progress=False).scene.bodies[1]
+    np.testing.assert_allclose(fitted.metallic, truth, atol=0.1)  # measured 0.08, where the ball's shadow lies
 
 
 def test_gradients_to_light():

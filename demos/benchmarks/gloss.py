@@ -1,11 +1,14 @@
 """Images of bodies that shine against Mitsuba's, by roughness, of metal and plastic.
 
     python demos/benchmarks/gloss.py [--data FOLDER] [--size 96] [--bounces 0|1|…] [--picture gloss.png]
+    python demos/benchmarks/gloss.py --textured [--surface gltf|principled] [--data FOLDER] [--bounces 0|1|…]
     python demos/benchmarks/gloss.py --loops [--data FOLDER] [--size 96] [--bounces 0|1|…]
 
 FOLDER has meshes/ and envmaps/, as for demos/benchmarks/accuracy.py. Mitsuba renders the same surface
 (demos/mitsuba_gloss.py), so that nothing is due to another one. Errors are of the whole image, and of the body that
-shines alone, relative L2, noise of the reference taken off. With --loops it prints the CPU time of an iteration of
+shines alone, relative L2, noise of the reference taken off. With --textured bodies have textures of roughness and
+metallic; a second line has the means of these in the library's images, and --surface principled Mitsuba's own surface,
+which differs a little. With --loops it prints the CPU time of an iteration of
 a torch loop in which the body moves, image and gradient, of the diffuse body and of those that shine, without Mitsuba.
 """
 
@@ -58,6 +61,33 @@ def glossy(scene: ws.Scene, roughness: float, kind: str) -> ws.Scene:
     """The scene with its first body of a roughness and kind."""
     body = dataclasses.replace(scene.bodies[0], roughness=roughness, **KINDS[kind])
     return dataclasses.replace(scene, bodies=(body, *scene.bodies[1:]))
+
+
+def textured(scene: ws.Scene) -> tuple[ws.Scene, ws.Scene]:
+    """The scene with stripes of roughness and patches of metal on its first body; and with their means instead."""
+    body = scene.bodies[0]
+    mesh = body.mesh if body.mesh.uvs is not None else ws.unwrap(body.mesh)
+    v, u = (np.mgrid[:256, :256] + 0.5) / 256
+    roughness = 0.4 + 0.25 * np.sin(2 * np.pi * 6 * u)
+    metallic = np.clip(0.5 + 4 * np.sin(2 * np.pi * 5 * u) * np.sin(2 * np.pi * 5 * v), 0, 1)
+    result = []
+    for values in ((roughness, metallic), (roughness.mean(), metallic.mean())):
+        gloss = dict(zip(("roughness", "metallic"), values, strict=True))
+        shiny = dataclasses.replace(body, mesh=mesh, albedo=KINDS["metal"]["albedo"], **gloss)
+        result.append(dataclasses.replace(scene, bodies=(shiny, *scene.bodies[1:])))
+    return result[0], result[1]
+
+
+def cases(scene: ws.Scene, *, has_textures: bool) -> list[tuple[str, ws.Scene, ws.Scene]]:
+    """Names of rows, scenes of references, and scenes of images that are compared with them."""
+    if has_textures:
+        truth, means = textured(scene)
+        return [(f"{'textures':19}", truth, truth), (f"{'their means':19}", truth, means)]
+    shiny = {
+        f"{roughness:<10}{kind:9}": glossy(scene, roughness, kind)
+        for roughness, kind in itertools.product(ROUGHNESS, KINDS)
+    }
+    return [(label, each, each) for label, each in shiny.items()]
 
 
 def image(scene: ws.Scene, method: str) -> tuple[np.ndarray, float]:
@@ -123,6 +153,8 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
     parser.add_argument("--references", type=Path, default=Path("out/references"), help="where references stay")
     parser.add_argument("--picture", type=Path, help="contact sheet: reference, then each method")
+    parser.add_argument("--textured", action="store_true", help="bodies with textures of roughness and metallic")
+    parser.add_argument("--surface", choices=("gltf", "principled"), default="gltf", help="of Mitsuba")
     parser.add_argument("--loops", action="store_true", help="times of iterations of a torch loop, and no images")
     arguments = parser.parse_args()
     ws.quiet()
@@ -130,22 +162,21 @@ def main() -> None:
         print_loops(scenes(arguments.data, arguments.size, arguments.bodies), arguments.bounces)
         return
     errors: dict[str, list[float]] = {method: [] for method in arguments.methods}
-    sheet = []
+    sheet, by = [], "mitsuba" if arguments.surface == "gltf" else arguments.surface
     print(f"{'body':16}{'roughness':10}{'kind':9}" + "".join(f"{name:>8} body    time" for name in arguments.methods))
-    for (name, plain), roughness, kind in itertools.product(
-        scenes(arguments.data, arguments.size, arguments.bodies).items(), ROUGHNESS, KINDS
-    ):
-        scene = dataclasses.replace(glossy(plain, roughness, kind), bounces=arguments.bounces)
-        request = Request(scene, "mitsuba", arguments.bounces, arguments.samples, arguments.references)
-        reference = request.reference()
-        row, line = [reference.mean], f"{name:16}{roughness:<10}{kind:9}"
-        for method in arguments.methods:
-            shown, seconds = image(scene, method)
-            errors[method].append(reference.error(shown))
-            line += f"{reference.error(shown):8.1%}{body_error(reference, shown):6.1%}{seconds:6.2f} s"
-            row.append(shown)
-        sheet.append(np.concatenate(row, axis=0))
-        print(line + f"   noise {reference.noise():.1%}", flush=True)
+    for name, plain in scenes(arguments.data, arguments.size, arguments.bodies).items():
+        plain = dataclasses.replace(plain, bounces=arguments.bounces)
+        for label, truth, shown_scene in cases(plain, has_textures=arguments.textured):
+            reference = Request(truth, by, arguments.bounces, arguments.samples, arguments.references).reference()
+            row, line = [reference.mean], f"{name:16}{label}"
+            for method in arguments.methods:
+                shown, seconds = image(shown_scene, method)
+                if shown_scene is truth:
+                    errors[method].append(reference.error(shown))
+                line += f"{reference.error(shown):8.1%}{body_error(reference, shown):6.1%}{seconds:6.2f} s"
+                row.append(shown)
+            sheet.append(np.concatenate(row, axis=0))
+            print(line + f"   noise {reference.noise():.1%}", flush=True)
     for method, values in errors.items():
         print(f"{method}: {np.mean(values):.1%} on average, {np.max(values):.1%} at worst")
     if arguments.picture:

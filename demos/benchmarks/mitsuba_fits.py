@@ -28,11 +28,12 @@ import torch
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos import problems
-from demos.mitsuba_gloss import surface
+from demos.mitsuba_gloss import color_of, surface
 from demos.problems import Case
 from demos.scenes import image_error, shipped_mesh
 from warpshadow import inverse
 from warpshadow.inverse.target import stacked
+from warpshadow.scene.body import GLOSS_ARGUMENTS
 
 SAMPLES = 64  # a pixel, for the image and again for its gradient
 MIN_LLVM = (17,)  # before, x86 has no minimum and maximum that pass NaN on
@@ -165,15 +166,16 @@ class RayTracer:
     Args:
         scene: The scene; bodies have one color or a texture.
         integrator: Of Mitsuba.
+        gloss: Surface of bodies that shine, as for :func:`demos.mitsuba_gloss.surface`.
     """
 
-    def __init__(self, scene: ws.Scene, integrator: Mapping[str, Any]):
+    def __init__(self, scene: ws.Scene, integrator: Mapping[str, Any], gloss: str = "gltf"):
         import mitsuba as mi
 
         _check_compiler()
         mi.set_variant("llvm_ad_rgb")
         mi.set_log_level(mi.LogLevel.Error)  # bodies that leave the image have wrong gradients: none does
-        bodies = {f"body{number}": _mesh(body, number) for number, body in enumerate(scene.bodies)}
+        bodies = {f"body{number}": _mesh(body, number, gloss) for number, body in enumerate(scene.bodies)}
         self.scene = mi.load_dict(
             {
                 "type": "scene",
@@ -217,7 +219,7 @@ def _check_compiler() -> None:
         raise ValueError(f"Mitsuba: got LLVM {got}, expected {MIN_LLVM[0]} or newer, named by DRJIT_LIBLLVM_PATH")
 
 
-def _mesh(body: ws.Body, number: int) -> Any:
+def _mesh(body: ws.Body, number: int, gloss: str) -> Any:
     """A body in world space; one with a texture has vertices of its own for each face, as its uvs may."""
     import mitsuba as mi
 
@@ -225,9 +227,10 @@ def _mesh(body: ws.Body, number: int) -> Any:
     positions, faces = mesh.positions, mesh.faces
     normals = vertex_normals(torch.tensor(positions), mesh.surface.faces).numpy()
     properties = mi.Properties()
-    side = surface(body) if body.is_glossy else {"type": "diffuse", "reflectance": _reflectance(body)}
+    has_texture = any(np.ndim(getattr(body, name)) > 1 for name in GLOSS_ARGUMENTS) or body.texture is not None
+    side = surface(body, gloss) if body.is_glossy else {"type": "diffuse", "reflectance": _reflectance(body)}
     properties["bsdf"] = mi.load_dict({"type": "twosided", "side": side})
-    if body.texture is not None:
+    if has_texture:
         positions, normals = positions[faces.ravel()], normals[faces.ravel()]
         faces = np.arange(len(positions)).reshape(-1, 3)
     shape = mi.Mesh(
@@ -235,14 +238,14 @@ def _mesh(body: ws.Body, number: int) -> Any:
         len(positions),
         len(faces),
         has_vertex_normals=True,
-        has_vertex_texcoords=body.texture is not None,
+        has_vertex_texcoords=has_texture,
         props=properties,
     )
     parameters = mi.traverse(shape)
     parameters["faces"] = faces.ravel().astype(np.uint32)
     parameters["vertex_positions"] = positions.ravel()
     parameters["vertex_normals"] = normals.ravel()
-    if body.texture is not None:
+    if has_texture:
         uvs = mesh.uvs[mesh.uv_faces.ravel()]
         parameters["vertex_texcoords"] = np.stack([uvs[:, 0], 1 - uvs[:, 1]], axis=1).ravel()  # v runs down there
     parameters.update()
@@ -250,13 +253,9 @@ def _mesh(body: ws.Body, number: int) -> Any:
 
 
 def _reflectance(body: ws.Body) -> dict[str, Any]:
-    import mitsuba as mi
-
-    if body.texture is not None:
-        return {"type": "bitmap", "bitmap": mi.Bitmap(body.texture.copy()), "raw": True}
-    if body.albedo.ndim > 1:
-        raise ValueError("Mitsuba: got a body with a color for each vertex, expected one color or a texture")
-    return {"type": "rgb", "value": body.albedo.tolist()}
+    """A color, or a texture."""
+    is_color = body.texture is None and body.albedo.ndim == 1
+    return {"type": "rgb", "value": body.albedo.tolist()} if is_color else color_of(body)
 
 
 def _sensor(camera: ws.Camera) -> dict[str, Any]:

@@ -57,10 +57,31 @@ def test_parts_of_different_gloss_have_it_at_vertices(tmp_path):
     np.testing.assert_array_equal(body.metallic, is_shiny)
 
 
-def test_of_a_texture_the_means_count_and_a_line_says_so(tmp_path):
-    codes = np.zeros((4, 4, 3), np.uint8)
-    codes[..., 1], codes[:2, :, 2] = 102, 255
-    path = write(tmp_path / "a.glb", {"metallicRoughnessTexture": Image.fromarray(codes), "metallicFactor": 0.5})
-    with pytest.warns(UserWarning, match=r"the means count \(roughness 0.4, metallic 0.25\)"):
-        body = ws.Body(path)
-    assert body.roughness == pytest.approx(0.4) and body.metallic == pytest.approx(0.25)
+CODES = np.zeros((4, 6, 3), np.uint8)
+CODES[..., 0], CODES[:, 1:3, 1], CODES[:2, :, 2] = 77, 102, 255
+
+
+def test_roughness_and_metallic_are_the_green_and_the_blue_of_a_texture_as_they_are(tmp_path):
+    path = write(
+        tmp_path / "a.glb",
+        {"metallicRoughnessTexture": Image.fromarray(CODES), "metallicFactor": 0.5, "roughnessFactor": 0.25},
+    )
+    for source in (path, trimesh.load_scene(path, process=False)):
+        body = ws.Body(source)
+        np.testing.assert_allclose(body.roughness, CODES[..., 1] / 255 * 0.25, rtol=1e-6)
+        np.testing.assert_allclose(body.metallic, CODES[..., 2] / 255 * 0.5, rtol=1e-6)
+
+
+def test_a_texture_that_is_even_is_a_number(tmp_path):
+    codes = np.full((4, 4, 3), 51, np.uint8)
+    body = ws.Body(write(tmp_path / "a.glb", {"metallicRoughnessTexture": Image.fromarray(codes)}))
+    np.testing.assert_allclose([body.roughness, body.metallic], [[0.2], [0.2]], rtol=1e-6)
+
+
+def test_where_parts_have_other_textures_the_means_count_and_a_line_says_so(tmp_path):
+    textured = {"metallicRoughnessTexture": Image.fromarray(CODES), "metallicFactor": 0.5}
+    with pytest.warns(UserWarning, match="of textures of roughness and metallic the means count, since a body takes"):
+        body = ws.Body(write(tmp_path / "a.glb", textured, {"roughnessFactor": 0.3}))
+    is_first = body.mesh.positions[:, 0] < 1.5
+    np.testing.assert_allclose(body.roughness, np.where(is_first, 0.4 / 3, 0.3), rtol=1e-6)
+    np.testing.assert_allclose(body.metallic, np.where(is_first, 0.25, 0.0), rtol=1e-6)

@@ -7,6 +7,7 @@ import warp as wp
 
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.gloss import lobes, prefilter, reflection, transmittance
+from warpshadow.stages.textures import numbers
 
 # Numbers near 1 after some tens of operations in float32.
 FLOAT32 = 2e-5
@@ -153,3 +154,29 @@ def test_plastic_takes_from_its_diffuse_layer_the_light_that_its_coat_reflects(d
     colored, _ = reflection.mix_reflection(numbers, *light, *scalars)
     # three coefficients for all cosines
     assert colored.numpy().mean() == pytest.approx(0.96 * (1 - twins.even_grazing(cosine)), abs=1e-3)
+
+
+def test_samples_that_share_a_receiver_give_it_the_mean_of_their_numbers(device):
+    """One sample interpolates between vertices, and one sees nothing."""
+    rng = np.random.default_rng(4)
+    faces = wp.array([[0, 1, 1], [0, 1, 2], [2, 2, 2], [3, 3, 3]], dtype=wp.vec3i, device=device)
+    face_ids = wp.array(np.array([[2, 3, 2, -1, 1, 2]]), dtype=wp.int32, device=device)
+    values = rng.uniform(size=(3, 6)).astype(np.float32)
+    samples = wp.array(values, dtype=wp.float32, device=device, requires_grad=True)
+    with wp.Tape() as tape:
+        means = numbers.means_of_receivers(samples, face_ids, faces, 4)
+    expected = np.stack([0 * values[:, 0], 0 * values[:, 0], values[:, [0, 2, 5]].mean(axis=1), values[:, 1]], axis=1)
+    np.testing.assert_allclose(means.numpy(), expected, atol=FLOAT32)
+    adj_means = rng.normal(size=(3, 4)).astype(np.float32)
+    tape.backward(grads={means: wp.array(adj_means, dtype=wp.float32, device=device)})
+    expected = np.zeros((3, 6))
+    expected[:, [0, 2, 5]], expected[:, 1] = adj_means[:, 2:3] / 3, adj_means[:, 3]
+    np.testing.assert_allclose(samples.grad.numpy(), expected, atol=FLOAT32)
+
+
+def test_numbers_are_grays_and_back(device):
+    values = np.random.default_rng(5).uniform(size=(2, 3, 4)).astype(np.float32)
+    grays = numbers.as_colors(wp.array(values, dtype=wp.float32, device=device))
+    np.testing.assert_array_equal(grays.numpy(), values[..., None].repeat(3, axis=-1))
+    np.testing.assert_array_equal(numbers.as_numbers(grays).numpy(), values.reshape(2, 12))
+    assert numbers.as_colors(grays) is grays

@@ -53,21 +53,22 @@ def base_color_factor(material, factors: Factors) -> tuple[float, ...] | None:
 def gloss_of(material) -> Gloss | None:
     """The roughness and metallic of a material of trimesh; None where its file says neither.
 
-    Of a texture the means count. Without one metallic is the file's, or else 0: glTF's own default is 1, but
-    files that leave it out, such as trimesh's, rarely mean a metal.
+    Without a texture metallic is what the file says, or else 0: glTF's own default is 1, but files that leave it out,
+    such as those of trimesh, rarely mean a metal.
     """
     roughness, metallic = (getattr(material, name, None) for name in ("roughnessFactor", "metallicFactor"))
     image = getattr(material, "metallicRoughnessTexture", None)
-    if image is None:
-        is_silent = roughness is None and metallic is None
-        return None if is_silent else _gloss(1.0 if roughness is None else roughness, metallic or 0.0)
-    _, green, blue = np.asarray(image.convert("RGB")).reshape(-1, 3).mean(axis=0) / 255
-    gloss = _gloss(
-        *((1.0 if factor is None else factor) * mean for factor, mean in ((roughness, green), (metallic, blue)))
-    )
-    means = f"roughness {gloss.roughness:.2g}, metallic {gloss.metallic:.2g}"
-    return gloss._replace(remark=f"of its metallic-roughness texture the means count ({means})")
+    if image is None and roughness is None and metallic is None:
+        return None
+    default_metallic = 0.0 if image is None else 1.0
+    factors = 1.0 if roughness is None else roughness, default_metallic if metallic is None else metallic
+    roughness, metallic = np.clip(factors, 0.0, 1.0).tolist()
+    return Gloss(roughness, metallic, image)
 
 
-def _gloss(roughness: float, metallic: float) -> Gloss:
-    return Gloss(*np.clip((roughness, metallic), 0.0, 1.0).tolist())
+def gloss_texels(gloss: Gloss) -> tuple[np.ndarray, np.ndarray]:
+    """Roughness and metallic of a surface, float32 of shape [1] each, or [height, width] where they vary."""
+    codes = np.zeros((1, 1, 3)) + 255 if gloss.image is None else np.asarray(gloss.image.convert("RGB"))
+    textures = codes[..., 1] / 255 * gloss.roughness, codes[..., 2] / 255 * gloss.metallic
+    roughness, metallic = ((texels if np.ptp(texels) else texels[0, :1]).astype(np.float32) for texels in textures)
+    return roughness, metallic

@@ -323,11 +323,11 @@ class BaseColor(NamedTuple):
 
 
 class Gloss(NamedTuple):
-    """glTF's roughness and metallic of a surface; and a remark on them for messages."""
+    """glTF's roughness and metallic of a surface: factors, of green and blue of an image of Pillow's, if any."""
 
     roughness: float
     metallic: float
-    remark: str = ""
+    image: Any = None
 
 
 DIFFUSE = Gloss(1.0, 0.0)  # a surface that does not shine

@@ -61,7 +61,7 @@ class Material(NamedTuple):
 
     Attributes:
         texture: Linear RGB, shape [height, width, 3].
-        roughness, metallic: glTF's, one number [1], or one for each vertex [vertex].
+        roughness, metallic: glTF's, one number [1], one for each vertex [vertex], or a texture [height, width].
     """
 
     texture: np.ndarray | None = None
@@ -110,14 +110,14 @@ def load_material(path: MeshSource) -> tuple[Mesh, Material]:
     """Read a mesh as :func:`load_mesh` does, and the surface that the file describes.
 
     A texture is the base color of glTF (times its factor), the ``map_Kd`` of OBJ, or the image of PLY, where all faces
-    have the same one, and uvs. USD colors are not read. glTF's materials have roughness and metallic,
-    :func:`warpshadow.assets.gltf.gloss_of`.
+    have the same one, and uvs. USD colors are not read. glTF's materials have roughness and metallic: factors, times
+    the green and the blue of a texture, which are linear, likewise if all faces have the same; else its means count.
 
     Args:
         path: As there.
     Warns:
-        As there; of a texture that cannot be read, or that counts in place of colors; and of a texture of roughness,
-        of which the mean counts.
+        As there; of a texture that cannot be read, or that counts in place of colors; and of textures of roughness of
+        which the means count.
     """
     mesh, picture, gloss, remarks, of_colors, of_gloss = _read(path)
     texture = None

@@ -8,14 +8,15 @@ from typing import NamedTuple
 import numpy as np
 
 from warpshadow.assets.color import GRAY, srgb_to_linear
-from warpshadow.assets.mesh import DIFFUSE, BaseColor, Mesh, MeshError, MeshPart, checked_indices
+from warpshadow.assets.gltf import gloss_texels
+from warpshadow.assets.mesh import DIFFUSE, BaseColor, Gloss, Mesh, MeshError, MeshPart, checked_indices
 from warpshadow.assets.topology import CREASE, first_at_places, is_listed_first
 
 
 class JoinedMesh(NamedTuple):
     """A mesh, the picture that all its faces share, its gloss, and remarks on surprises: on shape, colors and gloss.
 
-    ``gloss`` has roughness and metallic of the body, [1] each, or of each vertex, [vertex].
+    ``gloss`` has roughness and metallic of the body, each [1], of each vertex, [vertex], or a texture [height, width].
     """
 
     mesh: Mesh
@@ -57,19 +58,26 @@ def join_parts(parts: list[MeshPart], name: str) -> JoinedMesh:
     if any(pictures) and not is_one:
         why = "which need uvs" if mesh.uvs is None else "since a body takes one that all its faces have"
         of_colors.append(f"textures dropped, {why}")
-    of_gloss = sorted({part.gloss.remark for part in parts if part.gloss is not None and part.gloss.remark})
-    return JoinedMesh(mesh, pictures[0] if is_one else None, _joined_gloss(parts), remarks, of_colors, of_gloss)
-
-
-def _joined_gloss(parts: list[MeshPart]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Roughness and metallic of all parts, of each vertex where they differ; None if all parts are diffuse."""
     glosses = [part.gloss or DIFFUSE for part in parts]
-    if all(gloss.roughness == 1 and gloss.metallic == 0 for gloss in glosses):
-        return None
-    counts = [1] if len({gloss[:2] for gloss in glosses}) == 1 else [len(part.positions) for part in parts]
-    of_parts = [(gloss.roughness, gloss.metallic) for gloss in glosses[: len(counts)]]
-    roughness, metallic = np.repeat(np.array(of_parts, np.float32), counts, axis=0).T
-    return roughness, metallic
+    of_gloss = []
+    if any(gloss.image for gloss in glosses) and (mesh.uvs is None or any(gloss != glosses[0] for gloss in glosses)):
+        why = "which need uvs" if mesh.uvs is None else "since a body takes one that all its faces have"
+        of_gloss.append(f"of textures of roughness and metallic the means count, {why}")
+    gloss = _joined_gloss(glosses, [len(part.positions) for part in parts], has_textures=not of_gloss)
+    return JoinedMesh(mesh, pictures[0] if is_one else None, gloss, remarks, of_colors, of_gloss)
+
+
+def _joined_gloss(
+    glosses: list[Gloss], vertex_counts: list[int], *, has_textures: bool
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Roughness and metallic of all parts, of each vertex where they differ; None if all parts are diffuse."""
+    if has_textures and all(gloss == glosses[0] for gloss in glosses):
+        roughness, metallic = gloss_texels(glosses[0])
+    else:
+        means = [[texels.mean() for texels in gloss_texels(gloss)] for gloss in glosses]
+        counts = [1] if all(mean == means[0] for mean in means) else vertex_counts
+        roughness, metallic = np.repeat(np.array(means[: len(counts)], np.float32), counts, axis=0).T
+    return (roughness, metallic) if roughness.min() < 1 or metallic.max() > 0 else None
 
 
 def _joined_colors(parts: list[MeshPart]) -> np.ndarray | None:

@@ -12,7 +12,7 @@ import operator
 import numpy as np
 import warp as wp
 
-from warpshadow.device.batch import concatenate, cut
+from warpshadow.device.batch import concatenate, cut, rows
 from warpshadow.device.constants import constant
 from warpshadow.pipeline.lighting import Light, LitPoints, change_basis, receiver_text
 from warpshadow.pipeline.node import Input, Node, detached
@@ -25,6 +25,10 @@ from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sample_receivers import Span
+from warpshadow.stages.textures.footprint import Footprints
+from warpshadow.stages.textures.numbers import as_colors, as_numbers, means_of_receivers
+from warpshadow.stages.textures.pyramid import Textures
+from warpshadow.stages.textures.sample import sample_albedo
 
 _CELL_ROWS = 64  # rows of the map of free light in cells: each pixel has the light of the nearest cell
 
@@ -34,12 +38,14 @@ class GlossyPoints(LitPoints):
 
     Args:
         cameras: Clip matrices of its cameras, or one for all.
+        fragments, clip_positions: Nodes of its samples, and of the vertices in clip space.
     """
 
-    def __init__(self, view: LitPoints, cameras: Input):
+    def __init__(self, view: LitPoints, cameras: Input, fragments: Node, clip_positions: Node):
         glossy = view.merged_scene.is_glossy
-        self._all_receivers, self._cameras = view.receivers_node, cameras
         receivers = Node("", functools.partial(_glossy_receivers, glossy), view.receivers_node)
+        self._all_receivers, self._cameras = view.receivers_node, cameras
+        self._fragments, self._clip_positions = fragments, clip_positions
         arguments = view.method, view.materials, view.vertices, view.spheres, receivers, view.call
         super().__init__(*arguments, normals=view.normals, blocker_kinds=view.blocker_kinds, is_static=view.is_static)
         self._numbers = Node("", functools.partial(_numbers, glossy), detached(view.receivers_node))
@@ -82,17 +88,28 @@ class GlossyPoints(LitPoints):
 
     def _values(self, materials: Materials, name: str) -> Node:
         """Roughness or the like at the receivers, float32 of shape [batch, receiver]."""
-        return Node("", self._interpolate, self.receivers_node, materials.of_vertices(name))
+        of_vertices, textures = materials.of_vertices(name), materials.textures_of[name]
+        if not textures.images:
+            return Node("", self._interpolate, self.receivers_node, of_vertices)
+        arguments = self._fragments, self._clip_positions, textures.pyramids, str
+        cached_name = f"footprints in textures of {textures.sizes}"
+        footprints = self.cached(cached_name, None, functools.partial(textures.footprints, *arguments))
+        samples = Node("", self._sample, self._fragments, of_vertices, textures.pyramids, footprints)
+        return self.chosen(Node("", _means, self._all_receivers, samples))
 
     def _interpolate(self, receivers: Receivers, values: wp.array) -> wp.array:
+        """Numbers of the receivers, from those of all vertices."""
         faces, seen = self.merged_scene.faces, receivers.seen
         assert seen is not None
         if not seen.face_ids.size:
             return wp.empty((1, 0), dtype=wp.float32, device=faces.device)
         sides = constant(np.tile(faces.numpy(), (2, 1)), wp.vec3i, faces.device)
-        rows = Fragments(*(array.reshape((len(array), 1, -1)) for array in (seen.face_ids, seen.barycentrics)))
-        result = interpolate(rows, sides, values)
-        return result.reshape((len(result), -1))
+        fragments = Fragments(*(array.reshape((len(array), 1, -1)) for array in (seen.face_ids, seen.barycentrics)))
+        return rows(interpolate(fragments, sides, values))
+
+    def _sample(self, fragments: Fragments, values: wp.array, textures: Textures, footprints: Footprints) -> wp.array:
+        """Numbers of the view's samples: of textures and, on bodies without one, of vertices."""
+        return as_numbers(sample_albedo(fragments, self.merged_scene.faces, as_colors(values), textures, footprints))
 
     def _prefiltered(self, light: Input) -> Node:
         """Node of the texels of light, vec3 of shape [batch, texel]."""
@@ -121,6 +138,12 @@ def _sample(
     return sample_lobes(receivers.points, receivers.normals, roughness, cameras, sample_count)
 
 
+def _means(receivers: Receivers, samples: wp.array) -> wp.array:
+    """Means of the samples that share a receiver, float32 of shape [batch, receiver]. Differentiable: samples."""
+    count = len(receivers.on_static) + receivers.points.shape[1]
+    return means_of_receivers(samples, rows(receivers.fragments.face_ids), receivers.faces, count)
+
+
 def _spans(is_glossy: np.ndarray, receivers: Receivers) -> list[Span]:
     return [span for span in receivers.spans if span.body >= 0 and is_glossy[span.body]]
 
@@ -136,7 +159,7 @@ def _numbers(is_glossy: np.ndarray, receivers: Receivers) -> wp.array:
 
 
 def _chosen(light: wp.array, receivers: Receivers, is_glossy: np.ndarray) -> wp.array:
-    """Light on the glossy ones among a view's receivers, vec3 of shape [batch, receiver]. Differentiable: light."""
+    """Light or else of the glossy ones among a view's receivers, shape [batch, receiver]. Differentiable: light."""
     return _of_spans(light, _spans(is_glossy, receivers), -len(receivers.on_static))
 
 

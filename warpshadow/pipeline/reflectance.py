@@ -17,6 +17,7 @@ from warpshadow.pipeline.node import Input, Node, detached
 from warpshadow.scene.body import GLOSS_ARGUMENTS
 from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.textures.footprint import find_footprints
+from warpshadow.stages.textures.numbers import as_colors
 from warpshadow.stages.textures.pyramid import mip_pyramids
 from warpshadow.stages.textures.sample import sample_albedo
 
@@ -37,24 +38,73 @@ class SampleReflectance(NamedTuple):
     footprints: Node
 
 
+class BodyTextures:
+    """The textures of bodies, of their reflectance or of their roughness or the like.
+
+    Args:
+        merged_scene: The bodies.
+        source: Input of an array for each body; those of shape [batch, height, width] are textures, vec3 or float32.
+    Attributes:
+        images: The textures that there are.
+        sizes: Heights and widths of the bodies' textures, None without one.
+        pyramids: Node of the mip levels of the textures, all of them; numbers are grays.
+    """
+
+    def __init__(self, merged_scene: MergedScene, source: Input):
+        self._merged_scene, self._source = merged_scene, source
+        of_bodies = [image if image is not None and image.ndim == 3 else None for image in source.value()]
+        self.images = [image for image in of_bodies if image is not None]
+        self.sizes = tuple([None if image is None else image.shape[1:] for image in of_bodies])
+        self.pyramids = self.pyramids_to(lambda: None)
+
+    @property
+    def texture_of_face(self) -> wp.array:
+        """Index of each face's texture, -1 for none, int32 of shape [face]."""
+        has_texture = np.array([size is not None for size in self.sizes])
+        texture_of_body = np.where(has_texture, np.cumsum(has_texture) - 1, -1)
+        return constant(texture_of_body[self._merged_scene.body_of_face], wp.int32, self._merged_scene.device)
+
+    def pyramids_to(self, coarsest: Callable[[], int | None]) -> Node:
+        """Node of the mip levels of the textures down to the coarsest that is wanted, None for all."""
+
+        def why_flat() -> str:
+            is_flat = len(self.images) == 1 and coarsest() == 0
+            return "no sample takes a coarser level of the only texture" if is_flat else ""
+
+        return Node(
+            "mip pyramids",
+            lambda _: mip_pyramids([*map(as_colors, self.images)], coarsest=coarsest()),
+            self._source,
+            items=lambda: f"{sum(image.size for image in self.images):,} texels",
+            idle=why_flat,
+        )
+
+    def footprints(self, fragments: Node, clip_positions: Node, pyramids: Node, items: Callable[[], str]) -> Node:
+        """Node of the samples' footprints in the textures."""
+        merged_scene = self._merged_scene
+        maps = merged_scene.uvs, merged_scene.uv_faces, self.texture_of_face
+        sizes = detached(pyramids, is_constant=True)  # of which it takes these alone
+        arguments = fragments, merged_scene.faces, clip_positions, *maps, sizes
+        return Node("footprints", find_footprints, *arguments, items=items)
+
+
 class Materials:
     """Reflectance of each body.
 
     Args:
         merged_scene: The bodies.
         inputs: Arrays of each body, by name: "albedo", vec3 of shape [batch, 1] or [batch, vertex]; "textures", vec3 of
-            shape [batch, height, width], None without one; and where a body shines, its GLOSS_ARGUMENTS, float32
-            of shape [batch, 1] or [batch, vertex].
+            shape [batch, height, width], None without one; and where a body shines, those of GLOSS_ARGUMENTS, float32
+            of shape [batch, 1], [batch, vertex] or, a texture, [batch, height, width].
     Attributes:
         albedo, textures, roughness: These inputs; None where no body shines.
-        images: The textures that there are.
-        sizes: Heights and widths of the bodies' textures, None without one.
         vertex_albedo: Node of the reflectance of all vertices.
-        pyramids: Node of the mip levels of the textures, all of them.
+        textures_of: By name, the textures among an input's arrays.
     """
 
     def __init__(self, merged_scene: MergedScene, inputs: dict[str, Input]):
         self.merged_scene, self._inputs, self._of_scene = merged_scene, inputs, inputs
+        self.textures_of: dict[str, BodyTextures] = {}
         self._wire(inputs)
 
     def _wire(self, changed: Collection[str]) -> None:
@@ -63,11 +113,8 @@ class Materials:
         self.roughness = self._inputs.get("roughness")
         if "albedo" in changed:
             self.vertex_albedo = self.of_vertices("albedo")
-        if "textures" in changed:
-            images = self.textures.value()
-            self.images = [image for image in images if image is not None]
-            self.sizes = tuple([None if image is None else image.shape[1:] for image in images])
-            self.pyramids = self.pyramids_to(lambda: None)
+        textures = {name: BodyTextures(self.merged_scene, self._inputs[name]) for name in changed if name != "albedo"}
+        self.textures_of = self.textures_of | textures
 
     @classmethod
     def of_scene(cls, merged_scene: MergedScene) -> "Materials":
@@ -125,7 +172,7 @@ class Materials:
         if name in GLOSS_ARGUMENTS and not body.is_glossy:
             expected = "one for bodies that have roughness in the scene"
             raise ValueError(f"{where}: got some for {body.called!r}, expected {expected}")
-        if name == "textures":
+        if name == "textures" or (name in GLOSS_ARGUMENTS and array.ndim == 3):
             check.shape(where, array.shape, ("batch", "height", "width"))
             if body.mesh.uvs is None:
                 raise ValueError(
@@ -149,39 +196,14 @@ class Materials:
             )
 
     def of_vertices(self, name: str) -> Node:
-        """Node of an input of all vertices, such as their roughness, of shape [batch, vertex]."""
+        """Node of an input of all vertices, such as their roughness, [batch, vertex]; 0 where a texture has it."""
         counts = np.diff(self.merged_scene.first_vertex).tolist()
-        return Node("", lambda arrays: concatenate(arrays, counts), self._inputs[name])
 
-    @property
-    def texture_of_face(self) -> wp.array:
-        """Index of each face's texture, -1 for none, int32 of shape [face]."""
-        has_texture = np.array([size is not None for size in self.sizes])
-        texture_of_body = np.where(has_texture, np.cumsum(has_texture) - 1, -1)
-        return constant(texture_of_body[self.merged_scene.body_of_face], wp.int32, self.merged_scene.device)
+        def of_vertices(arrays: list[wp.array]) -> wp.array:
+            zero = constant(np.zeros((1, 1)), wp.float32, self.merged_scene.device)
+            return concatenate([zero if array.ndim == 3 else array for array in arrays], counts)
 
-    def pyramids_to(self, coarsest: Callable[[], int | None]) -> Node:
-        """Node of the mip levels of the textures down to the coarsest that is wanted, None for all."""
-
-        def why_flat() -> str:
-            is_flat = len(self.images) == 1 and coarsest() == 0
-            return "no sample takes a coarser level of the only texture" if is_flat else ""
-
-        return Node(
-            "mip pyramids",
-            lambda _: mip_pyramids(self.images, coarsest=coarsest()),
-            self.textures,
-            items=lambda: f"{sum(image.size for image in self.images):,} texels",
-            idle=why_flat,
-        )
-
-    def footprints(self, fragments: Node, clip_positions: Node, pyramids: Node, items: Callable[[], str]) -> Node:
-        """Node of the samples' footprints in the textures."""
-        merged_scene = self.merged_scene
-        maps = merged_scene.uvs, merged_scene.uv_faces, self.texture_of_face
-        sizes = detached(pyramids, is_constant=True)  # of which it takes these alone
-        arguments = fragments, merged_scene.faces, clip_positions, *maps, sizes
-        return Node("footprints", find_footprints, *arguments, items=items)
+        return Node("", of_vertices, self._inputs[name])
 
     def reflectance(
         self, fragments: Node, pyramids: Node, footprints: Node, items: Callable[[], str]
@@ -208,7 +230,7 @@ def _arrays_of(replacements: Mapping[str, BodyArrays]) -> Iterator[tuple[str, in
 
 
 def _of_bodies(merged_scene: MergedScene, name: str) -> list[wp.array | None]:
-    """Roughness or the like of each body, float32 of shape [1, 1] or [1, vertex]."""
+    """Roughness or the like of each body, float32 of shape [1, 1], [1, vertex] or [1, height, width]."""
     values = (getattr(body, name) for body in merged_scene.scene.bodies)
     rows = [GLOSS_DEFAULTS[name] if value is None else value for value in values]
-    return [wp.array(np.atleast_2d(row), dtype=wp.float32, device=merged_scene.device) for row in rows]
+    return [wp.array(np.atleast_1d(row)[None], dtype=wp.float32, device=merged_scene.device) for row in rows]

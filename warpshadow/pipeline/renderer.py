@@ -315,7 +315,7 @@ class SceneRenderer:
             albedo: As for :meth:`reflect`.
             textures: As for :meth:`reflect`.
             gloss: "roughness", "metallic" and "specular" of bodies that have roughness in the scene, each float32 of
-                shape [batch, 1] or [batch, vertex] for bodies, as albedo is given.
+                shape [batch, 1], [batch, vertex] or, as a texture, [batch, height, width], as albedo is given.
             view: From :meth:`view`, by default the scene's own.
                 Batches of 1 serve every instance of the others.
         Returns:

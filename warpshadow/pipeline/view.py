@@ -206,13 +206,14 @@ class View(LitPoints):
         return self.cached("reflectance", None, wire) if materials is self.materials else wire()
 
     def _find_reflectance(self, materials: Materials) -> SampleReflectance:
-        if not materials.images:
+        textures = materials.textures_of["textures"]
+        if not textures.images:
             return materials.untextured_reflectance(self.fragments_node, self._samples)
-        pyramids = materials.pyramids
+        pyramids = textures.pyramids
         if materials.textures is not self.materials.textures:
-            pyramids = materials.pyramids_to(functools.partial(self.coarsest_level, materials.sizes))
+            pyramids = textures.pyramids_to(functools.partial(self.coarsest_level, textures.sizes))
         arguments = self.fragments_node, self.clip_positions, pyramids, self._samples
-        footprints = self.cached("footprints", materials.sizes, functools.partial(materials.footprints, *arguments))
+        footprints = self.cached("footprints", textures.sizes, functools.partial(textures.footprints, *arguments))
         return materials.reflectance(self.fragments_node, pyramids, footprints, self._samples)
 
     def coarsest_level(self, sizes: tuple) -> int | None:
@@ -225,7 +226,7 @@ class View(LitPoints):
 
     def seen_texels(self, number: int) -> np.ndarray:
         """Weight of each texel of a body's texture in the samples, float32 of shape [height, width]."""
-        has_texture = [size is not None for size in self.materials.sizes]
+        has_texture = [size is not None for size in self.materials.textures_of["textures"].sizes]
         if not has_texture[number]:
             raise ValueError(f"body: got {number}, a body without a texture, expected one that has one")
         reflectance = self.reflectance(self.materials)
@@ -236,7 +237,8 @@ class View(LitPoints):
         """Node of the samples where bodies shine: of light in the surface's color, and of light that has its own."""
         from warpshadow.pipeline.gloss import GlossyPoints
 
-        points = self.cached("gloss", None, lambda: GlossyPoints(self, self.cameras))
+        arguments = self.cameras, self.fragments_node, self.clip_positions
+        points = self.cached("gloss", None, lambda: GlossyPoints(self, *arguments))
         colored, white = points.mixed(self, shading, light, materials)
         parts = self._radiance(colored, reflectance), self._radiance(white, self._white_reflectance)
         return Node("radiance", _sum_moving if self._is_moving else sum_radiance, *parts, caches=False)

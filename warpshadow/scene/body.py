@@ -84,11 +84,12 @@ class Body:
             has it darken the photograph, or with bounces tint it, by the ratio of the light that it receives with the
             other bodies to the light without them. In the image of :func:`warpshadow.render` its shadow is coverage
             alone. ``draw``, torch's renderer, fits and the viewer show it as any other body.
-        roughness: glTF's, in [0, 1], one number or one for each vertex [vertex], or an .npy file of them: the surface
-            shines by a GGX lobe of width α = roughness². None, the default, is the mesh's file's roughness, if that is
-            glTF and neither ``albedo`` nor ``texture`` is given, and else a diffuse surface. Below 0.1 it is shown as
-            0.1. Such a body has receivers at pixels; all methods but "log-sh" show it. It reflects other bodies
-            where light bounces; with ``bounces=0`` they are black in it, so metals want bounces.
+        roughness: glTF's, in [0, 1], one number, one for each vertex [vertex], or a texture [height, width], which
+            needs uvs, or an .npy file of them: the surface shines by a GGX lobe of width α = roughness². None, the
+            default, is the roughness of the mesh's file, if that is glTF and neither ``albedo`` nor ``texture`` is given,
+            and else a diffuse surface. Below 0.1 it is shown as 0.1. Such a body has receivers at pixels; all methods but
+            "log-sh" show it. It reflects other bodies where light bounces; with ``bounces=0`` they are black in it, so
+            metals want bounces.
         metallic: Likewise, how much of it is metal, which reflects its albedo and has no diffuse light; by default 0.
         specular: Likewise, strength of the reflection of all but metal, of which 1, the default, is 4% straight on.
     """
@@ -251,8 +252,9 @@ class Body:
         return texture
 
     def _check_gloss(self) -> None:
-        """Convert roughness, metallic and specular to float32 [1] or [vertex]; all are None without roughness."""
-        expected = f"a number from 0 to 1, one for each vertex, [vertex], or an {VALUES_SUFFIX} file of them"
+        """Convert roughness and the like to float32: [1], [vertex] or [height, width]."""
+        count = self.mesh.vertex_count
+        expected = f"a number from 0 to 1, one for each of the {count} vertices, or a texture [height, width]"
         for name in GLOSS_ARGUMENTS:
             value = getattr(self, name)
             if value is None:
@@ -260,7 +262,13 @@ class Body:
             if self.roughness is None:
                 raise ValueError(f"{name}: got {check.described(value)} without roughness, expected roughness, too")
             numbers = np.atleast_1d(check.numbers(name, value, expected=expected))
-            check.shape(name, numbers.shape, (1 if numbers.shape == (1,) else self.mesh.vertex_count,), expected)
+            if numbers.ndim == 2 and numbers.size and self.mesh.uvs is None:
+                raise ValueError(
+                    f"{name}: got a texture, {numbers.shape}, but mesh {self.mesh.name!r} has no uvs; expected numbers "
+                    "of vertices, [vertex], or uvs, as warpshadow.unwrap makes them"
+                )
+            if not numbers.size or (numbers.ndim != 2 and numbers.shape not in ((1,), (count,))):
+                raise ValueError(f"{name}: got shape {numbers.shape}, expected {expected}")
             check.finite(name, numbers, minimum=0.0, maximum=1.0)
             numbers.setflags(write=False)
             object.__setattr__(self, name, numbers)
@@ -289,7 +297,11 @@ class Body:
         """
         mesh = self.mesh.creased(angle)
         values: dict[str, Any] = {name: getattr(self, name) for name in GLOSS_ARGUMENTS}
-        of_vertices = {name: array[mesh.origins] for name, array in values.items() if np.size(array) > 1}
+        of_vertices = {
+            name: array[mesh.origins]
+            for name, array in values.items()
+            if np.shape(array) == self.mesh.positions.shape[:1]
+        }
         colors = self.albedo if self.albedo.ndim == 1 else self.albedo[mesh.origins]
         return replace(self, mesh=mesh, albedo=colors, **of_vertices)
 

@@ -240,8 +240,8 @@ def write_scene(scene: Scene, folder: AnyPath, *, stems: Sequence[str] | None = 
     Args:
         folder: Made if it is not there. It gets scene.toml, light.exr for an environment map, and for body N (from 0)
             body_N.obj, body_N.npz where it has spheres of its own, body_N.npy where it has a color for each vertex,
-            body_N_roughness.npy and the like where it has one for each vertex, and where it has a texture body_N.exr,
-            with body_N.png and body_N.mtl for programs that draw OBJ files.
+            body_N_roughness.npy and the like where it has one for each vertex or a texture of it, and where it has a
+            texture of its color body_N.exr, with body_N.png and body_N.mtl for programs that draw OBJ files.
         stems: In place of body_0, body_1, …: names of the bodies' files, without suffixes.
     Returns:
         The files.
@@ -314,8 +314,9 @@ def _write_body(body: Body, stem: Path) -> tuple[Table, list[Path]]:
         values = getattr(body, name)
         if values is None:
             continue
-        place[name] = _numbers(values)[0]
-        if values.size > 1:
+        if values.shape == (1,):
+            place[name] = _numbers(values)[0]
+        else:
             path = stem.with_name(f"{stem.name}_{name}{VALUES_SUFFIX}")
             with files.atomic_write(path) as unfinished:
                 np.save(unfinished, values)

@@ -184,8 +184,9 @@ class TorchRenderer(torch.nn.Module):
             clip_matrices: Cameras, [4, 4] or [batch, 4, 4], from :meth:`clip_matrices` or
                 :func:`~warpshadow.torch.clip_matrices_from_opengl`; by default the renderer's own.
             roughness, metallic, specular: Of bodies that have roughness in the scene, in [0, 1], one number, [] or [1],
-                or one for each vertex, [vertex], or either in a batch, [batch, 1 or vertex]; a list or a mapping, as
-                albedo.
+                one for each vertex, [vertex], or either in a batch, [batch, 1 or vertex]; or as images, [height, width]
+                or [batch, height, width], of bodies with uvs: one that is as wide as there are vertices, or 1 wide,
+                needs the batch. A list or a mapping, as albedo.
         Returns:
             Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4], or [batch, height, width, 4]
             where an argument has a batch dimension or the renderer's own cameras have; the background is 0.
@@ -331,12 +332,16 @@ class TorchRenderer(torch.nn.Module):
         if name == "textures":
             return tensor, wp.vec3, ("height", "width"), check.channels_last(np.shape(tensor))
         dtype = wp.vec3 if name == "albedo" else wp.float32
-        item = item_shape(dtype)
+        item, mesh = item_shape(dtype), self.scene.bodies[number].mesh
+        if name in GLOSS_ARGUMENTS and mesh.uvs is not None:
+            is_texture = np.ndim(tensor) == 2 and np.shape(tensor)[1] not in (1, mesh.vertex_count)
+            if is_texture or np.ndim(tensor) == 3:
+                return tensor, dtype, ("height", "width"), ""
         if isinstance(tensor, torch.Tensor) and tuple(tensor.shape) == item:  # one for the whole body
             tensor = tensor[None]
         shape = np.shape(tensor)
         counts = shape[: len(shape) - len(item)][-1:]
-        return tensor, dtype, counts if counts in ((), (1,)) else (self.scene.bodies[number].mesh.vertex_count,), ""
+        return tensor, dtype, counts if counts in ((), (1,)) else (mesh.vertex_count,), ""
 
     def _item_name(self, argument: str, values: PerBody[torch.Tensor] | None, number: int) -> str:
         """Name of an item for a body in messages: by the name of the body where that was given."""

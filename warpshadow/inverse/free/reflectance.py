@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -27,6 +27,34 @@ _MAX_PLAIN_DEVIATION = 1e-3  # deviation below which texels are of one color
 def _one_color(body: Body) -> np.ndarray:
     """A body's albedo, or the mean over its vertices, shape [3]."""
     return np.atleast_2d(body.albedo).mean(axis=0)
+
+
+def checked_size(size: Any) -> tuple[int, int]:
+    """Height and width of a texture [texels]."""
+    is_pair = isinstance(size, (tuple, list, np.ndarray)) and len(size) == 2
+    if not is_pair or not all(check.is_integer(count) and count > 0 for count in size):
+        raise ValueError(f"size: got {size!r}, expected height and width in whole texels, (256, 256)")
+    return size[0], size[1]
+
+
+def check_uvs(number: int, scene: Scene) -> None:
+    """Raise ValueError for a body that cannot have a texture."""
+    if scene.bodies[number].mesh.uvs is None:
+        raise ValueError(f"body: got {number}, whose mesh has no uvs; expected uvs, as warpshadow.unwrap makes them")
+
+
+def resized(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    """An image [height, width, channel] of another height and width."""
+    mode = "area" if size[0] <= image.shape[0] else "bilinear"
+    return (
+        torch.nn.functional.interpolate(image.permute(2, 0, 1)[None], size, mode=mode)[0].permute(1, 2, 0).contiguous()
+    )
+
+
+def variation(texels: torch.Tensor) -> torch.Tensor:
+    """Mean square of differences between neighboring texels, [height, width, …]. Differentiable: texels."""
+    squares = [texels.diff(dim=dim).square().sum() for dim in (0, 1)]  # sums: a single row has no mean down
+    return (squares[0] + squares[1]) / texels.numel()
 
 
 @dataclass(frozen=True)
@@ -103,30 +131,21 @@ class Texture(FreeOfBody):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.size is not None:
-            is_pair = isinstance(self.size, (tuple, list, np.ndarray)) and len(self.size) == 2
-            if not is_pair or not all(check.is_integer(count) and count > 0 for count in self.size):
-                raise ValueError(f"size: got {self.size!r}, expected height and width in whole texels, (256, 256)")
-            object.__setattr__(self, "size", tuple(self.size))
+            object.__setattr__(self, "size", checked_size(self.size))
         for name in ("smoothness", "total_variation", "palette"):
             check.nonnegative(name, getattr(self, name))
         check.integer("colors", self.colors, minimum=2)
 
     def check_scene(self, scene: Scene) -> None:
         """Raise ValueError for a body that cannot have a texture."""
-        body = scene.bodies[self.number]
-        if body.mesh.uvs is None:
-            raise ValueError(
-                f"body: got {self.number}, whose mesh has no uvs; expected uvs, as warpshadow.unwrap makes them"
-            )
+        check_uvs(self.number, scene)
 
     def start(self, setting: Setting) -> Values:
         """The body's texture, or its color: the mean of its vertices' colors, where each has one."""
         body = setting.scene.bodies[self.number]
         image = _one_color(body)[None, None] if body.texture is None else body.texture
         size = self.size or ((256, 256) if body.texture is None else image.shape[:2])
-        planes = setting.tensor(image).permute(2, 0, 1)[None]
-        mode = "area" if size[0] <= image.shape[0] else "bilinear"
-        texels = torch.nn.functional.interpolate(planes, size, mode=mode)[0].permute(1, 2, 0).contiguous()
+        texels = resized(setting.tensor(image), size)
         return {"texels": texels} | ({"palette": self._first_colors(texels)} if self.palette else {})
 
     def _first_colors(self, texels: torch.Tensor) -> torch.Tensor:
@@ -146,11 +165,10 @@ class Texture(FreeOfBody):
         """Penalty of unlikely textures."""
         texels = values["texels"]
         energies = []
-        if self.smoothness or self.total_variation:
-            squares = [texels.diff(dim=dim).square() for dim in (0, 1)]
-        if self.smoothness:  # sums: a single row has no mean down
-            energies.append(self.smoothness * (squares[0].sum() + squares[1].sum()) / texels.numel())
+        if self.smoothness:
+            energies.append(self.smoothness * variation(texels))
         if self.total_variation:
+            squares = [texels.diff(dim=dim).square() for dim in (0, 1)]
             lengths = [(square.sum(dim=-1) + _SMOOTHING_LENGTH**2).sqrt() - _SMOOTHING_LENGTH for square in squares]
             energies.append(self.total_variation * (lengths[0].sum() + lengths[1].sum()) / texels[..., 0].numel())
         if self.palette:

@@ -38,6 +38,7 @@ def path_traced(
         samples: Rays of direct light for each receiver.
     """
     merged_scene = points.merged_scene
+    colors = materials.textures_of["textures"]
     maximum, paths = merged_scene.scene.bounces, -(-samples // _RAYS_OF_PATH)
     bounces = _MAX_PATH_BOUNCES if maximum == "all" else maximum
 
@@ -67,7 +68,7 @@ def path_traced(
                 of_instance(normals),
                 of_instance(vertex_albedo),
                 None if textures is None else replace(textures, texels=of_instance(texels).reshape((1, -1))),
-                materials.texture_of_face,
+                colors.texture_of_face,
                 merged_scene.uvs[0],
                 merged_scene.uv_faces,
             )
@@ -86,7 +87,7 @@ def path_traced(
         points.normals,
         light,
         materials.vertex_albedo,
-        materials.pyramids if materials.images else None,
+        colors.pyramids if colors.images else None,
         items=lambda: f"{receiver_text(points)} × {paths:,} paths of {maximum} bounces",
         has_adjoint=False,
     )

@@ -1,0 +1,103 @@
+"""Textures of numbers, such as roughness: they are filtered as grays, since textures are linear RGB."""
+
+import warp as wp
+
+from warpshadow.device.batch import instance_in, rows
+from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty, zeros
+
+
+@wp.kernel
+def _to_grays(
+    # in
+    numbers: wp.array2d(dtype=wp.float32),
+    # out
+    grays: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a number."""
+    batch, item = wp.tid()
+    number = numbers[batch, item]
+    grays[batch, item] = wp.vec3(number, number, number)
+
+
+@wp.kernel
+def _from_grays(
+    # in
+    grays: wp.array2d(dtype=wp.vec3),
+    # out
+    numbers: wp.array2d(dtype=wp.float32),
+):
+    """A thread owns a number."""
+    batch, item = wp.tid()
+    numbers[batch, item] = grays[batch, item][0]
+
+
+def as_colors(values: wp.array) -> wp.array:
+    """Numbers as grays, of the same shape; colors as they are.
+
+    Args:
+        values: Float32 or vec3, of shape [batch, item] or [batch, height, width].
+    Differentiable: values.
+    """
+    if values.dtype == wp.vec3:
+        return values
+    grays = empty((len(values), values[0].size), dtype=wp.vec3, device=values.device)
+    launch(_to_grays, grays.shape, inputs=[values if values.ndim == 2 else rows(values)], outputs=[grays])
+    return grays.reshape(values.shape)
+
+
+def as_numbers(grays: wp.array) -> wp.array:
+    """The numbers of grays, float32 of shape [batch, item]. Differentiable: grays, [batch, height, width]."""
+    colors = rows(grays)
+    numbers = empty(colors.shape, dtype=wp.float32, device=grays.device)
+    launch(_from_grays, numbers.shape, inputs=[colors], outputs=[numbers])
+    return numbers
+
+
+@wp.kernel
+def _add_to_receivers(
+    # in
+    numbers: wp.array2d(dtype=wp.float32),
+    face_ids: wp.array2d(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    # out
+    sums: wp.array2d(dtype=wp.vec2),
+):
+    """A thread owns a sample; one that has no receiver of its own, but interpolates between some, adds nothing."""
+    batch, sample = wp.tid()
+    face = face_ids[instance_in(batch, face_ids.shape[0]), sample]
+    if face >= 0:
+        corners = faces[face]
+        if corners[0] == corners[1]:
+            wp.atomic_add(sums, batch, corners[0], wp.vec2(numbers[batch, sample], 1.0))
+
+
+@wp.kernel
+def _divide(
+    # in
+    sums: wp.array2d(dtype=wp.vec2),
+    # out
+    means: wp.array2d(dtype=wp.float32),
+):
+    """A thread owns a receiver."""
+    batch, receiver = wp.tid()
+    means[batch, receiver] = sums[batch, receiver][0] / wp.max(sums[batch, receiver][1], 1.0)
+
+
+def means_of_receivers(numbers: wp.array, face_ids: wp.array, faces: wp.array, receiver_count: int) -> wp.array:
+    """Means of the numbers of the samples that share a receiver; those of different faces are in different texels.
+
+    Args:
+        numbers: Float32 of shape [batch, sample].
+        face_ids: Of :attr:`.receivers.Receivers.fragments`, int32 of shape [view, sample].
+        faces: Of receivers, vec3i of shape [face].
+        receiver_count: Number of receivers.
+    Returns:
+        Float32 of shape [batch, receiver], 0 for receivers that are vertices.
+    Differentiable: numbers.
+    """
+    sums = zeros((len(numbers), receiver_count), dtype=wp.vec2, device=numbers.device)
+    launch(_add_to_receivers, numbers.shape, inputs=[numbers, face_ids, faces], outputs=[sums])
+    means = empty(sums.shape, dtype=wp.float32, device=numbers.device)
+    launch(_divide, means.shape, inputs=[sums], outputs=[means])
+    return means
