@@ -86,10 +86,10 @@ class Body:
             alone. ``draw``, torch's renderer, fits and the viewer show it as any other body.
         roughness: glTF's, in [0, 1], one number, one for each vertex [vertex], or a texture [height, width], which
             needs uvs, or an .npy file of them: the surface shines by a GGX lobe of width α = roughness². None, the
-            default, is the roughness of the mesh's file, if that is glTF and neither ``albedo`` nor ``texture`` is given,
-            and else a diffuse surface. Below 0.1 it is shown as 0.1. Such a body has receivers at pixels; all methods but
-            "log-sh" show it. It reflects other bodies where light bounces; with ``bounces=0`` they are black in it, so
-            metals want bounces.
+            default, is the roughness of the mesh's file, if that is glTF and neither ``albedo`` nor ``texture`` is
+            given, and else a diffuse surface. Below 0.1 it is shown as 0.1. Such a body has receivers at pixels; all
+            methods but "log-sh" show it. It reflects other bodies where light bounces; with ``bounces=0`` they are
+            black in it, so metals want bounces.
         metallic: Likewise, how much of it is metal, which reflects its albedo and has no diffuse light; by default 0.
         specular: Likewise, strength of the reflection of all but metal, of which 1, the default, is 4% straight on.
     """
