@@ -228,8 +228,8 @@ def _trace_lobes(trees: list[FaceTree], receivers: Receivers, directions: wp.arr
     points, normals, count = _without_gradient(receivers.points), receivers.normals, len(directions)
     traced = wp.empty(directions.shape, dtype=wp.float32, device=points.device)
     for instance in range(count if points.size else 0):
-        located = min(instance, len(points) - 1)
-        arguments = points[located], normals[located], directions[instance]
+        point_batch = min(instance, len(points) - 1)
+        arguments = points[point_batch], normals[point_batch], directions[instance]
         wp.copy(traced[instance], trace_lobes(trees[min(instance, len(trees) - 1)], *arguments))
     return traced
 

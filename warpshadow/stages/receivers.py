@@ -95,22 +95,22 @@ def _gather(
 ):
     """A thread owns a receiver: a vertex, or a fragment, −1 for nothing."""
     batch, receiver = wp.tid()
-    instance = instance_in(batch, positions.shape[0])
+    position_batch = instance_in(batch, positions.shape[0])
     fragment = receiver - vertices.shape[0]
     if fragment < 0:
         vertex, is_back = split_side(vertices[receiver], positions.shape[1])
-        points[batch, receiver] = positions[instance, vertex]
-        point_normals[batch, receiver] = wp.where(is_back, -1.0, 1.0) * normals[instance, vertex]
+        points[batch, receiver] = positions[position_batch, vertex]
+        point_normals[batch, receiver] = wp.where(is_back, -1.0, 1.0) * normals[position_batch, vertex]
     else:
-        view = instance_in(batch, seen_sides.shape[0])
-        weights = seen_barycentrics[view, fragment]
-        face, is_back = split_side(wp.max(seen_sides[view, fragment], 0), faces.shape[0])
-        point = at_point(positions[instance], faces[face], weights)
+        fragment_batch = instance_in(batch, seen_sides.shape[0])
+        weights = seen_barycentrics[fragment_batch, fragment]
+        face, is_back = split_side(wp.max(seen_sides[fragment_batch, fragment], 0), faces.shape[0])
+        point = at_point(positions[position_batch], faces[face], weights)
         if rises:
-            front, back = _rise(positions[instance], normals[instance], faces[face], weights)
+            front, back = _rise(positions[position_batch], normals[position_batch], faces[face], weights)
             point += wp.where(is_back, back, front)
         points[batch, receiver] = point
-        normal = wp.normalize(at_point(normals[instance], faces[face], weights))
+        normal = wp.normalize(at_point(normals[position_batch], faces[face], weights))
         point_normals[batch, receiver] = wp.where(is_back, -1.0, 1.0) * normal
 
 

@@ -38,8 +38,8 @@ def _cover(
     own = radiosity[instance_in(batch, radiosity.shape[0]), patch]
     result = own
     if distances[patch] > 0.0:
-        placed = instance_in(batch, centers.shape[0])
-        distance = wp.length(centers[placed, patch] - centers_before[placed, patch])
+        center_batch = instance_in(batch, centers.shape[0])
+        distance = wp.length(centers[center_batch, patch] - centers_before[center_batch, patch])
         part = wp.smoothstep(-1.0, 1.0, 3.0 - 2.0 * distance / distances[patch])
         result = own + part * (radiosity_before[instance_in(batch, radiosity.shape[0]), patch] - own)
     sent[batch, patch] = result

@@ -117,8 +117,8 @@ def _light_receivers_adjoint(
         first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
     )
     store, edges, adj_store = scratch[scratch_row], viewed_edges[scratch_row], adj_scratch[scratch_row]
-    seen_texels = instance_in(batch, texels.shape[0])
-    sent = texels[seen_texels]
+    texel_batch = instance_in(batch, texels.shape[0])
+    sent = texels[texel_batch]
     normal = normals[batch, receiver]
     cells = SIDE_ROWS * scene.grids.shape[0]
     for k in range(cells):
@@ -151,7 +151,7 @@ def _light_receivers_adjoint(
             if adj_transmittance:
                 adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + cosine * total
             if passing > 0.0:
-                hit_sides_adjoint(scene, cell, sent, side_count, store, edges, adj_store, seen_texels, adj_texels)
+                hit_sides_adjoint(scene, cell, sent, side_count, store, edges, adj_store, texel_batch, adj_texels)
     if adj_normals:
         adj_normals[batch, receiver] = adj_normals[batch, receiver] + adj_normal
     place_receiver_adjoint(

@@ -144,8 +144,8 @@ def _make_begin(lanes: int) -> wp.Function:
                         vertex = block * lanes + lane
                         maximum = float(1.0)
                         if inputs.unblocked:
-                            serving = instance_in(batch, inputs.unblocked.shape[0])
-                            maximum = inputs.unblocked[serving, vertex, at * BUNDLE + i]
+                            unblocked_batch = instance_in(batch, inputs.unblocked.shape[0])
+                            maximum = inputs.unblocked[unblocked_batch, vertex, at * BUNDLE + i]
                         blocked[lane] = maximum - inputs.transmittance[batch, vertex, at * BUNDLE + i]
                     task.blocked[bundle * BUNDLE + i] = blocked
                     if is_any_above(wp.max(blocked, -blocked), 0.0):
@@ -391,9 +391,9 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                                 adj_transmittance[batch, vertex, direction] - adj_blocked[lane]
                             )
                         if adj_unblocked:
-                            serving = instance_in(batch, adj_unblocked.shape[0])
-                            adj_unblocked[serving, vertex, direction] = (
-                                adj_unblocked[serving, vertex, direction] + adj_blocked[lane]
+                            unblocked_batch = instance_in(batch, adj_unblocked.shape[0])
+                            adj_unblocked[unblocked_batch, vertex, direction] = (
+                                adj_unblocked[unblocked_batch, vertex, direction] + adj_blocked[lane]
                             )
                     task.blocked[place] = wp.cw_mul(wp.cw_mul(facing, task.blocked[place]), inverse)
                     task.adj_cells[place] = adj_cell

@@ -171,21 +171,21 @@ def _make_gather(lanes: int) -> wp.Kernel:
         shares = scratch[scratch_place(worker, item), 0]
         columns = scratch[scratch_place(worker, item), 1]
         batch, block, normal, probes = begin(inputs, item, own.shape[1], shares)
-        turn = instance_in(batch, inputs.counts.shape[0])
+        weight_batch = instance_in(batch, inputs.counts.shape[0])
         for q in range(inputs.directions.shape[0]):
             passing = Lane(0.0)
             cosine = dot_direction(inputs.directions[q], normal)
             if is_any_above(cosine, 0.0):
-                indices = inputs.indices[turn, q]
-                weights = inputs.weights[turn, q]
+                indices = inputs.indices[weight_batch, q]
+                weights = inputs.weights[weight_batch, q]
                 of_rays = inputs.looks_at_rays[q]
                 if wp.static(lanes == 1) or of_rays == 1:
-                    for k in range(inputs.counts[turn, q]):
+                    for k in range(inputs.counts[weight_batch, q]):
                         for corner in range(probes.corner_count):
                             share = look(probes.rows[corner], of_rays, indices[k], inputs)
                             passing += weights[k] * wp.cw_mul(probes.weights[corner], share)
                 else:
-                    for k in range(inputs.counts[turn, q]):
+                    for k in range(inputs.counts[weight_batch, q]):
                         passing += weights[k] * shares[indices[k]]
             for lane in range(lanes):
                 passing[lane] = wp.where(cosine[lane] > 0.0, passing[lane], 1.0)
@@ -227,7 +227,7 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
         shares = scratch[scratch_place(worker, item), 0]
         adj_shares = scratch[scratch_place(worker, item), 1]
         batch, block, normal, probes = begin(inputs, item, adj_own.shape[1], shares)
-        turn = instance_in(batch, inputs.counts.shape[0])
+        weight_batch = instance_in(batch, inputs.counts.shape[0])
         if wp.static(lanes > 1):
             for cell in range(shares.shape[0]):
                 adj_shares[cell] = Lane(0.0)
@@ -239,11 +239,11 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
                 adj = Lane()
                 for lane in range(receiver_count):
                     adj[lane] = wp.where(cosine[lane] > 0.0, adj_own[batch, block * lanes + lane, q], 0.0)
-                indices = inputs.indices[turn, q]
-                weights = inputs.weights[turn, q]
+                indices = inputs.indices[weight_batch, q]
+                weights = inputs.weights[weight_batch, q]
                 of_rays = inputs.looks_at_rays[q]
                 if wp.static(lanes == 1) or of_rays == 1:
-                    for k in range(inputs.counts[turn, q]):
+                    for k in range(inputs.counts[weight_batch, q]):
                         adj_weight = float(0.0)
                         for corner in range(3):
                             if corner < probes.corner_count:
@@ -253,15 +253,17 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
                         if adj_all_weights:
                             if wp.static(lanes == 1):
                                 adj_weight = sum_over_warp(
-                                    adj_weight, (turn * inputs.directions.shape[0] + q) * adj_all_weights.shape[2] + k
+                                    adj_weight,
+                                    (weight_batch * inputs.directions.shape[0] + q) * adj_all_weights.shape[2] + k,
                                 )
                             if adj_weight != 0.0:
-                                wp.atomic_add(adj_all_weights, turn, q, k, adj_weight)
+                                wp.atomic_add(adj_all_weights, weight_batch, q, k, adj_weight)
                 else:
-                    for k in range(inputs.counts[turn, q]):
+                    for k in range(inputs.counts[weight_batch, q]):
                         adj_shares[indices[k]] = adj_shares[indices[k]] + weights[k] * adj
                         if adj_all_weights:
-                            wp.atomic_add(adj_all_weights, turn, q, k, total(wp.cw_mul(adj, shares[indices[k]])))
+                            adj_weight = total(wp.cw_mul(adj, shares[indices[k]]))
+                            wp.atomic_add(adj_all_weights, weight_batch, q, k, adj_weight)
         if adj_place_weights:
             for corner in range(3):
                 adj_corner = adj_place[corner]
