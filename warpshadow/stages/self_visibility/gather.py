@@ -262,8 +262,8 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
                     for k in range(inputs.counts[weight_batch, q]):
                         adj_shares[indices[k]] = adj_shares[indices[k]] + weights[k] * adj
                         if adj_all_weights:
-                            adj_weight = total(wp.cw_mul(adj, shares[indices[k]]))
-                            wp.atomic_add(adj_all_weights, weight_batch, q, k, adj_weight)
+                            adj_weight_sum = total(wp.cw_mul(adj, shares[indices[k]]))
+                            wp.atomic_add(adj_all_weights, weight_batch, q, k, adj_weight_sum)
         if adj_place_weights:
             for corner in range(3):
                 adj_corner = adj_place[corner]
