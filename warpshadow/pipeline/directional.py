@@ -389,16 +389,18 @@ class Directional(SphereMethod):
 
         return points.cached("cells", None if is_free else light, in_cells), projected_light
 
-    def cached_rows(self, static: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
+    def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """The light S_q that static bodies let through, [row, 3, direction]; but for the scene's, of 1: [row, 1, …]."""
         is_scenes = light is self.light
-        return static.rows("lit cells" if is_scenes else "cells", functools.partial(self._trace, is_scenes))
+        return static_bodies.rows("lit cells" if is_scenes else "cells", functools.partial(self._trace, is_scenes))
 
-    def _trace(self, is_scenes: bool, static: StaticBodies, vertices: np.ndarray, normals: wp.array) -> wp.array:
-        points, normals = static.gathered(vertices, normals)
-        numbers = wp.array(split_sides(vertices, len(static.has_vertex))[0], dtype=wp.int32, device=points.device)
+    def _trace(self, is_scenes: bool, static_bodies: StaticBodies, vertices: np.ndarray, normals: wp.array) -> wp.array:
+        points, normals = static_bodies.gathered(vertices, normals)
+        numbers = wp.array(
+            split_sides(vertices, len(static_bodies.has_vertex))[0], dtype=wp.int32, device=points.device
+        )
         samples = self._lit_samples if is_scenes else self._even_samples
-        return trace_cells(static.mesh, points[0], normals[0], numbers, samples, progress=self.progress)
+        return trace_cells(static_bodies.mesh, points[0], normals[0], numbers, samples, progress=self.progress)
 
     @functools.cached_property
     def _lit_samples(self) -> CellSamples:

@@ -63,7 +63,7 @@ class LitPoints:
         spheres: Centers and radii of the spheres.
         receivers: The points.
         call: Holds values of the points that may not be cached.
-        static: The static bodies among moving ones; None where any may move.
+        static_bodies: Those among moving ones; None where any may move.
         normals: Node of the normals of all vertices, vec3 of shape [batch, vertex]; by default its own.
         blocker_kinds: Which bodies block light by something else than their spheres.
         is_static: Whether bodies and points are where the scene and its camera have them, for good.
@@ -79,7 +79,7 @@ class LitPoints:
         spheres: Input,
         receivers: Node,
         call: Call,
-        static: StaticBodies | None = None,
+        static_bodies: StaticBodies | None = None,
         normals: Node | None = None,
         blocker_kinds: BlockerKinds = ONLY_SPHERES,
         is_static: bool = False,
@@ -88,7 +88,7 @@ class LitPoints:
         self.blocker_kinds, self.is_static, self.blocker_of_point = blocker_kinds, is_static, blocker_of_point
         self.method, self.materials, self.merged_scene = method, materials, method.merged_scene
         self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
-        self.call, self.static = call, static
+        self.call, self.static_bodies = call, static_bodies
         self.normals = Node("", vertex_normals, vertices, method.merged_scene.faces) if normals is None else normals
         self._last_light: Input | None = None  # that was known, but for the scene's
         self._cached: dict[str, tuple[Hashable, Any]] = {}
@@ -102,7 +102,7 @@ class LitPoints:
     def with_receivers(self: Points, receivers: Node) -> Points:
         """Other receivers, of which nothing is cached, among the same blockers, any of which may move."""
         points = copy.copy(self)
-        points.receivers_node, points.static, points.is_static = receivers, None, False
+        points.receivers_node, points.static_bodies, points.is_static = receivers, None, False
         points._cached, points._last_light = {}, None
         return points
 

@@ -67,14 +67,14 @@ class SceneViews:
     def keep(self, view: View) -> None:
         """Cache a view whose receivers are found, to be used again."""
         self._last_cameras = view.cameras
-        if view.static is not None:
-            self._static[view.static.moving] = view.static
+        if view.static_bodies is not None:
+            self._static[view.static_bodies.moving] = view.static_bodies
         if view.receivers_node.is_cached:
             self.last = (view, self.last[1]) if self.is_of_scene(view) else (self.last[0], view)
 
     def view(self, geometry: Geometry | None = None, clip_matrices: wp.array | None = None) -> View:
         """Build a lazy view, or reuse a cached one whose inputs match."""
-        vertices, spheres, cameras, static = self.vertices, self._spheres, self.clip_matrices, None
+        vertices, spheres, cameras, static_bodies = self.vertices, self._spheres, self.clip_matrices, None
         last, poses, matrices = self.last[1], [None], self._cameras
         if geometry is not None:
             rest = self._merged_scene.rest.arrays()
@@ -90,10 +90,10 @@ class SceneViews:
         # rays look at all moving bodies, and light bounces from moving bodies to static ones
         caches_rows = not (self._method.lights_samples or self._merged_scene.scene.bounces)
         if geometry is not None and geometry.moving is not None and caches_rows:
-            static = self._static.get(geometry.moving)
-            if static is None or not static.matches(geometry):
-                static = StaticBodies(self._merged_scene, geometry)
-        arguments = vertices, spheres, cameras, static, self._blocker_kinds(geometry, last)
+            static_bodies = self._static.get(geometry.moving)
+            if static_bodies is None or not static_bodies.matches(geometry):
+                static_bodies = StaticBodies(self._merged_scene, geometry)
+        arguments = vertices, spheres, cameras, static_bodies, self._blocker_kinds(geometry, last)
         for view in self.last:
             if view is not None and view.dependencies == arguments:
                 return view

@@ -352,21 +352,21 @@ class SphereBounces:
             PortionedShading, self._method, at_sources, projected_light, light, joined, where=_OF_SOURCES
         )
         lit = points.cached("direct at sources", (light, sources), make)
-        return self._still.add_bounces(direct, lit, points, materials)
+        return self._static_bounces.add_bounces(direct, lit, points, materials)
 
     def cached_bounced_free_shading(self, direct: Node, points: LitPoints, light: Input, materials: Materials) -> Node:
         """The same in free light, given a node of the direct shading of the receivers."""
         sources, at_sources = self._cached_sources(points, materials)
         transfers = points.cached("transfer", sources, lambda: self._method.transfers(at_sources, _OF_SOURCES))
-        return self._still.add_free_bounces(direct, transfers, light, points, materials)
+        return self._static_bounces.add_free_bounces(direct, transfers, light, points, materials)
 
     def _cached_sources(self, points: LitPoints, materials: Materials) -> tuple[Node, LitPoints]:
         """Node of the static sources, and the same sources as lit points."""
-        sources = self._still.sources(points, materials)
+        sources = self._static_bounces.sources(points, materials)
         return sources, points.cached("lit sources", sources, lambda: self._at(sources, points, materials))
 
     @functools.cached_property
-    def _still(self) -> StaticBounces:
+    def _static_bounces(self) -> StaticBounces:
         return StaticBounces(self._patches, self._count, progress=self._method.progress)
 
     def _at(
