@@ -166,10 +166,10 @@ class Radiosity(Node):
         item_text = f"{len(senders.areas):,} patches"
         idle = ALL_FLAT if all(senders.merged_scene.is_flat[body] for body in senders.bodies) else ""
         self._reflect = Node("radiosity", patch_radiosity, albedo, lit, items=item_text, caches=False)
-        self._own = Node(
+        self._reflect_self = Node(
             "self light of patches", patch_radiosity, albedo, lit, items=item_text, idle=idle, caches=False
         )
-        extra_inputs = self._reflect, self._own, *gathering.stages
+        extra_inputs = self._reflect, self._reflect_self, *gathering.stages
         super().__init__("", None, lit, albedo, projected_patches, frames, openness, extra_inputs=extra_inputs)
 
     def compute(self, call: Call) -> OutgoingRadiance:
@@ -178,7 +178,7 @@ class Radiosity(Node):
         senders, count = self._proxies.senders, self._count
         between = (
             None
-            if self._own.idle
+            if self._reflect_self.idle
             else self._self_form_factors.between_patches(senders, [portion.group for portion in lit])
         )
 
@@ -197,7 +197,7 @@ class Radiosity(Node):
         def add_radiosity_by_self(by_others: wp.array, radiosity: wp.array | None) -> wp.array:
             if between is None or radiosity is None:
                 return by_others
-            return total_light([by_others, self._own.run(call, albedo, radiosity, between)])
+            return total_light([by_others, self._reflect_self.run(call, albedo, radiosity, between)])
 
         self_bounces = 0 if between is None else SELF_BOUNCES
         return sent(

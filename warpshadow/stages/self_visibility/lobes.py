@@ -163,9 +163,9 @@ def _turn_lobes(
         start = band * band
         end = start + 2 * band + 1
         for i in range(start, end):
-            own = _self_coefficient(lobes, row, share, i)
+            coefficient = _self_coefficient(lobes, row, share, i)
             for k in range(start, end):
-                turned[batch, receiver, k] = turned[batch, receiver, k] + turns[turn_batch, k, i] * own
+                turned[batch, receiver, k] = turned[batch, receiver, k] + turns[turn_batch, k, i] * coefficient
 
 
 @wp.kernel(enable_backward=False)
@@ -204,10 +204,10 @@ def _turn_lobes_adjoint(
             start = band * band
             end = start + 2 * band + 1
             for i in range(start, end):
-                adj_own = float(0.0)
+                adj_coefficient = float(0.0)
                 for k in range(start, end):
-                    adj_own += turns[turn_batch, k, i] * adj_turned[batch, receiver, k]
-                adj_share += adj_own * wp.vec3(lobes[row[0], i], lobes[row[1], i], lobes[row[2], i])
+                    adj_coefficient += turns[turn_batch, k, i] * adj_turned[batch, receiver, k]
+                adj_share += adj_coefficient * wp.vec3(lobes[row[0], i], lobes[row[1], i], lobes[row[2], i])
         adj_places[batch, receiver] = adj_places[batch, receiver] + adj_share
 
 
