@@ -95,7 +95,7 @@ def varies(values: Iterable[Any]) -> bool:
     return any(isinstance(value, wp.array) and value.requires_grad for value in values)
 
 
-def detached(array: wp.array) -> wp.array:
+def without_gradient(array: wp.array) -> wp.array:
     """The same array without a gradient."""
     if not array.requires_grad:
         return array

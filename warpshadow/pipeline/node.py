@@ -178,6 +178,11 @@ class Node:
 AnyInput = Node | Input
 
 
+def identity(value: Any) -> Any:
+    """The function of a node that passes its input's value on."""
+    return value
+
+
 def detached(node: AnyInput, *, is_constant: bool = False) -> Node:
     """Make an input of a node's value that passes no gradient to the node.
 
@@ -185,7 +190,7 @@ def detached(node: AnyInput, *, is_constant: bool = False) -> Node:
         node: The node or input.
         is_constant: Whether the value is independent of the inputs' values.
     """
-    result = Node("", lambda value: value, node, caches=False)
+    result = Node("", identity, node, caches=False)
     result.differentiated_inputs = {}
     if is_constant:
         result.before, result.root_inputs, result.requires_grad = [], {}, False

@@ -12,7 +12,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.device.batch import common_batch
 from warpshadow.pipeline.geometry import PLACED, Geometry
 from warpshadow.pipeline.lighting import BlockerKinds, LitPoints, Method
-from warpshadow.pipeline.node import Call, Clock, Input, Node
+from warpshadow.pipeline.node import Call, Clock, Input, Node, identity
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.static import StaticBodies
 from warpshadow.pipeline.view import View
@@ -137,7 +137,7 @@ class SceneViews:
         Differentiable: all.
         """
         receivers = Input("receivers", Receivers(points, normals, None, None, None))  # type: ignore[arg-type]
-        node = Node("", lambda same: same, receivers)
+        node = Node("", identity, receivers)
         bodies, blocker_kinds = self._bodies(geometry), self._method.blocker_kinds(geometry, None)
         return LitPoints(self._method, self._materials, *bodies, node, self.call(), blocker_kinds=blocker_kinds)
 

@@ -10,7 +10,7 @@ import warp as wp
 from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.lighting import BlockerKinds, Light, LitPoints, Method, receiver_text
-from warpshadow.pipeline.node import Call, Input, Node, detached
+from warpshadow.pipeline.node import Call, Input, Node, detached, identity
 from warpshadow.pipeline.reflectance import Materials, SampleReflectance
 from warpshadow.stages.film import average, sample_radiance, sum_radiance
 from warpshadow.stages.normals import vertex_normals
@@ -99,7 +99,7 @@ class View(LitPoints):
             placed = detached(vertices), detached(cameras)
             sides = Node("sides", find_sides, fragments, faces, two_sided, *placed, items=samples, has_adjoint=False)
         else:
-            sides = Node("sides", _same, fragments, idle="every body is closed: none is seen from behind")
+            sides = Node("sides", identity, fragments, idle="every body is closed: none is seen from behind")
         edge_inputs = merged_scene.edges, clip, merged_scene.face_bodies, merged_scene.creases
         silhouettes = Node(
             "silhouettes", find_silhouettes, sides, faces, *edge_inputs, items=samples, has_adjoint=False
@@ -319,7 +319,7 @@ class View(LitPoints):
         smooth = _smooth_moving if is_moving else smooth_silhouettes
         smoothed = samples_of("smoothing", smooth, samples, self.silhouettes, self.clip_positions)
         if self._supersampling == 1:
-            return Node("averaging", _same, smoothed, idle="a pixel has one sample", caches=False)
+            return Node("averaging", identity, smoothed, idle="a pixel has one sample", caches=False)
         return samples_of("averaging", average, smoothed, self._supersampling)
 
     def _white_radiance_of(self, shading: Node) -> Node:
@@ -371,10 +371,6 @@ class View(LitPoints):
         which = f"image {number} of {len(face_ids)}" if len(face_ids) > 1 else "the image"
         remedy = 'Camera.framing(scene), or framing = "auto" in a scene file, shows all of it'
         return f"camera: {which} shows nothing of the scene: {reason}; {remedy}"
-
-
-def _same(value: object) -> object:
-    return value
 
 
 def _radiance(receivers: Receivers, shading: wp.array, reflectance: wp.array) -> wp.array:

@@ -17,7 +17,7 @@ from dataclasses import replace
 import warp as wp
 
 from warpshadow.device.batch import instance_in, rows
-from warpshadow.device.launch import detached, launch
+from warpshadow.device.launch import launch, without_gradient
 from warpshadow.device.parallel import run_length
 from warpshadow.device.tape import record_adjoint
 from warpshadow.stages.film import sample_radiance
@@ -177,7 +177,7 @@ def moving_radiance(
     Differentiable: shading, albedo, clip_positions; the latter in place of barycentrics of the fragments, but for the
     samples that are receivers themselves or interpolate between such, whose gradient is that of the receivers' points.
     """
-    fragments = replace(fragments, barycentrics=detached(fragments.barycentrics))
+    fragments = replace(fragments, barycentrics=without_gradient(fragments.barycentrics))
     samples = sample_radiance(fragments, faces, shading, albedo)
     edge_colors = find_edge_colors(samples, silhouettes, clip_positions, shading, receivers, albedo)
     if not clip_positions.requires_grad:
@@ -185,7 +185,7 @@ def moving_radiance(
     samples.requires_grad = True
 
     def adjoint() -> None:
-        light = interpolate(fragments, faces, detached(shading))
+        light = interpolate(fragments, faces, without_gradient(shading))
         run = run_length(samples.device, samples.shape[2])
         launch(
             _add_slopes,
