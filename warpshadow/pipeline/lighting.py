@@ -134,13 +134,15 @@ class LitPoints:
         check_light(light)
         if materials is None or not self.merged_scene.scene.bounces:
             materials = self.materials
-        source = self.light_input(light)
-        if isinstance(light, wp.array):
-            return self.method.free_shading(self, source, materials)
-        shade = functools.partial(self.method.known_shading, self, source, materials)
+        light_input = self.light_input(light)
+        if light_input.is_free:
+            return self.method.free_shading(self, light_input, materials)
+        shade = functools.partial(self.method.known_shading, self, light_input, materials)
         if materials is not self.materials:
             return shade()
-        return self.cached("shading of the scene" if source is self.method.light else "shading", source, shade)
+        return self.cached(
+            "shading of the scene" if light_input is self.method.light else "shading", light_input, shade
+        )
 
     def light_input(self, light: Light | None) -> Input:
         """The light as an input; the same for the same known light."""

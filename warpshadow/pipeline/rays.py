@@ -113,7 +113,7 @@ class Rays(Method):
         self, points: LitPoints, diffuse: Node, light: Input, view: LitPoints, choose: Callable[[Node], Node]
     ) -> Node:
         """Mean radiance of the blockers of points, by their light with bounces and without."""
-        if isinstance(light.value(), wp.array):
+        if light.is_free:
             direct = super().free_shading(view, light, view.materials)
         else:
             direct = view.cached(
