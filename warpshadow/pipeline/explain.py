@@ -169,5 +169,5 @@ def _listed(items: Iterable[str]) -> str:
 
 
 def _row(name: str, decision: Decision, last: float | None, items: str) -> tuple[str, str, str, str, str]:
-    time_taken = "" if last is None else f"{1e3 * last:.2f} ms"
-    return f"  {name}", "runs" if decision else "–", time_taken, items, decision.why
+    milliseconds = "" if last is None else f"{1e3 * last:.2f} ms"
+    return f"  {name}", "runs" if decision else "–", milliseconds, items, decision.why

@@ -135,7 +135,7 @@ def test_closed_patches_have_the_nearest_open_one_of_their_body_for_a_stand_in(m
     ball = senders.patches[0]
     is_open = np.ones(last, bool)
     is_open[:end] = ball.centers[:, 1] > 0.2
-    found = senders.stand_ins(is_open)
+    found = senders.nearest_open_patches(is_open)
     np.testing.assert_array_equal(found[is_open], np.flatnonzero(is_open))
     closed = np.flatnonzero(~is_open)
     assert len(closed) > 20 and is_open[found[closed]].all() and (found[closed] < end).all()
@@ -143,4 +143,6 @@ def test_closed_patches_have_the_nearest_open_one_of_their_body_for_a_stand_in(m
     steps = np.linalg.norm(ball.centers[closed][:, None] - ball.centers[is_open[:end]], axis=2).min(axis=1)
     np.testing.assert_allclose(away, steps, atol=0.05)  # normals count, too, which are a ball's places
     is_open[:end] = False
-    np.testing.assert_array_equal(senders.stand_ins(is_open), np.arange(last))  # nothing stands in for a body
+    np.testing.assert_array_equal(
+        senders.nearest_open_patches(is_open), np.arange(last)
+    )  # nothing stands in for a body

@@ -133,8 +133,8 @@ def blend_sharp_cells(
     device, row_count = passing.device, passing.shape[0] * passing.shape[1]
     cells = np.flatnonzero(places >= 0)
     of_spots = np.ones(len(cells)) if shares is None else shares[cells]
-    is_kept = varies([passing]) and bool((of_spots < 1).any())
-    blended = wp.clone(passing, requires_grad=False) if is_kept else passing
+    is_copied = varies([passing]) and bool((of_spots < 1).any())
+    blended = wp.clone(passing, requires_grad=False) if is_copied else passing
     pairs = constant(np.stack([cells, places[cells]], axis=1), wp.vec2i, device)
     inputs, cost = [pairs, constant(of_spots.astype(np.float32), wp.float32, device)], _CELL_COST * len(cells)
     return differentiable(
@@ -145,7 +145,7 @@ def blend_sharp_cells(
             _blend_sharp_cells_adjoint,
             row_count,
             inputs=inputs,
-            outputs=[adj, sharp_cells.grad, passing.grad if is_kept else None],
+            outputs=[adj, sharp_cells.grad, passing.grad if is_copied else None],
             cost=cost,
         ),
         result=blended,
