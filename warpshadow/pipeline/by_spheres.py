@@ -175,7 +175,7 @@ class SphereMethod(Method):
         """Shading of points in known light, which bounces from the materials."""
         projected_light = self.projected(light)
         if self.bounces is not None:
-            is_cached = points.is_static and materials is not points.materials
+            is_cached = points.is_scene_view and materials is not points.materials
             shade_all = self.bounces.cached_bounced_shading if is_cached else self.bounces.bounced_shading
             return shade_all(points, projected_light, light, materials)
         return PortionedShading(self, points, projected_light, light, joined)
@@ -184,7 +184,7 @@ class SphereMethod(Method):
         """Shading of points in free light; where it bounces between moving bodies, computed as for known light."""
         if self.bounces is None:
             return super().free_shading(points, light, materials)
-        if not points.is_static:
+        if not points.is_scene_view:
             return self.bounces.bounced_free_shading(
                 points, Node("", self._projected_if_given, light), light, materials
             )

@@ -47,7 +47,9 @@ class GlossyPoints(LitPoints):
         self._all_receivers, self._cameras = view.receivers_node, cameras
         self._fragments, self._clip_positions = fragments, clip_positions
         arguments = view.method, view.materials, view.vertices, view.spheres, receivers, view.call
-        super().__init__(*arguments, normals=view.normals, blocker_kinds=view.blocker_kinds, is_static=view.is_static)
+        super().__init__(
+            *arguments, normals=view.normals, blocker_kinds=view.blocker_kinds, is_scene_view=view.is_scene_view
+        )
         self._numbers = Node("", functools.partial(_numbers, glossy), detached(view.receivers_node))
 
     def mixed(self, view: LitPoints, diffuse: Node, light: Light | None, materials: Materials) -> tuple[Node, Node]:
@@ -113,7 +115,7 @@ class GlossyPoints(LitPoints):
 
     def _prefiltered(self, light: Input) -> Node:
         """Node of the texels of light, vec3 of shape [batch, texel]."""
-        if isinstance(light.value(), wp.array):
+        if light.is_free:
             return Node("prefiltering", self._blurred, light, items=lambda: f"{self.method.basis.size} coefficients")
         return self.method.prefiltered(light)
 

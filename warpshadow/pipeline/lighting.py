@@ -66,7 +66,7 @@ class LitPoints:
         static_bodies: Those among moving ones; None where any may move.
         normals: Node of the normals of all vertices, vec3 of shape [batch, vertex]; by default its own.
         blocker_kinds: Which bodies block light by something else than their spheres.
-        is_static: Whether bodies and points are where the scene and its camera have them, for good.
+        is_scene_view: Whether bodies and points are where the scene and its camera have them, for good.
         blocker_of_point: Of points that send light, the number of the blocker nearest to the patch of each, among the
             spheres of bodies that are not flat, −1 for none: NumPy of shape [receiver].
     """
@@ -82,10 +82,10 @@ class LitPoints:
         static_bodies: StaticBodies | None = None,
         normals: Node | None = None,
         blocker_kinds: BlockerKinds = ONLY_SPHERES,
-        is_static: bool = False,
+        is_scene_view: bool = False,
         blocker_of_point: np.ndarray | None = None,
     ):
-        self.blocker_kinds, self.is_static, self.blocker_of_point = blocker_kinds, is_static, blocker_of_point
+        self.blocker_kinds, self.is_scene_view, self.blocker_of_point = blocker_kinds, is_scene_view, blocker_of_point
         self.method, self.materials, self.merged_scene = method, materials, method.merged_scene
         self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
         self.call, self.static_bodies = call, static_bodies
@@ -102,7 +102,7 @@ class LitPoints:
     def with_receivers(self: Points, receivers: Node) -> Points:
         """Other receivers, of which nothing is cached, among the same blockers, any of which may move."""
         points = copy.copy(self)
-        points.receivers_node, points.static_bodies, points.is_static = receivers, None, False
+        points.receivers_node, points.static_bodies, points.is_scene_view = receivers, None, False
         points._cached, points._last_light = {}, None
         return points
 

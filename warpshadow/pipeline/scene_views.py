@@ -106,7 +106,7 @@ class SceneViews:
             call=self.call(),
             camera=self._cameras[0],
             counts=(len(poses), image_count),
-            is_static=geometry is None and clip_matrices is None and image_count == 1,
+            is_scene_view=geometry is None and clip_matrices is None and image_count == 1,
         )
 
     def _blocker_kinds(self, geometry: Geometry | None, last: LitPoints | None = None) -> BlockerKinds:

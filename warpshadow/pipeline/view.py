@@ -48,7 +48,7 @@ class View(LitPoints):
         call: Holds its values that may not be cached.
         camera: Has the cameras' size and near plane.
         counts: Number of geometries, and of images.
-        is_static: As for :class:`LitPoints`.
+        is_scene_view: As for :class:`LitPoints`.
     Attributes:
         dependencies: Vertices, spheres, cameras, static bodies, and how all block light.
         clip_positions, fragments_node, silhouettes, receivers_node: Nodes of the visible surfaces.
@@ -67,7 +67,7 @@ class View(LitPoints):
         call: Call,
         camera: Camera,
         counts: tuple[int, int],
-        is_static: bool = False,
+        is_scene_view: bool = False,
     ):
         self.dependencies = vertices, spheres, cameras, static_bodies, blocker_kinds
         self._separate_bodies = method.separate_bodies(blocker_kinds)
@@ -78,7 +78,7 @@ class View(LitPoints):
         self._sample_count = counts[1] * self._size[0] * self._size[1]
         normals, receivers = self._wire(method, vertices, spheres, cameras, static_bodies)
         super().__init__(
-            method, materials, vertices, spheres, receivers, call, static_bodies, normals, blocker_kinds, is_static
+            method, materials, vertices, spheres, receivers, call, static_bodies, normals, blocker_kinds, is_scene_view
         )
 
     def _wire(
