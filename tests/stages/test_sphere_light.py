@@ -138,7 +138,8 @@ def test_a_white_sphere_above_a_plane_sends_what_its_form_factor_says(count, err
     white = wp.full((1, 40), wp.vec3(0.5, 1.0, 2.0), dtype=wp.vec3, device=device)
     nodes = patches_of_clusters(np.zeros(40, int), np.zeros(1, int))
     shown = wp.array(np.maximum(-patches @ directions.T, 0), dtype=wp.float32, device=device)
-    table = find_proxy_radiance(white, shown, np.ones(40), *nodes)
+    all_open = wp.full((1, 40), wp.vec3(1.0), dtype=wp.vec3, device=device)
+    table = find_proxy_radiance(white, shown, all_open, np.ones(40), *nodes)
     arrays = put([v[None] for v in (points, normals, center, np.array([radius]))] + [None] * 3, device)[:4]
     passing = transmittance(*arrays, directions)
     got = stage.sphere_light(*arrays, table, passing, None, directions).numpy()[0]
