@@ -191,11 +191,11 @@ def test_log_visibility_without_a_horizon(double, device, check, spheres):
 
 
 @pytest.fixture
-def quad(double, monkeypatch):
+def cluster(double, monkeypatch):
     """Receivers, normals, centers and radii, as arguments: five spheres, of which four merge while they are seen so."""
     monkeypatch.setattr(double("stages.visibility.merging"), "MERGED_FROM", 4)
     centers, radii = 4 * random(7, 5, 3), 3 + random(8, 5) ** 2
-    middle, _, extents = twins.merged_quads(centers, radii)
+    middle, _, extents = twins.merged_clusters(centers, radii)
     away = unit(random(9, 6, 3))
     angles = np.array([0.36, 0.4, 0.43, 0.46, 0.49, 0.3])[:, None]  # of 0.5, where it begins, and 0.35, where it ends
     normals = unit(random(10, 6, 3) - 3 * away)
@@ -204,15 +204,15 @@ def quad(double, monkeypatch):
     return [(dtype, values[None]) for dtype, values in zip(dtypes, scene, strict=True)]
 
 
-def test_transmittance_of_spheres_that_merge(double, device, check, quad):
+def test_transmittance_of_spheres_that_merge(double, device, check, cluster):
     directions = double("maths.directions").fibonacci(16)
     transmittance = double("stages.visibility.directional").transmittance
-    check(lambda p, c, r: transmittance(p, None, c, r, directions, merging=1.0), quad[0], *quad[2:])
+    check(lambda p, c, r: transmittance(p, None, c, r, directions, merging=1.0), cluster[0], *cluster[2:])
 
 
-def test_log_visibility_of_spheres_that_merge(double, device, check, quad):
+def test_log_visibility_of_spheres_that_merge(double, device, check, cluster):
     accumulate = double("stages.visibility.log_sh").accumulate
-    check(lambda *scene: accumulate(*scene, order=4, merging=1.0), *quad)
+    check(lambda *scene: accumulate(*scene, order=4, merging=1.0), *cluster)
 
 
 def test_radiance_of_proxies(double, device, check):
@@ -235,11 +235,11 @@ def test_light_from_spheres(double, device, check, spheres):
 
 
 @pytest.mark.slow
-def test_light_from_spheres_that_merge(double, device, check, quad):
+def test_light_from_spheres_that_merge(double, device, check, cluster):
     directions = double("maths.directions").fibonacci(16)
     sphere_light = double("stages.bounces.sphere_light").sphere_light
     rest = (wp.vec4d, 1 + random(0, 1, 6, 16, 4) ** 2), (wp.float64, 0.5 * random(1, 1, 6, 16) ** 2)
-    check(lambda *scene: sphere_light(*scene, None, directions, merging=1.0), *quad, *rest)
+    check(lambda *scene: sphere_light(*scene, None, directions, merging=1.0), *cluster, *rest)
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """Names and docstrings: one word, one meaning."""
 
 import ast
+import re
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,6 +26,10 @@ BANNED = {
     *("DirectLightPart", "PartVisibility", "PartwiseShading", "PART_SIZE", "rooms", "with_self_light"),
     *("find_spot", "pull", "pulled", "pulls", "spot", "spot_place", "TexelFootprint", "torque", "truth"),
 }
+BANNED_PARTS = {"asked", "kept", "meant", "most", "pull", "pulled", "said", "taken", "told", "wanted"}
+"""Words that no name has among its parts. A preposition may be one, as in ``planes_around``, where an object follows it
+or it follows one."""
+
 FIRST_WORDS = ("What ", "Those ", "That which ", "Whatever ")
 
 
@@ -47,6 +52,16 @@ def names(node: ast.AST) -> Iterator[tuple[str, int]]:
             yield from names(child)
 
 
+def parts(tree: ast.Module) -> Iterator[tuple[str, str]]:
+    """Each part of each name, fields, attributes, functions and methods included; and the name, with its line."""
+    for node in ast.walk(tree):
+        stored = isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store)
+        if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.arg) or stored:
+            name = next(getattr(node, key) for key in ("name", "arg", "id", "attr") if hasattr(node, key))
+            for part in name.lower().split("_"):
+                yield part, f"{name} (line {node.lineno})"
+
+
 def docstrings(tree: ast.Module) -> Iterator[tuple[str, int]]:
     """Docstrings of modules, classes and functions, and the strings below constants and fields."""
     for node in ast.walk(tree):
@@ -63,8 +78,15 @@ def test_no_two_classes_have_one_name():
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_a_module_uses_no_banned_name(path):
-    banned = {f"{name} (line {line})" for name, line in names(ast.parse(path.read_text("utf-8"))) if name in BANNED}
-    assert not banned
+    tree = ast.parse(path.read_text("utf-8"))
+    banned = {f"{name} (line {line})" for name, line in names(tree) if name in BANNED}
+    assert not banned | {name for part, name in parts(tree) if part in BANNED_PARTS}
+
+
+def test_indices_into_batches_are_called_so():
+    texts = [path.read_text("utf-8") for path in FILES]
+    indices = [name for text in texts for name in re.findall(r"(\w+) = instance_in\(", text)]
+    assert len(indices) > 40 and not [name for name in indices if not name.endswith("_batch")]
 
 
 def test_no_docstring_begins_with_what():

@@ -261,10 +261,10 @@ def sphere_light(points, normals, centers, radii, proxy_radiance, passing, unblo
     return np.einsum("vq,vqc->vc", 4 / len(directions) * cosine * (unblocked - passing), mean)
 
 
-def merged_quads(centers, radii):
-    """Centers [quad, 3], radii [quad] and extents [quad] of the spheres of quads: moments by eigenvalues."""
-    quads = len(radii) // 4
-    c, r = centers[: 4 * quads].reshape(-1, 4, 3), radii[: 4 * quads].reshape(-1, 4)
+def merged_clusters(centers, radii):
+    """Centers [cluster, 3], radii [cluster] and extents [cluster] of the clusters' spheres: moments by eigenvalues."""
+    clusters = len(radii) // 4
+    c, r = centers[: 4 * clusters].reshape(-1, 4, 3), radii[: 4 * clusters].reshape(-1, 4)
     share = r**3 / (r**3).sum(axis=1, keepdims=True)
     middle = np.einsum("qk,qkx->qx", share, c)
     d = c - middle[:, None]
@@ -277,8 +277,8 @@ def merged_quads(centers, radii):
 
 
 def merging_transmittance(points, centers, radii, directions, merging, softness=0.35):
-    """Transmittance of spheres that merge, [vertex, direction]: each quad's four and its own by their shares."""
-    middle, radius, extents = merged_quads(centers, radii)
+    """Transmittance of spheres that merge, [vertex, direction]: each cluster's four and its own by their shares."""
+    middle, radius, extents = merged_clusters(centers, radii)
     tau = merging * 2 / np.sqrt(len(directions))
     q = (extents / np.linalg.norm(middle - points[:, None], axis=-1)) ** 2
     m = smoothstep((tau**2 - q) / (tau**2 - (0.7 * tau) ** 2))

@@ -55,7 +55,7 @@ def test_small_and_huge_blocks_go_back_at_once():
     spare = spare_memory(system)
     for size in (100, 2**32):
         spare.give_back(spare.take(size), size)
-    assert not system.blocks and spare.bytes_kept == 0
+    assert not system.blocks and spare.cached_bytes == 0
 
 
 def test_beyond_the_limit_all_go_back():
@@ -64,9 +64,9 @@ def test_beyond_the_limit_all_go_back():
     blocks = [spare.take(SIZE) for _ in range(4)]
     for number, block in enumerate(blocks[:3]):
         spare.give_back(block, SIZE)
-        assert spare.bytes_kept == (number + 1) * SIZE
+        assert spare.cached_bytes == (number + 1) * SIZE
     spare.give_back(blocks[3], SIZE)
-    assert not system.blocks and spare.bytes_kept == 0
+    assert not system.blocks and spare.cached_bytes == 0
 
 
 def test_where_the_system_has_no_more_spare_blocks_make_place():

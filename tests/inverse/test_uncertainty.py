@@ -92,7 +92,7 @@ def test_a_free_light_leaves_less_curvature_to_a_pose():
     forms = []
     for free in ([Pose(0)], [Pose(0), Light(2)]):
         result = result_of(free)
-        forms.append(NormalMatrix(result.problem, result.setting, result.values).form)
+        forms.append(NormalMatrix(result.problem, result.setting, result.values).normal_matrix)
     assert np.linalg.eigvalsh(forms[0] - forms[1]).min() > -0.02 * np.linalg.eigvalsh(forms[0]).max()
     assert np.trace(forms[1]) < 0.99 * np.trace(forms[0])
     assert 0 < result_of([Pose(0), Light(2)]).uncertainty.light < 0.2
@@ -150,7 +150,7 @@ def test_its_residuals_have_the_gradient_of_the_loss(kind, reduction):
     values["pose[0]"]["log_scale"] += 0.1
     normal, model = NormalMatrix(problem, setting, values), Model(problem, setting, small_stage(problem))
     slopes = []
-    for name, key, number in normal.places:
+    for name, key, number in normal.parameter_entries:
         ends = []
         for step in (0.01, -0.01):
             values[name][key].view(-1)[number] += step

@@ -209,8 +209,8 @@ def test_a_detached_input_matters_and_gets_no_gradient(clock):
     vertices = Input("vertices", array(requires_grad=True))
     inputs = (detached(vertices, is_constant=is_constant) for is_constant in (False, True))
     fixed, constant = (Node("node", None, each) for each in inputs)
-    assert fixed.requires_grad and not fixed.differentiated_inputs and list(fixed.sources) == [vertices]
-    assert not constant.requires_grad and not constant.sources and not constant.before[0].before
+    assert fixed.requires_grad and not fixed.differentiated_inputs and list(fixed.root_inputs) == [vertices]
+    assert not constant.requires_grad and not constant.root_inputs and not constant.before[0].before
 
 
 # ---------------------------------------------------------------------------------------------- times

@@ -14,7 +14,7 @@ EXACT = 3e-6  # float32, relative to sizes of about 1
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
 
-def random_quads(seed, count=50):
+def random_clusters(seed, count=50):
     """Four spheres each within one unit, of radii that differ, shape [1, sphere, …]."""
     rng = np.random.default_rng(seed)
     centers = (rng.normal(size=(count, 1, 3)) * 5 + rng.uniform(-0.3, 0.3, size=(count, 4, 3))).reshape(-1, 3)
@@ -29,10 +29,10 @@ def merge(centers, radii, device, requires_grad=False):
 
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
 def test_quads_are_those_of_the_float64_twin(scale, device):
-    centers, radii = random_quads(0)
+    centers, radii = random_clusters(0)
     centers, radii = centers[:-1] * np.float32(scale), radii[:-1] * np.float32(scale)  # three spheres are left over
     _, nodes = merge(centers, radii, device)
-    expected = twins.merged_quads(centers.astype(float), radii.astype(float))
+    expected = twins.merged_clusters(centers.astype(float), radii.astype(float))
     np.testing.assert_array_equal(nodes.centers.numpy()[0, :199], centers)
     np.testing.assert_array_equal(nodes.radii.numpy()[0, :199], radii)
     np.testing.assert_allclose(nodes.centers.numpy()[0, 199:], expected[0], rtol=0, atol=10 * EXACT * scale)
@@ -49,8 +49,8 @@ def test_a_quads_sphere_covers_what_its_spheres_do_on_average(spread, measured, 
     radii = rng.uniform(0.6, 1.0, 160).astype(np.float32)
     _, nodes = merge(centers, radii, device)
     ratios = []
-    for quad, radius in enumerate(nodes.radii.numpy()[0, 160:]):
-        own, sizes = centers[4 * quad : 4 * quad + 4], radii[4 * quad : 4 * quad + 4]
+    for cluster, radius in enumerate(nodes.radii.numpy()[0, 160:]):
+        own, sizes = centers[4 * cluster : 4 * cluster + 4], radii[4 * cluster : 4 * cluster + 4]
         extent = np.abs(own).max() + 1
         areas = []
         for _ in range(20):
@@ -65,13 +65,13 @@ def test_a_quads_sphere_covers_what_its_spheres_do_on_average(spread, measured, 
 
 @pytest.mark.parametrize("name", ["centers", "radii"])
 def test_gradients_of_quads_are_their_derivatives(name, verified_tape, device):
-    centers, radii = random_quads(2, count=3)
+    centers, radii = random_clusters(2, count=3)
     rng = np.random.default_rng(3)
     seeds = [rng.normal(size=shape) for shape in ((3, 3), (3,), (3,))]
 
     def loss(changed):
         values = {"centers": centers.astype(float), "radii": radii.astype(float)} | {name: changed}
-        return sum((part * seed).sum() for part, seed in zip(twins.merged_quads(**values), seeds, strict=True))
+        return sum((part * seed).sum() for part, seed in zip(twins.merged_clusters(**values), seeds, strict=True))
 
     with wp.Tape() as tape:
         arrays, nodes = merge(centers, radii, device, requires_grad=True)

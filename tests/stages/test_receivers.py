@@ -248,11 +248,13 @@ def test_receivers_of_bodies_that_are_told_apart_follow_each_other(device, wants
         if first < at_vertices:
             assert set(found.vertices.numpy()[first:end] // 3) == {face}
         else:
-            sides = found.seen.face_ids.numpy()[:, first - at_vertices : end - at_vertices]
+            sides = found.sample_fragments.face_ids.numpy()[:, first - at_vertices : end - at_vertices]
             assert set(sides[sides >= 0]) == {face}
             corners = positions.numpy()[0][faces.numpy()[sides]]
             at = np.einsum(
-                "brk,brkx->brx", found.seen.barycentrics.numpy()[:, first - at_vertices : end - at_vertices], corners
+                "brk,brkx->brx",
+                found.sample_fragments.barycentrics.numpy()[:, first - at_vertices : end - at_vertices],
+                corners,
             )
             gaps = np.abs(at - found.points.numpy()[:, first:end])[sides >= 0]
             assert gaps.max() < FLOAT32

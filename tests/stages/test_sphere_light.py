@@ -138,7 +138,8 @@ def test_a_white_sphere_above_a_plane_sends_what_its_form_factor_says(count, err
     white = wp.full((1, 40), wp.vec3(0.5, 1.0, 2.0), dtype=wp.vec3, device=device)
     nodes = patches_of_clusters(np.zeros(40, int), np.zeros(1, int))
     shown = wp.array(np.maximum(-patches @ directions.T, 0), dtype=wp.float32, device=device)
-    table = find_proxy_radiance(white, shown, np.ones(40), *nodes)
+    all_open = wp.full((1, 40), wp.vec3(1.0), dtype=wp.vec3, device=device)
+    table = find_proxy_radiance(white, shown, all_open, np.ones(40), *nodes)
     arrays = put([v[None] for v in (points, normals, center, np.array([radius]))] + [None] * 3, device)[:4]
     passing = transmittance(*arrays, directions)
     got = stage.sphere_light(*arrays, table, passing, None, directions).numpy()[0]
@@ -175,7 +176,7 @@ def merged(monkeypatch):
     monkeypatch.setattr(merging, "MERGED_FROM", 4)
     rng = np.random.default_rng(7)
     centers, radii = 4 * rng.normal(size=(5, 3)), 3 + rng.normal(size=5) ** 2
-    middle, _, extents = twins.merged_quads(centers, radii)
+    middle, _, extents = twins.merged_clusters(centers, radii)
     away = rng.normal(size=(6, 3))
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     angles = np.array([0.36, 0.4, 0.43, 0.46, 0.49, 0.3])[:, None]  # of 0.5, where it begins, and 0.35, where it ends
@@ -188,8 +189,8 @@ def merged(monkeypatch):
 
 
 def merging_twin(points, normals, centers, radii, *rest):
-    """Spheres with their part of the share, and the quad's sphere with the other."""
-    middle, radius, extents = twins.merged_quads(centers, radii)
+    """Spheres with their part of the share, and the cluster's sphere with the other."""
+    middle, radius, extents = twins.merged_clusters(centers, radii)
     m = twins.smoothstep((0.5**2 - (extents / np.linalg.norm(middle - points, axis=1)) ** 2) / (0.5**2 - 0.35**2))
     parts = np.stack([1 - m] * 4 + [np.ones_like(m), m], axis=1)
     centers, radii = np.concatenate([centers, middle]), np.concatenate([radii, radius])
@@ -304,14 +305,14 @@ def test_what_does_not_fit_is_refused(device):
 def test_spheres_that_are_left_out_are_as_those_of_no_radius(skip, device, monkeypatch):
     monkeypatch.setattr(merging, "MERGED_FROM", 4)
     values = [value[None] for value in scene(11, 16)]
-    quads = np.random.default_rng(0).uniform(0.1, 1, (1, 1, 16, 4))
-    values[4] = np.concatenate([values[4], quads], axis=1)
+    clusters = np.random.default_rng(0).uniform(0.1, 1, (1, 1, 16, 4))
+    values[4] = np.concatenate([values[4], clusters], axis=1)
     weights = np.random.default_rng(12).normal(size=(1, 19, 3))
     options = {"merging": 1.0}
     got, got_gradients = gradients(values, weights, 16, device, skip=skip, **options)
-    radii, quad = values[3].copy(), slice(0, 4)
+    radii, cluster = values[3].copy(), slice(0, 4)
     radii[0, slice(*skip)] = 0
-    if skip[0] < quad.stop:  # its four spheres no longer merge
+    if skip[0] < cluster.stop:  # its four spheres no longer merge
         options, values[4] = {"merging": 0}, values[4][:, :-1]
         got_gradients[4] = got_gradients[4][:, :-1]
     values[3] = radii

@@ -49,8 +49,8 @@ def note(text: str, is_quiet: bool) -> None:
         typer.echo(text)
 
 
-def _print_version(is_asked: bool) -> None:
-    if is_asked:
+def _print_version(prints: bool) -> None:
+    if prints:
         typer.echo(f"warpshadow {__version__}")
         raise typer.Exit
 

@@ -150,8 +150,8 @@ def _resumable(folder: Path) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt as error:
-        is_kept = has_checkpoint(folder)
-        remark = f"; the same command goes on from {folder / CHECKPOINT}" if is_kept else " before a checkpoint"
+        is_resumable = has_checkpoint(folder)
+        remark = f"; the same command goes on from {folder / CHECKPOINT}" if is_resumable else " before a checkpoint"
         remark += f"; {error}" if error.args else ""
         raise interrupted(remark) from error
 

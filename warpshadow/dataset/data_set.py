@@ -27,8 +27,8 @@ Item = TypeVar("Item")
 
 _MAP_SUFFIXES = (".exr", ".hdr", ".pic")
 
-_KEPT_BODIES = 64
-_KEPT_MAPS = 16  # how many files a process keeps in memory; it reads others again when a scene has them
+_CACHED_BODIES = 64
+_CACHED_MAPS = 16  # how many files a process keeps in memory; it reads others again when a scene has them
 _LISTED_FAULTS = 10  # files that an error names at most
 
 
@@ -165,7 +165,7 @@ class _ReadMesh(NamedTuple):
     content_hash: str  # hash the file's content, with its colors and texture, but not how it is creased
 
 
-@functools.lru_cache(_KEPT_BODIES)
+@functools.lru_cache(_CACHED_BODIES)
 def _read_body(path: Path, blockers: int | str, creased: float | None, fits: bool, device: str) -> _ReadMesh:
     body = Body(path, blockers=blockers)
     content_hash = body.mesh.content_hash
@@ -183,7 +183,7 @@ def _fitted(body: Body, device: str) -> Body:
     return replace(body, blockers=fit_spheres(body.mesh, body.blockers, device=device).spheres)
 
 
-@functools.lru_cache(_KEPT_MAPS)
+@functools.lru_cache(_CACHED_MAPS)
 def _read_map(path: Path) -> EnvironmentMap:
     return EnvironmentMap.read(path)
 

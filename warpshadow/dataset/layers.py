@@ -17,11 +17,11 @@ class LazyLayers:
     """Lazy layers of one image: each is computed when first asked for, once.
 
     Args:
-        most_bodies: Number of masks, so that images can be stacked; masks of missing bodies are 0.
+        mask_count: Number of masks, so that images can be stacked; masks of missing bodies are 0.
     """
 
-    def __init__(self, scene: Scene, device: str, most_bodies: int):
-        self.most_bodies = most_bodies
+    def __init__(self, scene: Scene, device: str, mask_count: int):
+        self.mask_count = mask_count
         self.renderer = Renderer(scene, device=device, progress=False)
 
     @functools.cached_property
@@ -43,7 +43,7 @@ class LazyLayers:
 
     def masks(self) -> Channels:
         """Part of each pixel that each body covers."""
-        names = [f"mask.{number}" for number in range(self.most_bodies)]
+        names = [f"mask.{number}" for number in range(self.mask_count)]
         return {name: self._channels.get(name, np.zeros_like(self._channels["Z"])) for name in names}
 
 

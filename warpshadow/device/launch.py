@@ -46,19 +46,19 @@ def launch(
             gradients. To a place in the gradient of another input only one row may add.
     """
     device = next(value.device for value in (*outputs, *sums, *inputs) if isinstance(value, wp.array))
-    is_wanted = kernel.options.get("enable_backward") is not False and varies(inputs)
-    if is_wanted:
+    needs_gradient = kernel.options.get("enable_backward") is not False and varies(inputs)
+    if needs_gradient:
         for output in outputs:
             if output is not None:
                 _require_gradient(in_huge_pages(output), kernel)
     if cost is None:
         shape, arguments = (dim,) if isinstance(dim, int) else dim, [*inputs, *outputs, *sums]
         warp_internals.bound_kernel(kernel, arguments, device)(shape)
-        if is_wanted:
+        if needs_gradient:
             record_kernel(kernel, shape, arguments, device)
         return
     launch_slices(kernel, dim, cost=cost, inputs=inputs, outputs=outputs, scratch=scratch, sums=sums, device=device)
-    if is_wanted:
+    if needs_gradient:
         assert not (scratch or sums), f"{kernel.key}: Warp's adjoint knows neither scratch memory nor sums"
         options = {"cost": 2 * cost, "inputs": inputs, "outputs": outputs, "shared": shared, "device": device}
         arrays = [value for value in (*inputs, *outputs) if isinstance(value, wp.array)]
@@ -95,7 +95,7 @@ def varies(values: Iterable[Any]) -> bool:
     return any(isinstance(value, wp.array) and value.requires_grad for value in values)
 
 
-def detached(array: wp.array) -> wp.array:
+def without_gradient(array: wp.array) -> wp.array:
     """The same array without a gradient."""
     if not array.requires_grad:
         return array

@@ -198,10 +198,10 @@ class _Reporter:
                     for waits in shown_waits:
                         _refresh(waits)
                     continue
-                told_waits = [waits for waits in shown_waits if waits and waits[0].age >= waits[0].patience]
-                if told_waits and time.monotonic() - self._reported >= _LINE_INTERVAL:
+                reported_waits = [waits for waits in shown_waits if waits and waits[0].age >= waits[0].patience]
+                if reported_waits and time.monotonic() - self._reported >= _LINE_INTERVAL:
                     self._reported = time.monotonic()
-                    for waits in told_waits:
+                    for waits in reported_waits:
                         say("; ".join(wait.line() for wait in waits))
 
 

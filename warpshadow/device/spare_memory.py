@@ -27,19 +27,19 @@ class SpareMemory:
         self._take, self._give_back, self._limit = take, give_back, limit
         octaves = range(_MIN_BYTES.bit_length() - 1, _MAX_BYTES.bit_length())
         steps = [2**octave * (_STEPS + step) // _STEPS for octave in octaves for step in range(_STEPS)]
-        self._kept: dict[int, list[int]] = {size: [] for size in steps if size <= _MAX_BYTES}
+        self._blocks: dict[int, list[int]] = {size: [] for size in steps if size <= _MAX_BYTES}
         self._lock = threading.RLock()
-        self.bytes_kept = 0  # of blocks that nobody uses
+        self.cached_bytes = 0  # of blocks that nobody uses
 
     def take(self, size: int) -> int:
         """Take a block of at least ``size`` bytes; returns its address, 0 where there is no memory."""
         size = _rounded(size)
         with self._lock:
-            if self._kept.get(size):
-                self.bytes_kept -= size
-                return self._kept[size].pop()
+            if self._blocks.get(size):
+                self.cached_bytes -= size
+                return self._blocks[size].pop()
         block = self._take(size)
-        if not block and self.bytes_kept:
+        if not block and self.cached_bytes:
             self.clear()
             block = self._take(size)
         return block
@@ -47,22 +47,22 @@ class SpareMemory:
     def give_back(self, block: int, size: int) -> None:
         """Give back a block that was taken for ``size`` bytes."""
         size = _rounded(size)
-        if size not in self._kept:
+        if size not in self._blocks:
             self._give_back(block)
             return
         with self._lock:
-            self._kept[size].append(block)
-            self.bytes_kept += size
-        if self.bytes_kept > self._limit:
+            self._blocks[size].append(block)
+            self.cached_bytes += size
+        if self.cached_bytes > self._limit:
             self.clear()
 
     def clear(self) -> None:
         """Give all that is kept back to the system."""
         with self._lock:
-            for blocks in self._kept.values():
+            for blocks in self._blocks.values():
                 while blocks:
                     self._give_back(blocks.pop())
-            self.bytes_kept = 0
+            self.cached_bytes = 0
 
 
 def _rounded(size: int) -> int:

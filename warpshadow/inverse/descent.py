@@ -163,8 +163,8 @@ class _Descent:
         others = state.get("fingerprints")
         changed = [
             name
-            for name, stage_tolerance in self.fingerprints.items()
-            if others is not None and others.get(name) != stage_tolerance
+            for name, fingerprint in self.fingerprints.items()
+            if others is not None and others.get(name) != fingerprint
         ]
         if others is None or changed:
             of_other = f"of another fit (other {', '.join(changed)})" if changed else "of no fit of this version"
@@ -324,8 +324,8 @@ def _descends(free: Free, stage: Stage) -> bool:
 def _copied(values: Mapping[str, Values], device: torch.device | None = None) -> dict[str, Values]:
     """A copy, on another device if one is given."""
     return {
-        name: {key: tensor.detach().to(device, copy=True) for key, tensor in stage_tolerance.items()}
-        for name, stage_tolerance in values.items()
+        name: {key: tensor.detach().to(device, copy=True) for key, tensor in tensors.items()}
+        for name, tensors in values.items()
     }
 
 

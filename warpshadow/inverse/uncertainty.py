@@ -102,7 +102,13 @@ class Uncertainty:
 
 
 class NormalMatrix:
-    """The normal matrix at some values, and the sum over tiles."""
+    """The normal matrix at some values, and the sum over tiles.
+
+    Attributes:
+        parameter_entries: Of each number: the parameter's name, its key, and the index in its flat tensor.
+        normal_matrix: H, by directions in which the numbers move, [direction, direction].
+        score_covariance: Σ g gᵀ, likewise.
+    """
 
     def __init__(self, problem: Problem, setting: Setting, values: Mapping[str, Values]):
         self.problem, self.setting = problem, setting
@@ -110,7 +116,7 @@ class NormalMatrix:
         stage = small_stage(problem)
         has_light = any(isinstance(free, Light) for free in problem.free)
         self.model = (ProjectedModel if has_light else Model)(problem, setting, stage)
-        self.places = _few_number_entries(self.values)
+        self.parameter_entries = _few_number_entries(self.values)
         self.directions = self._directions()
         self.roots: list[torch.Tensor] = []  # of the weights of colors, and of coverage
         with torch.no_grad():
@@ -121,10 +127,10 @@ class NormalMatrix:
             self.light = self._project_light() if isinstance(self.model, ProjectedModel) else None
         curvature = self.directions.T @ self._prior() @ self.directions
         flat = self.columns.reshape(-1, self.columns.shape[-1])
-        self.form = flat.T @ flat + PRIOR * curvature
-        self.form += _RIDGE * np.abs(self.form).max() * np.eye(len(self.form))
+        self.normal_matrix = flat.T @ flat + PRIOR * curvature
+        self.normal_matrix += _RIDGE * np.abs(self.normal_matrix).max() * np.eye(len(self.normal_matrix))
         scores = _by_tiles(self.columns * self.residuals[..., None])
-        self.middle = scores.T @ scores + PRIOR**2 * curvature
+        self.score_covariance = scores.T @ scores + PRIOR**2 * curvature
 
     def _directions(self) -> np.ndarray:
         """Directions in which the numbers may move, [number, direction].
@@ -132,10 +138,11 @@ class NormalMatrix:
         Of the numbers of a quaternion or of two columns the changes that turn the body by a radian about each axis, and
         none along which they change and it does not, such as a quaternion's length.
         """
-        directions = np.eye(len(self.places))
+        directions = np.eye(len(self.parameter_entries))
         for free in self.problem.free:
             if isinstance(free, Pose) and free.rotation != "axis-angle":
-                rows = [index for index, place in enumerate(self.places) if place[:2] == (free.name, "turn")]
+                entries = enumerate(self.parameter_entries)
+                rows = [index for index, entry in entries if entry[:2] == (free.name, "turn")]
                 turns = np.zeros((len(directions), 3))
                 turns[rows] = np.linalg.pinv(self.slopes(free, rows)[3:])
                 directions = np.concatenate([directions[:, ~directions[rows].any(axis=0)], turns], axis=1)
@@ -144,7 +151,7 @@ class NormalMatrix:
     def moved(self, step: np.ndarray) -> dict[str, Values]:
         """The values, their numbers moved by a step, [number]."""
         values = {name: {key: t.clone() for key, t in parts.items()} for name, parts in self.values.items()}
-        for (name, key, number), part in zip(self.places, step.tolist(), strict=True):
+        for (name, key, number), part in zip(self.parameter_entries, step.tolist(), strict=True):
             values[name][key].view(-1)[number] += part
         return values
 
@@ -165,7 +172,7 @@ class NormalMatrix:
         """Derivatives of a body's middle [scene units] and turn [radians] by some of the numbers, [6, row]."""
         slopes = np.zeros((6, len(rows)))
         for column, index in enumerate(rows):
-            name, key, number = self.places[index]
+            name, key, number = self.parameter_entries[index]
             parts = self.values[name]
             ends = []
             for step in (_STEP, -_STEP):
@@ -237,7 +244,7 @@ class NormalMatrix:
     def _prior(self) -> np.ndarray:
         """Precision that priors have, [number, number]: the curvature of regularizers of poses, planes and offsets."""
         rows = []
-        for name, key, number in self.places:
+        for name, key, number in self.parameter_entries:
             ends = []
             for step in (_STEP, -_STEP):
                 self.values[name][key].view(-1)[number] += step
@@ -259,7 +266,7 @@ class NormalMatrix:
         if total.requires_grad:
             total.backward()
         slopes = []
-        for name, key, number in self.places:
+        for name, key, number in self.parameter_entries:
             gradient = leaves[name][key].grad
             slopes.append(0.0 if gradient is None else float(gradient.view(-1)[number]))
         return np.array(slopes)
@@ -284,14 +291,14 @@ def uncertainty(
     if not _few_number_entries(values):
         return None
     normal = NormalMatrix(problem, setting, values)
-    inverse = normal.directions @ np.linalg.inv(normal.form)
-    covariance = inverse @ normal.middle @ inverse.T
+    inverse = normal.directions @ np.linalg.inv(normal.normal_matrix)
+    covariance = inverse @ normal.score_covariance @ inverse.T
     poses = {
         free.called(fitted): _pose_uncertainty(free, normal, covariance)
         for free in problem.free
         if isinstance(free, Pose)
     }
-    names = [f"{name}.{key}[{number}]" for name, key, number in normal.places]
+    names = [f"{name}.{key}[{number}]" for name, key, number in normal.parameter_entries]
     return Uncertainty(names, covariance, poses, normal.light)
 
 
@@ -300,7 +307,7 @@ def _pose_uncertainty(free: Pose, normal: NormalMatrix, covariance: np.ndarray) 
     setting = normal.setting
     plane = normal.plane(free)
     names = {free.name} if plane is None else {free.name, plane.name}
-    rows = [index for index, (name, _, _) in enumerate(normal.places) if name in names]
+    rows = [index for index, (name, _, _) in enumerate(normal.parameter_entries) if name in names]
     _, middle, scale = normal.posed(free)
     half = setting.extent(free.number) * float(scale)
     both = normal.slopes(free, rows)
@@ -328,11 +335,11 @@ def candidates_along_flat_direction(
     farther; the light is solved for anew.
     """
     normal = NormalMatrix(problem, setting, values)
-    poses = [index for index, (name, _, _) in enumerate(normal.places) if name.startswith(f"{Pose.key}[")]
-    weakest = np.zeros(len(normal.places))
+    poses = [index for index, (name, _, _) in enumerate(normal.parameter_entries) if name.startswith(f"{Pose.key}[")]
+    weakest = np.zeros(len(normal.parameter_entries))
     if poses:
         moving = normal.directions[poses].any(axis=0)
-        spread = np.linalg.inv(normal.form)[np.ix_(moving, moving)]
+        spread = np.linalg.inv(normal.normal_matrix)[np.ix_(moving, moving)]
         weakest = normal.directions[:, moving] @ np.linalg.eigh(spread)[1][:, -1]
     return [normal.moved(CANDIDATE_SPACING * (number // 2 + 1) * (-1) ** number * weakest) for number in range(count)]
 

@@ -9,7 +9,7 @@ import functools
 import numpy as np
 import warp as wp
 
-from warpshadow.device.launch import detached
+from warpshadow.device.launch import without_gradient
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.by_spheres import SphereMethod
 from warpshadow.pipeline.lighting import LitPoints
@@ -48,15 +48,15 @@ def find_squares(
     body_of_probe = np.where(probe_keys < 0, -1, probe_keys % len(is_adaptive))
     shares = np.zeros(probe_keys.shape, np.float32)
     with unrecorded():
-        bare = detached(spheres[0]), detached(spheres[1])
-        blockers = method.blockers(points.blocker_kinds, detached(positions), bare)
+        bare = without_gradient(spheres[0]), without_gradient(spheres[1])
+        blockers = method.blockers(points.blocker_kinds, without_gradient(positions), bare)
         for body in np.flatnonzero(is_adaptive).tolist():
             columns = _ragged(body_of_probe == body)
             if not columns.shape[1]:
                 continue
             samples = np.where(columns < 0, -1, probes[columns])
             seen = see_samples(fragments, samples)
-            facing = points_seen(detached(positions), detached(normals), merged_scene.faces, seen)
+            facing = points_seen(without_gradient(positions), without_gradient(normals), merged_scene.faces, seen)
             group = blockers.around_plane(*facing, body)
             portions = [method.sharp_share(portion) for portion in group.portions()]
             known = [portion for portion in portions if portion is not None]

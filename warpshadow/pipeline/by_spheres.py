@@ -159,7 +159,7 @@ class SphereMethod(Method):
         """
         return None
 
-    def cached_rows(self, static: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
+    def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """Rows of transmittance past static bodies, for known light or for any."""
         raise NotImplementedError
 
@@ -175,7 +175,7 @@ class SphereMethod(Method):
         """Shading of points in known light, which bounces from the materials."""
         projected_light = self.projected(light)
         if self.bounces is not None:
-            is_cached = points.is_static and materials is not points.materials
+            is_cached = points.is_scene_view and materials is not points.materials
             shade_all = self.bounces.cached_bounced_shading if is_cached else self.bounces.bounced_shading
             return shade_all(points, projected_light, light, materials)
         return PortionedShading(self, points, projected_light, light, joined)
@@ -184,7 +184,7 @@ class SphereMethod(Method):
         """Shading of points in free light; where it bounces between moving bodies, computed as for known light."""
         if self.bounces is None:
             return super().free_shading(points, light, materials)
-        if not points.is_static:
+        if not points.is_scene_view:
             return self.bounces.bounced_free_shading(
                 points, Node("", self._projected_if_given, light), light, materials
             )
@@ -290,7 +290,7 @@ class PortionedShading(Node):
         shadows = _static_shadows(method, points, light)
         cached_rows = shadows if shadows.function else None
         looked_up: Node | dict = self_visibility if self_visibility.function else {}
-        static_normals = None if points.static is None else points.static.normals
+        static_normals = None if points.static_bodies is None else points.static_bodies.normals
         before = receivers, blockers, projected_light, looked_up, cached_rows, static_normals
         super().__init__(
             "", None, *before, extra_inputs=(self_visibility, shadows, result, *extra_inputs), caches=caches
@@ -355,9 +355,9 @@ def _pairs(method: SphereMethod, points: LitPoints) -> str:
         return f"up to {spheres[bodies].sum():,} spheres{solids}"  # some are culled, or merged
 
     item_text = f"{receiver_text(points, static=False)} × {blockers(list(range(len(spheres))))}"
-    if points.static is None:
+    if points.static_bodies is None:
         return item_text
-    moving = list(points.static.moving)
+    moving = list(points.static_bodies.moving)
     return f"{item_text}, {receiver_text(points, moving=False)} on static bodies × {blockers(moving)}"
 
 
@@ -368,7 +368,9 @@ def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
     if method.why_no_shadows or not counts.sum():
         rest = "but flat ones " if points.blocker_kinds.planes else ""
         return method.why_no_shadows or f"no body {rest}has blockers"
-    if moving or (points.static and static and (method.joins_cached or counts[list(points.static.moving)].sum())):
+    if moving or (
+        points.static_bodies and static and (method.joins_cached or counts[list(points.static_bodies.moving)].sum())
+    ):
         return ""
     return "no moving body has blockers" if static else "nothing is seen"
 
@@ -399,12 +401,12 @@ def _why_no_self_visibility(method: SphereMethod, points: LitPoints) -> str:
 
 def _static_shadows(method: SphereMethod, points: LitPoints, light: Input | None) -> Node:
     """Node of cached transmittance past static bodies; its value is None if there are none."""
-    static = points.static
-    if static is None or not static.spheres[1].shape[1]:
+    static_bodies = points.static_bodies
+    if static_bodies is None or not static_bodies.spheres[1].shape[1]:
         bouncing = bool(method.merged_scene.scene.bounces)
         why = "light bounces: nothing of static bodies is cached" if bouncing else "no static body has blockers"
         return Node("static shadows", None, idle=why)
-    rows = method.cached_rows(static, light, points.blocker_kinds)
+    rows = method.cached_rows(static_bodies, light, points.blocker_kinds)
 
     def missing() -> int:
         receivers = points.receivers_node.value_if_known(points.call)
@@ -414,7 +416,7 @@ def _static_shadows(method: SphereMethod, points: LitPoints, light: Input | None
         "static shadows",
         rows.of_receivers,
         detached(points.receivers_node),
-        static.normals,
+        static_bodies.normals,
         items=lambda: f"up to {missing():,} vertices not seen before",
         idle=lambda: method.why_no_shadows or ("" if missing() else "cached: static bodies are the same"),
         caches=False,

@@ -140,8 +140,8 @@ def choose_receivers(
         unevenness[is_open] = light_unevenness(merged_scene, positions, seen, bodies, light)
     chosen[unevenness > UNEVEN] = "pixel"
     return [
-        ReceiverChoice(own if receivers == AUTO else receivers, size, float(error))
-        for own, receivers, size, error in zip(chosen.tolist(), requested, sizes, unevenness, strict=True)
+        ReceiverChoice(choice if receivers == AUTO else receivers, size, float(error))
+        for choice, receivers, size, error in zip(chosen.tolist(), requested, sizes, unevenness, strict=True)
     ]
 
 

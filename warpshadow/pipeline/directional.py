@@ -355,7 +355,7 @@ class Directional(SphereMethod):
     ) -> Node:
         """Mean radiance of the blockers of points, by their light with bounces and without."""
         cells, projected_light = self._lobe_cells(points, light)
-        free = light if isinstance(light.value(), wp.array) else None
+        free = light if light.is_free else None
         return Node("light of blockers", self._blocked, cells, points.receivers_node, projected_light, diffuse, free)
 
     def _blocked(
@@ -378,27 +378,35 @@ class Directional(SphereMethod):
 
     def _lobe_cells(self, points: LitPoints, light: Input) -> tuple[Node, Any]:
         """Node of the transmittance of cells, in portions, and the projected light that says which."""
-        is_free = isinstance(light.value(), wp.array)
         make = functools.partial(self.projected, light)
-        projected_light = self.free_projection if is_free else points.cached("projected", light, make)
+        projected_light = self.free_projection if light.is_free else points.cached("projected", light, make)
 
         def in_cells() -> Node:
             return PortionedCellTransmittance(
                 self, points, projected_light, None, list, where=" of gloss", is_shaded=False
             )
 
-        return points.cached("cells", None if is_free else light, in_cells), projected_light
+        return points.cached("cells", None if light.is_free else light, in_cells), projected_light
 
-    def cached_rows(self, static: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
-        """The light S_q that static bodies let through, [row, 3, direction]; but for the scene's, of 1: [row, 1, …]."""
-        is_scenes = light is self.light
-        return static.rows("lit cells" if is_scenes else "cells", functools.partial(self._trace, is_scenes))
+    def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
+        """Rows of the light of each cell that static bodies let through.
 
-    def _trace(self, is_scenes: bool, static: StaticBodies, vertices: np.ndarray, normals: wp.array) -> wp.array:
-        points, normals = static.gathered(vertices, normals)
-        numbers = wp.array(split_sides(vertices, len(static.has_vertex))[0], dtype=wp.int32, device=points.device)
-        samples = self._lit_samples if is_scenes else self._even_samples
-        return trace_cells(static.mesh, points[0], normals[0], numbers, samples, progress=self.progress)
+        Scene light: [row, 3, cell], premultiplied. Any other: [row, 1, cell], for white light.
+        """
+        is_scene_light = light is self.light
+        return static_bodies.rows(
+            "lit cells" if is_scene_light else "cells", functools.partial(self._trace, is_scene_light)
+        )
+
+    def _trace(
+        self, is_scene_light: bool, static_bodies: StaticBodies, vertices: np.ndarray, normals: wp.array
+    ) -> wp.array:
+        points, normals = static_bodies.gathered(vertices, normals)
+        numbers = wp.array(
+            split_sides(vertices, len(static_bodies.has_vertex))[0], dtype=wp.int32, device=points.device
+        )
+        samples = self._lit_samples if is_scene_light else self._even_samples
+        return trace_cells(static_bodies.mesh, points[0], normals[0], numbers, samples, progress=self.progress)
 
     @functools.cached_property
     def _lit_samples(self) -> CellSamples:

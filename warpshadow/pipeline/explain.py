@@ -130,15 +130,15 @@ def decide(image: Node, call: Call) -> dict[Node, Decision]:
 def _decision(node: Node, call: Call, reason: Decision) -> Decision:
     """Whether a node runs, given why it is asked for, or why it is not."""
     if node.value_if_known(call) is not None:
-        return Decision(False, f"cached: {_names(node.sources)} are the same")
+        return Decision(False, f"cached: {_names(node.root_inputs)} are the same")
     if idle := _text(node.idle):
         return Decision(False, idle)
     if not reason:
         return reason
     if node.requires_grad:
-        varying = (source for source in node.sources if source.requires_grad)
+        varying = (item for item in node.root_inputs if item.requires_grad)
         return Decision(True, f"a gradient to {_names(varying)} is asked for")
-    if news := [source.news for source in node.sources if source.news]:
+    if news := [item.news for item in node.root_inputs if item.news]:
         return Decision(True, _listed(dict.fromkeys(news)))
     return Decision(True, "nothing is cached yet") if node.caches else reason
 
@@ -154,8 +154,8 @@ def _stage(node: Node, forward: Decision) -> StageReport:
     return StageReport(node.name, forward, backward, _text(node.items) if forward else "")
 
 
-def _names(sources: Iterable[Input]) -> str:
-    return _listed(dict.fromkeys(source.name for source in sources))
+def _names(inputs: Iterable[Input]) -> str:
+    return _listed(dict.fromkeys(item.name for item in inputs))
 
 
 def _text(text: str | Callable[[], str]) -> str:
@@ -169,5 +169,5 @@ def _listed(items: Iterable[str]) -> str:
 
 
 def _row(name: str, decision: Decision, last: float | None, items: str) -> tuple[str, str, str, str, str]:
-    time_taken = "" if last is None else f"{1e3 * last:.2f} ms"
-    return f"  {name}", "runs" if decision else "–", time_taken, items, decision.why
+    milliseconds = "" if last is None else f"{1e3 * last:.2f} ms"
+    return f"  {name}", "runs" if decision else "–", milliseconds, items, decision.why

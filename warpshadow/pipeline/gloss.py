@@ -47,7 +47,9 @@ class GlossyPoints(LitPoints):
         self._all_receivers, self._cameras = view.receivers_node, cameras
         self._fragments, self._clip_positions = fragments, clip_positions
         arguments = view.method, view.materials, view.vertices, view.spheres, receivers, view.call
-        super().__init__(*arguments, normals=view.normals, blocker_kinds=view.blocker_kinds, is_static=view.is_static)
+        super().__init__(
+            *arguments, normals=view.normals, blocker_kinds=view.blocker_kinds, is_scene_view=view.is_scene_view
+        )
         self._numbers = Node("", functools.partial(_numbers, glossy), detached(view.receivers_node))
 
     def mixed(self, view: LitPoints, diffuse: Node, light: Light | None, materials: Materials) -> tuple[Node, Node]:
@@ -99,12 +101,14 @@ class GlossyPoints(LitPoints):
 
     def _interpolate(self, receivers: Receivers, values: wp.array) -> wp.array:
         """Numbers of the receivers, from those of all vertices."""
-        faces, seen = self.merged_scene.faces, receivers.seen
-        assert seen is not None
-        if not seen.face_ids.size:
+        faces, samples = self.merged_scene.faces, receivers.sample_fragments
+        assert samples is not None
+        if not samples.face_ids.size:
             return wp.empty((1, 0), dtype=wp.float32, device=faces.device)
         sides = constant(np.tile(faces.numpy(), (2, 1)), wp.vec3i, faces.device)
-        fragments = Fragments(*(array.reshape((len(array), 1, -1)) for array in (seen.face_ids, seen.barycentrics)))
+        fragments = Fragments(
+            *(array.reshape((len(array), 1, -1)) for array in (samples.face_ids, samples.barycentrics))
+        )
         return rows(interpolate(fragments, sides, values))
 
     def _sample(self, fragments: Fragments, values: wp.array, textures: Textures, footprints: Footprints) -> wp.array:
@@ -113,7 +117,7 @@ class GlossyPoints(LitPoints):
 
     def _prefiltered(self, light: Input) -> Node:
         """Node of the texels of light, vec3 of shape [batch, texel]."""
-        if isinstance(light.value(), wp.array):
+        if light.is_free:
             return Node("prefiltering", self._blurred, light, items=lambda: f"{self.method.basis.size} coefficients")
         return self.method.prefiltered(light)
 
@@ -175,17 +179,17 @@ def _glossy_receivers(is_glossy: np.ndarray, receivers: Receivers) -> Receivers:
     """The glossy ones among the receivers of a view, all of which pixels see. Differentiable: points, normals."""
     spans, count = _spans(is_glossy, receivers), 0
     assert receivers.vertices is not None
-    at_vertices, seen = receivers.vertices.size, receivers.seen
+    at_vertices, samples = receivers.vertices.size, receivers.sample_fragments
     renumbered = []
     for span in spans:
         renumbered.append(Span(span.body, count, count + span.end - span.first))
         count = renumbered[-1].end
 
-    if seen is None:
+    if samples is None:
         device = receivers.points.device
-        seen = Fragments(*(wp.empty((1, 0), dtype=dtype, device=device) for dtype in (wp.int32, wp.vec3)))
-    fragments = Fragments(*(_of_spans(array, spans, at_vertices) for array in (seen.face_ids, seen.barycentrics)))
+        samples = Fragments(*(wp.empty((1, 0), dtype=dtype, device=device) for dtype in (wp.int32, wp.vec3)))
+    fragments = Fragments(*(_of_spans(array, spans, at_vertices) for array in (samples.face_ids, samples.barycentrics)))
     none = constant(np.empty(0, int), wp.int32, receivers.points.device)
     points, normals = (_of_spans(array, spans, 0) for array in (receivers.points, receivers.normals))
     arguments = points, normals, receivers.faces, none, fragments
-    return Receivers(*arguments, spans=tuple(renumbered), vertices=none, seen=fragments)
+    return Receivers(*arguments, spans=tuple(renumbered), vertices=none, sample_fragments=fragments)

@@ -186,10 +186,10 @@ def find_groups(
         static_normals: Normals of all vertices of static bodies; None where any may move.
     """
     groups = list(_groups_that_move(receivers, blockers, self_lookups, points.blocker_of_point))
-    if points.static is None or not len(receivers.on_static):
+    if points.static_bodies is None or not len(receivers.on_static):
         return groups
     assert static_normals is not None
-    moving, facing = points.static.moving, points.static.receivers(receivers.on_static, static_normals)
+    moving, facing = points.static_bodies.moving, points.static_bodies.receivers(receivers.on_static, static_normals)
     planes, parts = blockers.planes_around(of_bodies=moving), blockers.convex_parts_around(of_bodies=moving)
     group = Group(*facing, *blockers.spheres_of(moving), cached_rows, planes=planes, convex_parts_around=parts)
     return [group, *groups] if receivers.points.shape[1] else [group]

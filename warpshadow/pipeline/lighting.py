@@ -63,10 +63,10 @@ class LitPoints:
         spheres: Centers and radii of the spheres.
         receivers: The points.
         call: Holds values of the points that may not be cached.
-        static: The static bodies among moving ones; None where any may move.
+        static_bodies: Those among moving ones; None where any may move.
         normals: Node of the normals of all vertices, vec3 of shape [batch, vertex]; by default its own.
         blocker_kinds: Which bodies block light by something else than their spheres.
-        is_static: Whether bodies and points are where the scene and its camera have them, for good.
+        is_scene_view: Whether bodies and points are where the scene and its camera have them, for good.
         blocker_of_point: Of points that send light, the number of the blocker nearest to the patch of each, among the
             spheres of bodies that are not flat, −1 for none: NumPy of shape [receiver].
     """
@@ -79,16 +79,16 @@ class LitPoints:
         spheres: Input,
         receivers: Node,
         call: Call,
-        static: StaticBodies | None = None,
+        static_bodies: StaticBodies | None = None,
         normals: Node | None = None,
         blocker_kinds: BlockerKinds = ONLY_SPHERES,
-        is_static: bool = False,
+        is_scene_view: bool = False,
         blocker_of_point: np.ndarray | None = None,
     ):
-        self.blocker_kinds, self.is_static, self.blocker_of_point = blocker_kinds, is_static, blocker_of_point
+        self.blocker_kinds, self.is_scene_view, self.blocker_of_point = blocker_kinds, is_scene_view, blocker_of_point
         self.method, self.materials, self.merged_scene = method, materials, method.merged_scene
         self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
-        self.call, self.static = call, static
+        self.call, self.static_bodies = call, static_bodies
         self.normals = Node("", vertex_normals, vertices, method.merged_scene.faces) if normals is None else normals
         self._last_light: Input | None = None  # that was known, but for the scene's
         self._cached: dict[str, tuple[Hashable, Any]] = {}
@@ -102,7 +102,7 @@ class LitPoints:
     def with_receivers(self: Points, receivers: Node) -> Points:
         """Other receivers, of which nothing is cached, among the same blockers, any of which may move."""
         points = copy.copy(self)
-        points.receivers_node, points.static, points.is_static = receivers, None, False
+        points.receivers_node, points.static_bodies, points.is_scene_view = receivers, None, False
         points._cached, points._last_light = {}, None
         return points
 
@@ -134,13 +134,15 @@ class LitPoints:
         check_light(light)
         if materials is None or not self.merged_scene.scene.bounces:
             materials = self.materials
-        source = self.light_input(light)
-        if isinstance(light, wp.array):
-            return self.method.free_shading(self, source, materials)
-        shade = functools.partial(self.method.known_shading, self, source, materials)
+        light_input = self.light_input(light)
+        if light_input.is_free:
+            return self.method.free_shading(self, light_input, materials)
+        shade = functools.partial(self.method.known_shading, self, light_input, materials)
         if materials is not self.materials:
             return shade()
-        return self.cached("shading of the scene" if source is self.method.light else "shading", source, shade)
+        return self.cached(
+            "shading of the scene" if light_input is self.method.light else "shading", light_input, shade
+        )
 
     def light_input(self, light: Light | None) -> Input:
         """The light as an input; the same for the same known light."""

@@ -113,32 +113,32 @@ class LogSH(SphereMethod):
             group.self_lookup.lobes, group.probe_weights, group.self_lookup.turn, order=self._order, bands=bands
         )
 
-    def cached_rows(self, static: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
+    def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """The log-visibility of the static spheres, for any light, [row, 1, order²]; and lobes, if one has its own."""
-        if any(body in blocker_kinds.traced for body in static.bodies):
+        if any(body in blocker_kinds.traced for body in static_bodies.bodies):
             find = functools.partial(self._accumulate_and_turn, blocker_kinds.traced)
-            return static.rows(("log sums and lobes", blocker_kinds.traced), find)
-        return static.rows("log sums", self._accumulate)
+            return static_bodies.rows(("log sums and lobes", blocker_kinds.traced), find)
+        return static_bodies.rows("log sums", self._accumulate)
 
-    def _accumulate(self, static: StaticBodies, vertices: np.ndarray, normals: wp.array) -> wp.array:
-        logs = self._logs(*static.gathered(vertices, normals), *static.spheres)
+    def _accumulate(self, static_bodies: StaticBodies, vertices: np.ndarray, normals: wp.array) -> wp.array:
+        logs = self._logs(*static_bodies.gathered(vertices, normals), *static_bodies.spheres)
         return logs.reshape((len(vertices), 1, self._order**2))
 
     def _accumulate_and_turn(
-        self, traced: tuple[int, ...], static: StaticBodies, vertices: np.ndarray, normals: wp.array
+        self, traced: tuple[int, ...], static_bodies: StaticBodies, vertices: np.ndarray, normals: wp.array
     ) -> wp.array:
         """Log sums of the spheres of other bodies, and lobes, [vertex, 2, order²]."""
-        assert static.rotations is not None
+        assert static_bodies.rotations is not None
         body_of_vertex, device = self.merged_scene.body_of_vertex, self.merged_scene.device
         rows = np.empty((len(vertices), 2, self._order**2), np.float32)
         bodies = body_of_vertex[vertices % len(body_of_vertex)]
         traced_bodies = tuple(np.intersect1d(traced, bodies).tolist())
-        turned = self.self_visibility.turned_lobes(traced_bodies, static.rotations, self._order)
+        turned = self.self_visibility.turned_lobes(traced_bodies, static_bodies.rotations, self._order)
         for body in np.unique(bodies).tolist():
             of_body = np.flatnonzero(bodies == body)
-            arguments = static.gathered(vertices[of_body], normals)
-            others = [other for other in static.bodies if not (other == body and body in traced)]
-            rows[of_body, 0] = self._logs(*arguments, *static.spheres_of(others)).numpy()[0]
+            arguments = static_bodies.gathered(vertices[of_body], normals)
+            others = [other for other in static_bodies.bodies if not (other == body and body in traced)]
+            rows[of_body, 0] = self._logs(*arguments, *static_bodies.spheres_of(others)).numpy()[0]
             if body in turned:
                 lobes, turn = turned[body]
                 result = self_visibility_lobes(

@@ -1,9 +1,9 @@
 """Nodes: a computed value, its inputs, whether it is cached, and why.
 
-A source is something given: vertices, a light. A node computes a value from sources and from other nodes when it is
-asked for it. Neither ever changes: where something else is given, there is another source, and there are other nodes
-that take it. So a node's value stays right for as long as the node exists. It is cached, and a node that keeps its
-value asks nothing that comes before it. Only values with a gradient are not cached: a tape is good for one playback.
+An :class:`Input` is a value from the caller, such as vertices or a light; a :class:`Node` computes one from inputs and
+nodes, when its value is asked for. Both are immutable: another value is another input, with other nodes after it. So a
+node's value stays right for as long as the node exists. It is cached, and a node with a cached value asks nothing that
+comes before it. Only values with a gradient are not cached: a tape is good for one playback.
 """
 
 import time
@@ -33,13 +33,18 @@ class Input:
         self.requires_grad = False
         for item in value if isinstance(value, (tuple, list)) else [value]:
             self.requires_grad |= getattr(item, "requires_grad", False)
-        self.sources, self.differentiated_inputs = {self: None}, {self: None} if self.requires_grad else {}
+        self.root_inputs, self.differentiated_inputs = {self: None}, {self: None} if self.requires_grad else {}
 
     def value(self, call: "Call | None" = None) -> Any:
         """The value."""
         if callable(self._value):
             self._value = self._value()
         return self._value
+
+    @property
+    def is_free(self) -> bool:
+        """Whether the value of an input of light is free light, an array, and not known light."""
+        return isinstance(self.value(), wp.array)
 
     @classmethod
     def renewed(cls, name: str, value: Any, last: "Input | None") -> "Input":
@@ -48,15 +53,15 @@ class Input:
         On a CPU values are compared. On a GPU, which would have to wait for that, an array is the same if it has the
         same ``origin``, the tensor whose memory it is, and the same ``version``, which counts the writes to that.
         """
-        source = cls(name, value)
-        if source.requires_grad:
-            return source
+        result = cls(name, value)
+        if result.requires_grad:
+            return result
         if last is not None and not last.requires_grad:
             if _is_same(value, last):
                 return last
-            source.news = f"{name} changed since the last call"
-        source._value = _copied(value)
-        return source
+            result.news = f"{name} changed since the last call"
+        result._value = _copied(value)
+        return result
 
 
 def _arrays(value: Any) -> list[wp.array]:
@@ -97,7 +102,7 @@ class Node:
     Args:
         name: Name of the stage; empty for a node that is neither timed nor explained.
         function: Computes the value from the inputs' values; None if nothing asks for it.
-        inputs: Nodes and sources; anything else is passed on as it is.
+        inputs: Nodes and inputs of the pipeline; anything else is passed on as it is.
         items: On how many items it is computed, in words.
         idle: Why there is nothing to do, in words; the function then passes something on.
         has_adjoint: Whether gradients take it more than to hand them on.
@@ -106,8 +111,8 @@ class Node:
 
     Items and idle may be functions that make the words.
     Attributes:
-        before: The nodes and sources that it depends on at once.
-        sources: All sources that it depends on.
+        before: The nodes and inputs that it depends on at once.
+        root_inputs: All inputs that it depends on.
         requires_grad: Whether a gradient to any of them is asked for; then nothing is cached.
         differentiated_inputs: The inputs that get a gradient from here.
     """
@@ -126,13 +131,13 @@ class Node:
         self.name, self.function, self.inputs = name, function, inputs
         self.items, self.idle, self.has_adjoint = items, idle, has_adjoint
         self.before: list[AnyInput] = []
-        self.sources: dict[Input, None] = {}  # in order
+        self.root_inputs: dict[Input, None] = {}  # in order
         self.differentiated_inputs: dict[Input, None] = {}
         self.requires_grad = False
         for item in (*inputs, *extra_inputs):
             if isinstance(item, (Node, Input)):
                 self.before.append(item)
-                self.sources |= item.sources
+                self.root_inputs |= item.root_inputs
                 self.differentiated_inputs |= item.differentiated_inputs
                 self.requires_grad |= item.requires_grad
         self.caches = caches and not self.requires_grad
@@ -178,17 +183,22 @@ class Node:
 AnyInput = Node | Input
 
 
+def identity(value: Any) -> Any:
+    """The function of a node that passes its input's value on."""
+    return value
+
+
 def detached(node: AnyInput, *, is_constant: bool = False) -> Node:
     """Make an input of a node's value that passes no gradient to the node.
 
     Args:
-        node: The node or source.
-        is_constant: Whether the value is independent of the sources' values.
+        node: The node or input.
+        is_constant: Whether the value is independent of the inputs' values.
     """
-    result = Node("", lambda value: value, node, caches=False)
+    result = Node("", identity, node, caches=False)
     result.differentiated_inputs = {}
     if is_constant:
-        result.before, result.sources, result.requires_grad = [], {}, False
+        result.before, result.root_inputs, result.requires_grad = [], {}, False
     return result
 
 

@@ -113,7 +113,7 @@ class Rays(Method):
         self, points: LitPoints, diffuse: Node, light: Input, view: LitPoints, choose: Callable[[Node], Node]
     ) -> Node:
         """Mean radiance of the blockers of points, by their light with bounces and without."""
-        if isinstance(light.value(), wp.array):
+        if light.is_free:
             direct = super().free_shading(view, light, view.materials)
         else:
             direct = view.cached(
@@ -183,7 +183,7 @@ class Rays(Method):
         return [*meshes, *meshes[-1:] * (len(points) - count)]
 
     def _shade(self, meshes: Meshes, receivers: Receivers, light: KnownLight) -> wp.array:
-        points, normals = _without_gradient(receivers.points), receivers.normals
+        points, normals = _checked_points(receivers.points), receivers.normals
         samples = sample_map(map_of(light), self._sample_count)
         traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
         for instance, mesh in enumerate(meshes):
@@ -193,7 +193,7 @@ class Rays(Method):
 
     def _shade_shared(self, trees: list[FaceTree], receivers: Receivers, light: KnownLight) -> wp.array:
         """Shading by rays in directions that all receivers share."""
-        points, normals, progress = _without_gradient(receivers.points), receivers.normals, self.progress
+        points, normals, progress = _checked_points(receivers.points), receivers.normals, self.progress
         count = -(-self.visibility.ray_count // PACKET) * PACKET
         traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
         for instance in range(len(points) if points.size else 0):
@@ -225,18 +225,18 @@ class Rays(Method):
 
 
 def _trace_lobes(trees: list[FaceTree], receivers: Receivers, directions: wp.array) -> wp.array:
-    points, normals, count = _without_gradient(receivers.points), receivers.normals, len(directions)
+    points, normals, count = _checked_points(receivers.points), receivers.normals, len(directions)
     traced = wp.empty(directions.shape, dtype=wp.float32, device=points.device)
     for instance in range(count if points.size else 0):
-        located = min(instance, len(points) - 1)
-        arguments = points[located], normals[located], directions[instance]
+        point_batch = min(instance, len(points) - 1)
+        arguments = points[point_batch], normals[point_batch], directions[instance]
         wp.copy(traced[instance], trace_lobes(trees[min(instance, len(trees) - 1)], *arguments))
     return traced
 
 
 def _openness(trees: list[FaceTree], receivers: Receivers) -> wp.array:
     """Light under an even sky of 1, vec3 of shape [batch, receiver]."""
-    points, normals = _without_gradient(receivers.points), receivers.normals
+    points, normals = _checked_points(receivers.points), receivers.normals
     result = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
     samples = cut_map(np.ones((64, 128, 3), np.float32), _EVEN_RAYS)
     for instance in range(len(points) if points.size else 0):
@@ -245,7 +245,8 @@ def _openness(trees: list[FaceTree], receivers: Receivers) -> wp.array:
     return result
 
 
-def _without_gradient(points: wp.array) -> wp.array:
+def _checked_points(points: wp.array) -> wp.array:
+    """Points, which may require no gradient."""
     if points.requires_grad:
         raise ValueError(
             "geometry: got arrays that require a gradient, which rays do not have; expected none, or another method"

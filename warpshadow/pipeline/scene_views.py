@@ -12,7 +12,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.device.batch import common_batch
 from warpshadow.pipeline.geometry import PLACED, Geometry
 from warpshadow.pipeline.lighting import BlockerKinds, LitPoints, Method
-from warpshadow.pipeline.node import Call, Clock, Input, Node
+from warpshadow.pipeline.node import Call, Clock, Input, Node, identity
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.static import StaticBodies
 from warpshadow.pipeline.view import View
@@ -67,14 +67,14 @@ class SceneViews:
     def keep(self, view: View) -> None:
         """Cache a view whose receivers are found, to be used again."""
         self._last_cameras = view.cameras
-        if view.static is not None:
-            self._static[view.static.moving] = view.static
+        if view.static_bodies is not None:
+            self._static[view.static_bodies.moving] = view.static_bodies
         if view.receivers_node.is_cached:
             self.last = (view, self.last[1]) if self.is_of_scene(view) else (self.last[0], view)
 
     def view(self, geometry: Geometry | None = None, clip_matrices: wp.array | None = None) -> View:
         """Build a lazy view, or reuse a cached one whose inputs match."""
-        vertices, spheres, cameras, static = self.vertices, self._spheres, self.clip_matrices, None
+        vertices, spheres, cameras, static_bodies = self.vertices, self._spheres, self.clip_matrices, None
         last, poses, matrices = self.last[1], [None], self._cameras
         if geometry is not None:
             rest = self._merged_scene.rest.arrays()
@@ -90,10 +90,10 @@ class SceneViews:
         # rays look at all moving bodies, and light bounces from moving bodies to static ones
         caches_rows = not (self._method.lights_samples or self._merged_scene.scene.bounces)
         if geometry is not None and geometry.moving is not None and caches_rows:
-            static = self._static.get(geometry.moving)
-            if static is None or not static.matches(geometry):
-                static = StaticBodies(self._merged_scene, geometry)
-        arguments = vertices, spheres, cameras, static, self._blocker_kinds(geometry, last)
+            static_bodies = self._static.get(geometry.moving)
+            if static_bodies is None or not static_bodies.matches(geometry):
+                static_bodies = StaticBodies(self._merged_scene, geometry)
+        arguments = vertices, spheres, cameras, static_bodies, self._blocker_kinds(geometry, last)
         for view in self.last:
             if view is not None and view.dependencies == arguments:
                 return view
@@ -106,7 +106,7 @@ class SceneViews:
             call=self.call(),
             camera=self._cameras[0],
             counts=(len(poses), image_count),
-            is_static=geometry is None and clip_matrices is None and image_count == 1,
+            is_scene_view=geometry is None and clip_matrices is None and image_count == 1,
         )
 
     def _blocker_kinds(self, geometry: Geometry | None, last: LitPoints | None = None) -> BlockerKinds:
@@ -137,7 +137,7 @@ class SceneViews:
         Differentiable: all.
         """
         receivers = Input("receivers", Receivers(points, normals, None, None, None))  # type: ignore[arg-type]
-        node = Node("", lambda same: same, receivers)
+        node = Node("", identity, receivers)
         bodies, blocker_kinds = self._bodies(geometry), self._method.blocker_kinds(geometry, None)
         return LitPoints(self._method, self._materials, *bodies, node, self.call(), blocker_kinds=blocker_kinds)
 

@@ -166,9 +166,9 @@ class SelfVisibility:
         vertex_count = receivers.vertices.size
         if first < vertex_count:
             return table.of_vertices(receivers.vertices[first:end])
-        seen, first, end = receivers.seen, first - vertex_count, end - vertex_count
-        assert seen is not None
-        return table.of_samples(Fragments(cut(seen.face_ids, first, end), cut(seen.barycentrics, first, end)))
+        fragments, first, end = receivers.sample_fragments, first - vertex_count, end - vertex_count
+        assert fragments is not None
+        return table.of_samples(Fragments(cut(fragments.face_ids, first, end), cut(fragments.barycentrics, first, end)))
 
     def probe_weights_of(self, body: int, vertices: np.ndarray) -> ProbeWeights:
         """Where vertices of a body, after the last of which backs are numbered, lie among its probes."""

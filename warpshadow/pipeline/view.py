@@ -10,7 +10,7 @@ import warp as wp
 from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.lighting import BlockerKinds, Light, LitPoints, Method, receiver_text
-from warpshadow.pipeline.node import Call, Input, Node, detached
+from warpshadow.pipeline.node import Call, Input, Node, detached, identity
 from warpshadow.pipeline.reflectance import Materials, SampleReflectance
 from warpshadow.stages.film import average, sample_radiance, sum_radiance
 from warpshadow.stages.normals import vertex_normals
@@ -43,12 +43,12 @@ class View(LitPoints):
         vertices: Positions of all vertices.
         spheres: Centers and radii of the spheres.
         cameras: Clip matrices.
-        static: The static bodies among moving ones; None where any may move.
+        static_bodies: Those among moving ones; None where any may move.
         blocker_kinds: Which bodies block light by something else than their spheres.
         call: Holds its values that may not be cached.
         camera: Has the cameras' size and near plane.
         counts: Number of geometries, and of images.
-        is_static: As for :class:`LitPoints`.
+        is_scene_view: As for :class:`LitPoints`.
     Attributes:
         dependencies: Vertices, spheres, cameras, static bodies, and how all block light.
         clip_positions, fragments_node, silhouettes, receivers_node: Nodes of the visible surfaces.
@@ -61,51 +61,53 @@ class View(LitPoints):
         vertices: Input,
         spheres: Input,
         cameras: Input,
-        static: "StaticBodies | None",
+        static_bodies: "StaticBodies | None",
         blocker_kinds: BlockerKinds,
         *,
         call: Call,
         camera: Camera,
         counts: tuple[int, int],
-        is_static: bool = False,
+        is_scene_view: bool = False,
     ):
-        self.dependencies = vertices, spheres, cameras, static, blocker_kinds
+        self.dependencies = vertices, spheres, cameras, static_bodies, blocker_kinds
         self._separate_bodies = method.separate_bodies(blocker_kinds)
         self._samples_receive = method.samples_receive(blocker_kinds)
         self.cameras = cameras
         self._camera, self._supersampling, self._pose_count = camera, method.merged_scene.scene.supersampling, counts[0]
         self._size = self._supersampling * camera.width, self._supersampling * camera.height
         self._sample_count = counts[1] * self._size[0] * self._size[1]
-        normals, receivers = self._wire(method, vertices, spheres, cameras, static)
+        normals, receivers = self._wire(method, vertices, spheres, cameras, static_bodies)
         super().__init__(
-            method, materials, vertices, spheres, receivers, call, static, normals, blocker_kinds, is_static
+            method, materials, vertices, spheres, receivers, call, static_bodies, normals, blocker_kinds, is_scene_view
         )
 
     def _wire(
-        self, method: Method, vertices: Input, spheres: Input, cameras: Input, static: "StaticBodies | None"
+        self, method: Method, vertices: Input, spheres: Input, cameras: Input, static_bodies: "StaticBodies | None"
     ) -> tuple[Node, Node]:
         """From the vertices to their normals and to the receivers."""
         merged_scene, samples, corners = method.merged_scene, self._samples, self._vertices
         faces, two_sided = merged_scene.faces, merged_scene.two_sided_faces
-        if static is None or cameras.requires_grad:
+        if static_bodies is None or cameras.requires_grad:
             clip = Node("clip positions", to_clip, vertices, cameras, items=corners)
         else:
-            cached = static.clip_positions(cameras)
-            clip = Node("clip positions", static.with_moving_clip_positions, vertices, cameras, cached, items=corners)
+            cached = static_bodies.clip_positions(cameras)
+            clip = Node(
+                "clip positions", static_bodies.with_moving_clip_positions, vertices, cameras, cached, items=corners
+            )
         fragments = Node("rasterization", rasterize, clip, faces, *self._size, items=samples)
         if two_sided.size:
             placed = detached(vertices), detached(cameras)
             sides = Node("sides", find_sides, fragments, faces, two_sided, *placed, items=samples, has_adjoint=False)
         else:
-            sides = Node("sides", _same, fragments, idle="every body is closed: none is seen from behind")
+            sides = Node("sides", identity, fragments, idle="every body is closed: none is seen from behind")
         edge_inputs = merged_scene.edges, clip, merged_scene.face_bodies, merged_scene.creases
         silhouettes = Node(
             "silhouettes", find_silhouettes, sides, faces, *edge_inputs, items=samples, has_adjoint=False
         )
-        if static is None:
+        if static_bodies is None:
             normals = Node("normals", vertex_normals, vertices, faces, items=corners)
         else:
-            normals = Node("normals", static.with_moving_normals, vertices, static.normals, items=corners)
+            normals = Node("normals", static_bodies.with_moving_normals, vertices, static_bodies.normals, items=corners)
         # receivers at vertices move with these alone; receivers at samples move with the samples' fragments, too
         seen = sides if self._samples_receive.any() else detached(sides)
         item_text = functools.partial(receiver_text, self)
@@ -128,7 +130,7 @@ class View(LitPoints):
         merged_scene, method, quadtree = self.merged_scene, self.method, None
         has_backs = fragments.sides is not None
         keeps_vertex, wants_samples = method.can_receive(self.blocker_kinds)[: 1 + has_backs], self._samples_receive
-        on_static_body = None if self.static is None else self.static.has_vertex
+        on_static_body = None if self.static_bodies is None else self.static_bodies.has_vertex
         separate_bodies = self._separate_bodies
         bodies = None if separate_bodies is None else separate_bodies[merged_scene.body_of_vertex]
         if is_readable(merged_scene.device):
@@ -176,11 +178,11 @@ class View(LitPoints):
     @functools.cached_property
     def _has_cached_shadows(self) -> np.ndarray:
         """Static bodies on which shadows of others are cached at vertices, bool of shape [body]."""
-        static, count = self.static, len(self.merged_scene.scene.bodies)
+        static_bodies, count = self.static_bodies, len(self.merged_scene.scene.bodies)
         result = np.zeros(count, bool)
-        if static is not None:
-            casting = [body for body in static.bodies if self.merged_scene.scene.bodies[body].casts_shadow]
-            result[[body for body in static.bodies if set(casting) - {body}]] = True
+        if static_bodies is not None:
+            casting = [body for body in static_bodies.bodies if self.merged_scene.scene.bodies[body].casts_shadow]
+            result[[body for body in static_bodies.bodies if set(casting) - {body}]] = True
         return result
 
     def image(self, light: Light | None, materials: Materials) -> Node:
@@ -317,7 +319,7 @@ class View(LitPoints):
         smooth = _smooth_moving if is_moving else smooth_silhouettes
         smoothed = samples_of("smoothing", smooth, samples, self.silhouettes, self.clip_positions)
         if self._supersampling == 1:
-            return Node("averaging", _same, smoothed, idle="a pixel has one sample", caches=False)
+            return Node("averaging", identity, smoothed, idle="a pixel has one sample", caches=False)
         return samples_of("averaging", average, smoothed, self._supersampling)
 
     def _white_radiance_of(self, shading: Node) -> Node:
@@ -336,8 +338,8 @@ class View(LitPoints):
         if self.receivers_node.value_if_known(self.call) is not None:
             return super().counts()
         can_receive, static = self.method.can_receive(self.blocker_kinds), 0
-        if self.static is not None:
-            static = int((can_receive & self.static.has_vertex).sum())
+        if self.static_bodies is not None:
+            static = int((can_receive & self.static_bodies.has_vertex).sum())
         samples = self._sample_count * self._samples_receive.any()
         return "up to ", int(self._pose_count * (can_receive.sum() - static) + samples), static
 
@@ -346,8 +348,8 @@ class View(LitPoints):
 
     def _vertices(self) -> str:
         count, static = int(self.merged_scene.first_vertex[-1]), 0
-        if self.static is not None:
-            static = int(self.static.has_vertex.sum())
+        if self.static_bodies is not None:
+            static = int(self.static_bodies.has_vertex.sum())
         return f"{count - static:,} vertices, {static:,} cached" if static else f"{count:,} vertices"
 
     def emptiness(self) -> str | None:
@@ -369,10 +371,6 @@ class View(LitPoints):
         which = f"image {number} of {len(face_ids)}" if len(face_ids) > 1 else "the image"
         remedy = 'Camera.framing(scene), or framing = "auto" in a scene file, shows all of it'
         return f"camera: {which} shows nothing of the scene: {reason}; {remedy}"
-
-
-def _same(value: object) -> object:
-    return value
 
 
 def _radiance(receivers: Receivers, shading: wp.array, reflectance: wp.array) -> wp.array:

@@ -85,7 +85,9 @@ def fitted_counts(scene: Scene) -> dict[int, int | str]:
         Numbers of the bodies, from 0, and how many spheres each takes, or "auto".
     """
     grounds, parts = _ground_spheres(scene), blocking_parts(scene)
-    counts = [SPHERES_BESIDE_PARTS if number in parts else _wanted(body) for number, body in enumerate(scene.bodies)]
+    counts = [
+        SPHERES_BESIDE_PARTS if number in parts else _requested_count(body) for number, body in enumerate(scene.bodies)
+    ]
     return {number: count for number, count in enumerate(counts) if count and grounds[number] is None}
 
 
@@ -140,7 +142,7 @@ def _announce(fits: Iterable[tuple[Mesh, int | str]], device: wp.DeviceLike, pro
     )
 
 
-def _wanted(body: Body) -> int | str:
+def _requested_count(body: Body) -> int | str:
     """How many spheres a body asks for."""
     return 0 if isinstance(body.blockers, Spheres) else body.blockers
 
@@ -150,7 +152,9 @@ def _ground_spheres(scene: Scene) -> list[Spheres | None]:
     meshes = [body.world_mesh() for body in scene.bodies]
     points = [mesh.world_points() for mesh in meshes]
     return [
-        _ground_sphere(meshes[k], [*points[:k], *points[k + 1 :]]) if _wanted(body) and body.mesh.is_flat else None
+        _ground_sphere(meshes[k], [*points[:k], *points[k + 1 :]])
+        if _requested_count(body) and body.mesh.is_flat
+        else None
         for k, body in enumerate(scene.bodies)
     ]
 

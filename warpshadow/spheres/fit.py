@@ -62,7 +62,7 @@ and of a colander 0.36, below which bodies have up to 1.9 times their light; of 
 
 _warned: weakref.WeakSet[Mesh] = weakref.WeakSet()
 
-_KEPT: weakref.WeakKeyDictionary[Mesh, dict[tuple, SphereFit]] = weakref.WeakKeyDictionary()
+_FITS: weakref.WeakKeyDictionary[Mesh, dict[tuple, SphereFit]] = weakref.WeakKeyDictionary()
 """Fits of meshes in memory, by their inputs and the cache that has them: reading one takes 2 ms."""
 
 _UNWRITTEN: dict[Path, tuple[np.ndarray, FitReport]] = {}
@@ -128,8 +128,8 @@ def fit_spheres(
         check.positive("error", error)
     where = check.device("device", device)
     key = count, error, seed, steps if refine else 0, where.alias, cache_folder()
-    if cache and key in _KEPT.get(mesh, ()):
-        return _KEPT[mesh][key]
+    if cache and key in _FITS.get(mesh, ()):
+        return _FITS[mesh][key]
     job, middle, diagonal = _job(mesh, seed, steps if refine else 0, where)
     fit = partial(_cached_fit if cache else _fit, job, progress)
     with unrecorded():
@@ -139,7 +139,7 @@ def fit_spheres(
     balls = balls[compact_order(balls[:, :3])]  # neighbors are culled together
     spheres = Spheres(balls[:, :3] * diagonal + middle, balls[:, 3] * diagonal)
     if cache:
-        _KEPT.setdefault(mesh, {})[key] = SphereFit(spheres, replace(report, cached=True))
+        _FITS.setdefault(mesh, {})[key] = SphereFit(spheres, replace(report, cached=True))
     return SphereFit(spheres, report)
 
 

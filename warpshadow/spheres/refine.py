@@ -36,7 +36,7 @@ from warpshadow.stages.visibility.traversal import sphere_view_type
 TOUCH = 0.8
 """Largest distance of a sphere's center from the body, outside of it [radii]; one in the open stands for nothing."""
 
-PULLED = 5  # steps after which spheres that are farther off are pulled back
+RETURN_INTERVAL = 5  # steps after which spheres that are farther off are pulled back
 
 _SPHERE_COST = 10.0  # nanoseconds that it takes to see a sphere from a receiver
 _PAIR_COST = 0.1  # nanoseconds that a sphere costs for a receiver and a direction
@@ -406,7 +406,7 @@ class Refinement:
         gradient[:, 3] *= spheres[:, 3]
         return loss, gradient
 
-    def _pull_back(self, spheres: np.ndarray) -> None:
+    def _return_to_body(self, spheres: np.ndarray) -> None:
         """Move spheres that left the body to where they touch it, in place."""
         distances, slopes = self.mesh.signed_distances(spheres[:, :3])
         excess = np.maximum(distances - TOUCH * spheres[:, 3], 0.0)
@@ -429,6 +429,6 @@ class Refinement:
             chosen, queue = queue[: self.BATCH], queue[self.BATCH :]
             _, gradient = self.gradient(spheres, chosen, width)
             adam.step(spheres, gradient, first_rate * 0.5 * (1 + np.cos(np.pi * done)))
-            if step % PULLED == 0 or step == steps - 1:
-                self._pull_back(spheres)
+            if step % RETURN_INTERVAL == 0 or step == steps - 1:
+                self._return_to_body(spheres)
             yield Descended.at(spheres, adam, queue, self.rng)

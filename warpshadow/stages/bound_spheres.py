@@ -41,12 +41,12 @@ def _move_centers(
 ):
     """A thread owns a sphere of an instance."""
     instance, sphere = wp.tid()
-    moved = instance_in(instance, positions.shape[0])
-    rest_instance = instance_in(instance, rest_positions.shape[0])
+    position_batch = instance_in(instance, positions.shape[0])
+    rest_batch = instance_in(instance, rest_positions.shape[0])
     shift = wp.vec3()
     for item in range(first[sphere], first[sphere + 1]):
         vertex = vertices[item]
-        shift += weights[item] * (positions[moved, vertex] - rest_positions[rest_instance, vertex])
+        shift += weights[item] * (positions[position_batch, vertex] - rest_positions[rest_batch, vertex])
     centers[instance, sphere] = rest_centers[instance_in(instance, rest_centers.shape[0]), sphere] + shift
 
 
@@ -63,11 +63,11 @@ def _sum_spreads(
 ):
     """A thread owns a sphere of an instance: the mean square distance of its vertices."""
     instance, sphere = wp.tid()
-    row = instance_in(instance, positions.shape[0])
+    position_batch = instance_in(instance, positions.shape[0])
     center = centers[instance_in(instance, centers.shape[0]), sphere]
     total = float(0.0)
     for item in range(first[sphere], first[sphere + 1]):
-        total += shares[item] * wp.length_sq(positions[row, vertices[item]] - center)
+        total += shares[item] * wp.length_sq(positions[position_batch, vertices[item]] - center)
     spreads[instance, sphere] = total
 
 

@@ -30,13 +30,13 @@ def _radiance(
     """A thread owns a run of samples of an instance."""
     row, column = wp.tid()
     batch, thread = find_run(worker, first_row + row, column)
-    view = instance_in(batch, face_ids.shape[0])
+    fragment_batch = instance_in(batch, face_ids.shape[0])
     of_receivers = shading[instance_in(batch, shading.shape[0])]
     of_samples = albedo[instance_in(batch, albedo.shape[0])]
     for sample in range(thread * run, (thread + 1) * run):
-        face = face_ids[view, sample]
+        face = face_ids[fragment_batch, sample]
         if face >= 0:
-            received = at_point(of_receivers, faces[face], barycentrics[view, sample])
+            received = at_point(of_receivers, faces[face], barycentrics[fragment_batch, sample])
             color = wp.cw_mul(received, of_samples[sample])
             samples[batch, sample] = wp.vec4(color[0], color[1], color[2], 1.0)
         else:

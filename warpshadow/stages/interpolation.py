@@ -72,12 +72,12 @@ def _make_interpolate(dtype: type) -> wp.Kernel:
         """A thread owns a run of samples of an instance."""
         row, column = wp.tid()
         instance, thread = find_run(worker, first_row + row, column)
-        view = instance_in(instance, face_ids.shape[0])
+        fragment_batch = instance_in(instance, face_ids.shape[0])
         values = attributes[instance_in(instance, attributes.shape[0])]
         for sample in range(thread * run, (thread + 1) * run):
-            face = face_ids[view, sample]
+            face = face_ids[fragment_batch, sample]
             if face >= 0:
-                image[instance, sample] = at_point(values, faces[face], barycentrics[view, sample])
+                image[instance, sample] = at_point(values, faces[face], barycentrics[fragment_batch, sample])
             else:
                 image[instance, sample] = dtype(0.0)
 

@@ -26,9 +26,10 @@ def _pose_points(
     """A thread owns a point of an instance."""
     batch, point = wp.tid()
     body = bodies[point]
-    pose = instance_in(batch, scales.shape[0])
+    pose_batch = instance_in(batch, scales.shape[0])
     at_rest = rest[instance_in(batch, rest.shape[0]), point]
-    posed[batch, point] = scales[pose, body] * (rotations[pose, body] * at_rest) + translations[pose, body]
+    turned = rotations[pose_batch, body] * at_rest
+    posed[batch, point] = scales[pose_batch, body] * turned + translations[pose_batch, body]
 
 
 @wp.kernel
@@ -73,9 +74,9 @@ def _move_pivots(
 ):
     """A thread owns a body of an instance."""
     batch, body = wp.tid()
-    pose = instance_in(batch, scales.shape[0])
-    arm = rotations[pose, body] * pivots[instance_in(batch, pivots.shape[0]), body]
-    moved[batch, body] = translations[pose, body] + sign * scales[pose, body] * arm
+    pose_batch = instance_in(batch, scales.shape[0])
+    arm = rotations[pose_batch, body] * pivots[instance_in(batch, pivots.shape[0]), body]
+    moved[batch, body] = translations[pose_batch, body] + sign * scales[pose_batch, body] * arm
 
 
 @dataclass(frozen=True)

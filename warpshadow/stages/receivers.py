@@ -30,7 +30,8 @@ class Receivers(NamedTuple):
 
     The first receivers are vertices of static bodies: they have indices, but no points and normals here. A sample of a
     pixel with a receiver r of its own sees a face (r, r, r), which follows the mesh's faces; after these come the
-    triangles of receivers in which samples interpolate.
+    triangles of receivers in which samples interpolate. The others are vertex receivers, then sample receivers;
+    a side of −1 is no receiver.
     """
 
     points: wp.array  # [batch, receiver − on static] vec3
@@ -40,12 +41,12 @@ class Receivers(NamedTuple):
     fragments: Fragments  # of these faces
     on_static: np.ndarray = np.empty(0, int)  # [on static], the vertices that the first receivers are
     spans: tuple[Span, ...] = ()  # of the others, where bodies are told apart; () for one group
-    vertices: wp.array | None = None  # [vertex receiver] int32, the vertices and backs that the first of them are, …
-    seen: Fragments | None = None  # … and the fragments of the rest: sides and barycentrics, [batch, own]; −1 for none
+    vertices: wp.array | None = None  # int32, the vertex or back of each vertex receiver, [vertex receiver]
+    sample_fragments: Fragments | None = None  # side and barycentrics of each sample receiver, [batch, sample receiver]
 
     def without_owners(self) -> "Receivers":
         """The same receivers, as points of which nobody knows the body."""
-        return self._replace(spans=(), vertices=None, seen=None)
+        return self._replace(spans=(), vertices=None, sample_fragments=None)
 
 
 _SMOOTH, _SHARP = 0.866, 0.707
@@ -95,22 +96,22 @@ def _gather(
 ):
     """A thread owns a receiver: a vertex, or a fragment, −1 for nothing."""
     batch, receiver = wp.tid()
-    instance = instance_in(batch, positions.shape[0])
+    position_batch = instance_in(batch, positions.shape[0])
     fragment = receiver - vertices.shape[0]
     if fragment < 0:
         vertex, is_back = split_side(vertices[receiver], positions.shape[1])
-        points[batch, receiver] = positions[instance, vertex]
-        point_normals[batch, receiver] = wp.where(is_back, -1.0, 1.0) * normals[instance, vertex]
+        points[batch, receiver] = positions[position_batch, vertex]
+        point_normals[batch, receiver] = wp.where(is_back, -1.0, 1.0) * normals[position_batch, vertex]
     else:
-        view = instance_in(batch, seen_sides.shape[0])
-        weights = seen_barycentrics[view, fragment]
-        face, is_back = split_side(wp.max(seen_sides[view, fragment], 0), faces.shape[0])
-        point = at_point(positions[instance], faces[face], weights)
+        fragment_batch = instance_in(batch, seen_sides.shape[0])
+        weights = seen_barycentrics[fragment_batch, fragment]
+        face, is_back = split_side(wp.max(seen_sides[fragment_batch, fragment], 0), faces.shape[0])
+        point = at_point(positions[position_batch], faces[face], weights)
         if rises:
-            front, back = _rise(positions[instance], normals[instance], faces[face], weights)
+            front, back = _rise(positions[position_batch], normals[position_batch], faces[face], weights)
             point += wp.where(is_back, back, front)
         points[batch, receiver] = point
-        normal = wp.normalize(at_point(normals[instance], faces[face], weights))
+        normal = wp.normalize(at_point(normals[position_batch], faces[face], weights))
         point_normals[batch, receiver] = wp.where(is_back, -1.0, 1.0) * normal
 
 
@@ -236,7 +237,7 @@ def find_receivers(
     vertices, on_static, receiver_faces, of_vertices, spans = numbering
     sides = fragments.face_ids if fragments.sides is None else fragments.sides
     receiver_fragments = fragments if fragments.sides is None else Fragments(sides, fragments.barycentrics)
-    batch_count, seen = len(positions), None
+    batch_count, sample_fragments = len(positions), None
     if wants_samples.any():
         batch_count = common_batch({"positions": positions, "fragments": sides})
         side_count, receiver_count = len(receiver_faces), numbering.receiver_count
@@ -247,12 +248,12 @@ def find_receivers(
             surface = SeenSurface(*seen_points, positions[0], faces, smooth_pieces)
         arguments = receiver_fragments, side_count, wants_samples, keys, supersampling, quadtree, surface
         sample_receivers = find_sample_receivers(*arguments)
-        receiver_fragments, seen = sample_receivers.fragments, sample_receivers.seen
+        receiver_fragments, sample_fragments = sample_receivers.fragments, sample_receivers.sample_fragments
         moving_count = numbering.moving_count
         spans += tuple(
             Span(body, moving_count + first, moving_count + end) for body, first, end in sample_receivers.spans
         )
-        count = side_count + seen.face_ids.shape[1]
+        count = side_count + sample_fragments.face_ids.shape[1]
         all_faces = empty(count + len(sample_receivers.triangles), dtype=wp.vec3i, device=device)
         launch(_add_faces, count, inputs=[receiver_faces, receiver_count], outputs=[all_faces])
         if len(sample_receivers.triangles):
@@ -264,11 +265,13 @@ def find_receivers(
     elif vertices is None:
         return Receivers(positions, normals, receiver_faces, of_vertices, receiver_fragments)
     vertices = of_vertices if vertices is None else vertices
-    points = _points(batch_count, positions, normals, faces, vertices, seen, rises=rises)
+    points = _points(batch_count, positions, normals, faces, vertices, sample_fragments, rises=rises)
     result = Receivers(*points, receiver_faces, of_vertices, receiver_fragments, on_static)
     if bodies is None:
         return result
-    return result._replace(spans=spans, vertices=vertices, seen=seen if seen and seen.face_ids.size else None)
+    if sample_fragments and not sample_fragments.face_ids.size:
+        sample_fragments = None
+    return result._replace(spans=spans, vertices=vertices, sample_fragments=sample_fragments)
 
 
 def _points(
@@ -277,17 +280,17 @@ def _points(
     normals: wp.array,
     faces: wp.array,
     vertices: wp.array,
-    seen: Fragments | None,
+    sample_fragments: Fragments | None,
     *,
     rises: bool = False,
 ) -> tuple[wp.array, wp.array]:
     """Points and normals of vertices and of fragments, for a number of instances. Differentiable: all but faces."""
     device = positions.device
-    if seen is None:
-        seen = Fragments(*(empty((1, 0), dtype=dtype, device=device) for dtype in (wp.int32, wp.vec3)))
-    shape = count, vertices.size + seen.face_ids.shape[1]
+    if sample_fragments is None:
+        sample_fragments = Fragments(*(empty((1, 0), dtype=dtype, device=device) for dtype in (wp.int32, wp.vec3)))
+    shape = count, vertices.size + sample_fragments.face_ids.shape[1]
     points, point_normals = (empty(shape, dtype=wp.vec3, device=device) for _ in range(2))
-    inputs = [positions, normals, faces, vertices, seen.face_ids, seen.barycentrics, rises]
+    inputs = [positions, normals, faces, vertices, sample_fragments.face_ids, sample_fragments.barycentrics, rises]
     launch(_gather, shape, inputs=inputs, outputs=[points, point_normals])
     return points, point_normals
 
@@ -313,11 +316,13 @@ def receivers_on_faces(
     Differentiable: positions, normals.
     """
     device = positions.device
-    seen = Fragments(constant(sides[None], wp.int32, device), constant(barycentrics[None], wp.vec3, device))
-    points = points_seen(positions, normals, faces, seen)
+    sample_fragments = Fragments(constant(sides[None], wp.int32, device), constant(barycentrics[None], wp.vec3, device))
+    points = points_seen(positions, normals, faces, sample_fragments)
     none = constant(np.empty(0, int), wp.int32, device)
     spans = () if bodies is None else spans_of(bodies)
-    return Receivers(*points, faces, none, seen, spans=spans, vertices=none, seen=seen)
+    return Receivers(
+        *points, faces, none, sample_fragments, spans=spans, vertices=none, sample_fragments=sample_fragments
+    )
 
 
 def points_seen(positions: wp.array, normals: wp.array, faces: wp.array, seen: Fragments) -> tuple[wp.array, wp.array]:

@@ -58,7 +58,7 @@ class SampleReceivers(NamedTuple):
     """Receivers that samples have."""
 
     fragments: Fragments  # of the mesh's sides, then of a face for each receiver, then of triangles
-    seen: Fragments  # sides and barycentrics that receivers see, [view, receiver]; −1 for none
+    sample_fragments: Fragments  # sides and barycentrics that receivers see, [view, receiver]; −1 for none
     triangles: np.ndarray  # [triangle, 3], the receivers in which others interpolate
     spans: tuple[Span, ...]
 

@@ -10,8 +10,9 @@ stages that ask where something lies in an image agree on this:
     relative      (x − w x₀, y − w y₀, w), relative to the ray through a position (x₀, y₀): nothing cancels near the ray
     line          ℓ with ℓ·(x, y, 1) = 0; a × b is the line through vertices a and b
     plane         n with n·(x, y, w) = 1; relative to a ray, n_w is the 1/w at which the ray meets it
-    direction     from a sample's center to that of a neighbor: 0 right, 1 left, 2 below, 3 above. Its axis is direction
-    / 2 distance      from a sample's center along a direction, 1 at the neighbor's center [samples]
+    direction     from a sample's center to that of a neighbor: 0 right, 1 left, 2 below, 3 above
+    axis          direction / 2, of a direction: 0 is x, 1 is y
+    distance      from a sample's center along a direction, 1 at the neighbor's center [samples]
 """
 
 import warp as wp

@@ -67,14 +67,14 @@ def _find_backs(
     In the world and in float64: in clip space a distant ground, seen at a grazing angle, would be lost in rounding.
     """
     view, thread = wp.tid()
-    instance = instance_in(view, positions.shape[0])
+    position_batch = instance_in(view, positions.shape[0])
     eye = _eye(clip_matrices[instance_in(view, clip_matrices.shape[0])])
     for i in range(thread * run, wp.min((thread + 1) * run, two_sided.shape[0])):
         face = two_sided[i]
         corners = faces[face]
-        a = wp.vec3d(positions[instance, corners[0]])
-        b = wp.vec3d(positions[instance, corners[1]])
-        c = wp.vec3d(positions[instance, corners[2]])
+        a = wp.vec3d(positions[position_batch, corners[0]])
+        b = wp.vec3d(positions[position_batch, corners[1]])
+        c = wp.vec3d(positions[position_batch, corners[2]])
         if wp.dot(wp.cross(b - a, c - a), a - eye) > wp.float64(0.0):
             shows_back[view, face] = True
             is_any[0] = True

@@ -17,7 +17,7 @@ from dataclasses import replace
 import warp as wp
 
 from warpshadow.device.batch import instance_in, rows
-from warpshadow.device.launch import detached, launch
+from warpshadow.device.launch import launch, without_gradient
 from warpshadow.device.parallel import run_length
 from warpshadow.device.tape import record_adjoint
 from warpshadow.stages.film import sample_radiance
@@ -87,23 +87,23 @@ def _add_slopes(
     width = fragments.width
     half = half_size(width, fragments.height)
     for batch in range(adj_samples.shape[0]):
-        view = instance_in(batch, receiver_face_ids.shape[0])
-        reflecting = instance_in(batch, albedo.shape[0])
+        fragment_batch = instance_in(batch, receiver_face_ids.shape[0])
+        albedo_batch = instance_in(batch, albedo.shape[0])
         of_receivers = shading[instance_in(batch, shading.shape[0])]
-        lit = instance_in(batch, light.shape[0])
-        clip = fragments.clip_positions[view]
+        light_batch = instance_in(batch, light.shape[0])
+        clip = fragments.clip_positions[fragment_batch]
         for sample in range(first, first + run):
-            at = view * adj_samples.shape[1] + sample
+            at = fragment_batch * adj_samples.shape[1] + sample
             face = fragments.face_ids[at]
             adj_sample = adj_samples[batch, sample]
             adj_color = wp.vec3(adj_sample[0], adj_sample[1], adj_sample[2])
             receivers = wp.vec3i()
             if face >= 0:
-                receivers = receiver_faces[receiver_face_ids[view, sample]]
+                receivers = receiver_faces[receiver_face_ids[fragment_batch, sample]]
             # A sample with receivers that samples see has the gradient of their points instead.
-            if face >= 0 and receiver_face_ids[view, sample] < first_own and wp.length_sq(adj_color) > 0.0:
-                adj_light = wp.cw_mul(adj_color, albedo[reflecting, sample])
-                here = light[lit, sample]
+            if face >= 0 and receiver_face_ids[fragment_batch, sample] < first_own and wp.length_sq(adj_color) > 0.0:
+                adj_light = wp.cw_mul(adj_color, albedo[albedo_batch, sample])
+                here = light[light_batch, sample]
                 color = samples[batch, sample]
                 center = sample_center(at, width, fragments.height)
                 entry = entries[at]
@@ -124,15 +124,15 @@ def _add_slopes(
                             if ends_before(line, direction) and t > MIN_DISTANCE and t <= 1.0:
                                 # entries are of all views; where one view serves all images, each has its
                                 # own colors
-                                rise = edge_colors[batch - view, entry, direction] - color
+                                rise = edge_colors[batch - fragment_batch, entry, direction] - color
                                 span = wp.min(t, 0.5)
                                 total = wp.dot(adj_color, wp.vec3(rise[0], rise[1], rise[2]))
                                 rises[direction / 2] += sense(direction) * span / t * total
                                 spans[direction / 2] += span
                         elif edge[0] == NOTHING and has_neighbor(at, direction, width, fragments.height):
                             other = neighbor(sample, direction, width)
-                            if receiver_face_ids[view, other] >= 0:
-                                rise_of_light = wp.dot(adj_light, light[lit, other] - here)
+                            if receiver_face_ids[fragment_batch, other] >= 0:
+                                rise_of_light = wp.dot(adj_light, light[light_batch, other] - here)
                                 rises[direction / 2] += sense(direction) * 0.5 * rise_of_light
                                 spans[direction / 2] += 0.5
                 slope = wp.cw_mul(wp.cw_div(rises, spans), half)
@@ -149,7 +149,7 @@ def _add_slopes(
                 depth = wp.dot(weights, wp.vec3(clip[corners[0]][3], clip[corners[1]][3], clip[corners[2]][3]))
                 adj_clip = relative_adjoint(center, wp.vec3(-slope[0], -slope[1], 0.0)) / depth
                 if wp.isfinite(adj_clip):
-                    add_to_corners(adj_clip_positions[view], corners, weights, adj_clip)
+                    add_to_corners(adj_clip_positions[fragment_batch], corners, weights, adj_clip)
 
 
 def moving_radiance(
@@ -177,7 +177,7 @@ def moving_radiance(
     Differentiable: shading, albedo, clip_positions; the latter in place of barycentrics of the fragments, but for the
     samples that are receivers themselves or interpolate between such, whose gradient is that of the receivers' points.
     """
-    fragments = replace(fragments, barycentrics=detached(fragments.barycentrics))
+    fragments = replace(fragments, barycentrics=without_gradient(fragments.barycentrics))
     samples = sample_radiance(fragments, faces, shading, albedo)
     edge_colors = find_edge_colors(samples, silhouettes, clip_positions, shading, receivers, albedo)
     if not clip_positions.requires_grad:
@@ -185,7 +185,7 @@ def moving_radiance(
     samples.requires_grad = True
 
     def adjoint() -> None:
-        light = interpolate(fragments, faces, detached(shading))
+        light = interpolate(fragments, faces, without_gradient(shading))
         run = run_length(samples.device, samples.shape[2])
         launch(
             _add_slopes,

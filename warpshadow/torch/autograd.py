@@ -107,8 +107,8 @@ def _let_waiting_threads_sleep() -> None:
     microseconds once it has more threads than there are cores (its manual, GOMP_SPINCOUNT). So it is given some that
     sleep for good. No setting of torch changes; and settings of the environment about waiting are left alone.
     """
-    is_said = "OMP_WAIT_POLICY" in os.environ or "GOMP_SPINCOUNT" in os.environ
-    if is_said or sys.platform != "linux" or not torch.backends.openmp.is_available():
+    is_set = "OMP_WAIT_POLICY" in os.environ or "GOMP_SPINCOUNT" in os.environ
+    if is_set or sys.platform != "linux" or not torch.backends.openmp.is_available():
         return
     others = torch.get_num_threads() - 1  # that a team has beside the thread that begins it
     started = [threading.Event() for _ in range(-(-len(os.sched_getaffinity(0)) // others))]
@@ -209,8 +209,8 @@ class _WarpFunction(torch.autograd.Function):
         arguments = [as_array(*pair) for pair in zip(tensors, call.dtypes, strict=True)]
         # streams are the device's, as Warp has it, not a thread's
         with one_call, _current_stream(call.device), recorded() if any(wants) else unrecorded() as tape:
-            for argument, is_wanted in zip(arguments, wants, strict=True):
-                if is_wanted:
+            for argument, needs_gradient in zip(arguments, wants, strict=True):
+                if needs_gradient:
                     require_gradient(argument)  # here, so that a graph that is captured zeroes the gradient
             results = call.function(*arguments)
         results = results if isinstance(results, tuple) else (results,)

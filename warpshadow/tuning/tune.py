@@ -92,9 +92,9 @@ class Tuning:
     @property
     def untried_counts(self) -> tuple[int, ...]:
         """Numbers of spheres that were not tried, since no fit of them is cached: ``fits=True`` makes them."""
-        own = fitted_counts(self.given)
-        tried = {trial.scene.bodies[number].blockers for trial in self.trials for number in own}
-        return tuple(count for count in SPHERE_COUNTS if own and count not in tried)
+        fitted = fitted_counts(self.given)
+        tried = {trial.scene.bodies[number].blockers for trial in self.trials for number in fitted}
+        return tuple(count for count in SPHERE_COUNTS if fitted and count not in tried)
 
     def __str__(self) -> str:
         """The table, the units of its errors and times, and the meaning of its marks."""
@@ -236,7 +236,7 @@ def tune(
     pairs = zip(
         scene.bodies, sample.decided(scene).bodies, np.where(is_coarse, "pixel", "vertex").tolist(), strict=True
     )
-    fine = [body.receivers if receivers == own.receivers else receivers for body, own, receivers in pairs]
+    fine = [body.receivers if receivers == decided.receivers else receivers for body, decided, receivers in pairs]
     counts: Sequence[Bounces] = (scene.bounces,)
     if bounces is not None:
         counts = (*BOUNCE_COUNTS, "all") if bounces == "all" else [count for count in BOUNCE_COUNTS if count <= bounces]
@@ -369,13 +369,13 @@ def _by_work(scene: Scene, sample: PointSample) -> Iterator[Scene]:
     if not scene.bounces:  # bounced light needs visibility
         yield replace(scene, visibility=scene.visibility.by("none"))
     yield from _all_directions(scene)
-    own = {
+    counts = {
         number: len(fit_spheres(mesh, device=sample.device).spheres) if count == AUTO else int(count)
         for number, (mesh, count) in fitted_meshes(scene).items()
     }
-    factor, maximum = 2, max(own.values(), default=SPHERE_COUNTS[-1])
+    factor, maximum = 2, max(counts.values(), default=SPHERE_COUNTS[-1])
     while factor * maximum <= SPHERE_COUNTS[-1] and _interpolation_error(scene, sample) < scene.visibility.error:
-        more = change_bodies(scene, "blockers", {number: factor * count for number, count in own.items()})
+        more = change_bodies(scene, "blockers", {number: factor * count for number, count in counts.items()})
         yield from _all_directions(more)
         factor *= 2
 
@@ -401,12 +401,12 @@ def _settings(scene: Scene, fine: Sequence[str], fits: bool, device: wp.DeviceLi
 def _sphere_variants(scene: Scene, fits: bool, device: wp.DeviceLike) -> Iterator[Scene]:
     """The scene with its own spheres, and with other numbers of them for all bodies."""
     yield scene
-    own = fitted_counts(scene)
+    fitted = fitted_counts(scene)
     meshes = [] if fits else [mesh for mesh, _ in fitted_meshes(scene).values()]
-    for count in SPHERE_COUNTS if own else ():
+    for count in SPHERE_COUNTS if fitted else ():
         is_at_hand = fits or all(is_fitted(mesh, count, device=device) for mesh in meshes)
-        if is_at_hand and set(own.values()) != {count}:
-            yield change_bodies(scene, "blockers", dict.fromkeys(own, count))
+        if is_at_hand and set(fitted.values()) != {count}:
+            yield change_bodies(scene, "blockers", dict.fromkeys(fitted, count))
 
 
 def _directional(visibility: Visibility) -> Iterator[Visibility]:

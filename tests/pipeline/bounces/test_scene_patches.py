@@ -93,7 +93,7 @@ def test_one_color_is_that_of_all_patches(merged_scene):
 
 
 def test_patches_of_bodies_of_different_scale_count_by_their_areas_in_the_scene():
-    """Where a quad has spheres of two bodies, what it sends is a mean over the patches of both."""
+    """Where a cluster has spheres of two bodies, what it sends is a mean over the patches of both."""
     big, small = ws.icosphere(1.0, 2), ws.icosphere(100.0, 2)  # as meshes; in the scene the first is 3 times as large
     bodies = ws.Body(big, scale=3.0, name="big"), ws.Body(small, scale=0.01, translation=(9, 0, 0), name="small")
     flat = ws.Body(ws.plane(2.0, 4), scale=2.5, translation=(0, -9, 0), name="ground")
@@ -108,7 +108,7 @@ def test_patches_of_bodies_of_different_scale_count_by_their_areas_in_the_scene(
         expected.append(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
     np.testing.assert_allclose(areas, expected, rtol=1e-5)
 
-    # a quad of two spheres of each body, whose patches all show the same, is as bright as areas say
+    # a cluster of two spheres of each body, whose patches all show the same, is as bright as areas say
     starts, numbers = np.int32([0, senders.first[2]]), np.arange(senders.first[2], dtype=np.int32)
     radiosity = np.repeat([1.0, 0.0, 0.0], np.diff(senders.first))[None, :, None].repeat(3, axis=2)
     shown = wp.full((1, len(senders.areas), 4), 0.25, wp.float32)
@@ -135,7 +135,7 @@ def test_closed_patches_have_the_nearest_open_one_of_their_body_for_a_stand_in(m
     ball = senders.patches[0]
     is_open = np.ones(last, bool)
     is_open[:end] = ball.centers[:, 1] > 0.2
-    found = senders.stand_ins(is_open)
+    found = senders.nearest_open_patches(is_open)
     np.testing.assert_array_equal(found[is_open], np.flatnonzero(is_open))
     closed = np.flatnonzero(~is_open)
     assert len(closed) > 20 and is_open[found[closed]].all() and (found[closed] < end).all()
@@ -143,4 +143,6 @@ def test_closed_patches_have_the_nearest_open_one_of_their_body_for_a_stand_in(m
     steps = np.linalg.norm(ball.centers[closed][:, None] - ball.centers[is_open[:end]], axis=2).min(axis=1)
     np.testing.assert_allclose(away, steps, atol=0.05)  # normals count, too, which are a ball's places
     is_open[:end] = False
-    np.testing.assert_array_equal(senders.stand_ins(is_open), np.arange(last))  # nothing stands in for a body
+    np.testing.assert_array_equal(
+        senders.nearest_open_patches(is_open), np.arange(last)
+    )  # nothing stands in for a body

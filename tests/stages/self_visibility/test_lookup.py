@@ -72,7 +72,7 @@ def test_weights_are_those_of_the_formula(device):
 def test_there_is_room_for_what_any_rotation_looks_up(device):
     _, lookup, kernels, _ = looked_up(rotations_of(300, seed=1), device)
     counts = lookup.counts.numpy()
-    assert counts.min() >= 2 and counts.max() < kernels.most
+    assert counts.min() >= 2 and counts.max() < kernels.max_lookups
 
 
 def test_light_of_a_narrow_cell_looks_at_few_rays_and_that_of_an_even_one_at_coarse_cells(device):

@@ -166,10 +166,10 @@ class Radiosity(Node):
         item_text = f"{len(senders.areas):,} patches"
         idle = ALL_FLAT if all(senders.merged_scene.is_flat[body] for body in senders.bodies) else ""
         self._reflect = Node("radiosity", patch_radiosity, albedo, lit, items=item_text, caches=False)
-        self._own = Node(
+        self._reflect_self = Node(
             "self light of patches", patch_radiosity, albedo, lit, items=item_text, idle=idle, caches=False
         )
-        extra_inputs = self._reflect, self._own, *gathering.stages
+        extra_inputs = self._reflect, self._reflect_self, *gathering.stages
         super().__init__("", None, lit, albedo, projected_patches, frames, openness, extra_inputs=extra_inputs)
 
     def compute(self, call: Call) -> OutgoingRadiance:
@@ -178,7 +178,7 @@ class Radiosity(Node):
         senders, count = self._proxies.senders, self._count
         between = (
             None
-            if self._own.idle
+            if self._reflect_self.idle
             else self._self_form_factors.between_patches(senders, [portion.group for portion in lit])
         )
 
@@ -197,7 +197,7 @@ class Radiosity(Node):
         def add_radiosity_by_self(by_others: wp.array, radiosity: wp.array | None) -> wp.array:
             if between is None or radiosity is None:
                 return by_others
-            return total_light([by_others, self._own.run(call, albedo, radiosity, between)])
+            return total_light([by_others, self._reflect_self.run(call, albedo, radiosity, between)])
 
         self_bounces = 0 if between is None else SELF_BOUNCES
         return sent(
@@ -352,21 +352,21 @@ class SphereBounces:
             PortionedShading, self._method, at_sources, projected_light, light, joined, where=_OF_SOURCES
         )
         lit = points.cached("direct at sources", (light, sources), make)
-        return self._still.add_bounces(direct, lit, points, materials)
+        return self._static_bounces.add_bounces(direct, lit, points, materials)
 
     def cached_bounced_free_shading(self, direct: Node, points: LitPoints, light: Input, materials: Materials) -> Node:
         """The same in free light, given a node of the direct shading of the receivers."""
         sources, at_sources = self._cached_sources(points, materials)
         transfers = points.cached("transfer", sources, lambda: self._method.transfers(at_sources, _OF_SOURCES))
-        return self._still.add_free_bounces(direct, transfers, light, points, materials)
+        return self._static_bounces.add_free_bounces(direct, transfers, light, points, materials)
 
     def _cached_sources(self, points: LitPoints, materials: Materials) -> tuple[Node, LitPoints]:
         """Node of the static sources, and the same sources as lit points."""
-        sources = self._still.sources(points, materials)
+        sources = self._static_bounces.sources(points, materials)
         return sources, points.cached("lit sources", sources, lambda: self._at(sources, points, materials))
 
     @functools.cached_property
-    def _still(self) -> StaticBounces:
+    def _static_bounces(self) -> StaticBounces:
         return StaticBounces(self._patches, self._count, progress=self._method.progress)
 
     def _at(

@@ -203,7 +203,7 @@ class Senders:
             positions, normals, self.merged_scene.faces, self.sides, self.barycentrics, self._bodies
         )
 
-    def stand_ins(self, is_open: np.ndarray) -> np.ndarray:
+    def nearest_open_patches(self, is_open: np.ndarray) -> np.ndarray:
         """The patch whose light each has: itself if it is open, else the nearest open one of its body, if any is.
 
         Args:

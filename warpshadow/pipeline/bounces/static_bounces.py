@@ -231,7 +231,7 @@ class StaticBounces:
             seen_by_sources = trace(sources.points.numpy()[0], sources.normals.numpy()[0], at_source)
             receiver_weights, to_cache_points = zip(*map(find_cache_points, at, facing, at_receivers), strict=True)
             means, is_buried = senders.mean.on_host(), seen_by_sources.is_buried
-            mean = mean_outside(means, is_buried)[senders.stand_ins(means @ ~is_buried > 0)]
+            mean = mean_outside(means, is_buried)[senders.nearest_open_patches(means @ ~is_buried > 0)]
             between = (mean @ seen_by_sources.factors).tocoo()
             is_same_body = np.equal(*(senders.body_of_patch[patches] for patches in between.coords))
             within_bodies, between_bodies = (

@@ -35,13 +35,13 @@ def _cover(
 ):
     """A thread owns a patch of an instance."""
     batch, patch = wp.tid()
-    own = radiosity[instance_in(batch, radiosity.shape[0]), patch]
-    result = own
+    current = radiosity[instance_in(batch, radiosity.shape[0]), patch]
+    result = current
     if distances[patch] > 0.0:
-        placed = instance_in(batch, centers.shape[0])
-        distance = wp.length(centers[placed, patch] - centers_before[placed, patch])
+        center_batch = instance_in(batch, centers.shape[0])
+        distance = wp.length(centers[center_batch, patch] - centers_before[center_batch, patch])
         part = wp.smoothstep(-1.0, 1.0, 3.0 - 2.0 * distance / distances[patch])
-        result = own + part * (radiosity_before[instance_in(batch, radiosity.shape[0]), patch] - own)
+        result = current + part * (radiosity_before[instance_in(batch, radiosity.shape[0]), patch] - current)
     sent[batch, patch] = result
 
 

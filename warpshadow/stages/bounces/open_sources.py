@@ -50,7 +50,7 @@ def _sum_open(
     """A thread owns a source of an instance: ⟨T⟩ and ⟨T_self⟩, linear in both as Warp's adjoint needs it."""
     batch, source = wp.tid()
     normal = normals[instance_in(batch, normals.shape[0]), source]
-    of_spheres = instance_in(batch, transmittance_spheres.shape[0])
+    sphere_batch = instance_in(batch, transmittance_spheres.shape[0])
     factor = 4.0 / float(directions.shape[0])
     total = wp.vec3(_HIDDEN, _HIDDEN, 0.0)
     for q in range(directions.shape[0]):
@@ -58,7 +58,7 @@ def _sum_open(
         of_self = float(1.0)
         if transmittance_self:
             of_self = transmittance_self[instance_in(batch, transmittance_self.shape[0]), source, q]
-        total += cosine * wp.vec3(transmittance_spheres[of_spheres, source, q], of_self, 0.0)
+        total += cosine * wp.vec3(transmittance_spheres[sphere_batch, source, q], of_self, 0.0)
     openness[batch, source] = total
 
 

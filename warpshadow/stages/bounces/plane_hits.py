@@ -29,13 +29,65 @@ from warpshadow.stages.planes.sides import (
 _MIN_WEIGHT_SUM = wp.constant(1.0e-30)  # the least Σ s
 
 
-# Scratch of a receiver, vec3, follows that of its sides. The hit of a cell on each of these, from ``6 plane_count`` on:
-#     4 i        coverage, distance, and how much that varies over the cell
-#     4 i + 1    radiosity
-#     4 i + 2    coverage of the outline, the mesh's share of that by texels, and 1 / c′
-#     4 i + 3    place in the plane, and the transmittance of the sides in front of it
 HIT_ROWS = SIDE_ROWS + 8
-"""Rows of scratch for each plane."""
+"""Rows of scratch for each plane: those of its sides, and four for the hit of a cell on each of two sides."""
+
+
+@wp.struct
+class PlaneHit:
+    """The hit of a cell on a side of a plane; or its adjoint, of coverage, distance, its range and radiosity."""
+
+    coverage: float
+    distance: float
+    distance_range: float  # by how much the distance varies over the cell
+    radiosity: wp.vec3
+    outline_coverage: float
+    mesh_share: float  # of the outline's coverage, by texels
+    per_cosine: float  # 1 / c′
+    center: wp.vec2  # in the plane
+    transmittance: float  # of the sides in front of it
+
+
+@wp.func
+def load_hit(store: wp.array(dtype=wp.vec3), first_hit: int, i: int):
+    """Load the hit on side i; without coverage, all else in it is old. ``first_hit`` is the row of the first."""
+    row = first_hit + 4 * i
+    hit = PlaneHit()
+    hit.coverage = store[row][0]
+    hit.distance = store[row][1]
+    hit.distance_range = store[row][2]
+    hit.radiosity = store[row + 1]
+    hit.outline_coverage = store[row + 2][0]
+    hit.mesh_share = store[row + 2][1]
+    hit.per_cosine = store[row + 2][2]
+    hit.center = wp.vec2(store[row + 3][0], store[row + 3][1])
+    hit.transmittance = store[row + 3][2]
+    return hit
+
+
+@wp.func
+def clear_hit(store: wp.array(dtype=wp.vec3), first_hit: int, i: int):
+    """Take its coverage away."""
+    store[first_hit + 4 * i] = wp.vec3()
+
+
+@wp.func
+def store_hit(store: wp.array(dtype=wp.vec3), first_hit: int, i: int, hit: PlaneHit):
+    """Overwrite it."""
+    row = first_hit + 4 * i
+    store[row] = wp.vec3(hit.coverage, hit.distance, hit.distance_range)
+    store[row + 1] = hit.radiosity
+    store[row + 2] = wp.vec3(hit.outline_coverage, hit.mesh_share, hit.per_cosine)
+    store[row + 3] = wp.vec3(hit.center[0], hit.center[1], hit.transmittance)
+
+
+@wp.func
+def add_to_hit(
+    adj_store: wp.array(dtype=wp.vec3), first_hit: int, i: int, coverage: float, distance: float, distance_range: float
+):
+    """Add to the adjoint of a hit."""
+    row = first_hit + 4 * i
+    adj_store[row] = adj_store[row] + wp.vec3(coverage, distance, distance_range)
 
 
 @wp.func
@@ -57,33 +109,34 @@ def hit_sides(
     """Store which plane sides this cell hits; return whether any. No part meets nothing."""
     if part <= 0.0:
         return False
-    cells = SIDE_ROWS * scene.grids.shape[0]
+    first_hit = SIDE_ROWS * scene.grids.shape[0]
     meets = bool(False)
     for i in range(side_count):
         side = load_side(scene, i, store)
         grid = scene.grids[side.f]
         place = load_place(store, side.f)
         share = plane_share(scene, grid, side, place, cell, edges)
-        store[cells + 4 * i] = wp.vec3()
+        clear_hit(store, first_hit, i)
         if share > 0.0:
+            hit = PlaneHit()
             footprint = footprint_on_side(scene, grid, side, place, cell.direction)
-            covered = float(1.0)
-            radiosity = wp.vec3()
+            hit.outline_coverage = share
+            hit.mesh_share = 1.0
+            hit.distance = footprint.distance
+            hit.distance_range = footprint.distance * scene.radius * footprint.per_cosine
+            hit.per_cosine = footprint.per_cosine
+            hit.center = footprint.center
             sends = grid.sides == 2 or not side.is_back
             if sends or is_covered_by_texels(grid):
                 first_level = levels_of(grid, side.is_back)
                 mip = find_mip_footprint(grid, scene, footprint)
                 if is_covered_by_texels(grid):
-                    covered = fetch(scene.covered, scene, first_level, mip)[0]
+                    hit.mesh_share = fetch(scene.covered, scene, first_level, mip)[0]
                 if sends:
-                    radiosity = fetch(texels, scene, first_level, mip)
+                    hit.radiosity = fetch(texels, scene, first_level, mip)
+            hit.coverage = share * hit.mesh_share
+            store_hit(store, first_hit, i, hit)
             meets = True
-            store[cells + 4 * i] = wp.vec3(
-                share * covered, footprint.distance, footprint.distance * scene.radius * footprint.per_cosine
-            )
-            store[cells + 4 * i + 1] = radiosity
-            store[cells + 4 * i + 2] = wp.vec3(share, covered, footprint.per_cosine)
-            store[cells + 4 * i + 3] = wp.vec3(footprint.center[0], footprint.center[1], 0.0)
     return meets
 
 
@@ -100,73 +153,74 @@ def hit_sides_adjoint(
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
     """Add to the gradients of a receiver relative to each plane, of viewed edges, and of an instance's texels."""
-    cells = SIDE_ROWS * scene.grids.shape[0]
+    first_hit = SIDE_ROWS * scene.grids.shape[0]
     for i in range(side_count):
-        if store[cells + 4 * i][0] > 0.0:
+        hit = load_hit(store, first_hit, i)
+        if hit.coverage > 0.0:
             side = load_side(scene, i, store)
             grid = scene.grids[side.f]
-            stored = store[cells + 4 * i + 2]
-            center = store[cells + 4 * i + 3]
             footprint = PlaneFootprint()
-            footprint.distance = store[cells + 4 * i][1]
-            footprint.per_cosine = stored[2]
-            footprint.center = wp.vec2(center[0], center[1])
-            adj_met = adj_store[cells + 4 * i]  # of coverage, distance, and t ρ / c′
-            adj_light = adj_store[cells + 4 * i + 1]  # of radiosity
+            footprint.distance = hit.distance
+            footprint.per_cosine = hit.per_cosine
+            footprint.center = hit.center
+            adj = load_hit(adj_store, first_hit, i)
             adj_mip = wp.vec3()
             sends = grid.sides == 2 or not side.is_back
             if sends or is_covered_by_texels(grid):
                 first_level = levels_of(grid, side.is_back)
                 mip = find_mip_footprint(grid, scene, footprint)
                 if is_covered_by_texels(grid):
-                    adj_covered = wp.vec3(adj_met[0] * stored[0], 0.0, 0.0)
+                    adj_covered = wp.vec3(adj.coverage * hit.outline_coverage, 0.0, 0.0)
                     adj_mip += fetch_adjoint(scene.covered, grid, scene, first_level, footprint, mip, adj_covered)
                 if sends:
-                    adj_mip += fetch_adjoint(texels, grid, scene, first_level, footprint, mip, adj_light)
+                    adj_mip += fetch_adjoint(texels, grid, scene, first_level, footprint, mip, adj.radiosity)
                     if adj_texels:
-                        scatter(adj_texels[instance], scene, first_level, mip, adj_light)
+                        scatter(adj_texels[instance], scene, first_level, mip, adj.radiosity)
             place = load_place(store, side.f)
+            adj_range = adj.distance_range
             footprint_on_side_adjoint(
-                scene, grid, side, place, cell.direction, footprint, adj_mip, adj_met[1], adj_met[2], adj_store
+                scene, grid, side, place, cell.direction, footprint, adj_mip, adj.distance, adj_range, adj_store
             )
-            adj_share = adj_met[0] * stored[1]
+            adj_share = adj.coverage * hit.mesh_share
             weighted = adj_share * side.weight
             coverage_adjoint(edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, weighted)
-            adj_store[side.row] = adj_store[side.row] + wp.vec3(0.0, 0.0, adj_share * stored[0] / side.weight)
+            adj_store[side.row] = adj_store[side.row] + wp.vec3(
+                0.0, 0.0, adj_share * hit.outline_coverage / side.weight
+            )
 
 
 @wp.func
-def _nearness(footprint: wp.vec3, other: wp.vec3):
-    """How far, in widths, another side is in front of one: −1 wholly behind it, 1 wholly in front."""
-    return (footprint[1] - other[1]) / (footprint[2] + other[2] + 1.0e-20)
+def _nearness(hit: PlaneHit, other: PlaneHit):
+    """How far, in ranges, another side is in front of one: −1 wholly behind it, 1 wholly in front."""
+    return (hit.distance - other.distance) / (hit.distance_range + other.distance_range + 1.0e-20)
 
 
 @wp.func
-def side_transmittance(i: int, excluded: int, cells: int, side_count: int, store: wp.array(dtype=wp.vec3)):
+def side_transmittance(i: int, excluded: int, first_hit: int, side_count: int, store: wp.array(dtype=wp.vec3)):
     """Part of a side's light that passes the sides in front of it, but for one of them."""
-    footprint = store[cells + 4 * i]
+    hit = load_hit(store, first_hit, i)
     part = float(1.0)
     for j in range(side_count):
-        other = store[cells + 4 * j]
-        if j != i and j != excluded and other[0] > 0.0:
-            part *= 1.0 - other[0] * wp.smoothstep(-1.0, 1.0, _nearness(footprint, other))
+        other = load_hit(store, first_hit, j)
+        if j != i and j != excluded and other.coverage > 0.0:
+            part *= 1.0 - other.coverage * wp.smoothstep(-1.0, 1.0, _nearness(hit, other))
     return part
 
 
 @wp.func
-def mean_light(cells: int, side_count: int, store: wp.array(dtype=wp.vec3)):
+def mean_light(first_hit: int, side_count: int, store: wp.array(dtype=wp.vec3)):
     """Find the mean radiosity of the sides that a cell hits, by its weights s; also their sum, and the coverages'."""
     light = wp.vec3()
     weights = float(0.0)
     covered = float(0.0)
     for i in range(side_count):
-        coverage = store[cells + 4 * i][0]
-        if coverage > 0.0:
-            transmitted = side_transmittance(i, i, cells, side_count, store)
-            store[cells + 4 * i + 3][2] = transmitted
-            light += (coverage * transmitted) * store[cells + 4 * i + 1]
-            weights += coverage * transmitted
-            covered += coverage
+        hit = load_hit(store, first_hit, i)
+        if hit.coverage > 0.0:
+            hit.transmittance = side_transmittance(i, i, first_hit, side_count, store)
+            store_hit(store, first_hit, i, hit)
+            light += (hit.coverage * hit.transmittance) * hit.radiosity
+            weights += hit.coverage * hit.transmittance
+            covered += hit.coverage
     weights = wp.max(weights, _MIN_WEIGHT_SUM)
     return light / weights, weights, covered
 
@@ -175,21 +229,21 @@ def mean_light(cells: int, side_count: int, store: wp.array(dtype=wp.vec3)):
 def side_transmittance_adjoint(
     i: int,
     adj_part: float,
-    cells: int,
+    first_hit: int,
     side_count: int,
     store: wp.array(dtype=wp.vec3),
     adj_store: wp.array(dtype=wp.vec3),
 ):
     """Add to the gradients of a cell's hits."""
-    footprint = store[cells + 4 * i]
+    hit = load_hit(store, first_hit, i)
     for j in range(side_count):
-        other = store[cells + 4 * j]
-        if j != i and other[0] > 0.0:
-            adj_factor = adj_part * side_transmittance(i, j, cells, side_count, store)
-            nearness = _nearness(footprint, other)
-            adj_near = -adj_factor * other[0] * smoothstep_slope(nearness) / (footprint[2] + other[2] + 1.0e-20)
-            adj_width = -adj_near * nearness
-            adj_store[cells + 4 * i] = adj_store[cells + 4 * i] + wp.vec3(0.0, adj_near, adj_width)
-            adj_store[cells + 4 * j] = adj_store[cells + 4 * j] + wp.vec3(
-                -adj_factor * wp.smoothstep(-1.0, 1.0, nearness), -adj_near, adj_width
-            )
+        other = load_hit(store, first_hit, j)
+        if j != i and other.coverage > 0.0:
+            adj_factor = adj_part * side_transmittance(i, j, first_hit, side_count, store)
+            nearness = _nearness(hit, other)
+            ranges = hit.distance_range + other.distance_range + 1.0e-20
+            adj_near = -adj_factor * other.coverage * smoothstep_slope(nearness) / ranges
+            adj_range = -adj_near * nearness
+            add_to_hit(adj_store, first_hit, i, 0.0, adj_near, adj_range)
+            adj_coverage = -adj_factor * wp.smoothstep(-1.0, 1.0, nearness)
+            add_to_hit(adj_store, first_hit, j, adj_coverage, -adj_near, adj_range)

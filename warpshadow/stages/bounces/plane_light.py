@@ -30,10 +30,14 @@ from warpshadow.device.memory import empty, zeros
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.bounces.plane_hits import (
     HIT_ROWS,
+    PlaneHit,
+    add_to_hit,
     hit_sides,
     hit_sides_adjoint,
+    load_hit,
     mean_light,
     side_transmittance_adjoint,
+    store_hit,
 )
 from warpshadow.stages.cell_coverage import ViewedEdge
 from warpshadow.stages.planes.cells import PlaneArrays, check_planes, plane_arrays
@@ -75,12 +79,12 @@ def _light_receivers(
     store, edges = scratch[scratch_row], viewed_edges[scratch_row]
     sent = texels[instance_in(batch, texels.shape[0])]
     normal = normals[batch, receiver]
-    cells = SIDE_ROWS * scene.grids.shape[0]
+    first_hit = SIDE_ROWS * scene.grids.shape[0]
     total = wp.vec3()
     for q in range(directions.shape[0]):
         weight = wp.dot(normal, directions[q]) * transmittance[batch, receiver, q]
         if hit_sides(scene, visible_cell(scene, normal, directions[q]), sent, weight, side_count, store, edges):
-            mean, _, covered = mean_light(cells, side_count, store)
+            mean, _, covered = mean_light(first_hit, side_count, store)
             total += (weight * wp.min(covered, 1.0)) * mean
     light[batch, receiver] = (4.0 / float(directions.shape[0])) * total
 
@@ -117,11 +121,11 @@ def _light_receivers_adjoint(
         first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
     )
     store, edges, adj_store = scratch[scratch_row], viewed_edges[scratch_row], adj_scratch[scratch_row]
-    seen_texels = instance_in(batch, texels.shape[0])
-    sent = texels[seen_texels]
+    texel_batch = instance_in(batch, texels.shape[0])
+    sent = texels[texel_batch]
     normal = normals[batch, receiver]
-    cells = SIDE_ROWS * scene.grids.shape[0]
-    for k in range(cells):
+    first_hit = SIDE_ROWS * scene.grids.shape[0]
+    for k in range(first_hit):
         adj_store[k] = wp.vec3()
     adj = (4.0 / float(directions.shape[0])) * adj_light[batch, receiver]
     adj_normal = wp.vec3()
@@ -132,26 +136,28 @@ def _light_receivers_adjoint(
         weight = cosine * passing
         cell = visible_cell(scene, normal, direction)
         if hit_sides(scene, cell, sent, cosine, side_count, store, edges):
-            mean, weights, covered = mean_light(cells, side_count, store)
+            mean, weights, covered = mean_light(first_hit, side_count, store)
             value = wp.dot(adj, mean)
             total = wp.min(covered, 1.0) * value
             factor = weight * wp.min(covered, 1.0) / weights
             adj_covered = wp.where(covered < 1.0, weight * value, 0.0)
             for i in range(side_count):
-                adj_store[cells + 4 * i] = wp.vec3(adj_covered, 0.0, 0.0)
+                hit = load_hit(store, first_hit, i)
+                adj_hit = PlaneHit()
+                adj_hit.coverage = adj_covered
+                adj_hit.radiosity = (factor * hit.coverage * hit.transmittance) * adj
+                store_hit(adj_store, first_hit, i, adj_hit)
             for i in range(side_count):
-                coverage = store[cells + 4 * i][0]
-                if coverage > 0.0:
-                    transmitted = store[cells + 4 * i + 3][2]
-                    adj_weight = factor * (wp.dot(adj, store[cells + 4 * i + 1]) - value)
-                    adj_store[cells + 4 * i] = adj_store[cells + 4 * i] + wp.vec3(transmitted * adj_weight, 0.0, 0.0)
-                    adj_store[cells + 4 * i + 1] = (factor * coverage * transmitted) * adj
-                    side_transmittance_adjoint(i, coverage * adj_weight, cells, side_count, store, adj_store)
+                hit = load_hit(store, first_hit, i)
+                if hit.coverage > 0.0:
+                    adj_weight = factor * (wp.dot(adj, hit.radiosity) - value)
+                    add_to_hit(adj_store, first_hit, i, hit.transmittance * adj_weight, 0.0, 0.0)
+                    side_transmittance_adjoint(i, hit.coverage * adj_weight, first_hit, side_count, store, adj_store)
             adj_normal += (passing * total) * direction
             if adj_transmittance:
                 adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + cosine * total
             if passing > 0.0:
-                hit_sides_adjoint(scene, cell, sent, side_count, store, edges, adj_store, seen_texels, adj_texels)
+                hit_sides_adjoint(scene, cell, sent, side_count, store, edges, adj_store, texel_batch, adj_texels)
     if adj_normals:
         adj_normals[batch, receiver] = adj_normals[batch, receiver] + adj_normal
     place_receiver_adjoint(
@@ -212,11 +218,11 @@ def plane_light(
     fronts = None if fronts is None else expand_rows(fronts, instances)
     scratch = receiver_scratch(planes, HIT_ROWS)
     variables = [points, normals, transmittance, frames, texels, fronts]
-    scene, cells = (
+    scene, first_hit = (
         plane_arrays(planes, cell_radius(len(directions)), skip),
         constant(directions, wp.vec3, points.device),
     )
-    inputs = [*variables, scene, cells]
+    inputs = [*variables, scene, first_hit]
     return differentiable(
         lambda light: launch(
             _light_receivers,

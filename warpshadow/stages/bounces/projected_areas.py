@@ -67,17 +67,17 @@ def _turn_from_planes(
     result = normal
     if spheres[source] >= 0:
         radius = radii[instance_in(batch, radii.shape[0]), spheres[source]]
-        of_planes = instance_in(batch, frames.shape[0])
+        frame_batch = instance_in(batch, frames.shape[0])
         for f in range(grids.shape[0]):
             grid = grids[f]
-            u = frames[of_planes, 3 * f + 1]
-            v = frames[of_planes, 3 * f + 2]
+            u = frames[frame_batch, 3 * f + 1]
+            v = frames[frame_batch, 3 * f + 2]
             up = wp.normalize(wp.cross(u, v))
             along_up = wp.dot(normal, up)
             front = fronts[instance_in(batch, fronts.shape[0]), source, f]
             away = front * wp.max(-along_up, 0.0) - (1.0 - front) * wp.max(along_up, 0.0)
             if grid.blocks != 0 and radius > 0.0:
-                offset = point - frames[of_planes, 3 * f]
+                offset = point - frames[frame_batch, 3 * f]
                 height = wp.dot(offset, up) / radius
                 x = wp.dot(offset, u) / wp.length(u)
                 y = wp.dot(offset, v) / wp.length(v)

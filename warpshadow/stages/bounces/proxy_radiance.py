@@ -26,7 +26,7 @@ from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.stages.visibility.merging import MERGING, QUAD, merged_count
+from warpshadow.stages.visibility.merging import CLUSTER_SIZE, MERGING, merged_count
 
 _AVERTED = wp.constant(1.0e-4)  # ε, the part of its area that a patch counts for where it shows none
 
@@ -37,7 +37,7 @@ _BLACK_SPHERE_WEIGHT = 0.25
 def patches_of_clusters(
     spheres: np.ndarray, nearest: np.ndarray, *, merging: float = MERGING
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Patches of spheres and then, where spheres merge, of the quads' spheres, which have the patches of all four.
+    """Patches of spheres and then, where spheres merge, of the clusters' spheres, which have the patches of all four.
 
     Args:
         spheres: Sphere of each patch, −1 for none, shape [patch].
@@ -54,8 +54,8 @@ def patches_of_clusters(
         patches_of_sphere if len(patches_of_sphere) or patch < 0 else np.array([patch])
         for patches_of_sphere, patch in zip(lists, nearest, strict=True)
     ]
-    for quad in range(merged_count(len(nearest), merging)):
-        lists.append(np.concatenate(lists[QUAD * quad : QUAD * (quad + 1)]))
+    for cluster in range(merged_count(len(nearest), merging)):
+        lists.append(np.concatenate(lists[CLUSTER_SIZE * cluster : CLUSTER_SIZE * (cluster + 1)]))
     starts = np.cumsum([0, *map(len, lists)])
     return starts.astype(np.int32), np.concatenate([*lists, []]).astype(np.int32)
 

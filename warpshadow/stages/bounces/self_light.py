@@ -21,9 +21,9 @@ def _mix_probes(
 ):
     """A thread owns a receiver of an instance."""
     batch, receiver = wp.tid()
-    lit = instance_in(batch, probe_light.shape[0])
-    placed = instance_in(batch, rows.shape[0])
-    light[batch, receiver] = at_point(probe_light[lit], rows[placed, receiver], weights[placed, receiver])
+    light_batch = instance_in(batch, probe_light.shape[0])
+    row_batch = instance_in(batch, rows.shape[0])
+    light[batch, receiver] = at_point(probe_light[light_batch], rows[row_batch, receiver], weights[row_batch, receiver])
 
 
 def self_light(factors: SparseMatrix, radiosity: wp.array, rows: wp.array, weights: wp.array) -> wp.array:

@@ -42,7 +42,7 @@ from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres
 from warpshadow.stages.visibility.culling import DirectionCells, make_cap_functions, make_cells, make_cull
 from warpshadow.stages.visibility.directional import PAIR_COST, SOFTNESS
 from warpshadow.stages.visibility.falloff import make_falloff, make_sphere_adjoint
-from warpshadow.stages.visibility.merging import ITEMS, MERGING, Gradients, merged_count
+from warpshadow.stages.visibility.merging import MERGING, NODES_PER_CLUSTER, Gradients, merged_count
 from warpshadow.stages.visibility.traversal import (
     ClusterTree,
     TraversalInputs,
@@ -73,7 +73,7 @@ def _task_type(lanes: int) -> Any:
         cells: DirectionCells
         first_bundle: int
         ends: wp.array(dtype=wp.int32)  # [bundle] 0 where nothing is blocked, else the traversal's end
-        reached_bundles: wp.array2d(dtype=wp.int32)  # bundles that a run, and then a quad, may reach
+        reached_bundles: wp.array2d(dtype=wp.int32)  # bundles that a run, and then a cluster, may reach
         blocked: wp.array(dtype=Lane)  # [direction] F − T; for the adjoint its product with the factor of R
         sums: wp.array(dtype=Lane)  # [direction · sum] of R
         adj_cells: wp.array(dtype=Lane)  # [direction] the adjoint of the light · R
@@ -131,8 +131,8 @@ def _make_begin(lanes: int) -> wp.Function:
         task.sums = sums[wp.where(inputs.stores_sums, item, place)]
         task.proxy_radiance = inputs.proxy_radiance[instance_in(batch, inputs.proxy_radiance.shape[0])]
         size = float(TINY_RADIUS)
-        for run in range(spheres.bounds_of_runs.shape[1]):
-            size = wp.max(size, spheres.bounds_of_runs[batch, run][3])
+        for run in range(spheres.run_bounds.shape[1]):
+            size = wp.max(size, spheres.run_bounds[batch, run][3])
         task.inverse_size = 1.0 / size
         for bundle in range(task.ends.shape[0]):
             task.ends[bundle] = 0
@@ -144,12 +144,12 @@ def _make_begin(lanes: int) -> wp.Function:
                         vertex = block * lanes + lane
                         maximum = float(1.0)
                         if inputs.unblocked:
-                            serving = instance_in(batch, inputs.unblocked.shape[0])
-                            maximum = inputs.unblocked[serving, vertex, at * BUNDLE + i]
+                            unblocked_batch = instance_in(batch, inputs.unblocked.shape[0])
+                            maximum = inputs.unblocked[unblocked_batch, vertex, at * BUNDLE + i]
                         blocked[lane] = maximum - inputs.transmittance[batch, vertex, at * BUNDLE + i]
                     task.blocked[bundle * BUNDLE + i] = blocked
                     if is_any_above(wp.max(blocked, -blocked), 0.0):
-                        task.ends[bundle] = spheres.bounds_of_quads.shape[1] * ITEMS
+                        task.ends[bundle] = spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
         return batch, block, receivers, task
 
     return begin
@@ -391,9 +391,9 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                                 adj_transmittance[batch, vertex, direction] - adj_blocked[lane]
                             )
                         if adj_unblocked:
-                            serving = instance_in(batch, adj_unblocked.shape[0])
-                            adj_unblocked[serving, vertex, direction] = (
-                                adj_unblocked[serving, vertex, direction] + adj_blocked[lane]
+                            unblocked_batch = instance_in(batch, adj_unblocked.shape[0])
+                            adj_unblocked[unblocked_batch, vertex, direction] = (
+                                adj_unblocked[unblocked_batch, vertex, direction] + adj_blocked[lane]
                             )
                     task.blocked[place] = wp.cw_mul(wp.cw_mul(facing, task.blocked[place]), inverse)
                     task.adj_cells[place] = adj_cell
@@ -425,7 +425,7 @@ def sphere_light(
 
     Args:
         points, normals, centers, radii: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
-        proxy_radiance: Light and area that spheres, and the quads that they merge into, show towards cells, vec4 of
+        proxy_radiance: Light and area that spheres, and the clusters that they merge into, show towards cells, vec4 of
             shape [batch, node, direction], from :func:`.proxy_radiance.find_proxy_radiance`. A batch of 1 serves every
             instance.
         transmittance: T past these spheres, float32 of shape [batch, receiver, direction], made with the same

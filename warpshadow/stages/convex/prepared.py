@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.launch import detached, launch
+from warpshadow.device.launch import launch, without_gradient
 from warpshadow.maths.convex import ConvexPart
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
@@ -94,7 +94,7 @@ class ConvexBlockers:
         count, device, arrays = corners.shape[0], corners.device, self.arrays
         planes = wp.empty((count, arrays.faces.size), dtype=wp.vec4, device=device)
         bounds = wp.empty((count, arrays.first_face.size - 1), dtype=wp.vec4, device=device)
-        launch(_bound, bounds.shape, inputs=[detached(corners), arrays], outputs=[planes, bounds])
+        launch(_bound, bounds.shape, inputs=[without_gradient(corners), arrays], outputs=[planes, bounds])
         return PlacedParts(corners, planes, bounds)
 
 

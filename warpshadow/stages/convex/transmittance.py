@@ -203,7 +203,7 @@ def _pass(
     row = first_row + wp.tid()
     batch, receiver = split_row(row, points.shape[1])
     place = scratch_place(worker, row)
-    instance = instance_in(batch, corners.shape[0])
+    corner_batch = instance_in(batch, corners.shape[0])
     normal = horizon_normal(horizon_normals, batch, receiver)
     for q in range(cells.directions.shape[0]):
         passing[batch, receiver, q] = 1.0
@@ -213,9 +213,9 @@ def _pass(
             covered_count = _cover(
                 points[batch, receiver],
                 normal,
-                corners[instance],
-                planes[instance],
-                bounds[instance],
+                corners[corner_batch],
+                planes[corner_batch],
+                bounds[corner_batch],
                 parts,
                 body,
                 cells,
@@ -260,7 +260,7 @@ def _pass_adjoint(
     row = first_row + wp.tid()
     batch, receiver = split_row(row, points.shape[1])
     place = scratch_place(worker, row)
-    instance = instance_in(batch, corners.shape[0])
+    corner_batch = instance_in(batch, corners.shape[0])
     point, normal = points[batch, receiver], horizon_normal(horizon_normals, batch, receiver)
     adj_point = wp.vec3()
     for q in range(cells.directions.shape[0]):
@@ -270,9 +270,9 @@ def _pass_adjoint(
             covered_count = _cover(
                 point,
                 normal,
-                corners[instance],
-                planes[instance],
-                bounds[instance],
+                corners[corner_batch],
+                planes[corner_batch],
+                bounds[corner_batch],
                 parts,
                 body,
                 cells,
@@ -283,7 +283,7 @@ def _pass_adjoint(
                 covered[place],
             )
             for part in range(parts.first_part[body], parts.first_part[body + 1]):
-                bound = _find_bound(point, normal, bounds[instance, part], radius)
+                bound = _find_bound(point, normal, bounds[corner_batch, part], radius)
                 if bound.is_seen and covered_count > 0:
                     count = int(_UNKNOWN_COUNT)
                     for k in range(covered_count):
@@ -294,10 +294,10 @@ def _pass_adjoint(
                         if adj != 0.0 and left > 0.0 and wp.dot(bound.axis, direction) > bound.cosine:
                             if count == _UNKNOWN_COUNT:
                                 count = _find_silhouette(
-                                    point, corners[instance], planes[instance], parts, part, silhouettes[place]
+                                    point, corners[corner_batch], planes[corner_batch], parts, part, silhouettes[place]
                                 )
                             coverage_adjoint(silhouettes[place], 0, count, direction, radius, -adj / left)
-                    adj_point += _silhouette_adjoint(silhouettes[place], wp.max(count, 0), instance, adj_corners)
+                    adj_point += _silhouette_adjoint(silhouettes[place], wp.max(count, 0), corner_batch, adj_corners)
             for k in range(covered_count):
                 coverages[place, covered[place, k]] = 0.0
     if adj_points:

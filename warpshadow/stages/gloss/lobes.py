@@ -91,10 +91,10 @@ def _sample_lobes(
 ):
     """A thread owns a receiver."""
     batch, receiver = split_row(first_row + wp.tid(), cosines.shape[1])
-    located = instance_in(batch, points.shape[0])
-    normal = normals[located, receiver]
+    point_batch = instance_in(batch, points.shape[0])
+    normal = normals[point_batch, receiver]
     eye = eye_of(clip_matrices[instance_in(batch, clip_matrices.shape[0])])
-    view = wp.normalize(eye - points[located, receiver])
+    view = wp.normalize(eye - points[point_batch, receiver])
     rough = wp.max(roughness[instance_in(batch, roughness.shape[0]), receiver], MIN_ROUGHNESS)
     width = rough * rough
     cosine = wp.clamp(wp.dot(normal, view), _MIN_COSINE, 0.99999)

@@ -129,14 +129,14 @@ def _look_up(
     """A thread owns a receiver."""
     batch, receiver = split_row(first_row + wp.tid(), light.shape[1])
     lit = texels[instance_in(batch, texels.shape[0])]
-    located = instance_in(batch, directions.shape[0])
+    direction_batch = instance_in(batch, directions.shape[0])
     for i in range(light.shape[2]):
-        direction = directions[located, receiver, i]
+        direction = directions[direction_batch, receiver, i]
         polar = wp.acos(wp.clamp(direction[1], -0.999999, 0.999999)) / wp.pi
         azimuth = wp.atan2(direction[0], -direction[2]) / (2.0 * wp.pi)
         azimuth = azimuth - wp.floor(azimuth)
         # half a texel of the map itself is between levels 0 and 1
-        blur = wp.max(filters[located, receiver, i][2] * float(levels[0][1]) / wp.pi, 0.5)
+        blur = wp.max(filters[direction_batch, receiver, i][2] * float(levels[0][1]) / wp.pi, 0.5)
         height = wp.clamp(wp.log2(blur) + 1.0, 0.0, float(_LEVELS) - 1.001)
         level = int(height)
         a = _at_level(lit, levels[level][0], levels[level][1], polar, azimuth)

@@ -46,18 +46,18 @@ def _sum_lobes(
 ):
     """A thread owns a receiver: G and G'."""
     batch, receiver = split_row(first_row + wp.tid(), straight.shape[1])
-    located = instance_in(batch, filters.shape[0])
-    lit = instance_in(batch, light.shape[0])
-    through = instance_in(batch, transmittance.shape[0])
+    filter_batch = instance_in(batch, filters.shape[0])
+    light_batch = instance_in(batch, light.shape[0])
+    transmittance_batch = instance_in(batch, transmittance.shape[0])
     instead = wp.vec3()
     if blocked:
         instead = blocked[instance_in(batch, blocked.shape[0]), receiver]
     total = wp.vec3()
     total_grazing = wp.vec3()
     for i in range(filters.shape[2]):
-        weight = filters[located, receiver, i]
-        share = transmittance[through, receiver, i]
-        radiance = share * light[lit, receiver, i] + (1.0 - share) * instead
+        weight = filters[filter_batch, receiver, i]
+        share = transmittance[transmittance_batch, receiver, i]
+        radiance = share * light[light_batch, receiver, i] + (1.0 - share) * instead
         total += weight[0] * radiance
         total_grazing += weight[1] * radiance
     straight[batch, receiver] = total

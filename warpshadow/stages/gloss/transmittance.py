@@ -79,11 +79,11 @@ def _sum_near(
 ):
     """A thread owns a receiver: the sums of k min(T, H) and of k H."""
     batch, receiver = split_row(first_row + wp.tid(), sums.shape[1])
-    located = instance_in(batch, directions.shape[0])
+    direction_batch = instance_in(batch, directions.shape[0])
     normal = normals[instance_in(batch, normals.shape[0]), receiver]
     row = transmittance[instance_in(batch, transmittance.shape[0])]
     for i in range(sums.shape[2]):
-        direction = directions[located, receiver, i]
+        direction = directions[direction_batch, receiver, i]
         texel = _texel(direction)
         total = wp.vec2()
         for k in range(neighbors.shape[1]):

@@ -92,14 +92,14 @@ def _find_extremes(
 ):
     """A thread owns an instance and a plane."""
     batch, f = wp.tid()
-    instance = instance_in(batch, frames.shape[0])
-    up = wp.cross(frames[instance, 3 * f + 1], frames[instance, 3 * f + 2])
+    frame_batch = instance_in(batch, frames.shape[0])
+    up = wp.cross(frames[frame_batch, 3 * f + 1], frames[frame_batch, 3 * f + 2])
     lowest, highest = int(0), int(0)
-    of_corners = instance_in(batch, corners.shape[0])
-    first = corners[of_corners, 0]
+    corner_batch = instance_in(batch, corners.shape[0])
+    first = corners[corner_batch, 0]
     minimum, maximum = float(0.0), float(0.0)
     for corner in range(1, corners.shape[1]):
-        height = wp.dot(corners[of_corners, corner] - first, up)
+        height = wp.dot(corners[corner_batch, corner] - first, up)
         if height < minimum:
             lowest, minimum = corner, height
         if height > maximum:
@@ -119,12 +119,12 @@ def _find_leanings(
 ):
     """A thread owns an instance and a plane."""
     batch, f = wp.tid()
-    instance = instance_in(batch, frames.shape[0])
+    frame_batch = instance_in(batch, frames.shape[0])
     leaning = float(0.0)
-    if wp.length_sq(frames[instance, 3 * f + 1]) > 0.0:
-        of_corners = instance_in(batch, corners.shape[0])
-        low = _height(corners[of_corners, extremes[batch, f][0]], frames, instance, f)
-        high = _height(corners[of_corners, extremes[batch, f][1]], frames, instance, f)
+    if wp.length_sq(frames[frame_batch, 3 * f + 1]) > 0.0:
+        corner_batch = instance_in(batch, corners.shape[0])
+        low = _height(corners[corner_batch, extremes[batch, f][0]], frames, frame_batch, f)
+        high = _height(corners[corner_batch, extremes[batch, f][1]], frames, frame_batch, f)
         leaning = wp.clamp((high + low) / wp.max(high - low, grids[f].margin), -1.0, 1.0)
     leanings[batch, f] = leaning
 
@@ -145,11 +145,11 @@ def _find_fronts(
 ):
     """A thread owns a point of an instance and a plane."""
     batch, receiver, f = wp.tid()
-    instance = instance_in(batch, frames.shape[0])
-    axis_u = frames[instance, 3 * f + 1]
+    frame_batch = instance_in(batch, frames.shape[0])
+    axis_u = frames[frame_batch, 3 * f + 1]
     front = float(0.0)
     if wp.length_sq(axis_u) > 0.0:
-        height = _height(points[instance_in(batch, points.shape[0]), receiver], frames, instance, f)
+        height = _height(points[instance_in(batch, points.shape[0]), receiver], frames, frame_batch, f)
         number = int(-1)
         if numbers:
             number = numbers[receiver]
@@ -157,7 +157,7 @@ def _find_fronts(
         if number >= 0:
             radius = radii[instance_in(batch, radii.shape[0]), number] / wp.length(axis_u)
         if radius > _MIN_BLOCKER_RADIUS:
-            middle = _height(centers[instance_in(batch, centers.shape[0]), number], frames, instance, f)
+            middle = _height(centers[instance_in(batch, centers.shape[0]), number], frames, frame_batch, f)
             if _FRONT_RADIUS_RATIO * wp.abs(height + middle) < radius:
                 front = wp.smoothstep(-1.0, 1.0, _FRONT_RADIUS_RATIO * (height + middle) / radius)
             else:
@@ -166,7 +166,7 @@ def _find_fronts(
             leaning = float(1.0)
             if leanings:
                 leaning = leanings[instance_in(batch, leanings.shape[0]), f]
-            up = wp.normalize(wp.cross(axis_u, frames[instance, 3 * f + 2]))
+            up = wp.normalize(wp.cross(axis_u, frames[frame_batch, 3 * f + 2]))
             facing = wp.dot(normals[instance_in(batch, normals.shape[0]), receiver], up)
             front = wp.smoothstep(
                 -1.0, 1.0, leaning + (1.0 - leaning * leaning) * facing + _over_margin(height, grids[f].margin)
@@ -236,16 +236,16 @@ def _lift(
 ):
     """A thread owns a point of an instance."""
     batch, receiver = wp.tid()
-    instance = instance_in(batch, frames.shape[0])
+    frame_batch = instance_in(batch, frames.shape[0])
     point = points[instance_in(batch, points.shape[0]), receiver]
     result = point
     for f in range(grids.shape[0]):
-        axis_u = frames[instance, 3 * f + 1]
+        axis_u = frames[frame_batch, 3 * f + 1]
         if f != skip and wp.length_sq(axis_u) > 0.0:
-            height = _height(point, frames, instance, f) / (2.0 * _LIFT_IN_MARGINS * grids[f].margin)
+            height = _height(point, frames, frame_batch, f) / (2.0 * _LIFT_IN_MARGINS * grids[f].margin)
             if wp.abs(height) < 1.0:
                 near = 1.0 - height * height
-                up = wp.normalize(wp.cross(axis_u, frames[instance, 3 * f + 2]))
+                up = wp.normalize(wp.cross(axis_u, frames[frame_batch, 3 * f + 2]))
                 side = 2.0 * fronts[batch, receiver, f] - 1.0
                 result += side * near * near * _LIFT_IN_MARGINS * grids[f].margin * wp.length(axis_u) * up
     lifted[batch, receiver] = result

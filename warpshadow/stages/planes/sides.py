@@ -177,10 +177,10 @@ def place_receiver(
     batch, receiver = split_row(row, points.shape[1])
     scratch_row = scratch_place(worker, row)
     store, edges = scratch[scratch_row], viewed_edges[scratch_row]
-    instance = instance_in(batch, frames.shape[0])
+    frame_batch = instance_in(batch, frames.shape[0])
     side_count = int(0)
     for f in range(scene.grids.shape[0]):
-        place = find_in_plane(points[batch, receiver], frames[instance], f)
+        place = find_in_plane(points[batch, receiver], frames[frame_batch], f)
         store_place(store, f, place)
         if f != scene.skip and wp.length_sq(place.normal) > 0.0:
             # below the plane the front fades, and the back takes over
@@ -216,12 +216,12 @@ def place_receiver_adjoint(
         adj_height = front_of_adjoint(fronts, grid, place.at[2], adj_front, batch, receiver, side.f, adj_fronts)
         adj.at = adj.at + wp.vec3(0.0, 0.0, adj_height)
         store_place(adj_store, side.f, adj)
-    instance = instance_in(batch, frames.shape[0])
+    frame_batch = instance_in(batch, frames.shape[0])
     adj_point = wp.vec3()
     for f in range(scene.grids.shape[0]):
         place, adj = load_place(store, f), load_place(adj_store, f)
         adj_point += find_in_plane_adjoint(
-            points[batch, receiver], frames[instance], f, place, adj, instance, adj_frames
+            points[batch, receiver], frames[frame_batch], f, place, adj, frame_batch, adj_frames
         )
     if adj_points:
         adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point

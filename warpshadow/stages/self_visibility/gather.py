@@ -164,37 +164,37 @@ def _make_gather(lanes: int) -> wp.Kernel:
         # scratch
         scratch: wp.array3d(dtype=Lane),
         # out
-        own: wp.array3d(dtype=wp.float32),
+        transmittance_self: wp.array3d(dtype=wp.float32),
     ):
         """A thread owns a block of receivers."""
         item = first_row + wp.tid()
         shares = scratch[scratch_place(worker, item), 0]
         columns = scratch[scratch_place(worker, item), 1]
-        batch, block, normal, probes = begin(inputs, item, own.shape[1], shares)
-        turn = instance_in(batch, inputs.counts.shape[0])
+        batch, block, normal, probes = begin(inputs, item, transmittance_self.shape[1], shares)
+        weight_batch = instance_in(batch, inputs.counts.shape[0])
         for q in range(inputs.directions.shape[0]):
             passing = Lane(0.0)
             cosine = dot_direction(inputs.directions[q], normal)
             if is_any_above(cosine, 0.0):
-                indices = inputs.indices[turn, q]
-                weights = inputs.weights[turn, q]
+                indices = inputs.indices[weight_batch, q]
+                weights = inputs.weights[weight_batch, q]
                 of_rays = inputs.looks_at_rays[q]
                 if wp.static(lanes == 1) or of_rays == 1:
-                    for k in range(inputs.counts[turn, q]):
+                    for k in range(inputs.counts[weight_batch, q]):
                         for corner in range(probes.corner_count):
                             share = look(probes.rows[corner], of_rays, indices[k], inputs)
                             passing += weights[k] * wp.cw_mul(probes.weights[corner], share)
                 else:
-                    for k in range(inputs.counts[turn, q]):
+                    for k in range(inputs.counts[weight_batch, q]):
                         passing += weights[k] * shares[indices[k]]
             for lane in range(lanes):
                 passing[lane] = wp.where(cosine[lane] > 0.0, passing[lane], 1.0)
             if wp.static(lanes == 1):
-                own[batch, block, q] = passing[0]
+                transmittance_self[batch, block, q] = passing[0]
             else:
                 columns[q] = passing
         if wp.static(lanes > 1):
-            store_columns(columns, 0, inputs.directions.shape[0], block, own[batch])
+            store_columns(columns, 0, inputs.directions.shape[0], block, transmittance_self[batch])
 
     return gather
 
@@ -212,7 +212,7 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
         worker: int,
         # in
         inputs: GatherInputs,
-        adj_own: wp.array3d(dtype=wp.float32),
+        adj_transmittance: wp.array3d(dtype=wp.float32),
         # scratch
         scratch: wp.array3d(dtype=Lane),
         # out
@@ -226,24 +226,24 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
         item = first_row + wp.tid()
         shares = scratch[scratch_place(worker, item), 0]
         adj_shares = scratch[scratch_place(worker, item), 1]
-        batch, block, normal, probes = begin(inputs, item, adj_own.shape[1], shares)
-        turn = instance_in(batch, inputs.counts.shape[0])
+        batch, block, normal, probes = begin(inputs, item, adj_transmittance.shape[1], shares)
+        weight_batch = instance_in(batch, inputs.counts.shape[0])
         if wp.static(lanes > 1):
             for cell in range(shares.shape[0]):
                 adj_shares[cell] = Lane(0.0)
-        receiver_count = wp.min(lanes, adj_own.shape[1] - block * lanes)
+        receiver_count = wp.min(lanes, adj_transmittance.shape[1] - block * lanes)
         adj_place = Weights()
         for q in range(inputs.directions.shape[0]):
             cosine = dot_direction(inputs.directions[q], normal)
             if is_any_above(cosine, 0.0):
                 adj = Lane()
                 for lane in range(receiver_count):
-                    adj[lane] = wp.where(cosine[lane] > 0.0, adj_own[batch, block * lanes + lane, q], 0.0)
-                indices = inputs.indices[turn, q]
-                weights = inputs.weights[turn, q]
+                    adj[lane] = wp.where(cosine[lane] > 0.0, adj_transmittance[batch, block * lanes + lane, q], 0.0)
+                indices = inputs.indices[weight_batch, q]
+                weights = inputs.weights[weight_batch, q]
                 of_rays = inputs.looks_at_rays[q]
                 if wp.static(lanes == 1) or of_rays == 1:
-                    for k in range(inputs.counts[turn, q]):
+                    for k in range(inputs.counts[weight_batch, q]):
                         adj_weight = float(0.0)
                         for corner in range(3):
                             if corner < probes.corner_count:
@@ -253,15 +253,17 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
                         if adj_all_weights:
                             if wp.static(lanes == 1):
                                 adj_weight = sum_over_warp(
-                                    adj_weight, (turn * inputs.directions.shape[0] + q) * adj_all_weights.shape[2] + k
+                                    adj_weight,
+                                    (weight_batch * inputs.directions.shape[0] + q) * adj_all_weights.shape[2] + k,
                                 )
                             if adj_weight != 0.0:
-                                wp.atomic_add(adj_all_weights, turn, q, k, adj_weight)
+                                wp.atomic_add(adj_all_weights, weight_batch, q, k, adj_weight)
                 else:
-                    for k in range(inputs.counts[turn, q]):
+                    for k in range(inputs.counts[weight_batch, q]):
                         adj_shares[indices[k]] = adj_shares[indices[k]] + weights[k] * adj
                         if adj_all_weights:
-                            wp.atomic_add(adj_all_weights, turn, q, k, total(wp.cw_mul(adj, shares[indices[k]])))
+                            adj_weight_sum = total(wp.cw_mul(adj, shares[indices[k]]))
+                            wp.atomic_add(adj_all_weights, weight_batch, q, k, adj_weight_sum)
         if adj_place_weights:
             for corner in range(3):
                 adj_corner = adj_place[corner]
@@ -312,11 +314,13 @@ def gather_self_transmittance(
     scratch = [Scratch((2, cell_count), lane_type(lanes))]
     cost = _LOOKUP_COST * _MEAN_LOOKUPS * direction_count * lanes
     return differentiable(
-        lambda own: launch(_make_gather(lanes), row_count, inputs=[inputs], scratch=scratch, outputs=[own], cost=cost),
-        lambda adj_own: launch(
+        lambda transmittance_self: launch(
+            _make_gather(lanes), row_count, inputs=[inputs], scratch=scratch, outputs=[transmittance_self], cost=cost
+        ),
+        lambda adj_transmittance: launch(
             _make_gather_adjoint(lanes),
             row_count,
-            inputs=[inputs, adj_own],
+            inputs=[inputs, adj_transmittance],
             scratch=scratch,
             outputs=[places.weights.grad],
             sums=[lookup.weights.grad],
@@ -341,12 +345,12 @@ def _multiply(
         products[batch, receiver, chunk] = wp.cw_mul(factors[batch, receiver, chunk], values[batch, receiver, chunk])
 
 
-def multiply_transmittances(own: wp.array, others: wp.array) -> wp.array:
+def multiply_transmittances(transmittance_self: wp.array, transmittance_others: wp.array) -> wp.array:
     """The product of two transmittances, float32 of shape [batch, receiver, direction]. Differentiable: both."""
-    use_vector_registers(__name__, own.device)
-    product = empty(own.shape, dtype=wp.float32, device=own.device)
-    if own.requires_grad or others.requires_grad:
+    use_vector_registers(__name__, transmittance_self.device)
+    product = empty(transmittance_self.shape, dtype=wp.float32, device=transmittance_self.device)
+    if transmittance_self.requires_grad or transmittance_others.requires_grad:
         require_gradient(product)  # before it is seen as chunks
-    inputs = [as_chunks(own), as_chunks(others)]
-    launch(_multiply, own.shape[:2], inputs=inputs, outputs=[as_chunks(product)])
+    inputs = [as_chunks(transmittance_self), as_chunks(transmittance_others)]
+    launch(_multiply, transmittance_self.shape[:2], inputs=inputs, outputs=[as_chunks(product)])
     return product

@@ -154,7 +154,7 @@ def _turn_lobes(
 ):
     """A thread owns a receiver."""
     batch, receiver = split_row(first_row + wp.tid(), turned.shape[1])
-    turn = instance_in(batch, turns.shape[0])
+    turn_batch = instance_in(batch, turns.shape[0])
     row = rows[instance_in(batch, rows.shape[0]), receiver]
     share = places[instance_in(batch, places.shape[0]), receiver]
     for k in range(bands * bands):
@@ -163,9 +163,9 @@ def _turn_lobes(
         start = band * band
         end = start + 2 * band + 1
         for i in range(start, end):
-            own = _self_coefficient(lobes, row, share, i)
+            coefficient = _self_coefficient(lobes, row, share, i)
             for k in range(start, end):
-                turned[batch, receiver, k] = turned[batch, receiver, k] + turns[turn, k, i] * own
+                turned[batch, receiver, k] = turned[batch, receiver, k] + turns[turn_batch, k, i] * coefficient
 
 
 @wp.kernel(enable_backward=False)
@@ -188,7 +188,7 @@ def _turn_lobes_adjoint(
 ):
     """A thread owns a receiver:  δ̄_a += K̄ᵀ G_a K,  b̄_j += L_jᵀ Dᵀ K̄."""
     batch, receiver = split_row(first_row + wp.tid(), adj_turned.shape[1])
-    turn = instance_in(batch, turns.shape[0])
+    turn_batch = instance_in(batch, turns.shape[0])
     if adj_turns:
         adj_turn = wp.vec3()
         for k in range(bands * bands):
@@ -196,7 +196,7 @@ def _turn_lobes_adjoint(
             for t in range(generators_first[k], generators_first[k + 1]):
                 spun += turned[batch, receiver, generators_index[t]] * generators[t]
             adj_turn += adj_turned[batch, receiver, k] * spun
-        wp.atomic_add(adj_turns, turn, adj_turn)
+        wp.atomic_add(adj_turns, turn_batch, adj_turn)
     if adj_places:
         row = rows[instance_in(batch, rows.shape[0]), receiver]
         adj_share = wp.vec3()
@@ -204,10 +204,10 @@ def _turn_lobes_adjoint(
             start = band * band
             end = start + 2 * band + 1
             for i in range(start, end):
-                adj_own = float(0.0)
+                adj_coefficient = float(0.0)
                 for k in range(start, end):
-                    adj_own += turns[turn, k, i] * adj_turned[batch, receiver, k]
-                adj_share += adj_own * wp.vec3(lobes[row[0], i], lobes[row[1], i], lobes[row[2], i])
+                    adj_coefficient += turns[turn_batch, k, i] * adj_turned[batch, receiver, k]
+                adj_share += adj_coefficient * wp.vec3(lobes[row[0], i], lobes[row[1], i], lobes[row[2], i])
         adj_places[batch, receiver] = adj_places[batch, receiver] + adj_share
 
 

@@ -37,7 +37,7 @@ class ResamplingKernels:
     looks_at_rays: wp.array(dtype=wp.int32)  # 1, or 0 for coarse cells [direction]
     rays: wp.array(dtype=wp.vec3)  # directions of rays, and of coarse cells, in the body's frame
     cells: wp.array(dtype=wp.vec3)
-    most: int  # lookups of a cell at most
+    max_lookups: int  # of a cell
 
 
 @cached_by_values
@@ -68,7 +68,7 @@ def find_resampling_kernels(
     kernels.reaches = constant(reaches, wp.float32, device)
     kernels.looks_at_rays = constant(looks_at_rays.astype(np.int32), wp.int32, device)
     kernels.rays, kernels.cells = constant(rays, wp.vec3, device), constant(cells, wp.vec3, device)
-    kernels.most = int(1.4 * counts.max() + 8)
+    kernels.max_lookups = int(1.4 * counts.max() + 8)
     return kernels
 
 
@@ -77,8 +77,8 @@ class ResamplingWeights(NamedTuple):
 
     Args:
         counts: Number of lookups, int32 of shape [batch, direction].
-        indices: Rays or coarse cells, int32 of shape [batch, direction, most].
-        weights: Their weights, float32 of shape [batch, direction, most]; 0 after the last.
+        indices: Rays or coarse cells, int32 of shape [batch, direction, lookup].
+        weights: Their weights, float32 of shape [batch, direction, lookup]; 0 after the last.
     """
 
     counts: wp.array
@@ -183,7 +183,7 @@ def find_resampling_weights(rotations: wp.array, body: int, kernels: ResamplingK
     shape = len(rotations), kernels.directions.size
     device = rotations.device
     counts = empty(shape, dtype=wp.int32, device=device)
-    indices = empty((*shape, kernels.most), dtype=wp.int32, device=device)
+    indices = empty((*shape, kernels.max_lookups), dtype=wp.int32, device=device)
     inputs = [rotations, body, kernels]
     weights = differentiable(
         lambda weights: launch(
@@ -195,7 +195,7 @@ def find_resampling_weights(rotations: wp.array, body: int, kernels: ResamplingK
             inputs=[*inputs, counts, indices, weights, adj_weights],
             outputs=[rotations.grad],
         ),
-        result=empty((*shape, kernels.most), dtype=wp.float32, device=device),
+        result=empty((*shape, kernels.max_lookups), dtype=wp.float32, device=device),
         variables=[rotations],
     )
     return ResamplingWeights(counts, indices, weights)

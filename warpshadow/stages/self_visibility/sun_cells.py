@@ -22,7 +22,7 @@ from warpshadow.device.lanes import lane_type, make_lane_functions, module_optio
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
-from warpshadow.maths.directions import CHUNK
+from warpshadow.maths.directions import CHUNK, brightest_chunk
 from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 
@@ -50,14 +50,8 @@ def find_sun_cells(power: np.ndarray, draw: Callable[[np.ndarray, int], np.ndarr
         draw: Draws directions from the light of some cells, of their numbers and how many of each: unit vectors [cell,
             count, 3].
     """
-    bright = np.flatnonzero(power > _BRIGHT * power.sum())
-    bright = np.sort(bright[np.argsort(-power[bright], kind="stable")[:CHUNK]])
-    if not len(bright):
-        return None
-    repeated = np.arange(CHUNK) * len(bright) // CHUNK
-    places = np.full(len(power), -1, np.int32)
-    places[bright] = np.searchsorted(repeated, np.arange(len(bright)))
-    return SunCells(draw(bright, PACKET)[repeated], places)
+    cells, repeated, places = brightest_chunk(power, power > _BRIGHT * power.sum())
+    return SunCells(draw(cells, PACKET)[repeated], places) if len(cells) else None
 
 
 class RayProbes(NamedTuple):

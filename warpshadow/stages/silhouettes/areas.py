@@ -67,8 +67,8 @@ def _measure(
         if wp.isfinite(line / line[direction / 2]):  # else vertices are so far away that products overflow
             its_edge = edges[entries[neighbor(samples[entry], direction, fragments.width)], opposite(direction)]
             is_end = edge[0] == its_edge[0] and edge[1] == its_edge[1]
-            counts = 1.0 / (1.0 + steepness * steepness * steepness * steepness)
-            share = wp.vec3(area, counts, wp.where(is_end, 1.0, 0.0))
+            line_weight = 1.0 / (1.0 + steepness * steepness * steepness * steepness)
+            share = wp.vec3(area, line_weight, wp.where(is_end, 1.0, 0.0))
     shares[entry, direction] = share
 
 
@@ -133,7 +133,7 @@ def measure_areas(samples: wp.array, edges: wp.array, entries: wp.array, arrays:
         entries: Of each sample, int32 of shape [sample].
         arrays: The fragments as kernels take them.
     Returns:
-        The area e beyond each line, how much it counts, ω, and whether a surface ends there, 1, or has a crease, 0;
+        The area e beyond each line, its weight ω, and whether a surface ends there, 1, or has a crease, 0;
         vec3 of shape [entry, 4], zero where there is no line.
     """
     shares = empty(edges.shape, dtype=wp.vec3, device=edges.device)

@@ -54,7 +54,7 @@ class Silhouettes:
         edges: Vertices a, b of the edge between it and its neighbor to the right, left, below and above, in the order
             in which the line a × b is positive on its surface; (−1, −1) where there is none, (−2, −2) where their
             faces intersect; vec2i of shape [entry, 4]. At a crease each of the two has the vertices of its own side.
-        shares: The area e of the sample that lies beyond each, how much it counts, ω, and whether a surface ends
+        shares: The area e of the sample that lies beyond each, its weight ω, and whether a surface ends
             there, 1, or has a crease, 0; vec3 of shape [entry, 4].
         entries: Entry of each sample of the flat images, −1 for none, int32 of shape [sample].
         faces: The rasterized faces, vec3i of shape [face].

@@ -36,11 +36,11 @@ def _loss(share: wp.vec3, neighbor_share: wp.vec3):
 
 
 @wp.func
-def _counts(shares: wp.array(dtype=wp.vec3), direction: int):
+def _area_weight(shares: wp.array(dtype=wp.vec3), direction: int):
     """Weight of the area in a direction: ω, less its loss to the areas in both directions across."""
     perpendicular = wp.where(direction < 2, 2, 0)
-    counts = shares[direction][1] - _loss(shares[direction], shares[perpendicular]) * shares[perpendicular][0]
-    return counts - _loss(shares[direction], shares[perpendicular + 1]) * shares[perpendicular + 1][0]
+    weight = shares[direction][1] - _loss(shares[direction], shares[perpendicular]) * shares[perpendicular][0]
+    return weight - _loss(shares[direction], shares[perpendicular + 1]) * shares[perpendicular + 1][0]
 
 
 @functools.cache
@@ -68,7 +68,7 @@ def _make_blend(dtype: type) -> wp.Kernel:
                 area = own_shares[direction][0]
                 if area > 0.0:
                     contrast = image[instance, neighbor(sample, direction, width)] - here
-                    total += area * _counts(own_shares, direction) * contrast
+                    total += area * _area_weight(own_shares, direction) * contrast
             smoothed[instance, sample] = total
 
     return blend
@@ -105,17 +105,17 @@ def _make_blend_adjoint(dtype: type) -> wp.Kernel:
                 share = own_shares[direction]
                 if share[0] > 0.0:
                     other = neighbor(sample, direction, width)
-                    counts = _counts(own_shares, direction)
+                    weight = _area_weight(own_shares, direction)
                     if adj_image:
-                        wp.atomic_add(adj_image, instance, other, share[0] * counts * adj)
-                        wp.atomic_sub(adj_image, instance, sample, share[0] * counts * adj)
+                        wp.atomic_add(adj_image, instance, other, share[0] * weight * adj)
+                        wp.atomic_sub(adj_image, instance, sample, share[0] * weight * adj)
                     if adj_areas:
                         contrast = image[instance, other] - image[instance, sample]
                         if edge_colors:
                             color_across = edge_colors[instance, entries[other], opposite(direction)]
                             contrast = color_across - edge_colors[instance, entry, direction]
                         change = inner(adj, contrast)
-                        wp.atomic_add(adj_areas, entry, direction, counts * change)
+                        wp.atomic_add(adj_areas, entry, direction, weight * change)
                         perpendicular = wp.where(direction < 2, 2, 0)
                         for k in range(2):
                             loss = _loss(share, own_shares[perpendicular + k]) * share[0]

@@ -142,8 +142,8 @@ def _find_footprints(
     if batch_count > 1:  # on a CPU dividing takes as long as much of the rest
         instance = thread // (image_width * image_height)
     sample = thread - instance * image_width * image_height
-    view = instance_in(instance, face_ids.shape[0])
-    face = face_ids[view, sample]
+    fragment_batch = instance_in(instance, face_ids.shape[0])
+    face = face_ids[fragment_batch, sample]
     texture = int(-1)
     if face >= 0:
         texture = texture_of_face[face]
@@ -157,7 +157,7 @@ def _find_footprints(
         uv_a = of_instance[uv_faces[face][0]]
         uv_b = of_instance[uv_faces[face][1]]
         uv_c = of_instance[uv_faces[face][2]]
-        weights = barycentrics[view, sample]
+        weights = barycentrics[fragment_batch, sample]
         uv = weights[0] * uv_a + weights[1] * uv_b + weights[2] * uv_c
         row = sample // image_width
         ray = center(sample - row * image_width, row, image_width, image_height)

@@ -173,22 +173,22 @@ def _color(
     texels: wp.array(dtype=wp.vec3),
 ):
     """Reflectance of a sample of an instance."""
-    footprint = instance_in(instance, sampled.texture_ids.shape[0])
-    texture = sampled.texture_ids[footprint, sample]
+    footprint_batch = instance_in(instance, sampled.texture_ids.shape[0])
+    texture = sampled.texture_ids[footprint_batch, sample]
     color = wp.vec3()
     if texture >= 0:
-        line = sampled.probes[footprint, sample]
-        uv = sampled.uvs[footprint, sample]
+        line = sampled.probes[footprint_batch, sample]
+        uv = sampled.uvs[footprint_batch, sample]
         level, coarse_part = _level_of(line[2], sampled.level_counts[texture])
         color = _filtered(texels, sampled.levels[texture, level], uv, line)
         if coarse_part > 0.0:
             coarse = _filtered(texels, sampled.levels[texture, level + 1], uv, line)
             color = (1.0 - coarse_part) * color + coarse_part * coarse
     else:
-        view = instance_in(instance, sampled.face_ids.shape[0])
-        face = sampled.face_ids[view, sample]
+        fragment_batch = instance_in(instance, sampled.face_ids.shape[0])
+        face = sampled.face_ids[fragment_batch, sample]
         if face >= 0:
-            color = at_point(vertex_albedo, sampled.faces[face], sampled.barycentrics[view, sample])
+            color = at_point(vertex_albedo, sampled.faces[face], sampled.barycentrics[fragment_batch, sample])
     return color
 
 
@@ -231,8 +231,8 @@ def _sample_adjoint_by_colors(
 ):
     """A thread owns a run of samples: the adjoint of `_sample` by the reflectance."""
     instance, thread = wp.tid()
-    footprint = instance_in(instance, sampled.texture_ids.shape[0])
-    view = instance_in(instance, sampled.face_ids.shape[0])
+    footprint_batch = instance_in(instance, sampled.texture_ids.shape[0])
+    fragment_batch = instance_in(instance, sampled.face_ids.shape[0])
     for sample in range(thread * sampled.run, (thread + 1) * sampled.run):
         adj_color = wp.vec3()
         if adj_radiance:
@@ -240,22 +240,23 @@ def _sample_adjoint_by_colors(
             adj_color = wp.vec3(adj[0], adj[1], adj[2])
         else:
             adj_color = adj_albedo[instance, sample]
-        texture = sampled.texture_ids[footprint, sample]
+        texture = sampled.texture_ids[footprint_batch, sample]
         if texture >= 0:
             if adj_texels:
                 adj_of_textures = adj_texels[instance_in(instance, adj_texels.shape[0])]
-                line = sampled.probes[footprint, sample]
-                uv = sampled.uvs[footprint, sample]
+                line = sampled.probes[footprint_batch, sample]
+                uv = sampled.uvs[footprint_batch, sample]
                 level, coarse_part = _level_of(line[2], sampled.level_counts[texture])
                 fine_color = (1.0 - coarse_part) * adj_color
                 _scatter(adj_of_textures, sampled.levels[texture, level], uv, line, fine_color)
                 if coarse_part > 0.0:
                     _scatter(adj_of_textures, sampled.levels[texture, level + 1], uv, line, coarse_part * adj_color)
         elif adj_vertex_albedo:
-            face = sampled.face_ids[view, sample]
+            face = sampled.face_ids[fragment_batch, sample]
             if face >= 0:
                 adj_of_vertices = adj_vertex_albedo[instance_in(instance, adj_vertex_albedo.shape[0])]
-                add_to_corners(adj_of_vertices, sampled.faces[face], sampled.barycentrics[view, sample], adj_color)
+                weights = sampled.barycentrics[fragment_batch, sample]
+                add_to_corners(adj_of_vertices, sampled.faces[face], weights, adj_color)
 
 
 @wp.func
@@ -287,13 +288,13 @@ def _sample_adjoint_by_places(
 ):
     """A thread owns a run of samples: the adjoint of `_sample` by where on their faces, and how wide, they are."""
     instance, thread = wp.tid()
-    footprint = instance_in(instance, sampled.texture_ids.shape[0])
+    footprint_batch = instance_in(instance, sampled.texture_ids.shape[0])
     of_textures = texels[instance_in(instance, texels.shape[0])]
     for sample in range(thread * sampled.run, (thread + 1) * sampled.run):
-        texture = sampled.texture_ids[footprint, sample]
+        texture = sampled.texture_ids[footprint_batch, sample]
         adj_color = adj_albedo[instance, sample]
         if texture >= 0:
-            line = sampled.probes[footprint, sample]
+            line = sampled.probes[footprint_batch, sample]
             count = line[3]
             level, coarse_part = _level_of(line[2], sampled.level_counts[texture])
             reach = _reach(count)
@@ -301,7 +302,7 @@ def _sample_adjoint_by_places(
             adj_v = float(0.0)
             adj_line = wp.vec4()
             for probe in range(-reach, reach + 1):
-                uv = sampled.uvs[footprint, sample]
+                uv = sampled.uvs[footprint_batch, sample]
                 step = float(probe) * wp.vec2(line[0], line[1])
                 weight = _share(probe, count) / count
                 slopes = _slopes(of_textures, sampled.levels[texture, level], uv, step, adj_color)
@@ -319,17 +320,18 @@ def _sample_adjoint_by_places(
                 weighted_probe = float(probe) * weight
                 adj_line += wp.vec4(weighted_probe * slopes[0], weighted_probe * slopes[1], adj_width, adj_count)
             if adj_uvs:
-                wp.atomic_add(adj_uvs, footprint, sample, wp.vec2(adj_u, adj_v))
+                wp.atomic_add(adj_uvs, footprint_batch, sample, wp.vec2(adj_u, adj_v))
             if adj_probes:
                 if reach == 0:
                     adj_line[3] = 0.0
-                wp.atomic_add(adj_probes, footprint, sample, adj_line)
+                wp.atomic_add(adj_probes, footprint_batch, sample, adj_line)
         elif adj_barycentrics:
-            view = instance_in(instance, sampled.face_ids.shape[0])
-            face = sampled.face_ids[view, sample]
+            fragment_batch = instance_in(instance, sampled.face_ids.shape[0])
+            face = sampled.face_ids[fragment_batch, sample]
             if face >= 0:
                 of_vertices = vertex_albedo[instance_in(instance, vertex_albedo.shape[0])]
-                wp.atomic_add(adj_barycentrics, view, sample, adj_weights(of_vertices, sampled.faces[face], adj_color))
+                adj = adj_weights(of_vertices, sampled.faces[face], adj_color)
+                wp.atomic_add(adj_barycentrics, fragment_batch, sample, adj)
 
 
 def sample_albedo(

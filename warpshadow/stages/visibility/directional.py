@@ -32,7 +32,7 @@ from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.visibility.cones import check_spheres
 from warpshadow.stages.visibility.culling import DirectionCells, cap_type, make_cap_functions, make_cells, make_cull
 from warpshadow.stages.visibility.falloff import make_falloff, make_sphere_adjoint
-from warpshadow.stages.visibility.merging import ITEMS, MERGING, Gradients
+from warpshadow.stages.visibility.merging import MERGING, NODES_PER_CLUSTER, Gradients
 from warpshadow.stages.visibility.traversal import (
     ClusterTree,
     TraversalInputs,
@@ -61,7 +61,7 @@ def _task_type(lanes: int) -> Any:
         cells: DirectionCells
         first_bundle: int
         ends: wp.array(dtype=wp.int32)  # [bundle] the place in the traversal where nothing is left to block
-        reached_bundles: wp.array2d(dtype=wp.int32)  # bundles that a run, and then a quad, may reach
+        reached_bundles: wp.array2d(dtype=wp.int32)  # bundles that a run, and then a cluster, may reach
         passing: wp.array(dtype=Lane)  # [direction] transmittance; for the adjoint its product with its adjoint
 
     return TransmittanceTask
@@ -162,7 +162,7 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
         for bundle in range(task.ends.shape[0]):
             for i in range(BUNDLE):
                 task.passing[bundle * BUNDLE + i] = Lane(1.0)
-            task.ends[bundle] = inputs.spheres.bounds_of_quads.shape[1] * ITEMS
+            task.ends[bundle] = inputs.spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
             if wp.static(has_horizon):
                 at = task.first_bundle + bundle
                 if not is_any_above(dot_direction(cells.axes[at], receivers.normals), -cells.half_angles[at][1]):

@@ -1,15 +1,16 @@
 """Merging: four neighboring spheres, seen from so far that they fall into one cell of directions, are one sphere.
 
-Spheres that follow each other in memory make up a quad, which has a sphere of its own at their middle, as large as they
-look on average over all directions, and an extent E, about half of their diameter. A receiver at distance D sees the
-quad under a half-angle of about E/D, and takes
+Spheres that follow each other in memory make up a cluster, which has a sphere of its own at their middle, as large as
+they look on average over all directions, and an extent E, about half of their diameter. A receiver at distance D sees
+the cluster under a half-angle of about E/D, and takes
 
     m = smoothstep((τ² − (E/D)²) / (τ² − τ0²)),  τ0 = 0.7 τ
 
-of the quad's sphere and 1 − m of the four: the four near by, the one from afar, and blended in between, so that nothing
-jumps as bodies move. The apparent displacement is τ at most. [Ren et al. 2006, section 6.2, has hierarchies like this.]
+of the cluster's sphere and 1 − m of the four: the four near by, the one from afar, and blended in between, so that
+nothing jumps as bodies move. The apparent displacement is τ at most. [Ren et al. 2006, section 6.2, has hierarchies
+like this.]
 
-How large a quad looks has two bounds. Its spheres' discs cover no more than their sum S = Σ r². Nor, nearly, do
+How large a cluster looks has two bounds. Its spheres' discs cover no more than their sum S = Σ r². Nor, nearly, do
 they cover more than the shadow of the ellipsoid with their moments M = Σ w_i (d_i d_iᵀ + r_i²/5 I), w_i their parts of
 the volume, which is 5 √(e2(M)/3) on average, e2 being the sum of the products of two eigenvalues; overlapping spheres
 bulge out of it, which a factor of 1.08 makes up for. So r² = (S⁻⁴ + (5.4 √(e2/3))⁻⁴)^(−1/4): for four spheres at random
@@ -29,8 +30,8 @@ from warpshadow.device.memory import empty
 from warpshadow.device.warp_sums import sum_over_warp, sums_over_warp
 from warpshadow.stages.visibility.cones import TINY_RADIUS
 
-QUAD = 4  # spheres that merge, in the order in which they are given: best near each other
-ITEMS = QUAD + 1  # spheres of a quad, its own included
+CLUSTER_SIZE = 4  # spheres that merge, in the order in which they are given: best near each other
+NODES_PER_CLUSTER = CLUSTER_SIZE + 1  # spheres of a cluster, its own included
 MERGING = 0.75  # τ: half-angle in cell radii under which four spheres are seen as one
 MERGED_FROM = 512  # fewer spheres do not merge: they are so large that hardly a receiver is far enough from them
 
@@ -42,11 +43,11 @@ _FARTHEST2 = 1.0e30  # (D/E)² is kept where its products are float32
 
 
 class ClusterNodes(NamedTuple):
-    """Spheres, and after them the spheres of their quads; of the quads there may be none."""
+    """Spheres, and after them the spheres of their clusters; of the clusters there may be none."""
 
     centers: wp.array  # [batch, node] vec3
     radii: wp.array  # [batch, node] float32
-    extents: wp.array  # [batch, quad] float32
+    extents: wp.array  # [batch, cluster] float32
 
 
 @wp.kernel
@@ -59,14 +60,17 @@ def _merge(
     merged_radii: wp.array2d(dtype=wp.float32),
     extents: wp.array2d(dtype=wp.float32),
 ):
-    """A thread owns a quad."""
-    batch, quad = wp.tid()
-    a = centers[batch, 4 * quad]
-    b = centers[batch, 4 * quad + 1]
-    c = centers[batch, 4 * quad + 2]
-    d = centers[batch, 4 * quad + 3]
+    """A thread owns a cluster."""
+    batch, cluster = wp.tid()
+    a = centers[batch, 4 * cluster]
+    b = centers[batch, 4 * cluster + 1]
+    c = centers[batch, 4 * cluster + 2]
+    d = centers[batch, 4 * cluster + 3]
     radius = wp.vec4(
-        radii[batch, 4 * quad], radii[batch, 4 * quad + 1], radii[batch, 4 * quad + 2], radii[batch, 4 * quad + 3]
+        radii[batch, 4 * cluster],
+        radii[batch, 4 * cluster + 1],
+        radii[batch, 4 * cluster + 2],
+        radii[batch, 4 * cluster + 3],
     )
     largest = wp.max(radius)
     if largest > TINY_RADIUS:
@@ -94,13 +98,13 @@ def _merge(
         ratio = ratio * ratio * ratio * ratio
         reach = square + wp.vec4(wp.dot(a, a), wp.dot(b, b), wp.dot(c, c), wp.dot(d, d))
         reach = wp.cw_mul(reach, reach)
-        merged_centers[batch, quad] = middle
-        merged_radii[batch, quad] = size * wp.sqrt(less / wp.sqrt(wp.sqrt(1.0 + ratio)))
-        extents[batch, quad] = size * wp.sqrt(wp.sqrt(wp.sqrt(wp.dot(reach, reach))))
+        merged_centers[batch, cluster] = middle
+        merged_radii[batch, cluster] = size * wp.sqrt(less / wp.sqrt(wp.sqrt(1.0 + ratio)))
+        extents[batch, cluster] = size * wp.sqrt(wp.sqrt(wp.sqrt(wp.dot(reach, reach))))
     else:
-        merged_centers[batch, quad] = a
-        merged_radii[batch, quad] = largest
-        extents[batch, quad] = largest
+        merged_centers[batch, cluster] = a
+        merged_radii[batch, cluster] = largest
+        extents[batch, cluster] = largest
 
 
 def check_merging(merging: float) -> None:
@@ -116,7 +120,7 @@ def merged_count(sphere_count: int, merging: float) -> int:
         ValueError: for ``merging`` out of range.
     """
     check_merging(merging)
-    return sphere_count // QUAD if merging > 0 and sphere_count >= MERGED_FROM else 0
+    return sphere_count // CLUSTER_SIZE if merging > 0 and sphere_count >= MERGED_FROM else 0
 
 
 def merge(centers: wp.array, radii: wp.array) -> ClusterNodes:
@@ -128,7 +132,7 @@ def merge(centers: wp.array, radii: wp.array) -> ClusterNodes:
     Differentiable: centers, radii.
     """
     batch_count, sphere_count = radii.shape
-    shape = batch_count, sphere_count // QUAD
+    shape = batch_count, sphere_count // CLUSTER_SIZE
     merged_centers = empty(shape, dtype=wp.vec3, device=radii.device)
     merged_radii, extents = (empty(shape, dtype=wp.float32, device=radii.device) for _ in range(2))
     launch(_merge, shape, inputs=[centers, radii], outputs=[merged_centers, merged_radii, extents])
@@ -152,14 +156,14 @@ def merge_where_far(centers: wp.array, radii: wp.array, merging: float) -> Clust
 
 @wp.struct
 class SphereClusters:
-    """Spheres and their quads, as kernels see them."""
+    """Spheres and their clusters, as kernels see them."""
 
     centers: wp.array2d(dtype=wp.vec3)  # [batch, node]
     radii: wp.array2d(dtype=wp.float32)
-    extents: wp.array2d(dtype=wp.float32)  # [batch, quad]
-    bounds_of_quads: wp.array2d(dtype=wp.vec4)
-    bounds_of_runs: wp.array2d(dtype=wp.vec4)
-    count: int  # of nodes that are no quad's
+    extents: wp.array2d(dtype=wp.float32)  # [batch, cluster]
+    cluster_bounds: wp.array2d(dtype=wp.vec4)
+    run_bounds: wp.array2d(dtype=wp.vec4)
+    count: int  # of nodes that are no cluster's
     skip_begin: int  # these spheres are left out, up to the next
     skip_end: int
     merging_angle: float
@@ -209,7 +213,7 @@ def make_add_to_node(lanes: int) -> wp.Function:
 
 @functools.cache
 def _make_blend(lanes: int) -> wp.Function:
-    """Make the kernel function of the share m of a quad's sphere: d/E, τ → m, and its derivative by (D/E)²."""
+    """Make the kernel function of the share m of a cluster's sphere: d/E, τ → m, and its derivative by (D/E)²."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
     fn = make_lane_functions(lanes)
     dot, smoothstep = fn.dot, fn.smoothstep
@@ -230,13 +234,13 @@ def _make_blend(lanes: int) -> wp.Function:
 
 @functools.cache
 def _make_relative(lanes: int) -> wp.Function:
-    """Make the kernel function of the offset from a block of receivers to a quad, over its extent: d/E and 1/E."""
+    """Make the kernel function of the offset from a block of receivers to a cluster, over its extent: d/E and 1/E."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
 
     @wp.func
-    def relative(points: Vectors, batch: int, quad: int, spheres: SphereClusters):
-        center = spheres.centers[batch, spheres.count + quad]
-        inverse = 1.0 / wp.max(spheres.extents[batch, quad], TINY_RADIUS)
+    def relative(points: Vectors, batch: int, cluster: int, spheres: SphereClusters):
+        center = spheres.centers[batch, spheres.count + cluster]
+        inverse = 1.0 / wp.max(spheres.extents[batch, cluster], TINY_RADIUS)
         offset = Vectors(
             inverse * (Lane(center[0]) - points.x),
             inverse * (Lane(center[1]) - points.y),
@@ -249,15 +253,17 @@ def _make_relative(lanes: int) -> wp.Function:
 
 @functools.cache
 def make_merged(lanes: int) -> wp.Function:
-    """Make the kernel function of the share that a quad's sphere has for a block of receivers."""
+    """Make the kernel function of the share that a cluster's sphere has for a block of receivers."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
     blend, relative = _make_blend(lanes), _make_relative(lanes)
 
     @wp.func
-    def merged(points: Vectors, batch: int, quad: int, spheres: SphereClusters):
+    def merged(points: Vectors, batch: int, cluster: int, spheres: SphereClusters):
         share = Lane(0.0)
-        if quad < spheres.extents.shape[1] and not meets(QUAD * quad, QUAD * (quad + 1), spheres):
-            offset, _inverse = relative(points, batch, quad, spheres)
+        if cluster < spheres.extents.shape[1] and not meets(
+            CLUSTER_SIZE * cluster, CLUSTER_SIZE * (cluster + 1), spheres
+        ):
+            offset, _inverse = relative(points, batch, cluster, spheres)
             share_, _slope = blend(offset, spheres.merging_angle)
             share = share_
         return share
@@ -267,7 +273,7 @@ def make_merged(lanes: int) -> wp.Function:
 
 @functools.cache
 def make_merged_adjoint(lanes: int) -> wp.Function:
-    """Make the adjoint of :func:`make_merged`'s function: m̄ → that of the offset to a quad, which is added to its own.
+    """Make the adjoint of :func:`make_merged`'s function: m̄ → that of the offset to a cluster, added to its own.
 
     With x = d/E and X² = |x|²:  X̄² = m' m̄,  d̄ = 2 x X̄² / E,  Ē = −2 X² X̄² / E.
     """
@@ -278,21 +284,23 @@ def make_merged_adjoint(lanes: int) -> wp.Function:
 
     @wp.func
     def adjoint(
-        points: Vectors, batch: int, quad: int, adj_merged: Lane, spheres: SphereClusters, gradients: Gradients
+        points: Vectors, batch: int, cluster: int, adj_merged: Lane, spheres: SphereClusters, gradients: Gradients
     ):
         adj_offset = Vectors()
-        if quad < spheres.extents.shape[1] and not meets(QUAD * quad, QUAD * (quad + 1), spheres):
-            offset, inverse = relative(points, batch, quad, spheres)
+        if cluster < spheres.extents.shape[1] and not meets(
+            CLUSTER_SIZE * cluster, CLUSTER_SIZE * (cluster + 1), spheres
+        ):
+            offset, inverse = relative(points, batch, cluster, spheres)
             _merged, slope = blend(offset, spheres.merging_angle)
             if is_any_above(slope, 0.0):
                 adj_offset = scale((2.0 * inverse) * wp.cw_mul(adj_merged, slope), offset)
-                add_to_node(adj_offset, Lane(0.0), batch, spheres.count + quad, gradients)
+                add_to_node(adj_offset, Lane(0.0), batch, spheres.count + cluster, gradients)
                 if gradients.extents:
                     adj_extent = -total(dot(adj_offset, offset))
                     if wp.static(lanes == 1):
-                        adj_extent = sum_over_warp(adj_extent, batch * gradients.extents.shape[1] + quad)
+                        adj_extent = sum_over_warp(adj_extent, batch * gradients.extents.shape[1] + cluster)
                     if adj_extent != 0.0:
-                        wp.atomic_add(gradients.extents, batch, quad, adj_extent)
+                        wp.atomic_add(gradients.extents, batch, cluster, adj_extent)
         return adj_offset
 
     return adjoint

@@ -19,7 +19,7 @@ import warp as wp
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import differentiable, launch, varies
 from warpshadow.device.parallel import split_row
-from warpshadow.maths.directions import CHUNK, MIN_WIDTH, cell_radius
+from warpshadow.maths.directions import CHUNK, MIN_WIDTH, brightest_chunk, cell_radius
 from warpshadow.stages.visibility.directional import SOFTNESS
 
 _RADII = 2.4  # radius of the cell whose soft edge is like a spot's penumbra, in half-angles of the spot
@@ -62,15 +62,12 @@ def find_sharp_cells(
         widest: Radius up to which cells are sharp, in radii of all cells.
     """
     radii = np.maximum(_RADII * spreads, max(_MIN_RADIUS, 1.001 * MIN_WIDTH / softness))
-    result = np.flatnonzero((radii < widest * cell_radius(len(power))) & (power > 0))
-    result = np.sort(result[np.argsort(-power[result], kind="stable")[:CHUNK]])
-    if power[result].sum() <= _MIN_SHARE * power.sum():
+    is_small = radii < widest * cell_radius(len(power))
+    cells, repeated, places = brightest_chunk(power, is_small & (power > 0))
+    if power[cells].sum() <= _MIN_SHARE * power.sum():
         return None
-    repeated = np.arange(CHUNK) * len(result) // CHUNK
-    places = np.full(len(power), -1, np.int32)
-    places[result] = np.searchsorted(repeated, np.arange(len(result)))
-    radius = np.sqrt(np.average(radii[result] ** 2, weights=power[result]))
-    return SharpCells(directions[result[repeated]], places, float(radius / cell_radius(CHUNK)))
+    radius = np.sqrt(np.average(radii[cells] ** 2, weights=power[cells]))
+    return SharpCells(directions[cells[repeated]], places, float(radius / cell_radius(CHUNK)))
 
 
 @wp.kernel(enable_backward=False)
@@ -136,8 +133,8 @@ def blend_sharp_cells(
     device, row_count = passing.device, passing.shape[0] * passing.shape[1]
     cells = np.flatnonzero(places >= 0)
     of_spots = np.ones(len(cells)) if shares is None else shares[cells]
-    is_kept = varies([passing]) and bool((of_spots < 1).any())
-    blended = wp.clone(passing, requires_grad=False) if is_kept else passing
+    is_copied = varies([passing]) and bool((of_spots < 1).any())
+    blended = wp.clone(passing, requires_grad=False) if is_copied else passing
     pairs = constant(np.stack([cells, places[cells]], axis=1), wp.vec2i, device)
     inputs, cost = [pairs, constant(of_spots.astype(np.float32), wp.float32, device)], _CELL_COST * len(cells)
     return differentiable(
@@ -148,7 +145,7 @@ def blend_sharp_cells(
             _blend_sharp_cells_adjoint,
             row_count,
             inputs=inputs,
-            outputs=[adj, sharp_cells.grad, passing.grad if is_kept else None],
+            outputs=[adj, sharp_cells.grad, passing.grad if is_copied else None],
             cost=cost,
         ),
         result=blended,

@@ -1,7 +1,7 @@
 """The traversal of spheres: a block of receivers visits the spheres that it can see, many at once left out.
 
-Four spheres that follow each other make up a quad, which has a sphere of its own for receivers far away
-(:mod:`warpshadow.stages.visibility.merging`), and four quads a run. Runs are culled as a whole; then quads; then
+Four spheres that follow each other make up a cluster, which has a sphere of its own for receivers far away
+(:mod:`warpshadow.stages.visibility.merging`), and four clusters a run. Runs are culled as a whole; then clusters; then
 spheres are visited. A method supplies culling and a visit; the traversal is generated around them, forward and adjoint.
 """
 
@@ -15,8 +15,8 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.stages.visibility.cones import TINY_RADIUS, cone_type, make_cone
 from warpshadow.stages.visibility.merging import (
-    ITEMS,
-    QUAD,
+    CLUSTER_SIZE,
+    NODES_PER_CLUSTER,
     ClusterNodes,
     Gradients,
     SphereClusters,
@@ -27,17 +27,17 @@ from warpshadow.stages.visibility.merging import (
     within,
 )
 
-QUADS = 4  # quads of a run. Spheres of a run, and then of a quad, are culled together: they had best be neighbors
-ALL = -1  # the number of candidates where all there is are: for runs
+CLUSTERS_PER_RUN = 4  # spheres of a run, and then of a cluster, are culled together: they had best be neighbors
+ALL = -1  # the number of candidates for a run: all that there are
 
 
 @wp.func
-def find_node(quad: int, item: int, sphere_count: int, node_count: int):
-    """Node of an item of a quad: its four spheres and then its own; −1 where there is none."""
-    node = quad * QUAD + item
+def find_node(cluster: int, item: int, sphere_count: int, node_count: int):
+    """Node of an item of a cluster: its four spheres and then its own; −1 where there is none."""
+    node = cluster * CLUSTER_SIZE + item
     last = sphere_count
-    if item == QUAD:
-        node = sphere_count + quad
+    if item == CLUSTER_SIZE:
+        node = sphere_count + cluster
         last = node_count
     if node >= last:
         node = -1
@@ -50,24 +50,28 @@ def _bound(
     centers: wp.array2d(dtype=wp.vec3),
     radii: wp.array2d(dtype=wp.float32),
     sphere_count: int,
-    quad_count: int,
+    cluster_count: int,
     # out
     bounds: wp.array2d(dtype=wp.vec4),
 ):
-    """A thread owns a run of quads: center and radius of a sphere around all of theirs, negative for none."""
+    """A thread owns a run of clusters: center and radius of a sphere around all of theirs, negative for none."""
     batch, run = wp.tid()
     low = wp.vec3(wp.inf)
     high = wp.vec3(-wp.inf)
-    for k in range(quad_count * ITEMS):
-        node = find_node(run * quad_count + k // ITEMS, k % ITEMS, sphere_count, radii.shape[1])
+    for k in range(cluster_count * NODES_PER_CLUSTER):
+        node = find_node(
+            run * cluster_count + k // NODES_PER_CLUSTER, k % NODES_PER_CLUSTER, sphere_count, radii.shape[1]
+        )
         if node >= 0 and radii[batch, wp.max(node, 0)] > TINY_RADIUS:
             extent = wp.vec3(radii[batch, node])
             low = wp.min(low, centers[batch, node] - extent)
             high = wp.max(high, centers[batch, node] + extent)
     middle = 0.5 * (low + high)
     reach = float(-1.0)
-    for k in range(quad_count * ITEMS):
-        node = find_node(run * quad_count + k // ITEMS, k % ITEMS, sphere_count, radii.shape[1])
+    for k in range(cluster_count * NODES_PER_CLUSTER):
+        node = find_node(
+            run * cluster_count + k // NODES_PER_CLUSTER, k % NODES_PER_CLUSTER, sphere_count, radii.shape[1]
+        )
         if node >= 0 and radii[batch, wp.max(node, 0)] > TINY_RADIUS:
             reach = wp.max(reach, wp.length(centers[batch, node] - middle) + radii[batch, node])
     if reach < 0.0:
@@ -76,15 +80,15 @@ def _bound(
 
 
 class ClusterTree(NamedTuple):
-    """Spheres with their quads and the bounds of these, which serve any receivers."""
+    """Spheres with their clusters and the bounds of these, which serve any receivers."""
 
     nodes: ClusterNodes
-    bounds_of_quads: wp.array
-    bounds_of_runs: wp.array
+    cluster_bounds: wp.array
+    run_bounds: wp.array
 
 
 def find_clusters(centers: wp.array, radii: wp.array, merging: float) -> ClusterTree:
-    """Merge spheres where there are enough of them, and bound their quads and runs.
+    """Merge spheres where there are enough of them, and bound their clusters and runs.
 
     Args:
         centers, radii: Spheres, [batch, sphere].
@@ -92,7 +96,7 @@ def find_clusters(centers: wp.array, radii: wp.array, merging: float) -> Cluster
     Differentiable: centers, radii to the nodes.
     """
     nodes, count = merge_where_far(centers, radii, merging), radii.shape[1]
-    return ClusterTree(nodes, _find_bounds(nodes, count, 1), _find_bounds(nodes, count, QUADS))
+    return ClusterTree(nodes, _find_bounds(nodes, count, 1), _find_bounds(nodes, count, CLUSTERS_PER_RUN))
 
 
 @wp.struct
@@ -135,17 +139,17 @@ def make_inputs(
     spheres.centers, spheres.radii, spheres.extents = nodes
     spheres.count, spheres.merging_angle = count, merging * cell
     spheres.skip_begin, spheres.skip_end = skip
-    spheres.bounds_of_quads, spheres.bounds_of_runs = bounds
+    spheres.cluster_bounds, spheres.run_bounds = bounds
     inputs = TraversalInputs()
     inputs.points, inputs.normals, inputs.spheres = points, normals, spheres
     return nodes, inputs
 
 
-def _find_bounds(nodes: ClusterNodes, sphere_count: int, quad_count: int) -> wp.array:
-    """Spheres around runs of quads, vec4 of shape [batch, run]."""
-    shape = nodes.radii.shape[0], -(-sphere_count // (QUAD * quad_count))
+def _find_bounds(nodes: ClusterNodes, sphere_count: int, cluster_count: int) -> wp.array:
+    """Spheres around runs of clusters, vec4 of shape [batch, run]."""
+    shape = nodes.radii.shape[0], -(-sphere_count // (CLUSTER_SIZE * cluster_count))
     bounds = empty(shape, dtype=wp.vec4, device=nodes.radii.device)
-    launch(_bound, shape, inputs=[nodes.centers, nodes.radii, sphere_count, quad_count], outputs=[bounds])
+    launch(_bound, shape, inputs=[nodes.centers, nodes.radii, sphere_count, cluster_count], outputs=[bounds])
     return bounds
 
 
@@ -223,10 +227,10 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
     """Make the kernel function that visits the spheres that a block of receivers can see.
 
     Args:
-        cull: (receivers, bound, place, among, task) → how many of ``among`` candidates the spheres in a bound may
-            matter to. The first sphere has that place in the traversal; a quad has the
-            candidates that its run left.
-        visit: (receivers, seen, count, task), called for each sphere with the count of its quad; for an adjoint →
+        cull: (receivers, bound, place, candidates, task) → to how many candidates the spheres in a bound may matter.
+            ``place`` is the first sphere's in the traversal. ``candidates`` is how many there are: :data:`ALL` for a
+            run, and for a cluster those that its run left.
+        visit: (receivers, seen, count, task), called for each sphere with the count of its cluster; for an adjoint →
             SphereAdjoint.
         Task: Struct of all else that these two read and write.
         is_adjoint: Whether to sum the results of the visits.
@@ -243,33 +247,35 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
     def traverse(receivers: ReceiverLanes, batch: int, spheres: SphereClusters, gradients: Gradients, task: Task):
         """Returns the adjoint of the receivers."""
         adj = ReceiverLanes()
-        for run in range(spheres.bounds_of_runs.shape[1]):
-            begin = run * QUADS
-            end = wp.min(begin + QUADS, spheres.bounds_of_quads.shape[1])
+        for run in range(spheres.run_bounds.shape[1]):
+            begin = run * CLUSTERS_PER_RUN
+            end = wp.min(begin + CLUSTERS_PER_RUN, spheres.cluster_bounds.shape[1])
             run_count = int(0)
-            if not within(begin * QUAD, wp.min(end * QUAD, spheres.count), spheres):
-                run_count = cull(receivers, spheres.bounds_of_runs[batch, run], begin * ITEMS, ALL, task)
+            if not within(begin * CLUSTER_SIZE, wp.min(end * CLUSTER_SIZE, spheres.count), spheres):
+                run_count = cull(receivers, spheres.run_bounds[batch, run], begin * NODES_PER_CLUSTER, ALL, task)
             if run_count == 0:
                 end = begin
-            for quad in range(begin, end):
-                count = cull(receivers, spheres.bounds_of_quads[batch, quad], quad * ITEMS, run_count, task)
+            for cluster in range(begin, end):
+                count = cull(
+                    receivers, spheres.cluster_bounds[batch, cluster], cluster * NODES_PER_CLUSTER, run_count, task
+                )
                 if count > 0:
-                    quad_share = merged(receivers.points, batch, quad, spheres)
+                    cluster_share = merged(receivers.points, batch, cluster, spheres)
                     adj_share = Lane(0.0)
-                    for item in range(ITEMS):
-                        node = find_node(quad, item, spheres.count, spheres.centers.shape[1])
-                        share = Lane(1.0) - quad_share
+                    for item in range(NODES_PER_CLUSTER):
+                        node = find_node(cluster, item, spheres.count, spheres.centers.shape[1])
+                        share = Lane(1.0) - cluster_share
                         sign = float(-1.0)
-                        if item == QUAD:
-                            share = quad_share
+                        if item == CLUSTER_SIZE:
+                            share = cluster_share
                             sign = 1.0
                         radius = float(0.0)
-                        is_left_out = item < QUAD and within(node, node + 1, spheres)
+                        is_left_out = item < CLUSTER_SIZE and within(node, node + 1, spheres)
                         if node >= 0 and not is_left_out and is_any_above(share, 0.0):
                             radius = spheres.radii[batch, node]
                         if radius > TINY_RADIUS:
                             seen = SphereView()
-                            seen.place = quad * ITEMS + item
+                            seen.place = cluster * NODES_PER_CLUSTER + item
                             seen.node = node
                             seen.offset = offset(spheres.centers[batch, node], receivers.points)
                             seen.curvature = 1.0 / radius
@@ -287,7 +293,7 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
                             else:
                                 visit(receivers, seen, count, task)
                     if wp.static(is_adjoint):
-                        adj_offset = merged_adjoint(receivers.points, batch, quad, adj_share, spheres, gradients)
+                        adj_offset = merged_adjoint(receivers.points, batch, cluster, adj_share, spheres, gradients)
                         adj.points = subtract(adj.points, adj_offset)
         return adj
 
