@@ -132,24 +132,18 @@ def draw_in_cells(radiance: np.ndarray, directions: np.ndarray, cells: np.ndarra
     return drawn
 
 
-def without_spots(
-    radiance: np.ndarray, directions: np.ndarray, cells: np.ndarray, spots: np.ndarray, angles: np.ndarray
-) -> np.ndarray:
-    """Make a map without the light near a spot in each of some cells around directions.
+def without_spots(radiance: np.ndarray, spots: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Make a map without the light near some spots, at least that of the pixel that each spot is in.
 
     Args:
-        radiance, directions: As for :func:`gather_cells`.
-        cells: Numbers of the cells.
-        spots: Directions of the spots of all cells, unit vectors [direction, 3].
-        angles: How far from its spot light is near [radians], [direction].
+        radiance: As for :func:`gather_cells`.
+        spots: Their directions, unit vectors [spot, 3].
+        angles: How far from its spot light is near [radians], [spot].
     """
-    owners = _cells_of_pixels(len(radiance), np.asarray(directions).astype(np.float32).tobytes())
-    rows, columns = np.nonzero(np.isin(np.arange(len(directions)), cells)[owners])
-    owner = owners[rows, columns]
-    towards = sh.equirectangular_directions(len(radiance))[rows, columns]
-    is_near = (towards * spots[owner]).sum(axis=1) >= np.cos(angles[owner])
+    towards, half_diagonal = sh.equirectangular_directions(len(radiance)), np.pi / len(radiance) / np.sqrt(2)
     result = np.array(radiance)
-    result[rows[is_near], columns[is_near]] = 0
+    for spot, angle in zip(spots, angles, strict=True):
+        result[towards @ spot >= np.cos(max(angle, half_diagonal))] = 0
     return result
 
 

@@ -108,10 +108,9 @@ class Directional(SphereMethod):
         sun = find_sun_cells(power, draw) if self.self_visibility.wants_rays else None
         sharp_cells = find(), find(WIDEST_PAST_PLANES)
         rest, rest_light, directions, spot_shares = known.radiance, cells, cells.directions, np.ones(len(power))
-        if sharp_cells[0] is not None:
-            is_sharp = sharp_cells[0].places >= 0
-            split = np.flatnonzero(is_sharp), cells.spots, _NEAR_SPOT * cells.spreads
-            rest = without_spots(known.radiance, self._directions, *split)
+        if sharp_cells[0] is not None and sharp_cells[1] is not None:
+            is_sharp = (sharp_cells[0].places >= 0) & (sharp_cells[1].places >= 0)
+            rest = without_spots(known.radiance, cells.spots[is_sharp], _NEAR_SPOT * cells.spreads[is_sharp])
             rest_light = gather_cells(rest, self._directions)
             directions = np.where(is_sharp[:, None], rest_light.directions, directions)
             spot_shares[is_sharp] = 1 - (rest_light.radiance @ LUMINANCE)[is_sharp] / power[is_sharp]
@@ -436,7 +435,7 @@ def _towards(
     if not directions.size:
         return wp.empty(directions.shape, dtype=wp.float32, device=directions.device)
     transmittance = _joined_cells(cells, count)
-    return transmittance_towards(transmittance, receivers.normals, directions, projected_light.directions)
+    return transmittance_towards(transmittance, receivers.normals, directions, projected_light.facing)
 
 
 def _joined_cells(cells: list[wp.array], count: int) -> wp.array:
