@@ -23,7 +23,6 @@ from test_end_to_end import (
     blob,
     gradient_and_differences,
     image_of_batch,
-    one_thread,  # noqa: F401  a fixture of all tests here
     random_batch,
     relative_error,
     scene_of,
@@ -34,6 +33,8 @@ from warpshadow.pipeline import groups
 from warpshadow.pipeline.bounces import by_spheres as pipeline_bounces
 from warpshadow.pipeline.bounces import patches, static_bounces
 from warpshadow.torch import TorchRenderer, rotation_matrices
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 METHODS = ("directional", "log-sh")
 

@@ -7,6 +7,8 @@ uses its private attributes; tests/viewer/test_app.py notices if they change.
 
 from __future__ import annotations
 
+import asyncio
+import concurrent.futures
 import contextlib
 import io
 import logging
@@ -22,6 +24,7 @@ from viser import _messages as messages
 
 from warpshadow import check
 
+_LAST_SECONDS = 0.1  # of viser's thread, which sends messages every 1/60 s
 OWN_NAMES = ("localhost", "127.0.0.1", "::1")  # names that only this machine has for itself
 
 
@@ -49,7 +52,11 @@ class Server(viser.ViserServer):
         self.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
 
     def close(self) -> None:
-        """Let all pages go, and serve no more."""
+        """Let all pages go, when they have heard the last messages, and serve no more."""
+        loop = self._websock_server._background_event_loop
+        if loop is not None:
+            with contextlib.suppress(concurrent.futures.TimeoutError, RuntimeError):  # busy, or closed already
+                asyncio.run_coroutine_threadsafe(asyncio.sleep(_LAST_SECONDS), loop).result(1.0)
         stopping = threading.Thread(target=self.stop, daemon=True)
         stopping.start()
         stopping.join(1.0)  # it lets nobody in from now on, but waits six seconds for connections that browsers keep
