@@ -131,7 +131,7 @@ def test_error_against_rays_is_told_at_rest_alone(scene, painter):
     told = painter.paint(viewer_state, page, FULL)
     rays = ws.render(dataclasses.replace(scene, visibility=Visibility("ray-traced", samples=4096)))
     truth = relative_error(ws.render(scene), rays)
-    assert told.error == pytest.approx(truth, abs=0.02) and 0.005 < truth < 0.2  # 256 rays are noisy
+    assert told.error == pytest.approx(truth, abs=0.03) and 0.005 < truth < 0.2  # 256 rays are noisy
     shadowless = painter.paint(dataclasses.replace(viewer_state, method="none"), page, FULL)
     assert shadowless.error > 2 * told.error
 

@@ -142,8 +142,8 @@ def without_spots(radiance: np.ndarray, spots: np.ndarray, angles: np.ndarray) -
     """
     towards, half_diagonal = sh.equirectangular_directions(len(radiance)), np.pi / len(radiance) / np.sqrt(2)
     result = np.array(radiance)
-    for spot, angle in zip(spots, angles, strict=True):
-        result[towards @ spot >= np.cos(max(angle, half_diagonal))] = 0
+    for direction, angle in zip(spots, angles, strict=True):
+        result[towards @ direction >= np.cos(max(angle, half_diagonal))] = 0
     return result
 
 
