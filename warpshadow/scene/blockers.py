@@ -84,7 +84,12 @@ def fitted_counts(scene: Scene) -> dict[int, int | str]:
     Returns:
         Numbers of the bodies, from 0, and how many spheres each takes, or "auto".
     """
-    grounds, parts = _ground_spheres(scene), blocking_parts(scene)
+    return _fitted_counts(scene, blocking_parts(scene))
+
+
+def _fitted_counts(scene: Scene, parts: dict[int, list[ConvexPart]]) -> dict[int, int | str]:
+    """The same, of a scene whose blocking parts are known."""
+    grounds = _ground_spheres(scene)
     counts = [
         SPHERES_BESIDE_PARTS if number in parts else _requested_count(body) for number, body in enumerate(scene.bodies)
     ]
@@ -97,7 +102,7 @@ def fitted_meshes(scene: Scene) -> dict[int, tuple[Mesh, int | str]]:
     A mesh is the body's own, or the solid behind it where it is land and no convex parts.
     """
     parts, result = blocking_parts(scene), {}
-    for number, count in fitted_counts(scene).items():
+    for number, count in _fitted_counts(scene, parts).items():
         solid = None if number in parts else _solid_behind(scene, number)
         result[number] = scene.bodies[number].mesh if solid is None else solid, count
     return result

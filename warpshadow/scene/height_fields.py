@@ -48,7 +48,7 @@ def solid_behind(body: Body, others: tuple[Body, ...]) -> Mesh | None:
     return None if body.mesh.surface.is_closed or body.mesh.is_flat else _solid_behind(body, others)
 
 
-@functools.lru_cache(16)
+@functools.lru_cache(128)  # a scene asks several times of each open body
 def _solid_behind(body: Body, others: tuple[Body, ...]) -> Mesh | None:
     """The solid behind an open, bent body, if it is land."""
     mesh, to_own = body.mesh, into_own_space(body)
