@@ -1,12 +1,10 @@
-"""Transmittance past convex blockers, such as boxes and rods.
+"""Coverage of cells by convex blockers, such as boxes and rods.
 
-    P_q = Π_bodies max(0, 1 − Σ_parts h_q)
-
-h is the share of cell q within the silhouette of a convex part (:mod:`warpshadow.stages.cell_coverage`), the edges
-between a face that a receiver sees and one that it does not.
-
-Parts of one body are beside each other, so they cover different parts of a cell; bodies are independent. Edges are
-exact, and so are thin parts: spheres bulge out of them.
+Each body covers h_q = Σ_parts h, with the moment Σ_parts μ, of cell q: h and μ are the coverage by the silhouette of a
+convex part (:mod:`warpshadow.stages.cell_coverage`), the edges between a face that a receiver sees and one that it does
+not. Parts of one body are beside each other, so they cover different parts of a cell. Prisms into which a body is cut
+both cover their seam, the face between them, where they are seen at a slant: it is taken off. How bodies are to each
+other, :mod:`.joint_coverage` tells. Edges are exact, and so are thin parts: spheres bulge out of them.
 """
 
 import numpy as np
@@ -19,7 +17,15 @@ from warpshadow.device.parallel import Scratch, scratch_place, split_row
 from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.cell_coverage import ViewedEdge, convex_coverage, coverage_adjoint, viewed_edge
 from warpshadow.stages.convex.prepared import ConvexArrays, ConvexBlockers, PlacedParts
-from warpshadow.stages.planes.transmittance import horizon_normal, is_above_horizon
+from warpshadow.stages.joint_coverage import (
+    BlockerSums,
+    blocker_adjoint,
+    joint_coverage,
+    joint_coverage_adjoint,
+    no_blockers,
+    with_blocker,
+)
+from warpshadow.stages.planes.coverage import horizon_normal, is_above_horizon
 from warpshadow.stages.visibility.culling import DirectionCells, make_cells
 from warpshadow.stages.visibility.directional import SOFTNESS
 
@@ -144,13 +150,14 @@ def _cover(
     body: int,
     cells: DirectionCells,
     radius: float,
-    passing: wp.array(dtype=wp.float32),
+    largest: wp.array(dtype=wp.float32),
     silhouette: wp.array(dtype=ViewedEdge),
-    coverage: wp.array(dtype=wp.float32),
+    coverage: wp.array(dtype=wp.vec4),
     covered: wp.array(dtype=wp.int32),
 ):
-    """Σ_parts h_q of a body, in cells through which something passes; returns how many it covers, and lists them."""
+    """Coverage by a body of cells that no other body covers wholly; returns how many it covers, and lists them."""
     covered_count = int(0)
+    enough = wp.where(parts.signs[parts.first_part[body + 1] - 1] < 0.0, 1.0e30, 1.0)  # seams take off
     for part in range(parts.first_part[body], parts.first_part[body + 1]):
         bound = _find_bound(point, normal, bounds[part], radius)
         if bound.is_seen:
@@ -161,25 +168,71 @@ def _cover(
                         direction = cells.directions[q]
                         if (
                             wp.dot(bound.axis, direction) > bound.cosine
-                            and passing[q] > 0.0
-                            and coverage[q] < 1.0
+                            and largest[q] < 1.0
+                            and coverage[q][0] < enough
                             and is_above_horizon(normal, direction)
                         ):
                             if count == _UNKNOWN_COUNT:
                                 count = _find_silhouette(point, corners, planes, parts, part, silhouette)
-                            share = float(1.0)
+                            by_part = wp.vec4(1.0, 0.0, 0.0, 0.0)
                             if count >= 0:
-                                share = convex_coverage(silhouette, 0, count, direction, radius)
-                            if share > 0.0:
-                                if coverage[q] == 0.0:
+                                by_part = convex_coverage(silhouette, 0, count, direction, radius)
+                            if by_part[0] > 0.0:
+                                if coverage[q][0] == 0.0:  # not by a seam, whose prisms cover the same cells
                                     covered[covered_count] = q
                                     covered_count += 1
-                                coverage[q] = coverage[q] + share
+                                coverage[q] = coverage[q] + parts.signs[part] * by_part
     return covered_count
 
 
+@wp.func
+def _cover_all(
+    point: wp.vec3,
+    normal: wp.vec3,
+    corners: wp.array(dtype=wp.vec3),
+    planes: wp.array(dtype=wp.vec4),
+    bounds: wp.array(dtype=wp.vec4),
+    parts: ConvexArrays,
+    skip: int,
+    cells: DirectionCells,
+    radius: float,
+    silhouette: wp.array(dtype=ViewedEdge),
+    largest: wp.array(dtype=wp.float32),
+    coverage: wp.array(dtype=wp.vec4),
+    covered: wp.array(dtype=wp.int32),
+    sums: wp.array(dtype=BlockerSums),
+):
+    """Store sums over all bodies for each cell."""
+    for q in range(cells.directions.shape[0]):
+        largest[q] = 0.0
+        coverage[q] = wp.vec4()
+        sums[q] = no_blockers()
+    for body in range(parts.first_part.shape[0] - 1):
+        if body != skip and parts.blocks[body] == 1:
+            covered_count = _cover(
+                point,
+                normal,
+                corners,
+                planes,
+                bounds,
+                parts,
+                body,
+                cells,
+                radius,
+                largest,
+                silhouette,
+                coverage,
+                covered,
+            )
+            for k in range(covered_count):
+                q = covered[k]
+                sums[q] = with_blocker(sums[q], coverage[q])
+                largest[q] = sums[q].largest
+                coverage[q] = wp.vec4()
+
+
 @wp.kernel(enable_backward=False)
-def _pass(
+def _cover_cells(
     first_row: int,
     worker: int,
     # in
@@ -194,45 +247,40 @@ def _pass(
     skip: int,
     # scratch
     silhouettes: wp.array2d(dtype=ViewedEdge),
-    coverages: wp.array2d(dtype=wp.float32),
+    largest: wp.array2d(dtype=wp.float32),
+    coverages: wp.array2d(dtype=wp.vec4),
     covered: wp.array2d(dtype=wp.int32),
+    sums: wp.array2d(dtype=BlockerSums),
     # out
-    passing: wp.array3d(dtype=wp.float32),
+    result: wp.array3d(dtype=wp.vec4),
 ):
     """A thread owns a receiver."""
     row = first_row + wp.tid()
     batch, receiver = split_row(row, points.shape[1])
     place = scratch_place(worker, row)
     corner_batch = instance_in(batch, corners.shape[0])
-    normal = horizon_normal(horizon_normals, batch, receiver)
+    _cover_all(
+        points[batch, receiver],
+        horizon_normal(horizon_normals, batch, receiver),
+        corners[corner_batch],
+        planes[corner_batch],
+        bounds[corner_batch],
+        parts,
+        skip,
+        cells,
+        radius,
+        silhouettes[place],
+        largest[place],
+        coverages[place],
+        covered[place],
+        sums[place],
+    )
     for q in range(cells.directions.shape[0]):
-        passing[batch, receiver, q] = 1.0
-        coverages[place, q] = 0.0
-    for body in range(parts.first_part.shape[0] - 1):
-        if body != skip and parts.blocks[body] == 1:
-            covered_count = _cover(
-                points[batch, receiver],
-                normal,
-                corners[corner_batch],
-                planes[corner_batch],
-                bounds[corner_batch],
-                parts,
-                body,
-                cells,
-                radius,
-                passing[batch, receiver],
-                silhouettes[place],
-                coverages[place],
-                covered[place],
-            )
-            for k in range(covered_count):
-                q = covered[place, k]
-                passing[batch, receiver, q] = passing[batch, receiver, q] * wp.max(0.0, 1.0 - coverages[place, q])
-                coverages[place, q] = 0.0
+        result[batch, receiver, q] = joint_coverage(sums[place, q])
 
 
 @wp.kernel(enable_backward=False)
-def _pass_adjoint(
+def _cover_cells_adjoint(
     first_row: int,
     worker: int,
     # in
@@ -245,26 +293,45 @@ def _pass_adjoint(
     cells: DirectionCells,
     radius: float,
     skip: int,
-    passing: wp.array3d(dtype=wp.float32),
-    adj_passing: wp.array3d(dtype=wp.float32),
+    adj_result: wp.array3d(dtype=wp.vec4),
     # scratch
     silhouettes: wp.array2d(dtype=ViewedEdge),
-    coverages: wp.array2d(dtype=wp.float32),
+    largest: wp.array2d(dtype=wp.float32),
+    coverages: wp.array2d(dtype=wp.vec4),
     covered: wp.array2d(dtype=wp.int32),
+    sums: wp.array2d(dtype=BlockerSums),
+    adj_sums: wp.array2d(dtype=BlockerSums),
     # out
     adj_points: wp.array2d(dtype=wp.vec3),
     # sums
     adj_corners: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a receiver:  ∂P/∂h = −P / (1 − Σ_parts h) where that is positive."""
+    """A thread owns a receiver; cells that are covered wholly have no gradient."""
     row = first_row + wp.tid()
     batch, receiver = split_row(row, points.shape[1])
     place = scratch_place(worker, row)
     corner_batch = instance_in(batch, corners.shape[0])
     point, normal = points[batch, receiver], horizon_normal(horizon_normals, batch, receiver)
-    adj_point = wp.vec3()
+    _cover_all(
+        point,
+        normal,
+        corners[corner_batch],
+        planes[corner_batch],
+        bounds[corner_batch],
+        parts,
+        skip,
+        cells,
+        radius,
+        silhouettes[place],
+        largest[place],
+        coverages[place],
+        covered[place],
+        sums[place],
+    )
     for q in range(cells.directions.shape[0]):
-        coverages[place, q] = 0.0
+        if largest[place, q] < 1.0:
+            adj_sums[place, q] = joint_coverage_adjoint(sums[place, q], adj_result[batch, receiver, q])
+    adj_point = wp.vec3()
     for body in range(parts.first_part.shape[0] - 1):
         if body != skip and parts.blocks[body] == 1:
             covered_count = _cover(
@@ -277,7 +344,7 @@ def _pass_adjoint(
                 body,
                 cells,
                 radius,
-                passing[batch, receiver],
+                largest[place],
                 silhouettes[place],
                 coverages[place],
                 covered[place],
@@ -289,22 +356,29 @@ def _pass_adjoint(
                     for k in range(covered_count):
                         q = covered[place, k]
                         direction = cells.directions[q]
-                        left = 1.0 - coverages[place, q]
-                        adj = adj_passing[batch, receiver, q] * passing[batch, receiver, q]
-                        if adj != 0.0 and left > 0.0 and wp.dot(bound.axis, direction) > bound.cosine:
-                            if count == _UNKNOWN_COUNT:
-                                count = _find_silhouette(
-                                    point, corners[corner_batch], planes[corner_batch], parts, part, silhouettes[place]
-                                )
-                            coverage_adjoint(silhouettes[place], 0, count, direction, radius, -adj / left)
+                        if wp.dot(bound.axis, direction) > bound.cosine:
+                            adj = parts.signs[part] * blocker_adjoint(
+                                sums[place, q], adj_sums[place, q], coverages[place, q]
+                            )
+                            if wp.length_sq(adj) > 0.0:
+                                if count == _UNKNOWN_COUNT:
+                                    count = _find_silhouette(
+                                        point,
+                                        corners[corner_batch],
+                                        planes[corner_batch],
+                                        parts,
+                                        part,
+                                        silhouettes[place],
+                                    )
+                                coverage_adjoint(silhouettes[place], 0, count, direction, radius, adj)
                     adj_point += _silhouette_adjoint(silhouettes[place], wp.max(count, 0), corner_batch, adj_corners)
             for k in range(covered_count):
-                coverages[place, covered[place, k]] = 0.0
+                coverages[place, covered[place, k]] = wp.vec4()
     if adj_points:
         adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
 
 
-def transmittance_past_parts(
+def part_coverage(
     points: wp.array,
     placed: PlacedParts,
     blockers: ConvexBlockers,
@@ -314,7 +388,7 @@ def transmittance_past_parts(
     horizon_normals: wp.array | None = None,
     skip: int | None = None,
 ) -> wp.array:
-    """Transmittance of cells past the convex parts of bodies.
+    """Coverage (h, μ) of cells by the convex parts of bodies.
 
     Args:
         points: Receivers [scene units], vec3 of shape [batch, receiver].
@@ -326,7 +400,7 @@ def transmittance_past_parts(
         skip: Number of the body that the receivers are part of, which blocks none of their light; None for none.
 
     Returns:
-        Float32 of shape [batch, receiver, direction].
+        vec4 of shape [batch, receiver, direction], for :func:`warpshadow.stages.joint_coverage.transmittance_past`.
 
     Differentiable: points, placed. Not: horizon_normals, which decides by steps.
     """
@@ -339,20 +413,22 @@ def transmittance_past_parts(
     cells = make_cells(directions, SOFTNESS, points.device)
     inputs = [points, horizon_normals, *placed, blockers.arrays, cells, own_radius, -1 if skip is None else skip]
     by_cell = (len(directions),)
-    scratch = [Scratch((blockers.edge_count,), ViewedEdge), Scratch(by_cell, wp.float32), Scratch(by_cell, wp.int32)]
+    scratch = [
+        Scratch((blockers.edge_count,), ViewedEdge),
+        *(Scratch(by_cell, dtype) for dtype in (wp.float32, wp.vec4, wp.int32, BlockerSums)),
+    ]
     cost = _PART_COST * placed.bounds.shape[1]
-    passing = wp.empty((*points.shape, len(directions)), dtype=wp.float32, device=points.device)
     return differentiable(
-        lambda result: launch(_pass, points.size, inputs=inputs, outputs=[result], scratch=scratch, cost=cost),
-        lambda adj_passing: launch(
-            _pass_adjoint,
+        lambda result: launch(_cover_cells, points.size, inputs=inputs, outputs=[result], scratch=scratch, cost=cost),
+        lambda adj_result: launch(
+            _cover_cells_adjoint,
             points.size,
-            inputs=[*inputs, passing, adj_passing],
+            inputs=[*inputs, adj_result],
             outputs=[points.grad],
             sums=[placed.corners.grad],
-            scratch=scratch,
-            cost=2 * cost,
+            scratch=[*scratch, scratch[-1]],
+            cost=3 * cost,
         ),
-        result=passing,
+        result=wp.empty((*points.shape, len(directions)), dtype=wp.vec4, device=points.device),
         variables=[points, placed.corners],
     )
