@@ -349,15 +349,15 @@ def test_what_patches_show(double, planes, check, device):
     check(lambda n, t: areas.find_projected_areas(n, t, mean, directions), *rest)
 
 
-def test_how_much_sources_count(double, device, check):
-    sources, radiosity = double("stages.bounces.open_sources"), double("stages.bounces.radiosity")
+def test_how_much_patch_samples_count(double, device, check):
+    patch_samples, radiosity = double("stages.bounces.openness"), double("stages.bounces.radiosity")
     directions, owners = double("maths.directions").fibonacci(16), np.array([0, 0, 2])
-    mean = radiosity.mean_over_sources(owners, np.array([0.3, 0.7, 1]), 3, device=device)
+    mean = radiosity.mean_over_patch_samples(owners, np.array([0.3, 0.7, 1]), 3, device=device)
     past_self = np.random.default_rng(1).random((1, 3, 16))
 
     def shown(albedo, light, normals, past_self, past_all):
-        openness = sources.find_openness(normals, past_self, past_all, directions)
-        shares, weights = sources.open_shares(openness, mean, owners)
+        openness = patch_samples.find_openness(normals, past_self, past_all, directions)
+        shares, weights = patch_samples.open_shares(openness, mean, owners)
         return radiosity.reflect(weights, radiosity.patch_radiosity(albedo, light, mean, shares))
 
     colors = (wp.vec3d, random(2, 1, 3, 3)), (wp.vec3d, random(3, 2, 3, 3))
@@ -367,7 +367,7 @@ def test_how_much_sources_count(double, device, check):
 def test_radiosity_and_self_light(double, device, check):
     sparse, self_light = double("stages.sparse").SparseMatrix, double("stages.bounces.self_light").self_light
     radiosity = double("stages.bounces.radiosity")
-    mean = radiosity.mean_over_sources(np.array([0, 0, 2]), np.array([0.3, 0.7, 1]), 3, device=device)
+    mean = radiosity.mean_over_patch_samples(np.array([0, 0, 2]), np.array([0.3, 0.7, 1]), 3, device=device)
     factors = sparse.of(np.abs(random(0, 5, 3)), device=device)
     rows = put(np.array([[[0, 1, 2], [4, 4, 3]]]), wp.vec3i, device)
 

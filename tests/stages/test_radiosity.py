@@ -6,13 +6,13 @@ import warp as wp
 
 from warpshadow.device.tape import recorded
 from warpshadow.stages.bounces.colored import ColoredTransfer, colored_light
-from warpshadow.stages.bounces.radiosity import mean_over_sources, patch_radiosity
+from warpshadow.stages.bounces.radiosity import mean_over_patch_samples, patch_radiosity
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
 FLOAT32 = 1e-5
-PATCHES = np.array([0, 0, 0, 1, 3, 3])  # of each source; patch 2 has none
+PATCHES = np.array([0, 0, 0, 1, 3, 3])  # of each patch sample; patch 2 has none
 WEIGHTS = np.array([0.2, 0.3, 0.5, 1.0, 0.6, 0.4])
 
 
@@ -75,9 +75,9 @@ def test_a_matrix_of_zeros_gives_zeros(device):
 
 
 @pytest.mark.parametrize(("albedos", "lights"), [(1, 1), (1, 2), (2, 1), (2, 2)])
-def test_radiosity_is_albedo_times_the_mean_of_the_sources(albedos, lights, device, verified_tape):
+def test_radiosity_is_albedo_times_the_mean_of_the_patch_samples(albedos, lights, device, verified_tape):
     albedo, light = uniform(albedos, 4, 3, seed=1), uniform(lights, 6, 3, seed=2)
-    mean = mean_over_sources(PATCHES, WEIGHTS, 4, device=device)
+    mean = mean_over_patch_samples(PATCHES, WEIGHTS, 4, device=device)
     on_device = colors(albedo, device), colors(light, device)
     with recorded() as tape:
         radiosity = patch_radiosity(*on_device, mean)
@@ -93,7 +93,7 @@ def test_radiosity_is_albedo_times_the_mean_of_the_sources(albedos, lights, devi
 
 
 def test_white_patches_in_unit_light_have_unit_radiosity(device):
-    mean = mean_over_sources(PATCHES, WEIGHTS, 4, device=device)
+    mean = mean_over_patch_samples(PATCHES, WEIGHTS, 4, device=device)
     white = wp.full((1, 4), wp.vec3(1.0), dtype=wp.vec3, device=device)
     lit = wp.full((1, 6), wp.vec3(1.0), dtype=wp.vec3, device=device)
     expected = np.array([1, 1, 0, 1])[:, None] * np.ones(3)

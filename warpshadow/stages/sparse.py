@@ -1,4 +1,4 @@
-"""Sparse matrices multiplied with colors: patches from sources, receivers from patches, patches from texels."""
+"""Sparse matrices multiplied with colors: patches from patch samples, receivers from patches, patches from texels."""
 
 from __future__ import annotations
 

@@ -210,13 +210,13 @@ class Proxies:
         return np.concatenate([find_depths(item.centers, item.normals, item.areas) for item in self.senders.patches])
 
     @functools.cached_property
-    def blocker_of_source(self) -> np.ndarray:
-        """The blocker nearest to the patch of each source, among spheres of bodies that are not flat; −1 for none."""
-        return self._blockers[0][self.senders.patch_of_source]
+    def blocker_of_sample(self) -> np.ndarray:
+        """Sphere nearest to the patch of each patch sample, −1 for none: int32 of shape [patch sample]."""
+        return self._blockers[0][self.senders.patch_of_sample]
 
     def projected_patches(
         self,
-        sources: Receivers,
+        patch_samples: Receivers,
         cells: list[CellTransmittance],
         spheres: tuple[wp.array, wp.array],
         frames: wp.array | None,
@@ -224,19 +224,19 @@ class Proxies:
         """Patches as receivers see them.
 
         Args:
-            sources: Where they are lit.
-            cells: Transmittance of the sources, in portions.
+            patch_samples: Where they are lit.
+            cells: Transmittance of the patch samples, in portions.
             spheres: Centers and radii of all spheres.
             frames: Where flat bodies are.
         """
-        normals, planes, senders = sources.normals, self.planes, self.senders
+        normals, planes, senders = patch_samples.normals, self.planes, self.senders
         centers, radii = self.merged_scene.spheres_of(self.nonplanar_bodies, spheres)
         if planes is not None:
-            numbers, points, device = self.blocker_of_source, sources.points, normals.device
-            of_sources = NearestBlockers(centers, radii, constant(numbers, wp.int32, device))
-            fronts = find_fronts(points, normals, None, of_sources, frames, planes.all)
+            numbers, points, device = self.blocker_of_sample, patch_samples.points, normals.device
+            of_patch_samples = NearestBlockers(centers, radii, constant(numbers, wp.int32, device))
+            fronts = find_fronts(points, normals, None, of_patch_samples, frames, planes.all)
             if self.covers is not None:
-                numbers = np.where(self.covers[1][senders.patch_of_source] > 0, np.int32(-1), numbers)
+                numbers = np.where(self.covers[1][senders.patch_of_sample] > 0, np.int32(-1), numbers)
             normals = turn_from_planes(points, normals, radii, numbers, fronts, frames, planes.all)
         rows = [
             wp.full_like(portion.transmittance_spheres, 1.0, requires_grad=False)
@@ -247,7 +247,7 @@ class Proxies:
         transmittance = joined([row.reshape((len(row), -1)) for row in rows])
         directions = cells[0].directions
         transmittance = transmittance.reshape((len(transmittance), len(senders.sides), len(directions)))
-        placed = place_proxies(sources, senders.mean, radii, *self._blockers, self._depths)
+        placed = place_proxies(patch_samples, senders.mean, radii, *self._blockers, self._depths)
         if self.black_bodies:
             others = self.merged_scene.spheres_of(self.black_bodies, spheres)
             counts = [len(senders.areas), others[1].shape[1]]

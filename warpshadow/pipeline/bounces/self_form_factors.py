@@ -51,18 +51,18 @@ class SelfFormFactors:
             self._of_body[body] = SparseMatrix.of(form_factors, device=merged_scene.device)
         return self._of_body[body]
 
-    def between_patches(self, senders: Senders, sources: Sequence[Group]) -> SparseMatrix:
-        """Form factors of each patch to other patches of its body, averaged over its sources."""
+    def between_patches(self, senders: Senders, patch_samples: Sequence[Group]) -> SparseMatrix:
+        """Form factors of each patch to other patches of its body, averaged over its patch samples."""
         if senders not in self._between:
             from scipy.sparse import vstack
 
-            of_sources = vstack([self._of_group(senders, group) for group in sources])
-            between = senders.mean.on_host() @ of_sources
+            of_patch_samples = vstack([self._of_group(senders, group) for group in patch_samples])
+            between = senders.mean.on_host() @ of_patch_samples
             self._between[senders] = SparseMatrix.of(between, device=senders.merged_scene.device)
         return self._between[senders]
 
     def _of_group(self, senders: Senders, group: Group) -> csr_matrix:
-        """Form factors of each source of a group to the patches of its body, among all patches."""
+        """Form factors of each patch sample of a group to the patches of its body, among all patches."""
         from scipy.sparse import csr_matrix
 
         shape, body = (group.points.shape[1], len(senders.areas)), group.body

@@ -25,7 +25,7 @@ _NEEDLE = 0.01
 """Area of a piece that stays whole however long it is, where pieces should be 1 long: so the number of pieces is
 bounded."""
 
-SOURCES = 4  # sources of a patch, at most
+SAMPLES_PER_PATCH = 4  # patch samples of a patch, at most
 
 _NORMAL_WEIGHT = 1.0
 """How far apart opposite normals are, in units of the body's size: both sides of a thin wall have patches of their own.
@@ -33,9 +33,9 @@ With 0.4, images with two bounces of nested boxes and of stairs were 8.6 and 10.
 7.6 and 9.3%; for a bowl, rooms and chairs they are the same."""
 
 _COMPACT = np.repeat([1.0, 10.0], 3)
-"""Weights of position and normal by which patches are put in order. Kernels look at sources that follow each other at
-once, and leave out spheres below the horizon of all: in a city of 60 boxes and cylinders that saves a fifth of their
-time."""
+"""Weights of position and normal by which patches are put in order. Kernels look at patch samples that follow each
+other at once, and leave out spheres below the horizon of all: in a city of 60 boxes and cylinders that saves a fifth of
+their time."""
 
 _COMPACT_RUN = 4  # patches that are best near each other
 
@@ -64,11 +64,11 @@ class Pieces(NamedTuple):
 class PatchSamples(NamedTuple):
     """Points of a mesh at which its patches are lit, consecutive for each patch; a vertex is a special case."""
 
-    faces: np.ndarray  # face that each lies on, int32 of shape [source]
-    barycentrics: np.ndarray  # and where on it, float32 of shape [source, 3]
-    is_back: np.ndarray  # whether it is lit from the face's back, bool of shape [source]
-    patches: np.ndarray  # patch that each belongs to, ascending, int32 of shape [source]
-    weights: np.ndarray  # share of that patch, which add up to 1 in each, float32 of shape [source]
+    faces: np.ndarray  # face that each lies on, int32 of shape [patch sample]
+    barycentrics: np.ndarray  # and where on it, float32 of shape [patch sample, 3]
+    is_back: np.ndarray  # whether it is lit from the face's back, bool of shape [patch sample]
+    patches: np.ndarray  # patch that each belongs to, ascending, int32 of shape [patch sample]
+    weights: np.ndarray  # share of that patch, which add up to 1 in each, float32 of shape [patch sample]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ class Patches:
         areas: Area of each, float32 of shape [patch].
         centers: Mean position, float32 of shape [patch, 3].
         normals: Mean normal, of unit length, float32 of shape [patch, 3].
-        sources: Where they are lit.
+        patch_samples: Where they are lit.
         pieces: Their pieces.
         of_pieces: Patch of each piece's front and back, int32 of shape [2, piece]; −1 for sides that send nothing.
         grid: The grid of a plane body, None for others.
@@ -88,7 +88,7 @@ class Patches:
     areas: np.ndarray
     centers: np.ndarray
     normals: np.ndarray
-    sources: PatchSamples
+    patch_samples: PatchSamples
     pieces: Pieces
     of_pieces: np.ndarray
     grid: PlaneTexture | None = None
@@ -110,7 +110,7 @@ def find_patches(
     *,
     is_two_sided: bool,
     count: int = MAX_PATCHES,
-    sources: int = SOURCES,
+    patch_samples: int = SAMPLES_PER_PATCH,
     device: wp.DeviceLike = None,
 ) -> Patches:
     """Find the patches of a body, by k-means of position and normal.
@@ -123,7 +123,7 @@ def find_patches(
         faces: Faces that wind alike, shape [face, 3].
         is_two_sided: Whether the backs of faces send light, too: each side then has half of the patches.
         count: Number of patches, at most.
-        sources: Number of sources of each, at most.
+        patch_samples: Number of patch samples of each, at most.
     Returns:
         Patches; none where no face has an area.
     """
@@ -145,7 +145,7 @@ def find_patches(
     labels[is_outside] = _clusters(features[is_outside], areas[is_outside], count)
     result: list[tuple[int, np.ndarray, int, float]] = []
     for patch, members in enumerate(_members(labels)):
-        for group in _split(members, cut.middles, areas, sources):
+        for group in _split(members, cut.middles, areas, patch_samples):
             middle = np.average(cut.middles[group], axis=0, weights=areas[group])
             piece = group[np.linalg.norm(cut.middles[group] - middle, axis=1).argmin()]
             barycentrics = cut.pieces.corners[piece]
@@ -160,7 +160,7 @@ def find_patches(
     labels[reaches_out] = labels[is_outside][_nearest(features[is_outside], features[reaches_out])]
     return Patches(
         *_on_sides(sides, sums[:, 6], sums[:, :3] / sums[:, 6:], _unit(sums[:, 3:6])),
-        _sources_of(result, sides, len(sums)),
+        _patch_samples_of(result, sides, len(sums)),
         cut.pieces,
         _of_sides(labels, sides, len(sums)),
     )
@@ -174,7 +174,7 @@ def find_plane_patches(
     Args:
         positions, faces, is_two_sided, others: As for :func:`warpshadow.stages.planes.grid.find_grid`.
     Returns:
-        Patches, row by row: texels off the mesh have no area and no source.
+        Patches, row by row: texels off the mesh have no area and no patch sample.
     """
     grid, covered = find_grid(positions, faces, is_two_sided=is_two_sided, others=others)
     frame, origin = grid.frame, grid.origin
@@ -190,7 +190,7 @@ def find_plane_patches(
     areas = grid.covered.ravel() * texels.prod(axis=1)
     return Patches(
         *_on_sides(grid.sides, areas, centers, np.tile(frame[2], (len(areas), 1))),
-        _sources_of([(*point, 1.0) for point in zip(*covered, strict=True)], grid.sides, len(areas)),
+        _patch_samples_of([(*point, 1.0) for point in zip(*covered, strict=True)], grid.sides, len(areas)),
         cut.pieces,
         _of_sides(labels, grid.sides, len(areas)),
         grid,
@@ -346,8 +346,8 @@ def _of_sides(labels: np.ndarray, sides: int, count: int) -> np.ndarray:
     return np.stack([labels, labels + count if sides == 2 else np.full_like(labels, -1)]).astype(np.int32)
 
 
-def _sources_of(result: list[tuple[int, np.ndarray, int, float]], sides: int, count: int) -> PatchSamples:
-    """Sources on all sides from the sources on the front: face, barycentrics, patch and weight of each."""
+def _patch_samples_of(result: list[tuple[int, np.ndarray, int, float]], sides: int, count: int) -> PatchSamples:
+    """Patch samples on all sides from the patch samples on the front: face, barycentrics, patch and weight of each."""
     faces, barycentrics, patches, weights = zip(*result, strict=True) if result else ([], [], [], [])
     number = len(result)
     owners = np.array(patches, np.int32)

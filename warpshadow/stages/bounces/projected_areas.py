@@ -1,6 +1,6 @@
 """Projected area of patches towards each cell, without the parts hidden by their own body or by a plane.
 
-Towards a receiver that sees a patch in direction ω, its sources s with weights w show
+Towards a receiver that sees a patch in direction ω, its patch samples s with weights w show
 
     g_p(ω) = Σ_s w_ps max(−n′_s·ω, 0) (β + (1 − β) T_s(−ω)),  β = 0.1
 
@@ -18,7 +18,7 @@ so the part of a normal that points into a plane with normal N fades,
     n′ = n + c max(−n·N, 0) N,  c = f r² / (d² + r²) · Π_axes [S((y_most − y) / r) − S((y_least − y) / r)]
 
 which is about 1 − d / (d + r), but smooth where bodies lie: S is the smoothstep from 0 at −1 to 1 at 1, y
-where the source is along the plane, and f the part of the front that it sees; so it is for the back, with −N.
+where the patch sample is along the plane, and f the part of the front that it sees; so it is for the back, with −N.
 
 Measured with a ground and two bounces, images against all bounces by a path tracer, relative RMSE: a machine part that
 lies on the ground 7.8% by normals alone, 7.6% with T, 5.5% with T and n′; a cow 2.1%, 2.0% and 1.8%; a man of thin
@@ -60,13 +60,13 @@ def _turn_from_planes(
     # out
     turned: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a source of an instance."""
-    batch, source = wp.tid()
-    point = points[instance_in(batch, points.shape[0]), source]
-    normal = normals[instance_in(batch, normals.shape[0]), source]
+    """A thread owns a patch sample of an instance."""
+    batch, patch_sample = wp.tid()
+    point = points[instance_in(batch, points.shape[0]), patch_sample]
+    normal = normals[instance_in(batch, normals.shape[0]), patch_sample]
     result = normal
-    if spheres[source] >= 0:
-        radius = radii[instance_in(batch, radii.shape[0]), spheres[source]]
+    if spheres[patch_sample] >= 0:
+        radius = radii[instance_in(batch, radii.shape[0]), spheres[patch_sample]]
         frame_batch = instance_in(batch, frames.shape[0])
         for f in range(grids.shape[0]):
             grid = grids[f]
@@ -74,7 +74,7 @@ def _turn_from_planes(
             v = frames[frame_batch, 3 * f + 2]
             up = wp.normalize(wp.cross(u, v))
             along_up = wp.dot(normal, up)
-            front = fronts[instance_in(batch, fronts.shape[0]), source, f]
+            front = fronts[instance_in(batch, fronts.shape[0]), patch_sample, f]
             away = front * wp.max(-along_up, 0.0) - (1.0 - front) * wp.max(along_up, 0.0)
             if grid.blocks != 0 and radius > 0.0:
                 offset = point - frames[frame_batch, 3 * f]
@@ -85,7 +85,7 @@ def _turn_from_planes(
                 within = _part_within(x, grid.minimum[0] * wp.length(u), grid.maximum[0] * wp.length(u), radius)
                 within *= _part_within(y, grid.minimum[1] * wp.length(v), grid.maximum[1] * wp.length(v), radius)
                 result += within / (1.0 + height * height) * away * up
-    turned[batch, source] = result
+    turned[batch, patch_sample] = result
 
 
 def turn_from_planes(
@@ -97,20 +97,20 @@ def turn_from_planes(
     frames: wp.array,
     planes: PlaneBlockers,
 ) -> wp.array:
-    """Normals of sources without the part that points into a plane on which they lie.
+    """Normals of patch samples without the part that points into a plane on which they lie.
 
     Args:
-        points: Sources [scene units], vec3 of shape [batch, source].
-        normals: Their unit normals, vec3 of shape [batch, source].
+        points: Patch samples [scene units], vec3 of shape [batch, patch sample].
+        normals: Their unit normals, vec3 of shape [batch, patch sample].
         radii: Radii of spheres [scene units], float32 of shape [batch, sphere].
-        spheres: The blocker nearest to the patch of each source, −1 for none, which keeps its normal: NumPy of shape
-            [source].
-        fronts: Part of the front of each plane that sources see, float32 of shape [batch, source, plane], from
-            :func:`.fronts.find_fronts`.
+        spheres: The blocker nearest to the patch of each patch sample, −1 for none, which keeps its normal: NumPy of
+            shape [patch sample].
+        fronts: Part of the front of each plane that patch samples see, float32 of shape [batch, patch sample, plane],
+            from :func:`.fronts.find_fronts`.
         frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`.PlaneBlockers.frames`.
         planes: The planes. Planes that cast no shadow do not count.
     Returns:
-        n′, vec3 of shape [batch, source]. Any batch may be 1.
+        n′, vec3 of shape [batch, patch sample]. Any batch may be 1.
     Differentiable: points, normals, radii, fronts, frames.
     """
     check.shape("normals", normals.shape, ("batch", points.shape[1]))
@@ -138,7 +138,7 @@ def _project(
     normals: wp.array2d(dtype=wp.vec3),
     transmittance: wp.array3d(dtype=wp.float32),
     starts: wp.array(dtype=wp.int32),
-    sources: wp.array(dtype=wp.int32),
+    patch_samples: wp.array(dtype=wp.int32),
     weights: wp.array(dtype=wp.float32),
     directions: wp.array(dtype=wp.vec3),
     opposite: wp.array(dtype=wp.int32),
@@ -149,9 +149,9 @@ def _project(
     batch, patch, direction = wp.tid()
     total = float(0.0)
     for k in range(starts[patch], starts[patch + 1]):
-        normal = normals[instance_in(batch, normals.shape[0]), sources[k]]
+        normal = normals[instance_in(batch, normals.shape[0]), patch_samples[k]]
         cosine = wp.max(-wp.dot(normal, directions[direction]), 0.0)
-        passing = transmittance[instance_in(batch, transmittance.shape[0]), sources[k], opposite[direction]]
+        passing = transmittance[instance_in(batch, transmittance.shape[0]), patch_samples[k], opposite[direction]]
         total += weights[k] * cosine * (_HIDDEN + (1.0 - _HIDDEN) * passing)
     projected_areas[batch, patch, direction] = total
 
@@ -170,9 +170,9 @@ def find_projected_areas(
     """Projected areas of patches towards cells, for :func:`.proxy_radiance.find_proxy_radiance`.
 
     Args:
-        normals: Of the sources, n′, vec3 of shape [batch, source], from :func:`turn_from_planes`.
-        transmittance: T, self-transmittance of each source, float32 of shape [batch, source, direction].
-        mean: The matrix w, [patch, source], from :func:`.radiosity.mean_over_sources`.
+        normals: Of the patch samples, n′, vec3 of shape [batch, patch sample], from :func:`turn_from_planes`.
+        transmittance: T, self-transmittance of each patch sample, float32 of shape [batch, patch sample, direction].
+        mean: The matrix w, [patch, patch sample], from :func:`.radiosity.mean_over_patch_samples`.
         directions: Unit vectors ω of the cells, from a receiver towards the patch, NumPy of shape [direction, 3].
     Returns:
         g, float32 of shape [batch, patch, direction]. Any batch may be 1.

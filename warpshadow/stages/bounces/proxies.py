@@ -73,7 +73,7 @@ def _place(
 
 
 def place_proxies(
-    sources: Receivers,
+    patch_samples: Receivers,
     mean: SparseMatrix,
     blocker_radii: wp.array,
     numbers: np.ndarray,
@@ -83,24 +83,26 @@ def place_proxies(
     """Place the spheres that stand in for patches.
 
     Args:
-        sources: Where patches are lit.
-        mean: The weights of these, [patch, source], from :func:`.radiosity.mean_over_sources`.
+        patch_samples: Where patches are lit.
+        mean: The weights of these, [patch, patch sample], from :func:`.radiosity.mean_over_patch_samples`.
         blocker_radii: Radii of the spheres that block light [scene units], float32 of shape [batch, sphere].
         numbers: One of them beside each patch, −1 for patches that nothing stands in for, shape [patch].
         ratios: Radius of each proxy in radii of that sphere, shape [patch].
         depths: How far below its patch the center of each is, in radii of the proxy, shape [patch].
     Returns:
         Centers, vec3 of shape [batch, patch], and radii, float32 of the same shape.
-    Differentiable: points and normals of the sources, blocker_radii.
+    Differentiable: points and normals of the patch samples, blocker_radii.
     """
     check.shape("numbers", numbers.shape, (mean.shape[0],))
     check.shape("ratios", ratios.shape, (mean.shape[0],))
     check.shape("depths", depths.shape, (mean.shape[0],))
-    count = common_batch({"sources": sources.points, "normals": sources.normals, "radii": blocker_radii})
+    count = common_batch(
+        {"patch_samples": patch_samples.points, "normals": patch_samples.normals, "radii": blocker_radii}
+    )
     device = blocker_radii.device
     centers = empty((count, len(numbers)), dtype=wp.vec3, device=device)
     radii = empty((count, len(numbers)), dtype=wp.float32, device=device)
-    means = multiply(mean, sources.points), multiply(mean, sources.normals)
+    means = multiply(mean, patch_samples.points), multiply(mean, patch_samples.normals)
     fixed = [constant(np.asarray(numbers, np.int32), wp.int32, device)]
     fixed += [constant(values, wp.float32, device) for values in (ratios, depths)]
     launch(_place, centers.shape, inputs=[*means, blocker_radii, *fixed], outputs=[centers, radii])

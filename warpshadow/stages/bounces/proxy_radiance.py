@@ -6,7 +6,7 @@ sphere in direction ω, its patches send
     E_j(ω) = Σ_p A_p (v_p g_p + ε) B_p / Σ_p A_p (v_p g_p + ε),  ε = 0.0001
 
 the mean of their radiosities B by the area that they show: g_p is that of a unit (:mod:`.projected_areas`), and v_p
-makes patches count that other bodies do not bury (:mod:`.open_sources`). Patches
+makes patches count that other bodies do not bury (:mod:`.openness`). Patches
 that face away count for ε of their area: where none shows itself the mean is still one, so it is smooth, and nothing is
 divided by zero. The sunlit top of a slab is brighter than its bottom by more than a hundred times: by ε = 0.01 it shone
 through, and the floor of a car park below was 19% too bright.
@@ -105,7 +105,7 @@ def find_proxy_radiance(
         projected_areas: g of each patch towards each cell, float32 of shape [batch, patch, direction], from
             :func:`.projected_areas.find_projected_areas`.
         open_weights: v of each patch, in three equal channels, vec3 of shape [batch, patch], from
-            :func:`.open_sources.open_shares`.
+            :func:`.openness.open_shares`.
         areas: Of patches [scene units²], not negative, float32 of shape [patch].
         starts, numbers: Patches of each node, from :func:`patches_of_clusters`.
     Returns:

@@ -1,4 +1,4 @@
-"""Radiosity of patches: the light that they reflect of the light at their sources."""
+"""Radiosity of patches: the light that they reflect of the light at their patch samples."""
 
 import numpy as np
 import warp as wp
@@ -10,13 +10,15 @@ from warpshadow.device.memory import empty
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
 
-def mean_over_sources(patches: np.ndarray, weights: np.ndarray, count: int, *, device: wp.DeviceLike) -> SparseMatrix:
-    """The matrix of means of patches over their sources.
+def mean_over_patch_samples(
+    patches: np.ndarray, weights: np.ndarray, count: int, *, device: wp.DeviceLike
+) -> SparseMatrix:
+    """The matrix of means of patches over their patch samples.
 
     Args:
-        patches: Patch of each source, shape [source].
-        weights: Share of its patch that each source has, shape [source].
-        count: Number of patches; one without sources has a mean of 0.
+        patches: Patch of each patch sample, shape [patch sample].
+        weights: Share of its patch that each patch sample has, shape [patch sample].
+        count: Number of patches; one without patch samples has a mean of 0.
     """
     from scipy.sparse import csr_matrix
 
@@ -39,7 +41,7 @@ def _reflect(
 
 
 def patch_radiosity(albedo: wp.array, light: wp.array, mean: SparseMatrix, shares: wp.array | None = None) -> wp.array:
-    """Radiosity of patches: albedo times the mean light of their sources.
+    """Radiosity of patches: albedo times the mean light of their patch samples.
 
         B_p = a_p Σ_s w_ps f_s (S_s + I_s)
 
@@ -47,10 +49,11 @@ def patch_radiosity(albedo: wp.array, light: wp.array, mean: SparseMatrix, share
 
     Args:
         albedo: Mean reflectance of each patch, vec3 of shape [batch, patch].
-        light: Light that each source would reflect if it were white, direct and bounced, vec3 of shape [batch, source].
-        mean: The weights w, from :func:`mean_over_sources`.
-        shares: f, how much each source counts, vec3 of shape [batch, source], from :func:`.open_sources.open_shares`;
-            None for 1.
+        light: Light that each patch sample would reflect if it were white, direct and bounced, vec3 of shape [batch,
+            patch sample].
+        mean: The weights w, from :func:`mean_over_patch_samples`.
+        shares: f, how much each patch sample counts, vec3 of shape [batch, patch sample], from
+            :func:`.openness.open_shares`; None for 1.
     Returns:
         vec3 of shape [batch, patch]; any batch may be 1, and then serves every instance.
     Differentiable: albedo, light, shares.

@@ -21,16 +21,16 @@ lifted to, off all of them, k = 5 m:
 
     x + Σ_f (2 front_f − 1) k (1 − (h_f / 2 k)²)² N_f
 
-A body that has sunk into a ground a little has sources of bounced light on its surface below. A point there gets the
-light of the ground's back: the light of the sky there. But receivers do not see the sources, they see spheres. So a
-source is on the side of a plane on which the blocker nearest to its patch is:
+A body that has sunk into a ground a little has patch samples on its surface below. A point there gets the light of the
+ground's back: the light of the sky there. But receivers do not see the patch samples, they see spheres. So a patch
+sample is on the side of a plane on which the blocker nearest to its patch is:
 
     front = S(1.25 (h + c) / r)
 
-c is the height of that sphere's center, and r its radius. A sphere that touches a plane from above has all its sources
-in front, and one that touches it from below, behind; 1.25 leaves room for spheres that bulge out of their mesh. So the
-light at a source changes over the depth of a sphere. With a margin of a tenth of a texel it jumped: the gradient of a
-ball that touches a ground held for steps of 1/5000 of its radius.
+c is the height of that sphere's center, and r its radius. A sphere that touches a plane from above has all its patch
+samples in front, and one that touches it from below, behind; 1.25 leaves room for spheres that bulge out of their mesh.
+So the light at a patch sample changes over the depth of a sphere. With a margin of a tenth of a texel it jumped: the
+gradient of a ball that touches a ground held for steps of 1/5000 of its radius.
 """
 
 from __future__ import annotations
@@ -45,14 +45,15 @@ from warpshadow.device.launch import launch
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 
 _FRONT_RADIUS_RATIO = wp.constant(1.25)
-"""A source is wholly in front of a plane where its height and its sphere's add up to 1/1.25 of the sphere's radius."""
+"""A patch sample is wholly in front of a plane where its height and its sphere's add up to 1/1.25 of the sphere's
+radius."""
 
 _LIFT_IN_MARGINS = wp.constant(5.0)  # how far receivers in a plane are lifted off it, in its margins
 _MIN_BLOCKER_RADIUS = wp.constant(1.0e-18)  # radius up to which a sphere blocks nothing
 
 
 class NearestBlockers(NamedTuple):
-    """Of each source of light the sphere that blocks light nearest to its patch."""
+    """Of each patch sample the sphere blocker nearest to its patch."""
 
     centers: wp.array  # [batch, sphere] vec3
     radii: wp.array  # [batch, sphere] float32
@@ -191,7 +192,7 @@ def find_fronts(
         normals: Their unit normals, vec3 of shape [batch, receiver].
         corners: Vertices of their body that are farthest out [scene units], vec3 of shape [batch, corner]. None
             where it is not known: receivers are in front down to the plane itself.
-        spheres: The blockers nearest to sources of light; None where no receiver is one.
+        spheres: The blockers nearest to patch samples; None where no receiver is one.
         frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`.PlaneBlockers.frames`. Any batch
             may be 1.
     Returns:

@@ -1,13 +1,13 @@
-"""Open sources: how much each source counts in its patch, and each patch among others, by how open they are.
+"""Openness: how much each patch sample counts in its patch, and each patch among others, by how open they are.
 
-Where bodies touch or stick in each other, sources of a patch may lie inside another body, and those of a book's side
-between other books. These are dark, and few see them. So a source s of patch p counts by how open it is,
+Where bodies touch or stick in each other, patch samples of a patch may lie inside another body, and those of a book's
+side between other books. These are dark, and few see them. So a patch sample s of patch p counts by how open it is,
 
     o_s = ⟨T⟩ + ε,  ⟨T⟩ = 4/Q Σ_q max(n·ω_q, 0) T_q
     f_s = o_s / Σ_r w_pr o_r
 
-with T the transmittance past all bodies but planes, and w the weights of sources in their patch: the light of a patch
-is Σ_s w_ps f_s L_s. Seen from outside, parts of a patch count just by how open they are.
+with T the transmittance past all bodies but planes, and w the weights of patch samples in their patch: the light of a
+patch is Σ_s w_ps f_s L_s. Seen from outside, parts of a patch count just by how open they are.
 
 A patch that other bodies bury wholly counts hardly at all beside others, in a texel of a plane or among the proxies
 that a receiver sees through a cell, by the part of what its own body leaves open that others leave open, too:
@@ -33,7 +33,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
-_HIDDEN = wp.constant(0.01)  # ε, by which sources count of a patch that is buried wholly
+_HIDDEN = wp.constant(0.01)  # ε, by which patch samples count of a patch that is buried wholly
 _BURIED = wp.constant(0.1)  # r of a patch that counts half
 
 
@@ -47,9 +47,9 @@ def _sum_open(
     # out
     openness: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a source of an instance: ⟨T⟩ and ⟨T_self⟩, linear in both as Warp's adjoint needs it."""
-    batch, source = wp.tid()
-    normal = normals[instance_in(batch, normals.shape[0]), source]
+    """A thread owns a patch sample of an instance: ⟨T⟩ and ⟨T_self⟩, linear in both as Warp's adjoint needs it."""
+    batch, patch_sample = wp.tid()
+    normal = normals[instance_in(batch, normals.shape[0]), patch_sample]
     sphere_batch = instance_in(batch, transmittance_spheres.shape[0])
     factor = 4.0 / float(directions.shape[0])
     total = wp.vec3(_HIDDEN, _HIDDEN, 0.0)
@@ -57,23 +57,23 @@ def _sum_open(
         cosine = factor * wp.max(wp.dot(normal, directions[q]), 0.0)
         of_self = float(1.0)
         if transmittance_self:
-            of_self = transmittance_self[instance_in(batch, transmittance_self.shape[0]), source, q]
-        total += cosine * wp.vec3(transmittance_spheres[sphere_batch, source, q], of_self, 0.0)
-    openness[batch, source] = total
+            of_self = transmittance_self[instance_in(batch, transmittance_self.shape[0]), patch_sample, q]
+        total += cosine * wp.vec3(transmittance_spheres[sphere_batch, patch_sample, q], of_self, 0.0)
+    openness[batch, patch_sample] = total
 
 
 def find_openness(
     normals: wp.array, transmittance_self: wp.array | None, transmittance_spheres: wp.array, directions: np.ndarray
 ) -> wp.array:
-    """How open the hemispheres of sources are past all bodies, and past their own.
+    """How open the hemispheres of patch samples are past all bodies, and past their own.
 
     Args:
-        normals: Of the sources, vec3 of shape [batch, source].
-        transmittance_self: T_self, float32 of shape [batch, source, direction]; None for 1.
+        normals: Of the patch samples, vec3 of shape [batch, patch sample].
+        transmittance_self: T_self, float32 of shape [batch, patch sample, direction]; None for 1.
         transmittance_spheres: T, of the same shape. Any batch may be 1.
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
     Returns:
-        ⟨T⟩ + ε, ⟨T_self⟩ + ε and 0, vec3 of shape [batch, source].
+        ⟨T⟩ + ε, ⟨T_self⟩ + ε and 0, vec3 of shape [batch, patch sample].
     Differentiable: normals, transmittance_self, transmittance_spheres.
     """
     shape = "batch", normals.shape[1], len(directions)
@@ -95,13 +95,15 @@ def _share(
     # in
     openness: wp.array2d(dtype=wp.vec3),
     means: wp.array2d(dtype=wp.vec3),
-    patch_of_source: wp.array(dtype=wp.int32),
+    patch_of_sample: wp.array(dtype=wp.int32),
     # out
     shares: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a source of an instance: f, in three channels."""
-    batch, source = wp.tid()
-    shares[batch, source] = wp.vec3(openness[batch, source][0] / means[batch, patch_of_source[source]][0])
+    """A thread owns a patch sample of an instance: f, in three channels."""
+    batch, patch_sample = wp.tid()
+    shares[batch, patch_sample] = wp.vec3(
+        openness[batch, patch_sample][0] / means[batch, patch_of_sample[patch_sample]][0]
+    )
 
 
 @wp.kernel
@@ -111,7 +113,7 @@ def _weigh(
     # out
     weights: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a patch of an instance: v, in three channels, 0 for a patch without sources."""
+    """A thread owns a patch of an instance: v, in three channels, 0 for a patch without patch samples."""
     batch, patch = wp.tid()
     mean = means[batch, patch]
     weight = float(0.0)
@@ -123,23 +125,23 @@ def _weigh(
 
 
 class Openness(NamedTuple):
-    """How much sources and patches count by how open they are, in three equal channels."""
+    """How much patch samples and patches count by how open they are, in three equal channels."""
 
-    shares: wp.array  # f, of sources in their patches, vec3 of shape [batch, source]
+    shares: wp.array  # f, of patch samples in their patches, vec3 of shape [batch, patch sample]
     weights: wp.array  # v, of patches among others, vec3 of shape [batch, patch]
 
 
-def open_shares(openness: wp.array, mean: SparseMatrix, patch_of_source: np.ndarray) -> Openness:
-    """How much sources count in their patches, 1 on average, and patches among others.
+def open_shares(openness: wp.array, mean: SparseMatrix, patch_of_sample: np.ndarray) -> Openness:
+    """How much patch samples count in their patches, 1 on average, and patches among others.
 
     Args:
-        openness: Of the sources, from :func:`find_openness`, vec3 of shape [batch, source].
-        mean: The weights w, [patch, source], from :func:`.radiosity.mean_over_sources`.
-        patch_of_source: The patch of each source, shape [source].
+        openness: Of the patch samples, from :func:`find_openness`, vec3 of shape [batch, patch sample].
+        mean: The weights w, [patch, patch sample], from :func:`.radiosity.mean_over_patch_samples`.
+        patch_of_sample: The patch of each patch sample, shape [patch sample].
     Differentiable: openness.
     """
-    check.shape("patch_of_source", patch_of_source.shape, (openness.shape[1],))
-    owners = constant(np.asarray(patch_of_source, np.int32), wp.int32, openness.device)
+    check.shape("patch_of_sample", patch_of_sample.shape, (openness.shape[1],))
+    owners = constant(np.asarray(patch_of_sample, np.int32), wp.int32, openness.device)
     means = multiply(mean, openness)
     shares = empty(openness.shape, dtype=wp.vec3, device=openness.device)
     weights = empty(means.shape, dtype=wp.vec3, device=openness.device)
