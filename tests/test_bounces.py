@@ -532,7 +532,7 @@ def test_what_bounces_between_bodies_that_stand_still_is_kept(method, name, monk
     def refuse(*_, **__):
         raise AssertionError("it is computed again")
 
-    monkeypatch.setattr(static_bounces, "trace_factors", refuse)
+    monkeypatch.setattr(static_bounces, "trace_form_factors", refuse)
     monkeypatch.setattr(type(renderer.warp._method), "find_visibility", refuse)
     monkeypatch.setattr(type(renderer.warp._method), "find_visibility_past_planes", refuse)
     with torch.no_grad():

@@ -343,7 +343,7 @@ def test_what_patches_show(double, planes, check, device):
     points, normals = plane_receivers()
     spheres, radii = np.int32([1, 0, 1]), np.array([[0.3, 0.5]])
     given = (wp.vec3d, points), (wp.vec3d, normals), (wp.float64, radii), (wp.float64, random(1, 1, 3, 2) ** 2)
-    check(lambda p, n, r, *f: areas.turn_from_planes(p, n, r, spheres, *f, planes), *given, (wp.vec3d, FRAMES))
+    check(lambda p, n, r, *f: areas.tilt_normals_off_planes(p, n, r, spheres, *f, planes), *given, (wp.vec3d, FRAMES))
     mean = sparse.of(np.array([[0.7, 0.3, 0], [0, 0, 1]]), device=device)
     rest = (wp.vec3d, normals), (wp.float64, random(1, 1, 3, 16) ** 2)
     check(lambda n, t: areas.find_projected_areas(n, t, mean, directions), *rest)

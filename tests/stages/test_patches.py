@@ -5,7 +5,7 @@ import pytest
 
 import warpshadow as ws
 from demos.scenes import shipped_mesh
-from warpshadow.stages.bounces.factors import patch_mesh, trace_factors
+from warpshadow.stages.bounces.form_factors import patch_mesh, trace_form_factors
 from warpshadow.stages.bounces.patches import find_patches, find_plane_patches
 from warpshadow.stages.planes.grid import squeezed, stretched
 
@@ -45,7 +45,7 @@ def test_patches_cover_the_surface_of_each_side_once(mesh):
     assert 24 // sides <= patches.count <= 256  # four for each side of a box
     np.testing.assert_allclose(patches.areas.sum(), sides * area_of(mesh), rtol=ROUNDING)
     assert patches.areas.min() > 0
-    front, back = patches.of_pieces
+    front, back = patches.patch_of_pieces
     assert set(front) == set(range(patches.count // sides))
     np.testing.assert_array_equal(back, front + patches.count // 2 if sides == 2 else -1)
     pieces = patches.pieces.positions(mesh.positions, mesh.surface.faces)
@@ -65,7 +65,7 @@ def test_faces_between_boxes_that_touch_belong_to_no_patch():
     steps = joined(low, high)
     patches = patches_of(steps)
     pieces = patches.pieces.positions(steps.positions, steps.surface.faces)
-    middles, front = pieces.mean(axis=1), patches.of_pieces[0]
+    middles, front = pieces.mean(axis=1), patches.patch_of_pieces[0]
     is_between = np.isclose(pieces[..., 2], 1).all(axis=1) & (middles[:, 1] < 0.9)
     assert is_between.sum() > 10 and (front[is_between] == -1).all()
     is_outside = ~np.isclose(pieces[..., 2], 1).all(axis=1)
@@ -85,10 +85,10 @@ def test_narrow_steps_are_not_black_where_their_faces_go_on_below_the_next_one(d
     points = np.stack([np.full(60, 0.05), np.full(60, 0.11), places], axis=1)
     normals = np.tile([0.0, -1.0, 0.0], (60, 1))
     of_patches, of_body = (
-        trace_factors(
+        trace_form_factors(
             patch_mesh(patches, steps.positions, steps.surface.faces, device=device), *of_faces, points, normals
         )
-        for of_faces in ((patches.of_pieces, patches.count), (np.zeros_like(patches.of_pieces), 1))
+        for of_faces in ((patches.patch_of_pieces, patches.count), (np.zeros_like(patches.patch_of_pieces), 1))
     )
     seen = of_body.toarray().ravel()
     assert seen.min() > 0.9
@@ -109,7 +109,7 @@ def test_every_patch_has_up_to_four_patch_samples_on_it_that_weigh_one(mesh):
     # a patch sample is nearer to its patch's middle than the patch is wide
     distance = np.linalg.norm(patch_sample_points(patches, mesh) - patches.centers[patch_samples.patches], axis=1)
     assert (distance < 2 * np.sqrt(patches.areas[patch_samples.patches])).mean() > 0.95
-    np.testing.assert_array_equal(patch_samples.is_back, patch_samples.patches >= len(set(patches.of_pieces[0])))
+    np.testing.assert_array_equal(patch_samples.is_back, patch_samples.patches >= len(set(patches.patch_of_pieces[0])))
 
 
 def test_patch_samples_lie_on_large_faces_not_at_their_corners():
@@ -135,13 +135,13 @@ def test_needles_do_not_make_pieces_without_end():
 def test_patches_are_the_same_again():
     mesh = shipped_mesh("bear")
     first, second = patches_of(mesh), patches_of(mesh)
-    np.testing.assert_array_equal(first.of_pieces, second.of_pieces)
+    np.testing.assert_array_equal(first.patch_of_pieces, second.patch_of_pieces)
     np.testing.assert_array_equal(first.patch_samples.faces, second.patch_samples.faces)
 
 
 def test_a_mesh_without_area_has_no_patches():
     patches = find_patches(np.zeros((3, 3)), np.array([[0, 1, 2]]), is_two_sided=True)
-    assert patches.count == 0 and patches.of_pieces.shape == (2, 0) and not len(patches.patch_samples.faces)
+    assert patches.count == 0 and patches.patch_of_pieces.shape == (2, 0) and not len(patches.patch_samples.faces)
 
 
 def test_patches_belong_to_the_sphere_whose_surface_is_nearest():
@@ -229,6 +229,6 @@ def test_pieces_of_a_flat_body_belong_to_the_texels_in_which_they_lie():
     pieces = patches.pieces.positions(mesh.positions, mesh.surface.faces)
     areas = np.linalg.norm(np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0]), axis=1) / 2
     assert areas.sum() == pytest.approx(16)
-    away = np.linalg.norm(pieces.mean(axis=1) - patches.centers[patches.of_pieces[0]], axis=1)
-    assert (away < np.sqrt(patches.areas[patches.of_pieces[0]]) * 1.5).all()
-    assert (patches.of_pieces[1] == -1).all()
+    away = np.linalg.norm(pieces.mean(axis=1) - patches.centers[patches.patch_of_pieces[0]], axis=1)
+    assert (away < np.sqrt(patches.areas[patches.patch_of_pieces[0]]) * 1.5).all()
+    assert (patches.patch_of_pieces[1] == -1).all()

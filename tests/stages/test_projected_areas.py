@@ -6,7 +6,7 @@ import warp as wp
 from test_plane_light import Setting, ramp
 
 from warpshadow.maths.directions import fibonacci
-from warpshadow.stages.bounces.projected_areas import find_projected_areas, turn_from_planes
+from warpshadow.stages.bounces.projected_areas import find_projected_areas, tilt_normals_off_planes
 from warpshadow.stages.bounces.radiosity import mean_over_patch_samples
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
@@ -79,7 +79,7 @@ def test_normals_turned_from_flats_are_those_of_the_twin(device):
     fronts = np.random.default_rng(2).uniform(size=(7, 3))
     values = [setting.points[0], setting.normals[0], np.array([0.3, 0.5]), fronts, np.asarray(frames, float)]
     compare(
-        lambda p, n, r, *f: turn_from_planes(p, n, r, SPHERES, *f, setting.planes),
+        lambda p, n, r, *f: tilt_normals_off_planes(p, n, r, SPHERES, *f, setting.planes),
         lambda *scene: twin_turned(*scene, setting.grids, setting.blocks),
         values,
         (wp.vec3, wp.vec3, wp.float32, wp.float32, wp.vec3),
@@ -111,7 +111,9 @@ def turned(height, normal, device, front=1.0, **options):
     radii = wp.full((1, 1), 0.2, dtype=wp.float32, device=device)
     frames = wp.array([setting.frames(setting.vertices[0])], dtype=wp.vec3, device=device)
     fronts = wp.full((1, 1, 1), front, dtype=wp.float32, device=device)
-    return turn_from_planes(points, normals, radii, np.zeros(1, int), fronts, frames, setting.planes).numpy()[0, 0]
+    return tilt_normals_off_planes(points, normals, radii, np.zeros(1, int), fronts, frames, setting.planes).numpy()[
+        0, 0
+    ]
 
 
 def test_a_bottom_that_lies_on_a_ground_shows_nothing_and_one_above_it_does(device):
@@ -145,4 +147,4 @@ def test_what_does_not_fit_is_refused(device):
     frames = wp.array([setting.frames(setting.vertices[0])], dtype=wp.vec3, device=device)
     radii, fronts = (wp.ones(shape, dtype=wp.float32, device=device) for shape in ((1, 1), (1, 2, 1)))
     with pytest.raises(ValueError, match="spheres: got 1, expected −1 to 0"):
-        turn_from_planes(normals, normals, radii, np.array([0, 1]), fronts, frames, setting.planes)
+        tilt_normals_off_planes(normals, normals, radii, np.array([0, 1]), fronts, frames, setting.planes)

@@ -35,7 +35,7 @@ def test_a_sparse_product_and_its_adjoint_are_those_of_the_matrix(shape, device,
     values = uniform(2, shape[1], 3, seed=2)
     given = colors(values, device)
     with recorded() as tape:
-        product = multiply(SparseMatrix.of(matrix, device=device), given)
+        product = multiply(SparseMatrix.from_matrix(matrix, device=device), given)
     np.testing.assert_allclose(product.numpy(), matrix @ values, rtol=FLOAT32, atol=FLOAT32)
     weights = uniform(2, shape[0], 3, seed=3)
     (gradient,) = gradients(tape, product, weights, given)
@@ -46,10 +46,10 @@ def test_a_sparse_product_and_its_adjoint_are_those_of_the_matrix(shape, device,
 def test_what_is_added_to_a_product_has_the_gradient_of_the_sum(given, device, verified_tape):
     matrix, values, more = uniform(7, 5), uniform(given[0], 5, 3, seed=1), uniform(given[1], 7, 3, seed=2)
     on_device = colors(values, device), colors(more, device)
-    sparse = SparseMatrix.of(matrix, device=device)
-    assert np.array_equal(sparse.on_host().toarray(), matrix)
+    sparse = SparseMatrix.from_matrix(matrix, device=device)
+    assert np.array_equal(sparse.to_scipy().toarray(), matrix)
     with recorded() as tape:
-        total = multiply(sparse, on_device[0], plus=on_device[1])
+        total = multiply(sparse, on_device[0], addend=on_device[1])
     np.testing.assert_allclose(total.numpy(), matrix @ values + more, rtol=FLOAT32)
     weights = uniform(2, 7, 3, seed=3)
     adj_values, adj_more = gradients(tape, total, weights, *on_device)
@@ -62,7 +62,7 @@ def test_colored_transfer_lights_each_color_by_itself(device, verified_tape):
     lit, light = uniform(6, 50, 3), uniform(2, 6, 3, seed=1)
     given = colors(light, device)
     with recorded() as tape:
-        found = colored_light(ColoredTransfer.of(lit, device=device), given)
+        found = colored_light(ColoredTransfer.from_lit_receivers(lit, device=device), given)
     np.testing.assert_allclose(found.numpy(), np.einsum("kxc,bkc->bxc", lit, light), rtol=FLOAT32)
     weights = uniform(2, 50, 3, seed=2)
     (gradient,) = gradients(tape, found, weights, given)
@@ -70,7 +70,7 @@ def test_colored_transfer_lights_each_color_by_itself(device, verified_tape):
 
 
 def test_a_matrix_of_zeros_gives_zeros(device):
-    product = multiply(SparseMatrix.of(np.zeros((3, 2)), device=device), colors(uniform(1, 2, 3), device))
+    product = multiply(SparseMatrix.from_matrix(np.zeros((3, 2)), device=device), colors(uniform(1, 2, 3), device))
     assert np.array_equal(product.numpy(), np.zeros((1, 3, 3)))
 
 

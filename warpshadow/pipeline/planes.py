@@ -93,7 +93,7 @@ class ScenePlanes:
         columns = np.concatenate([first + corners for first, corners in zip(starts[:-1], self._corners, strict=True)])
         entries = np.ones(len(columns)), (np.arange(len(columns)), columns)
         matrix = csr_matrix(entries, shape=(len(columns), int(starts[-1])))
-        return SparseMatrix.of(matrix, device=self._merged_scene.device)
+        return SparseMatrix.from_matrix(matrix, device=self._merged_scene.device)
 
     def _body(self, number: int) -> PlaneBody:
         if number not in self._bodies:

@@ -19,9 +19,9 @@ import warp as wp
 
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.stages.interpolation import at_point
+from warpshadow.stages.interpolation import interpolate_at
 from warpshadow.stages.light_samples import LightSamples
-from warpshadow.stages.ray_tracing import RAY_COST, escapes, mesh_id, nearest, parts
+from warpshadow.stages.ray_tracing import RAY_COST, escapes, first_hit, mesh_id, progress_slices
 from warpshadow.stages.textures.pyramid import Textures
 from warpshadow.stages.textures.sample import at_uv
 
@@ -79,8 +79,10 @@ def _albedo(surfaces: _SurfaceArrays, face: int, weights: wp.vec3):
     """Reflectance at a point of a face: bilinear in the finest level of its texture, or between vertices."""
     texture = surfaces.texture_of_face[face]
     if texture < 0:
-        return at_point(surfaces.vertex_albedo, surfaces.faces[face], weights)
-    return at_uv(surfaces.texels, surfaces.levels[texture, 0], at_point(surfaces.uvs, surfaces.uv_faces[face], weights))
+        return interpolate_at(surfaces.vertex_albedo, surfaces.faces[face], weights)
+    return at_uv(
+        surfaces.texels, surfaces.levels[texture, 0], interpolate_at(surfaces.uvs, surfaces.uv_faces[face], weights)
+    )
 
 
 @wp.func
@@ -132,12 +134,12 @@ def _trace_bounces(
         reflected = wp.vec3(1.0)
         for _bounce in range(bounce_count):
             toward = _toward(normal, u, v)
-            hit = nearest(surfaces.mesh, point, normal, toward)
+            hit = first_hit(surfaces.mesh, point, normal, toward)
             if hit.face < 0:
                 break
             corners = surfaces.faces[hit.face]
-            point = at_point(surfaces.positions, corners, hit.weights)
-            normal = wp.normalize(at_point(surfaces.normals, corners, hit.weights))
+            point = interpolate_at(surfaces.positions, corners, hit.weights)
+            normal = wp.normalize(interpolate_at(surfaces.normals, corners, hit.weights))
             normal = wp.where(hit.is_back, -normal, normal)
             reflected = wp.cw_mul(reflected, _albedo(surfaces, hit.face, hit.weights))
             drawn = int(wp.randu(state) % wp.uint32(directions.shape[0]))
@@ -181,7 +183,7 @@ def trace_bounces(
     radiance = wp.array(count / np.pi * samples.radiance.reshape(-1, 3), dtype=wp.vec3, device=device)
     light = empty(points.shape, dtype=wp.vec3, device=device)
     traced, cost = _struct(surfaces), 2 * bounces * paths
-    for part in parts(points.shape[0], 2**20 // cost, progress):
+    for part in progress_slices(points.shape[0], 2**20 // cost, progress):
         launch(
             _trace_bounces,
             part.stop - part.start,

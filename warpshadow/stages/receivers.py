@@ -15,7 +15,7 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, from_numpy, zeros
 from warpshadow.device.parallel import run_length
-from warpshadow.stages.interpolation import at_point
+from warpshadow.stages.interpolation import interpolate_at
 from warpshadow.stages.quadtree import Quadtree
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.sample_receivers import SeenSurface, Span, find_sample_receivers, spans_of
@@ -62,7 +62,7 @@ def _rise(positions: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3), 
     to twice the height of a sphere through the corners. With half of that a bunny of 3,500 vertices keeps some of the
     dark specks where light grazes its normals, which come from flat faces in their own shadow.
     """
-    point = at_point(positions, corners, weights)
+    point = interpolate_at(positions, corners, weights)
     # of unit length, so that no product of three leaves the range of float32
     edge = wp.normalize(positions[corners[1]] - positions[corners[0]])
     other_edge = wp.normalize(positions[corners[2]] - positions[corners[0]])
@@ -106,12 +106,12 @@ def _gather(
         fragment_batch = instance_in(batch, seen_sides.shape[0])
         weights = seen_barycentrics[fragment_batch, fragment]
         face, is_back = split_side(wp.max(seen_sides[fragment_batch, fragment], 0), faces.shape[0])
-        point = at_point(positions[position_batch], faces[face], weights)
+        point = interpolate_at(positions[position_batch], faces[face], weights)
         if rises:
             front, back = _rise(positions[position_batch], normals[position_batch], faces[face], weights)
             point += wp.where(is_back, back, front)
         points[batch, receiver] = point
-        normal = wp.normalize(at_point(normals[position_batch], faces[face], weights))
+        normal = wp.normalize(interpolate_at(normals[position_batch], faces[face], weights))
         point_normals[batch, receiver] = wp.where(is_back, -1.0, 1.0) * normal
 
 

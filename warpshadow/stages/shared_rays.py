@@ -25,7 +25,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
 from warpshadow.stages.light_samples import LightSamples
 from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open, packets_of
-from warpshadow.stages.ray_tracing import parts
+from warpshadow.stages.ray_tracing import progress_slices
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sample_receivers import ALIKE, LEVEL
 
@@ -226,7 +226,7 @@ def trace_shared(
     if has_corners[at_corners].any():
         raise ValueError("corners: got receivers at corners that have corners themselves, expected none")
     known = empty((len(at_corners), tracing.packet_count), dtype=wp.int32, device=points.device)
-    for part in parts(len(at_corners), size, progress):
+    for part in progress_slices(len(at_corners), size, progress):
         tracing.trace(at_corners[part], open_lanes=known[part])
     if len(at_corners):
         rows = np.full(corners.receivers.shape, -1)
@@ -236,7 +236,7 @@ def trace_shared(
         light = (light[corners.receivers] * corners.weights).sum(axis=1)
         tracing.take_over(known, rows, corners.weights, TOLERANCE * np.pi * light)
     others = np.setdiff1d(np.arange(len(points)), at_corners, assume_unique=True)
-    for part in parts(len(others), size, progress):
+    for part in progress_slices(len(others), size, progress):
         tracing.trace(others[part])
     return tracing.shading
 

@@ -21,7 +21,7 @@ from warpshadow.device.launch import launch, without_gradient
 from warpshadow.device.parallel import run_length
 from warpshadow.device.tape import record_adjoint
 from warpshadow.stages.film import sample_radiance
-from warpshadow.stages.interpolation import add_to_corners, adj_weights, interpolate
+from warpshadow.stages.interpolation import interpolate, interpolate_values_adjoint, interpolate_weights_adjoint
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.screen import (
     distance,
@@ -139,7 +139,7 @@ def _add_slopes(
                 corners = fragments.faces[face]
                 if wp.min(spans) == 0.0:
                     receiver_slope = _slope_of_face(
-                        adj_weights(of_receivers, receivers, adj_light), corners, center, clip
+                        interpolate_weights_adjoint(of_receivers, receivers, adj_light), corners, center, clip
                     )
                     slope = wp.vec2(
                         wp.where(spans[0] == 0.0, receiver_slope[0], slope[0]),
@@ -149,7 +149,7 @@ def _add_slopes(
                 depth = wp.dot(weights, wp.vec3(clip[corners[0]][3], clip[corners[1]][3], clip[corners[2]][3]))
                 adj_clip = relative_adjoint(center, wp.vec3(-slope[0], -slope[1], 0.0)) / depth
                 if wp.isfinite(adj_clip):
-                    add_to_corners(adj_clip_positions[fragment_batch], corners, weights, adj_clip)
+                    interpolate_values_adjoint(adj_clip_positions[fragment_batch], corners, weights, adj_clip)
 
 
 def moving_radiance(

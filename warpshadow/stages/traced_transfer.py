@@ -11,7 +11,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.directions import CHUNK, fibonacci
 from warpshadow.stages.ray_packets import PACKET, FaceTree, build_face_tree, make_find_open, packets_of
-from warpshadow.stages.ray_tracing import parts
+from warpshadow.stages.ray_tracing import progress_slices
 
 _RAY_COST = 60.0  # nanoseconds that a ray takes
 
@@ -88,7 +88,7 @@ def trace_transfer(
     values = (4 / len(directions) * functions(directions)).astype(np.float32)
     transfer = np.empty((points.shape[0], values.shape[1]), np.float32)
     tree = _tree(mesh, points.device)
-    for part in parts(points.shape[0], 2**22 // len(directions), progress):
+    for part in progress_slices(points.shape[0], 2**22 // len(directions), progress):
         shape = part.stop - part.start, len(directions)
         cosines = empty(shape, dtype=wp.float32, device=points.device)
         inputs = [tree, points[part], normals[part], packets]

@@ -133,7 +133,7 @@ class ScenePatches:
                 mean = self._mean(
                     number, bodies, reflectance[number].shape[1], None if image is None else image.shape[1:]
                 )
-                total = multiply(mean, reflectance[number], plus=total)
+                total = multiply(mean, reflectance[number], addend=total)
             return total
 
         return Node("patch albedo", means, materials.albedo, materials.textures, items=f"{sum(counts):,} patches")
@@ -155,7 +155,7 @@ class ScenePatches:
                 means = mean_over_vertices(patches, *shape)
             others = {other: csr_matrix((self.of_body(other).count, color_count)) for other in bodies}
             matrix = vstack([*(others | {number: means}).values()])
-            self._means[key] = SparseMatrix.of(matrix, device=self.merged_scene.device)
+            self._means[key] = SparseMatrix.from_matrix(matrix, device=self.merged_scene.device)
         return self._means[key]
 
 

@@ -33,17 +33,17 @@ from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.colored import ColoredTransfer, colored_light
-from warpshadow.stages.bounces.factors import (
+from warpshadow.stages.bounces.form_factors import (
     BLACK_ENTRIES,
     PatchFormFactors,
     loose_mesh,
     mean_outside,
-    ratios,
-    scaled,
-    scaled_to_sky,
-    trace_factors,
+    scale_rows,
+    scale_to_sky,
+    scaling_factors,
+    trace_form_factors,
 )
-from warpshadow.stages.bounces.irradiance_cache import choose_cache_points, interpolation
+from warpshadow.stages.bounces.irradiance_cache import choose_cache_points, interpolation_matrix
 from warpshadow.stages.bounces.radiosity import reflect
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
@@ -72,14 +72,14 @@ class _GeometryFactors(NamedTuple):
     def to_receivers(self, direct: wp.array, bounced: wp.array) -> wp.array:
         """Add bounced light of cache points to direct shading, vec3 [batch, receiver]. Differentiable: both."""
         if self.shape[0] == 1:
-            return multiply(self.receiver_weights, bounced, plus=direct)
+            return multiply(self.receiver_weights, bounced, addend=direct)
         if len(bounced) > 1:
             raise ValueError(
                 f"light, albedo, textures: got a batch of {len(bounced)} for {self.shape[0]} views by "
                 'method "ray-traced" with bounces, expected one for them all; method = "directional" takes '
                 "batches"
             )
-        return multiply(self.receiver_weights, bounced, plus=direct.reshape((1, -1))).reshape(self.shape)
+        return multiply(self.receiver_weights, bounced, addend=direct.reshape((1, -1))).reshape(self.shape)
 
 
 class StaticBounces:
@@ -175,11 +175,11 @@ class StaticBounces:
 
         def light_of_others(radiosity: wp.array | None) -> wp.array:
             """Light on patches from the sky and from other bodies."""
-            return patch_light if radiosity is None else multiply(factors.between_bodies, radiosity, plus=patch_light)
+            return patch_light if radiosity is None else multiply(factors.between_bodies, radiosity, addend=patch_light)
 
         def reflect_all(by_others: wp.array, radiosity: wp.array | None) -> wp.array:
             return reflect(
-                albedo, by_others if radiosity is None else multiply(factors.within_bodies, radiosity, plus=by_others)
+                albedo, by_others if radiosity is None else multiply(factors.within_bodies, radiosity, addend=by_others)
             )
 
         arguments = self._bounces, light_of_others, reflect_all, senders.areas
@@ -209,8 +209,8 @@ class StaticBounces:
             def trace(points: np.ndarray, normals: np.ndarray, sky: np.ndarray | None) -> PatchFormFactors:
                 count = len(senders.areas)
                 arguments = mesh, of_faces, count + len(BLACK_ENTRIES), points, normals
-                form_factors = trace_factors(*arguments, rays=self._rays, progress=self._progress)
-                return scaled_to_sky(
+                form_factors = trace_form_factors(*arguments, rays=self._rays, progress=self._progress)
+                return scale_to_sky(
                     form_factors, np.append(casts[senders.body_of_patch], [True] * len(BLACK_ENTRIES)), sky
                 )
 
@@ -224,9 +224,9 @@ class StaticBounces:
                 )
                 is_cache_point = ~form_factors.is_buried | form_factors.is_buried.all()
                 cache_points = cache_points[is_cache_point]
-                means = interpolation(points, normals, cache_points)
+                means = interpolation_matrix(points, normals, cache_points)
                 if sky is not None:
-                    means = scaled(means, ratios(1 - sky, means @ (1 - sky[cache_points])))
+                    means = scale_rows(means, scaling_factors(1 - sky, means @ (1 - sky[cache_points])))
                 return means, form_factors.factors[is_cache_point]
 
             at, facing, device = receivers.points.numpy(), receivers.normals.numpy(), positions.device
@@ -237,7 +237,7 @@ class StaticBounces:
                 patch_samples.points.numpy()[0], patch_samples.normals.numpy()[0], at_patch_sample
             )
             receiver_weights, to_cache_points = zip(*map(find_cache_points, at, facing, at_receivers), strict=True)
-            means, is_buried = senders.mean.on_host(), seen_by_patch_samples.is_buried
+            means, is_buried = senders.mean.to_scipy(), seen_by_patch_samples.is_buried
             mean = mean_outside(means, is_buried)[senders.nearest_open_patches(means @ ~is_buried > 0)]
             between = (mean @ seen_by_patch_samples.factors).tocoo()
             is_same_body = np.equal(*(senders.body_of_patch[patches] for patches in between.coords))
@@ -246,11 +246,11 @@ class StaticBounces:
                 for which in (is_same_body, ~is_same_body)
             )
             return _GeometryFactors(
-                SparseMatrix.of(mean, device=device),
-                SparseMatrix.of(within_bodies, device=device),
-                SparseMatrix.of(between_bodies, device=device),
-                SparseMatrix.of(vstack(to_cache_points), device=device),
-                SparseMatrix.of(block_diag(receiver_weights), device=device),
+                SparseMatrix.from_matrix(mean, device=device),
+                SparseMatrix.from_matrix(within_bodies, device=device),
+                SparseMatrix.from_matrix(between_bodies, device=device),
+                SparseMatrix.from_matrix(vstack(to_cache_points), device=device),
+                SparseMatrix.from_matrix(block_diag(receiver_weights), device=device),
                 at.shape[:2],
             )
 
@@ -286,7 +286,9 @@ class StaticBounces:
                 place = senders.bodies.index(number)
                 patches = senders.patches[place]
                 corners.append(patches.pieces.positions(body_positions, faces))
-                patch_of_side = np.where(patches.of_pieces < 0, -1, patches.of_pieces + senders.first[place])
+                patch_of_side = np.where(
+                    patches.patch_of_pieces < 0, -1, patches.patch_of_pieces + senders.first[place]
+                )
             else:
                 corners.append(body_positions[faces])
                 patch_of_side = np.full((2, len(faces)), -1)
@@ -302,4 +304,4 @@ def _light_on_patches(at_patch_samples: wp.array, factors: _GeometryFactors) -> 
 
 def _as_transfer(lit: wp.array) -> ColoredTransfer:
     """The matrix of receivers that are lit by each coefficient alone, vec3 of shape [coefficient, receiver]."""
-    return ColoredTransfer.of(lit.numpy(), device=lit.device)
+    return ColoredTransfer.from_lit_receivers(lit.numpy(), device=lit.device)

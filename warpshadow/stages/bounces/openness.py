@@ -33,12 +33,12 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
-_HIDDEN = wp.constant(0.01)  # ε, by which patch samples count of a patch that is buried wholly
-_BURIED = wp.constant(0.1)  # r of a patch that counts half
+_MIN_OPENNESS = wp.constant(0.01)  # ε, by which patch samples count of a patch that is buried wholly
+_BURIED_RATIO = wp.constant(0.1)  # r of a patch that counts half
 
 
 @wp.kernel
-def _sum_open(
+def _sum_openness(
     # in
     normals: wp.array2d(dtype=wp.vec3),
     transmittance_self: wp.array3d(dtype=wp.float32),
@@ -52,14 +52,18 @@ def _sum_open(
     normal = normals[instance_in(batch, normals.shape[0]), patch_sample]
     sphere_batch = instance_in(batch, transmittance_spheres.shape[0])
     factor = 4.0 / float(directions.shape[0])
-    total = wp.vec3(_HIDDEN, _HIDDEN, 0.0)
+    openness_sums = wp.vec3(_MIN_OPENNESS, _MIN_OPENNESS, 0.0)
     for q in range(directions.shape[0]):
         cosine = factor * wp.max(wp.dot(normal, directions[q]), 0.0)
-        of_self = float(1.0)
+        sample_transmittance_self = float(1.0)
         if transmittance_self:
-            of_self = transmittance_self[instance_in(batch, transmittance_self.shape[0]), patch_sample, q]
-        total += cosine * wp.vec3(transmittance_spheres[sphere_batch, patch_sample, q], of_self, 0.0)
-    openness[batch, patch_sample] = total
+            sample_transmittance_self = transmittance_self[
+                instance_in(batch, transmittance_self.shape[0]), patch_sample, q
+            ]
+        openness_sums += cosine * wp.vec3(
+            transmittance_spheres[sphere_batch, patch_sample, q], sample_transmittance_self, 0.0
+        )
+    openness[batch, patch_sample] = openness_sums
 
 
 def find_openness(
@@ -82,16 +86,16 @@ def find_openness(
     if transmittance_self is not None:
         check.shape("transmittance_self", transmittance_self.shape, shape)
         arrays["transmittance_self"] = transmittance_self
-    count, device = common_batch(arrays), normals.device
-    cells = constant(np.asarray(directions, np.float32), wp.vec3, device)
-    openness = empty((count, normals.shape[1]), dtype=wp.vec3, device=device)
-    inputs = [normals, transmittance_self, transmittance_spheres, cells]
-    launch(_sum_open, openness.shape, inputs=inputs, outputs=[openness])
+    batch_count, device = common_batch(arrays), normals.device
+    cell_directions = constant(np.asarray(directions, np.float32), wp.vec3, device)
+    openness = empty((batch_count, normals.shape[1]), dtype=wp.vec3, device=device)
+    inputs = [normals, transmittance_self, transmittance_spheres, cell_directions]
+    launch(_sum_openness, openness.shape, inputs=inputs, outputs=[openness])
     return openness
 
 
 @wp.kernel
-def _share(
+def _find_shares(
     # in
     openness: wp.array2d(dtype=wp.vec3),
     means: wp.array2d(dtype=wp.vec3),
@@ -107,7 +111,7 @@ def _share(
 
 
 @wp.kernel
-def _weigh(
+def _find_weights(
     # in
     means: wp.array2d(dtype=wp.vec3),
     # out
@@ -118,7 +122,7 @@ def _weigh(
     mean = means[batch, patch]
     weight = float(0.0)
     if mean[1] > 0.0:
-        ratio = mean[0] / (_BURIED * mean[1])
+        ratio = mean[0] / (_BURIED_RATIO * mean[1])
         power = ratio * ratio * ratio * ratio
         weight = power / (power + 1.0)
     weights[batch, patch] = wp.vec3(weight)
@@ -141,10 +145,10 @@ def open_shares(openness: wp.array, mean: SparseMatrix, patch_of_sample: np.ndar
     Differentiable: openness.
     """
     check.shape("patch_of_sample", patch_of_sample.shape, (openness.shape[1],))
-    owners = constant(np.asarray(patch_of_sample, np.int32), wp.int32, openness.device)
+    patch_indices = constant(np.asarray(patch_of_sample, np.int32), wp.int32, openness.device)
     means = multiply(mean, openness)
     shares = empty(openness.shape, dtype=wp.vec3, device=openness.device)
     weights = empty(means.shape, dtype=wp.vec3, device=openness.device)
-    launch(_share, shares.shape, inputs=[openness, means, owners], outputs=[shares])
-    launch(_weigh, weights.shape, inputs=[means], outputs=[weights])
+    launch(_find_shares, shares.shape, inputs=[openness, means, patch_indices], outputs=[shares])
+    launch(_find_weights, weights.shape, inputs=[means], outputs=[weights])
     return Openness(shares, weights)

@@ -23,7 +23,7 @@ def mean_over_patch_samples(
     from scipy.sparse import csr_matrix
 
     entries = (weights, (patches, np.arange(len(patches))))
-    return SparseMatrix.of(csr_matrix(entries, shape=(count, len(patches))), device=device)
+    return SparseMatrix.from_matrix(csr_matrix(entries, shape=(count, len(patches))), device=device)
 
 
 @wp.kernel
@@ -36,8 +36,8 @@ def _reflect(
 ):
     """A thread owns a patch of an instance."""
     batch, patch = wp.tid()
-    reflectance = albedo[instance_in(batch, albedo.shape[0]), patch]
-    radiosity[batch, patch] = wp.cw_mul(reflectance, light[instance_in(batch, light.shape[0]), patch])
+    patch_albedo = albedo[instance_in(batch, albedo.shape[0]), patch]
+    radiosity[batch, patch] = wp.cw_mul(patch_albedo, light[instance_in(batch, light.shape[0]), patch])
 
 
 def patch_radiosity(albedo: wp.array, light: wp.array, mean: SparseMatrix, shares: wp.array | None = None) -> wp.array:
@@ -68,7 +68,7 @@ def reflect(albedo: wp.array, light: wp.array) -> wp.array:
     Differentiable: albedo, light.
     """
     check.shape("albedo", albedo.shape, ("batch", light.shape[1]))
-    instances = common_batch({"albedo": albedo, "light": light})
-    radiosity = empty((instances, light.shape[1]), dtype=wp.vec3, device=light.device)
+    batch_count = common_batch({"albedo": albedo, "light": light})
+    radiosity = empty((batch_count, light.shape[1]), dtype=wp.vec3, device=light.device)
     launch(_reflect, radiosity.shape, inputs=[albedo, light], outputs=[radiosity])
     return radiosity

@@ -77,7 +77,7 @@ class ConvexBlockers:
             len(bodies),
             max(len(part.edges) for part in parts),
             arrays,
-            SparseMatrix.of(_chosen(vertices, vertex_count), device=device),
+            SparseMatrix.from_matrix(_chosen(vertices, vertex_count), device=device),
         )
 
     def placed(self, positions: wp.array) -> PlacedParts:

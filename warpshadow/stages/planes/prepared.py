@@ -122,8 +122,8 @@ class PlaneBlockers:
             wp.array(np.repeat(np.concatenate(covered)[:, None], 3, axis=1), dtype=wp.vec3, device=device),
             wp.array(outlines, dtype=wp.vec4, device=device),
             wp.array(vectors / np.linalg.norm(vectors, axis=1, keepdims=True), dtype=wp.vec2, device=device),
-            SparseMatrix.of(vstack(pyramids), device=device) if patch_count else None,
-            SparseMatrix.of(vstack(frames), device=device),
+            SparseMatrix.from_matrix(vstack(pyramids), device=device) if patch_count else None,
+            SparseMatrix.from_matrix(vstack(frames), device=device),
             any(body.blocks and not body.grid.is_whole for body in bodies),
         )
 

@@ -10,7 +10,7 @@ import warp as wp
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.directions import fibonacci
-from warpshadow.stages.ray_tracing import nearest
+from warpshadow.stages.ray_tracing import first_hit
 from warpshadow.stages.self_visibility.probes import VisibilityProbes
 from warpshadow.stages.self_visibility.trace import VisibilityRows
 
@@ -40,7 +40,7 @@ def _find_buried(
     inner = int(0)
     for ray in range(directions.shape[0]):
         if wp.dot(normals[row], directions[ray]) > 0.0:
-            hit = nearest(mesh, points[row], normals[row], directions[ray])
+            hit = first_hit(mesh, points[row], normals[row], directions[ray])
             if hit.face >= 0:
                 if hit.is_back == (row >= probe_count):
                     outer += 1

@@ -20,7 +20,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open, packets_of
-from warpshadow.stages.ray_tracing import parts
+from warpshadow.stages.ray_tracing import progress_slices
 
 RAYS = 4096  # rays of a probe, if memory allows
 MIN_RAYS = 256  # rays of a probe, for any amount of memory
@@ -215,7 +215,7 @@ def trace_rows(
     if before is not None:
         first = len(before)
         wp.copy(rows.bits[:first], wp.array(before, dtype=wp.uint32, device=device))
-    for part in parts(row_count, _BLOCK // count, progress, "tracing self-shadows", first=first):
+    for part in progress_slices(row_count, _BLOCK // count, progress, "tracing self-shadows", first=first):
         inputs = [tree, places[part], facing[part], packets, lowest, level, nearest]
         size = part.stop - part.start
         launch(_make_trace(), size, inputs=inputs, outputs=[rows.bits[part]], cost=_RAY_COST * count)

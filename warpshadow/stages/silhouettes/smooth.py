@@ -21,7 +21,7 @@ from warpshadow.device.batch import accumulate
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import zeros
 from warpshadow.device.warp_internals import scalar_type
-from warpshadow.stages.interpolation import inner
+from warpshadow.stages.interpolation import inner_product
 from warpshadow.stages.screen import neighbor, opposite
 from warpshadow.stages.silhouettes.areas import add_to_vertices
 from warpshadow.stages.silhouettes.find import Silhouettes
@@ -114,7 +114,7 @@ def _make_blend_adjoint(dtype: type) -> wp.Kernel:
                         if edge_colors:
                             color_across = edge_colors[instance, entries[other], opposite(direction)]
                             contrast = color_across - edge_colors[instance, entry, direction]
-                        change = inner(adj, contrast)
+                        change = inner_product(adj, contrast)
                         wp.atomic_add(adj_areas, entry, direction, weight * change)
                         perpendicular = wp.where(direction < 2, 2, 0)
                         for k in range(2):

@@ -15,7 +15,7 @@ from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import differentiable, launch, varies
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import run_length, split_row
-from warpshadow.stages.interpolation import add_to_corners, adj_weights, at_point
+from warpshadow.stages.interpolation import interpolate_at, interpolate_values_adjoint, interpolate_weights_adjoint
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.textures.footprint import Footprints
 from warpshadow.stages.textures.pyramid import Textures
@@ -188,7 +188,7 @@ def _color(
         fragment_batch = instance_in(instance, sampled.face_ids.shape[0])
         face = sampled.face_ids[fragment_batch, sample]
         if face >= 0:
-            color = at_point(vertex_albedo, sampled.faces[face], sampled.barycentrics[fragment_batch, sample])
+            color = interpolate_at(vertex_albedo, sampled.faces[face], sampled.barycentrics[fragment_batch, sample])
     return color
 
 
@@ -256,7 +256,7 @@ def _sample_adjoint_by_colors(
             if face >= 0:
                 adj_of_vertices = adj_vertex_albedo[instance_in(instance, adj_vertex_albedo.shape[0])]
                 weights = sampled.barycentrics[fragment_batch, sample]
-                add_to_corners(adj_of_vertices, sampled.faces[face], weights, adj_color)
+                interpolate_values_adjoint(adj_of_vertices, sampled.faces[face], weights, adj_color)
 
 
 @wp.func
@@ -330,7 +330,7 @@ def _sample_adjoint_by_places(
             face = sampled.face_ids[fragment_batch, sample]
             if face >= 0:
                 of_vertices = vertex_albedo[instance_in(instance, vertex_albedo.shape[0])]
-                adj = adj_weights(of_vertices, sampled.faces[face], adj_color)
+                adj = interpolate_weights_adjoint(of_vertices, sampled.faces[face], adj_color)
                 wp.atomic_add(adj_barycentrics, fragment_batch, sample, adj)
 
 
