@@ -25,7 +25,7 @@ share the disc. Shapes that meet at an edge share the cells there without a rema
 
 import warp as wp
 
-_LEAST = wp.constant(1.0e-12)
+_MIN_DISTANCE = wp.constant(1.0e-12)
 """The least distance of an edge from ω."""
 
 
@@ -64,57 +64,57 @@ class Chord:
 
 
 @wp.func
-def _along_line(end: wp.vec3, axis: wp.vec3, direction: wp.vec3, half: float, behind: float):
-    """Where an end of an edge lies on its line, up to the disc's border; ``behind`` if it is behind the receiver."""
-    ahead = wp.dot(end, direction)
-    if ahead <= 0.0:
-        return behind
-    aside = wp.dot(end, axis)
-    if ahead * half <= wp.abs(aside):
-        return wp.where(aside > 0.0, half, -half)
-    return aside / ahead
+def _position_on_line(end: wp.vec3, axis: wp.vec3, direction: wp.vec3, half_chord: float, position_behind: float):
+    """Position s of an end of an edge on its line, clamped to the disc; ``position_behind`` behind the receiver."""
+    forward_component = wp.dot(end, direction)
+    if forward_component <= 0.0:
+        return position_behind
+    lateral_component = wp.dot(end, axis)
+    if forward_component * half_chord <= wp.abs(lateral_component):
+        return wp.where(lateral_component > 0.0, half_chord, -half_chord)
+    return lateral_component / forward_component
 
 
 @wp.func
-def _find_chord(edges: wp.array(dtype=ViewedEdge), e: int, cosine: float, direction: wp.vec3, radius: float):
+def _find_chord(edges: wp.array(dtype=ViewedEdge), edge: int, cosine: float, direction: wp.vec3, radius: float):
     """Find the chord of an edge, m·ω = ``cosine``."""
     chord = Chord()
     chord.scale = 1.0 / wp.sqrt(wp.max(0.0, 1.0 - cosine * cosine))
     chord.distance = cosine * chord.scale
-    half2 = radius * radius - chord.distance * chord.distance
-    a = edges[e].begin
-    b = edges[e].end
-    if half2 > 0.0 and (wp.dot(a, direction) > 0.0 or wp.dot(b, direction) > 0.0):
-        half = wp.sqrt(half2)
-        chord.tangent = chord.scale * wp.cross(direction, edges[e].normal)
-        chord.begin = _along_line(b, chord.tangent, direction, half, -half)
-        chord.end = _along_line(a, chord.tangent, direction, half, half)
+    half_chord2 = radius * radius - chord.distance * chord.distance
+    a = edges[edge].begin
+    b = edges[edge].end
+    if half_chord2 > 0.0 and (wp.dot(a, direction) > 0.0 or wp.dot(b, direction) > 0.0):
+        half_chord = wp.sqrt(half_chord2)
+        chord.tangent = chord.scale * wp.cross(direction, edges[edge].normal)
+        chord.begin = _position_on_line(b, chord.tangent, direction, half_chord, -half_chord)
+        chord.end = _position_on_line(a, chord.tangent, direction, half_chord, half_chord)
     return chord
 
 
 @wp.func
-def _share_past_edges(edges: wp.array(dtype=ViewedEdge), first: int, count: int, direction: wp.vec3, radius: float):
+def _share_within_edges(edges: wp.array(dtype=ViewedEdge), first: int, count: int, direction: wp.vec3, radius: float):
     """Share of a cell between its edges and its border, h − w."""
     area = float(0.0)
     product = wp.vec2(1.0, 0.0)
-    turn_count = float(0.0)
-    for e in range(first, first + count):
-        cosine = wp.dot(edges[e].normal, direction)
+    branch_crossings = float(0.0)
+    for edge in range(first, first + count):
+        cosine = wp.dot(edges[edge].normal, direction)
         if wp.abs(cosine) < radius:
-            chord = _find_chord(edges, e, cosine, direction, radius)
+            chord = _find_chord(edges, edge, cosine, direction, radius)
             if chord.end > chord.begin:
                 length = chord.end - chord.begin
-                d = wp.where(cosine > 0.0, chord.distance, wp.min(chord.distance, -_LEAST))  # of 0, turns by +π
+                d = wp.where(cosine > 0.0, chord.distance, wp.min(chord.distance, -_MIN_DISTANCE))  # of 0, turns by +π
                 area += 0.5 * d * length
                 x, y = d * d + chord.begin * chord.end, d * length
                 scale = 1.0 / wp.max(wp.abs(x), wp.abs(y))
-                before = product[1]
-                product = scale * wp.vec2(product[0] * x + before * y, before * x - product[0] * y)
-                if y > 0.0 and before < 0.0 and product[1] >= 0.0:
-                    turn_count -= 1.0
-                if y < 0.0 and before >= 0.0 and product[1] < 0.0:
-                    turn_count += 1.0
-    area += 0.5 * radius * radius * (wp.atan2(product[1], product[0]) + 2.0 * wp.pi * turn_count)
+                imaginary_part = product[1]
+                product = scale * wp.vec2(product[0] * x + imaginary_part * y, imaginary_part * x - product[0] * y)
+                if y > 0.0 and imaginary_part < 0.0 and product[1] >= 0.0:
+                    branch_crossings -= 1.0
+                if y < 0.0 and imaginary_part >= 0.0 and product[1] < 0.0:
+                    branch_crossings += 1.0
+    area += 0.5 * radius * radius * (wp.atan2(product[1], product[0]) + 2.0 * wp.pi * branch_crossings)
     return area / (wp.pi * radius * radius)
 
 
@@ -123,15 +123,15 @@ def convex_coverage(edges: wp.array(dtype=ViewedEdge), first: int, count: int, d
     """Share of a cell, 0 to 1, within a convex outline of ``count`` edges from ``first`` on; it is 0 without edges."""
     if count == 0:
         return 0.0
-    nearest = radius
-    for e in range(first, first + count):
-        nearest = wp.min(nearest, wp.dot(edges[e].normal, direction))
-        if nearest <= -radius:
+    min_cosine = radius
+    for edge in range(first, first + count):
+        min_cosine = wp.min(min_cosine, wp.dot(edges[edge].normal, direction))
+        if min_cosine <= -radius:
             return 0.0
-    if nearest >= radius:
+    if min_cosine >= radius:
         return 1.0
-    winding = wp.where(nearest > 0.0, 1.0, 0.0)
-    return wp.clamp(winding + _share_past_edges(edges, first, count, direction, radius), 0.0, 1.0)
+    winding = wp.where(min_cosine > 0.0, 1.0, 0.0)
+    return wp.clamp(winding + _share_within_edges(edges, first, count, direction, radius), 0.0, 1.0)
 
 
 @wp.func
@@ -139,43 +139,43 @@ def outline_coverage(
     edges: wp.array(dtype=ViewedEdge),
     first: int,
     count: int,
-    down: wp.vec3,
+    plane_normal: wp.vec3,
     axis: wp.vec3,
     direction: wp.vec3,
     radius: float,
 ):
     """Share of a cell within any outline of a plane, whose normal away from the receiver and one axis are given."""
     winding = int(0)
-    nearest = radius
-    is_ahead = wp.dot(down, direction) > 0.0
+    min_abs_cosine = radius
+    is_ahead = wp.dot(plane_normal, direction) > 0.0
     side = wp.cross(direction, axis)
-    for e in range(first, first + count):
-        cosine = wp.dot(edges[e].normal, direction)
-        nearest = wp.min(nearest, wp.abs(cosine))
-        begins_below = wp.dot(edges[e].begin, side) <= 0.0
-        ends_below = wp.dot(edges[e].end, side) <= 0.0
+    for edge in range(first, first + count):
+        cosine = wp.dot(edges[edge].normal, direction)
+        min_abs_cosine = wp.min(min_abs_cosine, wp.abs(cosine))
+        begins_below = wp.dot(edges[edge].begin, side) <= 0.0
+        ends_below = wp.dot(edges[edge].end, side) <= 0.0
         if is_ahead and begins_below and not ends_below and cosine > 0.0:
             winding += 1
         if is_ahead and ends_below and not begins_below and cosine <= 0.0:
             winding -= 1
     share = float(winding)
-    if nearest < radius:
-        share += _share_past_edges(edges, first, count, direction, radius)
+    if min_abs_cosine < radius:
+        share += _share_within_edges(edges, first, count, direction, radius)
     return wp.clamp(share, 0.0, 1.0)
 
 
 @wp.func
 def coverage_adjoint(
-    edges: wp.array(dtype=ViewedEdge), first: int, count: int, direction: wp.vec3, radius: float, adj: float
+    edges: wp.array(dtype=ViewedEdge), first: int, count: int, direction: wp.vec3, radius: float, adj_coverage: float
 ):
     """Add to the gradients of the edges' normals, of either function."""
-    for e in range(first, first + count):
-        normal = edges[e].normal
+    for edge in range(first, first + count):
+        normal = edges[edge].normal
         cosine = wp.dot(normal, direction)
         if wp.abs(cosine) < radius:
-            chord = _find_chord(edges, e, cosine, direction, radius)
+            chord = _find_chord(edges, edge, cosine, direction, radius)
             if chord.end > chord.begin:
-                foot = direction - (chord.distance * chord.scale) * (normal - cosine * direction)
-                middle = foot + 0.5 * (chord.begin + chord.end) * chord.tangent
-                scale = adj * chord.scale * (chord.end - chord.begin) / (wp.pi * radius * radius)
-                edges[e].adj_normal = edges[e].adj_normal + scale * middle
+                line_foot = direction - (chord.distance * chord.scale) * (normal - cosine * direction)
+                chord_middle = line_foot + 0.5 * (chord.begin + chord.end) * chord.tangent
+                scale = adj_coverage * chord.scale * (chord.end - chord.begin) / (wp.pi * radius * radius)
+                edges[edge].adj_normal = edges[edge].adj_normal + scale * chord_middle

@@ -24,15 +24,15 @@ from warpshadow.stages.film import sample_radiance
 from warpshadow.stages.interpolation import interpolate, interpolate_values_adjoint, interpolate_weights_adjoint
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.screen import (
-    distance,
+    direction_sign,
     ends_before,
     half_size,
     has_neighbor,
+    line_distance,
     neighbor,
-    relative,
-    relative_adjoint,
+    relative_to_ray,
+    relative_to_ray_adjoint,
     sample_center,
-    sense,
 )
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
 from warpshadow.stages.silhouettes.find import Silhouettes
@@ -49,9 +49,9 @@ def _slope_of_face(values: wp.vec3, corners: wp.vec3i, center: wp.vec2, clip_pos
 
     Barycentrics are to each other as the last components of these normals of the planes through the eye and an edge.
     """
-    a = relative(clip_positions[corners[0]], center)
-    b = relative(clip_positions[corners[1]], center)
-    c = relative(clip_positions[corners[2]], center)
+    a = relative_to_ray(clip_positions[corners[0]], center)
+    b = relative_to_ray(clip_positions[corners[1]], center)
+    c = relative_to_ray(clip_positions[corners[2]], center)
     normal_a = wp.cross(b, c)
     normal_b = wp.cross(c, a)
     normal_c = wp.cross(a, b)
@@ -120,20 +120,20 @@ def _add_slopes(
                             edge = edges[entry, direction]
                         if edge[0] >= 0:
                             line = edge_line(edge, center, clip)
-                            t = distance(line, direction, half)
+                            t = line_distance(line, direction, half)
                             if ends_before(line, direction) and t > MIN_DISTANCE and t <= 1.0:
                                 # entries are of all views; where one view serves all images, each has its
                                 # own colors
                                 rise = edge_colors[batch - fragment_batch, entry, direction] - color
                                 span = wp.min(t, 0.5)
                                 total = wp.dot(adj_color, wp.vec3(rise[0], rise[1], rise[2]))
-                                rises[direction / 2] += sense(direction) * span / t * total
+                                rises[direction / 2] += direction_sign(direction) * span / t * total
                                 spans[direction / 2] += span
                         elif edge[0] == NOTHING and has_neighbor(at, direction, width, fragments.height):
                             other = neighbor(sample, direction, width)
                             if receiver_face_ids[fragment_batch, other] >= 0:
                                 rise_of_light = wp.dot(adj_light, light[light_batch, other] - here)
-                                rises[direction / 2] += sense(direction) * 0.5 * rise_of_light
+                                rises[direction / 2] += direction_sign(direction) * 0.5 * rise_of_light
                                 spans[direction / 2] += 0.5
                 slope = wp.cw_mul(wp.cw_div(rises, spans), half)
                 corners = fragments.faces[face]
@@ -147,7 +147,7 @@ def _add_slopes(
                     )
                 weights = fragments.barycentrics[at]
                 depth = wp.dot(weights, wp.vec3(clip[corners[0]][3], clip[corners[1]][3], clip[corners[2]][3]))
-                adj_clip = relative_adjoint(center, wp.vec3(-slope[0], -slope[1], 0.0)) / depth
+                adj_clip = relative_to_ray_adjoint(center, wp.vec3(-slope[0], -slope[1], 0.0)) / depth
                 if wp.isfinite(adj_clip):
                     interpolate_values_adjoint(adj_clip_positions[fragment_batch], corners, weights, adj_clip)
 

@@ -16,7 +16,7 @@ from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
 from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.screen import center, relative, volumes
+from warpshadow.stages.screen import center, ray_volumes, relative_to_ray
 from warpshadow.stages.textures.pyramid import Textures
 
 PROBE_LINE_EXCESS = 0.25
@@ -68,10 +68,10 @@ def _uv_derivatives(
     the sample, and ``step`` is that of the ray from one sample to the next. With volumes v, linear in the ray,
     uv = Σ v_i uv_i / Σ v_i has the derivative Σ v_i' (uv_i - uv) / Σ v_i, on the whole plane of the face.
     """
-    at_a = relative(a, ray)
-    at_b = relative(b, ray)
-    at_c = relative(c, ray)
-    spanned = volumes(at_a, at_b, at_c)
+    at_a = relative_to_ray(a, ray)
+    at_b = relative_to_ray(b, ray)
+    at_c = relative_to_ray(c, ray)
+    spanned = ray_volumes(at_a, at_b, at_c)
     total = spanned[0] + spanned[1] + spanned[2]
     by_x = wp.vec3(at_b[1] * c[3] - b[3] * at_c[1], at_c[1] * a[3] - c[3] * at_a[1], at_a[1] * b[3] - a[3] * at_b[1])
     by_y = wp.vec3(b[3] * at_c[0] - at_b[0] * c[3], c[3] * at_a[0] - at_c[0] * a[3], a[3] * at_b[0] - at_a[0] * b[3])
