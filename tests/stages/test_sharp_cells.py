@@ -42,7 +42,7 @@ def test_a_sun_is_found_where_it_is_and_as_wide_as_it_is():
     cells, sharp_cells = narrow_of(map_with_discs((SUN, 2000.0), sky=0.01))
     brightest = np.argmax(cells.radiance.sum(axis=1))
     assert sharp_cells.directions.shape == (CHUNK, 3)
-    np.testing.assert_allclose(sharp_cells.directions[sharp_cells.places[brightest]] @ SUN, 1, atol=1e-5)
+    np.testing.assert_allclose(sharp_cells.directions[sharp_cells.slots[brightest]] @ SUN, 1, atol=1e-5)
     # the cell's own edge would be 4 times as wide; with it goes the mean of the sky in the cell
     assert 2.3 * HALF_ANGLE < sharp_cells.scale * cell_radius(CHUNK) < 2.7 * HALF_ANGLE
 
@@ -50,9 +50,9 @@ def test_a_sun_is_found_where_it_is_and_as_wide_as_it_is():
 def test_two_suns_have_a_place_each():
     other = SUN * [-1, 1, -1]
     cells, sharp_cells = narrow_of(map_with_discs((SUN, 2000.0), (other, 1000.0)))
-    found = np.flatnonzero(sharp_cells.places >= 0)
+    found = np.flatnonzero(sharp_cells.slots >= 0)
     assert len(found) >= 2
-    np.testing.assert_array_equal(sharp_cells.directions[sharp_cells.places[found]], cells.spots[found])
+    np.testing.assert_array_equal(sharp_cells.directions[sharp_cells.slots[found]], cells.spots[found])
 
 
 def test_a_sun_of_5_degrees_is_narrow_where_planes_block_it_alone():
@@ -66,7 +66,7 @@ def test_a_sun_of_5_degrees_is_narrow_where_planes_block_it_alone():
 def test_without_its_spot_a_cell_has_the_light_around_it():
     light, directions = map_with_discs((SUN, 2000.0)), fibonacci(CELLS)
     cells, sharp_cells = narrow_of(light)
-    found = np.flatnonzero(sharp_cells.places >= 0)
+    found = np.flatnonzero(sharp_cells.slots >= 0)
     rest = without_spots(light.radiance, cells.spots[found], 2 * cells.spreads[found])
     assert rest.max() == np.float32(0.2)
     around = gather_cells(rest, directions)
@@ -88,7 +88,7 @@ def test_a_sun_of_one_pixel_is_the_spot_of_its_cells(height):
         cells, sharp_cells = narrow_of(EnvironmentMap(radiance))
         if sharp_cells is None and height == 16:  # its pixels are as wide as cells
             continue
-        found = np.flatnonzero(sharp_cells.places >= 0)
+        found = np.flatnonzero(sharp_cells.slots >= 0)
         rest = without_spots(radiance, cells.spots[found], 2 * cells.spreads[found])
         assert rest.max() == np.float32(0.3)
         assert rest[row, column, 0] == 0

@@ -31,7 +31,7 @@ from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.pipeline.self_visibility import SelfVisibilityLookup
 from warpshadow.pipeline.static import StaticBodies, VertexRows
 from warpshadow.scene.blockers import blocking_planes
-from warpshadow.stages.cached_cells import CachedRows, cell_transfer, light_cells
+from warpshadow.stages.cached_cells import CachedRows, cell_transfer, shade_cached_cells
 from warpshadow.stages.gloss.reflection import blocked_radiance
 from warpshadow.stages.gloss.transmittance import transmittance_towards
 from warpshadow.stages.light_samples import CellSamples, cell_samples, even_samples, sample_map
@@ -109,7 +109,7 @@ class Directional(SphereMethod):
         sharp_cells = find(), find(WIDEST_PAST_PLANES)
         rest, rest_light, directions, spot_shares = known.radiance, cells, cells.directions, np.ones(len(power))
         if sharp_cells[0] is not None and sharp_cells[1] is not None:
-            is_sharp = (sharp_cells[0].places >= 0) & (sharp_cells[1].places >= 0)
+            is_sharp = (sharp_cells[0].slots >= 0) & (sharp_cells[1].slots >= 0)
             rest = without_spots(known.radiance, cells.spots[is_sharp], _NEAR_SPOT * cells.spreads[is_sharp])
             rest_light = gather_cells(rest, self._directions)
             directions = np.where(is_sharp[:, None], rest_light.directions, directions)
@@ -263,7 +263,7 @@ class Directional(SphereMethod):
             )
         assert group.body is not None
         of_sun = trace_sun_cells(rays[0], group.probe_weights, rays[1], group.body, projected_light.sun)
-        return blend_sharp_cells(transmittance_self, of_sun, projected_light.sun.places)
+        return blend_sharp_cells(transmittance_self, of_sun, projected_light.sun.slots)
 
     def transfer(self, visibility: GroupVisibility, group: Group, projected_light: ProjectedCells) -> wp.array:
         """Transfer vectors; the transmittance as it is where cached cells hold known light."""
@@ -277,7 +277,7 @@ class Directional(SphereMethod):
     def shade_transfer(self, transfer: wp.array, group: Group, projected_light: ProjectedCells) -> wp.array:
         """Shading of a portion, vec3 of shape [batch, receiver]."""
         if group.cached_rows is not None and _has_light(group.cached_rows):
-            return light_cells(transfer, group.cached_rows)
+            return shade_cached_cells(transfer, group.cached_rows)
         return super().shade_transfer(transfer, group, projected_light)
 
     def shade_transmittance(

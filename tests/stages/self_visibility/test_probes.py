@@ -66,8 +66,8 @@ def test_a_long_rail_is_cut_and_the_small_faces_beside_it_are_not():
     ball, rail = ws.icosphere(1.0, 5), np.array([(2, 0, 0), (6, 0, 0), (2, 0.01, 0), (6, 0.01, 0)])
     points = np.concatenate([ball.positions, rail]).astype(np.float32)
     faces = np.concatenate([ball.faces, FACES + len(ball.positions)])
-    for samples_receive in (False, True):
-        longest = longest_edge(points, faces, samples_receive=samples_receive)
+    for has_sample_receivers in (False, True):
+        longest = longest_edge(points, faces, has_sample_receivers=has_sample_receivers)
         new = find_probes(points, np.tile(NORMALS[:1], (len(points), 1)), faces, longest).positions[len(points) :]
         assert 20 < len(new) < 1000 and (new[:, 0] > 2).all()
 

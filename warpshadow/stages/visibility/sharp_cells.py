@@ -40,12 +40,12 @@ class SharpCells(NamedTuple):
 
     Args:
         directions: Unit vectors to where their light comes from, some repeated: [16, 3].
-        places: Index of each cell among them, −1 for cells that are not sharp: [direction].
+        slots: Index of each cell among them, −1 for cells that are not sharp: [direction].
         scale: Radius of the cells that their edges go by, in radii of one of 16 cells.
     """
 
     directions: np.ndarray
-    places: np.ndarray
+    slots: np.ndarray
     scale: float
 
 
@@ -63,11 +63,11 @@ def find_sharp_cells(
     """
     radii = np.maximum(_RADII * spreads, max(_MIN_RADIUS, 1.001 * MIN_WIDTH / softness))
     is_small = radii < widest * cell_radius(len(power))
-    cells, repeated, places = brightest_chunk(power, is_small & (power > 0))
+    cells, repeated, slots = brightest_chunk(power, is_small & (power > 0))
     if power[cells].sum() <= _MIN_SHARE * power.sum():
         return None
     radius = np.sqrt(np.average(radii[cells] ** 2, weights=power[cells]))
-    return SharpCells(directions[cells[repeated]], places, float(radius / cell_radius(CHUNK)))
+    return SharpCells(directions[cells[repeated]], slots, float(radius / cell_radius(CHUNK)))
 
 
 @wp.kernel(enable_backward=False)
@@ -115,7 +115,7 @@ def _blend_sharp_cells_adjoint(
 
 
 def blend_sharp_cells(
-    passing: wp.array, sharp_cells: wp.array, places: np.ndarray, shares: np.ndarray | None = None
+    passing: wp.array, sharp_cells: wp.array, slots: np.ndarray, shares: np.ndarray | None = None
 ) -> wp.array:
     """Blend sharp cells into all; in place, unless the adjoint of ``passing`` needs it: call before anything reads it.
 
@@ -124,18 +124,18 @@ def blend_sharp_cells(
     Args:
         passing: Transmittance of all cells, float32 of shape [batch, receiver, direction]; it may be changed.
         sharp_cells: That of :attr:`SharpCells.directions`, float32 of shape [batch, receiver, 16].
-        places: Of :class:`SharpCells`.
+        slots: Of :class:`SharpCells`.
         shares: σ, the share of each cell's light that its spot has [direction]; None for 1.
     Returns:
         float32 of shape [batch, receiver, direction].
     Differentiable: passing, sharp_cells.
     """
     device, row_count = passing.device, passing.shape[0] * passing.shape[1]
-    cells = np.flatnonzero(places >= 0)
+    cells = np.flatnonzero(slots >= 0)
     of_spots = np.ones(len(cells)) if shares is None else shares[cells]
     is_copied = varies([passing]) and bool((of_spots < 1).any())
     blended = wp.clone(passing, requires_grad=False) if is_copied else passing
-    pairs = constant(np.stack([cells, places[cells]], axis=1), wp.vec2i, device)
+    pairs = constant(np.stack([cells, slots[cells]], axis=1), wp.vec2i, device)
     inputs, cost = [pairs, constant(of_spots.astype(np.float32), wp.float32, device)], _CELL_COST * len(cells)
     return differentiable(
         lambda result: launch(
