@@ -9,7 +9,7 @@ from warpshadow.assets.cells import gather_cells, without_spots
 from warpshadow.device.tape import recorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.stages.poses import Poses
-from warpshadow.stages.visibility.sharp_cells import WIDEST_PAST_PLANES, blend_sharp_cells, find_sharp_cells
+from warpshadow.stages.visibility.sharp_cells import MAX_RADIUS_PAST_PLANES, blend_sharp_cells, find_sharp_cells
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -58,9 +58,9 @@ def test_two_suns_have_a_place_each():
 def test_a_sun_of_5_degrees_is_narrow_where_planes_block_it_alone():
     wide = map_with_discs((fibonacci(CELLS)[40], 500.0), half_angle=np.radians(5))
     assert narrow_of(wide)[1] is None
-    sharp_cells = narrow_of(wide, widest=WIDEST_PAST_PLANES)[1]
-    assert 1 < sharp_cells.scale * cell_radius(CHUNK) / cell_radius(CELLS) < WIDEST_PAST_PLANES
-    assert narrow_of(EnvironmentMap.constant(1.0), widest=WIDEST_PAST_PLANES)[1] is None
+    sharp_cells = narrow_of(wide, max_radius=MAX_RADIUS_PAST_PLANES)[1]
+    assert 1 < sharp_cells.scale * cell_radius(CHUNK) / cell_radius(CELLS) < MAX_RADIUS_PAST_PLANES
+    assert narrow_of(EnvironmentMap.constant(1.0), max_radius=MAX_RADIUS_PAST_PLANES)[1] is None
 
 
 def test_without_its_spot_a_cell_has_the_light_around_it():

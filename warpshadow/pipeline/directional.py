@@ -46,7 +46,7 @@ from warpshadow.stages.sides import split_sides
 from warpshadow.stages.transfer import directional_transfer
 from warpshadow.stages.visibility import directional
 from warpshadow.stages.visibility.sharp_cells import (
-    WIDEST_PAST_PLANES,
+    MAX_RADIUS_PAST_PLANES,
     SharpCells,
     blend_sharp_cells,
     find_sharp_cells,
@@ -106,7 +106,7 @@ class Directional(SphereMethod):
         find = functools.partial(find_sharp_cells, power, cells.spots, cells.spreads, softness)
         draw = functools.partial(draw_in_cells, known.radiance, self._directions)
         sun = find_sun_cells(power, draw) if self.self_visibility.wants_rays else None
-        sharp_cells = find(), find(WIDEST_PAST_PLANES)
+        sharp_cells = find(), find(MAX_RADIUS_PAST_PLANES)
         rest, rest_light, directions, spot_shares = known.radiance, cells, cells.directions, np.ones(len(power))
         if sharp_cells[0] is not None and sharp_cells[1] is not None:
             is_sharp = (sharp_cells[0].slots >= 0) & (sharp_cells[1].slots >= 0)

@@ -101,7 +101,7 @@ class LightInputs:
 
 @functools.cache
 def _make_load_task(lanes: int) -> wp.Function:
-    """Make the kernel function that finds out which receivers and directions a thread works on."""
+    """Make the kernel function that loads the receivers and directions of a thread."""
     Lane, LightTask = lane_type(lanes), _task_type(lanes)
     fn = make_lane_functions(lanes)
     is_any_above, dot_direction = fn.is_any_above, fn.dot_direction
@@ -190,7 +190,7 @@ def _make_light(lanes: int) -> wp.Kernel:
     fn = make_lane_functions(lanes)
     sqrt, is_any_above, dot_direction, add_vectors = fn.sqrt, fn.is_any_above, fn.dot_direction, fn.add_vectors
     load_task, weigh, falloff = _make_load_task(lanes), _make_weight(lanes), make_falloff(lanes)
-    widen, reaches, rises, soften = make_cap_functions(True, lanes)
+    widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(True, lanes)
     SUMS = wp.constant(_SUMS)
     LEAST = wp.constant(_LEAST)
 
@@ -199,17 +199,17 @@ def _make_light(lanes: int) -> wp.Kernel:
         cone = sphere_view.cone
         cells = task.cells
         sine = sqrt(cone.sine2)
-        cap = widen(cone.axis, cone.cosine, sine, cells)
-        if rises(cap, receivers.normals):
+        cap = widen_cone(cone.axis, cone.cosine, sine, cells)
+        if is_above_horizon(cap, receivers.normals):
             slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
             nearness = weigh(sphere_view.offset, sphere_view.curvature, task.inverse_size)
             opacity = wp.cw_mul(opacity, wp.cw_mul(nearness, nearness))
             for k in range(count):
                 bundle = task.reached_bundles[1, k]
                 direction_bundle = task.first_bundle + bundle
-                if reaches(cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle]):
+                if reaches_bundle(cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle]):
                     for i in range(BUNDLE):
-                        t, step = soften(cells.directions[direction_bundle * BUNDLE + i], cap, slope)
+                        t, step = soft_edge(cells.directions[direction_bundle * BUNDLE + i], cap, slope)
                         if is_any_above(t, 0.0):
                             share = wp.cw_mul(opacity, step)
                             node_radiance = task.proxy_radiance[sphere_view.node, direction_bundle * BUNDLE + i]
@@ -268,7 +268,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
     add, load, total, add_vectors = fn.add, fn.load, fn.total, fn.add_vectors
     load_task, weigh = _make_load_task(lanes), _make_weight(lanes)
     falloff, sphere_adjoint = make_falloff(lanes), make_sphere_adjoint(lanes)
-    widen, reaches, rises, soften = make_cap_functions(True, lanes)
+    widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(True, lanes)
     SUMS = wp.constant(_SUMS)
     LEAST = wp.constant(_LEAST)
     CORE2 = wp.constant(_CORE**2)
@@ -285,12 +285,12 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         cone = sphere_view.cone
         cells = task.cells
         sine = sqrt(cone.sine2)
-        cap = widen(cone.axis, cone.cosine, sine, cells)
-        if rises(cap, receivers.normals):
+        cap = widen_cone(cone.axis, cone.cosine, sine, cells)
+        if is_above_horizon(cap, receivers.normals):
             slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
             nearness = weigh(sphere_view.offset, sphere_view.curvature, task.inverse_size)
             weight = wp.cw_mul(nearness, nearness)
-            is_any_met = bool(False)
+            is_any_blocked = bool(False)
             sum_adj_t = Lane(0.0)
             sum_t = Lane(0.0)
             sum_x = Lane(0.0)
@@ -300,12 +300,12 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
             for k in range(count):
                 bundle = task.reached_bundles[1, k]
                 direction_bundle = task.first_bundle + bundle
-                if reaches(cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle]):
+                if reaches_bundle(cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle]):
                     for i in range(BUNDLE):
                         omega = cells.directions[direction_bundle * BUNDLE + i]
-                        t, step = soften(omega, cap, slope)
+                        t, step = soft_edge(omega, cap, slope)
                         if is_any_above(t, 0.0):
-                            is_any_met = True
+                            is_any_blocked = True
                             weighted_blocked = wp.cw_mul(weight, task.blocked[bundle * BUNDLE + i])
                             adj_cell = task.adj_cells[bundle * BUNDLE + i]
                             node_radiance = task.proxy_radiance[sphere_view.node, direction_bundle * BUNDLE + i]
@@ -314,8 +314,8 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                             )
                             adj_blocked = wp.cw_mul(weighted_blocked, light - node_radiance[3] * adj_cell)
                             adj_opacity += wp.cw_mul(adj_blocked, step)
-                            rise = wp.cw_mul(t, Lane(1.0) - t)
-                            adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_blocked, opacity), rise)
+                            step_slope = wp.cw_mul(t, Lane(1.0) - t)
+                            adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_blocked, opacity), step_slope)
                             sum_adj_t += adj_t
                             sum_t += wp.cw_mul(adj_t, t)
                             sum_x += omega[0] * adj_t
@@ -335,7 +335,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                                     direction_bundle * BUNDLE + i,
                                     adj_node_radiance,
                                 )
-            if is_any_met:
+            if is_any_blocked:
                 sum_omega = Vectors(sum_x, sum_y, sum_z)
                 adj_offset, adj_radius, adj_weight = sphere_adjoint(
                     sphere_view,
@@ -491,7 +491,7 @@ def sphere_light(
     cell = cell_radius(len(directions))
     nodes, traversed = make_inputs(points, normals, centers, radii, merging, cell, skip, clusters)
     row_count = batch_count * block_count(vertex_count, lanes)
-    dim = run_dimensions(device, row_count, spans)
+    launch_dim = run_dimensions(device, row_count, spans)
     variables = [points, normals, *nodes, proxy_radiance, transmittance, transmittance_others]
     stores_sums = varies(variables)
     scratch = [
@@ -515,7 +515,7 @@ def sphere_light(
         adj_transmittance_others = [None if transmittance_others is None else transmittance_others.grad]
         launch(
             _make_light_adjoint(lanes),
-            dim,
+            launch_dim,
             cost=2 * cost,
             inputs=[inputs, *cached, adj_light],
             scratch=scratch,
@@ -530,7 +530,7 @@ def sphere_light(
     return differentiable(
         lambda light: launch(
             _make_light(lanes),
-            dim,
+            launch_dim,
             cost=cost,
             inputs=[inputs],
             scratch=scratch if stores_sums else [*scratch, Scratch(*sums)],
