@@ -646,7 +646,7 @@ def test_transmittance_of_lobes(double, device, check, glossy):
     module, cells = double("stages.gloss.transmittance"), double("maths.directions").fibonacci(16)
     towards = unit(glossy[1][1][:, :, None] + 0.3 * random(4, 1, 2, 2, 3))
     arguments = (wp.float64, random(3, 1, 2, 16)), glossy[1], (wp.vec3d, towards)
-    check(lambda *arguments: module.transmittance_towards(*arguments, cells), *arguments)
+    check(lambda *arguments: module.transmittance_of_directions(*arguments, cells), *arguments)
 
 
 @pytest.mark.parametrize("quantity", [0, 1])

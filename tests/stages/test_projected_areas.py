@@ -141,7 +141,7 @@ def test_one_instance_serves_all(counts, device):
 def test_what_does_not_fit_is_refused(device):
     mean = mean_over_patch_samples(np.zeros(2, int), np.array([0.5, 0.5]), 1, device=device)
     normals = wp.zeros((1, 2), dtype=wp.vec3, device=device)
-    with pytest.raises(ValueError, match=r"passing: got shape \(1, 2, 8\), expected \[batch, 2, 32\]"):
+    with pytest.raises(ValueError, match=r"transmittance: got shape \(1, 2, 8\), expected \[batch, 2, 32\]"):
         find_projected_areas(normals, wp.zeros((1, 2, 8), dtype=wp.float32, device=device), mean, DIRECTIONS)
     setting = Setting(device, names=("ground",))
     frames = wp.array([setting.frames(setting.vertices[0])], dtype=wp.vec3, device=device)

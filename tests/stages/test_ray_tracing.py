@@ -417,8 +417,8 @@ def test_receivers_in_several_launches_get_what_they_get_in_one(device, monkeypa
     mesh, points, normals, expected = ball_over_points(device)
     basis, samples = HarmonicBasis(3), sample_map(np.ones((16, 32, 3), np.float32), 256)
     transfer = trace_transfer(mesh, points, normals, basis.functions, 256).numpy()
-    parts = ray_tracing.parts
-    monkeypatch.setattr(ray_tracing, "parts", lambda total, size, progress: parts(total, 5, progress))
+    parts = ray_tracing.progress_slices
+    monkeypatch.setattr(ray_tracing, "progress_slices", lambda total, size, progress: parts(total, 5, progress))
     assert np.abs(trace_transfer(mesh, points, normals, basis.functions, 256).numpy() - transfer).max() < 1e-6
     shading = trace_shading(mesh, points, normals, samples).numpy()
     assert np.abs(shading - expected[:, None]).max() < 0.06  # 256 rays: 4% measured

@@ -33,7 +33,7 @@ from warpshadow.pipeline.static import StaticBodies, VertexRows
 from warpshadow.scene.blockers import blocking_planes
 from warpshadow.stages.cached_cells import CachedRows, cell_transfer, shade_cached_cells
 from warpshadow.stages.gloss.reflection import blocked_radiance
-from warpshadow.stages.gloss.transmittance import transmittance_towards
+from warpshadow.stages.gloss.transmittance import transmittance_of_directions
 from warpshadow.stages.light_samples import CellSamples, cell_samples, even_samples, sample_map
 from warpshadow.stages.planes.partial_cells import SAMPLES, coverage_of_light
 from warpshadow.stages.planes.transmittance import plane_coverage, transmittance_past_planes
@@ -435,7 +435,7 @@ def _towards(
     if not directions.size:
         return wp.empty(directions.shape, dtype=wp.float32, device=directions.device)
     transmittance = _joined_cells(cells, count)
-    return transmittance_towards(transmittance, receivers.normals, directions, projected_light.facing)
+    return transmittance_of_directions(transmittance, receivers.normals, directions, projected_light.facing)
 
 
 def _joined_cells(cells: list[wp.array], count: int) -> wp.array:

@@ -51,11 +51,11 @@ def probe_grid(size: tuple[int, int], supersampling: int) -> tuple[np.ndarray, n
         supersampling: Samples of a pixel across and down.
     """
     counts = (PROBE_SPACING * -(-length // (supersampling * MAX_SIDE)) + 1 for length in size)
-    rows_, columns = (
+    rows, columns = (
         np.minimum(PROBE_SPACING * supersampling * np.arange(count), length - 1)
         for count, length in zip(counts, size, strict=True)
     )
-    return rows_, columns
+    return rows, columns
 
 
 @wp.func
@@ -82,27 +82,34 @@ def _has_key(keys: wp.array2d(dtype=wp.int32), row: int, column: int, key: int):
 
 
 @wp.func
-def _bend(shares: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.int32), row: int, column: int):
+def _curvature_error(shares: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.int32), row: int, column: int):
     """Error of linear interpolation over a distance of probes beside a probe: an eighth of the second difference."""
     key = keys[row, column]
-    bend = float(0.0)
-    for way in range(2):
-        i = 1 - way
-        if _has_key(keys, row - i, column - way, key) and _has_key(keys, row + i, column + way, key):
-            second = shares[row - i, column - way] - 2.0 * shares[row, column] + shares[row + i, column + way]
-            bend = wp.max(bend, wp.abs(second) / 8.0)
-    return bend
+    curvature_error = float(0.0)
+    for axis in range(2):
+        i = 1 - axis
+        if _has_key(keys, row - i, column - axis, key) and _has_key(keys, row + i, column + axis, key):
+            second_difference = (
+                shares[row - i, column - axis] - 2.0 * shares[row, column] + shares[row + i, column + axis]
+            )
+            curvature_error = wp.max(curvature_error, wp.abs(second_difference) / 8.0)
+    return curvature_error
 
 
 @wp.func
-def _gap(
-    shares: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.int32), key: int, at: wp.vec2i, a: wp.vec2i, b: wp.vec2i
+def _probe_error(
+    shares: wp.array2d(dtype=float),
+    keys: wp.array2d(dtype=wp.int32),
+    key: int,
+    probe: wp.vec2i,
+    a: wp.vec2i,
+    b: wp.vec2i,
 ):
     """Error of interpolation between two probes, at a third one."""
-    gap = float(0.0)
-    if keys[at[0], at[1]] == key:
-        gap = wp.abs(shares[at[0], at[1]] - 0.5 * (shares[a[0], a[1]] + shares[b[0], b[1]]))
-    return gap
+    probe_error = float(0.0)
+    if keys[probe[0], probe[1]] == key:
+        probe_error = wp.abs(shares[probe[0], probe[1]] - 0.5 * (shares[a[0], a[1]] + shares[b[0], b[1]]))
+    return probe_error
 
 
 @wp.kernel(enable_backward=False)
@@ -127,25 +134,25 @@ def _cut_squares(
     The first pixel of a square is its upper left.
     """
     view, i = split_row(first_row + wp.tid(), probe_keys.shape[1] / 2)
-    seen = sides[view]
-    near = probe_keys[view]
+    view_sides = sides[view]
+    view_keys = probe_keys[view]
     shares = probe_shares[view]
-    for j in range(near.shape[1] / 2):
+    for j in range(view_keys.shape[1] / 2):
         row = 2 * i
         column = 2 * j
-        key = near[row, column]
-        holds = key >= 0 and near[row, column + 2] == key and near[row + 2, column] == key
-        if holds and near[row + 2, column + 2] == key:
+        key = view_keys[row, column]
+        holds = key >= 0 and view_keys[row, column + 2] == key and view_keys[row + 2, column] == key
+        if holds and view_keys[row + 2, column + 2] == key:
             a = wp.vec2i(row, column)
             b = wp.vec2i(row, column + 2)
             c = wp.vec2i(row + 2, column)
             d = wp.vec2i(row + 2, column + 2)
-            gap = _gap(shares, near, key, wp.vec2i(row + 1, column + 1), b, c)
-            gap = wp.max(gap, _gap(shares, near, key, wp.vec2i(row, column + 1), a, b))
-            gap = wp.max(gap, _gap(shares, near, key, wp.vec2i(row + 1, column), a, c))
-            gap = wp.max(gap, _gap(shares, near, key, wp.vec2i(row + 1, column + 2), b, d))
-            gap = wp.max(gap, _gap(shares, near, key, wp.vec2i(row + 2, column + 1), c, d))
-            holds = gap <= tolerance
+            probe_error = _probe_error(shares, view_keys, key, wp.vec2i(row + 1, column + 1), b, c)
+            probe_error = wp.max(probe_error, _probe_error(shares, view_keys, key, wp.vec2i(row, column + 1), a, b))
+            probe_error = wp.max(probe_error, _probe_error(shares, view_keys, key, wp.vec2i(row + 1, column), a, c))
+            probe_error = wp.max(probe_error, _probe_error(shares, view_keys, key, wp.vec2i(row + 1, column + 2), b, d))
+            probe_error = wp.max(probe_error, _probe_error(shares, view_keys, key, wp.vec2i(row + 2, column + 1), c, d))
+            holds = probe_error <= tolerance
         else:
             holds = False
         for quarter in range(4):
@@ -153,19 +160,22 @@ def _cut_squares(
             top = row + quarter / 2
             left = column + quarter % 2
             if not holds:
-                key = near[top, left]
-                is_one = key >= 0 and near[top, left + 1] == key and near[top + 1, left] == key
+                key = view_keys[top, left]
+                is_one = key >= 0 and view_keys[top, left + 1] == key and view_keys[top + 1, left] == key
                 size = 1
-                if is_one and near[top + 1, left + 1] == key:
-                    low = wp.min(shares[top, left], shares[top, left + 1])
-                    low = wp.min(low, wp.min(shares[top + 1, left], shares[top + 1, left + 1]))
-                    high = wp.max(shares[top, left], shares[top, left + 1])
-                    high = wp.max(high, wp.max(shares[top + 1, left], shares[top + 1, left + 1]))
-                    bend = float(0.0)
-                    if high - low > tolerance:
+                if is_one and view_keys[top + 1, left + 1] == key:
+                    min_share = wp.min(shares[top, left], shares[top, left + 1])
+                    min_share = wp.min(min_share, wp.min(shares[top + 1, left], shares[top + 1, left + 1]))
+                    max_share = wp.max(shares[top, left], shares[top, left + 1])
+                    max_share = wp.max(max_share, wp.max(shares[top + 1, left], shares[top + 1, left + 1]))
+                    curvature_error = float(0.0)
+                    if max_share - min_share > tolerance:
                         for corner in range(4):
-                            bend = wp.max(bend, _bend(shares, near, top + corner / 2, left + corner % 2))
-                    if bend <= tolerance:
+                            curvature_error = wp.max(
+                                curvature_error,
+                                _curvature_error(shares, view_keys, top + corner / 2, left + corner % 2),
+                            )
+                    if curvature_error <= tolerance:
                         size = 2
             for pixel in range(4):
                 y = 2 * top + pixel / 2
@@ -173,10 +183,10 @@ def _cut_squares(
                 if y < sizes.shape[1] and x < sizes.shape[2]:
                     pixel_size = size
                     if size == 1:
-                        key = _key_at(seen, keys, sample_at(y, x, supersampling, height, width))
+                        key = _key_at(view_sides, keys, sample_at(y, x, supersampling, height, width))
                         for corner in range(1, 4):
                             other = sample_at(y + corner / 2, x + corner % 2, supersampling, height, width)
-                            if key < 0 or _key_at(seen, keys, other) != key:
+                            if key < 0 or _key_at(view_sides, keys, other) != key:
                                 pixel_size = 0
                     sizes[view, y, x] = pixel_size
                     is_first[view, y, x] = pixel_size > 0 and y % pixel_size == 0 and x % pixel_size == 0
@@ -213,12 +223,12 @@ def find_quadtree(
         inputs=[*inputs, supersampling, height, width, tolerance],
         outputs=[sizes, is_first],
     )
-    first = np.flatnonzero(is_first.numpy())
+    first_pixels = np.flatnonzero(is_first.numpy())
     numbers = np.zeros(shape, np.int32)
-    numbers.ravel()[first] = np.arange(len(first))
-    view_and_row, column = np.divmod(first, shape[2])
-    view, row = np.divmod(view_and_row, shape[1])
-    side = sizes.numpy().ravel()[first]
+    numbers.ravel()[first_pixels] = np.arange(len(first_pixels))
+    view_rows, column = np.divmod(first_pixels, shape[2])
+    view, row = np.divmod(view_rows, shape[1])
+    side = sizes.numpy().ravel()[first_pixels]
     top, bottom = (np.minimum(end * supersampling, height - 1) for end in (row, row + side))
     left, right = (np.minimum(end * supersampling, width - 1) for end in (column, column + side))
     top, bottom = ((view * height + end) * width for end in (top, bottom))
@@ -231,5 +241,5 @@ def find_quadtree(
 def keys_of(sides: wp.array, keys: np.ndarray, supersampling: int) -> np.ndarray:
     """The keys of the sides that probes see, −1 for none, int of shape [view, row, column]."""
     row, column = probe_grid(sides.shape[1:], supersampling)
-    seen = sides.numpy()[:, row[:, None], column]
-    return np.where(seen < 0, -1, keys[seen]) if len(keys) else np.full(seen.shape, -1)
+    view_sides = sides.numpy()[:, row[:, None], column]
+    return np.where(view_sides < 0, -1, keys[view_sides]) if len(keys) else np.full(view_sides.shape, -1)

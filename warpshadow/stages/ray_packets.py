@@ -48,30 +48,30 @@ def build_face_tree(positions: np.ndarray, faces: np.ndarray, device: wp.DeviceL
     corners = np.asarray(positions, np.float32)[np.asarray(faces)]
     face_count, depth = len(corners), max(int(np.ceil(np.log2(max(len(corners), 1) / _LEAF))), 0)
     lowest, highest = (np.ascontiguousarray(end(corners, axis=1).T) for end in (np.min, np.max))  # [3, face]
-    middles, permutation = (lowest + highest) / 2, np.arange(face_count)
+    centers, permutation = (lowest + highest) / 2, np.arange(face_count)
     for level in range(depth):
         bounds, halves = _bounds(face_count, level), _bounds(face_count, level + 1)[1::2]
-        low, high = (end.reduceat(middles, bounds[:-1], axis=1) for end in (np.minimum, np.maximum))
-        longest_axis = np.argmax(high - low, axis=0)
+        leaf_lowers, leaf_uppers = (end.reduceat(centers, bounds[:-1], axis=1) for end in (np.minimum, np.maximum))
+        longest_axis = np.argmax(leaf_uppers - leaf_lowers, axis=0)
         sizes = np.stack([np.diff(bounds), halves - bounds[:-1]], axis=1)  # faces, and those of the first half
         for size, half in np.unique(sizes, axis=0):
             boxes = np.flatnonzero((sizes == (size, half)).all(axis=1))
-            places = bounds[boxes, None] + np.arange(size)
-            parted = np.argpartition(middles[longest_axis[boxes, None], places], half, axis=1)
-            parted += bounds[boxes, None]
-            permutation[places], middles[:, places] = permutation[parted], middles[:, parted]
+            face_positions = bounds[boxes, None] + np.arange(size)
+            partitioned = np.argpartition(centers[longest_axis[boxes, None], face_positions], half, axis=1)
+            partitioned += bounds[boxes, None]
+            permutation[face_positions], centers[:, face_positions] = permutation[partitioned], centers[:, partitioned]
     corners, leaf_count = corners[permutation], 1 << depth
     lowers, uppers = np.zeros((2, 2 * leaf_count, 3), np.float32)
     if face_count:
         starts = _bounds(face_count, depth)[:-1]
-        low = np.minimum.reduceat(lowest[:, permutation], starts, axis=1).T
-        high = np.maximum.reduceat(highest[:, permutation], starts, axis=1).T
-        slack = np.float32(_SLACK) * np.maximum(-low, high).max(axis=1, keepdims=True)
-        lowers[leaf_count:], uppers[leaf_count:] = low - slack, high + slack
+        leaf_lowers = np.minimum.reduceat(lowest[:, permutation], starts, axis=1).T
+        leaf_uppers = np.maximum.reduceat(highest[:, permutation], starts, axis=1).T
+        slack = np.float32(_SLACK) * np.maximum(-leaf_lowers, leaf_uppers).max(axis=1, keepdims=True)
+        lowers[leaf_count:], uppers[leaf_count:] = leaf_lowers - slack, leaf_uppers + slack
     for level in reversed(range(depth)):
-        box, below = slice(1 << level, 2 << level), slice(2 << level, 4 << level)
-        lowers[box] = lowers[below].reshape(-1, 2, 3).min(axis=1)
-        uppers[box] = uppers[below].reshape(-1, 2, 3).max(axis=1)
+        parents, children = slice(1 << level, 2 << level), slice(2 << level, 4 << level)
+        lowers[parents] = lowers[children].reshape(-1, 2, 3).min(axis=1)
+        uppers[parents] = uppers[children].reshape(-1, 2, 3).max(axis=1)
     tree = FaceTree()
     tree.corners, tree.lowers, tree.uppers = (
         wp.array(values, dtype=wp.vec3, device=device) for values in (corners.reshape(-1, 3, 3), lowers, uppers)
@@ -208,20 +208,20 @@ def make_find_open() -> wp.Function:
         leaf_count: int,
         point: wp.vec3,
         normal: wp.vec3,
-        toward: Vectors,
+        ray_directions: Vectors,
         facing_rays: wp.int32,
-        last: int,
+        last_face: int,
     ) -> wp.vec2i:
         """Find which rays of a packet meet no face.
 
         Args:
             corners, lowers, uppers, leaf_count: The faces, a :class:`FaceTree`.
             point, normal: The receiver; none of these rays goes below its horizon.
-            toward: Directions of the rays.
+            ray_directions: Directions of the rays.
             facing_rays: Bits of the rays to trace, which are above the horizon.
-            last: A face that is likely to block them, −1 for none.
+            last_face: A face that is likely to block them, −1 for none.
         Returns:
-            Bits of the rays that escape; and a face that blocked some, or ``last``.
+            Bits of the rays that escape; and a face that blocked some, or ``last_face``.
         """
         ...
 

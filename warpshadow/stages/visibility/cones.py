@@ -74,8 +74,8 @@ def make_cone(lanes: int) -> wp.Function:
         distance = sqrt(wp.max(dot(scaled_offset, scaled_offset), Lane(MIN_DISTANCE2)))
         inverse = wp.cw_div(Lane(1.0), distance)
         sine2 = wp.min(wp.cw_mul(inverse, inverse), Lane(BLEND_SINE2))
-        # The blend's cubic misses its cosine by exactly 0 from 1.01 r on, where blend_position is: sums need no cases, and
-        # sine2 keeps its digits even where a compiler fuses multiplication and addition.
+        # The blend's cubic misses its cosine by exactly 0 from 1.01 r on, as blend_position is 0 there: sums need no
+        # cases, and sine2 keeps its digits even where a compiler fuses multiplication and addition.
         t = wp.min(wp.max((1.0 / BLEND) * (distance - Lane(1.0)), Lane(0.0)), Lane(1.0))
         blend_position = Lane(1.0) - t
         cosine_deficit = wp.cw_mul(
