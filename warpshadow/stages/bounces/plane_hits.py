@@ -21,7 +21,7 @@ from warpshadow.stages.planes.sides import (
     VisibleCell,
     footprint_on_side,
     footprint_on_side_adjoint,
-    load_place,
+    load_local_receiver,
     load_side,
     plane_share,
 )
@@ -119,12 +119,12 @@ def find_side_hits(
     for side_index in range(side_count):
         side = load_side(scene, side_index, store)
         grid = scene.grids[side.f]
-        place = load_place(store, side.f)
-        share = plane_share(scene, grid, side, place, cell, edges)
+        local_receiver = load_local_receiver(store, side.f)
+        share = plane_share(scene, grid, side, local_receiver, cell, edges)
         clear_hit(store, first_hit, side_index)
         if share > 0.0:
             hit = PlaneHit()
-            footprint = footprint_on_side(scene, grid, side, place, cell.direction)
+            footprint = footprint_on_side(scene, grid, side, local_receiver, cell.direction)
             hit.outline_coverage = share
             hit.mesh_share = 1.0
             hit.distance = footprint.distance
@@ -181,10 +181,19 @@ def find_side_hits_adjoint(
                     adj_mip += fetch_adjoint(texels, grid, scene, first_level, footprint, mip, adj_hit.radiosity)
                     if adj_texels:
                         scatter(adj_texels[instance], scene, first_level, mip, adj_hit.radiosity)
-            place = load_place(store, side.f)
+            local_receiver = load_local_receiver(store, side.f)
             adj_range = adj_hit.distance_range
             footprint_on_side_adjoint(
-                scene, grid, side, place, cell.direction, footprint, adj_mip, adj_hit.distance, adj_range, adj_store
+                scene,
+                grid,
+                side,
+                local_receiver,
+                cell.direction,
+                footprint,
+                adj_mip,
+                adj_hit.distance,
+                adj_range,
+                adj_store,
             )
             adj_share = adj_hit.coverage * hit.mesh_share
             adj_weighted_share = adj_share * side.weight

@@ -44,8 +44,8 @@ from warpshadow.stages.planes.cells import PlaneArrays, check_planes, plane_arra
 from warpshadow.stages.planes.prepared import PlaneBlockers
 from warpshadow.stages.planes.sides import (
     SIDE_ROWS,
-    place_receiver,
-    place_receiver_adjoint,
+    prepare_receiver,
+    prepare_receiver_adjoint,
     receiver_scratch,
     visible_cell,
 )
@@ -73,7 +73,7 @@ def _light_receivers(
     light: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver."""
-    batch, receiver, scratch_row, side_count = place_receiver(
+    batch, receiver, scratch_row, side_count = prepare_receiver(
         first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
     )
     store, edges = scratch[scratch_row], viewed_edges[scratch_row]
@@ -119,7 +119,7 @@ def _light_receivers_adjoint(
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver."""
-    batch, receiver, scratch_row, side_count = place_receiver(
+    batch, receiver, scratch_row, side_count = prepare_receiver(
         first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
     )
     store, edges, adj_store = scratch[scratch_row], viewed_edges[scratch_row], adj_scratch[scratch_row]
@@ -164,7 +164,7 @@ def _light_receivers_adjoint(
                 )
     if adj_normals:
         adj_normals[batch, receiver] = adj_normals[batch, receiver] + adj_normal
-    place_receiver_adjoint(
+    prepare_receiver_adjoint(
         batch,
         receiver,
         side_count,

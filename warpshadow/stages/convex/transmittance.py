@@ -70,9 +70,9 @@ def _find_silhouette(
             b = corners[end] - point
             n = wp.cross(a, b)
             if wp.length_sq(n) > _MIN_EDGE_SINE * _MIN_EDGE_SINE * wp.length_sq(a) * wp.length_sq(b):
-                viewed = viewed_edge(a, b, n)
-                viewed.corners = wp.vec2i(begin, end)
-                silhouette[count] = viewed
+                seen_edge = viewed_edge(a, b, n)
+                seen_edge.corners = wp.vec2i(begin, end)
+                silhouette[count] = seen_edge
                 count += 1
     return wp.where(count < 3, 0, count)  # fewer enclose nothing
 
@@ -84,14 +84,14 @@ def _silhouette_adjoint(
     """Add to the gradients of corners; returns that of the receiver."""
     adj_point = wp.vec3()
     for e in range(count):
-        viewed = silhouette[e]
-        adj_n = viewed.adj_normal / viewed.length
-        adj_a = wp.cross(viewed.end, adj_n)
-        adj_b = wp.cross(adj_n, viewed.begin)
+        seen_edge = silhouette[e]
+        adj_n = seen_edge.adj_normal / seen_edge.length
+        adj_a = wp.cross(seen_edge.end, adj_n)
+        adj_b = wp.cross(adj_n, seen_edge.begin)
         adj_point -= adj_a + adj_b
         if adj_corners:
-            wp.atomic_add(adj_corners, instance, viewed.corners[0], adj_a)
-            wp.atomic_add(adj_corners, instance, viewed.corners[1], adj_b)
+            wp.atomic_add(adj_corners, instance, seen_edge.corners[0], adj_a)
+            wp.atomic_add(adj_corners, instance, seen_edge.corners[1], adj_b)
     return adj_point
 
 
@@ -108,20 +108,20 @@ class PartBound:
 @wp.func
 def _find_bound(point: wp.vec3, normal: wp.vec3, bound: wp.vec4, radius: float):
     """Find the cone around a part, widened by the radius of cells."""
-    result = PartBound()
+    part_bound = PartBound()
     away = wp.vec3(bound[0], bound[1], bound[2]) - point
-    result.is_seen = wp.dot(normal, away) > -bound[3] or wp.length_sq(normal) == 0.0
+    part_bound.is_seen = wp.dot(normal, away) > -bound[3] or wp.length_sq(normal) == 0.0
     distance2 = wp.length_sq(away)
-    result.cosine = -1.0
+    part_bound.cosine = -1.0
     if distance2 > bound[3] * bound[3]:
         distance = wp.sqrt(distance2)
-        result.axis = away / distance
+        part_bound.axis = away / distance
         sine = _BOUND_MARGIN * bound[3] / distance
         cosine = wp.sqrt(wp.max(0.0, 1.0 - sine * sine))
         scale = 1.0 / wp.sqrt(1.0 + radius * radius)
-        result.cosine = (cosine - sine * radius) * scale
-        result.sine = (sine + cosine * radius) * scale
-    return result
+        part_bound.cosine = (cosine - sine * radius) * scale
+        part_bound.sine = (sine + cosine * radius) * scale
+    return part_bound
 
 
 @wp.func
@@ -134,7 +134,7 @@ def _reaches(bound: PartBound, axis: wp.vec3, half_angle: wp.vec2):
 
 
 @wp.func
-def _cover(
+def _find_coverage(
     point: wp.vec3,
     normal: wp.vec3,
     corners: wp.array(dtype=wp.vec3),
@@ -144,10 +144,10 @@ def _cover(
     body: int,
     cells: DirectionCells,
     radius: float,
-    passing: wp.array(dtype=wp.float32),
+    transmittances: wp.array(dtype=wp.float32),
     silhouette: wp.array(dtype=ViewedEdge),
     coverage: wp.array(dtype=wp.float32),
-    covered: wp.array(dtype=wp.int32),
+    covered_cells: wp.array(dtype=wp.int32),
 ):
     """Σ_parts h_q of a body, in cells through which something passes; returns how many it covers, and lists them."""
     covered_count = int(0)
@@ -161,7 +161,7 @@ def _cover(
                         direction = cells.directions[q]
                         if (
                             wp.dot(bound.axis, direction) > bound.cosine
-                            and passing[q] > 0.0
+                            and transmittances[q] > 0.0
                             and coverage[q] < 1.0
                             and is_above_horizon(normal, direction)
                         ):
@@ -172,14 +172,14 @@ def _cover(
                                 share = convex_coverage(silhouette, 0, count, direction, radius)
                             if share > 0.0:
                                 if coverage[q] == 0.0:
-                                    covered[covered_count] = q
+                                    covered_cells[covered_count] = q
                                     covered_count += 1
                                 coverage[q] = coverage[q] + share
     return covered_count
 
 
 @wp.kernel(enable_backward=False)
-def _pass(
+def _attenuate(
     first_row: int,
     worker: int,
     # in
@@ -195,22 +195,22 @@ def _pass(
     # scratch
     silhouettes: wp.array2d(dtype=ViewedEdge),
     coverages: wp.array2d(dtype=wp.float32),
-    covered: wp.array2d(dtype=wp.int32),
+    covered_cells: wp.array2d(dtype=wp.int32),
     # out
-    passing: wp.array3d(dtype=wp.float32),
+    transmittances: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a receiver."""
     row = first_row + wp.tid()
     batch, receiver = split_row(row, points.shape[1])
-    place = scratch_place(worker, row)
+    slot = scratch_place(worker, row)
     corner_batch = instance_in(batch, corners.shape[0])
     normal = horizon_normal(horizon_normals, batch, receiver)
     for q in range(cells.directions.shape[0]):
-        passing[batch, receiver, q] = 1.0
-        coverages[place, q] = 0.0
+        transmittances[batch, receiver, q] = 1.0
+        coverages[slot, q] = 0.0
     for body in range(parts.first_part.shape[0] - 1):
         if body != skip and parts.blocks[body] == 1:
-            covered_count = _cover(
+            covered_count = _find_coverage(
                 points[batch, receiver],
                 normal,
                 corners[corner_batch],
@@ -220,19 +220,21 @@ def _pass(
                 body,
                 cells,
                 radius,
-                passing[batch, receiver],
-                silhouettes[place],
-                coverages[place],
-                covered[place],
+                transmittances[batch, receiver],
+                silhouettes[slot],
+                coverages[slot],
+                covered_cells[slot],
             )
             for k in range(covered_count):
-                q = covered[place, k]
-                passing[batch, receiver, q] = passing[batch, receiver, q] * wp.max(0.0, 1.0 - coverages[place, q])
-                coverages[place, q] = 0.0
+                q = covered_cells[slot, k]
+                transmittances[batch, receiver, q] = transmittances[batch, receiver, q] * wp.max(
+                    0.0, 1.0 - coverages[slot, q]
+                )
+                coverages[slot, q] = 0.0
 
 
 @wp.kernel(enable_backward=False)
-def _pass_adjoint(
+def _attenuate_adjoint(
     first_row: int,
     worker: int,
     # in
@@ -245,12 +247,12 @@ def _pass_adjoint(
     cells: DirectionCells,
     radius: float,
     skip: int,
-    passing: wp.array3d(dtype=wp.float32),
-    adj_passing: wp.array3d(dtype=wp.float32),
+    transmittances: wp.array3d(dtype=wp.float32),
+    adj_transmittances: wp.array3d(dtype=wp.float32),
     # scratch
     silhouettes: wp.array2d(dtype=ViewedEdge),
     coverages: wp.array2d(dtype=wp.float32),
-    covered: wp.array2d(dtype=wp.int32),
+    covered_cells: wp.array2d(dtype=wp.int32),
     # out
     adj_points: wp.array2d(dtype=wp.vec3),
     # sums
@@ -259,15 +261,15 @@ def _pass_adjoint(
     """A thread owns a receiver:  ∂P/∂h = −P / (1 − Σ_parts h) where that is positive."""
     row = first_row + wp.tid()
     batch, receiver = split_row(row, points.shape[1])
-    place = scratch_place(worker, row)
+    slot = scratch_place(worker, row)
     corner_batch = instance_in(batch, corners.shape[0])
     point, normal = points[batch, receiver], horizon_normal(horizon_normals, batch, receiver)
     adj_point = wp.vec3()
     for q in range(cells.directions.shape[0]):
-        coverages[place, q] = 0.0
+        coverages[slot, q] = 0.0
     for body in range(parts.first_part.shape[0] - 1):
         if body != skip and parts.blocks[body] == 1:
-            covered_count = _cover(
+            covered_count = _find_coverage(
                 point,
                 normal,
                 corners[corner_batch],
@@ -277,36 +279,36 @@ def _pass_adjoint(
                 body,
                 cells,
                 radius,
-                passing[batch, receiver],
-                silhouettes[place],
-                coverages[place],
-                covered[place],
+                transmittances[batch, receiver],
+                silhouettes[slot],
+                coverages[slot],
+                covered_cells[slot],
             )
             for part in range(parts.first_part[body], parts.first_part[body + 1]):
                 bound = _find_bound(point, normal, bounds[corner_batch, part], radius)
                 if bound.is_seen and covered_count > 0:
                     count = int(_UNKNOWN_COUNT)
                     for k in range(covered_count):
-                        q = covered[place, k]
+                        q = covered_cells[slot, k]
                         direction = cells.directions[q]
-                        left = 1.0 - coverages[place, q]
-                        adj = adj_passing[batch, receiver, q] * passing[batch, receiver, q]
-                        if adj != 0.0 and left > 0.0 and wp.dot(bound.axis, direction) > bound.cosine:
+                        open_share = 1.0 - coverages[slot, q]
+                        adj_open = adj_transmittances[batch, receiver, q] * transmittances[batch, receiver, q]
+                        if adj_open != 0.0 and open_share > 0.0 and wp.dot(bound.axis, direction) > bound.cosine:
                             if count == _UNKNOWN_COUNT:
                                 count = _find_silhouette(
-                                    point, corners[corner_batch], planes[corner_batch], parts, part, silhouettes[place]
+                                    point, corners[corner_batch], planes[corner_batch], parts, part, silhouettes[slot]
                                 )
-                            coverage_adjoint(silhouettes[place], 0, count, direction, radius, -adj / left)
-                    adj_point += _silhouette_adjoint(silhouettes[place], wp.max(count, 0), corner_batch, adj_corners)
+                            coverage_adjoint(silhouettes[slot], 0, count, direction, radius, -adj_open / open_share)
+                    adj_point += _silhouette_adjoint(silhouettes[slot], wp.max(count, 0), corner_batch, adj_corners)
             for k in range(covered_count):
-                coverages[place, covered[place, k]] = 0.0
+                coverages[slot, covered_cells[slot, k]] = 0.0
     if adj_points:
         adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
 
 
 def transmittance_past_parts(
     points: wp.array,
-    placed: PlacedParts,
+    placed_parts: PlacedParts,
     blockers: ConvexBlockers,
     directions: np.ndarray,
     *,
@@ -318,7 +320,7 @@ def transmittance_past_parts(
 
     Args:
         points: Receivers [scene units], vec3 of shape [batch, receiver].
-        placed: Where the parts are, from :meth:`.ConvexBlockers.placed`; the batch may be 1.
+        placed_parts: Where the parts are, from :meth:`.ConvexBlockers.placed`; the batch may be 1.
         blockers: The bodies.
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
         radius: Of cells that do not tile the sphere [rad]; by default that of so many even ones, which do.
@@ -328,31 +330,35 @@ def transmittance_past_parts(
     Returns:
         Float32 of shape [batch, receiver, direction].
 
-    Differentiable: points, placed. Not: horizon_normals, which decides by steps.
+    Differentiable: points, placed_parts. Not: horizon_normals, which decides by steps.
     """
     check.shape("points", points.shape, ("batch", "receiver"))
     check.shape("directions", directions.shape, ("direction", 3))
     if skip is not None:
         check.choice("skip", skip, range(blockers.body_count))
-    points = expand(points, common_batch({"points": points, "corners": placed.corners}))
+    points = expand(points, common_batch({"points": points, "corners": placed_parts.corners}))
     own_radius = cell_radius(len(directions)) if radius is None else radius
     cells = make_cells(directions, SOFTNESS, points.device)
-    inputs = [points, horizon_normals, *placed, blockers.arrays, cells, own_radius, -1 if skip is None else skip]
-    by_cell = (len(directions),)
-    scratch = [Scratch((blockers.edge_count,), ViewedEdge), Scratch(by_cell, wp.float32), Scratch(by_cell, wp.int32)]
-    cost = _PART_COST * placed.bounds.shape[1]
-    passing = wp.empty((*points.shape, len(directions)), dtype=wp.float32, device=points.device)
+    inputs = [points, horizon_normals, *placed_parts, blockers.arrays, cells, own_radius, -1 if skip is None else skip]
+    cell_shape = (len(directions),)
+    scratch = [
+        Scratch((blockers.edge_count,), ViewedEdge),
+        Scratch(cell_shape, wp.float32),
+        Scratch(cell_shape, wp.int32),
+    ]
+    cost = _PART_COST * placed_parts.bounds.shape[1]
+    transmittances = wp.empty((*points.shape, len(directions)), dtype=wp.float32, device=points.device)
     return differentiable(
-        lambda result: launch(_pass, points.size, inputs=inputs, outputs=[result], scratch=scratch, cost=cost),
-        lambda adj_passing: launch(
-            _pass_adjoint,
+        lambda result: launch(_attenuate, points.size, inputs=inputs, outputs=[result], scratch=scratch, cost=cost),
+        lambda adj_transmittances: launch(
+            _attenuate_adjoint,
             points.size,
-            inputs=[*inputs, passing, adj_passing],
+            inputs=[*inputs, transmittances, adj_transmittances],
             outputs=[points.grad],
-            sums=[placed.corners.grad],
+            sums=[placed_parts.corners.grad],
             scratch=scratch,
             cost=2 * cost,
         ),
-        result=passing,
-        variables=[points, placed.corners],
+        result=transmittances,
+        variables=[points, placed_parts.corners],
     )

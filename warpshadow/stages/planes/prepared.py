@@ -100,14 +100,16 @@ class PlaneBlockers:
             edges.append((grid.outline if is_exact else grid.rectangle()).reshape(-1, 4))
             matrices = _halvings(*grid.covered.shape)
             for side in range(grid.sides):
-                for matrix, blurred, (height, width) in matrices:
+                for matrix, level_matrix, (height, width) in matrices:
                     levels.append((texel_count, width, height))
                     scales.append((width / grid.covered.shape[1], height / grid.covered.shape[0]))
                     texel_count += width * height
                     covered.append(matrix @ grid.covered.ravel())
                     if patch_count:
                         first = body.first_patch + side * grid.covered.size
-                        pyramids.append(_shifted(blurred.multiply(grid.covered.ravel()).tocsr(), first, patch_count))
+                        pyramids.append(
+                            _shifted(level_matrix.multiply(grid.covered.ravel()).tocsr(), first, patch_count)
+                        )
             grids.append(_kernel_grid(body, first_level, len(matrices), first_edge, edges[-1]))
             grids[-1].is_covered_by_texels = int(not is_exact)
             frames.append(_frame_matrix(body, vertex_count))
@@ -115,7 +117,7 @@ class PlaneBlockers:
         vectors = outlines[:, 2:] - outlines[:, :2]
         return PlaneBlockers(
             len(bodies),
-            tuple(number for number, body in enumerate(bodies) if body.blocks),
+            tuple(body_index for body_index, body in enumerate(bodies) if body.blocks),
             wp.array(grids, dtype=PlaneGrid, device=device),
             wp.array(np.array(levels), dtype=wp.vec3i, device=device),
             wp.array(np.array(scales), dtype=wp.vec2, device=device),
@@ -156,12 +158,12 @@ def _halvings(height: int, width: int) -> list[tuple[csr_matrix, csr_matrix, tup
     sizes = [(height, width)]
     while max(sizes[-1]) > 1:
         sizes.append((max(sizes[-1][0] // 2, 1), max(sizes[-1][1] // 2, 1)))
-    result = []
+    levels = []
     for rows, columns in sizes:
-        of_rows, of_columns = _means(height, rows), _means(width, columns)
-        matrices = kron(of_rows, of_columns), kron(blur(rows) @ of_rows, blur(columns) @ of_columns)
-        result.append((matrices[0].tocsr(), matrices[1].tocsr(), (rows, columns)))
-    return result
+        row_means, column_means = _means(height, rows), _means(width, columns)
+        matrices = kron(row_means, column_means), kron(blur(rows) @ row_means, blur(columns) @ column_means)
+        levels.append((matrices[0].tocsr(), matrices[1].tocsr(), (rows, columns)))
+    return levels
 
 
 def _means(fine: int, coarse: int) -> csr_matrix:
@@ -199,13 +201,15 @@ def _frame_matrix(body: PlaneBody, vertex_count: int) -> csr_matrix:
 
     vertices = np.unique(body.faces)
     points = (body.positions[vertices].astype(np.float64) - body.grid.origin) @ body.grid.frame[:2].T
-    first = np.linalg.norm(points - points.mean(axis=0), axis=1).argmax()
-    second = np.linalg.norm(points - points[first], axis=1).argmax()
-    axis_u = points[second] - points[first]
-    third = np.abs(axis_u[0] * (points - points[first])[:, 1] - axis_u[1] * (points - points[first])[:, 0]).argmax()
-    chosen = [first, second, third]
+    first_point = np.linalg.norm(points - points.mean(axis=0), axis=1).argmax()
+    second_point = np.linalg.norm(points - points[first_point], axis=1).argmax()
+    axis_u = points[second_point] - points[first_point]
+    third_point = np.abs(
+        axis_u[0] * (points - points[first_point])[:, 1] - axis_u[1] * (points - points[first_point])[:, 0]
+    ).argmax()
+    frame_points = [first_point, second_point, third_point]
     # the rows w with Σ w = 1 and Σ w p = 0 for the origin, and Σ w = 0 and Σ w p = e for an axis e
-    system = np.concatenate([points[chosen].T, np.ones((1, 3))])
+    system = np.concatenate([points[frame_points].T, np.ones((1, 3))])
     weights = np.linalg.solve(system, np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]).T).T
-    columns = np.tile(body.first_vertex + vertices[chosen], 3)
+    columns = np.tile(body.first_vertex + vertices[frame_points], 3)
     return csr_matrix((weights.ravel(), (np.repeat(np.arange(3), 3), columns)), shape=(3, vertex_count))

@@ -20,9 +20,9 @@ from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.cell_coverage import ViewedEdge, coverage_adjoint
 from warpshadow.stages.planes.cells import (
+    LocalReceiver,
     PlaneArrays,
     PlaneFootprint,
-    ReceiverInPlane,
     check_planes,
     fetch,
     fetch_adjoint,
@@ -37,11 +37,11 @@ from warpshadow.stages.planes.sides import (
     VisibleCell,
     footprint_on_side,
     footprint_on_side_adjoint,
-    load_place,
+    load_local_receiver,
     load_side,
-    place_receiver,
-    place_receiver_adjoint,
     plane_share,
+    prepare_receiver,
+    prepare_receiver_adjoint,
     receiver_scratch,
     visible_cell,
 )
@@ -51,11 +51,11 @@ _PASS_COST = 0.4  # time of a cell that is only multiplied [ns]
 
 
 @wp.struct
-class PlaneCover:
+class PlaneCoverage:
     """Coverage of a cell by a side."""
 
     outline: float  # by its outline
-    part: float  # of that, that the mesh covers, by texels
+    mesh_share: float  # of that, that the mesh covers, by texels
     footprint: PlaneFootprint  # of these texels
 
 
@@ -64,19 +64,19 @@ def side_coverage(
     scene: PlaneArrays,
     grid: PlaneGrid,
     side: PlaneSide,
-    place: ReceiverInPlane,
+    local_receiver: LocalReceiver,
     cell: VisibleCell,
     edges: wp.array(dtype=ViewedEdge),
 ):
     """Coverage of a cell by a side."""
-    covered = PlaneCover()
-    covered.part = 1.0
-    covered.outline = plane_share(scene, grid, side, place, cell, edges)
-    if is_covered_by_texels(grid) and covered.outline > 0.0:
-        covered.footprint = footprint_on_side(scene, grid, side, place, cell.direction)
-        mip = find_mip_footprint(grid, scene, covered.footprint)
-        covered.part = fetch(scene.covered, scene, grid.first_level, mip)[0]
-    return covered
+    coverage = PlaneCoverage()
+    coverage.mesh_share = 1.0
+    coverage.outline = plane_share(scene, grid, side, local_receiver, cell, edges)
+    if is_covered_by_texels(grid) and coverage.outline > 0.0:
+        coverage.footprint = footprint_on_side(scene, grid, side, local_receiver, cell.direction)
+        mip = find_mip_footprint(grid, scene, coverage.footprint)
+        coverage.mesh_share = fetch(scene.covered, scene, grid.first_level, mip)[0]
+    return coverage
 
 
 @wp.func
@@ -84,27 +84,29 @@ def side_coverage_adjoint(
     scene: PlaneArrays,
     grid: PlaneGrid,
     side: PlaneSide,
-    place: ReceiverInPlane,
+    local_receiver: LocalReceiver,
     cell: VisibleCell,
-    adj: float,
+    adj_coverage: float,
     edges: wp.array(dtype=ViewedEdge),
     adj_store: wp.array(dtype=wp.vec3),
 ):
     """Add to the gradients of the receiver relative to the plane, of the side's weight, and of viewed edges."""
-    covered = PlaneCover()
-    covered.part = 1.0
+    coverage = PlaneCoverage()
+    coverage.mesh_share = 1.0
     if side.weight < 1.0 or is_covered_by_texels(grid):
-        covered = side_coverage(scene, grid, side, place, cell, edges)
-        adj_weight = adj * covered.part * covered.outline / side.weight
+        coverage = side_coverage(scene, grid, side, local_receiver, cell, edges)
+        adj_weight = adj_coverage * coverage.mesh_share * coverage.outline / side.weight
         adj_store[side.row] = adj_store[side.row] + wp.vec3(0.0, 0.0, adj_weight)
-    if is_covered_by_texels(grid) and covered.outline > 0.0:
-        footprint = covered.footprint
-        adj_part = wp.vec3(adj * covered.outline, 0.0, 0.0)
+    if is_covered_by_texels(grid) and coverage.outline > 0.0:
+        footprint = coverage.footprint
+        adj_part = wp.vec3(adj_coverage * coverage.outline, 0.0, 0.0)
         mip = find_mip_footprint(grid, scene, footprint)
         adj_mip = fetch_adjoint(scene.covered, grid, scene, grid.first_level, footprint, mip, adj_part)
-        footprint_on_side_adjoint(scene, grid, side, place, cell.direction, footprint, adj_mip, 0.0, 0.0, adj_store)
-    weighted = adj * side.weight * covered.part
-    coverage_adjoint(edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, weighted)
+        footprint_on_side_adjoint(
+            scene, grid, side, local_receiver, cell.direction, footprint, adj_mip, 0.0, 0.0, adj_store
+        )
+    adj_outline = adj_coverage * side.weight * coverage.mesh_share
+    coverage_adjoint(edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, adj_outline)
 
 
 @wp.func
@@ -122,7 +124,7 @@ def is_above_horizon(normal: wp.vec3, direction: wp.vec3):
 
 
 @wp.kernel(enable_backward=False)
-def _cover(
+def _find_coverage(
     first_row: int,
     worker: int,
     # in
@@ -136,33 +138,33 @@ def _cover(
     scratch: wp.array2d(dtype=wp.vec3),
     viewed_edges: wp.array2d(dtype=ViewedEdge),
     # out
-    result: wp.array3d(dtype=wp.float32),
+    coverages: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a receiver:  C_q = Σ_k h_k."""
-    batch, receiver, scratch_row, side_count = place_receiver(
+    batch, receiver, scratch_row, side_count = prepare_receiver(
         first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
     )
     store, edges = scratch[scratch_row], viewed_edges[scratch_row]
     normal = horizon_normal(horizon_normals, batch, receiver)
-    covered = result[batch, receiver]
+    coverage = coverages[batch, receiver]
     for q in range(directions.shape[0]):
-        covered[q] = 0.0
+        coverage[q] = 0.0
     for i in range(side_count):
         side = load_side(scene, i, store)
         grid = scene.grids[side.f]
-        in_plane = load_place(store, side.f)
+        local_receiver = load_local_receiver(store, side.f)
         if grid.blocks == 1:
             for q in range(directions.shape[0]):
                 direction = directions[q]
-                if is_above_horizon(normal, direction) and covered[q] < 1.0:
+                if is_above_horizon(normal, direction) and coverage[q] < 1.0:
                     cell = visible_cell(scene, normal, direction)
-                    by_side = side_coverage(scene, grid, side, in_plane, cell, edges)
-                    if by_side.outline > 0.0:
-                        covered[q] = covered[q] + by_side.outline * by_side.part
+                    coverage_of_side = side_coverage(scene, grid, side, local_receiver, cell, edges)
+                    if coverage_of_side.outline > 0.0:
+                        coverage[q] = coverage[q] + coverage_of_side.outline * coverage_of_side.mesh_share
 
 
 @wp.kernel(enable_backward=False)
-def _cover_adjoint(
+def _find_coverage_adjoint(
     first_row: int,
     worker: int,
     # in
@@ -172,7 +174,7 @@ def _cover_adjoint(
     fronts: wp.array3d(dtype=wp.float32),
     scene: PlaneArrays,
     directions: wp.array(dtype=wp.vec3),
-    adj_result: wp.array3d(dtype=wp.float32),
+    adj_coverages: wp.array3d(dtype=wp.float32),
     # scratch
     scratch: wp.array2d(dtype=wp.vec3),
     viewed_edges: wp.array2d(dtype=ViewedEdge),
@@ -184,7 +186,7 @@ def _cover_adjoint(
     adj_frames: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver; cells that are covered wholly are taken to have no gradient."""
-    batch, receiver, scratch_row, side_count = place_receiver(
+    batch, receiver, scratch_row, side_count = prepare_receiver(
         first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
     )
     store, edges, adj_store = scratch[scratch_row], viewed_edges[scratch_row], adj_scratch[scratch_row]
@@ -194,14 +196,14 @@ def _cover_adjoint(
     for i in range(side_count):
         side = load_side(scene, i, store)
         grid = scene.grids[side.f]
-        in_plane = load_place(store, side.f)
+        local_receiver = load_local_receiver(store, side.f)
         if grid.blocks == 1:
             for q in range(directions.shape[0]):
-                adj = adj_result[batch, receiver, q]
-                if adj != 0.0 and is_above_horizon(normal, directions[q]):
+                adj_coverage = adj_coverages[batch, receiver, q]
+                if adj_coverage != 0.0 and is_above_horizon(normal, directions[q]):
                     cell = visible_cell(scene, normal, directions[q])
-                    side_coverage_adjoint(scene, grid, side, in_plane, cell, adj, edges, adj_store)
-    place_receiver_adjoint(
+                    side_coverage_adjoint(scene, grid, side, local_receiver, cell, adj_coverage, edges, adj_store)
+    prepare_receiver_adjoint(
         batch,
         receiver,
         side_count,
@@ -219,43 +221,47 @@ def _cover_adjoint(
 
 
 @wp.kernel(enable_backward=False)
-def _pass(
+def _attenuate(
     first_row: int,
     worker: int,
     # in
     transmittance: wp.array3d(dtype=wp.float32),
-    covered: wp.array3d(dtype=wp.float32),
+    coverage: wp.array3d(dtype=wp.float32),
     # out
-    passing: wp.array3d(dtype=wp.float32),
+    attenuated: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a receiver:  P_q = T_q max(0, 1 − C_q)."""
-    batch, receiver = split_row(first_row + wp.tid(), passing.shape[1])
-    for q in range(passing.shape[2]):
-        passing[batch, receiver, q] = transmittance[batch, receiver, q] * wp.max(0.0, 1.0 - covered[batch, receiver, q])
+    batch, receiver = split_row(first_row + wp.tid(), attenuated.shape[1])
+    for q in range(attenuated.shape[2]):
+        attenuated[batch, receiver, q] = transmittance[batch, receiver, q] * wp.max(
+            0.0, 1.0 - coverage[batch, receiver, q]
+        )
 
 
 @wp.kernel(enable_backward=False)
-def _pass_adjoint(
+def _attenuate_adjoint(
     first_row: int,
     worker: int,
     # in
     transmittance: wp.array3d(dtype=wp.float32),
-    covered: wp.array3d(dtype=wp.float32),
-    adj_passing: wp.array3d(dtype=wp.float32),
+    coverage: wp.array3d(dtype=wp.float32),
+    adj_attenuated: wp.array3d(dtype=wp.float32),
     # out
     adj_transmittance: wp.array3d(dtype=wp.float32),
     adj_covered: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a receiver."""
-    batch, receiver = split_row(first_row + wp.tid(), adj_passing.shape[1])
-    for q in range(adj_passing.shape[2]):
-        adj, left = adj_passing[batch, receiver, q], 1.0 - covered[batch, receiver, q]
-        if left > 0.0:
+    batch, receiver = split_row(first_row + wp.tid(), adj_attenuated.shape[1])
+    for q in range(adj_attenuated.shape[2]):
+        adj_coverage, open_share = adj_attenuated[batch, receiver, q], 1.0 - coverage[batch, receiver, q]
+        if open_share > 0.0:
             if adj_transmittance:
-                adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + adj * left
+                adj_transmittance[batch, receiver, q] = (
+                    adj_transmittance[batch, receiver, q] + adj_coverage * open_share
+                )
             if adj_covered:
-                blocked = adj * transmittance[batch, receiver, q]
-                adj_covered[batch, receiver, q] = adj_covered[batch, receiver, q] - blocked
+                adj_open_share = adj_coverage * transmittance[batch, receiver, q]
+                adj_covered[batch, receiver, q] = adj_covered[batch, receiver, q] - adj_open_share
 
 
 def plane_coverage(
@@ -299,11 +305,13 @@ def plane_coverage(
     inputs, cost = [points, horizon_normals, frames, fronts, scene, cells], _CELL_COST * cells.size * planes.count
     scratch = receiver_scratch(planes)
     return differentiable(
-        lambda result: launch(_cover, points.size, inputs=inputs, scratch=scratch, outputs=[result], cost=cost),
-        lambda adj_result: launch(
-            _cover_adjoint,
+        lambda coverages: launch(
+            _find_coverage, points.size, inputs=inputs, scratch=scratch, outputs=[coverages], cost=cost
+        ),
+        lambda adj_coverages: launch(
+            _find_coverage_adjoint,
             points.size,
-            inputs=[*inputs, adj_result],
+            inputs=[*inputs, adj_coverages],
             scratch=[*scratch, scratch[0]],
             outputs=[points.grad, None if fronts is None else fronts.grad],
             sums=[frames.grad],
@@ -314,28 +322,28 @@ def plane_coverage(
     )
 
 
-def transmittance_past_planes(transmittance: wp.array, covered: wp.array) -> wp.array:
+def transmittance_past_planes(transmittance: wp.array, coverage: wp.array) -> wp.array:
     """Transmittance past planes, given the transmittance past all else, T_q max(0, 1 − C_q).
 
     Args:
         transmittance: Past all else, float32 of shape [batch, receiver, direction]; its batch may be 1.
-        covered: Coverage by planes, :func:`plane_coverage`, of the same shape; its batch may be 1.
+        coverage: Coverage by planes, :func:`plane_coverage`, of the same shape; its batch may be 1.
     Returns:
         Float32 of the same shape.
-    Differentiable: transmittance, covered.
+    Differentiable: transmittance, coverage.
     """
-    check.shape("transmittance", transmittance.shape, ("batch", *covered.shape[1:]))
-    count = common_batch({"transmittance": transmittance, "covered": covered})
-    transmittance, covered = expand_rows(transmittance, count), expand_rows(covered, count)
+    check.shape("transmittance", transmittance.shape, ("batch", *coverage.shape[1:]))
+    count = common_batch({"transmittance": transmittance, "coverage": coverage})
+    transmittance, coverage = expand_rows(transmittance, count), expand_rows(coverage, count)
     rows, cost = transmittance.shape[0] * transmittance.shape[1], _PASS_COST * transmittance.shape[2]
-    inputs = [transmittance, covered]
+    inputs = [transmittance, coverage]
     return differentiable(
-        lambda passing: launch(_pass, rows, inputs=inputs, outputs=[passing], cost=cost),
-        lambda adj_passing: launch(
-            _pass_adjoint,
+        lambda attenuated: launch(_attenuate, rows, inputs=inputs, outputs=[attenuated], cost=cost),
+        lambda adj_attenuated: launch(
+            _attenuate_adjoint,
             rows,
-            inputs=[*inputs, adj_passing],
-            outputs=[transmittance.grad, covered.grad],
+            inputs=[*inputs, adj_attenuated],
+            outputs=[transmittance.grad, coverage.grad],
             cost=2 * cost,
         ),
         result=wp.empty(transmittance.shape, dtype=wp.float32, device=transmittance.device),
