@@ -101,7 +101,7 @@ def refinement(device):
 
 def seen_from(fit, chosen):
     """Points [receiver, 3] of a refinement, and the directions that they look to [receiver, direction, 3]."""
-    places = fit.receivers.places[:, chosen].T.astype(np.float64)
+    places = fit.receivers.frame_rows[:, chosen].T.astype(np.float64)
     frames = places[:, 3:].reshape(-1, 3, 3)
     return places[:, :3], np.einsum("qi,pij->pqj", fit.receivers.directions, frames)
 

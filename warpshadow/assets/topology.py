@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from warpshadow.maths.adjacency import edge_neighbors, number_places
+from warpshadow.maths.adjacency import edge_neighbors, number_positions
 from warpshadow.maths.components import connected_components
 
 CREASE = 30.0  # edges whose faces bend by more are sharp [degrees]
@@ -18,7 +18,7 @@ def welded(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     The first of each stays, in order: so split vertices become one again.
     """
     used = np.unique(faces)
-    places = number_places(positions[used])
+    places = number_positions(positions[used])
     _, first, place = np.unique(places, return_index=True, return_inverse=True)
     first_vertices = np.sort(first)
     number = np.searchsorted(first_vertices, first)[place]
@@ -58,7 +58,7 @@ def join_at_places(positions: np.ndarray, faces: np.ndarray, *attributes: np.nda
 
 def first_at_places(rows: np.ndarray) -> np.ndarray:
     """Index of the first row that equals each, shape [row]."""
-    group = number_places(rows)
+    group = number_positions(rows)
     first = np.empty(len(group), np.int64)
     first[group[::-1]] = np.arange(len(group))[::-1]  # the last of these assignments stays
     return first[group]
@@ -80,7 +80,7 @@ def part_at_creases(
         The faces by new vertices, int32 of shape [face, 3]; and the vertex that each new one is a copy of, int32 of
         shape [vertex]: the old ones are the first, in their order.
     """
-    places = number_places(positions)[surface.faces]
+    places = number_positions(positions)[surface.faces]
     face, edge, neighbor, cosines = _bends(surface, positions, each_once=False)
     is_smooth = cosines >= np.cos(np.radians(angle))
     face, edge, neighbor = face[is_smooth], edge[is_smooth], neighbor[is_smooth]
@@ -225,7 +225,7 @@ def is_listed_first(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
     Faces without area are not compared.
     """
-    places = number_places(positions)
+    places = number_positions(positions)
     sums = _scrambled(places)[faces].sum(axis=1)  # equal for the same corners, and hardly ever for others
     rising = np.sort(sums)
     repeated = rising[1:][rising[1:] == rising[:-1]]
@@ -252,7 +252,7 @@ def _scrambled(numbers: np.ndarray) -> np.ndarray:
 
 def join_faces(positions: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | None) -> MeshTopology:
     """Join faces of which none is listed twice."""
-    places = number_places(positions)[faces]
+    places = number_positions(positions)[faces]
     neighbors = edge_neighbors(places)
     first, last = np.roll(places, -1, axis=1), np.roll(places, -2, axis=1)  # of the edges opposite to corners
     neighbor = np.maximum(neighbors, 0)

@@ -82,10 +82,10 @@ def brightest_chunk(power: np.ndarray, is_chosen: np.ndarray) -> tuple[np.ndarra
     """
     cells = np.flatnonzero(is_chosen)
     cells = np.sort(cells[np.argsort(-power[cells], kind="stable")[:CHUNK]])
-    repeated = np.arange(CHUNK) * len(cells) // CHUNK
-    places = np.full(len(power), -1, np.int32)
-    places[cells] = np.searchsorted(repeated, np.arange(len(cells)))
-    return cells, repeated, places
+    repeated_cells = np.arange(CHUNK) * len(cells) // CHUNK
+    slots = np.full(len(power), -1, np.int32)
+    slots[cells] = np.searchsorted(repeated_cells, np.arange(len(cells)))
+    return cells, repeated_cells, slots
 
 
 class BundleCones(NamedTuple):

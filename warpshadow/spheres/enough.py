@@ -38,8 +38,8 @@ def enough_spheres(
     mesh: NormalizedMesh,
     receivers: FitReceivers,
     seed: int,
-    known: Sequence[Sequence[float]] = (),
-    keep: Callable[[list[Sequence[float]]], None] = lambda errors: None,
+    cached_errors: Sequence[Sequence[float]] = (),
+    store_errors: Callable[[list[Sequence[float]]], None] = lambda errors: None,
 ) -> int:
     """How many spheres a body needs, a power of two from 8 to 1024.
 
@@ -48,19 +48,19 @@ def enough_spheres(
 
     Args:
         mesh, receivers, seed: The mesh to fit, its receivers, and the seed of random choices.
-        known: Errors of the first short fits, where an interrupted call found them.
-        keep: Gets the known fits, after each short fit.
+        cached_errors: Errors of the first short fits, where an interrupted call found them.
+        store_errors: Gets the known fits, after each short fit.
     """
     judges = FitReceivers(mesh, _TEST_RECEIVERS, np.random.default_rng(seed + 1), sharpness=0.0)
     before = np.inf, np.inf
-    errors = list(known)
+    errors = list(cached_errors)
     for number, count in enumerate(TRIED_COUNTS):
         if number == len(errors):
             rng = np.random.default_rng(seed)
             start = greedy_cover(mesh, count, rng)
             *_, last = Refinement(mesh, receivers, rng).run(start, _STEPS + int(_STEPS_MORE * count))
             errors.append(_errors(Refinement(mesh, judges, rng), last.spheres))
-            keep(errors)
+            store_errors(errors)
         error, shadow_error = errors[number]
         if error <= _MAX_ERROR:
             return _where(count, before[0], error)
@@ -74,11 +74,12 @@ def enough_spheres(
 def _errors(judge: Refinement, spheres: np.ndarray) -> tuple[float, float]:
     """Error at receivers that are not on the mesh, relative to the light there and to the light that is missing."""
     judges = judge.receivers
-    chosen = judges.off_surface
-    visibility = judges.visibility[chosen]
-    wrong = judge.transmittance(spheres, chosen, judge.WIDTHS[1]) - visibility
+    off_surface = judges.off_surface
+    visibility = judges.visibility[off_surface]
+    wrong = judge.transmittance(spheres, off_surface, judge.WIDTHS[1]) - visibility
     parts = [
-        np.sum(judges.weights[chosen] * (part @ judges.metric) * part) for part in (wrong, visibility, 1 - visibility)
+        np.sum(judges.weights[off_surface] * (part @ judges.metric) * part)
+        for part in (wrong, visibility, 1 - visibility)
     ]
     wrong, seen, missing = np.sqrt(parts)
     return float(wrong / max(seen, 1e-9)), float(wrong / max(missing, 1e-9))

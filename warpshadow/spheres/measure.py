@@ -68,13 +68,13 @@ def _errors(mesh: NormalizedMesh, spheres: np.ndarray, points: np.ndarray, norma
     visible = trace_visibility(mesh.mesh, receivers, array(normals[None].astype(np.float32)), rays).numpy()[0]
     centers = array(spheres[None, :, :3].astype(np.float32))
     radii = wp.array(spheres[None, :, 3].astype(np.float32), dtype=wp.float32, device=mesh.device)
-    passing = 1 - exact_occlusion(receivers, rays, centers, radii).numpy()[0]
+    transmittance = 1 - exact_occlusion(receivers, rays, centers, radii).numpy()[0]
     cosine = np.maximum(normals @ directions.T, 0)
     light = np.stack([_sky(directions, azimuth) for azimuth in np.pi / 2 * np.arange(4)], axis=1)
-    seen = 2 * visible.mean(axis=1) >= 0.05
-    expected = (cosine * visible)[seen] @ light
-    missing, wrong = 1.0 - visible, 1.0 * passing - visible
-    error, shadow = (float(np.linalg.norm((cosine * part)[seen] @ light)) for part in (wrong, missing))
+    is_lit = 2 * visible.mean(axis=1) >= 0.05
+    expected = (cosine * visible)[is_lit] @ light
+    missing_shadow, wrong_shadow = 1.0 - visible, 1.0 * transmittance - visible
+    error, shadow = (float(np.linalg.norm((cosine * part)[is_lit] @ light)) for part in (wrong_shadow, missing_shadow))
     return error / max(float(np.linalg.norm(expected)), 1e-15), error / max(shadow, 1e-15)
 
 
@@ -84,21 +84,21 @@ def measure(mesh: NormalizedMesh, spheres: np.ndarray, seconds: float) -> FitRep
     grid = (np.arange(GROUND) + 0.5) / GROUND - 0.5
     x, z = np.meshgrid(2.5 * mesh.longest * grid, 2.5 * mesh.longest * grid)
     ground = np.column_stack([x.ravel(), np.full(x.size, mesh.low[1] - 1e-5), z.ravel()])
-    up = np.tile([0.0, 1.0, 0.0], (len(ground), 1))
+    up_normals = np.tile([0.0, 1.0, 0.0], (len(ground), 1))
 
     outside_volume = 0.0
     if (spheres[:, 3] > 0).any():
         samples = ball_samples(16 * max(1, 512 // len(spheres)), rng)
         points = spheres[:, None, :3] + spheres[:, None, 3:] * samples
         shares = np.broadcast_to(spheres[:, 3:] ** 3, points.shape[:2]) / _containing(spheres, points)
-        outside = mesh.signed_distances(points.reshape(-1, 3))[0].reshape(shares.shape) > 0
-        outside_volume = float(shares[outside].sum() / shares.sum())
+        is_outside = mesh.signed_distances(points.reshape(-1, 3))[0].reshape(shares.shape) > 0
+        outside_volume = float(shares[is_outside].sum() / shares.sum())
     surface, _ = mesh.sample(4000, rng)
     grown = spheres + [0, 0, 0, 0.01]
     air, _ = around(mesh, NEARBY, rng)
-    turned = rng.normal(size=air.shape)
-    nearby = air, turned / np.linalg.norm(turned, axis=1, keepdims=True)
-    ground_error, shadow_error = _errors(mesh, spheres, ground, up)
+    random_directions = rng.normal(size=air.shape)
+    nearby = air, random_directions / np.linalg.norm(random_directions, axis=1, keepdims=True)
+    ground_error, shadow_error = _errors(mesh, spheres, ground, up_normals)
     return FitReport(
         sphere_count=len(spheres),
         coverage=float((_containing(grown, surface) > 0).mean()),

@@ -41,8 +41,8 @@ def _trace_frames(
     receiver = first_row + row
     frame = frames[receiver]
     start = points[receiver] + 1.0e-4 * frame[2]
-    blocked = wp.mesh_query_ray_anyhit(mesh, start, wp.transpose(frame) * directions[direction], 1.0e30)
-    visibility[receiver, direction] = wp.uint8(wp.where(blocked, 0, 1))
+    is_blocked = wp.mesh_query_ray_anyhit(mesh, start, wp.transpose(frame) * directions[direction], 1.0e30)
+    visibility[receiver, direction] = wp.uint8(wp.where(is_blocked, 0, 1))
 
 
 def hemisphere(count: int) -> np.ndarray:
@@ -82,7 +82,7 @@ class FitReceivers:
         parts.append(_around(mesh, count - ground - surface, rng))
         points, normals = (np.concatenate(item) for item in zip(*parts, strict=True))
         frames = _frames(normals, rng)
-        self.places = np.column_stack([points, frames.reshape(-1, 9)]).T.astype(np.float32)
+        self.frame_rows = np.column_stack([points, frames.reshape(-1, 9)]).T.astype(np.float32)
         """Where they are: points, and the rows of frames, [12, receiver]."""
         self.directions = hemisphere(self.DIRECTIONS)
         """Directions in the frame of each receiver [direction, 3]."""
@@ -113,7 +113,7 @@ class FitReceivers:
 def _on_surface(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Half at vertices, where renderers shade, half between them."""
     parts = mesh.sample_vertices(count // 2, rng), mesh.sample(count - count // 2, rng)
-    points, normals = (np.concatenate(pair) for pair in zip(*parts, strict=True))
+    points, normals = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     return points, normals
 
 
@@ -131,18 +131,18 @@ def around(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[
     shell_count = count - count // 3
     away = rng.normal(size=(shell_count, 3))
     away *= rng.uniform(size=(shell_count, 1)) ** 2 * 0.5 * mesh.longest / np.linalg.norm(away, axis=1, keepdims=True)
-    within = mesh.low + rng.uniform(size=(count // 3, 3)) * (mesh.high - mesh.low)
-    points = np.concatenate([mesh.sample(shell_count, rng)[0] + away, within])
+    box_points = mesh.low + rng.uniform(size=(count // 3, 3)) * (mesh.high - mesh.low)
+    points = np.concatenate([mesh.sample(shell_count, rng)[0] + away, box_points])
     distances, slopes = mesh.signed_distances(points)
-    inside = distances < 0  # and from there out of it
-    points[inside] -= (distances[inside, None] - 1e-3) * slopes[inside]
+    is_inside = distances < 0  # and from there out of it
+    points[is_inside] -= (distances[is_inside, None] - 1e-3) * slopes[is_inside]
     return points, -slopes
 
 
 def _around(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    points, toward = around(mesh, count, rng)
-    toward = 0.5 * rng.normal(size=(count, 3)) + np.where(rng.uniform(size=(count, 1)) < 0.5, toward, 0.0)
-    return points, toward / np.linalg.norm(toward, axis=1, keepdims=True)
+    points, bias = around(mesh, count, rng)
+    bias = 0.5 * rng.normal(size=(count, 3)) + np.where(rng.uniform(size=(count, 1)) < 0.5, bias, 0.0)
+    return points, bias / np.linalg.norm(bias, axis=1, keepdims=True)
 
 
 def _frames(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -151,8 +151,8 @@ def _frames(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     x = np.cross(helper, normals)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     y = np.cross(normals, x)
-    turn = rng.uniform(0, 2 * np.pi, size=(len(normals), 1))
-    rows = [np.cos(turn) * x + np.sin(turn) * y, np.cos(turn) * y - np.sin(turn) * x, normals]
+    angles = rng.uniform(0, 2 * np.pi, size=(len(normals), 1))
+    rows = [np.cos(angles) * x + np.sin(angles) * y, np.cos(angles) * y - np.sin(angles) * x, normals]
     return np.stack(rows, axis=1).astype(np.float32)
 
 
