@@ -331,7 +331,7 @@ def test_a_damaged_file_of_an_interrupt_is_not_read(tmp_path, monkeypatch):
     path = cache_path("own_shadows", "0" * 64)
     path.parent.mkdir()
     path.with_suffix(".part.npz").write_bytes(b"PK damaged")
-    found = load_or_compute(path, dict, lambda unfinished: dict(unfinished.before), lambda made: made, what="thing")
+    found = load_or_compute(path, dict, lambda unfinished: dict(unfinished.before), lambda made: made, noun="thing")
     assert found == {} and cached_files("own_shadows") == [path]
 
 

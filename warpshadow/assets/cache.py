@@ -73,16 +73,16 @@ class Unfinished:
         """
         self._arrays, self._done = arrays, done
 
-    def write(self, what: str) -> str:
+    def write(self, noun: str) -> str:
         """Write the last partial result; return a line that says so, or nothing if there is none."""
         if self._arrays is None:
             return ""
         try:
             _write(self._path, self._arrays())
         except OSError as problem:
-            check.warn(f"the unfinished {what} could not be cached in {self._path.parent} ({problem})")
+            check.warn(f"the unfinished {noun} could not be cached in {self._path.parent} ({problem})")
             return ""
-        return f"{self._done} of the {what} are cached, and the next call goes on from there"
+        return f"{self._done} of the {noun} are cached, and the next call goes on from there"
 
     def remove(self) -> None:
         """Remove the partial result of an interrupted call, since the work is done."""
@@ -102,7 +102,7 @@ def load_or_compute(
     make: Callable[[Unfinished], Item],
     arrays: Callable[[Item], Mapping[str, np.ndarray]],
     *,
-    what: str,
+    noun: str,
 ) -> Item:
     """Read something from the cache, or make it and write it there; a second process that wants it, too, waits for it.
 
@@ -111,7 +111,7 @@ def load_or_compute(
         read: Makes it of the arrays in the file.
         make: Makes it anew, from where an interrupt left it.
         arrays: The arrays of it that are cached.
-        what: Noun for warnings, such as "fit".
+        noun: Noun for warnings, such as "fit".
     Raises:
         KeyboardInterrupt: at an interrupt; it says how much is cached.
     """
@@ -125,17 +125,17 @@ def load_or_compute(
                 with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
                     return read(stored)
             except Exception as problem:  # any error of a damaged file: the result can be computed again
-                check.warn(f"cached {what} {path} cannot be read ({problem}); it is made again")
+                check.warn(f"cached {noun} {path} cannot be read ({problem}); it is made again")
         unfinished = Unfinished(path)
         try:
             made = make(unfinished)
         except (KeyboardInterrupt, SystemExit) as interrupt:
-            if (note := unfinished.write(what)) and isinstance(interrupt, KeyboardInterrupt):
+            if (note := unfinished.write(noun)) and isinstance(interrupt, KeyboardInterrupt):
                 interrupt.args = (note,)
             raise
         try:
             _write(path, arrays(made))
             unfinished.remove()
         except OSError as problem:
-            check.warn(f"the {what} could not be cached in {path.parent} ({problem})")
+            check.warn(f"the {noun} could not be cached in {path.parent} ({problem})")
     return made

@@ -100,8 +100,8 @@ class Camera:
             intrinsics=check.array("intrinsics", intrinsics, (3, 3)),
             rotation=check.array("rotation", rotation, (3, 3)),
             translation=check.array("translation", translation, (3,)),
-            width=check.integer("width", width, what="pixels"),
-            height=check.integer("height", height, what="pixels"),
+            width=check.integer("width", width, unit="pixels"),
+            height=check.integer("height", height, unit="pixels"),
             near=check.positive("near", near),
         )
         if not np.array_equal(self.intrinsics[2], (0.0, 0.0, 1.0)):
@@ -355,7 +355,7 @@ class Camera:
         """
         points = framed_points(shown)
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
-        angles = 360 * np.arange(check.integer("count", count, what="cameras")) / count
+        angles = 360 * np.arange(check.integer("count", count, unit="cameras")) / count
         cameras = [self.turned(angle, middle) for angle in angles]
         if self._missing_distance(points) > 1e-6 * np.ptp(points, axis=0).max():
             return cameras

@@ -94,7 +94,7 @@ def _frame_camera(values: Mapping[str, Any], image: Path, size: tuple[int, int] 
             f"{', '.join(_PINHOLES)}; colmap image_undistorter makes images of one"
         )
     if "w" in values and "h" in values:
-        width, height = (check.integer(key, int(check.number(key, values[key])), what="pixels") for key in "wh")
+        width, height = (check.integer(key, int(check.number(key, values[key])), unit="pixels") for key in "wh")
     else:
         width, height = size or _image_size(image)
     fx, fy = _focal_length("x", values, width), _focal_length("y", values, height)

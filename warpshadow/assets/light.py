@@ -112,7 +112,7 @@ class EnvironmentMap:
     @classmethod
     def constant(cls, rgb: npt.ArrayLike = 1.0, height: int = 16) -> EnvironmentMap:
         """Make a map of the same radiance everywhere, one number or RGB."""
-        check.integer("height", height, what="rows")
+        check.integer("height", height, unit="rows")
         return cls(np.broadcast_to(_color("rgb", rgb), (height, 2 * height, 3)))
 
     def write(self, path: AnyPath) -> None:

@@ -44,7 +44,7 @@ def synthetic_sky(
         raise ValueError("sun_direction: got a zero vector, expected a direction")
     for name, value in (("sun_strength", sun_strength), ("sun_radius", sun_radius), ("ground_albedo", ground_albedo)):
         check.nonnegative(name, value)
-    check.integer("height", height, what="rows")
+    check.integer("height", height, unit="rows")
     sun = sun / np.linalg.norm(sun)
     towards, weights = sh.equirectangular_directions(height), sh.pixel_solid_angles(height)[:, None]
     edges = np.minimum(np.pi * np.arange(height + 1) / height, np.pi / 2)

@@ -189,14 +189,14 @@ def _read_map(path: Path) -> EnvironmentMap:
 
 
 def _hashes(
-    folder: Path, what: str, suffixes: Sequence[str], hash_of: Callable[[Path], str], progress: bool
+    folder: Path, noun: str, suffixes: Sequence[str], hash_of: Callable[[Path], str], progress: bool
 ) -> dict[str, str]:
     """Hashes of the files below a folder, by their names in it; RecipeError names all faults."""
     paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in suffixes and path.is_file())
     if not paths:
-        raise RecipeError(f"{what}: got the folder {folder} without any, expected files {', '.join(suffixes)}")
+        raise RecipeError(f"{noun}: got the folder {folder} without any, expected files {', '.join(suffixes)}")
     hashes, faults = {}, []
-    with progress_bar(len(paths), f"reading {what}", "file", shows=progress) as bar:
+    with progress_bar(len(paths), f"reading {noun}", "file", shows=progress) as bar:
         for path in paths:
             try:
                 with check.located(str(path)):
@@ -207,5 +207,5 @@ def _hashes(
     if faults:
         more = f"\nand {len(faults) - _LISTED_FAULTS} more" * (len(faults) > _LISTED_FAULTS)
         listed = "\n".join(faults[:_LISTED_FAULTS])
-        raise RecipeError(f"{what}: got {len(faults)} of {len(paths)} that cannot be used:\n{listed}{more}")
+        raise RecipeError(f"{noun}: got {len(faults)} of {len(paths)} that cannot be used:\n{listed}{more}")
     return hashes

@@ -79,7 +79,7 @@ class Recipe:
     def __post_init__(self) -> None:
         check.integer("images", self.images)
         check.integer("seed", self.seed, minimum=0)
-        check.integer("shard", self.shard, what="images")
+        check.integer("shard", self.shard, unit="images")
         check.instance("layers", self.layers, (list, tuple), f"a list of some of {', '.join(map(repr, _LAYERS))}")
         for layer in self.layers:
             check.choice("layers", layer, _LAYERS)

@@ -89,7 +89,7 @@ def write_shards(
 
 def _worker_count(data_set: DataSet, workers: int | None) -> int:
     if workers is not None:
-        return check.integer("workers", workers, what="processes")
+        return check.integer("workers", workers, unit="processes")
     return thread_count() if data_set.device == "cpu" else 1
 
 

@@ -87,15 +87,15 @@ class Wait:
     """Work that somebody waits for, and how much of it is done.
 
     Args:
-        what: Label of the work, such as "shading".
+        label: Label of the work, such as "shading".
         total: Number of units; None where it is not known.
         unit: Unit of the count, such as "receiver"; empty where nothing is counted.
         done: Units that were done before.
         patience: Time before lines tell of it, and of work within it [s].
     """
 
-    def __init__(self, what: str = "", total: int | None = None, unit: str = "", done: int = 0, patience: float = 0.0):
-        self.what, self.total, self.unit, self.done, self.patience = what, total, unit, done, patience
+    def __init__(self, label: str = "", total: int | None = None, unit: str = "", done: int = 0, patience: float = 0.0):
+        self.label, self.total, self.unit, self.done, self.patience = label, total, unit, done, patience
         self.remark = ""
         self.bar: Any = None  # tqdm's, where it shows one
         self.outer_bar: Any = None  # or that in which its words show
@@ -112,7 +112,7 @@ class Wait:
         if self.bar is not None:
             self.bar.update(count)
         elif self.outer_bar is not None and self.age >= _DELAY:
-            self.outer_bar.set_postfix_str(self.what)
+            self.outer_bar.set_postfix_str(self.label)
             self.outer_bar = None  # said
 
     def expect(self, left: int) -> None:
@@ -126,11 +126,11 @@ class Wait:
                 self.bar.container.children[1].max = self.total
             self.bar.refresh()
 
-    def describe(self, what: str, remark: str = "") -> None:
+    def describe(self, label: str, remark: str = "") -> None:
         """Label the bar, from its next update, with the work under way and a remark on it."""
-        self.what, self.remark = what, remark
+        self.label, self.remark = label, remark
         if self.bar is not None:
-            self.bar.set_description_str(what, refresh=False)
+            self.bar.set_description_str(label, refresh=False)
             self.bar.set_postfix_str(remark, refresh=False)
 
     def line(self) -> str:
@@ -143,7 +143,7 @@ class Wait:
                 parts.append(f"{show_time(left)} left")
         if self.remark:
             parts.append(self.remark)
-        return f"{self.what}: {', '.join(parts)}"
+        return f"{self.label}: {', '.join(parts)}"
 
 
 class _ThreadState(threading.local):
@@ -210,7 +210,7 @@ def _refresh(waits: list[Wait]) -> None:
     bar = next((wait.bar for wait in waits if wait.bar is not None), None)
     if bar is not None and not in_ipython():
         if waits[-1].outer_bar is bar:
-            bar.set_postfix_str(waits[-1].what, refresh=False)
+            bar.set_postfix_str(waits[-1].label, refresh=False)
         bar.refresh()
 
 
@@ -220,11 +220,11 @@ if hasattr(os, "register_at_fork"):  # a child has its lock, but not its thread
 
 
 @contextlib.contextmanager
-def waiting(what: str, *, shows: bool = True) -> Iterator[None]:
+def waiting(label: str, *, shows: bool = True) -> Iterator[None]:
     """Say in files every ten seconds that a block runs, if it lasts as long; bars within it show as without.
 
     Args:
-        what: Label of the work, such as "rendering".
+        label: Label of the work, such as "rendering".
         shows: Whether to say anything, of compiled kernels too.
     """
     if _this_thread.waits or _this_thread.is_hidden:
@@ -232,7 +232,7 @@ def waiting(what: str, *, shows: bool = True) -> Iterator[None]:
         return
     _this_thread.is_hidden = not shows
     try:
-        with _within(Wait(what, patience=_LINE_INTERVAL), shows=shows):
+        with _within(Wait(label, patience=_LINE_INTERVAL), shows=shows):
             yield
     finally:
         _this_thread.is_hidden = False
@@ -240,7 +240,7 @@ def waiting(what: str, *, shows: bool = True) -> Iterator[None]:
 
 @contextlib.contextmanager
 def progress_bar(
-    total: int | None, what: str, unit: str, *, done: int = 0, shows: bool = True, stays: bool = False
+    total: int | None, label: str, unit: str, *, done: int = 0, shows: bool = True, stays: bool = False
 ) -> Iterator[Wait]:
     """Show a bar while a block runs, if that takes longer than a second; within another bar, its words alone.
 
@@ -248,7 +248,7 @@ def progress_bar(
 
     Args:
         total: Number of units; None where it is not known.
-        what: Label of the work, such as "shading".
+        label: Label of the work, such as "shading".
         unit: Unit of the count, such as "receiver"; empty where nothing is counted.
         done: Units that were done before.
         shows: Whether to show it.
@@ -256,7 +256,7 @@ def progress_bar(
     Returns:
         On it the block calls ``update(count)``, and ``expect(left)`` where it ends early.
     """
-    wait = Wait(what, total, unit, done)
+    wait = Wait(label, total, unit, done)
     shows = shows and _bars_show
     if shows and _can_be_seen():
         wait.outer_bar = next((outer.bar for outer in _this_thread.waits if outer.bar is not None), None)
@@ -267,7 +267,7 @@ def progress_bar(
 
             only_time = {} if unit else {"bar_format": "{desc} [{elapsed}]"}
             delay = 0 if stays else _DELAY
-            wait.bar = tqdm(total=total, desc=what, unit=unit, initial=done, delay=delay, leave=stays, **only_time)
+            wait.bar = tqdm(total=total, desc=label, unit=unit, initial=done, delay=delay, leave=stays, **only_time)
     with _within(wait, shows=shows):
         yield wait
 
@@ -298,8 +298,8 @@ _module_numbers = itertools.count(1)
 
 def _compiling() -> contextlib.AbstractContextManager:
     """Say that kernels are compiled, and of which module of this process."""
-    what = f"compiling kernels, module {next(_module_numbers)}"
-    return progress_bar(None, what, "", shows=not _this_thread.is_hidden)
+    label = f"compiling kernels, module {next(_module_numbers)}"
+    return progress_bar(None, label, "", shows=not _this_thread.is_hidden)
 
 
 around_compilation(_compiling)

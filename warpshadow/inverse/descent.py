@@ -443,8 +443,8 @@ def _descend(
     saved = previewed = time.perf_counter()
     durations: list[float] = []
     done = sum(map(len, descent.losses))
-    total, what = done + descent.iterations_left(), "preparing: kernels, shadows, form factors"
-    with progress_bar(total, what, "it", done=done, shows=progress, stays=True) as bar:
+    total, label = done + descent.iterations_left(), "preparing: kernels, shadows, form factors"
+    with progress_bar(total, label, "it", done=done, shows=progress, stays=True) as bar:
         start = time.perf_counter()
         for _ in descent.run():
             now = time.perf_counter()

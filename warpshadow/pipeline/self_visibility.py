@@ -359,5 +359,5 @@ class SelfVisibility:
             read,
             trace,
             lambda rows: {name: array.numpy() for name, array in rows._asdict().items()},
-            what="self-shadow",
+            noun="self-shadow",
         )

@@ -326,7 +326,7 @@ def _cached_fit(fit_key: _SphereFitKey, progress: bool, count: int | str) -> tup
     path = _cache_path(fit_key, count)
     if path in _UNWRITTEN and not path.exists():
         return _UNWRITTEN[path]
-    fit_count = load_or_compute(path, read, partial(_fit, fit_key, progress, count), arrays, what="fit_count")
+    fit_count = load_or_compute(path, read, partial(_fit, fit_key, progress, count), arrays, noun="fit_count")
     if not path.exists():
         _UNWRITTEN[path] = fit_count[0], replace(fit_count[1], cached=True)
     return fit_count

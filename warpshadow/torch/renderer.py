@@ -302,13 +302,13 @@ class TorchRenderer(torch.nn.Module):
         arguments = Arguments(self.device, cameras=self.cameras if has_cameras else None)
         inputs: dict[str, Any] = {"light": light, "geometry": None, "clip_matrices": None}
         if isinstance(light, torch.Tensor):
-            what = describe_coefficients(self.basis, light.shape[-2] if light.ndim > 1 else 0)
+            description = describe_coefficients(self.basis, light.shape[-2] if light.ndim > 1 else 0)
             if light.ndim == 3 and light.shape[1] == 2 * light.shape[0]:
-                what += (
+                description += (
                     "; of a map [height, width, 3] that is known, light=EnvironmentMap(map.numpy()); its coefficients "
                     "are torch.as_tensor(renderer.basis.coefficients(EnvironmentMap(map.numpy())), dtype=torch.float32)"
                 )
-            inputs["light"] = arguments.add("light", light, wp.vec3, (self.basis.size,), what)
+            inputs["light"] = arguments.add("light", light, wp.vec3, (self.basis.size,), description)
         elif isinstance(light, np.ndarray):  # which a renderer takes for known light
             raise ValueError("light: got ndarray, expected a tensor of torch.float32: torch.as_tensor makes one")
         if geometry is not None:

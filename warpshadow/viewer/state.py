@@ -96,7 +96,7 @@ class ViewerState:
             raise ValueError(f"directions: got {self.directions}, expected at most {MAX_CELLS}")
         within("softness", self.softness, 0.05, 1.5)
         if self.spheres is not None:
-            check.integer("spheres", self.spheres, what="spheres")
+            check.integer("spheres", self.spheres, unit="spheres")
             within("spheres", self.spheres, 1, MAX_SPHERES)
         check.choice("receivers", self.receivers, (AS_GIVEN, *RECEIVERS))
         check_bounces(self.bounces)

@@ -117,5 +117,5 @@ def self_form_factors(
         read,
         trace,
         lambda form_factors: {name: getattr(form_factors, name) for name in ("data", "indices", "indptr")},
-        what="form factors",
+        noun="form factors",
     )
