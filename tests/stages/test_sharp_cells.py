@@ -29,7 +29,7 @@ def map_with_discs(*discs, sky=0.2, height=256, half_angle=HALF_ANGLE):
 
 def narrow_of(light, count=CELLS, **options):
     cells = light.cells(fibonacci(count))
-    return cells, find_sharp_cells(cells.radiance.sum(axis=1), cells.spots, cells.spreads, **options)
+    return cells, find_sharp_cells(cells.radiance.sum(axis=1), cells.spots, cells.half_angles, **options)
 
 
 def test_an_even_sky_and_a_bright_half_have_no_narrow_cells():
@@ -67,13 +67,15 @@ def test_without_its_spot_a_cell_has_the_light_around_it():
     light, directions = map_with_discs((SUN, 2000.0)), fibonacci(CELLS)
     cells, sharp_cells = narrow_of(light)
     found = np.flatnonzero(sharp_cells.slots >= 0)
-    rest = without_spots(light.radiance, cells.spots[found], 2 * cells.spreads[found])
+    rest = without_spots(light.radiance, cells.spots[found], 2 * cells.half_angles[found])
     assert rest.max() == np.float32(0.2)
     around = gather_cells(rest, directions)
     changed = np.flatnonzero((around.radiance != cells.radiance).any(axis=1))
     assert set(found) <= set(changed)
     assert (light.directions()[rest[..., 0] == 0] @ SUN > np.cos(3.5 * HALF_ANGLE)).all()
-    cap = (1 - np.cos(2 * cells.spreads[found])) * CELLS / 2  # its share of a cell; two suns' caps may reach out of it
+    cap = (
+        (1 - np.cos(2 * cells.half_angles[found])) * CELLS / 2
+    )  # its share of a cell; two suns' caps may reach out of it
     assert (around.radiance[found, 0] < 0.21).all()
     assert (around.radiance[found, 0] > 0.2 * (0.75 - cap)).all()
 
@@ -89,7 +91,7 @@ def test_a_sun_of_one_pixel_is_the_spot_of_its_cells(height):
         if sharp_cells is None and height == 16:  # its pixels are as wide as cells
             continue
         found = np.flatnonzero(sharp_cells.slots >= 0)
-        rest = without_spots(radiance, cells.spots[found], 2 * cells.spreads[found])
+        rest = without_spots(radiance, cells.spots[found], 2 * cells.half_angles[found])
         assert rest.max() == np.float32(0.3)
         assert rest[row, column, 0] == 0
 

@@ -44,8 +44,8 @@ def cache_path(kind: Kind, key: str) -> Path:
 
 def cached_files(kind: Kind) -> list[Path]:
     """List the cached files of a kind, and the partial files that a killed process left."""
-    result = (cache_folder() / kind).glob("*.npz")
-    return sorted(path for path in result if _OWN_NAME.fullmatch(path.name) and path.is_file())
+    cache_files = (cache_folder() / kind).glob("*.npz")
+    return sorted(path for path in cache_files if _OWN_NAME.fullmatch(path.name) and path.is_file())
 
 
 class Unfinished:
@@ -61,8 +61,12 @@ class Unfinished:
         self._done = ""
         self.before: dict[str, np.ndarray] = {}
         # ignore a damaged file, whatever error it raises
-        with contextlib.suppress(Exception), self._path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            self.before = dict(stored)
+        with (
+            contextlib.suppress(Exception),
+            self._path.open("rb") as file,
+            np.load(file, allow_pickle=False) as cached_arrays,
+        ):
+            self.before = dict(cached_arrays)
 
     def keep(self, arrays: Callable[[], Mapping[str, np.ndarray]], done: str) -> None:
         """Note how far the work is.
@@ -99,7 +103,7 @@ def _write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 def load_or_compute(
     path: Path,
     read: Callable[[Mapping[str, np.ndarray]], Item],
-    make: Callable[[Unfinished], Item],
+    compute: Callable[[Unfinished], Item],
     arrays: Callable[[Item], Mapping[str, np.ndarray]],
     *,
     noun: str,
@@ -109,33 +113,33 @@ def load_or_compute(
     Args:
         path: From :func:`cache_path`.
         read: Makes it of the arrays in the file.
-        make: Makes it anew, from where an interrupt left it.
+        compute: Makes it anew, from where an interrupt left it.
         arrays: The arrays of it that are cached.
         noun: Noun for warnings, such as "fit".
     Raises:
         KeyboardInterrupt: at an interrupt; it says how much is cached.
     """
-    with contextlib.ExitStack() as held:
+    with contextlib.ExitStack() as lock_stack:
         if not path.exists():
             with contextlib.suppress(OSError):  # of a folder that cannot be written to
                 path.parent.mkdir(parents=True, exist_ok=True)
-                held.enter_context(files.locked(path))
+                lock_stack.enter_context(files.locked(path))
         if path.exists():
             try:
-                with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-                    return read(stored)
+                with path.open("rb") as file, np.load(file, allow_pickle=False) as cached_arrays:
+                    return read(cached_arrays)
             except Exception as problem:  # any error of a damaged file: the result can be computed again
                 check.warn(f"cached {noun} {path} cannot be read ({problem}); it is made again")
         unfinished = Unfinished(path)
         try:
-            made = make(unfinished)
+            computed_item = compute(unfinished)
         except (KeyboardInterrupt, SystemExit) as interrupt:
             if (note := unfinished.write(noun)) and isinstance(interrupt, KeyboardInterrupt):
                 interrupt.args = (note,)
             raise
         try:
-            _write(path, arrays(made))
+            _write(path, arrays(computed_item))
             unfinished.remove()
         except OSError as problem:
             check.warn(f"the {noun} could not be cached in {path.parent} ({problem})")
-    return made
+    return computed_item

@@ -100,17 +100,17 @@ class Directional(SphereMethod):
         """Cells that look to where their light comes from: a sun is rarely in the middle of one."""
         known = as_light(light)
         cells = known.cells(self._directions)
-        if cells.spots is None or cells.spreads is None:
+        if cells.spots is None or cells.half_angles is None:
             return ProjectedCells(cells.directions, self._on_device(cells.radiance), cells.directions)
         power, softness = cells.radiance @ LUMINANCE, self.visibility.softness
-        find = functools.partial(find_sharp_cells, power, cells.spots, cells.spreads, softness)
+        find = functools.partial(find_sharp_cells, power, cells.spots, cells.half_angles, softness)
         draw = functools.partial(draw_in_cells, known.radiance, self._directions)
         sun = find_sun_cells(power, draw) if self.self_visibility.wants_rays else None
         sharp_cells = find(), find(MAX_RADIUS_PAST_PLANES)
         rest, rest_light, directions, spot_shares = known.radiance, cells, cells.directions, np.ones(len(power))
         if sharp_cells[0] is not None and sharp_cells[1] is not None:
             is_sharp = (sharp_cells[0].slots >= 0) & (sharp_cells[1].slots >= 0)
-            rest = without_spots(known.radiance, cells.spots[is_sharp], _NEAR_SPOT * cells.spreads[is_sharp])
+            rest = without_spots(known.radiance, cells.spots[is_sharp], _NEAR_SPOT * cells.half_angles[is_sharp])
             rest_light = gather_cells(rest, self._directions)
             directions = np.where(is_sharp[:, None], rest_light.directions, directions)
             spot_shares[is_sharp] = 1 - (rest_light.radiance @ LUMINANCE)[is_sharp] / power[is_sharp]
@@ -121,7 +121,7 @@ class Directional(SphereMethod):
             coefficients,
             cells.directions,
             cells.spots,
-            cells.spreads,
+            cells.half_angles,
             *sharp_cells,
             spot_shares=spot_shares,
             samples=samples,

@@ -44,7 +44,7 @@ def test_rays_go_to_where_the_light_of_their_cell_is(height):
         mean = rays.mean(axis=0)
         assert np.linalg.norm(mean / np.linalg.norm(mean) - known.directions[cell]) < 0.03
         spread = np.arccos(2 * np.linalg.norm(mean) - 1)
-        assert 0.75 < spread / known.spreads[cell] < 1.35  # of all light; a cell's is that of its brightest part
+        assert 0.75 < spread / known.half_angles[cell] < 1.35  # of all light; a cell's is that of its brightest part
 
 
 def test_even_light_has_no_sun_cells():
