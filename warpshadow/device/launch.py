@@ -99,9 +99,9 @@ def without_gradient(array: wp.array) -> wp.array:
     """The same array without a gradient."""
     if not array.requires_grad:
         return array
-    same = reshaped(array, array.shape)
-    same.requires_grad = False
-    return same
+    flat_array = reshaped(array, array.shape)
+    flat_array.requires_grad = False
+    return flat_array
 
 
 def _require_gradient(output: wp.array, kernel: wp.Kernel) -> None:

@@ -169,9 +169,9 @@ class _Reporter:
     def begin(self, waits: list[Wait]) -> None:
         """Report the waits of a thread from now on."""
         with self._lock:
-            now = time.monotonic()
-            if not self._waits_of_threads and now - self._ended >= _LINE_INTERVAL:
-                self._reported = now
+            current_time = time.monotonic()
+            if not self._waits_of_threads and current_time - self._ended >= _LINE_INTERVAL:
+                self._reported = current_time
             self._waits_of_threads.append(waits)
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="warpshadow-progress", daemon=True)
@@ -183,7 +183,9 @@ class _Reporter:
         with self._lock:
             yield
             if not waits:
-                self._waits_of_threads = [others for others in self._waits_of_threads if others is not waits]
+                self._waits_of_threads = [
+                    other_waits for other_waits in self._waits_of_threads if other_waits is not waits
+                ]
                 self._ended = time.monotonic()
 
     def _run(self) -> None:
