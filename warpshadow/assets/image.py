@@ -72,8 +72,9 @@ def read_image(
         return pixels
     if undo_exposure is None:
         check.warn(
-            f"{path}: warpshadow wrote it, exposed by {exposure_record.exposure:+.2f} stops, tone {exposure_record.tone}, "
-            "and reads it as it is shown; undo_exposure=True reads the radiance, and False the same without this warning"
+            f"{path}: warpshadow wrote it, exposed by {exposure_record.exposure:+.2f} stops, tone "
+            f"{exposure_record.tone}, and reads it as it is shown; undo_exposure=True reads the radiance, and False "
+            "the same without this warning"
         )
         return pixels
     colors = pixels[..., :3] if pixels.shape[2] > 2 else pixels[..., :1]

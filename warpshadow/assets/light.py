@@ -70,8 +70,9 @@ class EnvironmentMap:
             row, col, channel = np.argwhere(bad_values)[0]
             raise ImageError(
                 f"radiance: got {bad_values.sum()} NaN, Inf or negative values or such beyond "
-                f"{check.LARGEST:g} (first at row {row}, column {col}, channel {channel}: {pixels[row, col, channel]}), "
-                "expected finite values of 0 or more; sanitize='zero' or 'neighbors' repairs them on reading"
+                f"{check.LARGEST:g} (first at row {row}, column {col}, channel {channel}: "
+                f"{pixels[row, col, channel]}), expected finite values of 0 or more; sanitize='zero' "
+                "or 'neighbors' repairs them on reading"
             )
         pixels.setflags(write=False)
         object.__setattr__(self, "radiance", pixels)

@@ -22,11 +22,11 @@ def common_batch(arrays: Mapping[str, Any]) -> int:
     first, count = next(((name, count) for name, count in counts.items() if count != 1), ("", 1))
     for name, got in counts.items():
         if got not in (1, count):
-            item, joined = (of.replace("geometry.positions", "the poses of geometry") for of in (first, name))
+            item, second = (of.replace("geometry.positions", "the poses of geometry") for of in (first, name))
             raise ValueError(
                 f"{name}: got a batch of {got}, expected 1 or {count}, as {first} has; for all {got * count} pairs "
-                f"repeat each of {item} {got} times in a row, in torch repeat_interleave({got}, 0), and all of {joined} "
-                f"{count} times, repeat({count}, 1, …)"
+                f"repeat each of {item} {got} times in a row, in torch repeat_interleave({got}, 0), and all of "
+                f"{second} {count} times, repeat({count}, 1, …)"
             )
     return count
 

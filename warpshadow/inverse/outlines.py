@@ -48,18 +48,18 @@ class Outlines:
 
 def outlines_of(targets: Sequence[Target], scene: Scene, scale: float, device: torch.device) -> Outlines | None:
     """The outlines of targets; None where they have none."""
-    painted = [
+    painted_outlines = [
         (view, scene.body_number(body, "outlines"), mask)
         for view, target in enumerate(targets)
         for body, mask in target.outlines.items()
     ]
-    if not painted:
+    if not painted_outlines:
         return None
-    views, bodies, masks = zip(*painted, strict=True)
+    views, bodies, masks = zip(*painted_outlines, strict=True)
     distances = np.stack([signed_distances(mask) for mask in masks])
-    down, width_means = (area_means(count, max(1, round(count * scale))) for count in distances.shape[1:])
-    small = torch.einsum("ih,ohw,jw->oij", down, torch.from_numpy(distances), width_means)
-    return Outlines(views, bodies, small.contiguous().to(device), scale)
+    height_means, width_means = (area_means(count, max(1, round(count * scale))) for count in distances.shape[1:])
+    small_distances = torch.einsum("ih,ohw,jw->oij", height_means, torch.from_numpy(distances), width_means)
+    return Outlines(views, bodies, small_distances.contiguous().to(device), scale)
 
 
 def signed_distances(mask: np.ndarray) -> np.ndarray:

@@ -105,8 +105,8 @@ class QuasiNewton(torch.optim.Optimizer):
     def _sides(self, place: torch.Tensor) -> torch.Tensor:
         """On which side of a value its bound is, ±1, where it was clamped to one; 0 elsewhere."""
         memory = self._memory
-        stays = torch.where(place == memory["place"], memory["sides"], 0.0)
-        return torch.where(place == memory["aim"], stays, torch.sign(memory["aim"] - place))
+        kept_sides = torch.where(place == memory["place"], memory["sides"], 0.0)
+        return torch.where(place == memory["aim"], kept_sides, torch.sign(memory["aim"] - place))
 
     def _accept_or_reject(self, loss: float, place: torch.Tensor, gradient: torch.Tensor) -> None:
         """Keep the last step or take it back, and bound the next."""
@@ -118,10 +118,10 @@ class QuasiNewton(torch.optim.Optimizer):
             self._add_curvature_pair(step, change)
         rise = loss - memory["loss"]
         if rise >= 0 and length > 0:
-            lowest = (
+            lower_bound = (
                 -slope / (2 * (rise - slope)) if rise > slope else _MAX_BOUND_FACTOR
             )  # of the parabola through both
-            memory["bound"] = length * min(max(lowest, _MIN_BOUND_FACTOR), _MAX_BOUND_FACTOR)
+            memory["bound"] = length * min(max(lower_bound, _MIN_BOUND_FACTOR), _MAX_BOUND_FACTOR)
             return
         if length > 0.8 * memory["bound"]:
             memory["bound"] = min(_BOUND_GROWTH * memory["bound"], _MAX_BOUND * self._rate)
@@ -141,11 +141,11 @@ class QuasiNewton(torch.optim.Optimizer):
         [Chen et al. 2014, Large-scale L-BFGS using MapReduce], whose dot products are read all at once.
         """
         memory, (steps, changes) = self._memory, self.curvature
-        moves = (memory["sides"] * memory["gradient"] >= 0).to(memory["gradient"])
-        downhill = -memory["gradient"] * moves
+        is_movable = (memory["sides"] * memory["gradient"] >= 0).to(memory["gradient"])
+        downhill = -memory["gradient"] * is_movable
         if not steps:
             return downhill
-        vectors = torch.stack([*steps, *changes, downhill]).double() * moves
+        vectors = torch.stack([*steps, *changes, downhill]).double() * is_movable
         products = np.array(_read(*(vectors @ vectors.T)))
         count = len(steps)
         pairs = [(k, count + k) for k in range(count)]
@@ -168,9 +168,9 @@ def _products(step: T, change: T) -> tuple[tuple[T, T], ...]:
     return (step, change), (step, step), (change, change)
 
 
-def _has_positive_curvature(mixed: float, step: float, change: float) -> bool:
+def _has_positive_curvature(mixed_product: float, step: float, change: float) -> bool:
     """Whether the loss curves upwards over a step, by its :func:`_products` with how the gradient changed."""
-    return mixed > _MIN_CURVATURE_COSINE * math.sqrt(step * change)
+    return mixed_product > _MIN_CURVATURE_COSINE * math.sqrt(step * change)
 
 
 def _dot(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:

@@ -76,8 +76,8 @@ class Report:
         values: dict[str, Any] = {
             f"{name}.{key}": item.cpu().numpy() for name, parts in result.values.items() for key, item in parts.items()
         }
-        with files.atomic_write(folder / "parameters.npz") as unfinished:
-            np.savez(unfinished, **values)
+        with files.atomic_write(folder / "parameters.npz") as temporary_path:
+            np.savez(temporary_path, **values)
         written.append(folder / "parameters.npz")
         written += [*self._write_pictures(folder), *plot_losses(result, folder / "loss.png")]
         toml_tables.write(folder / SUMMARY, self._summary())
@@ -171,8 +171,8 @@ def found_values(result: Result) -> list[str]:
         for name, unit in (("translation", ""), ("rotation", "°"), ("scale", ""), ("albedo", "")):
             values = np.asarray(getattr(after, name))
             if not np.array_equal(values, getattr(before, name)) and values.size <= 3:
-                shown = ", ".join(f"{value:.4g}" for value in values.ravel())
-                lines.append(f"{after.called}: {name} ({shown}){unit}")
+                rounded_text = ", ".join(f"{value:.4g}" for value in values.ravel())
+                lines.append(f"{after.called}: {name} ({rounded_text}){unit}")
     if scene.light is not start.light:
         radiance = map_of(scene.light)
         x, y, z = EnvironmentMap(np.maximum(radiance, 0)).directions().reshape(-1, 3)[radiance.sum(axis=2).argmax()]
@@ -206,7 +206,7 @@ def plot_losses(result: Result, path: AnyPath) -> list[Path]:
         first += len(losses)
     axes.set_xlabel("iteration (a color for each candidate of each stage)")
     axes.set_ylabel(f"loss ({result.problem.loss.kind})")
-    with files.atomic_write(path) as unfinished:
-        figure.savefig(unfinished, dpi=120)
+    with files.atomic_write(path) as temporary_path:
+        figure.savefig(temporary_path, dpi=120)
     pyplot.close(figure)
     return [Path(path)]

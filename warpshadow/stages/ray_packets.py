@@ -101,9 +101,9 @@ def make_find_open() -> wp.Function:
     const int face_count = corners.shape[0];
     float x[{PACKET}], y[{PACKET}], z[{PACKET}], a[{PACKET}], b[{PACKET}], c[{PACKET}], open[{PACKET}];
     for (int lane = 0; lane < {PACKET}; ++lane) {{
-        x[lane] = toward.x.c[lane];
-        y[lane] = toward.y.c[lane];
-        z[lane] = toward.z.c[lane];
+        x[lane] = ray_directions.x.c[lane];
+        y[lane] = ray_directions.y.c[lane];
+        z[lane] = ray_directions.z.c[lane];
         a[lane] = 1.0f / (x[lane] == 0.0f ? 1.0e-20f : x[lane]);
         b[lane] = 1.0f / (y[lane] == 0.0f ? 1.0e-20f : y[lane]);
         c[lane] = 1.0f / (z[lane] == 0.0f ? 1.0e-20f : z[lane]);
@@ -157,10 +157,10 @@ def make_find_open() -> wp.Function:
         }}
         is_left = is_left_now;
         if (is_blocked)
-            last = face;
+            last_face = face;
     }};
-    if (last >= 0 && is_left)
-        meet(last);
+    if (last_face >= 0 && is_left)
+        meet(last_face);
     for (int box = is_left ? 1 : 0; box > 0;) {{
         const wp::vec3 lower = wp::index(lowers, box) - point, upper = wp::index(uppers, box) - point;
         float top = 0.0f;
@@ -199,7 +199,7 @@ def make_find_open() -> wp.Function:
     unsigned found = 0;
     for (int lane = 0; lane < {PACKET}; ++lane)
         found |= open[lane] > 0.0f ? 1u << lane : 0u;
-    return wp::vec_t<2, int>((int)found, last);
+    return wp::vec_t<2, int>((int)found, last_face);
     """)
     def find_open(  # type: ignore[empty-body]
         corners: wp.array2d(dtype=wp.vec3),

@@ -149,9 +149,9 @@ class TorchRenderer(torch.nn.Module):
 
     def set_extra_state(self, state: torch.Tensor) -> None:
         """Raise ValueError unless a ``state_dict`` is of a renderer whose tensors mean the same."""
-        stored, expected = (bytes(item.tolist()).decode() for item in (state, self.get_extra_state()))
-        if stored != expected:
-            raise ValueError(f"state_dict: got that of a TorchRenderer with {stored}, expected {expected}")
+        stored_meaning, expected = (bytes(item.tolist()).decode() for item in (state, self.get_extra_state()))
+        if stored_meaning != expected:
+            raise ValueError(f"state_dict: got that of a TorchRenderer with {stored_meaning}, expected {expected}")
 
     @uncompiled
     @check.keywords(**_ELSEWHERE)
@@ -199,8 +199,8 @@ class TorchRenderer(torch.nn.Module):
         )
 
         def draw(inputs: dict[str, Any]) -> wp.array:
-            seen = inputs.pop("geometry"), inputs.pop("clip_matrices")
-            return self.warp.draw(**inputs, view=self.warp.view(*seen))
+            geometry_and_cameras = inputs.pop("geometry"), inputs.pop("clip_matrices")
+            return self.warp.draw(**inputs, view=self.warp.view(*geometry_and_cameras))
 
         is_affine = {"light": True, "albedo": not self.scene.bounces, "textures": not self.scene.bounces}
         affine = [name for name in arguments.names if is_affine.get(name.partition("[")[0])]
@@ -320,8 +320,8 @@ class TorchRenderer(torch.nn.Module):
             for number, tensor in enumerate(self.scene.per_body(values, name)):
                 if tensor is not None:
                     message_name = self._item_name(name, values, number)
-                    of_body = self._body_rows(name, number, tensor)
-                    slots[number] = arguments.add(f"{name}[{number}]", *of_body, message_name=message_name)
+                    body_rows = self._body_rows(name, number, tensor)
+                    slots[number] = arguments.add(f"{name}[{number}]", *body_rows, message_name=message_name)
             (inputs.setdefault("gloss", {}) if name in GLOSS_ARGUMENTS else inputs)[name] = slots
         return arguments, inputs
 
@@ -432,9 +432,9 @@ class TorchRenderer(torch.nn.Module):
             intrinsics [camera, 3, 3]; [3, 3], [3] and [3, 3] of the scene's own camera.
         """
         names = "rotation", "translation", "intrinsics"
-        stacked = (np.stack([getattr(camera, name) for camera in self.cameras]) for name in names)
-        of_cameras = (torch.tensor(item, dtype=torch.float32, device=self.device) for item in stacked)
-        R, t, K = of_cameras if self.warp.has_camera_batch else (item[0] for item in of_cameras)
+        stacked_arrays = (np.stack([getattr(camera, name) for camera in self.cameras]) for name in names)
+        camera_tensors = (torch.tensor(item, dtype=torch.float32, device=self.device) for item in stacked_arrays)
+        R, t, K = camera_tensors if self.warp.has_camera_batch else (item[0] for item in camera_tensors)
         return R, t, K
 
     @uncompiled

@@ -163,14 +163,14 @@ def with_planes_last(free: Sequence[Free]) -> tuple[Free, ...]:
     """
     planes = []
     for plane in (item for item in free if isinstance(item, Plane)):
-        standing = [pose for pose in free if isinstance(pose, Pose) and pose.stands_on == plane.number]
-        for pose in standing:
+        standing_poses = [pose for pose in free if isinstance(pose, Pose) and pose.stands_on == plane.number]
+        for pose in standing_poses:
             if pose.distance is not None:
                 raise ValueError(
                     f"{pose.name}: got a distance beside a free {plane.name}, expected priors of the plane"
                 )
         if any(isinstance(pose, Pose) and pose.number == plane.number for pose in free):
             raise ValueError(f"{plane.name}: got a free pose of the same body, expected one of them")
-        carried = {*plane._moving()[1:], *(pose.number for pose in standing)}
-        planes.append(replace(plane, carries=tuple(sorted(carried))))
+        carried_bodies = {*plane._moving()[1:], *(pose.number for pose in standing_poses)}
+        planes.append(replace(plane, carries=tuple(sorted(carried_bodies))))
     return (*(item for item in free if not isinstance(item, Plane)), *planes)

@@ -125,13 +125,13 @@ class CameraPose(Free):
         """R, t and K of the views; shifts of the eye are in units of its distance from the scene."""
         rotations = rotation_matrices(values["turn"]) @ setting.tensor([camera.rotation for camera in cameras])
         eyes = setting.tensor([camera.eye for camera in cameras])
-        moved = eyes + setting.tensor(setting.distances) * values["shift"]
+        moved_eyes = eyes + setting.tensor(setting.distances) * values["shift"]
         intrinsics = setting.tensor([camera.intrinsics for camera in cameras])
         if self.focal:
             zoom = torch.ones_like(intrinsics)
             zoom[:, :2, :2] = values["log_focal"].exp()[:, None, None]
             intrinsics = intrinsics * zoom
-        return rotations, -(rotations @ moved[..., None])[..., 0], intrinsics
+        return rotations, -(rotations @ moved_eyes[..., None])[..., 0], intrinsics
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Move the cameras."""
