@@ -72,7 +72,7 @@ def fit(
             raise ValueError(f"--workers, --ray: got the fit file {where}, expected a pattern, a folder or a .txt file")
         on = device_of(device)
         check_folder(output)
-        loaded = load_fit(where)
+        loaded_fit = load_fit(where)
         output.mkdir(exist_ok=True)
         state = checkpoints.load(output / CHECKPOINT)
         was_over = state is not None and state["reason"] is not None
@@ -84,7 +84,7 @@ def fit(
         if viewer is not None:
             typer.echo(viewer.url)
             viewer.open(browser)
-        result = loaded.run(
+        result = loaded_fit.run(
             device=str(on),
             checkpoint=output / CHECKPOINT,
             checkpoint_seconds=checkpoint_seconds,
@@ -175,8 +175,8 @@ def dataset(
     from warpshadow.dataset import DataSet, load_recipe, write_shards
 
     with clear_errors():
-        loaded = load_recipe(recipe)
-        data_set = DataSet(loaded, device=device_of(device))
+        loaded_fit = load_recipe(recipe)
+        data_set = DataSet(loaded_fit, device=device_of(device))
         start, before = time.perf_counter(), {*output.glob("*.tar")}
         try:
             shards = write_shards(data_set, output, workers=workers)
@@ -184,5 +184,7 @@ def dataset(
             raise interrupted(f"; the same command goes on in {output}") from error
         size = sum(shard.stat().st_size for shard in shards)
         seconds = time.perf_counter() - start
-        made = f"{seconds:.0f} s" if {*shards} - before else f"all there before; to make them anew, remove {output}"
-        note(f"{output}: {len(shards)} shards, {loaded.images} images, {size / 1e6:.3g} MB, {made}", is_quiet)
+        made_text = (
+            f"{seconds:.0f} s" if {*shards} - before else f"all there before; to make them anew, remove {output}"
+        )
+        note(f"{output}: {len(shards)} shards, {loaded_fit.images} images, {size / 1e6:.3g} MB, {made_text}", is_quiet)

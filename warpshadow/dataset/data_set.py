@@ -58,8 +58,8 @@ class DataSet:
 
     def __init__(self, recipe: Recipe, *, device: wp.DeviceLike = "cpu", progress: bool = True):
         check.instance("recipe", recipe, Recipe, "a Recipe; load_recipe(path) reads one")
-        where = check.device("device", device)
-        self.recipe, self.device = recipe, str(where)
+        render_device = check.device("device", device)
+        self.recipe, self.device = recipe, str(render_device)
         for split in recipe.splits:
             if not self.numbers(split):
                 raise RecipeError(f"[splits]: {split} got none of the {recipe.images} images, expected one or more")
@@ -90,10 +90,10 @@ class DataSet:
         """The assets of a split; RecipeError if there are none."""
         names = {}
         for kind, hashes in self.hashes.items():
-            owners = {name: _split_of(self.recipe, content) for name, content in hashes.items()}
-            names[kind] = tuple(name for name, owner in owners.items() if owner == split)
+            split_of_names = {name: _split_of(self.recipe, content) for name, content in hashes.items()}
+            names[kind] = tuple(name for name, name_split in split_of_names.items() if name_split == split)
             if not names[kind]:
-                counts = ", ".join(f"{item} {list(owners.values()).count(item)}" for item in self.recipe.splits)
+                counts = ", ".join(f"{item} {list(split_of_names.values()).count(item)}" for item in self.recipe.splits)
                 raise RecipeError(
                     f"[splits]: {split} got none of the {len(hashes)} {kind} ({counts}), expected one or more: try "
                     "another seed, a larger part, or more files"
@@ -103,8 +103,8 @@ class DataSet:
     def numbers(self, split: str) -> range:
         """Numbers of the images of a split; splits follow one another."""
         check.choice("split", split, self.recipe.splits)
-        ends = [round(self.recipe.images * part) for part in itertools.accumulate(self.recipe.splits.values())]
-        starts = dict(zip(self.recipe.splits, itertools.pairwise([0, *ends]), strict=True))
+        split_ends = [round(self.recipe.images * part) for part in itertools.accumulate(self.recipe.splits.values())]
+        starts = dict(zip(self.recipe.splits, itertools.pairwise([0, *split_ends]), strict=True))
         return range(*starts[split])
 
     def split_of(self, number: int) -> str:
@@ -136,8 +136,10 @@ class DataSet:
 def _split_of(recipe: Recipe, content: str) -> str:
     """The split that a content hash belongs to."""
     place = int(hashlib.sha256(f"{recipe.seed} {content}".encode()).hexdigest()[:16], 16) / 16**16
-    ends = itertools.accumulate(recipe.splits.values())
-    return next((split for split, end in zip(recipe.splits, ends, strict=True) if place < end), [*recipe.splits][-1])
+    split_ends = itertools.accumulate(recipe.splits.values())
+    return next(
+        (split for split, end in zip(recipe.splits, split_ends, strict=True) if place < end), [*recipe.splits][-1]
+    )
 
 
 # ---------------------------------------------------------------------------------------------- files
@@ -205,7 +207,7 @@ def _hashes(
                 faults.append(str(fault).replace(f"{path}: mesh: {path}: ", f"{path}: "))
             bar.update()
     if faults:
-        more = f"\nand {len(faults) - _LISTED_FAULTS} more" * (len(faults) > _LISTED_FAULTS)
+        rest_text = f"\nand {len(faults) - _LISTED_FAULTS} more" * (len(faults) > _LISTED_FAULTS)
         listed = "\n".join(faults[:_LISTED_FAULTS])
-        raise RecipeError(f"{noun}: got {len(faults)} of {len(paths)} that cannot be used:\n{listed}{more}")
+        raise RecipeError(f"{noun}: got {len(faults)} of {len(paths)} that cannot be used:\n{listed}{rest_text}")
     return hashes

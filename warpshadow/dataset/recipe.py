@@ -173,9 +173,9 @@ def _table(values: Table, name: str) -> Table:
     with check.located(f"[{name}]"):
         table: Table = values.get(name, {})
         toml_tables.check_table(table)
-        known = _KEYS[name]
-        if known is not None:
-            check.known_keys("key", table, known)
+        known_keys = _KEYS[name]
+        if known_keys is not None:
+            check.known_keys("key", table, known_keys)
         return table
 
 
