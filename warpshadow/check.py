@@ -355,17 +355,18 @@ def described(value: object) -> str:
 
 def finite(name: str, values: np.ndarray, *, minimum: float = -LARGEST, maximum: float = LARGEST) -> None:
     """Raise ValueError when an array holds NaN, Inf or numbers out of range, with their count and the first place."""
-    bad = ~np.isfinite(values)
-    if bad.any():
-        place = tuple(int(i) for i in np.argwhere(bad)[0])
+    is_bad = ~np.isfinite(values)
+    if is_bad.any():
+        first_index = tuple(int(i) for i in np.argwhere(is_bad)[0])
         raise ValueError(
-            f"{name}: got {int(bad.sum())} NaN or Inf values (first at index {place}), expected finite numbers"
+            f"{name}: got {int(is_bad.sum())} NaN or Inf values (first at index {first_index}), expected finite numbers"
         )
-    outside = (values < minimum) | (values > maximum)
-    if outside.any():
-        place = tuple(int(i) for i in np.argwhere(outside)[0])
+    is_outside = (values < minimum) | (values > maximum)
+    if is_outside.any():
+        first_index = tuple(int(i) for i in np.argwhere(is_outside)[0])
         raise ValueError(
-            f"{name}: got {int(outside.sum())} values out of range (first at index {place}: {values[place]:g}), "
+            f"{name}: got {int(is_outside.sum())} values out of range (first at index {first_index}: "
+            f"{values[first_index]:g}), "
             f"expected {minimum:g} to {maximum:g}"
         )
 

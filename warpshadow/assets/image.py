@@ -350,14 +350,14 @@ def _low_tiles(picture: Any) -> list | None:
     """
     low_tiles = []
     for tile in picture.tile:
-        *place, arguments = tile
-        layout, *rest = arguments if isinstance(arguments, tuple) else (arguments,)
+        *tile_position, arguments = tile
+        layout, *other_arguments = arguments if isinstance(arguments, tuple) else (arguments,)
         color, _, order = str(layout).partition(";")
         if color not in ("RGB", "RGBX", "RGBA") or order not in _OTHER_ORDER:
             return None
         layout = f"{color};{_OTHER_ORDER[order]}"
-        arguments = (layout, *rest) if isinstance(arguments, tuple) else layout
-        low_tiles.append(getattr(tile, "_make", tuple)([*place, arguments]))  # a plain tuple before Pillow 11
+        arguments = (layout, *other_arguments) if isinstance(arguments, tuple) else layout
+        low_tiles.append(getattr(tile, "_make", tuple)([*tile_position, arguments]))  # a plain tuple before Pillow 11
     return low_tiles
 
 

@@ -122,15 +122,19 @@ def rounds_edges(surface: MeshTopology, positions: np.ndarray) -> bool:
     linked_face, edge = np.nonzero(surface.neighbors >= 0)
     pieces = connected_components(linked_face, surface.neighbors[linked_face, edge], len(surface.faces))
     count = int(pieces.max()) + 1
-    sharp, bent_edges = (
+    sharp_lengths, bent_edges = (
         np.bincount(pieces[face], lengths * (cosines < np.cos(np.radians(angle))), count) for angle in (50, 20)
     )
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     np.minimum.at(low, pieces, corners.min(axis=1))
     np.maximum.at(high, pieces, corners.max(axis=1))
     diagonals = np.linalg.norm(high - low, axis=1)
-    is_many = (diagonals < sharp) & (sharp < 25 * diagonals) & (bent_edges - sharp < 0.1 * sharp)
-    return bool(sharp[is_many].sum() > max(diagonal, sharp.sum() / 2))
+    is_many = (
+        (diagonals < sharp_lengths)
+        & (sharp_lengths < 25 * diagonals)
+        & (bent_edges - sharp_lengths < 0.1 * sharp_lengths)
+    )
+    return bool(sharp_lengths[is_many].sum() > max(diagonal, sharp_lengths.sum() / 2))
 
 
 def draws_lines(surface: MeshTopology, positions: np.ndarray) -> bool:

@@ -30,7 +30,9 @@ class _Render(typer.core.TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Read the command line."""
         if not any(text.startswith("-o") or text.partition("=")[0] == "--output" for text in args):
-            alone = [text for before, text in itertools.pairwise(args) if not before.startswith("-")]
+            alone = [
+                text for previous_argument, text in itertools.pairwise(args) if not previous_argument.startswith("-")
+            ]
             for text in alone:
                 if Path(text).suffix.lower() in (".exr", *SUFFIXES, *VIDEO_SUFFIXES):
                     raise typer.BadParameter(f"expected -o {text}", ctx, param_hint=text)

@@ -135,10 +135,10 @@ class DataSet:
 
 def _split_of(recipe: Recipe, content: str) -> str:
     """The split that a content hash belongs to."""
-    place = int(hashlib.sha256(f"{recipe.seed} {content}".encode()).hexdigest()[:16], 16) / 16**16
+    position = int(hashlib.sha256(f"{recipe.seed} {content}".encode()).hexdigest()[:16], 16) / 16**16
     split_ends = itertools.accumulate(recipe.splits.values())
     return next(
-        (split for split, end in zip(recipe.splits, split_ends, strict=True) if place < end), [*recipe.splits][-1]
+        (split for split, end in zip(recipe.splits, split_ends, strict=True) if position < end), [*recipe.splits][-1]
     )
 
 
@@ -154,10 +154,10 @@ class _LazyFiles(Sequence[Item], Generic[Item]):
     def __len__(self) -> int:
         return len(self._names)
 
-    def __getitem__(self, place):
+    def __getitem__(self, position):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # all warnings about a file were given when the data set was made
-            return self._read(self._folder / self._names[place])
+            return self._read(self._folder / self._names[position])
 
 
 class _ReadMesh(NamedTuple):

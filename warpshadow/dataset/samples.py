@@ -110,7 +110,7 @@ def _about(data_set: DataSet, number: int, drawn_scene: DrawnScene) -> dict[str,
     """How a scene was drawn."""
     scene, recipe, split = drawn_scene.scene, data_set.recipe, data_set.split_of(number)
     stock = data_set.stocks[split]
-    meshes = [stock.meshes[place] for place in drawn_scene.prototypes]
+    meshes = [stock.meshes[prototype] for prototype in drawn_scene.prototypes]
     light: dict[str, Plain] = {}
     if drawn_scene.light is not None and stock.maps is not None:
         light_placement = {"rotation": drawn_scene.light.rotation, "scale": drawn_scene.light.scale}
@@ -128,8 +128,12 @@ def _about(data_set: DataSet, number: int, drawn_scene: DrawnScene) -> dict[str,
 
 def _placed(body: Body, mesh: str) -> dict[str, Plain]:
     albedo = None if body.texture is not None or body.albedo.ndim > 1 else _numbers(body.albedo)
-    place = {"rotation": body.rotation.tolist(), "translation": body.translation.tolist(), "scale": float(body.scale)}
-    return {"mesh": mesh, "albedo": albedo, **place}
+    pose_record = {
+        "rotation": body.rotation.tolist(),
+        "translation": body.translation.tolist(),
+        "scale": float(body.scale),
+    }
+    return {"mesh": mesh, "albedo": albedo, **pose_record}
 
 
 def _numbers(values: np.ndarray) -> Plain:

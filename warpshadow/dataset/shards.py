@@ -213,13 +213,15 @@ def _prepare_folder(folder: Path, about: dict[str, Plain]) -> None:
         temporary_path.unlink(missing_ok=True)
 
 
-def _difference(result: Plain, requested: Plain, where: str = "") -> str:
+def _difference(result: Plain, requested: Plain, position_text: str = "") -> str:
     """The first difference of two indices, in words; nothing if there is none."""
     if isinstance(result, dict) and isinstance(requested, dict):
         for key in [*requested, *(key for key in result if key not in requested)]:
             if key not in result or key not in requested:
-                return f"{where}{key} is {'new' if key in requested else 'gone'}"
-            if difference := _difference(result[key], requested[key], f"{where}{key}: "):
+                return f"{position_text}{key} is {'new' if key in requested else 'gone'}"
+            if difference := _difference(result[key], requested[key], f"{position_text}{key}: "):
                 return difference
         return ""
-    return "" if result == requested else f"{where}was {check.described(result)}, is {check.described(requested)}"
+    return (
+        "" if result == requested else f"{position_text}was {check.described(result)}, is {check.described(requested)}"
+    )

@@ -96,12 +96,12 @@ class _Descent:
         # The optimizer is identified by an instance of it: a partial or a lambda has no name that tells all of it.
         state = self.optimizer.state_dict()
         groups = [{key: value for key, value in group.items() if key != "params"} for group in state["param_groups"]]
-        made = f"{type(self.optimizer).__qualname__} {groups!r} {state['state']!r}"
+        optimizer_text = f"{type(self.optimizer).__qualname__} {groups!r} {state['state']!r}"
         self.fingerprints = problem.fingerprints() | {
             "stages": repr(stages),
             "tolerance": repr(tolerance),
             "seed": repr(seed),
-            "optimizer": made,
+            "optimizer": optimizer_text,
         }
 
     def _candidates_of_stage(self, best: list[_Candidate]) -> list[_Candidate]:
@@ -176,12 +176,12 @@ class _Descent:
             )
         device = self.setting.device
         self.stage = state["stage"]
-        self.candidates = [_Candidate(_copied(values, device), *rest) for values, *rest in state["candidates"]]
+        self.candidates = [_Candidate(_copied(values, device), *fields) for values, *fields in state["candidates"]]
         self.is_found = state["is_found"]
         self.begin_stage()
         self._begin_run(_Candidate(_copied(state["values"], device), None))
         self.optimizer.load_state_dict(state["optimizer"])
-        self.ended = [_FinishedRun(loss, _copied(best, device), *rest) for loss, best, *rest in state["ended"]]
+        self.ended = [_FinishedRun(loss, _copied(best, device), *fields) for loss, best, *fields in state["ended"]]
         self.best, self.failure = _copied(state["best"], device), state["failure"]
         self.losses, self.descents, self.reason = state["losses"], state["descents"], state["reason"]
 

@@ -72,7 +72,7 @@ def signed_distances(mask: np.ndarray) -> np.ndarray:
     is_inside = mask >= 0.5
     if is_inside.all() or not is_inside.any():
         return np.full(mask.shape, np.hypot(*mask.shape) * (1 if is_inside.all() else -1), np.float32)
-    far = distance_transform_edt(is_inside) - distance_transform_edt(~is_inside)
-    far -= 0.5 * np.sign(far)
-    crosses = np.abs(far) <= 0.5
-    return np.where(crosses, mask - 0.5, far).astype(np.float32)
+    signed_distance = distance_transform_edt(is_inside) - distance_transform_edt(~is_inside)
+    signed_distance -= 0.5 * np.sign(signed_distance)
+    crosses = np.abs(signed_distance) <= 0.5
+    return np.where(crosses, mask - 0.5, signed_distance).astype(np.float32)

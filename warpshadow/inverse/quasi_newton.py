@@ -74,9 +74,9 @@ class QuasiNewton(torch.optim.Optimizer):
         else:
             self._accept_or_reject(loss, place, gradient)
         direction, bound = self._direction(), memory["bound"]
-        longest, slope = _read(direction.abs().max(), _dot(memory["gradient"], direction))
-        if longest > bound or not self.curvature[0]:  # a gradient alone does not tell how far
-            factor = bound / longest if longest > 0 else 0.0
+        longest_step, slope = _read(direction.abs().max(), _dot(memory["gradient"], direction))
+        if longest_step > bound or not self.curvature[0]:  # a gradient alone does not tell how far
+            factor = bound / longest_step if longest_step > 0 else 0.0
             direction, slope = factor * direction, factor * slope
         memory["hoped"] = -slope
         memory["aim"] = memory["place"] + direction
@@ -116,16 +116,16 @@ class QuasiNewton(torch.optim.Optimizer):
         slope, length, *products = _read(*numbers)
         if _has_positive_curvature(*products):
             self._add_curvature_pair(step, change)
-        rise = loss - memory["loss"]
-        if rise >= 0 and length > 0:
+        loss_increase = loss - memory["loss"]
+        if loss_increase >= 0 and length > 0:
             lower_bound = (
-                -slope / (2 * (rise - slope)) if rise > slope else _MAX_BOUND_FACTOR
+                -slope / (2 * (loss_increase - slope)) if loss_increase > slope else _MAX_BOUND_FACTOR
             )  # of the parabola through both
             memory["bound"] = length * min(max(lower_bound, _MIN_BOUND_FACTOR), _MAX_BOUND_FACTOR)
             return
         if length > 0.8 * memory["bound"]:
             memory["bound"] = min(_BOUND_GROWTH * memory["bound"], _MAX_BOUND * self._rate)
-        memory["gained"] = -rise
+        memory["gained"] = -loss_increase
         self._keep(loss, place, gradient, self._sides(place))
 
     def _add_curvature_pair(self, step: torch.Tensor, change: torch.Tensor) -> None:

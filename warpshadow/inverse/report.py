@@ -104,17 +104,17 @@ class Report:
         for image, gains in zip(images, fitted.white_balances, strict=False):  # none unless they were free
             image["white_balance"] = list(gains)
         light = self.result.light
-        known = {} if light is None else {"light": {"undetermined": round(light.undetermined_share, 4)}}
+        known_entries = {} if light is None else {"light": {"undetermined": round(light.undetermined_share, 4)}}
         unsure = self._uncertainty_table()
-        return {"fit": fit, **known, **unsure, "view": views, "image": images}
+        return {"fit": fit, **known_entries, **unsure, "view": views, "image": images}
 
     def _uncertainty_table(self) -> toml_tables.Table:
         """Standard deviations of poses, light and exposures; a warning for each body that hardly is where it is."""
-        known = self.result.uncertainty
-        if known is None:
+        uncertainty = self.result.uncertainty
+        if uncertainty is None:
             return {}
         table: toml_tables.Table = {}
-        for name, pose in known.poses.items():
+        for name, pose in uncertainty.poses.items():
             table[name] = {"shift": pose.shift.tolist(), "turn": pose.turn, "least": str(pose)}
             if pose.is_flat:
                 check.warn(
@@ -123,10 +123,10 @@ class Report:
                     "(stands_on), a prior or another view would tell more",
                     DiagnosticWarning,
                 )
-        if known.light is not None:
-            table["light"] = known.light
-        if known.stops:
-            table["stops"] = known.stops
+        if uncertainty.light is not None:
+            table["light"] = uncertainty.light
+        if uncertainty.stops:
+            table["stops"] = uncertainty.stops
         return {"uncertainty": table} if table else {}
 
     def _write_pictures(self, folder: Path) -> list[Path]:

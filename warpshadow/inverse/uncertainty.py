@@ -194,14 +194,14 @@ class NormalMatrix:
         model, loss = self.model, self.problem.loss
         world = model.world(self.values)
         bounded_images = bounded(world.images(), model.targets, model.saturated)
-        kinds = [(bounded_images[..., :3] - model.targets[..., :3]) / self.setting.unit]
+        residuals = [(bounded_images[..., :3] - model.targets[..., :3]) / self.setting.unit]
         if model.targets.shape[-1] == 4:
-            kinds.append(bounded_images[..., 3:] - model.targets[..., 3:])
+            residuals.append(bounded_images[..., 3:] - model.targets[..., 3:])
         if not self.roots:
             share = loss.pixel_shares(model.weights)[..., None]
             factors = (1.0, loss.coverage)
-            self.roots = [(f * share * loss.pixel_weights(x)).sqrt() for f, x in zip(factors, kinds, strict=False)]
-        parts = [roots * x for roots, x in zip(self.roots, kinds, strict=True)]
+            self.roots = [(f * share * loss.pixel_weights(x)).sqrt() for f, x in zip(factors, residuals, strict=False)]
+        parts = [roots * x for roots, x in zip(self.roots, residuals, strict=True)]
         if model.outlines is not None:
             gaps = model.outlines.differences(world.masks(), world.outline_offsets)
             pixels = gaps.new_zeros(len(model.cameras), *gaps.shape[1:], len(gaps))

@@ -193,8 +193,8 @@ def _is_reflex(points: np.ndarray, previous_vertex: int, corner: int, next_verte
 
 def _turns(polygon: np.ndarray) -> np.ndarray:
     """Sine of the angle by which the way around a polygon turns left at each corner, [corner]."""
-    inward, onward = polygon - np.roll(polygon, 1, axis=0), np.roll(polygon, -1, axis=0) - polygon
-    return _cross(inward, onward) / (np.linalg.norm(inward, axis=1) * np.linalg.norm(onward, axis=1))
+    inward, next_end = polygon - np.roll(polygon, 1, axis=0), np.roll(polygon, -1, axis=0) - polygon
+    return _cross(inward, next_end) / (np.linalg.norm(inward, axis=1) * np.linalg.norm(next_end, axis=1))
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -73,8 +73,8 @@ def greedy_cover(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> 
 
     cover_radii = balls[:, 3] + 0.1 * spacing
     squares = (samples**2).sum(axis=1)[:, None] + (balls[:, :3] ** 2).sum(axis=1) - 2 * samples @ balls[:, :3].T
-    covers = (squares < cover_radii**2).astype(np.float32)  # [sample, ball]
-    gain = left @ covers
+    is_covering = (squares < cover_radii**2).astype(np.float32)  # [sample, ball]
+    gain = left @ is_covering
     is_picked = np.zeros(len(balls), bool)
     picked_balls = []
     for _ in range(min(count, len(balls))):
@@ -83,8 +83,8 @@ def greedy_cover(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> 
             best_ball = int(rng.choice(np.flatnonzero(~is_picked)))
         is_picked[best_ball] = True
         picked_balls.append(best_ball)
-        covered_samples = np.flatnonzero(covers[:, best_ball])
-        gain -= 0.9 * left[covered_samples] @ covers[covered_samples]
+        covered_samples = np.flatnonzero(is_covering[:, best_ball])
+        gain -= 0.9 * left[covered_samples] @ is_covering[covered_samples]
         left[covered_samples] *= 0.1
     return balls[picked_balls]
 

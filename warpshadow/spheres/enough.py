@@ -52,7 +52,7 @@ def enough_spheres(
         store_errors: Gets the known fits, after each short fit.
     """
     judges = FitReceivers(mesh, _TEST_RECEIVERS, np.random.default_rng(seed + 1), sharpness=0.0)
-    before = np.inf, np.inf
+    previous_error = np.inf, np.inf
     errors = list(cached_errors)
     for number, count in enumerate(TRIED_COUNTS):
         if number == len(errors):
@@ -63,12 +63,12 @@ def enough_spheres(
             store_errors(errors)
         error, shadow_error = errors[number]
         if error <= _MAX_ERROR:
-            return _where(count, before[0], error)
-        stalls = error > _MIN_ERROR_RATIO * before[0]
-        if stalls and before[1] <= RAGGED_ERROR:
+            return _where(count, previous_error[0], error)
+        stalls = error > _MIN_ERROR_RATIO * previous_error[0]
+        if stalls and previous_error[1] <= RAGGED_ERROR:
             return count // 2
-        before = error, shadow_error
-    return TRIED_COUNTS[-1] if stalls and before[1] <= RAGGED_ERROR else MAX_SPHERES
+        previous_error = error, shadow_error
+    return TRIED_COUNTS[-1] if stalls and previous_error[1] <= RAGGED_ERROR else MAX_SPHERES
 
 
 def _errors(judge: Refinement, spheres: np.ndarray) -> tuple[float, float]:
@@ -76,18 +76,18 @@ def _errors(judge: Refinement, spheres: np.ndarray) -> tuple[float, float]:
     judges = judge.receivers
     off_surface = judges.off_surface
     visibility = judges.visibility[off_surface]
-    wrong = judge.transmittance(spheres, off_surface, judge.WIDTHS[1]) - visibility
+    total_error = judge.transmittance(spheres, off_surface, judge.WIDTHS[1]) - visibility
     parts = [
         np.sum(judges.weights[off_surface] * (part @ judges.metric) * part)
-        for part in (wrong, visibility, 1 - visibility)
+        for part in (total_error, visibility, 1 - visibility)
     ]
-    wrong, seen, missing = np.sqrt(parts)
-    return float(wrong / max(seen, 1e-9)), float(wrong / max(missing, 1e-9))
+    total_error, lit_error, missing = np.sqrt(parts)
+    return float(total_error / max(lit_error, 1e-9)), float(total_error / max(missing, 1e-9))
 
 
-def _where(count: int, before: float, error: float) -> int:
+def _where(count: int, previous_error: float, error: float) -> int:
     """Where, from a quarter of the count on, the error becomes small enough; it falls with a power of the count."""
     if count == TRIED_COUNTS[0]:
         return count
-    part = np.log(before / _MAX_ERROR) / max(np.log(before / error), 1e-6)
+    part = np.log(previous_error / _MAX_ERROR) / max(np.log(previous_error / error), 1e-6)
     return count // 4 * 2 ** int(np.clip(np.ceil(2 * part - 0.25), 1, 2))

@@ -154,16 +154,16 @@ def _warn_of_holes(mesh: Mesh, count: int | str, report: FitReport) -> None:
             report.surface_error > BAD_SURFACE
         ),
     }
-    wrong = next((words for words, is_wrong in wrongs.items() if is_wrong), None)
+    fault = next((words for words, is_wrong in wrongs.items() if is_wrong), None)
     number = report.sphere_count if isinstance(count, str) else count
-    if wrong is None or number < MANY or mesh in _warned or mesh.is_flat:
+    if fault is None or number < MANY or mesh in _warned or mesh.is_flat:
         return
     _warned.add(mesh)
     auto_advice = "" if count == AUTO else 'blockers = "auto" takes as many as it needs, and '
     parts = "parts of it that are bodies of their own have spheres each"
     closing_advice = "closed with walls and a bottom, where nothing is behind it, it has room for them"
     check.warn(
-        f"{mesh.name!r} is thin for {number} spheres: {wrong}; {auto_advice}"
+        f"{mesh.name!r} is thin for {number} spheres: {fault}; {auto_advice}"
         f"{parts if mesh.surface.is_closed else closing_advice}, "
         'and method = "ray-traced" has the shadow of the mesh'
     )

@@ -121,8 +121,8 @@ def _on_grounds(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> t
     """On grounds at and below the lowest point."""
     square = rng.uniform(-1, 1, size=(count, 2))
     square *= 1.25 * mesh.longest * np.abs(square).max(axis=1, keepdims=True) ** 0.5  # denser near the body
-    drop = np.where(rng.uniform(size=count) < 0.25, 0.3 * mesh.longest, 0.0) * rng.uniform(size=count)
-    points = np.column_stack([square[:, 0], mesh.low[1] - 1e-5 - drop, square[:, 1]])
+    depth = np.where(rng.uniform(size=count) < 0.25, 0.3 * mesh.longest, 0.0) * rng.uniform(size=count)
+    points = np.column_stack([square[:, 0], mesh.low[1] - 1e-5 - depth, square[:, 1]])
     return points, np.tile([0.0, 1.0, 0.0], (count, 1))
 
 

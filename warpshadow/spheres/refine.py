@@ -329,7 +329,9 @@ class DescentState(NamedTuple):
     random: np.ndarray  # state of the generator, JSON
 
     @classmethod
-    def at(cls, spheres: np.ndarray, adam: Adam, queue: np.ndarray, rng: np.random.Generator) -> DescentState:
+    def from_optimizer(
+        cls, spheres: np.ndarray, adam: Adam, queue: np.ndarray, rng: np.random.Generator
+    ) -> DescentState:
         """Copy it."""
         random = np.array(json.dumps(rng.bit_generator.state))
         return cls(spheres.copy(), adam.mean.copy(), adam.square.copy(), np.array(adam.age), queue, random)
@@ -443,4 +445,4 @@ class Refinement:
             adam.step(spheres, gradient, first_rate * 0.5 * (1 + np.cos(np.pi * progress_share)))
             if step % RETURN_INTERVAL == 0 or step == steps - 1:
                 self._return_to_body(spheres)
-            yield DescentState.at(spheres, adam, queue, self.rng)
+            yield DescentState.from_optimizer(spheres, adam, queue, self.rng)

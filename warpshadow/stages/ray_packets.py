@@ -47,8 +47,10 @@ def build_face_tree(positions: np.ndarray, faces: np.ndarray, device: wp.DeviceL
     """
     corners = np.asarray(positions, np.float32)[np.asarray(faces)]
     face_count, depth = len(corners), max(int(np.ceil(np.log2(max(len(corners), 1) / _LEAF))), 0)
-    lowest, highest = (np.ascontiguousarray(end(corners, axis=1).T) for end in (np.min, np.max))  # [3, face]
-    centers, permutation = (lowest + highest) / 2, np.arange(face_count)
+    lower_corners, upper_corners = (
+        np.ascontiguousarray(end(corners, axis=1).T) for end in (np.min, np.max)
+    )  # [3, face]
+    centers, permutation = (lower_corners + upper_corners) / 2, np.arange(face_count)
     for level in range(depth):
         bounds, halves = _bounds(face_count, level), _bounds(face_count, level + 1)[1::2]
         leaf_lowers, leaf_uppers = (end.reduceat(centers, bounds[:-1], axis=1) for end in (np.minimum, np.maximum))
@@ -64,8 +66,8 @@ def build_face_tree(positions: np.ndarray, faces: np.ndarray, device: wp.DeviceL
     lowers, uppers = np.zeros((2, 2 * leaf_count, 3), np.float32)
     if face_count:
         starts = _bounds(face_count, depth)[:-1]
-        leaf_lowers = np.minimum.reduceat(lowest[:, permutation], starts, axis=1).T
-        leaf_uppers = np.maximum.reduceat(highest[:, permutation], starts, axis=1).T
+        leaf_lowers = np.minimum.reduceat(lower_corners[:, permutation], starts, axis=1).T
+        leaf_uppers = np.maximum.reduceat(upper_corners[:, permutation], starts, axis=1).T
         slack = np.float32(_SLACK) * np.maximum(-leaf_lowers, leaf_uppers).max(axis=1, keepdims=True)
         lowers[leaf_count:], uppers[leaf_count:] = leaf_lowers - slack, leaf_uppers + slack
     for level in reversed(range(depth)):

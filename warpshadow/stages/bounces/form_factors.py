@@ -163,9 +163,9 @@ def scale_to_sky(factors: csr_matrix, is_blocker: np.ndarray, sky: np.ndarray | 
     return PatchFormFactors(factors[:, : -len(BLACK_ENTRIES)], is_buried)
 
 
-def scaling_factors(target: np.ndarray, current: np.ndarray) -> np.ndarray:
+def scaling_factors(target: np.ndarray, current_values: np.ndarray) -> np.ndarray:
     """Factors that scale current values to targets: 0 for negative targets, 1 where the value is 0."""
-    return np.where(current > 0, np.maximum(target, 0) / np.where(current > 0, current, 1), 1)
+    return np.where(current_values > 0, np.maximum(target, 0) / np.where(current_values > 0, current_values, 1), 1)
 
 
 def scale_rows(matrix: csr_matrix, factors: np.ndarray) -> csr_matrix:

@@ -31,7 +31,7 @@ def _blend_overlays(
     overlay_centers: wp.array2d(dtype=wp.vec3),
     distances: wp.array(dtype=wp.float32),
     # out
-    sent: wp.array2d(dtype=wp.vec3),
+    overlaid: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a patch of an instance."""
     batch, patch = wp.tid()
@@ -44,7 +44,7 @@ def _blend_overlays(
         sent_radiosity = patch_radiosity + overlay_share * (
             overlay_radiosity[instance_in(batch, radiosity.shape[0]), patch] - patch_radiosity
         )
-    sent[batch, patch] = sent_radiosity
+    overlaid[batch, patch] = sent_radiosity
 
 
 def overlaid_radiosity(
@@ -64,7 +64,7 @@ def overlaid_radiosity(
     check.shape("centers", centers.shape, ("batch", overlay_weights.shape[0]))
     check.shape("distances", distances.shape, (overlay_weights.shape[0],))
     count = common_batch({"radiosity": radiosity, "centers": centers})
-    sent = empty((count, overlay_weights.shape[0]), dtype=wp.vec3, device=radiosity.device)
+    overlaid = empty((count, overlay_weights.shape[0]), dtype=wp.vec3, device=radiosity.device)
     distance_array = constant(np.asarray(distances, np.float32), wp.float32, radiosity.device)
     arguments = [
         radiosity,
@@ -73,5 +73,5 @@ def overlaid_radiosity(
         multiply(overlay_weights, centers),
         distance_array,
     ]
-    launch(_blend_overlays, sent.shape, inputs=arguments, outputs=[sent])
-    return sent
+    launch(_blend_overlays, overlaid.shape, inputs=arguments, outputs=[overlaid])
+    return overlaid

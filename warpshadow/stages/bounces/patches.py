@@ -167,8 +167,10 @@ def find_patches(
                     areas[sample_pieces].sum() / areas[members].sum(),
                 )
             )
-    weighted = np.concatenate([areas[:, None] * piece_mesh.centroids, piece_mesh.area_vectors, areas[:, None]], axis=1)
-    sums = _cluster_sums(labels[is_outside], weighted[is_outside])
+    weighted_moments = np.concatenate(
+        [areas[:, None] * piece_mesh.centroids, piece_mesh.area_vectors, areas[:, None]], axis=1
+    )
+    sums = _cluster_sums(labels[is_outside], weighted_moments[is_outside])
     labels[reaches_out] = labels[is_outside][_nearest_center(features[is_outside], features[reaches_out])]
     return Patches(
         *_repeat_on_sides(side_count, sums[:, 6], sums[:, :3] / sums[:, 6:], _normalized(sums[:, 3:6])),

@@ -41,9 +41,9 @@ _HIDDEN = wp.constant(0.1)  # β, by which parts count that their own body hides
 
 
 @wp.func
-def _share_within(position: float, lower_bound: float, upper_bound: float, reach: float):
+def _share_within(position: float, lower_bound: float, upper_bound: float, half_width: float):
     """Part of an interval around a place that lies between two others."""
-    lower_offset, upper_offset = (lower_bound - position) / reach, (upper_bound - position) / reach
+    lower_offset, upper_offset = (lower_bound - position) / half_width, (upper_bound - position) / half_width
     return wp.smoothstep(-1.0, 1.0, upper_offset) - wp.smoothstep(-1.0, 1.0, lower_offset)
 
 

@@ -33,7 +33,7 @@ _COST = 60.0  # nanoseconds that a sample takes
 wp.set_module_options({"max_unroll": 1})
 
 
-def sample_places(count: int) -> np.ndarray:
+def hemisphere_points(count: int) -> np.ndarray:
     """Height in the cap and cosine and sine of the azimuth of each sample, on a spiral: shape [sample, 3]."""
     i = np.arange(count)
     azimuth = np.pi * (1 + np.sqrt(5)) * i
@@ -83,7 +83,7 @@ def _sample_lobes(
     normals: wp.array2d(dtype=wp.vec3),
     roughness: wp.array2d(dtype=wp.float32),
     clip_matrices: wp.array(dtype=wp.mat44),
-    places: wp.array(dtype=wp.vec3),
+    sample_points: wp.array(dtype=wp.vec3),
     # out
     directions: wp.array3d(dtype=wp.vec3),
     filters: wp.array3d(dtype=wp.vec3),
@@ -109,14 +109,14 @@ def _sample_lobes(
     # in the frame of tangent, bitangent and normal; the cap is that of mirrors of width 1
     stretched_view = wp.normalize(wp.vec3(width * sine, 0.0, cosine))
     for i in range(directions.shape[2]):
-        sample_place = places[i]
-        height = (1.0 - sample_place[0]) * (1.0 + stretched_view[2]) - stretched_view[2]
+        sample_point = sample_points[i]
+        height = (1.0 - sample_point[0]) * (1.0 + stretched_view[2]) - stretched_view[2]
         radius = wp.sqrt(wp.max(1.0 - height * height, 1.0e-12))
         mirror = wp.normalize(
             wp.vec3(
-                width * (radius * sample_place[1] + stretched_view[0]),
-                width * radius * sample_place[2],
-                (1.0 - sample_place[0]) * (1.0 + stretched_view[2]),
+                width * (radius * sample_point[1] + stretched_view[0]),
+                width * radius * sample_point[2],
+                (1.0 - sample_point[0]) * (1.0 + stretched_view[2]),
             )
         )
         view_cosine = mirror[0] * sine + mirror[2] * cosine
@@ -172,7 +172,7 @@ def sample_lobes(
     launch(
         _sample_lobes,
         shape[0] * shape[1],
-        inputs=[points, normals, roughness, clip_matrices, constant(sample_places(sample_count), wp.vec3, device)],
+        inputs=[points, normals, roughness, clip_matrices, constant(hemisphere_points(sample_count), wp.vec3, device)],
         outputs=[directions, filters, cosines],
         shared=[clip_matrices, points, normals, roughness],
         cost=_COST * sample_count,

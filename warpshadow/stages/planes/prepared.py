@@ -61,7 +61,7 @@ class PlaneBlockers:
 
     Args:
         count: Number of planes.
-        blocking: The plane blockers.
+        is_blocking: The plane blockers.
         grids: Their grids, of shape [plane].
         levels: First texel, width and height of each mip level, for each side of each plane, vec3i of shape [level].
         level_scales: Its texels for one of the finest level, vec2 of shape [level].
@@ -75,7 +75,7 @@ class PlaneBlockers:
     """
 
     count: int
-    blocking: tuple[int, ...]
+    is_blocking: tuple[int, ...]
     grids: wp.array
     levels: wp.array
     level_scales: wp.array

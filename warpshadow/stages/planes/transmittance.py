@@ -299,7 +299,7 @@ def plane_coverage(
     points, fronts = expand(points, count), None if fronts is None else expand_rows(fronts, count)
     own_radius = cell_radius(len(directions)) if radius is None else radius
     scene = plane_arrays(planes, own_radius, skip, tiles=radius is None)
-    if not set(planes.blocking) - {skip}:
+    if not set(planes.is_blocking) - {skip}:
         return None
     cells = constant(directions, wp.vec3, points.device)
     inputs, cost = [points, horizon_normals, frames, fronts, scene, cells], _CELL_COST * cells.size * planes.count

@@ -320,8 +320,8 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
         base_share = Lane(1.0) - blend
         adj_dc = wp.cw_mul(base_share, base_dot)
         if wp.max(blend) > 0.0:
-            squared, change = square_held_adjoint(half_base, depth, table, adj_row, product)
-            adj_depth += wp.cw_mul(blend, change) + wp.cw_mul(blend_slope, squared - base_dot)
+            squared_dot, change = square_held_adjoint(half_base, depth, table, adj_row, product)
+            adj_depth += wp.cw_mul(blend, change) + wp.cw_mul(blend_slope, squared_dot - base_dot)
             for i in range(wp.static(order**2)):
                 adj_half = 0.5 * wp.cw_mul(blend, product[i])
                 adj_dc += wp.cw_mul(adj_half, half_base[i])
