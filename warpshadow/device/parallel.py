@@ -106,7 +106,7 @@ def split_row(row: int, count: int):
 
 
 class Scratch(NamedTuple):
-    """Memory that a kernel's thread writes to and nobody reads later, an array's row [*shape] for each."""
+    """Scratch memory of a kernel: a row [*shape] of an array for each thread, not read after the launch."""
 
     shape: tuple[int, ...]
     dtype: type
@@ -201,7 +201,7 @@ def _launch_slices(
     """Launch a kernel, or its adjoint where gradients of its arguments are given.
 
     Args:
-        summed_arguments: What all rows add to, by the place of the argument that it is, or is the gradient of.
+        summed_arguments: Arrays to which all rows add, by argument index; a gradient has the index of its argument.
     """
     dim, workers = _shape(dim), thread_count()
     arguments = [0, 0 if device.is_cpu else -1, *arguments]
@@ -250,7 +250,7 @@ def _with_gradient(array: wp.array, gradient: wp.array) -> wp.array:
 
 
 def _share(run: Callable[[int, int], None], slice_count: int, workers: int) -> None:
-    """Run slices, by their numbers and those of their threads, on the calling thread and the threads of the pool.
+    """Run slices, by slice and thread index, on the calling thread and the threads of the pool.
 
     Each begins with a part of its own, the same in every launch, so that rows stay in the caches of one core from
     kernel to kernel; one that is done takes over from the end of another's part. Threads that got no core before all

@@ -66,7 +66,7 @@ def announce(work: str, seconds: float, alternative: str, *, shows: bool = True)
     """Announce work of more than half a minute: its time, and a setting that avoids it.
 
     Args:
-        work: What is done, such as "tracing the shadow of a body on itself".
+        work: Name of the work, such as "tracing the shadow of a body on itself".
         seconds: How long it takes on one thread [s]; it runs on all.
         alternative: A setting that avoids the work, such as 'method="ray-traced" needs none'.
         shows: Whether to say it.

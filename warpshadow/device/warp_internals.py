@@ -156,7 +156,8 @@ def bound_kernel(
     It takes the dimensions of a launch, and then values in place of the first arguments, if they are others each time.
 
     On a CPU arguments go straight to the compiled function: ``wp.launch`` takes ten times as long to look at them as
-    small kernels run. Warp launches what is unusual, such as an argument of a wrong type, of which it tells.
+    small kernels run. Warp itself launches unusual calls, such as with an argument of a wrong type, and reports the
+    error.
     """
     signature = _cpu_signature(kernel) if device.is_cpu else None
     is_plain = wp._src.context.runtime._apic_capture is None and not wp.config.print_launches
@@ -220,7 +221,7 @@ def _free(pointer: int, size: int) -> None:
 
 
 def new_array(shape: int | Sequence[int], dtype: type, device: wp.Device) -> wp.array:
-    """Make an array of memory that nobody has written to, as ``wp.empty`` does in three times the time."""
+    """Make an array of uninitialized memory, in a third of the time of ``wp.empty``."""
     runtime = wp._src.context.runtime
     if not device.is_cpu or runtime._apic_capture is not None:
         return wp.empty(shape, dtype, device=device)

@@ -105,8 +105,8 @@ class QuasiNewton(torch.optim.Optimizer):
     def _sides(self, place: torch.Tensor) -> torch.Tensor:
         """On which side of a value its bound is, ±1, where it was clamped to one; 0 elsewhere."""
         memory = self._memory
-        kept_sides = torch.where(place == memory["place"], memory["sides"], 0.0)
-        return torch.where(place == memory["aim"], kept_sides, torch.sign(memory["aim"] - place))
+        unchanged_sides = torch.where(place == memory["place"], memory["sides"], 0.0)
+        return torch.where(place == memory["aim"], unchanged_sides, torch.sign(memory["aim"] - place))
 
     def _accept_or_reject(self, loss: float, place: torch.Tensor, gradient: torch.Tensor) -> None:
         """Keep the last step or take it back, and bound the next."""

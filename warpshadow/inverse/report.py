@@ -165,7 +165,7 @@ def _stems(scene: Scene) -> list[str]:
 
 
 def found_values(result: Result) -> list[str]:
-    """Describe in a line each what a fit changed: poses, colors, exposures, and where light is strongest."""
+    """Describe the changes of a fit, a line each: poses, colors, exposures, and where light is strongest."""
     lines, start, scene = [], result.problem.scene, result.scene
     for before, after in zip(start.bodies, scene.bodies, strict=True):
         for name, unit in (("translation", ""), ("rotation", "°"), ("scale", ""), ("albedo", "")):

@@ -49,7 +49,7 @@ BAD_SHADOW = 0.18
 0.27; a ring and rocks, whose shadows are small but whole, 0.16; man, monkey, cow, teapot and bunny 0.02 to 0.07."""
 
 MIN_GROUND_ERROR = 0.01
-"""Error of a ground below which nobody sees how ragged a shadow is: of a slab that lies on it, 0.004. Chair, fence and
+"""Error of a ground below which ragged shadows are not visible: of a slab that lies on it, 0.004. Chair, fence and
 table have 0.02 to 0.05."""
 
 BAD_AIR = 0.45

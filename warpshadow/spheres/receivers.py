@@ -60,7 +60,7 @@ class FitReceivers:
         mesh: The body.
         count: How many.
         rng: Draws them.
-        sharpness: Weight of errors under a sun next to those under each wider light.
+        sharpness: Weight of errors under a sun relative to errors under each wider light.
 
     A receiver sees 128 directions of a hemisphere. Receivers on a mesh look along its normals, to both sides of an open
     one. Of the receivers in the space around a body and within its bounds, half look toward the nearest surface, and

@@ -45,7 +45,7 @@ class Receivers(NamedTuple):
     sample_fragments: Fragments | None = None  # side and barycentrics of each sample receiver, [batch, sample receiver]
 
     def without_bodies(self) -> "Receivers":
-        """The same receivers, as points of which nobody knows the body."""
+        """The same receivers, as points without bodies."""
         return self._replace(spans=(), vertices=None, sample_fragments=None)
 
 
@@ -229,7 +229,7 @@ def find_receivers(
         supersampling: Supersampling, the samples of a pixel across and down: samples of a pixel with the same face
             share a receiver.
         quadtree: Squares in which samples of faces that want them interpolate; None for none.
-        smooth_pieces: Smooth piece of each face, int32 of shape [face], where those that see different faces of one
+        smooth_pieces: Smooth piece of each face, int32 of shape [face], where samples that see different faces of one
             share a receiver, too; None where they do not.
         rises: Whether samples' receivers rise from their faces towards the surface that normals round, for rays.
     Returns:

@@ -1,7 +1,7 @@
 """Sample receivers: points that samples see, at which light is evaluated for them.
 
 Samples of a pixel that see the same side share one, at the mean of their points: with four samples a pixel that is 1.1
-to 1.5 receivers a pixel, where faces have 400 to 10 pixels. In stills those that see different faces share one, too, if
+to 1.5 receivers a pixel, where faces have 400 to 10 pixels. In stills samples of different faces share one, too, if
 these belong to one smooth piece and the surface is even: shared by two slats of a bench, it lay in the gap or in the
 leg behind, and was black. (Stills of the cage of demos/kinds.py, 128², were 3.5% off, and are 2.5%.) In squares of a
 quadtree there is one at each corner, and samples interpolate in triangles of these.
@@ -362,7 +362,7 @@ def find_sample_receivers(
 ) -> SampleReceivers:
     """Find the receivers of samples.
 
-    They come body by body. While a graph is captured nobody knows how many there are, and each body has room for one at
+    They come body by body. While a graph is captured their number is unknown, and each body has room for one at
     every sample.
 
     Args:
@@ -372,7 +372,7 @@ def find_sample_receivers(
         bodies: Body of each face, −1 for faces that need not be told apart, shape [face].
         supersampling: Samples of a pixel across and down.
         quadtree: Squares at whose corners there are receivers; None for none.
-        surface: What samples see, of one instance, where those of a pixel share a receiver that see different faces
+        surface: Visible surface of one instance, where samples of a pixel share a receiver if they see different faces
             of one smooth surface, too; None where they do not.
     Differentiable: barycentrics, where receivers see them.
     """

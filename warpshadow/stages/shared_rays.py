@@ -8,9 +8,9 @@ Some receivers tell where light comes from, so that most directions go there (:f
 Rays go through the scene in packets of 16 that are close to each other (:mod:`.ray_packets`).
 
 Neighbors in an image mostly see the same light. So all rays of receivers at the corners of squares of pixels are traced
-(:func:`find_corners`). Receivers within a square take over what its corners agree on, interpolate the visibility of
-doubtful rays that bring little light, and trace the others. So edges of shadows are as sharp as if all were traced;
-but a shadow that falls between the corners is missed.
+(:func:`find_corners`). Receivers within a square take over the visibility on which its corners agree, interpolate the
+visibility of doubtful rays that bring little light, and trace the others. So edges of shadows are as sharp as if all
+were traced; but a shadow that falls between the corners is missed.
 """
 
 import functools
@@ -326,7 +326,7 @@ class _Tracing:
     def take_over(
         self, corner_visibility: wp.array, corner_rows: np.ndarray, weights: np.ndarray, tolerances: np.ndarray
     ) -> None:
-        """Let receivers take over the visibility of their corners in later calls; rows are those of the visibility."""
+        """Let receivers take over the visibility of their corners, by row, in later calls."""
         dtypes = zip((corner_rows, weights, tolerances), (wp.vec4i, wp.vec4, wp.float32), strict=True)
         self._corners = (
             *(wp.array(values, dtype=dtype, device=corner_visibility.device) for values, dtype in dtypes),

@@ -263,7 +263,7 @@ class _WarpAdjoint(torch.autograd.Function):
 def _current_stream(device: torch.device) -> wp.ScopedStream:
     """Launch on torch's current stream, which while it is captured must not wait for streams that are not.
 
-    Else Warp's stream waits for it at the end: there Warp frees what has been used, once nobody holds it.
+    Else Warp's stream waits for it at the end: there Warp frees memory that has no reference left.
     """
     is_cuda = device.type == "cuda"
     stream = wp.stream_from_torch(torch.cuda.current_stream(device)) if is_cuda else None

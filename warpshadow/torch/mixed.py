@@ -133,7 +133,7 @@ class MixedRenderer(torch.nn.Module):
         Args:
             which: Scene of each image, from 0, whole numbers of shape [batch].
             rotations, translations, scales: As of a TorchRenderer, of as many bodies as the scene with the most has.
-            moving: Bodies that the poses move, as of a TorchRenderer; a scene passes over those that it has not.
+            moving: Bodies that the poses move, as of a TorchRenderer; a scene ignores bodies that it does not have.
             pivot: "center", or None, as of a TorchRenderer.
         Returns:
             For each scene the geometry of its images, None where it has none.

@@ -211,7 +211,7 @@ class TorchRenderer(torch.nn.Module):
     def layers(
         self, *, geometry: Geometry[torch.Tensor] | None = None, clip_matrices: torch.Tensor | None = None
     ) -> LayerTensors:
-        """Find depth, normals, bodies and their masks: what images show beside color.
+        """Find layers beside color: depth, normals, bodies and their masks.
 
         Args:
             geometry, clip_matrices: As for :meth:`forward`.

@@ -41,7 +41,7 @@ EQUAL_TIME_SHARE = 0.1
 Where none is accurate enough, the same holds of their errors; then the faster is better.
 """
 
-ERROR_STEP = 0.003  # errors that differ by less than this count as equal, too: nobody sees it
+ERROR_STEP = 0.003  # errors that differ by less than this count as equal, too: it is not visible
 # error of interpolation between a body's vertices from which on its pixels are tried as receivers
 COARSE_FACES_ERROR = 0.005
 

@@ -46,11 +46,11 @@ class Frame:
     Args:
         rgb: The picture, sRGB, uint8 of shape [height, width, 3].
         depth: Distance along the view [page units], float32 of shape [row, column], which may be fewer; None where
-            nobody asked for it.
+            it was not requested.
         quality: The quality it was made with.
         seconds: How long it took.
         cells: Its cells, in words.
-        error: Relative L2 error of the bodies' pixels against rays; None where nobody asked for it.
+        error: Relative L2 error of the bodies' pixels against rays; None where it was not requested.
     """
 
     rgb: np.ndarray

@@ -6,7 +6,7 @@ before it, as long as it is near them:
 
     B′_p = B_p + c_p (Σ_t k_pt B_t − B_p),  c_p = S(3 − 2 |x_p − Σ_t k_pt x_t| / d_p)
 
-x_p is the center of its proxy, and d_p, at least its radius, how far it is from those texels where the scene has both;
+x_p is the center of its proxy, and d_p, at least its radius, its distance from these texels in the scene as given;
 S is the smoothstep from 0 at −1 to 1 at 1. Without it, pieces on a board of chess, a plane over a slab, lost 5 to 10%
 of their light.
 """

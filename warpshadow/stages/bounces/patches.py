@@ -116,7 +116,7 @@ def find_patches(
 ) -> Patches:
     """Find the patches of a body, by k-means of position and normal.
 
-    Pieces inside another part of a closed body, as those between the steps of stairs that are boxes, belong to none. A
+    Pieces inside another part of a closed body, such as between steps of stairs that are boxes, belong to none. A
     piece that is mostly inside, and reaches out, sends the light of the nearest patch, whose area does not count it.
 
     Args:
@@ -334,7 +334,7 @@ def _split_evenly(items: np.ndarray, points: np.ndarray, weights: np.ndarray, co
 
 
 def _cluster_members(labels: np.ndarray) -> list[np.ndarray]:
-    """Items of each cluster; those of −1 belong to none."""
+    """Items of each cluster; items of label −1 belong to none."""
     permutation = np.argsort(labels, kind="stable")[np.count_nonzero(labels < 0) :]
     return np.split(permutation, np.flatnonzero(np.diff(labels[permutation])) + 1) if len(permutation) else []
 

@@ -30,7 +30,7 @@ _MIN_WEIGHT_SUM = wp.constant(1.0e-30)  # the least Σ s
 
 
 HIT_ROWS = SIDE_ROWS + 8
-"""Rows of scratch for each plane: those of its sides, and four for the hit of a cell on each of two sides."""
+"""Rows of scratch for each plane: `SIDE_ROWS`, and four for the hit of a cell on each of two sides."""
 
 
 @wp.struct

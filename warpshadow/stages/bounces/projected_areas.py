@@ -7,8 +7,8 @@ Towards a receiver that sees a patch in direction ω, its patch samples s with w
 parts of its area. T_s is the body's self-transmittance in the cell that contains −ω. Other bodies do not count: the
 receiver's self-transmittance covers them, and one of them may be where the receiver is.
 
-Parts that their own body hides still count for β: a receiver in a cavity of that body is nearer than what hides them,
-and sees nothing else. By β = 0 a third of what a ball in an open box saw of the box was its outside.
+Parts that their own body hides still count for β: a receiver in a cavity of that body is nearer than the parts
+that hide them, and sees nothing else. With β = 0 a third of the box that a ball in an open box saw was its outside.
 
 Plane blockers cannot count as T, since a receiver on a ground is behind the ground in each direction from which it is
 lit. But receivers above a ground hardly see patches that face it and are near it. The bottom of a sphere of radius r,

@@ -154,7 +154,7 @@ def _add_tail(
 
 
 def add_tail(radiosities: Sequence[wp.array], areas: np.ndarray) -> wp.array:
-    """Radiosity of patches after all bounces, from those after the first ones.
+    """Radiosity of patches after all bounces, extrapolated from the radiosities after the first bounces.
 
     Args:
         radiosities: By direct light, and after one to four bounces, vec3 of shape [batch, patch]; a batch of 1

@@ -85,7 +85,7 @@ def _divide_sums(
 
 
 def means_of_receivers(scalars: wp.array, face_ids: wp.array, faces: wp.array, receiver_count: int) -> wp.array:
-    """Means of the numbers of the samples that share a receiver; those of different faces are in different texels.
+    """Means of the scalars of samples that share a receiver; samples of different faces are in different texels.
 
     Args:
         scalars: Float32 of shape [batch, sample].
