@@ -427,7 +427,7 @@ def _is_within(values: np.ndarray, minimum: float, maximum: float) -> bool:
 
 
 def _outside_on_device(arrays: Mapping[str, wp.array], ranges: Mapping[str, tuple[float, float]]) -> list[str]:
-    """The same by a kernel, with one readback."""
+    """Check that arrays are finite by a kernel, with one readback."""
     device = next(iter(arrays.values())).device
     faults = wp.zeros(len(arrays), dtype=wp.int32, device=device)
     for argument, (name, array) in enumerate(arrays.items()):

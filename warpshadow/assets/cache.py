@@ -49,7 +49,7 @@ def cached_files(kind: Kind) -> list[Path]:
 
 
 class Unfinished:
-    """How far the work on something is that is to be cached; an interrupt leaves it for the next call.
+    """Progress of a computation whose result is to be cached; an interrupt leaves it for the next call.
 
     Attributes:
         before: Arrays that an interrupted call left; none where the work begins.

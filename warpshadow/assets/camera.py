@@ -368,7 +368,7 @@ class Camera:
         ]
 
     def _missing_distance(self, points: np.ndarray, margin: float = 0.0) -> float:
-        """How much farther away, along the view, it shows all points; below 0 if it does, and may be nearer."""
+        """Distance by which it must move back along the view to show all points; negative if it may move nearer."""
         x, y, z = self.rotation @ points.T + self.translation[:, None]
         (fx, skew, cx), (_, fy, cy), _ = self.intrinsics
         edges = (1 - margin) * np.array([cx, self.width - cx, cy, self.height - cy])  # pixels to the edges
@@ -379,12 +379,12 @@ class Camera:
         return float((np.maximum(depths.max(axis=0), self.near) - z).max())
 
     def resized(self, factor: float) -> Camera:
-        """The same view on an image ``factor`` times as wide and high, rounded to whole pixels, at least one."""
+        """Scale the image of a view by ``factor``, rounded to whole pixels, at least one."""
         factor = check.positive("factor", factor)
         return self.stretched(*(max(1, round(count * factor)) for count in (self.width, self.height)))
 
     def stretched(self, width: int, height: int) -> Camera:
-        """The same view on an image of another size [pixels]; of other proportions, pixels are not square."""
+        """Stretch a view to an image of another size [pixels]; with other proportions, pixels are not square."""
         width, height = check.image_size((width, height))
         intrinsics = np.diag([width / self.width, height / self.height, 1.0]) @ self.intrinsics
         return Camera(intrinsics, self.rotation, self.translation, width, height, self.near)

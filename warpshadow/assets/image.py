@@ -344,7 +344,7 @@ def is_wide(picture: Any) -> bool:
 
 
 def _low_tiles(picture: Any) -> list | None:
-    """Where and how a picture's lower bytes are stored, if it has 16 bits for each of three or four colors, else None.
+    """Find the storage of a picture's lower bytes, if it has 16 bits for each of three or four colors, else None.
 
     Pillow's colors have 8 bits, the upper bytes. Read in the other order, the lower ones are in their place.
     """

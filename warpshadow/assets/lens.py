@@ -21,7 +21,7 @@ def checked_distortion(value: npt.ArrayLike) -> np.ndarray:
 
 
 def distorted(points: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    """Where a lens images points of the plane z = 1 in camera space, shape [..., 2] [Brown 1966; OpenCV].
+    """Distort points of the plane z = 1 in camera space, shape [..., 2] [Brown 1966; OpenCV].
 
     x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²)
     y' = y (1 + k1 r² + k2 r⁴ + k3 r⁶) + p1 (r² + 2 y²) + 2 p2 x y

@@ -166,7 +166,7 @@ class Mesh:
 
     @functools.cached_property
     def surface(self) -> MeshTopology:
-        """How its faces are joined."""
+        """Topology of its faces."""
         return join_faces(self.positions, self.faces, self.uv_faces)
 
     @functools.cached_property
@@ -242,7 +242,7 @@ class Mesh:
 
     @functools.cached_property
     def split_count(self) -> int:
-        """How many vertices :meth:`welded` joins to others, if their normals draw lines over a smooth surface, or 0."""
+        """Count the vertices that :meth:`welded` would join, if normals draw lines over a smooth surface, or 0."""
         if self.origins is not None or not draws_lines(self.surface, self.positions):  # creased on purpose, or none
             return 0
         return len(self._used) - len(self.welded()._used)

@@ -123,10 +123,10 @@ def png_bytes(codes: np.ndarray) -> bytes:
 
 
 class Development(NamedTuple):
-    """How linear values became a picture."""
+    """Exposure and tone curve by which linear values became a picture."""
 
     exposure: float
-    """In stops."""
+    """Exposure [stops]."""
 
     tone: str
     """Tone curve."""

@@ -38,7 +38,7 @@ def plane(size: float | tuple[float, float] = 2.0, segments: int | tuple[int, in
 
 
 _INFINITE_EXTENT = 1e4
-"""How far an infinite ground goes, in sizes: seen from one size above, it ends 0.006 degrees below the horizon."""
+"""Extent of an infinite ground, in sizes: seen from one size above, it ends 0.006 degrees below the horizon."""
 
 
 def infinite_ground(size: float = 2.0, segments: int = 64) -> Mesh:

@@ -27,7 +27,7 @@ Channels = dict[str, np.ndarray]  # float32 of shape [height, width], by names
 
 
 class Coding(Protocol):
-    """How the channels of a picture become codes."""
+    """Conversion of a picture's channels to codes."""
 
     def codes(self, values: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
         """Encode values [height, width, channel]; return the codes and their range."""
@@ -49,7 +49,7 @@ class Even:
     high: float = 1.0
 
     def codes(self, values: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
-        """As :class:`Coding` says."""
+        """Encode channels; see :class:`Coding`."""
         maximum = 2**self.bits - 1
         rounding = (self.high - self.low) / maximum / 2
         minimum, maximum_value = float(values.min()), float(values.max())
@@ -63,7 +63,7 @@ class Srgb:
     """Color and coverage in 8 bits: sRGB, not premultiplied, exposed so that the brightest value is just white."""
 
     def codes(self, values: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
-        """As :class:`Coding` says."""
+        """Encode channels; see :class:`Coding`."""
         alpha = np.rint(values[..., 3:].astype(np.float64) * 255).clip(0, 255)
         color = np.divide(values[..., :3], values[..., 3:], out=np.zeros_like(values[..., :3]), where=alpha > 0)
         max_radiance = float(color.max())

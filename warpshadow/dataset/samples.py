@@ -45,7 +45,7 @@ class Sample(NamedTuple):
     spheres: np.ndarray | None
     """float32 of shape [sphere, 5]: center, radius [scene units], number of the body; None where the layer is not."""
     scene: dict[str, Plain]
-    """How the scene was drawn."""
+    """Random choices of the scene."""
 
     @property
     def color(self) -> np.ndarray:
@@ -107,7 +107,7 @@ def _spheres(scene: Scene) -> np.ndarray:
 
 
 def _about(data_set: DataSet, number: int, drawn_scene: DrawnScene) -> dict[str, Plain]:
-    """How a scene was drawn."""
+    """Random choices of a scene."""
     scene, recipe, split = drawn_scene.scene, data_set.recipe, data_set.split_of(number)
     stock = data_set.stocks[split]
     meshes = [stock.meshes[prototype] for prototype in drawn_scene.prototypes]

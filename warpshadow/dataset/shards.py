@@ -33,9 +33,9 @@ class Shard(NamedTuple):
     """A .tar file of a data set."""
 
     name: str
-    """Of the file: its split, and its number in that."""
+    """File name: the split, and the number within it."""
     numbers: range
-    """Of its images."""
+    """Numbers of its images."""
 
 
 def shards_of(data_set: DataSet) -> list[Shard]:

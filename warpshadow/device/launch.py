@@ -96,7 +96,7 @@ def varies(values: Iterable[Any]) -> bool:
 
 
 def without_gradient(array: wp.array) -> wp.array:
-    """The same array without a gradient."""
+    """View an array without its gradient."""
     if not array.requires_grad:
         return array
     flat_array = reshaped(array, array.shape)

@@ -244,7 +244,7 @@ def _launch_slices(
 
 
 def _with_gradient(array: wp.array, gradient: wp.array) -> wp.array:
-    """The same array with another gradient: to that a kernel adds where it reads a row of the array as an array."""
+    """View an array with another gradient, to which kernels add that read a row of the array as an array."""
     assert array.is_contiguous
     return wp.array(ptr=array.ptr, dtype=array.dtype, shape=array.shape, device=array.device, grad=gradient)
 

@@ -103,7 +103,7 @@ class Wait:
 
     @property
     def age(self) -> float:
-        """How long it takes so far [s]."""
+        """Elapsed time [s]."""
         return time.monotonic() - self._start
 
     def update(self, count: int = 1) -> None:
@@ -134,7 +134,7 @@ class Wait:
             self.bar.set_postfix_str(remark, refresh=False)
 
     def line(self) -> str:
-        """How far it is, for people."""
+        """Progress, as text."""
         parts = [show_time(self.age)]
         if self.unit and self.total is not None:
             parts.insert(0, f"{self.done:,} of {self.total:,} {self.unit}s")

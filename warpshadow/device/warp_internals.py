@@ -73,7 +73,7 @@ _NO_ARRAY = _types.array_t()  # the descriptor of an argument None
 
 @functools.cache
 def _cpu_signature(kernel: wp.Kernel) -> tuple[Any, Any, list[Any], dict] | None:
-    """How a CPU kernel takes its arguments.
+    """Calling convention of a CPU kernel.
 
     Returns:
         Structs of the arguments and of their gradients; dtype and dimensions of each array, None of a struct, and ()
@@ -300,7 +300,7 @@ def kernel_modules() -> dict[str, wp.Module]:
 
 
 def around_compilation(context: Callable[[], contextlib.AbstractContextManager]) -> None:
-    """From now on, compile modules of kernels within a context, and one that several processes need in one of them.
+    """Compile modules of kernels within a context from now on; of several processes, one compiles.
 
     The others wait, and load it from Warp's cache. Should the one be killed, its lock ends with it, and the next
     compiles. A module that was compiled before, maybe where nothing can be written, is read without.
@@ -336,7 +336,7 @@ def _locked(folder: str) -> Iterator[None]:
 
 
 def load_silently(package: str) -> None:
-    """From now on, load modules of a package's kernels without Warp's line for each.
+    """Load modules of a package's kernels from now on without Warp's line for each.
 
     Its other messages stay, and so do these where ``wp.config.log_level`` is ``wp.LOG_DEBUG``.
     """

@@ -124,5 +124,5 @@ def _state(path: Path, payload: bytes) -> dict[str, Any]:
 
 
 def previous_path(path: Path) -> Path:
-    """Where the checkpoint before the last is kept."""
+    """Path of the previous checkpoint."""
     return path.with_name(f"{path.name}.previous")

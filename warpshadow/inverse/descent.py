@@ -51,7 +51,7 @@ class _Diverged(Exception):
 
 
 class _Candidate(NamedTuple):
-    """Where a run begins."""
+    """Start of a run."""
 
     values: dict[str, Values]
     curvature: Curvature | None  # that a QuasiNewton found in the stage before

@@ -56,7 +56,7 @@ class FoundLight:
 
     @property
     def determined(self) -> np.ndarray:
-        """Which directions the images determined, bool of shape [height, 2·height]."""
+        """Whether the images determined a direction, bool of shape [height, 2·height]."""
         return self.influence >= MIN_INFLUENCE
 
     @property
@@ -102,7 +102,7 @@ def found_light(
 
 
 def influence_of_cells(problem: Problem, setting: Setting, values: Mapping[str, Values]) -> np.ndarray:
-    """How much light from each of 512 cells matters to the images, 1 on the average, shape [cell]."""
+    """Find the influence of each of 512 cells' light on the images, 1 on average, shape [cell]."""
     cells = Light(None, directions=_CELLS)
     free = [cells if isinstance(item, Light) else item for item in problem.free]
     by_cells = Problem(problem.scene, problem.targets, free, problem.loss, problem.still)

@@ -52,7 +52,7 @@ _LOCK_TIMEOUT = 60.0
 
 @dataclass(frozen=True)
 class Ending:
-    """How one of many fits ended.
+    """Outcome of one of many fits.
 
     Args:
         name: Of the fit, and of its folder.
@@ -199,7 +199,7 @@ class _FitJob:
         return self.results / self.name
 
     def recorded(self) -> Ending | None:
-        """How it ended before."""
+        """Its previous outcome."""
         path = self.folder / _RECORD
         if not path.exists():
             return None

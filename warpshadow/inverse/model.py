@@ -87,7 +87,7 @@ class Model:
 
 
 class LightModel(Model):
-    """The same where light alone is free and differences are squared: a quadratic form, computed without images.
+    """Model where light alone is free and differences are squared: a quadratic form, computed without images.
 
     Images are linear in the light, I_c = J_c L_c for each color c, so the loss is Σ_c L_cᵀ G_c L_c − 2 g_c·L_c + const
     with G_c = J_cᵀ W J_c and g_c = J_cᵀ W t_c, W the pixels' shares in the loss. Sums are float64: near the

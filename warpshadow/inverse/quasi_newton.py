@@ -103,7 +103,7 @@ class QuasiNewton(torch.optim.Optimizer):
         self._memory.update(loss=loss, place=place, gradient=gradient, sides=sides)
 
     def _sides(self, place: torch.Tensor) -> torch.Tensor:
-        """On which side of a value its bound is, ±1, where it was clamped to one; 0 elsewhere."""
+        """Side of the bound to which a value was clamped, ±1; 0 for other values."""
         memory = self._memory
         unchanged_sides = torch.where(place == memory["place"], memory["sides"], 0.0)
         return torch.where(place == memory["aim"], unchanged_sides, torch.sign(memory["aim"] - place))

@@ -146,7 +146,7 @@ class Target:
         return np.ascontiguousarray(image_and_weights[..., :-1])
 
     def weights(self) -> np.ndarray:
-        """How much each pixel counts, float32 of shape [height, width]."""
+        """Weights of the pixels, float32 of shape [height, width]."""
         return np.ones(self.image.shape[:2], np.float32) if self.mask is None else self.mask
 
 

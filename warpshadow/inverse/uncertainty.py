@@ -78,7 +78,7 @@ class PoseUncertainty:
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """How well a fit knows its few parameters.
+    """Uncertainty of a fit's few parameters.
 
     Args:
         names: Of the numbers, as "pose[0].shift[1]".
@@ -99,7 +99,7 @@ class Uncertainty:
 
     @property
     def stops(self) -> list[float]:
-        """Of the exposures of the views."""
+        """Standard deviations of the views' exposures."""
         return [sd / np.log(2.0) for name, sd in self.deviations.items() if name.startswith("exposure.log[")]
 
 
@@ -284,7 +284,7 @@ def _by_tiles(pixels: np.ndarray) -> np.ndarray:
 def uncertainty(
     problem: Problem, setting: Setting, values: Mapping[str, Values], fitted: FittedScene
 ) -> Uncertainty | None:
-    """How well a fit knows its few parameters; None where it has none.
+    """Find the uncertainty of a fit's few parameters; None without any.
 
     Args:
         problem, setting, values: Of the result.

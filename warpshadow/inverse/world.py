@@ -49,7 +49,7 @@ class Setting:
 
     @functools.cached_property
     def distances(self) -> np.ndarray:
-        """From the middle of the scene to the eye of each view, shape [view, 1]: the unit of the eye's shifts."""
+        """Distance from the scene's middle to the eye of each view, [view, 1]: the unit of the eye's shifts."""
         low, high = zip(*(body.world_mesh().bounds for body in self.scene.bodies), strict=True)
         center = (np.min(low, axis=0) + np.max(high, axis=0)) / 2
         return np.linalg.norm([camera.eye - center for camera in self.cameras], axis=1, keepdims=True)

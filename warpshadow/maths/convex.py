@@ -38,7 +38,7 @@ class ConvexPart(NamedTuple):
     faces: np.ndarray
     """Three corners of each face, counterclockwise from outside, numbers among the corners, shape [face, 3]."""
     edges: np.ndarray
-    """Where each edge begin and ends, numbers among the corners, and the faces to its left and right, [edge, 4]."""
+    """Ends of each edge, indices of corners, and the faces to its left and right, [edge, 4]."""
 
 
 def find_convex_parts(

@@ -109,7 +109,7 @@ def _cuts(points: np.ndarray, region: np.ndarray) -> list[list[np.ndarray]]:
 
 
 def _deviation(points: np.ndarray, region: np.ndarray) -> float:
-    """How far a region is from a panel: its thickness, or the mean width by which a convex outline is larger."""
+    """Deviation of a region from a panel: its thickness, or the mean width by which a convex outline is larger."""
     from scipy.spatial import ConvexHull
 
     local_points = points[region] @ _principal_axes(points[np.unique(region)]).T

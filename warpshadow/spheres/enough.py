@@ -1,4 +1,4 @@
-"""As many spheres as a body needs: from short fits of a few counts."""
+"""Number of spheres that a body needs, from short fits of a few counts."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def enough_spheres(
     cached_errors: Sequence[Sequence[float]] = (),
     store_errors: Callable[[list[Sequence[float]]], None] = lambda errors: None,
 ) -> int:
-    """How many spheres a body needs, a power of two from 8 to 1024.
+    """Find the number of spheres that a body needs, a power of two from 8 to 1024.
 
     The error of short fits of 8, 32, 128 and 512 spheres falls with their number. Taken is where it is small enough, or
     where it falls no longer and the shadow is whole.
@@ -86,7 +86,7 @@ def _errors(judge: Refinement, spheres: np.ndarray) -> tuple[float, float]:
 
 
 def _where(count: int, previous_error: float, error: float) -> int:
-    """Where, from a quarter of the count on, the error becomes small enough; it falls with a power of the count."""
+    """Estimate the count, from a quarter of ``count`` on, at which the error is small enough: it falls with a power."""
     if count == TRIED_COUNTS[0]:
         return count
     part = np.log(previous_error / _MAX_ERROR) / max(np.log(previous_error / error), 1e-6)

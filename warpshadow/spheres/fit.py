@@ -176,7 +176,7 @@ def is_fitted(mesh: Mesh, count: int | str, *, device: wp.DeviceLike = "cpu") ->
 
 
 def fit_seconds(count: int | str) -> float:
-    """How long a fit takes, about, on one thread [s].
+    """Estimate the time of a fit on one thread [s].
 
     Measured on a bunny and a Zen 4: 2.1 s for 64 spheres, 4.9 for 256, 14.5 for 1024; "auto", which takes 256, 8.4.
     """

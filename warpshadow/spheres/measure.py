@@ -1,4 +1,4 @@
-"""How well spheres stand in for a mesh."""
+"""Errors of the spheres that approximate a mesh."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DIRECTIONS = 512  # rays from each of them
 
 @dataclass(frozen=True)
 class FitReport:
-    """How well spheres stand in for a mesh.
+    """Errors of the spheres that approximate a mesh.
 
     The errors are ‖E_spheres − E_mesh‖ / ‖E_mesh‖ over receivers, E the irradiance under a sky with a sun of
     10°, for four azimuths of the sun. Receivers whose hemisphere is less than 5% open, which hardly any
@@ -34,11 +34,11 @@ class FitReport:
     outside_volume: float
     """Share of the union's volume that lies outside the mesh, the air of a cavity included; 1 for a sheet."""
     ground_error: float
-    """On a square of 2.5 times the bounding box's longest side at the height of the lowest point, y up."""
+    """Error on a square of 2.5 times the bounding box's longest side at the height of the lowest point, y up."""
     surface_error: float
-    """On the mesh's own vertices, weighted by area; on both sides of an open mesh, for any winding."""
+    """Error on the mesh's own vertices, weighted by area; on both sides of an open mesh, for any winding."""
     nearby_error: float
-    """In the air around it and in its cavities, most of it close to the mesh, on receivers that look anywhere."""
+    """Error in the air around it and in its cavities, mostly close to the mesh, on receivers of random normals."""
     shadow_error: float
     """The error on the ground relative to the shadow there, ‖E_spheres − E_mesh‖ / ‖E_unshadowed − E_mesh‖."""
     seconds: float

@@ -83,7 +83,7 @@ class FitReceivers:
         points, normals = (np.concatenate(item) for item in zip(*parts, strict=True))
         frames = _frames(normals, rng)
         self.frame_rows = np.column_stack([points, frames.reshape(-1, 9)]).T.astype(np.float32)
-        """Where they are: points, and the rows of frames, [12, receiver]."""
+        """Points, and the rows of frames, [12, receiver]."""
         self.directions = hemisphere(self.DIRECTIONS)
         """Directions in the frame of each receiver [direction, 3]."""
         self.metric = _light_metric(self.directions, sharpness)
@@ -100,13 +100,13 @@ class FitReceivers:
         openness = (self.visibility / self.directions[:, 2]).mean(axis=1) / 2
         floor = self.VISIBLE_FLOOR
         self.weights = (floor + (1 - floor) * np.minimum(openness, 1)).astype(np.float32)[:, None]
-        """How much errors at receivers count [receiver, 1]."""
+        """Weights of the errors at receivers [receiver, 1]."""
         if mesh.is_sheet:
             self.weights[:surface] *= self.SHEET
         self.off_surface = np.arange(surface, count)  # receivers that are not on the mesh
 
     def __len__(self) -> int:
-        """How many."""
+        """Number of receivers."""
         return len(self.visibility)
 
 
@@ -118,7 +118,7 @@ def _on_surface(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> t
 
 
 def _on_grounds(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """On grounds at and below the lowest point."""
+    """Draw receivers on grounds at and below the lowest point."""
     square = rng.uniform(-1, 1, size=(count, 2))
     square *= 1.25 * mesh.longest * np.abs(square).max(axis=1, keepdims=True) ** 0.5  # denser near the body
     depth = np.where(rng.uniform(size=count) < 0.25, 0.3 * mesh.longest, 0.0) * rng.uniform(size=count)

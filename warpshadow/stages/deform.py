@@ -164,7 +164,7 @@ class DeformationGraph:
 
     @one_at_a_time
     def centers(self, translations: wp.array) -> wp.array:
-        """Where the nodes themselves go: vec3 of shape [batch, node]. Differentiable: translations."""
+        """Displaced positions of the nodes: vec3 of shape [batch, node]. Differentiable: translations."""
         check.shape("translations", translations.shape, ("batch", self.node_positions.shape[0]))
         check.finite_arrays({"translations": translations})
         moved_centers = wp.empty_like(translations, requires_grad=False)
@@ -185,7 +185,7 @@ class DeformationGraph:
 
     @one_at_a_time
     def shear(self, matrices: wp.array) -> wp.array:
-        """How far the matrices are from rotations, Σ |MᵀM − I|² (as E_rot of Sumner): float32 of shape [batch].
+        """Distance of the matrices from rotations, Σ |MᵀM − I|² (as E_rot of Sumner): float32 of shape [batch].
 
         Differentiable: matrices.
         """

@@ -23,7 +23,7 @@ PACKET = CHUNK  # rays of a packet
 _LEAF = 4  # faces of a leaf at most
 
 _SLACK = 2.0**-20
-"""How far leaves reach beyond their faces, as a part of their largest coordinate: points lie on faces to rounding.
+"""Margin of leaves around their faces, as a share of their largest coordinate: points lie on faces to rounding.
 
 Of the largest of all faces it would be too far: an infinite ground's reach 10⁵ times as far as the bodies on it."""
 
@@ -88,7 +88,7 @@ def packets_of(directions: np.ndarray) -> np.ndarray:
 
 
 def _bounds(count: int, level: int) -> np.ndarray:
-    """Where the boxes of a level have their first faces, and the end of the last: each has as many, but for one."""
+    """First faces of the boxes of a level, and the end of the last: their counts differ by at most one."""
     return np.arange((1 << level) + 1) * count >> level
 
 

@@ -16,7 +16,7 @@ from warpshadow.stages.light_samples import CellSamples, LightSamples
 RAY_COST = 200.0  # nanoseconds that a ray takes
 
 ROUNDING = 2.0**-21
-"""How far a point interpolated in float32 may lie off its face: a part of the face's largest coordinate, by axis."""
+"""Distance of a point, interpolated in float32, from its face, at most: a share of its largest coordinate, by axis."""
 
 WALL_COSINE = 1.0e-3
 """Cosine between a face's normal and a receiver's below which the face is a wall at whose foot the receiver lies: it is

@@ -45,7 +45,7 @@ class Receivers(NamedTuple):
     sample_fragments: Fragments | None = None  # side and barycentrics of each sample receiver, [batch, sample receiver]
 
     def without_bodies(self) -> "Receivers":
-        """The same receivers, as points without bodies."""
+        """Drop the bodies of receivers."""
         return self._replace(spans=(), vertices=None, sample_fragments=None)
 
 
@@ -58,7 +58,7 @@ such normals round the edges of a box, whose points would rise into its neighbor
 def _rise_to_smooth_surface(
     positions: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3), corners: wp.vec3i, weights: wp.vec3
 ):
-    """How much points rise from a face, seen from its front and its back, towards the surface that its normals round.
+    """Offsets of a point from its face, seen from front and back, towards the surface that smooth normals describe.
 
     Each corner's tangent plane, where it is above the point, raises it [Hanika 2021, "Hacking the shadow terminator"]:
     to twice the height of a sphere through the corners. With half of that a bunny of 3,500 vertices keeps some of the
@@ -137,7 +137,7 @@ def _add_faces(
 
 
 class Numbering(NamedTuple):
-    """Which vertices are receivers, and their numbers."""
+    """Vertices that are receivers, and their indices."""
 
     vertices: (
         wp.array | None

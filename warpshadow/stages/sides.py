@@ -22,7 +22,7 @@ _FACE_RUN = 1024  # faces that a thread owns on a CPU, so that it finds the came
 
 @wp.func
 def split_side(number: int, count: int):
-    """Which of ``count`` faces or vertices a number is, and whether it is seen from behind."""
+    """Split the number of a side into the index of ``count`` faces or vertices, and whether it is the back."""
     is_back = number >= count
     return wp.where(is_back, number - count, number), is_back
 
@@ -41,7 +41,7 @@ def split_sides(numbers: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray
 
 @wp.func
 def _eye_position(clip_matrix: wp.mat44):
-    """Where a camera is: the point whose x, y and w in clip space are zero."""
+    """Eye of a camera: the point whose x, y and w in clip space are zero."""
     x = wp.vec3d(wp.vec3(clip_matrix[0, 0], clip_matrix[0, 1], clip_matrix[0, 2]))
     y = wp.vec3d(wp.vec3(clip_matrix[1, 0], clip_matrix[1, 1], clip_matrix[1, 2]))
     w = wp.vec3d(wp.vec3(clip_matrix[3, 0], clip_matrix[3, 1], clip_matrix[3, 2]))

@@ -152,7 +152,7 @@ class _Call:
     affine: frozenset[str]
 
     def moved(self, tensors: Sequence[torch.Tensor], directions: Sequence[torch.Tensor | None]) -> list[torch.Tensor]:
-        """How the results change as tensors move in directions: Σ f(…, direction, …) − f(…, 0, …), exact if affine.
+        """Change of the results as tensors move in directions: Σ f(…, direction, …) − f(…, 0, …), exact if affine.
 
         Differentiable: tensors, directions.
         """

@@ -64,7 +64,7 @@ class MixedRenderer(torch.nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where its tensors are."""
+        """Device of its tensors."""
         return self._renderer(0).device
 
     @uncompiled
@@ -252,7 +252,7 @@ class MixedRenderer(torch.nn.Module):
 
 
 class _Batch:
-    """Which images of a batch are of which scene."""
+    """Scenes of the images of a batch."""
 
     def __init__(self, which: torch.Tensor | Sequence[int], scene_count: int):
         numbers = which.tolist() if isinstance(which, torch.Tensor) else which

@@ -146,7 +146,7 @@ class PointSample:
 
 
 def seen_on_faces(view: View, chosen_samples: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where samples of the first image of a view lie on faces.
+    """Positions on faces of samples of a view's first image.
 
     Args:
         chosen_samples: Flat indices of samples that see a face, shape [point].

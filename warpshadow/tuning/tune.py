@@ -171,7 +171,7 @@ def _bounces(scene: Scene) -> str:
 
 
 def _spheres(scene: Scene, fitted: Iterable[int]) -> str:
-    """How many spheres are fitted to each of some bodies, and how many others are given."""
+    """Numbers of spheres that are fitted to bodies, and of given ones."""
     if scene.visibility.method not in SPHERE_METHODS:
         return "–"
     counts = [scene.bodies[number].blockers for number in fitted]

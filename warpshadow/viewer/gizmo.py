@@ -23,13 +23,13 @@ def radius(body: Body) -> float:
 
 
 def handle_of(pose: BodyPose, body: Body, page_scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where the handles of a body are: quaternion, w first, and position [page units]."""
+    """Pose of a body's handles: quaternion, w first, and position [page units]."""
     body_rotation = Rotation.from_rotvec(pose.rotation, degrees=True)
     return quaternion(body_rotation), page_scale * (body_rotation.apply(middle(body)) + pose.translation)
 
 
 def pose_of(wxyz: np.ndarray, position: np.ndarray, body: Body, page_scale: float) -> BodyPose:
-    """Where a body is that was dragged by its handles.
+    """Pose of a body that was dragged by its handles.
 
     Raises:
         ValueError: for numbers that are not finite, and for a quaternion of 0.

@@ -116,7 +116,7 @@ class Loop:
             self._ask(*self._clients.values())
 
     def camera_of(self, name: Hashable) -> PageCamera | None:
-        """From where a page looks; None where it is gone, or has not said."""
+        """Camera of a page; None where the page is gone or has sent none."""
         with self._changed:
             client = self._clients.get(name)
             return None if client is None else client.camera

@@ -167,7 +167,7 @@ class Painter:
         return key, self._renderers.get(key, lambda: Renderer(scene, device=self._device, progress=self._progress))
 
     def _geometry(self, key: Hashable, renderer: Renderer, viewer_state: ViewerState) -> Geometry | None:
-        """Where bodies are; None where the scene has them."""
+        """Placed bodies; None where they are as in the scene."""
         if not viewer_state.has_moved(self.scene):
             return None
         rotations = [Rotation.from_rotvec(pose.rotation, degrees=True).as_matrix() for pose in viewer_state.poses]
@@ -273,7 +273,7 @@ def relative_error(image: np.ndarray, reference: np.ndarray) -> float | None:
 
 
 def error_picture(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """How far an image is from the reference, a fifth of its mean as full red (too bright) or blue (too dark).
+    """Difference of an image from the reference, a fifth of its mean as full red (too bright) or blue (too dark).
 
     Args:
         image: Linear RGB and coverage, shape [height, width, 4].

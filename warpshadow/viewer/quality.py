@@ -1,4 +1,4 @@
-"""How good an image is made: few pixels and cells while something moves, then better ones while it rests."""
+"""Quality of images: few pixels and cells while something moves, then more while it rests."""
 
 from __future__ import annotations
 

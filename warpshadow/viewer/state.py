@@ -32,7 +32,7 @@ PICTURE, ERROR = "picture", "error against rays"
 
 @dataclass(frozen=True)
 class BodyPose:
-    """Where a body is: turned by a rotation, then moved.
+    """Pose of a body: a rotation, then a translation.
 
     Args:
         rotation: Axis-angle vector [degrees].

@@ -106,7 +106,7 @@ class Pose(FreeOfBody):
             raise ValueError("size: got a prior of a size that is not free, expected scale = true beside it")
 
     def numbered(self, scene: Scene) -> Pose:
-        """The same of the bodies' numbers."""
+        """Replace names of bodies by their numbers."""
         numbered_pose = replace(self, body=scene.body_number(self.body))
         if self.stands_on is None:
             return numbered_pose
@@ -156,7 +156,7 @@ class Pose(FreeOfBody):
             )
 
     def start(self, setting: Setting) -> Values:
-        """Where the body is."""
+        """Pose of the body."""
         possible = self.constraint(setting)
         turn = np.zeros(len(possible.turns)) if self.rotation == "axis-angle" else _NO_TURN[self.rotation]
         values = {"turn": setting.tensor(turn), "shift": setting.tensor(np.zeros(len(possible.shifts)))}
@@ -197,7 +197,7 @@ class Pose(FreeOfBody):
         return rotation, possible.touching(center, rotation, scale, setting.tensor(setting.middle(self.number))), scale
 
     def _start_middle(self, setting: Setting) -> np.ndarray:
-        """Where the body's middle is at the start, in the world."""
+        """Initial position of the body's middle in the world."""
         return setting.scene.bodies[self.number].to_world(setting.middle(self.number))
 
     def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:

@@ -63,7 +63,7 @@ class Exposure(Free):
 
 @dataclass(frozen=True)
 class OutlineOffset(Free):
-    """By how much the painted outlines of each view lie inside the true ones, since no mask is right to the pixel.
+    """Distance by which painted outlines of each view lie inside the true ones: no mask is right to the pixel.
 
     Args:
         deviation: Standard deviation of its prior [pixels].
@@ -99,7 +99,7 @@ class OutlineOffset(Free):
 
 @dataclass(frozen=True)
 class CameraPose(Free):
-    """Where each view was taken: the eye, how it looks, and maybe the focal length.
+    """Camera pose of each view: eye, rotation and, if free, focal length.
 
     Args:
         focal: Whether the focal length is free, too.

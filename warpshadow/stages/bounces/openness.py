@@ -69,7 +69,7 @@ def _sum_openness(
 def find_openness(
     normals: wp.array, transmittance_self: wp.array | None, transmittance_spheres: wp.array, directions: np.ndarray
 ) -> wp.array:
-    """How open the hemispheres of patch samples are past all bodies, and past their own.
+    """Find the openness of patch samples' hemispheres past all bodies, and past their own.
 
     Args:
         normals: Of the patch samples, vec3 of shape [batch, patch sample].
@@ -129,14 +129,14 @@ def _find_weights(
 
 
 class Openness(NamedTuple):
-    """How much patch samples and patches count by how open they are, in three equal channels."""
+    """Weights of patch samples and patches by their openness, in three equal channels."""
 
     shares: wp.array  # f, of patch samples in their patches, vec3 of shape [batch, patch sample]
     weights: wp.array  # v, of patches among others, vec3 of shape [batch, patch]
 
 
 def open_shares(openness: wp.array, mean: SparseMatrix, patch_of_sample: np.ndarray) -> Openness:
-    """How much patch samples count in their patches, 1 on average, and patches among others.
+    """Find the weights of patch samples in their patches, 1 on average, and of patches among others.
 
     Args:
         openness: Of the patch samples, from :func:`find_openness`, vec3 of shape [batch, patch sample].

@@ -28,9 +28,9 @@ bounded."""
 SAMPLES_PER_PATCH = 4  # patch samples of a patch, at most
 
 _NORMAL_WEIGHT = 1.0
-"""How far apart opposite normals are, in units of the body's size: both sides of a thin wall have patches of their own.
-With 0.4, images with two bounces of nested boxes and of stairs were 8.6 and 10.5% off images with all patches, by this
-7.6 and 9.3%; for a bowl, rooms and chairs they are the same."""
+"""Distance of opposite normals in feature space, in units of the body's size: both sides of a thin wall have patches of
+their own. With 0.4, images with two bounces of nested boxes and of stairs were 8.6 and 10.5% off images with all
+patches, by this 7.6 and 9.3%; for a bowl, rooms and chairs they are the same."""
 
 _SORT_WEIGHTS = np.repeat([1.0, 10.0], 3)
 """Weights of position and normal by which patches are put in order. Kernels look at patch samples that follow each
@@ -40,8 +40,8 @@ their time."""
 _SORT_RUN = 4  # patches that are best near each other
 
 _LIFT = 1e-4
-"""How far above a piece rays start that find out whether it is inside another part, in units of the body's size: where
-two parts touch, each is inside the other."""
+"""Height above a piece at which rays start that tell whether it is inside another part, in units of the body's size:
+where two parts touch, each is inside the other."""
 
 _INWARD_SHARE = 0.1  # how far from a corner towards the middle a piece is looked at, to see whether it reaches out
 
@@ -259,7 +259,7 @@ def _cut_faces(
 
 
 def _find_outside(mesh: wp.Mesh, corners: np.ndarray, lift: float) -> tuple[np.ndarray, np.ndarray]:
-    """Which pieces are outside of all parts of their body, and which of the others reach out.
+    """Find pieces outside of all parts of their body, and pieces inside that reach out.
 
     Args:
         mesh: The body, of parts that are closed.

@@ -205,7 +205,7 @@ def find_side_hits_adjoint(
 
 @wp.func
 def _relative_distance(hit: PlaneHit, other: PlaneHit):
-    """How far, in ranges, another side is in front of one: −1 wholly behind it, 1 wholly in front."""
+    """Distance of another side in front of one, in ranges: −1 wholly behind it, 1 wholly in front."""
     return (hit.distance - other.distance) / (hit.distance_range + other.distance_range + 1.0e-20)
 
 

@@ -83,7 +83,7 @@ class ConvexBlockers:
         )
 
     def placed(self, positions: wp.array) -> PlacedParts:
-        """Where parts are.
+        """Convex parts in the world.
 
         Args:
             positions: Vertices of all bodies [scene units], vec3 of shape [batch, vertex]. Parts must stay convex:
@@ -101,7 +101,7 @@ class ConvexBlockers:
 
 
 class PlacedParts(NamedTuple):
-    """Where parts are."""
+    """Convex parts in the world."""
 
     corners: wp.array  # vec3 of shape [batch, corner]
     planes: wp.array  # of faces: outward normals N, and N·x of their points, vec4 of shape [batch, face]
@@ -137,7 +137,7 @@ def _bound_parts(
 
 
 def _starts(counts: Sequence[int]) -> np.ndarray:
-    """Where items of each begin, and the end of the last."""
+    """First index of each part's items, and the end of the last."""
     return np.cumsum([0, *counts]).astype(np.int32)
 
 

@@ -56,7 +56,7 @@ def resize_rows(radiance: np.ndarray, rows: int) -> np.ndarray:
 
 @functools.cache
 def _blur_spectra(rows: int, sigma: float) -> np.ndarray:
-    """Of a Gaussian from row to row, over longitude: [row, row of the source, frequency]."""
+    """Spectra of a Gaussian blur from row to row, over longitude: [row, row of the source, frequency]."""
     polar = np.pi * (np.arange(rows) + 0.5) / rows
     longitudes = np.pi * np.arange(2 * rows) / rows
     solid_angles = sh.pixel_solid_angles(rows)

@@ -188,7 +188,7 @@ def front_weight_slope(grid: PlaneGrid, height: float):
 
 @wp.func
 def position_on_side(grid: PlaneGrid, local_receiver: LocalReceiver, is_back: bool):
-    """Where a receiver is above a side: a margin where it is not, and smoothly its height from two of them on."""
+    """Position of a receiver above a side: at least a margin high, and its own height from two margins on."""
     height = wp.where(is_back, -local_receiver.position[2], local_receiver.position[2])
     front_ramp = wp.clamp(height / grid.margin, 0.0, 2.0)
     return wp.vec3(
@@ -288,7 +288,7 @@ def find_footprint_adjoint(
 
 @wp.struct
 class MipFootprint:
-    """Where on a grid a footprint lies, and how large it is there."""
+    """Position and size of a footprint on a grid."""
 
     texel: wp.vec2  # in texels of the finest level, from its corner
     slopes: wp.vec2  # of that by the center in the plane

@@ -53,14 +53,14 @@ _MIN_BLOCKER_RADIUS = wp.constant(1.0e-18)  # radius up to which a sphere blocks
 
 
 class NearestBlockers(NamedTuple):
-    """Of each patch sample the sphere blocker nearest to its patch."""
+    """Sphere blockers nearest to the patches of patch samples."""
 
     centers: wp.array  # [batch, sphere] vec3
     radii: wp.array  # [batch, sphere] float32
     blocker_indices: wp.array  # [point] int32, the sphere of each; −1 for none
 
     def cut(self, points: slice) -> NearestBlockers:
-        """The same of some points."""
+        """Select some points."""
         return self._replace(blocker_indices=self.blocker_indices[points])
 
 
@@ -220,7 +220,7 @@ def find_fronts(
 
 
 def _body_sides(corners: wp.array, frames: wp.array, planes: PlaneBlockers) -> wp.array:
-    """On which side of each plane a body lies, b, float32 of shape [batch, plane]. Differentiable: corners, frames."""
+    """Find the side b of each plane on which a body lies, [batch, plane]. Differentiable: corners, frames."""
     count = common_batch({"corners": corners, "frames": frames})
     extremes = wp.empty((count, planes.count), dtype=wp.vec2i, device=corners.device)
     launch(_find_extremes, extremes.shape, inputs=[corners, frames], outputs=[extremes])

@@ -67,7 +67,7 @@ class PlaneTexture(NamedTuple):
         return np.stack(np.meshgrid(*map(np.diff, edges)), axis=-1)
 
     def in_texels(self, points: np.ndarray) -> np.ndarray:
-        """Where points (a, b) are [..., 2], in texels from the corner ``low``."""
+        """Map points (a, b) [..., 2] to texels, counted from the corner ``low``."""
         height, width = self.covered.shape
         return (squeezed(points / self.spread) - self.low) / (self.high - self.low) * (width, height)
 

@@ -50,7 +50,7 @@ _CELL_COST = 4.0  # mean time of a cell of a receiver [ns]: few are looked at
 
 @wp.func
 def _partial_weight(coverage: float):
-    """How much a cell counts as covered in part."""
+    """Weight of a cell as partially covered."""
     return wp.clamp(_PER_RAMP * wp.min(coverage, 1.0 - coverage), 0.0, 1.0)
 
 

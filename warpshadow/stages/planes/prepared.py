@@ -130,7 +130,7 @@ class PlaneBlockers:
         )
 
     def frames(self, positions: wp.array) -> wp.array:
-        """Where planes are: origin, and both axes, each as long as the body's scale.
+        """Frames of planes: origin, and both axes, each as long as the body's scale.
 
         Args:
             positions: Vertices of all bodies [scene units], vec3 of shape [batch, vertex]. Three of each body count, so

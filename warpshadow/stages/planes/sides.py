@@ -65,7 +65,7 @@ def load_side(scene: PlaneArrays, i: int, store: wp.array(dtype=wp.vec3)):
 
 @wp.func
 def load_local_receiver(store: wp.array(dtype=wp.vec3), f: int):
-    """Where a receiver is relative to a plane."""
+    """Load a receiver in the axes of a plane."""
     local_receiver = LocalReceiver()
     local_receiver.position = store[4 * f]
     local_receiver.axis_u = store[4 * f + 1]

@@ -88,7 +88,7 @@ def find_buried(
 
 
 def find_dilation(probes: VisibilityProbes, is_buried: np.ndarray) -> np.ndarray:
-    """For each row, the row it copies visibility from: itself, or its nearest unburied neighbor along edges.
+    """Find the row from which each row copies visibility: itself, or its nearest unburied neighbor along edges.
 
     Args:
         probes: The probes.

@@ -26,7 +26,7 @@ lose 3.5%.
 _MAX_SAMPLE_EDGE = 1.2  # longest edge where samples receive, in edges of that even cut
 
 _MAX_VERTEX_EDGE = 4.0
-"""The same where only vertices receive: probes between them are there for vertices that are buried …"""
+"""Longest edge where only vertices receive: probes between them are there for vertices that are buried …"""
 
 _ENTRY_RATIO = 1 / 3
 """Longest edge that enters another part of the body, as a spoke a hub, over that of others. Images of the cage and of

@@ -54,7 +54,7 @@ _UNKNOWN_EDGE, _NO_EDGE = NOTHING, -2
 
 @dataclass(frozen=True, eq=False)
 class Silhouettes:
-    """Where an image has silhouettes: an entry for every sample beside one.
+    """Silhouettes of an image: an entry for every sample beside one.
 
     Args:
         samples: Number of the sample in the flat images [batch, height, width], −1 in an entry that is not used, int32
@@ -98,7 +98,7 @@ def _endpoint_on_screen(p: wp.vec4, q: wp.vec4, samples_per_unit: wp.vec2):
 
 @wp.func
 def _center_count_before(coordinate: float, count: int):
-    """How many of ``count`` samples have their centers before a coordinate [samples]."""
+    """Number of the ``count`` samples whose centers are before a coordinate [samples]."""
     return int(wp.clamp(wp.ceil(coordinate - 0.5), 0.0, float(count)))
 
 

@@ -83,7 +83,7 @@ def _halving(fine_count: int, coarse_count: int) -> csr_matrix:
 
 
 class _Layout:
-    """Where the levels of textures lie in an array of texels."""
+    """Layout of the levels of textures in an array of texels."""
 
     def __init__(self, sizes: Sizes, device: str):
         level_sizes_of_textures = [level_sizes(*size) for size in sizes]

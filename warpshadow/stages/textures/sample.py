@@ -81,7 +81,7 @@ class _Cell:
 
 @wp.func
 def _texel_position(level: wp.vec3i, uv: wp.vec2):
-    """Where a uv lies in a level [texels], relative to the center of its first texel; it repeats outside of [0, 1]."""
+    """Position of a uv in a level [texels], relative to the center of its first texel; it repeats outside of [0, 1]."""
     x = (uv[0] - wp.floor(uv[0])) * float(level[1]) - 0.5
     y = (1.0 - (uv[1] - wp.floor(uv[1]))) * float(level[2]) - 0.5
     return wp.vec2(x, y)
