@@ -24,7 +24,7 @@ from warpshadow.assets.topology import (
     creases,
     draws_lines,
     is_listed_first,
-    join_at_places,
+    join_at_positions,
     join_faces,
     part_at_creases,
     rounds_edges,
@@ -238,7 +238,7 @@ class Mesh:
         their numbers: faces refer to the first at each place.
         """
         colors = [] if self.colors is None else [self.colors]
-        return replace(self, faces=join_at_places(self.positions, self.faces, *colors), origins=None)
+        return replace(self, faces=join_at_positions(self.positions, self.faces, *colors), origins=None)
 
     @functools.cached_property
     def split_count(self) -> int:

@@ -28,7 +28,7 @@ from warpshadow.assets.ply import ply_colors, ply_corner_uvs, ply_fault
 from warpshadow.assets.topology import (
     CREASE,
     is_listed_first,
-    join_at_places,
+    join_at_positions,
     join_faces,
     part_at_creases,
     rounds_edges,
@@ -272,7 +272,7 @@ def _trimesh_part(shape, of_file: bool, factors: Factors) -> MeshPart:
     keeps_faces = shape.source.file_type in ("glb", "gltf", "stl")  # faces without normals are flat; or welded later
     if normals is None and not keeps_faces and len(faces) and np.isfinite(positions).all():
         checked_faces = checked_indices("faces", faces, len(positions), "vertex")
-        welded_vertices = join_at_places(positions, checked_faces, *vertex_attributes)
+        welded_vertices = join_at_positions(positions, checked_faces, *vertex_attributes)
     elif uvs is None:
         return part
     else:  # normals of meshes that were changed differ a little at seams

@@ -10,7 +10,7 @@ import numpy as np
 from warpshadow.assets.color import GRAY, srgb_to_linear
 from warpshadow.assets.gltf import gloss_texels
 from warpshadow.assets.mesh import DIFFUSE, BaseColor, Gloss, Mesh, MeshError, MeshPart, checked_indices
-from warpshadow.assets.topology import CREASE, first_at_places, is_listed_first
+from warpshadow.assets.topology import CREASE, first_at_positions, is_listed_first
 
 
 class JoinedMesh(NamedTuple):
@@ -115,7 +115,7 @@ def fan(corner_counts: np.ndarray) -> np.ndarray:
 
 def weld(faces: np.ndarray, *attributes: np.ndarray) -> np.ndarray:
     """Let faces refer to the first of the vertices that agree in all attributes."""
-    return first_at_places(np.column_stack(attributes))[faces]
+    return first_at_positions(np.column_stack(attributes))[faces]
 
 
 def joined_normals(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:

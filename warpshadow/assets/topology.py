@@ -27,7 +27,7 @@ def welded(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     return positions[used[first_vertices]], renumbered[faces]
 
 
-def join_at_places(positions: np.ndarray, faces: np.ndarray, *attributes: np.ndarray) -> np.ndarray:
+def join_at_positions(positions: np.ndarray, faces: np.ndarray, *attributes: np.ndarray) -> np.ndarray:
     """Let faces refer to the first of the vertices at one place that agree in all attributes.
 
     Where a mesh has many sharp edges, as boxes have, and most of them are parted, they stay so. Where angles of all
@@ -40,7 +40,7 @@ def join_at_places(positions: np.ndarray, faces: np.ndarray, *attributes: np.nda
     Returns:
         The faces by the vertices that stay, shape [face, 3].
     """
-    first_vertices = first_at_places(np.column_stack([positions, *attributes]))
+    first_vertices = first_at_positions(np.column_stack([positions, *attributes]))
     if (first_vertices == np.arange(len(first_vertices))).all():
         return faces
     is_first = is_listed_first(positions, faces)  # edges of the others would have too many faces
@@ -52,11 +52,11 @@ def join_at_places(positions: np.ndarray, faces: np.ndarray, *attributes: np.nda
         count = len(positions)
         fan_count = int(fans.max()) + 1
         smooth = connected_components(faces[is_first].ravel(), count + fans.ravel(), count + fan_count)[:count]
-        first_vertices = first_at_places(smooth[:, None])
+        first_vertices = first_at_positions(smooth[:, None])
     return first_vertices[faces]
 
 
-def first_at_places(rows: np.ndarray) -> np.ndarray:
+def first_at_positions(rows: np.ndarray) -> np.ndarray:
     """Index of the first row that equals each, shape [row]."""
     group = number_positions(rows)
     first = np.empty(len(group), np.int64)

@@ -90,7 +90,7 @@ if hasattr(os, "register_at_fork"):
 
 
 @wp.func
-def scratch_place(worker: int, row: int):
+def scratch_slot(worker: int, row: int):
     """The scratch memory that a kernel's thread may use."""
     slot = worker
     if worker < 0:
@@ -206,14 +206,14 @@ def _launch_slices(
     dim, workers = _shape(dim), thread_count()
     arguments = [0, 0 if device.is_cpu else -1, *arguments]
     gradients = None if gradients is None else [None, None, *gradients]
-    maximum, least_work = _SLICES_PER_THREAD * workers, _MIN_WORK
+    maximum, min_work = _SLICES_PER_THREAD * workers, _MIN_WORK
     if summed_arguments:  # as many for any number of threads
-        least_work = _MIN_SUMMED_WORK
+        min_work = _MIN_SUMMED_WORK
         maximum = min(
             _SUMMED_SLICES, max(2, _SUMMED_SIZE // max(1, *(array.size for array in summed_arguments.values())))
         )
     is_divisible = device.is_cpu and not device.is_capturing
-    slice_count = min(dim[0], maximum, int(math.prod(dim) * cost / least_work)) if is_divisible else 1
+    slice_count = min(dim[0], maximum, int(math.prod(dim) * cost / min_work)) if is_divisible else 1
     launch = functools.partial(warp_internals.bound_kernel, kernel, device=device)
     if not summed_arguments and slice_count > workers:
         slice_count -= slice_count % workers  # as many for each thread

@@ -63,7 +63,7 @@ def enough_spheres(
             store_errors(errors)
         error, shadow_error = errors[number]
         if error <= _MAX_ERROR:
-            return _where(count, previous_error[0], error)
+            return _find_count(count, previous_error[0], error)
         stalls = error > _MIN_ERROR_RATIO * previous_error[0]
         if stalls and previous_error[1] <= RAGGED_ERROR:
             return count // 2
@@ -85,7 +85,7 @@ def _errors(judge: Refinement, spheres: np.ndarray) -> tuple[float, float]:
     return float(total_error / max(lit_error, 1e-9)), float(total_error / max(missing, 1e-9))
 
 
-def _where(count: int, previous_error: float, error: float) -> int:
+def _find_count(count: int, previous_error: float, error: float) -> int:
     """Estimate the count, from a quarter of ``count`` on, at which the error is small enough: it falls with a power."""
     if count == TRIED_COUNTS[0]:
         return count

@@ -126,12 +126,12 @@ def cut_map(
     cuts = cut_halves(importance)
     samples = _mean_samples(radiance, solid_angle, cuts)
     if find_shares is not None:
-        seen_importance = importance.copy()
+        visible_importance = importance.copy()
         pixels = cuts.round().astype(int).reshape(-1, 4).tolist()
         for (top, bottom, left, right), sun_share in zip(pixels, find_shares(samples), strict=True):
-            seen_importance[top:bottom, left:right] *= _UNSEEN_SHARE + (1 - _UNSEEN_SHARE) * count * sun_share
-        seen_importance *= importance[~is_sun].sum() / max(seen_importance[~is_sun].sum(), 1e-300)
-        samples = _mean_samples(radiance, solid_angle, cut_halves(np.where(is_sun, importance, seen_importance)))
+            visible_importance[top:bottom, left:right] *= _UNSEEN_SHARE + (1 - _UNSEEN_SHARE) * count * sun_share
+        visible_importance *= importance[~is_sun].sum() / max(visible_importance[~is_sun].sum(), 1e-300)
+        samples = _mean_samples(radiance, solid_angle, cut_halves(np.where(is_sun, importance, visible_importance)))
     permutation = compact_order(samples.directions[0], runs=(CHUNK, BUNDLE))
     return LightSamples(samples.directions[:, permutation], samples.radiance[:, permutation])
 

@@ -25,7 +25,7 @@ from warpshadow.device.lanes import (
 )
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty, require_gradient, zeros
-from warpshadow.device.parallel import Scratch, scratch_place, split_row
+from warpshadow.device.parallel import Scratch, scratch_slot, split_row
 from warpshadow.maths import sh
 from warpshadow.maths.directions import CHUNK, check_count
 from warpshadow.stages.sh_kernels import (
@@ -67,7 +67,7 @@ def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
         """A thread owns a block of receivers: the SH product of their visibility and clamped cosine."""
         row = first_row + wp.tid()
         batch, block = find_block(row, normals.shape[1])
-        slot = scratch_place(worker, row)
+        slot = scratch_slot(worker, row)
         cosine = scratch[slot, 0]
         for i in range(wp.static(order**2)):
             cosine[i] = Lane(0.0)
@@ -118,7 +118,7 @@ def _sh_transfer_adjoint_kernel(order: int, is_shadowed: bool, lanes: int) -> wp
         """A thread owns a block of receivers. Γ is symmetric:  T = V * H  has  V̄ = H * T̄  and  H̄ = V * T̄."""
         row = first_row + wp.tid()
         batch, block = find_block(row, normals.shape[1])
-        slot = scratch_place(worker, row)
+        slot = scratch_slot(worker, row)
         adj_row = scratch[slot, 0]
         factor = scratch[slot, 1]
         product = scratch[slot, 2]
@@ -220,7 +220,7 @@ def _sh_product_kernel(order: int, lanes: int) -> wp.Kernel:
         """A thread owns a block of receivers, to whose products it adds. Factors may have bands 0 … n' < n only."""
         row = first_row + wp.tid()
         batch, block = find_block(row, products.shape[1])
-        slot = scratch_place(worker, row)
+        slot = scratch_slot(worker, row)
         first = scratch[slot, 0]
         second = scratch[slot, 1]
         product = scratch[slot, 2]

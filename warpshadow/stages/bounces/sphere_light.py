@@ -36,7 +36,7 @@ from warpshadow.device.lanes import (
 )
 from warpshadow.device.launch import differentiable, launch, varies
 from warpshadow.device.memory import empty, zeros
-from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_place
+from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_slot
 from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres
 from warpshadow.stages.visibility.culling import DirectionCells, make_cap_functions, make_cells, make_cull
@@ -59,7 +59,9 @@ _CORE = 0.25  # radii within which a sphere's weight hardly grows any more
 _NEAREST2 = 1.0e-12
 """The least d² + (r/4)², in squares of the radius of the largest run of spheres: so √w is at most 1e12."""
 
-_LEAST = 1.0e-30  # the least denominator of R; spheres that block so little of a cell that they have less leave T at F
+_MIN_DENOMINATOR = (
+    1.0e-30  # the least denominator of R; spheres that block so little of a cell that they have less leave T at F
+)
 _SUMS = 4  # Σ w a L, of three colors, and Σ w a S
 
 
@@ -120,7 +122,7 @@ def _make_load_task(lanes: int) -> wp.Function:
         batch, block, receivers = load_receivers(inputs.traversed, row)
         spheres = inputs.traversed.spheres
         item = row * inputs.span_count + span
-        slot = scratch_place(worker, item)
+        slot = scratch_slot(worker, item)
         task = LightTask()
         task.cells = inputs.cells
         task.first_bundle = span * (scratch.shape[2] // BUNDLE)
@@ -192,7 +194,7 @@ def _make_light(lanes: int) -> wp.Kernel:
     load_task, weigh, falloff = _make_load_task(lanes), _make_weight(lanes), make_falloff(lanes)
     widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(True, lanes)
     SUMS = wp.constant(_SUMS)
-    LEAST = wp.constant(_LEAST)
+    MIN_DENOMINATOR = wp.constant(_MIN_DENOMINATOR)
 
     @wp.func(inline=True)
     def visit(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: LightTask):
@@ -250,7 +252,7 @@ def _make_light(lanes: int) -> wp.Kernel:
                     omega = task.cells.directions[(task.first_bundle + bundle) * BUNDLE + i]
                     cosine = inputs.factor * wp.max(dot_direction(omega, receivers.normals), Lane(0.0))
                     weight_factor = wp.cw_mul(cosine, task.blocked[slot])
-                    weight_factor = wp.cw_div(weight_factor, wp.max(task.sums[slot * SUMS + 3], Lane(LEAST)))
+                    weight_factor = wp.cw_div(weight_factor, wp.max(task.sums[slot * SUMS + 3], Lane(MIN_DENOMINATOR)))
                     light_sum.x += wp.cw_mul(weight_factor, task.sums[slot * SUMS])
                     light_sum.y += wp.cw_mul(weight_factor, task.sums[slot * SUMS + 1])
                     light_sum.z += wp.cw_mul(weight_factor, task.sums[slot * SUMS + 2])
@@ -270,7 +272,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
     falloff, sphere_adjoint = make_falloff(lanes), make_sphere_adjoint(lanes)
     widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(True, lanes)
     SUMS = wp.constant(_SUMS)
-    LEAST = wp.constant(_LEAST)
+    MIN_DENOMINATOR = wp.constant(_MIN_DENOMINATOR)
     CORE2 = wp.constant(_CORE**2)
 
     @wp.func(inline=True)
@@ -401,7 +403,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                     slot = bundle * BUNDLE + i
                     direction = (task.first_bundle + bundle) * BUNDLE + i
                     omega = task.cells.directions[direction]
-                    inverse = wp.cw_div(Lane(1.0), wp.max(task.sums[slot * SUMS + 3], Lane(LEAST)))
+                    inverse = wp.cw_div(Lane(1.0), wp.max(task.sums[slot * SUMS + 3], Lane(MIN_DENOMINATOR)))
                     mean = Vectors(task.sums[slot * SUMS], task.sums[slot * SUMS + 1], task.sums[slot * SUMS + 2])
                     adj_cell = wp.cw_mul(inverse, dot(task.adj_light, mean))
                     cosine = dot_direction(omega, receivers.normals)

@@ -15,7 +15,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, instance_in
 from warpshadow.device.launch import differentiable, launch
-from warpshadow.device.parallel import Scratch, scratch_place, split_row
+from warpshadow.device.parallel import Scratch, scratch_slot, split_row
 from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.cell_coverage import ViewedEdge, convex_coverage, coverage_adjoint, viewed_edge
 from warpshadow.stages.convex.prepared import ConvexArrays, ConvexBlockers, PlacedParts
@@ -202,7 +202,7 @@ def _attenuate(
     """A thread owns a receiver."""
     row = first_row + wp.tid()
     batch, receiver = split_row(row, points.shape[1])
-    slot = scratch_place(worker, row)
+    slot = scratch_slot(worker, row)
     corner_batch = instance_in(batch, corners.shape[0])
     normal = horizon_normal(horizon_normals, batch, receiver)
     for q in range(cells.directions.shape[0]):
@@ -261,7 +261,7 @@ def _attenuate_adjoint(
     """A thread owns a receiver:  ∂P/∂h = −P / (1 − Σ_parts h) where that is positive."""
     row = first_row + wp.tid()
     batch, receiver = split_row(row, points.shape[1])
-    slot = scratch_place(worker, row)
+    slot = scratch_slot(worker, row)
     corner_batch = instance_in(batch, corners.shape[0])
     point, normal = points[batch, receiver], horizon_normal(horizon_normals, batch, receiver)
     adj_point = wp.vec3()
@@ -337,9 +337,17 @@ def transmittance_past_parts(
     if skip is not None:
         check.choice("skip", skip, range(blockers.body_count))
     points = expand(points, common_batch({"points": points, "corners": placed_parts.corners}))
-    own_radius = cell_radius(len(directions)) if radius is None else radius
+    radius_of_cells = cell_radius(len(directions)) if radius is None else radius
     cells = make_cells(directions, SOFTNESS, points.device)
-    inputs = [points, horizon_normals, *placed_parts, blockers.arrays, cells, own_radius, -1 if skip is None else skip]
+    inputs = [
+        points,
+        horizon_normals,
+        *placed_parts,
+        blockers.arrays,
+        cells,
+        radius_of_cells,
+        -1 if skip is None else skip,
+    ]
     cell_shape = (len(directions),)
     scratch = [
         Scratch((blockers.edge_count,), ViewedEdge),

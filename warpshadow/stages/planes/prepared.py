@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 MAX_EDGES = 128
 """Edges of an outline at most: beyond, it is that of the rectangle, of which the mesh takes its share by texels."""
 
-_BESIDE = 0.002  # how much texels count in their neighbors, which have their light if nothing of their own is seen
+_NEIGHBOR_WEIGHT = (
+    0.002  # how much texels count in their neighbors, which have their light if nothing of their own is seen
+)
 _MARGIN = 0.001  # margin of planes, in widths of the smallest texel
 
 
@@ -153,7 +155,7 @@ def _halvings(height: int, width: int) -> list[tuple[csr_matrix, csr_matrix, tup
     from scipy.sparse import diags, kron
 
     def blur(count: int) -> csr_matrix:
-        return diags([_BESIDE, 1.0, _BESIDE], [-1, 0, 1], shape=(count, count)).tocsr()
+        return diags([_NEIGHBOR_WEIGHT, 1.0, _NEIGHBOR_WEIGHT], [-1, 0, 1], shape=(count, count)).tocsr()
 
     sizes = [(height, width)]
     while max(sizes[-1]) > 1:

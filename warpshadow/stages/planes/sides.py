@@ -3,7 +3,7 @@
 import warp as wp
 
 from warpshadow.device.batch import instance_in
-from warpshadow.device.parallel import Scratch, scratch_place, split_row
+from warpshadow.device.parallel import Scratch, scratch_slot, split_row
 from warpshadow.stages.cell_coverage import ViewedEdge, convex_coverage, outline_coverage, viewed_edge
 from warpshadow.stages.planes.cells import (
     LocalReceiver,
@@ -125,7 +125,7 @@ def _view_outline_adjoint(
     side: PlaneSide,
     local_receiver: LocalReceiver,
     edges: wp.array(dtype=ViewedEdge),
-    adj_place: LocalReceiver,
+    adj_local_receiver: LocalReceiver,
 ):
     """Add to the gradient of the receiver relative to the plane."""
     position = position_on_side(grid, local_receiver, side.is_back)
@@ -139,15 +139,19 @@ def _view_outline_adjoint(
         adj_a = wp.cross(axis[0] * local_receiver.axis_u + axis[1] * local_receiver.axis_v, adj_n)
         adj_axis = wp.cross(adj_n, wp.where(side.is_back, edge.begin, edge.end))
         adj_foot += adj_a
-        adj_place.axis_u = adj_place.axis_u + (edge_ends[0] - position[0]) * adj_a + axis[0] * adj_axis
-        adj_place.axis_v = adj_place.axis_v + (edge_ends[1] - position[1]) * adj_a + axis[1] * adj_axis
-    adj_place.normal = adj_place.normal + (sign * position[2]) * adj_foot
+        adj_local_receiver.axis_u = (
+            adj_local_receiver.axis_u + (edge_ends[0] - position[0]) * adj_a + axis[0] * adj_axis
+        )
+        adj_local_receiver.axis_v = (
+            adj_local_receiver.axis_v + (edge_ends[1] - position[1]) * adj_a + axis[1] * adj_axis
+        )
+    adj_local_receiver.normal = adj_local_receiver.normal + (sign * position[2]) * adj_foot
     adj_at = wp.vec3(
         -wp.dot(adj_foot, local_receiver.axis_u),
         -wp.dot(adj_foot, local_receiver.axis_v),
         sign * wp.dot(adj_foot, local_receiver.normal),
     )
-    return side_adjoint(grid, local_receiver, side.is_back, wp.vec3(), adj_at, wp.vec3(), adj_place)
+    return side_adjoint(grid, local_receiver, side.is_back, wp.vec3(), adj_at, wp.vec3(), adj_local_receiver)
 
 
 @wp.func
@@ -185,7 +189,7 @@ def prepare_receiver(
     Returns its instance and number, its place in scratch memory, and how many sides are stored.
     """
     batch, receiver = split_row(row, points.shape[1])
-    scratch_row = scratch_place(worker, row)
+    scratch_row = scratch_slot(worker, row)
     store, edges = scratch[scratch_row], viewed_edges[scratch_row]
     frame_batch = instance_in(batch, frames.shape[0])
     side_count = int(0)
@@ -305,9 +309,11 @@ def footprint_on_side_adjoint(
         wp.vec2(adj_mip[0], adj_mip[1]),
     )
     adj_at, adj_toward = find_footprint_adjoint(scene, local_direction, footprint, adj_t, adj_cosine, adj_center)
-    adj_place = load_local_receiver(adj_store, side.f)
+    adj_local_receiver = load_local_receiver(adj_store, side.f)
     store_local_receiver(
-        adj_store, side.f, side_adjoint(grid, local_receiver, side.is_back, direction, adj_at, adj_toward, adj_place)
+        adj_store,
+        side.f,
+        side_adjoint(grid, local_receiver, side.is_back, direction, adj_at, adj_toward, adj_local_receiver),
     )
 
 

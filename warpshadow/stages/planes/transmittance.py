@@ -297,8 +297,8 @@ def plane_coverage(
     check_planes(planes, points, frames, directions, skip)
     count = common_batch({"points": points, "frames": frames, "fronts": fronts})
     points, fronts = expand(points, count), None if fronts is None else expand_rows(fronts, count)
-    own_radius = cell_radius(len(directions)) if radius is None else radius
-    scene = plane_arrays(planes, own_radius, skip, tiles=radius is None)
+    radius_of_cells = cell_radius(len(directions)) if radius is None else radius
+    scene = plane_arrays(planes, radius_of_cells, skip, tiles=radius is None)
     if not set(planes.is_blocking) - {skip}:
         return None
     cells = constant(directions, wp.vec3, points.device)

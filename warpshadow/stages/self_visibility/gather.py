@@ -27,7 +27,7 @@ from warpshadow.device.lanes import (
 )
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import as_items, empty, require_gradient
-from warpshadow.device.parallel import Scratch, scratch_place
+from warpshadow.device.parallel import Scratch, scratch_slot
 from warpshadow.device.warp_sums import sum_over_warp
 from warpshadow.stages.self_visibility.lookup import ResamplingKernels, ResamplingWeights
 from warpshadow.stages.self_visibility.probes import ProbeWeights
@@ -168,8 +168,8 @@ def _make_gather(lanes: int) -> wp.Kernel:
     ):
         """A thread owns a block of receivers."""
         item = first_row + wp.tid()
-        shares = scratch[scratch_place(worker, item), 0]
-        columns = scratch[scratch_place(worker, item), 1]
+        shares = scratch[scratch_slot(worker, item), 0]
+        columns = scratch[scratch_slot(worker, item), 1]
         batch, block, normal, probes = load_block(inputs, item, transmittance_self.shape[1], shares)
         weight_batch = instance_in(batch, inputs.counts.shape[0])
         for q in range(inputs.directions.shape[0]):
@@ -224,8 +224,8 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
         The latter is summed up by cells first:  S̄_c = Σ_qk T̄_q w_qk where c_qk = c,  b̄_j += Σ_c S̄_c S_jc.
         """
         item = first_row + wp.tid()
-        shares = scratch[scratch_place(worker, item), 0]
-        adj_shares = scratch[scratch_place(worker, item), 1]
+        shares = scratch[scratch_slot(worker, item), 0]
+        adj_shares = scratch[scratch_slot(worker, item), 1]
         batch, block, normal, probes = load_block(inputs, item, adj_transmittance.shape[1], shares)
         weight_batch = instance_in(batch, inputs.counts.shape[0])
         if wp.static(lanes > 1):

@@ -27,7 +27,7 @@ from warpshadow.device.lanes import (
 )
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
-from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_place
+from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_slot
 from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.visibility.cones import check_spheres
 from warpshadow.stages.visibility.culling import DirectionCells, cap_type, make_cap_functions, make_cells, make_cull
@@ -85,7 +85,7 @@ def _make_load_task(has_horizon: bool, lanes: int) -> wp.Function:
         reached_bundles: wp.array3d(dtype=wp.int32),
     ):
         batch, block, receivers = load_receivers(inputs, row)
-        slot = scratch_place(worker, row * all_ends.shape[1] + span)
+        slot = scratch_slot(worker, row * all_ends.shape[1] + span)
         ends = all_ends[row, span]
         task = TransmittanceTask(cells, span * ends.shape[0], ends, reached_bundles[slot], scratch[slot])
         return batch, block, receivers, task

@@ -24,7 +24,7 @@ from warpshadow import check
 from warpshadow.device.lanes import block_count, lane_count, lane_type, make_lane_functions, module_options
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty, zeros
-from warpshadow.device.parallel import Scratch, scratch_place
+from warpshadow.device.parallel import Scratch, scratch_slot
 from warpshadow.maths import sh
 from warpshadow.stages.sh_kernels import ProductTable, make_multiply, product_table
 from warpshadow.stages.visibility.held_squares import UNIT, make_square, make_square_adjoint
@@ -212,7 +212,7 @@ def _make_exponentiate(order: int, base: str, keeps_powers: bool, lanes: int) ->
         """
         thread = first_row + wp.tid()
         batch, block = find_block(thread, log_sh.shape[1])
-        thread_scratch = scratch[scratch_place(worker, thread)]
+        thread_scratch = scratch[scratch_slot(worker, thread)]
         row = thread_scratch[0]
         square = thread_scratch[1]
         half_base = thread_scratch[2]
@@ -283,7 +283,7 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
         """
         thread = first_row + wp.tid()
         batch, block = find_block(thread, log_sh.shape[1])
-        thread_scratch = scratch[scratch_place(worker, thread)]
+        thread_scratch = scratch[scratch_slot(worker, thread)]
         log = thread_scratch[0]
         adj_row = thread_scratch[1]
         product = thread_scratch[2]

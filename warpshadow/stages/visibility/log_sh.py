@@ -12,7 +12,7 @@ from warpshadow import check
 from warpshadow.device.lanes import block_count, lane_count, lane_type, make_lane_functions, module_options
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
-from warpshadow.device.parallel import Scratch, scratch_place
+from warpshadow.device.parallel import Scratch, scratch_slot
 from warpshadow.maths import sh
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.sh_kernels import make_add_rotated_zonal, make_rotated_zonal_adjoint, zonal_type
@@ -125,7 +125,7 @@ def _make_accumulate(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
         """A thread owns a block of receivers and sums the log-visibility of all spheres."""
         thread = first_row + wp.tid()
         batch, block, receivers = load_receivers(inputs, thread)
-        row = scratch[scratch_place(worker, thread)]
+        row = scratch[scratch_slot(worker, thread)]
         for i in range(wp.static(order**2)):
             row[i] = Lane(0.0)
         traverse(receivers, batch, inputs.spheres, Gradients(), LogTask(table, row))
@@ -219,7 +219,7 @@ def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Ke
         """A thread owns a block of receivers."""
         thread = first_row + wp.tid()
         batch, block, receivers = load_receivers(inputs, thread)
-        row = scratch[scratch_place(worker, thread)]
+        row = scratch[scratch_slot(worker, thread)]
         load_rows(adj_log_sh[batch], block, row)
         gradients = Gradients(adj_centers, adj_radii, adj_extents)
         adj_receivers = traverse(receivers, batch, inputs.spheres, gradients, LogTask(table, row))
