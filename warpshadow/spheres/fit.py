@@ -320,13 +320,13 @@ def _cached_fit(fit_key: _SphereFitKey, progress: bool, count: int | str) -> tup
         check.shape("spheres", spheres.shape, (report.sphere_count, 4))
         return spheres, replace(report, cached=True)
 
-    def arrays(fit_count: tuple[np.ndarray, FitReport]) -> dict[str, np.ndarray]:
-        return {"spheres": fit_count[0], "report": np.array(json.dumps(asdict(fit_count[1])))}
+    def arrays(fit: tuple[np.ndarray, FitReport]) -> dict[str, np.ndarray]:
+        return {"spheres": fit[0], "report": np.array(json.dumps(asdict(fit[1])))}
 
     path = _cache_path(fit_key, count)
     if path in _UNWRITTEN and not path.exists():
         return _UNWRITTEN[path]
-    fit_count = load_or_compute(path, read, partial(_fit, fit_key, progress, count), arrays, noun="fit_count")
+    fit = load_or_compute(path, read, partial(_fit, fit_key, progress, count), arrays, noun="fit")
     if not path.exists():
-        _UNWRITTEN[path] = fit_count[0], replace(fit_count[1], cached=True)
-    return fit_count
+        _UNWRITTEN[path] = fit[0], replace(fit[1], cached=True)
+    return fit

@@ -140,13 +140,13 @@ def _make_trace() -> wp.Kernel:
 
 
 def trace_sun_cells(
-    probes: RayProbes, slots: ProbeWeights, rotations: wp.array, body: int, cells: SunCells
+    probes: RayProbes, probe_weights: ProbeWeights, rotations: wp.array, body: int, cells: SunCells
 ) -> wp.array:
     """Trace the self-visibility of a body's receivers in sun cells.
 
     Args:
         probes: Of the body.
-        slots: Where the receivers lie among them.
+        probe_weights: Where the receivers lie among them.
         rotations: R of each body, mat33 of shape [batch, body].
         body: Index of the body.
         cells: The sun cells.
@@ -155,15 +155,17 @@ def trace_sun_cells(
     Differentiable: no.
     """
     device, cell_count = rotations.device, int((cells.slots >= 0).sum())
-    batch_count = common_batch({"slots": slots.rows, "rotations": rotations})
-    transmittance = empty((batch_count, slots.rows.shape[1], len(cells.directions)), dtype=wp.float32, device=device)
+    batch_count = common_batch({"probe_weights": probe_weights.rows, "rotations": rotations})
+    transmittance = empty(
+        (batch_count, probe_weights.rows.shape[1], len(cells.directions)), dtype=wp.float32, device=device
+    )
     direction_lanes = constant(cells.directions.swapaxes(1, 2), lane_type(PACKET), device)
     starts = np.sort(cells.slots[cells.slots >= 0])
     first_slots = constant(starts[np.searchsorted(starts, np.arange(CHUNK), side="right") - 1], wp.int32, device)
     launch(
         _make_trace(),
         batch_count * transmittance.shape[1],
-        inputs=[*probes, *slots, rotations, body, direction_lanes, first_slots],
+        inputs=[*probes, *probe_weights, rotations, body, direction_lanes, first_slots],
         outputs=[transmittance],
         cost=_PACKET_COST * cell_count,
     )
