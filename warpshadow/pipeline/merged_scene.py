@@ -242,7 +242,7 @@ class MergedScene:
         if pivot is not None:
             poses = poses.about(self.pivots(pivot))
         numbers = None if moving is None else self.scene.body_numbers(moving, "moving")
-        turned = None if rest.rotations is None else poses.compose_rotations(rest.rotations)
+        turned = None if rest.rotations is None else poses.turned(rest.rotations)
         if numbers is None or rest.moving is None:
             return Geometry(
                 poses.points(rest.positions, self._vertex_bodies),

@@ -166,12 +166,12 @@ def _cut_rectangle(
     if count == 1:
         yield rows, columns
         return
-    pixel_step = np.pi / (len(table) - 1)
-    centers = np.clip((len(table) - 1) / 2, *rows)
-    is_tall = np.ptp(rows) > np.ptp(columns) * np.sin(pixel_step * centers)
+    row_angle = np.pi / (len(table) - 1)
+    middle_row = np.clip((len(table) - 1) / 2, *rows)
+    is_tall = np.ptp(rows) > np.ptp(columns) * np.sin(row_angle * middle_row)
     cut_axis_ends, cut_axis_table, rectangle_ends = (rows, table, columns) if is_tall else (columns, table.T, rows)
-    lower_bounds, upper_bounds = (_interpolate_axis(cut_axis_table.T, end) for end in rectangle_ends)
-    sums = upper_bounds - lower_bounds
+    lower_sums, upper_sums = (_interpolate_axis(cut_axis_table.T, end) for end in rectangle_ends)
+    sums = upper_sums - lower_sums
     first_sum, last_sum = _interpolate_axis(sums, cut_axis_ends[0]), _interpolate_axis(sums, cut_axis_ends[1])
     half_count = count // 2
     cut_sum = first_sum + (last_sum - first_sum) * half_count / count

@@ -153,7 +153,7 @@ class Poses:
         launch(_pose_radii, posed.shape, inputs=[rest, bodies, self.scales], outputs=[posed])
         return posed
 
-    def compose_rotations(self, rest: wp.array) -> wp.array:
+    def turned(self, rest: wp.array) -> wp.array:
         """Compose rotations with rotations at rest, mat33 of shape [batch, body]. Differentiable: rest, rotations."""
         batch_count = common_batch({"rest": rest, "rotations": self.rotations})
         rotated = empty((batch_count, rest.shape[1]), dtype=wp.mat33, device=rest.device)

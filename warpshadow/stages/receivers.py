@@ -162,7 +162,7 @@ def number_receivers(
     faces: wp.array,
     keeps_vertex: np.ndarray,
     is_static: np.ndarray | None = None,
-    permutation: np.ndarray | None = None,
+    sequence: np.ndarray | None = None,
     bodies: np.ndarray | None = None,
 ) -> Numbering:
     """Choose the vertices that are receivers.
@@ -171,24 +171,24 @@ def number_receivers(
         faces: Vertex indices, vec3i of shape [face].
         keeps_vertex: Which are, bool of shape [1, vertex], or [2, vertex] with their backs: see :func:`seen_vertices`.
         is_static: Vertices of static bodies, bool of shape [vertex]; None if there are none.
-        permutation: All vertices in the sequence in which they become receivers, shape [vertex]: light is found fastest
+        sequence: All vertices in the sequence in which they become receivers, shape [vertex]: light is found fastest
             where neighbors follow each other. None for the mesh's.
         bodies: Body of each vertex, −1 for vertices that need not be told apart, shape [vertex]: receivers of a body
             then follow each other. None where all share their blockers.
     """
     device, (side_count, vertex_count) = faces.device, keeps_vertex.shape
-    if side_count == 1 and keeps_vertex.all() and is_static is None and permutation is None and bodies is None:
+    if side_count == 1 and keeps_vertex.all() and is_static is None and sequence is None and bodies is None:
         of_vertices = constant(np.arange(vertex_count), wp.int32, device)
         return Numbering(None, np.empty(0, int), faces, of_vertices)
     is_static = np.zeros(vertex_count, bool) if is_static is None else is_static
-    permutation = np.arange(vertex_count) if permutation is None else permutation
+    sequence = np.arange(vertex_count) if sequence is None else sequence
     side_offsets = vertex_count * np.arange(side_count)
-    permutation = (permutation + side_offsets[:, None]).ravel()
+    sequence = (sequence + side_offsets[:, None]).ravel()
     if bodies is not None:
         bodies = np.tile(bodies, side_count)
-        permutation = permutation[np.argsort(bodies[permutation], kind="stable")]
+        sequence = sequence[np.argsort(bodies[sequence], kind="stable")]
     is_static_receiver, is_moving_receiver = (keeps_vertex & is_static).ravel(), (keeps_vertex & ~is_static).ravel()
-    on_static, vertices = permutation[is_static_receiver[permutation]], permutation[is_moving_receiver[permutation]]
+    on_static, vertices = sequence[is_static_receiver[sequence]], sequence[is_moving_receiver[sequence]]
     of_vertices = np.full(keeps_vertex.size, -1, np.int32)
     of_vertices[np.concatenate([on_static, vertices])] = np.arange(len(on_static) + len(vertices))
     corners = of_vertices[faces.numpy() + side_offsets[:, None, None]].reshape(-1, 3)

@@ -103,14 +103,14 @@ def _find_sides(
 
 
 def find_sides(
-    fragments: Fragments, faces: wp.array, two_sided_faces: wp.array, positions: wp.array, clip_matrices: wp.array
+    fragments: Fragments, faces: wp.array, two_sided: wp.array, positions: wp.array, clip_matrices: wp.array
 ) -> Fragments:
     """Find which side of its face each sample sees.
 
     Args:
         fragments: The fragments, of shape [batch, height, width].
         faces: Vertex indices, vec3i of shape [face].
-        two_sided_faces: The faces of which both sides can be seen, int32 of shape [item].
+        two_sided: The faces of which both sides can be seen, int32 of shape [item].
         positions: Vertices [scene units], vec3 of shape [batch, vertex].
         clip_matrices: Cameras, mat44 of shape [batch]. Either of these batches may be 1 and then serves every instance.
     Returns:
@@ -126,8 +126,8 @@ def find_sides(
     run = run_length(device, _FACE_RUN)
     launch(
         _find_backs,
-        (view_count, -(-two_sided_faces.shape[0] // run)),
-        inputs=[positions, faces, two_sided_faces, clip_matrices, run],
+        (view_count, -(-two_sided.shape[0] // run)),
+        inputs=[positions, faces, two_sided, clip_matrices, run],
         outputs=[shows_back, has_back[:1]],
     )
     if not device.is_capturing and not has_back.numpy()[0]:

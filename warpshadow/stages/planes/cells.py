@@ -160,7 +160,7 @@ def front_of_adjoint(
     fronts: wp.array3d(dtype=wp.float32),
     grid: PlaneGrid,
     height: float,
-    adj_receiver: float,
+    adj_front: float,
     batch: int,
     receiver: int,
     f: int,
@@ -169,9 +169,9 @@ def front_of_adjoint(
     """Add to the gradient of the height."""
     if fronts:
         if adj_fronts:
-            adj_fronts[batch, receiver, f] = adj_fronts[batch, receiver, f] + adj_receiver
+            adj_fronts[batch, receiver, f] = adj_fronts[batch, receiver, f] + adj_front
         return float(0.0)
-    return adj_receiver * front_weight_slope(grid, height)
+    return adj_front * front_weight_slope(grid, height)
 
 
 @wp.func
@@ -371,22 +371,22 @@ def _find_corners(scene: PlaneArrays, level_index: int, texel: wp.vec2):
 
 @wp.func
 def _interpolate_corners(texels: wp.array(dtype=wp.vec3), corners: _Corners):
-    upper_left = (1.0 - corners.s) * texels[corners.upper_left] + corners.s * texels[
+    upper_value = (1.0 - corners.s) * texels[corners.upper_left] + corners.s * texels[
         corners.upper_left + corners.column_step
     ]
-    lower_left = (1.0 - corners.s) * texels[corners.lower_left] + corners.s * texels[
+    lower_value = (1.0 - corners.s) * texels[corners.lower_left] + corners.s * texels[
         corners.lower_left + corners.column_step
     ]
-    return (1.0 - corners.t) * upper_left + corners.t * lower_left
+    return (1.0 - corners.t) * upper_value + corners.t * lower_value
 
 
 @wp.func
-def _interpolation_slopes(texels: wp.array(dtype=wp.vec3), corners: _Corners, adj_receiver: wp.vec3):
+def _interpolation_slopes(texels: wp.array(dtype=wp.vec3), corners: _Corners, adj_value: wp.vec3):
     """Slopes of the dot product with a color, by the texel of the finest level."""
-    a = wp.dot(adj_receiver, texels[corners.upper_left])
-    b = wp.dot(adj_receiver, texels[corners.upper_left + corners.column_step])
-    c = wp.dot(adj_receiver, texels[corners.lower_left])
-    d = wp.dot(adj_receiver, texels[corners.lower_left + corners.column_step])
+    a = wp.dot(adj_value, texels[corners.upper_left])
+    b = wp.dot(adj_value, texels[corners.upper_left + corners.column_step])
+    c = wp.dot(adj_value, texels[corners.lower_left])
+    d = wp.dot(adj_value, texels[corners.lower_left + corners.column_step])
     slope_u = (1.0 - corners.t) * (b - a) + corners.t * (d - c)
     slope_t = (1.0 - corners.s) * (c - a) + corners.s * (d - b)
     return wp.vec2(corners.slopes[0] * slope_u, corners.slopes[1] * slope_t)
@@ -410,19 +410,17 @@ def fetch_adjoint(
     first_level: int,
     footprint: PlaneFootprint,
     mip: MipFootprint,
-    adj_receiver: wp.vec3,
+    adj_value: wp.vec3,
 ):
     """Gradients of the place, and of the logarithm of t / √c′, as which the footprint is wide."""
     fine = _find_corners(scene, first_level + mip.level, mip.texel)
-    slopes = _interpolation_slopes(texels, fine, adj_receiver)
+    slopes = _interpolation_slopes(texels, fine, adj_value)
     adj_log = float(0.0)
     if mip.coarse_share > 0.0:
         coarse = _find_corners(scene, first_level + mip.level + 1, mip.texel)
-        slopes = (1.0 - mip.coarse_share) * slopes + mip.coarse_share * _interpolation_slopes(
-            texels, coarse, adj_receiver
-        )
+        slopes = (1.0 - mip.coarse_share) * slopes + mip.coarse_share * _interpolation_slopes(texels, coarse, adj_value)
         adj_log = mip.part_slope * wp.dot(
-            adj_receiver, _interpolate_corners(texels, coarse) - _interpolate_corners(texels, fine)
+            adj_value, _interpolate_corners(texels, coarse) - _interpolate_corners(texels, fine)
         )
     adj_x = slopes[0] * mip.slopes[0]
     adj_y = slopes[1] * mip.slopes[1]
@@ -434,17 +432,17 @@ def fetch_adjoint(
 
 @wp.func
 def scatter(
-    adj_texels: wp.array(dtype=wp.vec3), scene: PlaneArrays, first_level: int, mip: MipFootprint, adj_receiver: wp.vec3
+    adj_texels: wp.array(dtype=wp.vec3), scene: PlaneArrays, first_level: int, mip: MipFootprint, adj_value: wp.vec3
 ):
     """Add to the gradients of texels: the adjoint of :func:`fetch` by its values."""
-    coarse_share = 1.0 - mip.coarse_share
+    level_share = 1.0 - mip.coarse_share
     for coarser in range(2):
-        if coarse_share > 0.0:
+        if level_share > 0.0:
             c = _find_corners(scene, first_level + mip.level + coarser, mip.texel)
-            upper_left = (coarse_share * (1.0 - c.t)) * adj_receiver
-            lower_left = (coarse_share * c.t) * adj_receiver
-            wp.atomic_add(adj_texels, c.upper_left, (1.0 - c.s) * upper_left)
-            wp.atomic_add(adj_texels, c.upper_left + c.column_step, c.s * upper_left)
-            wp.atomic_add(adj_texels, c.lower_left, (1.0 - c.s) * lower_left)
-            wp.atomic_add(adj_texels, c.lower_left + c.column_step, c.s * lower_left)
-        coarse_share = mip.coarse_share
+            adj_upper = (level_share * (1.0 - c.t)) * adj_value
+            adj_lower = (level_share * c.t) * adj_value
+            wp.atomic_add(adj_texels, c.upper_left, (1.0 - c.s) * adj_upper)
+            wp.atomic_add(adj_texels, c.upper_left + c.column_step, c.s * adj_upper)
+            wp.atomic_add(adj_texels, c.lower_left, (1.0 - c.s) * adj_lower)
+            wp.atomic_add(adj_texels, c.lower_left + c.column_step, c.s * adj_lower)
+        level_share = mip.coarse_share

@@ -239,7 +239,7 @@ def _lift_points(
     grids: wp.array(dtype=PlaneGrid),
     skip: int,
     # out
-    lifted_points_: wp.array2d(dtype=wp.vec3),
+    lifted: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a point of an instance."""
     batch, receiver = wp.tid()
@@ -257,7 +257,7 @@ def _lift_points(
                 lifted_point += (
                     side * nearness * nearness * _LIFT_IN_MARGINS * grids[f].margin * wp.length(axis_u) * plane_normal
                 )
-    lifted_points_[batch, receiver] = lifted_point
+    lifted[batch, receiver] = lifted_point
 
 
 def lifted_points(
@@ -273,7 +273,7 @@ def lifted_points(
         Points, vec3 of shape [batch, receiver].
     Differentiable: points, fronts, frames.
     """
-    lifted_points_ = wp.empty(fronts.shape[:2], dtype=wp.vec3, device=points.device)
+    lifted = wp.empty(fronts.shape[:2], dtype=wp.vec3, device=points.device)
     inputs = [points, fronts, frames, planes.grids, -1 if skip is None else skip]
-    launch(_lift_points, lifted_points_.shape, inputs=inputs, outputs=[lifted_points_])
-    return lifted_points_
+    launch(_lift_points, lifted.shape, inputs=inputs, outputs=[lifted])
+    return lifted

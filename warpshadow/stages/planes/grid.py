@@ -61,8 +61,8 @@ class PlaneTexture(NamedTuple):
         """Widths and heights of the texels at their middles, [row, column, 2]."""
         count = np.array(self.covered.shape[::-1])
         edges = [
-            self.spread * stretched(np.linspace(low, high, point_indices + 1))
-            for low, high, point_indices in zip(self.low, self.high, count, strict=True)
+            self.spread * stretched(np.linspace(low, high, axis_count + 1))
+            for low, high, axis_count in zip(self.low, self.high, count, strict=True)
         ]
         return np.stack(np.meshgrid(*map(np.diff, edges)), axis=-1)
 
@@ -81,8 +81,8 @@ class PlaneTexture(NamedTuple):
         """Points evenly over every texel, ``points_per_texel`` along each side: [row · split, column · split, 2]."""
         height, width = self.covered.shape
         axes = [
-            self.spread * stretched(low + (high - low) * (np.arange(point_indices) + 0.5) / point_indices)
-            for low, high, point_indices in zip(
+            self.spread * stretched(low + (high - low) * (np.arange(axis_count) + 0.5) / axis_count)
+            for low, high, axis_count in zip(
                 self.low, self.high, (width * points_per_texel, height * points_per_texel), strict=True
             )
         ]

@@ -253,14 +253,12 @@ def _attenuate_adjoint(
     """A thread owns a receiver."""
     batch, receiver = split_row(first_row + wp.tid(), adj_attenuated.shape[1])
     for q in range(adj_attenuated.shape[2]):
-        adj_coverage, open_share = adj_attenuated[batch, receiver, q], 1.0 - coverage[batch, receiver, q]
+        adj_cell, open_share = adj_attenuated[batch, receiver, q], 1.0 - coverage[batch, receiver, q]
         if open_share > 0.0:
             if adj_transmittance:
-                adj_transmittance[batch, receiver, q] = (
-                    adj_transmittance[batch, receiver, q] + adj_coverage * open_share
-                )
+                adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + adj_cell * open_share
             if adj_covered:
-                adj_open_share = adj_coverage * transmittance[batch, receiver, q]
+                adj_open_share = adj_cell * transmittance[batch, receiver, q]
                 adj_covered[batch, receiver, q] = adj_covered[batch, receiver, q] - adj_open_share
 
 

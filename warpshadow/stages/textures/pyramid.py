@@ -77,9 +77,9 @@ def _halving(fine_count: int, coarse_count: int) -> csr_matrix:
         shares = np.full((coarse_count, 2), 0.5)
     else:
         shares = np.stack([coarse_count - coarse, np.full(coarse_count, coarse_count), coarse + 1], axis=1) / fine_count
-    column_matrix = 2 * coarse[:, None] + np.arange(shares.shape[1])
+    fine_indices = 2 * coarse[:, None] + np.arange(shares.shape[1])
     starts = np.arange(coarse_count + 1) * shares.shape[1]
-    return csr_matrix((shares.ravel(), column_matrix.ravel(), starts), (coarse_count, fine_count))
+    return csr_matrix((shares.ravel(), fine_indices.ravel(), starts), (coarse_count, fine_count))
 
 
 class _Layout:
@@ -147,13 +147,13 @@ def _halve(
     batch, thread = wp.tid()
     instance_texels = texels[batch]
     for texel in range(thread * run, (thread + 1) * run):
-        start, column_matrix, row_matrix = _fine_texels(texel, fine, coarse)
+        start, column_shares, row_shares = _fine_texels(texel, fine, coarse)
         mean = wp.vec3()
         for i in range(3):
-            if row_matrix[i] > 0.0:
+            if row_shares[i] > 0.0:
                 for j in range(3):
-                    if column_matrix[j] > 0.0:
-                        mean += (row_matrix[i] * column_matrix[j]) * instance_texels[start + i * fine[1] + j]
+                    if column_shares[j] > 0.0:
+                        mean += (row_shares[i] * column_shares[j]) * instance_texels[start + i * fine[1] + j]
         instance_texels[coarse[0] + texel] = mean
 
 
@@ -170,14 +170,14 @@ def _halve_adjoint(
     batch, thread = wp.tid()
     instance_texels = adj_texels[batch]
     for texel in range(thread * run, (thread + 1) * run):
-        start, column_matrix, row_matrix = _fine_texels(texel, fine, coarse)
+        start, column_shares, row_shares = _fine_texels(texel, fine, coarse)
         adj_mean = instance_texels[coarse[0] + texel]
         for i in range(3):
-            if row_matrix[i] > 0.0:
+            if row_shares[i] > 0.0:
                 for j in range(3):
-                    if column_matrix[j] > 0.0:
+                    if column_shares[j] > 0.0:
                         wp.atomic_add(
-                            instance_texels, start + i * fine[1] + j, (row_matrix[i] * column_matrix[j]) * adj_mean
+                            instance_texels, start + i * fine[1] + j, (row_shares[i] * column_shares[j]) * adj_mean
                         )
 
 

@@ -110,12 +110,12 @@ def _cell(level: wp.vec3i, x: float, y: float):
         right_column = _repeated(right_column, level[1])
         top = _repeated(top, level[2])
         bottom = _repeated(bottom, level[2])
-    upper_weight = level[0] + top * level[1]
-    lower_weight = level[0] + bottom * level[1]
-    cell.above_left = upper_weight + left_column
-    cell.above_right = upper_weight + right_column
-    cell.below_left = lower_weight + left_column
-    cell.below_right = lower_weight + right_column
+    upper_row = level[0] + top * level[1]
+    lower_row = level[0] + bottom * level[1]
+    cell.above_left = upper_row + left_column
+    cell.above_right = upper_row + right_column
+    cell.below_left = lower_row + left_column
+    cell.below_right = lower_row + right_column
     return cell
 
 
@@ -280,13 +280,13 @@ def _slopes(texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2, step:
     above_right = wp.dot(texels[cell.above_right], adj_color)
     below_left = wp.dot(texels[cell.below_left], adj_color)
     below_right = wp.dot(texels[cell.below_right], adj_color)
-    upper_weight = (1.0 - cell.s) * above_left + cell.s * above_right
-    lower_weight = (1.0 - cell.s) * below_left + cell.s * below_right
+    upper_color = (1.0 - cell.s) * above_left + cell.s * above_right
+    lower_color = (1.0 - cell.s) * below_left + cell.s * below_right
     slope_s = (1.0 - cell.t) * (above_right - above_left) + cell.t * (below_right - below_left)
     return wp.vec3(
         slope_s * float(level[1]),
-        (upper_weight - lower_weight) * float(level[2]),
-        (1.0 - cell.t) * upper_weight + cell.t * lower_weight,
+        (upper_color - lower_color) * float(level[2]),
+        (1.0 - cell.t) * upper_color + cell.t * lower_color,
     )
 
 
