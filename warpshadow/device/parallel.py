@@ -156,7 +156,11 @@ def launch_slices(
         *(empty((rows, *shape), dtype=dtype, device=device) for shape, dtype in scratch),
         *outputs,
     ]
-    summed_arguments = {slot: array for slot, array in enumerate(sums, 2 + len(leading_arguments)) if array is not None}
+    summed_arguments = {
+        argument_index: array
+        for argument_index, array in enumerate(sums, 2 + len(leading_arguments))
+        if array is not None
+    }
     _launch_slices(kernel, dim, cost, [*leading_arguments, *sums], summed_arguments, None, device)
 
 
@@ -178,8 +182,8 @@ def launch_adjoint_slices(
     arguments = [*inputs, *outputs]
     gradients = gradients_of(arguments)
     summed_arguments = {
-        slot: value.grad
-        for slot, value in enumerate(inputs, 2)
+        argument_index: value.grad
+        for argument_index, value in enumerate(inputs, 2)
         if isinstance(value, wp.array) and value.requires_grad and any(value is array for array in shared)
     }
     _launch_slices(kernel, dim, cost, arguments, summed_arguments, gradients, device)
@@ -221,17 +225,21 @@ def _launch_slices(
         launch(arguments, gradients=gradients)(dim)
         return
     slice_sums = {
-        slot: zeros((slice_count, *array.shape), array.dtype, device=device) for slot, array in summed_arguments.items()
+        argument_index: zeros((slice_count, *array.shape), array.dtype, device=device)
+        for argument_index, array in summed_arguments.items()
     }
     kernel.module.load(device, 1)  # compiled here, not by each thread
     launches = [] if slice_sums else [launch(arguments, gradients=gradients)] * slice_count
     for number in range(len(launches), slice_count):
         values, adjoints = list(arguments), None if gradients is None else list(gradients)
-        for slot, parts in slice_sums.items():
+        for argument_index, parts in slice_sums.items():
             if adjoints is None:
-                values[slot] = parts[number]
+                values[argument_index] = parts[number]
             else:
-                values[slot], adjoints[slot] = _with_gradient(values[slot], parts[number]), parts[number]
+                values[argument_index], adjoints[argument_index] = (
+                    _with_gradient(values[argument_index], parts[number]),
+                    parts[number],
+                )
         launches.append(launch(values, gradients=adjoints))
     starts = [dim[0] * k // slice_count for k in range(slice_count + 1)]
 
@@ -239,8 +247,8 @@ def _launch_slices(
         launches[number]((starts[number + 1] - starts[number], *dim[1:]), starts[number], worker)
 
     _share(run, slice_count, workers)
-    for slot, parts in slice_sums.items():
-        summed_arguments[slot].numpy()[...] += parts.numpy().sum(axis=0)
+    for argument_index, parts in slice_sums.items():
+        summed_arguments[argument_index].numpy()[...] += parts.numpy().sum(axis=0)
 
 
 def _with_gradient(array: wp.array, gradient: wp.array) -> wp.array:

@@ -155,11 +155,11 @@ def _shade_adjoint_light(
             wp.atomic_add(adj_light, light_batch, 2, first_direction + i, blue[i])
     else:
         for k in range(first_direction, transfer.shape[2]):
-            irradiance = wp.vec3()
+            adj_coefficient = wp.vec3()
             for vertex in range(begin, end):
-                irradiance += transfer[transfer_batch, vertex, k] * adj_shading[batch, vertex]
+                adj_coefficient += transfer[transfer_batch, vertex, k] * adj_shading[batch, vertex]
             for channel in range(3):
-                wp.atomic_add(adj_light, light_batch, channel, k, irradiance[channel])
+                wp.atomic_add(adj_light, light_batch, channel, k, adj_coefficient[channel])
 
 
 def _channels(light: wp.array) -> wp.array:

@@ -55,9 +55,9 @@ def _face_slope(values: wp.vec3, corners: wp.vec3i, center: wp.vec2, clip_positi
     normal_a = wp.cross(b, c)
     normal_b = wp.cross(c, a)
     normal_c = wp.cross(a, b)
-    adj_step = normal_a + normal_b + normal_c
+    normal_sum = normal_a + normal_b + normal_c
     slope = values[0] * normal_a + values[1] * normal_b + values[2] * normal_c
-    slope = (slope - slope[2] / adj_step[2] * adj_step) / adj_step[2]
+    slope = (slope - slope[2] / normal_sum[2] * normal_sum) / normal_sum[2]
     return wp.vec2(slope[0], slope[1])
 
 

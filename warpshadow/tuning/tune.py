@@ -346,12 +346,12 @@ def resolved(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = Fa
 def _resolve(scene: Scene, device: wp.DeviceLike, progress: bool) -> Scene:
     accepted_error = scene.visibility.error
     sample = PointSample(scene, device=device, progress=progress)
-    tried_counts: list[tuple[float, Scene]] = []
+    tried_scenes: list[tuple[float, Scene]] = []
     for setting in _by_work(scene, sample):
-        tried_counts.append((sample.error(sample.shading(setting)), setting))
-        if tried_counts[-1][0] <= accepted_error:
+        tried_scenes.append((sample.error(sample.shading(setting)), setting))
+        if tried_scenes[-1][0] <= accepted_error:
             return setting
-    error, nearest = min(tried_counts, key=lambda item: item[0])
+    error, nearest = min(tried_scenes, key=lambda item: item[0])
     interpolation_error = _interpolation_error(scene, sample)
     reason = f"; interpolation between vertices alone has {interpolation_error:.3f}: receivers = 'pixel'"
     reason *= interpolation_error >= accepted_error
@@ -397,9 +397,9 @@ def _settings(scene: Scene, fine: Sequence[str], fits: bool, device: wp.DeviceLi
         scene_with_receivers = change_bodies(scene, "receivers", dict(enumerate(receivers)))
         if not scene.bounces:
             yield replace(scene_with_receivers, visibility=scene.visibility.by("none"))
-        for next_scene in _sphere_variants(scene_with_receivers, fits, device):
+        for variant in _sphere_variants(scene_with_receivers, fits, device):
             for visibility in (*_directional(scene.visibility), *_harmonic(scene.visibility)):
-                yield replace(next_scene, visibility=visibility)
+                yield replace(variant, visibility=visibility)
 
 
 def _sphere_variants(scene: Scene, fits: bool, device: wp.DeviceLike) -> Iterator[Scene]:
