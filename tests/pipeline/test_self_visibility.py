@@ -285,7 +285,7 @@ def test_torch_carries_rotations_and_what_is_deformed():
 
 
 def test_what_was_traced_at_an_interrupt_is_not_traced_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(trace, "_BLOCK", 2**18)  # 64 points a block, of 642
+    monkeypatch.setattr(trace, "_BLOCK_RAYS", 2**18)  # 64 points a block, of 642
     blocks, launch = [], trace.launch
 
     def counting(kernel, dim, **options):
