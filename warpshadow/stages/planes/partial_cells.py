@@ -92,7 +92,7 @@ def _find_coverage(
         grid = scene.grids[side.f]
         if grid.blocks == 1 and weighted_sum < 1.0:
             covered = side_coverage(scene, grid, side, load_local_receiver(store, side.f), cell, edges)
-            weighted_sum += covered.outline * covered.part
+            weighted_sum += covered.outline * covered.mesh_share
     return weighted_sum
 
 
