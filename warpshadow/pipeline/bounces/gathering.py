@@ -149,7 +149,7 @@ class Proxies:
             starts = int(merged_scene.first_vertex[number]), int(senders.first[place])
             bodies.append(PlaneBody(grid, body.mesh.positions, body.mesh.surface.faces, *starts, body.casts_shadow))
         counts = len(senders.areas), int(merged_scene.first_vertex[-1])
-        planes = PlaneBlockers.of(bodies, *counts, device=merged_scene.device)
+        planes = PlaneBlockers.from_bodies(bodies, *counts, device=merged_scene.device)
         return SenderPlanes(planes, {number: k for k, number in enumerate(numbers)})
 
     @functools.cached_property

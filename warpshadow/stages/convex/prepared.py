@@ -58,7 +58,7 @@ class ConvexBlockers:
     corners_of_vertices: SparseMatrix
 
     @staticmethod
-    def of(bodies: Sequence[ConvexBody], vertex_count: int, *, device: wp.DeviceLike) -> ConvexBlockers:
+    def from_bodies(bodies: Sequence[ConvexBody], vertex_count: int, *, device: wp.DeviceLike) -> ConvexBlockers:
         """Prepare bodies, among bodies that have so many vertices together."""
         parts = [part for body in bodies for part in body.parts]
         starts = {name: _starts([len(getattr(part, name)) for part in parts]) for name in ConvexPart._fields}

@@ -89,7 +89,9 @@ class PlaneBlockers:
     has_holes: bool
 
     @staticmethod
-    def of(bodies: Sequence[PlaneBody], patch_count: int, vertex_count: int, *, device: wp.DeviceLike) -> PlaneBlockers:
+    def from_bodies(
+        bodies: Sequence[PlaneBody], patch_count: int, vertex_count: int, *, device: wp.DeviceLike
+    ) -> PlaneBlockers:
         """Prepare flat bodies, among bodies that have so many patches and vertices together; 0 if none sends light."""
         from scipy.sparse import vstack
 
