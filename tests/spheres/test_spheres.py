@@ -24,7 +24,7 @@ from warpshadow.spheres import measure as stage_3
 from warpshadow.spheres import refine as stage_2
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
 from warpshadow.spheres.receivers import FitReceivers
-from warpshadow.stages.visibility.cones import BLEND, FADE
+from warpshadow.stages.visibility.cones import BLEND, FADE_RADIUS
 from warpshadow.stages.visibility.directional import SOFTNESS, transmittance
 
 SEED = 3
@@ -66,7 +66,7 @@ def twin_cone(distance):
 
 
 def twin_near(distance):
-    t = np.minimum(distance / FADE, 1)
+    t = np.minimum(distance / FADE_RADIUS, 1)
     return t**2 * (3 - 2 * t)
 
 

@@ -6,7 +6,13 @@ import warp as wp
 
 import warpshadow as ws
 from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.self_visibility.probes import _ENTRY, ProbeTable, VisibilityProbes, find_probes, longest_edge
+from warpshadow.stages.self_visibility.probes import (
+    _ENTRY_RATIO,
+    ProbeTable,
+    VisibilityProbes,
+    find_probes,
+    longest_edge,
+)
 
 # Interpolated float32 positions of size 1.
 FLOAT32 = 1e-6
@@ -56,7 +62,7 @@ def test_edges_that_enter_another_part_are_cut_finer_and_faces_agree(longest):
     lengths = np.linalg.norm(probes.positions[ends[:, 0]] - probes.positions[ends[:, 1]], axis=1)
     inside = is_inside(probes.positions)
     enters = inside[ends[:, 0]] != inside[ends[:, 1]]
-    assert enters.any() and lengths[enters].max() <= _ENTRY * longest and lengths.max() <= longest
+    assert enters.any() and lengths[enters].max() <= _ENTRY_RATIO * longest and lengths.max() <= longest
     assert len(probes.positions) - len(ends) + counts.sum() // 3 == 1
     without = find_probes(POSITIONS, NORMALS, FACES, longest)
     assert len(without.positions) <= len(probes.positions) < len(without.positions) + 60
