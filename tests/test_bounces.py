@@ -282,7 +282,7 @@ def test_it_says_what_runs_for_bounces_and_what_does_not():
     for name in ("self light", "plane light", "sphere light", "radiosity", "self light of patches"):
         assert explained[name].forward and explained[name].backward, name
     still = renderer.explain(light)
-    for name in ("form factors", "transfer of sources", "bounces"):
+    for name in ("form factors", "transfer of patch samples", "bounces"):
         assert still[name].forward, name
     assert still["bounces"].backward and not still["form factors"].backward
     only = dataclasses.replace(renderer.scene, bodies=renderer.scene.bodies[:1])
@@ -292,10 +292,10 @@ def test_it_says_what_runs_for_bounces_and_what_does_not():
     assert ws.Renderer(ground).explain()["self light"].forward.why == "all that reflects is flat"
 
 
-def test_one_bounce_asks_for_no_light_between_bodies_sources():
+def test_one_bounce_asks_for_no_light_between_bodies_patch_samples():
     explained = ws.Renderer(bounced("directional", ON_BOTH, 1)).explain()
     assert explained["self light of patches"].forward
-    for name in ("plane light of sources", "sphere light of sources"):
+    for name in ("plane light of patch samples", "sphere light of patch samples"):
         assert explained[name].forward.why == "light bounces once", name
 
 
@@ -532,7 +532,7 @@ def test_what_bounces_between_bodies_that_stand_still_is_kept(method, name, monk
     def refuse(*_, **__):
         raise AssertionError("it is computed again")
 
-    monkeypatch.setattr(static_bounces, "trace_factors", refuse)
+    monkeypatch.setattr(static_bounces, "trace_form_factors", refuse)
     monkeypatch.setattr(type(renderer.warp._method), "find_visibility", refuse)
     monkeypatch.setattr(type(renderer.warp._method), "find_visibility_past_planes", refuse)
     with torch.no_grad():
@@ -568,7 +568,13 @@ def test_a_geometry_given_again_is_not_seen_again_where_light_bounces(method, na
         found = image_and_gradient(renderer, name, 2 * start, geometry)
         explained = renderer.explain(**{name: 2 * start if name == "light" else [2 * start, None]}, geometry=geometry)
     assert all(map(torch.equal, found, image_and_gradient(fresh, name, 2 * start, geometry)))
-    for stage in ("sources", "visibility of sources", "transfer of sources", "visibility", "transfer"):
+    for stage in (
+        "patch samples",
+        "visibility of patch samples",
+        "transfer of patch samples",
+        "visibility",
+        "transfer",
+    ):
         assert explained[stage].forward.why.startswith("cached: "), stage
     assert explained["shading"].forward and explained["plane light"].forward
     moved = geometry.map(lambda array: array.clone())

@@ -256,7 +256,7 @@ def planes(double, device):
         module.PlaneBody(patches.grid, square, faces, 4 * number, number * count, True)
         for number, patches in enumerate(found)
     ]
-    return module.PlaneBlockers.of(bodies, 3 * count, 8, device=device)
+    return module.PlaneBlockers.from_bodies(bodies, 3 * count, 8, device=device)
 
 
 FRAMES = np.array([[[0, 0, 0], [1, 0, 0], [0, 0, -1], [0.1, 0.3, -1.1], [0.9, 0, 0], [0, 0.9, 0]]])
@@ -297,7 +297,7 @@ def holed_planes(double, device):
     for number, own in enumerate((faces[:1], faces)):
         patches = find(square, own, is_two_sided=False)
         bodies.append(module.PlaneBody(patches.grid, square, own, 4 * number, 0, True))
-    return module.PlaneBlockers.of(bodies, 0, 8, device=device)
+    return module.PlaneBlockers.from_bodies(bodies, 0, 8, device=device)
 
 
 @pytest.mark.parametrize("name", ["planes", "holed_planes"])
@@ -326,7 +326,7 @@ def test_coverage_by_convex_parts(double, check, device):
         module.ConvexBody([first, second._replace(corners=second.corners + 6)], 0),
         module.ConvexBody([third], 10),
     ]
-    blockers = module.ConvexBlockers.of(bodies, 14, device=device)
+    blockers = module.ConvexBlockers.from_bodies(bodies, 14, device=device)
     positions = np.concatenate([points + shift for points, shift in zip(corners, shifts, strict=True)])[None]
     points = np.array([[[0.1, 2.2, 0.3], [-0.4, 0.7, -1.9], [2.5, 0.2, 1.5]]])
     given = (wp.vec3d, points), (wp.vec3d, positions)
@@ -354,21 +354,21 @@ def test_what_patches_show(double, planes, check, device):
     points, normals = plane_receivers()
     spheres, radii = np.int32([1, 0, 1]), np.array([[0.3, 0.5]])
     given = (wp.vec3d, points), (wp.vec3d, normals), (wp.float64, radii), (wp.float64, random(1, 1, 3, 2) ** 2)
-    check(lambda p, n, r, *f: areas.turn_from_planes(p, n, r, spheres, *f, planes), *given, (wp.vec3d, FRAMES))
-    mean = sparse.of(np.array([[0.7, 0.3, 0], [0, 0, 1]]), device=device)
+    check(lambda p, n, r, *f: areas.tilt_normals_off_planes(p, n, r, spheres, *f, planes), *given, (wp.vec3d, FRAMES))
+    mean = sparse.from_matrix(np.array([[0.7, 0.3, 0], [0, 0, 1]]), device=device)
     rest = (wp.vec3d, normals), (wp.float64, random(1, 1, 3, 16) ** 2)
     check(lambda n, t: areas.find_projected_areas(n, t, mean, directions), *rest)
 
 
-def test_how_much_sources_count(double, device, check):
-    sources, radiosity = double("stages.bounces.open_sources"), double("stages.bounces.radiosity")
+def test_how_much_patch_samples_count(double, device, check):
+    patch_samples, radiosity = double("stages.bounces.openness"), double("stages.bounces.radiosity")
     directions, owners = double("maths.directions").fibonacci(16), np.array([0, 0, 2])
-    mean = radiosity.mean_over_sources(owners, np.array([0.3, 0.7, 1]), 3, device=device)
+    mean = radiosity.mean_over_patch_samples(owners, np.array([0.3, 0.7, 1]), 3, device=device)
     past_self = np.random.default_rng(1).random((1, 3, 16))
 
     def shown(albedo, light, normals, past_self, past_all):
-        openness = sources.find_openness(normals, past_self, past_all, directions)
-        shares, weights = sources.open_shares(openness, mean, owners)
+        openness = patch_samples.find_openness(normals, past_self, past_all, directions)
+        shares, weights = patch_samples.open_shares(openness, mean, owners)
         return radiosity.reflect(weights, radiosity.patch_radiosity(albedo, light, mean, shares))
 
     colors = (wp.vec3d, random(2, 1, 3, 3)), (wp.vec3d, random(3, 2, 3, 3))
@@ -378,8 +378,8 @@ def test_how_much_sources_count(double, device, check):
 def test_radiosity_and_self_light(double, device, check):
     sparse, self_light = double("stages.sparse").SparseMatrix, double("stages.bounces.self_light").self_light
     radiosity = double("stages.bounces.radiosity")
-    mean = radiosity.mean_over_sources(np.array([0, 0, 2]), np.array([0.3, 0.7, 1]), 3, device=device)
-    factors = sparse.of(np.abs(random(0, 5, 3)), device=device)
+    mean = radiosity.mean_over_patch_samples(np.array([0, 0, 2]), np.array([0.3, 0.7, 1]), 3, device=device)
+    factors = sparse.from_matrix(np.abs(random(0, 5, 3)), device=device)
     rows = put(np.array([[[0, 1, 2], [4, 4, 3]]]), wp.vec3i, device)
 
     def light(albedo, shading, weights):
@@ -657,7 +657,7 @@ def test_transmittance_of_lobes(double, device, check, glossy):
     module, cells = double("stages.gloss.transmittance"), double("maths.directions").fibonacci(16)
     towards = unit(glossy[1][1][:, :, None] + 0.3 * random(4, 1, 2, 2, 3))
     arguments = (wp.float64, random(3, 1, 2, 16)), glossy[1], (wp.vec3d, towards)
-    check(lambda *arguments: module.transmittance_towards(*arguments, cells), *arguments)
+    check(lambda *arguments: module.transmittance_of_directions(*arguments, cells), *arguments)
 
 
 @pytest.mark.parametrize("quantity", [0, 1])

@@ -101,13 +101,13 @@ def test_its_patches_are_few_and_all_have_pieces(away):
     mesh = ws.infinite_ground(SIZE)
     others = BALL.mesh.positions + np.float32([away, 1, 0.3 * away])
     patches = find_plane_patches(mesh.positions, mesh.surface.faces, is_two_sided=False, others=others)
-    pieces = np.bincount(patches.of_pieces[0], minlength=patches.count)
+    pieces = np.bincount(patches.patch_of_pieces[0], minlength=patches.count)
     assert (pieces[patches.areas > 0] > 0).all()
     assert mesh.face_count < pieces.sum() < 100_000
     corners = patches.pieces.positions(mesh.positions, mesh.surface.faces)
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     np.testing.assert_allclose(areas.sum(), np.pi * (1e4 * SIZE) ** 2, rtol=0.01)
-    found = np.bincount(patches.of_pieces[0], areas, patches.count)
+    found = np.bincount(patches.patch_of_pieces[0], areas, patches.count)
     near = (np.linalg.norm(patches.centers - others.mean(axis=0), axis=1) < 20) & (patches.areas > 0)
     assert np.abs(found - patches.areas)[near].sum() < 0.1 * patches.areas[near].sum()
 

@@ -15,6 +15,16 @@ BANNED = {
     # bare verbs, adverbs and prepositions: they do not say what a variable holds
     *("across", "along", "among", "apart", "around", "asked", "beside", "beyond", "each", "found", "given", "kept"),
     *("least", "meant", "most", "past", "said", "taken", "told", "wanted"),
+    *("agreed", "ahead", "amount", "answered", "arm", "aside", "at_corner", "at_once", "at_origin", "bend"),
+    *("blurred", "brought", "climbs", "closest", "compared", "computed", "consumed", "cropped", "dark", "decline"),
+    *("descended", "developed", "dilates", "doubled", "doubtful", "dragged", "early", "edge_found", "ended"),
+    *("enters", "escaping", "evaluated", "faded", "failed", "farther", "fewer", "following", "forced", "gained"),
+    *("held", "here", "inside", "is_met", "lack", "large", "later", "lean", "leaning", "leanings", "learned", "less"),
+    *("lies_on", "loaded", "look", "measured", "meets", "more", "nearer", "opened", "padded", "painted", "parsed"),
+    *("pending", "picked", "plus", "previewed", "ranked", "reaches", "reaching", "refused", "rendered", "repeated"),
+    *("resumed", "rolled", "same", "saved", "sense", "shadowed", "shifted", "sized", "slab", "solved", "spanned"),
+    *("spun", "standing", "started", "stopping", "summed", "surrounding", "takes_part", "tested", "there", "timed"),
+    *("toward", "tried", "turning", "untimed", "untried", "viewed", "want", "warned", "way", "worst", "worth"),
     # words that the glossary has replaced: see "Glossary" in warpshadow/README.md
     *("assembly", "exitance", "flats", "lenders", "narrow", "own_light", "own_shadows", "past_all", "past_own"),
     *("past_solid", "seat", "sites", "stand_ins", "stands", "walk"),
@@ -25,6 +35,13 @@ BANNED = {
     *("Assembly", "Flats", "Narrow", "Own", "Seen", "StandIns"),
     *("DirectLightPart", "PartVisibility", "PartwiseShading", "PART_SIZE", "rooms", "with_self_light"),
     *("find_spot", "pull", "pulled", "pulls", "spot", "spot_place", "TexelFootprint", "torque", "truth"),
+    *("add_to_corners", "add_to_vertices", "adj_turned", "adj_unblocked", "at_point", "at_uv", "Covers", "depth_of"),
+    *("Descended", "edge_at", "edge_between", "edge_of", "find_blocker", "find_in_plane", "find_turned", "hit_sides"),
+    *("image_of", "light_cells", "load_place", "looks_at_rays", "loudness", "make_look_up", "mean_light"),
+    *("merge_where_far", "number_places", "numbers_of", "of_rays", "on_host", "over_nothing", "own_count"),
+    *("own_shares", "own_sides", "place_receiver", "place_weights", "PlaneCover", "points_seen", "radiosity_before"),
+    *("ReceiverInPlane", "scaled_to_sky", "see_samples", "SeenSurface", "trace_factors", "transmittance_towards"),
+    *("turn_from_planes", "unblocked_batch", "with_rows", "with_tail", "without_owners"),
 }
 BANNED_PARTS = {"asked", "kept", "meant", "most", "pull", "pulled", "said", "taken", "told", "wanted"}
 """Words that no name has among its parts. A preposition may be one, as in ``planes_around``, where an object follows it

@@ -53,7 +53,7 @@ _MODULES = {
     "tune": "tuning.tune",
     "view": "viewer",
 }
-"""Where names are that stand on kernels: each is imported when it is first asked for."""
+"""Modules of the names that need kernels: each is imported on first use."""
 
 __all__ = [
     "Body",

@@ -173,11 +173,11 @@ def path(name: str, value: object) -> Path:
     return Path(value)
 
 
-def index(name: str, value: object, count: int, what: str, alternative: str = "") -> None:
+def index(name: str, value: object, count: int, noun: str, alternative: str = "") -> None:
     """Raise ValueError unless a value is the number of one of ``count`` things, from 0; the message calls one that."""
     if not is_integer(value) or value not in range(count):
         raise ValueError(
-            f"{name}: got {described(value)}, expected the number of a {what}, from 0 to {count - 1}{alternative}"
+            f"{name}: got {described(value)}, expected the number of a {noun}, from 0 to {count - 1}{alternative}"
         )
 
 
@@ -283,10 +283,10 @@ def nonnegative(name: str, value: object) -> float:
     return float(value)
 
 
-def integer(name: str, value: object, *, minimum: int = 1, what: str = "") -> int:
+def integer(name: str, value: object, *, minimum: int = 1, unit: str = "") -> int:
     """Return a whole number, maybe of something, as an int, or raise ValueError."""
     if not is_integer(value) or value < minimum:
-        of = f"{what}, " if what else ""
+        of = f"{unit}, " if unit else ""
         raise ValueError(f"{name}: got {described(value)}, expected a whole number of {of}at least {minimum}")
     return int(value)
 
@@ -302,7 +302,7 @@ def image_size(size: object) -> tuple[int, int]:
     """Return width and height [pixels], or raise ValueError."""
     if not isinstance(size, (Sequence, np.ndarray)) or isinstance(size, str) or len(size) != 2:
         raise ValueError(f"size: got {described(size)}, expected width and height [pixels], such as (640, 480)")
-    return integer("size (width)", size[0], what="pixels"), integer("size (height)", size[1], what="pixels")
+    return integer("size (width)", size[0], unit="pixels"), integer("size (height)", size[1], unit="pixels")
 
 
 def pixels(name: str, values: object, *, expected: str, error: type[ValueError] = ValueError) -> np.ndarray:
@@ -355,17 +355,18 @@ def described(value: object) -> str:
 
 def finite(name: str, values: np.ndarray, *, minimum: float = -LARGEST, maximum: float = LARGEST) -> None:
     """Raise ValueError when an array holds NaN, Inf or numbers out of range, with their count and the first place."""
-    bad = ~np.isfinite(values)
-    if bad.any():
-        place = tuple(int(i) for i in np.argwhere(bad)[0])
+    is_bad = ~np.isfinite(values)
+    if is_bad.any():
+        first_index = tuple(int(i) for i in np.argwhere(is_bad)[0])
         raise ValueError(
-            f"{name}: got {int(bad.sum())} NaN or Inf values (first at index {place}), expected finite numbers"
+            f"{name}: got {int(is_bad.sum())} NaN or Inf values (first at index {first_index}), expected finite numbers"
         )
-    outside = (values < minimum) | (values > maximum)
-    if outside.any():
-        place = tuple(int(i) for i in np.argwhere(outside)[0])
+    is_outside = (values < minimum) | (values > maximum)
+    if is_outside.any():
+        first_index = tuple(int(i) for i in np.argwhere(is_outside)[0])
         raise ValueError(
-            f"{name}: got {int(outside.sum())} values out of range (first at index {place}: {values[place]:g}), "
+            f"{name}: got {int(is_outside.sum())} values out of range (first at index {first_index}: "
+            f"{values[first_index]:g}), "
             f"expected {minimum:g} to {maximum:g}"
         )
 
@@ -426,7 +427,7 @@ def _is_within(values: np.ndarray, minimum: float, maximum: float) -> bool:
 
 
 def _outside_on_device(arrays: Mapping[str, wp.array], ranges: Mapping[str, tuple[float, float]]) -> list[str]:
-    """The same by a kernel, with one readback."""
+    """Check that arrays are finite by a kernel, with one readback."""
     device = next(iter(arrays.values())).device
     faults = wp.zeros(len(arrays), dtype=wp.int32, device=device)
     for argument, (name, array) in enumerate(arrays.items()):
@@ -464,17 +465,17 @@ def shape(name: str, got: tuple[int, ...], expected: tuple[int | str, ...], mean
         raise ValueError(f"{name}: got shape {tuple(got)}, expected [{lengths}]{meaning and f': {meaning}'}")
 
 
-def importable(module: str, what: str, package: str, extra: str) -> None:
+def importable(module: str, feature: str, package: str, extra: str) -> None:
     """Raise ImportError, which says how to install it, unless a module of one of our extras can be imported."""
     try:
         importlib.import_module(module)
     except ImportError as error:
-        raise ImportError(missing(what, package, extra)) from error
+        raise ImportError(missing(feature, package, extra)) from error
 
 
-def missing(what: str, package: str, extra: str) -> str:
+def missing(feature: str, package: str, extra: str) -> str:
     """The message for a package of one of our extras that is not installed."""
-    return f'{what} needs the package {package}: pip install "warpshadow[{extra}]"'
+    return f'{feature} needs the package {package}: pip install "warpshadow[{extra}]"'
 
 
 def _suggestion(value: object, choices: list) -> str:

@@ -52,7 +52,7 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
         for order, is_shadowed in [(2, True), (8, True), (8, False)]
     },
     **{f"_sh_product_kernel {order}": partial(transfer._sh_product_kernel, order, LANES) for order in ORDERS},
-    **{f"_make_evaluate {order}": partial(lobes._make_evaluate, order) for order in ORDERS},
+    **{f"_make_evaluate_rotated {order}": partial(lobes._make_evaluate_rotated, order) for order in ORDERS},
     **{
         f"{make.__name__} {dtype.__name__}": partial(make, dtype)
         for make in (

@@ -359,7 +359,7 @@ def test_cells_of_an_even_light_are_even_and_as_wide_as_their_solid_angle():
     directions = fibonacci(128)
     environment = EnvironmentMap.constant(2.0, height=128)
     np.testing.assert_allclose(environment.cells(directions).radiance, 2, rtol=0.1)  # Fibonacci cells vary by 6%
-    np.testing.assert_allclose(environment.cells(directions).spreads, 2 / np.sqrt(128), rtol=0.1)
+    np.testing.assert_allclose(environment.cells(directions).half_angles, 2 / np.sqrt(128), rtol=0.1)
 
 
 def test_a_point_light_has_its_own_direction_and_no_spread():
@@ -381,7 +381,7 @@ def test_the_sky_around_a_sun_does_not_widen_it():
     lit = np.argmax(sun.cells(directions).radiance[:, 0])
     both = EnvironmentMap(sun.radiance + np.float32(1)).cells(directions)
     np.testing.assert_allclose(both.spots[lit], direction_twin(20.5, 30.5, 64), atol=1e-3)
-    assert both.spreads[lit] < 1.1 * np.pi / 64  # a tenth of its cell
+    assert both.half_angles[lit] < 1.1 * np.pi / 64  # a tenth of its cell
     assert both.directions[lit] @ both.spots[lit] < np.cos(np.radians(0.3))  # the mean of both is beside it
 
 

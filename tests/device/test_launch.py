@@ -13,7 +13,7 @@ from warpshadow.device.parallel import (
     find_run,
     run_dimensions,
     run_length,
-    scratch_place,
+    scratch_slot,
     set_thread_count,
     strip_count,
 )
@@ -52,7 +52,7 @@ def _cube(
 ):
     """A thread owns a value."""
     row = first_row + wp.tid()
-    own = scratch[scratch_place(worker, row)]
+    own = scratch[scratch_slot(worker, row)]
     own[0] = values[row] * values[row]
     cubes[row] = own[0] * values[row]
     if total:

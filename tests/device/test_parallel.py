@@ -13,7 +13,7 @@ import warp as wp
 from warpshadow.assets.primitives import icosphere
 from warpshadow.device import parallel
 from warpshadow.device.launch import launch
-from warpshadow.device.parallel import Scratch, scratch_place
+from warpshadow.device.parallel import Scratch, scratch_slot
 from warpshadow.maths.adjacency import edge_neighbors
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.interpolation import interpolate
@@ -48,7 +48,7 @@ def _spread(
 ):
     """A thread owns a value; the scratch memory would not keep it, were it another thread's, too."""
     row = first_row + wp.tid()
-    own = scratch[scratch_place(worker, row)]
+    own = scratch[scratch_slot(worker, row)]
     for _ in range(200):
         own[0] = values[row]
     squares[row] = own[0] * own[0]

@@ -101,7 +101,7 @@ MOVES = {
 def test_gradients_of_the_ground_are_those_of_differences(mesh, moving, bounces):
     """No pixel shows another body, so no rasterizer takes part.
 
-    Where light bounces no body touches another: light of a patch jumps as one of its sources enters a part.
+    Where light bounces no body touches another: light of a patch jumps as one of its patch samples enters a part.
     """
     if moving and bounces:
         pytest.skip("where light bounces nothing of static bodies is cached")

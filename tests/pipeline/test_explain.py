@@ -461,13 +461,13 @@ def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
     if module in ("stages.self_visibility.trace", "stages.self_visibility.lookup", "stages.self_visibility.lobes"):
         return "self-shadows"
     of_visibility = "stages.visibility", "stages.self_visibility.gather", "stages.ray_tracing"
-    if module.startswith(of_visibility) or key == "_add_rows":
+    if module.startswith(of_visibility) or key == "_add_cached_rows":
         return VISIBILITY
     if module.startswith("stages.silhouettes"):
         after = {
             "_find_edge_colors": "radiance",
             "blend": "smoothing",
-            "_measure_adjoint": "smoothing",
+            "_measure_areas_adjoint": "smoothing",
         }
         return next((name for part, name in after.items() if part in key), "silhouettes")
     if module.startswith("stages.textures"):
@@ -479,7 +479,7 @@ def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
     if module in ("stages.rasterization", "stages.barycentrics"):
         return "rasterization"
     if module in ("stages.transfer", "stages.cached_cells"):
-        return "shading" if "_light_cells" in key else "transfer"
+        return "shading" if "_shade_cells" in key else "transfer"
     if module == "stages.film":
         return "averaging" if "average" in key else "radiance"
     if module in ("stages.sample_receivers", "stages.quadtree"):

@@ -100,10 +100,10 @@ def test_gradients_of_pixels_inside_the_ball_are_those_of_differences(moving):
     assert float(shift.grad) == pytest.approx((ends[0] - ends[1]) / (2 * STEP), rel=0.01)
 
 
-# By the heights of the sources themselves a step of 0.003 is off by a third, and one of 0.02 twice or more.
+# By the heights of the patch samples themselves a step of 0.003 is off by a third, and one of 0.02 twice or more.
 @pytest.mark.parametrize(("bounces", "off"), [(1, 0.01), (2, 0.02)])
 def test_a_ball_that_touches_the_ground_has_the_gradient_of_wide_steps(bounces, off):
-    """Its lowest sources sink into the ground, whose back does not light them.
+    """Its lowest patch samples sink into the ground, whose back does not light them.
 
     Where one does the slope dips, by an eighth half a thousandth above contact. So gradients have the mean of a wide
     step, and none is far from it.

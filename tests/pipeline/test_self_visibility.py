@@ -285,7 +285,7 @@ def test_torch_carries_rotations_and_what_is_deformed():
 
 
 def test_what_was_traced_at_an_interrupt_is_not_traced_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(trace, "_BLOCK", 2**18)  # 64 points a block, of 642
+    monkeypatch.setattr(trace, "_BLOCK_RAYS", 2**18)  # 64 points a block, of 642
     blocks, launch = [], trace.launch
 
     def counting(kernel, dim, **options):
@@ -331,7 +331,7 @@ def test_a_damaged_file_of_an_interrupt_is_not_read(tmp_path, monkeypatch):
     path = cache_path("own_shadows", "0" * 64)
     path.parent.mkdir()
     path.with_suffix(".part.npz").write_bytes(b"PK damaged")
-    found = load_or_compute(path, dict, lambda unfinished: dict(unfinished.before), lambda made: made, what="thing")
+    found = load_or_compute(path, dict, lambda unfinished: dict(unfinished.before), lambda made: made, noun="thing")
     assert found == {} and cached_files("own_shadows") == [path]
 
 

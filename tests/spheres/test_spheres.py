@@ -24,7 +24,7 @@ from warpshadow.spheres import measure as stage_3
 from warpshadow.spheres import refine as stage_2
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
 from warpshadow.spheres.receivers import FitReceivers
-from warpshadow.stages.visibility.cones import BLEND, FADE
+from warpshadow.stages.visibility.cones import BLEND, FADE_RADIUS
 from warpshadow.stages.visibility.directional import SOFTNESS, transmittance
 
 SEED = 3
@@ -66,7 +66,7 @@ def twin_cone(distance):
 
 
 def twin_near(distance):
-    t = np.minimum(distance / FADE, 1)
+    t = np.minimum(distance / FADE_RADIUS, 1)
     return t**2 * (3 - 2 * t)
 
 
@@ -101,7 +101,7 @@ def refinement(device):
 
 def seen_from(fit, chosen):
     """Points [receiver, 3] of a refinement, and the directions that they look to [receiver, direction, 3]."""
-    places = fit.receivers.places[:, chosen].T.astype(np.float64)
+    places = fit.receivers.frame_rows[:, chosen].T.astype(np.float64)
     frames = places[:, 3:].reshape(-1, 3, 3)
     return places[:, :3], np.einsum("qi,pij->pqj", fit.receivers.directions, frames)
 

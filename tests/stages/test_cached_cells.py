@@ -6,7 +6,7 @@ import warp as wp
 
 from warpshadow.device.tape import recorded
 from warpshadow.maths.directions import CHUNK
-from warpshadow.stages.cached_cells import CachedRows, add_rows, cell_transfer, light_cells
+from warpshadow.stages.cached_cells import CachedRows, add_rows, cell_transfer, shade_cached_cells
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -38,7 +38,7 @@ def test_shading_is_the_sum_of_kept_light_over_what_is_let_through(device, verif
     cached, light = cached_rows(3, device)
     transmittance, values = transmittance_of(device)
     with recorded() as tape:
-        shading = light_cells(transmittance, cached)
+        shading = shade_cached_cells(transmittance, cached)
     np.testing.assert_allclose(shading.numpy(), np.einsum("brq,rcq->brc", values, light), rtol=FLOAT32)
     weights = uniform(BATCH, RECEIVERS, 3, seed=2)
     expected = np.einsum("brc,rcq->brq", weights, light)
@@ -59,13 +59,13 @@ def test_a_tape_that_is_played_back_again_adds_to_the_gradient(device):
     cached, _ = cached_rows(3, device)
     transmittance, _ = transmittance_of(device)
     with recorded() as tape:
-        shading = light_cells(transmittance, cached)
+        shading = shade_cached_cells(transmittance, cached)
     weights = uniform(BATCH, RECEIVERS, 3, seed=2)
     once = gradient_of(transmittance, tape, shading, weights).copy()
     np.testing.assert_allclose(gradient_of(transmittance, tape, shading, weights), 2 * once, rtol=FLOAT32)
 
 
-@pytest.mark.parametrize(("combine", "channels"), [(light_cells, 3), (cell_transfer, 1)])
+@pytest.mark.parametrize(("combine", "channels"), [(shade_cached_cells, 3), (cell_transfer, 1)])
 def test_nothing_is_recorded_without_a_gradient_to_find(combine, channels, device):
     with recorded() as tape:
         result = combine(transmittance_of(device, requires_grad=False)[0], cached_rows(channels, device)[0])

@@ -8,7 +8,7 @@ import twins
 import warp as wp
 
 from warpshadow.device.lanes import lane_type, make_lane_functions, module_options
-from warpshadow.stages.visibility.cones import BLEND, FADE, TINY_RADIUS, make_cone
+from warpshadow.stages.visibility.cones import BLEND, FADE_RADIUS, TINY_RADIUS, make_cone
 
 # cos θ and sin²θ where they are exact: a few float32 roundings.
 FLOAT32 = 3e-7
@@ -105,13 +105,13 @@ def test_the_sphere_fades_out_smoothly_towards_its_center(device):
     ratios = np.linspace(0, 1, 200)
     _, _, _, weight = kernel_cones(along((0, 1, 0), ratios), 1.0, device)
     assert weight[0] < 1e-30
-    assert np.abs(weight - twins.smoothstep(ratios / FADE)).max() < FLOAT32 * 4
-    assert (weight[ratios > FADE] == 1).all()
+    assert np.abs(weight - twins.smoothstep(ratios / FADE_RADIUS)).max() < FLOAT32 * 4
+    assert (weight[ratios > FADE_RADIUS] == 1).all()
     direction, *_ = kernel_cones(np.zeros((1, 3), np.float32), 1.0, device)
     assert not direction.any()
 
 
-@pytest.mark.parametrize("seam", [1.0, 1 + BLEND, FADE])
+@pytest.mark.parametrize("seam", [1.0, 1 + BLEND, FADE_RADIUS])
 def test_value_and_slope_of_the_rule_are_continuous(seam, device):
     """Slopes on both sides of a seam, by differences over h, differ by no more than the curvature allows.
 

@@ -35,7 +35,7 @@ def blockers(device, *, blocks=(True, True)):
             (part,) = find_convex_parts(MESHES[number].vertices, MESHES[number].faces)
             found.append(part._replace(corners=part.corners + starts[number] - starts[parts[0]]))
         bodies.append(ConvexBody(found, int(starts[parts[0]]), is_blocking))
-    return ConvexBlockers.of(bodies, int(starts[-1]), device=device)
+    return ConvexBlockers.from_bodies(bodies, int(starts[-1]), device=device)
 
 
 def hits(vertices, point, rays):
@@ -92,7 +92,7 @@ def test_coverages_of_cells_are_those_of_rays(number, device):
 def test_a_panel_is_two_sided_and_blocks_nothing_of_receivers_in_its_plane(device):
     corners = np.array([[-0.5, 0.2, -0.4], [0.6, 0.2, -0.5], [0.5, 0.2, 0.6], [-0.4, 0.2, 0.3]])
     (panel,) = find_convex_parts(corners, np.array([[0, 1, 2], [0, 2, 3]]))
-    some = ConvexBlockers.of([ConvexBody([panel], 0)], 4, device=device)
+    some = ConvexBlockers.from_bodies([ConvexBody([panel], 0)], 4, device=device)
     placed = some.placed(wp.array(corners[None], dtype=wp.vec3, device=device))
     points = np.array([[0.1, 1.0, 0.0], [0.1, -0.1, 0.1], [0.1, 0.2, 0.1], [3.0, 0.2, 0.1]])
     arguments = wp.array(points[None], dtype=wp.vec3, device=device), placed, some, DIRECTIONS
@@ -109,7 +109,7 @@ def test_a_cell_whose_middle_is_on_an_edge_is_half_covered(turn, device):
     """Wherever the outline begins."""
     corners = np.roll(np.array([[0, 0, 1], [3, 0, 1], [3, 3, 1], [0, 3, 1.0]]), turn, axis=0)
     (panel,) = find_convex_parts(corners, np.array([[0, 1, 2], [0, 2, 3]]))
-    some = ConvexBlockers.of([ConvexBody([panel], 0)], 4, device=device)
+    some = ConvexBlockers.from_bodies([ConvexBody([panel], 0)], 4, device=device)
     placed = some.placed(wp.array(corners[None], dtype=wp.vec3, device=device))
     points = np.array([[0, 1, 0], [1, 0, 0], [0, 2, 2], [1, 1, 0.0]])
     directions = np.tile([0, 0, 1.0], (16, 1)) * np.where(np.arange(16) < 8, 1, -1)[:, None]
@@ -125,7 +125,7 @@ def test_prisms_of_a_body_cover_their_seam_once(device):
     bracket = trimesh.creation.extrude_triangulation(outline, triangles, 1.0)
     parts = find_convex_parts(bracket.vertices, bracket.faces)
     assert [part.is_seam for part in parts] == [False, False, True]
-    some = ConvexBlockers.of([ConvexBody(parts, 0)], len(bracket.vertices), device=device)
+    some = ConvexBlockers.from_bodies([ConvexBody(parts, 0)], len(bracket.vertices), device=device)
     placed = some.placed(wp.array(bracket.vertices[None], dtype=wp.vec3, device=device))
     points = np.array([[-1.5, -0.7, 1.8], [-0.6, -0.9, -1.2]])  # from outside the notch
     solids = [bracket.vertices[part.corners] for part in parts[:2]]

@@ -98,7 +98,7 @@ def test_maps_keep_their_energy_with_other_rows():
     radiance = np.random.default_rng(0).uniform(size=(50, 100, 3))
     for rows in (16, 64):
         power = (
-            prefilter.with_rows(radiance, rows).sum(axis=1)
+            prefilter.resize_rows(radiance, rows).sum(axis=1)
             * np.diff(-np.cos(np.pi * np.arange(rows + 1) / rows))[:, None]
         )
         own = radiance.sum(axis=1) * np.diff(-np.cos(np.pi * np.arange(51) / 50))[:, None]
@@ -114,7 +114,7 @@ def test_transmittance_of_samples_is_the_mean_of_the_cells_around(device):
         wp.array(through, dtype=wp.float32, device=device),
         *(wp.array(value, dtype=wp.vec3, device=device) for value in (normals, directions)),
     ]
-    got = transmittance.transmittance_towards(*inputs, cells).numpy()
+    got = transmittance.transmittance_of_directions(*inputs, cells).numpy()
     expected = twins.transmittance_near(through, normals, directions, cells, transmittance.KERNEL_RADIUS)
     assert np.abs(got - expected).max() < 20 * FLOAT32
 
@@ -178,5 +178,5 @@ def test_numbers_are_grays_and_back(device):
     values = np.random.default_rng(5).uniform(size=(2, 3, 4)).astype(np.float32)
     grays = numbers.as_colors(wp.array(values, dtype=wp.float32, device=device))
     np.testing.assert_array_equal(grays.numpy(), values[..., None].repeat(3, axis=-1))
-    np.testing.assert_array_equal(numbers.as_numbers(grays).numpy(), values.reshape(2, 12))
+    np.testing.assert_array_equal(numbers.as_scalars(grays).numpy(), values.reshape(2, 12))
     assert numbers.as_colors(grays) is grays

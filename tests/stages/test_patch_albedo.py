@@ -20,7 +20,9 @@ def test_colors_of_vertices_have_the_mean_of_their_interpolation_over_each_patch
     faces, pieces = mesh.surface.faces, patches.pieces
     found = mean_over_vertices(patches, mesh.positions, faces) @ colors
     sums, areas = np.zeros((patches.count, 3)), np.zeros(patches.count)
-    for face, corners, patch in zip(pieces.faces, pieces.corners.astype(float), patches.of_pieces[0], strict=True):
+    for face, corners, patch in zip(
+        pieces.faces, pieces.corners.astype(float), patches.patch_of_pieces[0], strict=True
+    ):
         points, shades = (corners @ values[faces[face]].astype(float) for values in (mesh.positions, colors))
         area = np.linalg.norm(np.cross(points[1] - points[0], points[2] - points[0])) / 2
         sums[patch] += area * shades.mean(axis=0)

@@ -5,7 +5,7 @@ import pytest
 
 import warpshadow as ws
 from demos.scenes import shipped_mesh
-from warpshadow.stages.bounces.factors import patch_mesh, trace_factors
+from warpshadow.stages.bounces.form_factors import patch_mesh, trace_form_factors
 from warpshadow.stages.bounces.patches import find_patches, find_plane_patches
 from warpshadow.stages.planes.grid import squeezed, stretched
 
@@ -29,9 +29,9 @@ def area_of(mesh):
     return np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
 
 
-def source_points(patches, mesh):
-    sources = patches.sources
-    return np.einsum("sk,skx->sx", sources.barycentrics, mesh.positions[mesh.surface.faces[sources.faces]])
+def patch_sample_points(patches, mesh):
+    patch_samples = patches.patch_samples
+    return np.einsum("sk,skx->sx", patch_samples.barycentrics, mesh.positions[mesh.surface.faces[patch_samples.faces]])
 
 
 @pytest.fixture(scope="module", params=["bunny", "rocks", "box"])
@@ -45,7 +45,7 @@ def test_patches_cover_the_surface_of_each_side_once(mesh):
     assert 24 // sides <= patches.count <= 256  # four for each side of a box
     np.testing.assert_allclose(patches.areas.sum(), sides * area_of(mesh), rtol=ROUNDING)
     assert patches.areas.min() > 0
-    front, back = patches.of_pieces
+    front, back = patches.patch_of_pieces
     assert set(front) == set(range(patches.count // sides))
     np.testing.assert_array_equal(back, front + patches.count // 2 if sides == 2 else -1)
     pieces = patches.pieces.positions(mesh.positions, mesh.surface.faces)
@@ -65,7 +65,7 @@ def test_faces_between_boxes_that_touch_belong_to_no_patch():
     steps = joined(low, high)
     patches = patches_of(steps)
     pieces = patches.pieces.positions(steps.positions, steps.surface.faces)
-    middles, front = pieces.mean(axis=1), patches.of_pieces[0]
+    middles, front = pieces.mean(axis=1), patches.patch_of_pieces[0]
     is_between = np.isclose(pieces[..., 2], 1).all(axis=1) & (middles[:, 1] < 0.9)
     assert is_between.sum() > 10 and (front[is_between] == -1).all()
     is_outside = ~np.isclose(pieces[..., 2], 1).all(axis=1)
@@ -85,10 +85,10 @@ def test_narrow_steps_are_not_black_where_their_faces_go_on_below_the_next_one(d
     points = np.stack([np.full(60, 0.05), np.full(60, 0.11), places], axis=1)
     normals = np.tile([0.0, -1.0, 0.0], (60, 1))
     of_patches, of_body = (
-        trace_factors(
+        trace_form_factors(
             patch_mesh(patches, steps.positions, steps.surface.faces, device=device), *of_faces, points, normals
         )
-        for of_faces in ((patches.of_pieces, patches.count), (np.zeros_like(patches.of_pieces), 1))
+        for of_faces in ((patches.patch_of_pieces, patches.count), (np.zeros_like(patches.patch_of_pieces), 1))
     )
     seen = of_body.toarray().ravel()
     assert seen.min() > 0.9
@@ -97,31 +97,31 @@ def test_narrow_steps_are_not_black_where_their_faces_go_on_below_the_next_one(d
     np.testing.assert_allclose(patches.areas.sum(), area_of(steps) - hidden, rtol=0.05)
 
 
-def test_every_patch_has_up_to_four_sources_on_it_that_weigh_one(mesh):
+def test_every_patch_has_up_to_four_patch_samples_on_it_that_weigh_one(mesh):
     patches = patches_of(mesh)
-    sources = patches.sources
-    assert (np.diff(sources.patches) >= 0).all()
-    counts = np.bincount(sources.patches, minlength=patches.count)
+    patch_samples = patches.patch_samples
+    assert (np.diff(patch_samples.patches) >= 0).all()
+    counts = np.bincount(patch_samples.patches, minlength=patches.count)
     assert counts.min() >= 1 and counts.max() <= 4
-    np.testing.assert_allclose(np.bincount(sources.patches, sources.weights), 1, rtol=ROUNDING)
-    np.testing.assert_allclose(sources.barycentrics.sum(axis=1), 1, rtol=ROUNDING)
-    assert sources.barycentrics.min() >= 0
-    # a source is nearer to its patch's middle than the patch is wide
-    distance = np.linalg.norm(source_points(patches, mesh) - patches.centers[sources.patches], axis=1)
-    assert (distance < 2 * np.sqrt(patches.areas[sources.patches])).mean() > 0.95
-    np.testing.assert_array_equal(sources.is_back, sources.patches >= len(set(patches.of_pieces[0])))
+    np.testing.assert_allclose(np.bincount(patch_samples.patches, patch_samples.weights), 1, rtol=ROUNDING)
+    np.testing.assert_allclose(patch_samples.barycentrics.sum(axis=1), 1, rtol=ROUNDING)
+    assert patch_samples.barycentrics.min() >= 0
+    # a patch sample is nearer to its patch's middle than the patch is wide
+    distance = np.linalg.norm(patch_sample_points(patches, mesh) - patches.centers[patch_samples.patches], axis=1)
+    assert (distance < 2 * np.sqrt(patches.areas[patch_samples.patches])).mean() > 0.95
+    np.testing.assert_array_equal(patch_samples.is_back, patch_samples.patches >= len(set(patches.patch_of_pieces[0])))
 
 
-def test_sources_lie_on_large_faces_not_at_their_corners():
+def test_patch_samples_lie_on_large_faces_not_at_their_corners():
     """A vertex of a box sees three of its sides, and none as a patch does."""
     patches = patches_of(box())
-    assert patches.sources.barycentrics.max() < 0.99
+    assert patches.patch_samples.barycentrics.max() < 0.99
     assert np.abs(patches.normals).max(axis=1).min() > 1 - ROUNDING  # none goes around an edge
 
 
-def test_sources_of_small_faces_are_vertices():
+def test_patch_samples_of_small_faces_are_vertices():
     patches = patches_of(shipped_mesh("bunny"))
-    assert (patches.sources.barycentrics.max(axis=1) == 1).all()
+    assert (patches.patch_samples.barycentrics.max(axis=1) == 1).all()
 
 
 def test_needles_do_not_make_pieces_without_end():
@@ -135,13 +135,13 @@ def test_needles_do_not_make_pieces_without_end():
 def test_patches_are_the_same_again():
     mesh = shipped_mesh("bear")
     first, second = patches_of(mesh), patches_of(mesh)
-    np.testing.assert_array_equal(first.of_pieces, second.of_pieces)
-    np.testing.assert_array_equal(first.sources.faces, second.sources.faces)
+    np.testing.assert_array_equal(first.patch_of_pieces, second.patch_of_pieces)
+    np.testing.assert_array_equal(first.patch_samples.faces, second.patch_samples.faces)
 
 
 def test_a_mesh_without_area_has_no_patches():
     patches = find_patches(np.zeros((3, 3)), np.array([[0, 1, 2]]), is_two_sided=True)
-    assert patches.count == 0 and patches.of_pieces.shape == (2, 0) and not len(patches.sources.faces)
+    assert patches.count == 0 and patches.patch_of_pieces.shape == (2, 0) and not len(patches.patch_samples.faces)
 
 
 def test_patches_belong_to_the_sphere_whose_surface_is_nearest():
@@ -175,8 +175,8 @@ def test_an_even_grid_has_equal_texels(segments):
     np.testing.assert_allclose(patches.areas, 18 / 288, rtol=0.02)
     np.testing.assert_allclose(patches.centers.mean(axis=0), [5, -1, 2], atol=1e-4)
     np.testing.assert_allclose(patches.normals, [[0, 1, 0]] * 288, atol=ROUNDING)
-    np.testing.assert_allclose(source_points(patches, mesh), patches.centers, atol=1e-4)
-    np.testing.assert_array_equal(patches.sources.patches, np.arange(288))
+    np.testing.assert_allclose(patch_sample_points(patches, mesh), patches.centers, atol=1e-4)
+    np.testing.assert_array_equal(patches.patch_samples.patches, np.arange(288))
 
 
 def test_a_grid_is_finer_near_other_bodies():
@@ -200,7 +200,7 @@ def test_a_square_that_is_turned_has_a_grid_of_its_own_size():
     assert np.linalg.det(grid.frame) == pytest.approx(1)
 
 
-def test_texels_off_the_mesh_have_no_sources():
+def test_texels_off_the_mesh_have_no_patch_samples():
     """An L of three squares."""
     corners = np.array([[x, 0, z] for x in range(3) for z in range(3)], float)
     squares = [(0, 1), (0, 0), (1, 0)]
@@ -209,9 +209,9 @@ def test_texels_off_the_mesh_have_no_sources():
     mesh = ws.Mesh(corners, faces)
     patches = flat_patches_of(mesh)
     assert patches.areas.sum() == pytest.approx(3, rel=0.02)
-    has_source = np.isin(np.arange(patches.count), patches.sources.patches)
-    np.testing.assert_array_equal(has_source, patches.areas > 0)
-    points = source_points(patches, mesh)
+    has_patch_sample = np.isin(np.arange(patches.count), patches.patch_samples.patches)
+    np.testing.assert_array_equal(has_patch_sample, patches.areas > 0)
+    points = patch_sample_points(patches, mesh)
     assert not ((points[:, 0] > 1 + ROUNDING) & (points[:, 2] > 1 + ROUNDING)).any()
 
 
@@ -220,7 +220,7 @@ def test_both_sides_of_a_grid_have_patches():
     patches = find_plane_patches(mesh.positions, mesh.surface.faces, is_two_sided=True)
     assert patches.count == 2 * 24 * 24 and patches.grid.sides == 2
     np.testing.assert_allclose(patches.normals[576:], [[0, -1, 0]] * 576, atol=ROUNDING)
-    assert patches.sources.is_back[576:].all() and not patches.sources.is_back[:576].any()
+    assert patches.patch_samples.is_back[576:].all() and not patches.patch_samples.is_back[:576].any()
 
 
 def test_pieces_of_a_flat_body_belong_to_the_texels_in_which_they_lie():
@@ -229,6 +229,6 @@ def test_pieces_of_a_flat_body_belong_to_the_texels_in_which_they_lie():
     pieces = patches.pieces.positions(mesh.positions, mesh.surface.faces)
     areas = np.linalg.norm(np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0]), axis=1) / 2
     assert areas.sum() == pytest.approx(16)
-    away = np.linalg.norm(pieces.mean(axis=1) - patches.centers[patches.of_pieces[0]], axis=1)
-    assert (away < np.sqrt(patches.areas[patches.of_pieces[0]]) * 1.5).all()
-    assert (patches.of_pieces[1] == -1).all()
+    away = np.linalg.norm(pieces.mean(axis=1) - patches.centers[patches.patch_of_pieces[0]], axis=1)
+    assert (away < np.sqrt(patches.areas[patches.patch_of_pieces[0]]) * 1.5).all()
+    assert (patches.patch_of_pieces[1] == -1).all()

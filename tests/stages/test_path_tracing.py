@@ -265,8 +265,8 @@ def test_parts_of_receivers_are_those_of_the_whole(device, monkeypatch):
     surfaces = make_surfaces(mesh, colors, device, texture=texture, textured=textured)
     points, normals = np.tile([0.3, 0, 0.2], (20, 1)), np.tile([0.0, 1, 0], (20, 1))
     whole = bounced(surfaces, points, normals, UNIFORM, bounces=2, paths=8)
-    parts = path_tracing.parts
-    monkeypatch.setattr(path_tracing, "parts", lambda total, size, progress: parts(total, 7, progress))
+    parts = path_tracing.progress_slices
+    monkeypatch.setattr(path_tracing, "progress_slices", lambda total, size, progress: parts(total, 7, progress))
     np.testing.assert_array_equal(bounced(surfaces, points, normals, UNIFORM, bounces=2, paths=8), whole)
 
 

@@ -1,4 +1,4 @@
-"""Fronts of flats that sources see: their formula, its gradients, and what it means."""
+"""Fronts of flats that patch samples see: their formula, its gradients, and what it means."""
 
 import numpy as np
 import pytest
@@ -88,7 +88,7 @@ def test_fronts_and_their_gradients_are_those_of_the_twin(device):
 
 
 @pytest.mark.parametrize(("center", "at_ground", "deep"), [(0.2, 1, 0), (0.16, 1, 0), (-0.2, 0, 0), (0, 0.5, 0)])
-def test_a_source_is_on_the_side_on_which_its_sphere_is(center, at_ground, deep, device):
+def test_a_patch_sample_is_on_the_side_on_which_its_sphere_is(center, at_ground, deep, device):
     """A sphere of radius 0.2: it stands on the ground, bulges into it, hangs from below, and is half sunk."""
     setting = Setting(device, names=("ground",))
     points = wp.array([[[0.1, 0, 0.1], [0.1, -1, 0.1]]], dtype=wp.vec3, device=device)

@@ -263,7 +263,7 @@ class Setting:
             posed.append(scale * mesh.positions.astype(float) @ rotation.T + translation)
             vertex_count, patch_count = vertex_count + mesh.vertex_count, patch_count + patches.count
         self.grids, self.blocks = [body.grid for body in bodies], blocks
-        self.planes = PlaneBlockers.of(bodies, patch_count, vertex_count, device=device)
+        self.planes = PlaneBlockers.from_bodies(bodies, patch_count, vertex_count, device=device)
         self.vertices = np.repeat(np.concatenate(posed)[None], batch, axis=0)
         points = rng.uniform([-1.2, 0.05, -1], [1.2, 1.6, 1.2], size=(7, 3))
         points[5] = [0.4, -0.2, 0.3]  # below the ground
@@ -487,7 +487,7 @@ def single(device, *, size=4.0, two_sided=False, mesh=None, others=None):
     faces = mesh.surface.faces
     patches = find_plane_patches(mesh.positions, faces, is_two_sided=two_sided, others=others)
     body = PlaneBody(patches.grid, mesh.positions, faces, 0, 0, blocks=True)
-    planes = PlaneBlockers.of([body], patches.count, mesh.vertex_count, device=device)
+    planes = PlaneBlockers.from_bodies([body], patches.count, mesh.vertex_count, device=device)
     return patches, planes, planes.frames(wp.array(mesh.positions[None], dtype=wp.vec3, device=device))
 
 

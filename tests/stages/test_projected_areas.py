@@ -6,8 +6,8 @@ import warp as wp
 from test_plane_light import Setting, ramp
 
 from warpshadow.maths.directions import fibonacci
-from warpshadow.stages.bounces.projected_areas import find_projected_areas, turn_from_planes
-from warpshadow.stages.bounces.radiosity import mean_over_sources
+from warpshadow.stages.bounces.projected_areas import find_projected_areas, tilt_normals_off_planes
+from warpshadow.stages.bounces.radiosity import mean_over_patch_samples
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -19,7 +19,7 @@ SPHERES = np.int32([0, 1, 1, 0, -1, 1, 0])
 
 
 def twin_turned(points, normals, radii, fronts, frames, grids, blocks):
-    """Normals [source, 3] without what points into flats."""
+    """Normals [patch sample, 3] without what points into flats."""
     turned = normals.copy()
     for s, sphere in enumerate(SPHERES):
         for f, grid in enumerate(grids):
@@ -79,7 +79,7 @@ def test_normals_turned_from_flats_are_those_of_the_twin(device):
     fronts = np.random.default_rng(2).uniform(size=(7, 3))
     values = [setting.points[0], setting.normals[0], np.array([0.3, 0.5]), fronts, np.asarray(frames, float)]
     compare(
-        lambda p, n, r, *f: turn_from_planes(p, n, r, SPHERES, *f, setting.planes),
+        lambda p, n, r, *f: tilt_normals_off_planes(p, n, r, SPHERES, *f, setting.planes),
         lambda *scene: twin_turned(*scene, setting.grids, setting.blocks),
         values,
         (wp.vec3, wp.vec3, wp.float32, wp.float32, wp.vec3),
@@ -93,7 +93,7 @@ def test_what_is_shown_is_that_of_the_twin(device):
     owners, weights = np.array([0, 0, 2, 2, 2]), np.array([0.4, 0.6, 0.5, 0.2, 0.3])
     matrix = np.zeros((3, 5))
     matrix[owners, np.arange(5)] = weights
-    mean = mean_over_sources(owners, weights, 3, device=device)
+    mean = mean_over_patch_samples(owners, weights, 3, device=device)
     compare(
         lambda n, t: find_projected_areas(n, t, mean, DIRECTIONS),
         lambda n, t: twin_shown(n, t, matrix),
@@ -111,7 +111,9 @@ def turned(height, normal, device, front=1.0, **options):
     radii = wp.full((1, 1), 0.2, dtype=wp.float32, device=device)
     frames = wp.array([setting.frames(setting.vertices[0])], dtype=wp.vec3, device=device)
     fronts = wp.full((1, 1, 1), front, dtype=wp.float32, device=device)
-    return turn_from_planes(points, normals, radii, np.zeros(1, int), fronts, frames, setting.planes).numpy()[0, 0]
+    return tilt_normals_off_planes(points, normals, radii, np.zeros(1, int), fronts, frames, setting.planes).numpy()[
+        0, 0
+    ]
 
 
 def test_a_bottom_that_lies_on_a_ground_shows_nothing_and_one_above_it_does(device):
@@ -128,7 +130,7 @@ def test_a_bottom_that_lies_on_a_ground_shows_nothing_and_one_above_it_does(devi
 def test_one_instance_serves_all(counts, device):
     rng = np.random.default_rng(1)
     normals, passing = rng.normal(size=(counts[0], 2, 3)), rng.random((counts[1], 2, 32))
-    mean = mean_over_sources(np.zeros(2, int), np.array([0.5, 0.5]), 1, device=device)
+    mean = mean_over_patch_samples(np.zeros(2, int), np.array([0.5, 0.5]), 1, device=device)
     arrays = wp.array(normals, dtype=wp.vec3, device=device), wp.array(passing, dtype=wp.float32, device=device)
     got = find_projected_areas(*arrays, mean, DIRECTIONS).numpy()
     for batch in range(2):
@@ -137,12 +139,12 @@ def test_one_instance_serves_all(counts, device):
 
 
 def test_what_does_not_fit_is_refused(device):
-    mean = mean_over_sources(np.zeros(2, int), np.array([0.5, 0.5]), 1, device=device)
+    mean = mean_over_patch_samples(np.zeros(2, int), np.array([0.5, 0.5]), 1, device=device)
     normals = wp.zeros((1, 2), dtype=wp.vec3, device=device)
-    with pytest.raises(ValueError, match=r"passing: got shape \(1, 2, 8\), expected \[batch, 2, 32\]"):
+    with pytest.raises(ValueError, match=r"transmittance: got shape \(1, 2, 8\), expected \[batch, 2, 32\]"):
         find_projected_areas(normals, wp.zeros((1, 2, 8), dtype=wp.float32, device=device), mean, DIRECTIONS)
     setting = Setting(device, names=("ground",))
     frames = wp.array([setting.frames(setting.vertices[0])], dtype=wp.vec3, device=device)
     radii, fronts = (wp.ones(shape, dtype=wp.float32, device=device) for shape in ((1, 1), (1, 2, 1)))
     with pytest.raises(ValueError, match="spheres: got 1, expected −1 to 0"):
-        turn_from_planes(normals, normals, radii, np.array([0, 1]), fronts, frames, setting.planes)
+        tilt_normals_off_planes(normals, normals, radii, np.array([0, 1]), fronts, frames, setting.planes)

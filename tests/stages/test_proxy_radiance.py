@@ -121,7 +121,7 @@ def test_what_does_not_fit_is_refused(patches, device):
         find_proxy_radiance(b, g, wp.array(weights[:, :8], dtype=wp.vec3, device=device), areas, *nodes)
     with pytest.raises(ValueError, match="areas: got 1 values out of range"):
         find_proxy_radiance(b, g, v, np.r_[areas[:8], -1.0], *nodes)
-    with pytest.raises(ValueError, match="numbers: got 0 to 9, expected patches, 0 to 8"):
+    with pytest.raises(ValueError, match="patch_indices: got 0 to 9, expected patches, 0 to 8"):
         find_proxy_radiance(b, g, v, areas, nodes[0], np.arange(1, 10) % 10 * (np.arange(9) > 0))
-    with pytest.raises(ValueError, match="starts: got .*, expected 0 to the 9 numbers, rising"):
+    with pytest.raises(ValueError, match="starts: got .*, expected 0 to the 9 indices, rising"):
         find_proxy_radiance(b, g, v, areas, nodes[0][:-2], nodes[1])

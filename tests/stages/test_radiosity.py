@@ -6,13 +6,13 @@ import warp as wp
 
 from warpshadow.device.tape import recorded
 from warpshadow.stages.bounces.colored import ColoredTransfer, colored_light
-from warpshadow.stages.bounces.radiosity import mean_over_sources, patch_radiosity
+from warpshadow.stages.bounces.radiosity import mean_over_patch_samples, patch_radiosity
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
 FLOAT32 = 1e-5
-PATCHES = np.array([0, 0, 0, 1, 3, 3])  # of each source; patch 2 has none
+PATCHES = np.array([0, 0, 0, 1, 3, 3])  # of each patch sample; patch 2 has none
 WEIGHTS = np.array([0.2, 0.3, 0.5, 1.0, 0.6, 0.4])
 
 
@@ -35,7 +35,7 @@ def test_a_sparse_product_and_its_adjoint_are_those_of_the_matrix(shape, device,
     values = uniform(2, shape[1], 3, seed=2)
     given = colors(values, device)
     with recorded() as tape:
-        product = multiply(SparseMatrix.of(matrix, device=device), given)
+        product = multiply(SparseMatrix.from_matrix(matrix, device=device), given)
     np.testing.assert_allclose(product.numpy(), matrix @ values, rtol=FLOAT32, atol=FLOAT32)
     weights = uniform(2, shape[0], 3, seed=3)
     (gradient,) = gradients(tape, product, weights, given)
@@ -46,10 +46,10 @@ def test_a_sparse_product_and_its_adjoint_are_those_of_the_matrix(shape, device,
 def test_what_is_added_to_a_product_has_the_gradient_of_the_sum(given, device, verified_tape):
     matrix, values, more = uniform(7, 5), uniform(given[0], 5, 3, seed=1), uniform(given[1], 7, 3, seed=2)
     on_device = colors(values, device), colors(more, device)
-    sparse = SparseMatrix.of(matrix, device=device)
-    assert np.array_equal(sparse.on_host().toarray(), matrix)
+    sparse = SparseMatrix.from_matrix(matrix, device=device)
+    assert np.array_equal(sparse.to_scipy().toarray(), matrix)
     with recorded() as tape:
-        total = multiply(sparse, on_device[0], plus=on_device[1])
+        total = multiply(sparse, on_device[0], addend=on_device[1])
     np.testing.assert_allclose(total.numpy(), matrix @ values + more, rtol=FLOAT32)
     weights = uniform(2, 7, 3, seed=3)
     adj_values, adj_more = gradients(tape, total, weights, *on_device)
@@ -62,7 +62,7 @@ def test_colored_transfer_lights_each_color_by_itself(device, verified_tape):
     lit, light = uniform(6, 50, 3), uniform(2, 6, 3, seed=1)
     given = colors(light, device)
     with recorded() as tape:
-        found = colored_light(ColoredTransfer.of(lit, device=device), given)
+        found = colored_light(ColoredTransfer.from_lit_receivers(lit, device=device), given)
     np.testing.assert_allclose(found.numpy(), np.einsum("kxc,bkc->bxc", lit, light), rtol=FLOAT32)
     weights = uniform(2, 50, 3, seed=2)
     (gradient,) = gradients(tape, found, weights, given)
@@ -70,14 +70,14 @@ def test_colored_transfer_lights_each_color_by_itself(device, verified_tape):
 
 
 def test_a_matrix_of_zeros_gives_zeros(device):
-    product = multiply(SparseMatrix.of(np.zeros((3, 2)), device=device), colors(uniform(1, 2, 3), device))
+    product = multiply(SparseMatrix.from_matrix(np.zeros((3, 2)), device=device), colors(uniform(1, 2, 3), device))
     assert np.array_equal(product.numpy(), np.zeros((1, 3, 3)))
 
 
 @pytest.mark.parametrize(("albedos", "lights"), [(1, 1), (1, 2), (2, 1), (2, 2)])
-def test_radiosity_is_albedo_times_the_mean_of_the_sources(albedos, lights, device, verified_tape):
+def test_radiosity_is_albedo_times_the_mean_of_the_patch_samples(albedos, lights, device, verified_tape):
     albedo, light = uniform(albedos, 4, 3, seed=1), uniform(lights, 6, 3, seed=2)
-    mean = mean_over_sources(PATCHES, WEIGHTS, 4, device=device)
+    mean = mean_over_patch_samples(PATCHES, WEIGHTS, 4, device=device)
     on_device = colors(albedo, device), colors(light, device)
     with recorded() as tape:
         radiosity = patch_radiosity(*on_device, mean)
@@ -93,7 +93,7 @@ def test_radiosity_is_albedo_times_the_mean_of_the_sources(albedos, lights, devi
 
 
 def test_white_patches_in_unit_light_have_unit_radiosity(device):
-    mean = mean_over_sources(PATCHES, WEIGHTS, 4, device=device)
+    mean = mean_over_patch_samples(PATCHES, WEIGHTS, 4, device=device)
     white = wp.full((1, 4), wp.vec3(1.0), dtype=wp.vec3, device=device)
     lit = wp.full((1, 6), wp.vec3(1.0), dtype=wp.vec3, device=device)
     expected = np.array([1, 1, 0, 1])[:, None] * np.ones(3)

@@ -12,7 +12,7 @@ from warpshadow.maths import sh
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages import ray_tracing
 from warpshadow.stages.light_samples import SET_COUNT, cell_samples, even_samples, sample_map
-from warpshadow.stages.ray_tracing import nearest, trace_cells, trace_shading, trace_visibility
+from warpshadow.stages.ray_tracing import first_hit, trace_cells, trace_shading, trace_visibility
 from warpshadow.stages.traced_transfer import trace_transfer
 
 SEED = 5
@@ -213,13 +213,13 @@ def _find_nearest(
 ):
     """A thread owns a ray."""
     i = wp.tid()
-    hit = nearest(mesh, points[i], normals[i], directions[i])
+    hit = first_hit(mesh, points[i], normals[i], directions[i])
     faces[i] = hit.face
     weights[i] = hit.weights
     is_back[i] = hit.is_back
 
 
-def find_nearest(mesh: Mesh, points, normals, directions, device) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def find_first_hits(mesh: Mesh, points, normals, directions, device) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Face, barycentrics, and whether it is met from behind, of the nearest hit of each ray."""
     count = len(points)
     outputs = [wp.empty(count, dtype=dtype, device=device) for dtype in (wp.int32, wp.vec3, wp.bool)]
@@ -236,7 +236,7 @@ def test_rays_meet_the_face_that_is_nearest_of_all(device):
     rng = np.random.default_rng(SEED)
     points, directions = rng.uniform(-2, 2, size=(2, 600, 3)).astype(np.float32)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    faces, weights, is_back = find_nearest(mesh, points, directions, directions, device)
+    faces, weights, is_back = find_first_hits(mesh, points, directions, directions, device)
 
     a, b, c = np.moveaxis(mesh.positions[mesh.faces].astype(np.float64), 1, 0)
     matrices = np.stack(np.broadcast_arrays(-directions[:, None], b - a, c - a), axis=-1)  # [ray, face, 3, 3]
@@ -262,7 +262,7 @@ def test_rays_below_the_face_that_a_receiver_lies_on_meet_nothing(device):
     directions = fibonacci(256)
     directions = directions[(directions @ normal > 0) & (np.abs(directions[:, 1]) > 0.01)]
     points = np.tile([0.1, 0.0, 0.2], (len(directions), 1))
-    faces, _, is_back = find_nearest(sheets, points, np.tile(normal, (len(directions), 1)), directions, device)
+    faces, _, is_back = find_first_hits(sheets, points, np.tile(normal, (len(directions), 1)), directions, device)
     from_behind = directions[:, 1] < 0
     assert from_behind.sum() > 20 and (faces[from_behind] == -1).all()
     reached = points + directions / np.abs(directions[:, 1:2])
@@ -417,8 +417,8 @@ def test_receivers_in_several_launches_get_what_they_get_in_one(device, monkeypa
     mesh, points, normals, expected = ball_over_points(device)
     basis, samples = HarmonicBasis(3), sample_map(np.ones((16, 32, 3), np.float32), 256)
     transfer = trace_transfer(mesh, points, normals, basis.functions, 256).numpy()
-    parts = ray_tracing.parts
-    monkeypatch.setattr(ray_tracing, "parts", lambda total, size, progress: parts(total, 5, progress))
+    parts = ray_tracing.progress_slices
+    monkeypatch.setattr(ray_tracing, "progress_slices", lambda total, size, progress: parts(total, 5, progress))
     assert np.abs(trace_transfer(mesh, points, normals, basis.functions, 256).numpy() - transfer).max() < 1e-6
     shading = trace_shading(mesh, points, normals, samples).numpy()
     assert np.abs(shading - expected[:, None]).max() < 0.06  # 256 rays: 4% measured

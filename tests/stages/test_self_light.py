@@ -8,7 +8,7 @@ import warpshadow as ws
 from demos.scenes import shipped_mesh
 from warpshadow.device.tape import recorded
 from warpshadow.maths.directions import fibonacci
-from warpshadow.stages.bounces.factors import patch_mesh, trace_factors
+from warpshadow.stages.bounces.form_factors import patch_mesh, trace_form_factors
 from warpshadow.stages.bounces.patches import find_patches
 from warpshadow.stages.bounces.self_light import self_light
 from warpshadow.stages.normals import vertex_normals
@@ -31,7 +31,7 @@ def factors_of(mesh, points, normals, device, *, sides=True, rays=1024):
     faces = mesh.surface.faces
     patches = find_patches(mesh.positions, faces, is_two_sided=sides)
     traced = patch_mesh(patches, mesh.positions, faces, device=device)
-    return patches, trace_factors(traced, patches.of_pieces, patches.count, points, normals, rays=rays)
+    return patches, trace_form_factors(traced, patches.patch_of_pieces, patches.count, points, normals, rays=rays)
 
 
 def of_square_above(height):
@@ -111,7 +111,10 @@ def test_light_is_mixed_from_the_sites_around_a_receiver(lit, placed, device, po
     given = [wp.array(values, dtype=wp.vec3, device=device, requires_grad=True) for values in (radiosity, weights)]
     with recorded() as tape:
         light = self_light(
-            SparseMatrix.of(factors, device=device), given[0], wp.array(rows, dtype=wp.vec3i, device=device), given[1]
+            SparseMatrix.from_matrix(factors, device=device),
+            given[0],
+            wp.array(rows, dtype=wp.vec3i, device=device),
+            given[1],
         )
     at_sites = (factors @ radiosity)[[0] * 2 if lit == 1 else [0, 1]][: max(lit, placed)]
     rows, weights = (np.broadcast_to(values, (max(lit, placed), 5, 3)) for values in (rows, weights))

@@ -9,7 +9,7 @@ from warpshadow.assets.cells import gather_cells, without_spots
 from warpshadow.device.tape import recorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.stages.poses import Poses
-from warpshadow.stages.visibility.sharp_cells import WIDEST_PAST_PLANES, blend_sharp_cells, find_sharp_cells
+from warpshadow.stages.visibility.sharp_cells import MAX_RADIUS_PAST_PLANES, blend_sharp_cells, find_sharp_cells
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -29,7 +29,7 @@ def map_with_discs(*discs, sky=0.2, height=256, half_angle=HALF_ANGLE):
 
 def narrow_of(light, count=CELLS, **options):
     cells = light.cells(fibonacci(count))
-    return cells, find_sharp_cells(cells.radiance.sum(axis=1), cells.spots, cells.spreads, **options)
+    return cells, find_sharp_cells(cells.radiance.sum(axis=1), cells.spots, cells.half_angles, **options)
 
 
 def test_an_even_sky_and_a_bright_half_have_no_narrow_cells():
@@ -42,7 +42,7 @@ def test_a_sun_is_found_where_it_is_and_as_wide_as_it_is():
     cells, sharp_cells = narrow_of(map_with_discs((SUN, 2000.0), sky=0.01))
     brightest = np.argmax(cells.radiance.sum(axis=1))
     assert sharp_cells.directions.shape == (CHUNK, 3)
-    np.testing.assert_allclose(sharp_cells.directions[sharp_cells.places[brightest]] @ SUN, 1, atol=1e-5)
+    np.testing.assert_allclose(sharp_cells.directions[sharp_cells.slots[brightest]] @ SUN, 1, atol=1e-5)
     # the cell's own edge would be 4 times as wide; with it goes the mean of the sky in the cell
     assert 2.3 * HALF_ANGLE < sharp_cells.scale * cell_radius(CHUNK) < 2.7 * HALF_ANGLE
 
@@ -50,30 +50,32 @@ def test_a_sun_is_found_where_it_is_and_as_wide_as_it_is():
 def test_two_suns_have_a_place_each():
     other = SUN * [-1, 1, -1]
     cells, sharp_cells = narrow_of(map_with_discs((SUN, 2000.0), (other, 1000.0)))
-    found = np.flatnonzero(sharp_cells.places >= 0)
+    found = np.flatnonzero(sharp_cells.slots >= 0)
     assert len(found) >= 2
-    np.testing.assert_array_equal(sharp_cells.directions[sharp_cells.places[found]], cells.spots[found])
+    np.testing.assert_array_equal(sharp_cells.directions[sharp_cells.slots[found]], cells.spots[found])
 
 
 def test_a_sun_of_5_degrees_is_narrow_where_planes_block_it_alone():
     wide = map_with_discs((fibonacci(CELLS)[40], 500.0), half_angle=np.radians(5))
     assert narrow_of(wide)[1] is None
-    sharp_cells = narrow_of(wide, widest=WIDEST_PAST_PLANES)[1]
-    assert 1 < sharp_cells.scale * cell_radius(CHUNK) / cell_radius(CELLS) < WIDEST_PAST_PLANES
-    assert narrow_of(EnvironmentMap.constant(1.0), widest=WIDEST_PAST_PLANES)[1] is None
+    sharp_cells = narrow_of(wide, max_radius=MAX_RADIUS_PAST_PLANES)[1]
+    assert 1 < sharp_cells.scale * cell_radius(CHUNK) / cell_radius(CELLS) < MAX_RADIUS_PAST_PLANES
+    assert narrow_of(EnvironmentMap.constant(1.0), max_radius=MAX_RADIUS_PAST_PLANES)[1] is None
 
 
 def test_without_its_spot_a_cell_has_the_light_around_it():
     light, directions = map_with_discs((SUN, 2000.0)), fibonacci(CELLS)
     cells, sharp_cells = narrow_of(light)
-    found = np.flatnonzero(sharp_cells.places >= 0)
-    rest = without_spots(light.radiance, cells.spots[found], 2 * cells.spreads[found])
+    found = np.flatnonzero(sharp_cells.slots >= 0)
+    rest = without_spots(light.radiance, cells.spots[found], 2 * cells.half_angles[found])
     assert rest.max() == np.float32(0.2)
     around = gather_cells(rest, directions)
     changed = np.flatnonzero((around.radiance != cells.radiance).any(axis=1))
     assert set(found) <= set(changed)
     assert (light.directions()[rest[..., 0] == 0] @ SUN > np.cos(3.5 * HALF_ANGLE)).all()
-    cap = (1 - np.cos(2 * cells.spreads[found])) * CELLS / 2  # its share of a cell; two suns' caps may reach out of it
+    cap = (
+        (1 - np.cos(2 * cells.half_angles[found])) * CELLS / 2
+    )  # its share of a cell; two suns' caps may reach out of it
     assert (around.radiance[found, 0] < 0.21).all()
     assert (around.radiance[found, 0] > 0.2 * (0.75 - cap)).all()
 
@@ -88,8 +90,8 @@ def test_a_sun_of_one_pixel_is_the_spot_of_its_cells(height):
         cells, sharp_cells = narrow_of(EnvironmentMap(radiance))
         if sharp_cells is None and height == 16:  # its pixels are as wide as cells
             continue
-        found = np.flatnonzero(sharp_cells.places >= 0)
-        rest = without_spots(radiance, cells.spots[found], 2 * cells.spreads[found])
+        found = np.flatnonzero(sharp_cells.slots >= 0)
+        rest = without_spots(radiance, cells.spots[found], 2 * cells.half_angles[found])
         assert rest.max() == np.float32(0.3)
         assert rest[row, column, 0] == 0
 

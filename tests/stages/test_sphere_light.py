@@ -292,7 +292,7 @@ def test_what_does_not_fit_is_refused(device):
         stage.sphere_light(*good[:4], good[4][:, :6], *good[5:], fibonacci(64))
     with pytest.raises(ValueError, match=r"transmittance: got shape \(1, 19, 64\), expected \[1, 19, 32\]"):
         stage.sphere_light(*good[:4], good[4][:, :, :32].contiguous(), *good[5:], fibonacci(32))
-    with pytest.raises(ValueError, match=r"unblocked: got shape \(1, 18, 64\), expected \[1, 19, 64\]"):
+    with pytest.raises(ValueError, match=r"transmittance_others: got shape \(1, 18, 64\), expected \[1, 19, 64\]"):
         stage.sphere_light(*good[:6], good[6][:, :18], fibonacci(64))
     with pytest.raises(ValueError, match="radii: got 7 values out of range"):
         negative = wp.full((1, 7), -1.0, dtype=wp.float32, device=device)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpshadow.stages.bounces.tail import with_tail
+from warpshadow.stages.bounces.tail import add_tail
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -36,20 +36,20 @@ def twin(radiosities):
 @pytest.mark.parametrize("ratios", [[np.array([0.0, 0.5, 0.9])], [0.9, 0.5], [0.8, 0.3, -0.1]])
 def test_sums_of_geometric_series_are_exact(scale, ratios, device):
     radiosities, all_of_it = series(scale, *ratios)
-    np.testing.assert_allclose(with_tail(put(radiosities, device), AREAS).numpy(), all_of_it, rtol=2e-3)
+    np.testing.assert_allclose(add_tail(put(radiosities, device), AREAS).numpy(), all_of_it, rtol=2e-3)
 
 
 def test_light_that_does_not_die_away_gets_forty_nine_more_terms(device):
     one = np.ones((1, 7, 3))
-    found = with_tail(put([one, 2 * one, 3 * one, 4 * one, 5 * one], device), AREAS).numpy()
+    found = add_tail(put([one, 2 * one, 3 * one, 4 * one, 5 * one], device), AREAS).numpy()
     np.testing.assert_allclose(found, 54, rtol=1e-4)
-    dark = with_tail(put([0 * one] * 5, device), AREAS).numpy()
+    dark = add_tail(put([0 * one] * 5, device), AREAS).numpy()
     assert (dark == 0).all()
 
 
 def test_a_number_of_radiosities_other_than_five_is_refused(device):
     with pytest.raises(ValueError, match=r"radiosities: got 3, expected 5"):
-        with_tail(put([np.ones((1, 7, 3))] * 3, device), AREAS)
+        add_tail(put([np.ones((1, 7, 3))] * 3, device), AREAS)
 
 
 def test_light_is_that_of_a_twin_and_the_gradient_that_of_differences(device):
@@ -57,7 +57,7 @@ def test_light_is_that_of_a_twin_and_the_gradient_that_of_differences(device):
     weights = RANDOM.normal(size=(1, 7, 3))
     arrays = put(values, device, requires_grad=True)
     with wp.Tape() as tape:
-        result = with_tail(arrays, AREAS)
+        result = add_tail(arrays, AREAS)
     np.testing.assert_allclose(result.numpy(), twin(values), rtol=1e-5)
     result.grad.assign(weights.astype(np.float32))
     tape.backward()

@@ -131,12 +131,14 @@ def check_basis(basis: object) -> None:
 
 def describe_coefficients(basis: Basis, count: int) -> str:
     """Describe the coefficients of a basis, for messages to callers who gave ``count`` of them."""
-    what = f"HarmonicBasis({basis.order})" if isinstance(basis, HarmonicBasis) else f"cells of {basis.size} directions"
+    basis_name = (
+        f"HarmonicBasis({basis.order})" if isinstance(basis, HarmonicBasis) else f"cells of {basis.size} directions"
+    )
     order = int(round(np.sqrt(count)))
     others = [f"HarmonicBasis({order})"] if order in sh.ORDERS and order**2 == count else []
     others += [f"CellBasis(warpshadow.fibonacci({count}))"] if count and not count % CHUNK else []
     remedy = f"; for {count} make the renderer with basis={' or '.join(others)}" if others else ""
-    return f"coefficients in renderer.basis, {what}{remedy}"
+    return f"coefficients in renderer.basis, {basis_name}{remedy}"
 
 
 def _checked_coefficients(basis: Basis, coefficients: npt.ArrayLike) -> np.ndarray:

@@ -44,12 +44,12 @@ def cache_path(kind: Kind, key: str) -> Path:
 
 def cached_files(kind: Kind) -> list[Path]:
     """List the cached files of a kind, and the partial files that a killed process left."""
-    result = (cache_folder() / kind).glob("*.npz")
-    return sorted(path for path in result if _OWN_NAME.fullmatch(path.name) and path.is_file())
+    cache_files = (cache_folder() / kind).glob("*.npz")
+    return sorted(path for path in cache_files if _OWN_NAME.fullmatch(path.name) and path.is_file())
 
 
 class Unfinished:
-    """How far the work on something is that is to be cached; an interrupt leaves it for the next call.
+    """Progress of a computation whose result is to be cached; an interrupt leaves it for the next call.
 
     Attributes:
         before: Arrays that an interrupted call left; none where the work begins.
@@ -61,8 +61,12 @@ class Unfinished:
         self._done = ""
         self.before: dict[str, np.ndarray] = {}
         # ignore a damaged file, whatever error it raises
-        with contextlib.suppress(Exception), self._path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            self.before = dict(stored)
+        with (
+            contextlib.suppress(Exception),
+            self._path.open("rb") as file,
+            np.load(file, allow_pickle=False) as cached_arrays,
+        ):
+            self.before = dict(cached_arrays)
 
     def keep(self, arrays: Callable[[], Mapping[str, np.ndarray]], done: str) -> None:
         """Note how far the work is.
@@ -73,16 +77,16 @@ class Unfinished:
         """
         self._arrays, self._done = arrays, done
 
-    def write(self, what: str) -> str:
+    def write(self, noun: str) -> str:
         """Write the last partial result; return a line that says so, or nothing if there is none."""
         if self._arrays is None:
             return ""
         try:
             _write(self._path, self._arrays())
         except OSError as problem:
-            check.warn(f"the unfinished {what} could not be cached in {self._path.parent} ({problem})")
+            check.warn(f"the unfinished {noun} could not be cached in {self._path.parent} ({problem})")
             return ""
-        return f"{self._done} of the {what} are cached, and the next call goes on from there"
+        return f"{self._done} of the {noun} are cached, and the next call goes on from there"
 
     def remove(self) -> None:
         """Remove the partial result of an interrupted call, since the work is done."""
@@ -99,43 +103,43 @@ def _write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 def load_or_compute(
     path: Path,
     read: Callable[[Mapping[str, np.ndarray]], Item],
-    make: Callable[[Unfinished], Item],
+    compute: Callable[[Unfinished], Item],
     arrays: Callable[[Item], Mapping[str, np.ndarray]],
     *,
-    what: str,
+    noun: str,
 ) -> Item:
     """Read something from the cache, or make it and write it there; a second process that wants it, too, waits for it.
 
     Args:
         path: From :func:`cache_path`.
         read: Makes it of the arrays in the file.
-        make: Makes it anew, from where an interrupt left it.
+        compute: Makes it anew, from where an interrupt left it.
         arrays: The arrays of it that are cached.
-        what: Noun for warnings, such as "fit".
+        noun: Noun for warnings, such as "fit".
     Raises:
         KeyboardInterrupt: at an interrupt; it says how much is cached.
     """
-    with contextlib.ExitStack() as held:
+    with contextlib.ExitStack() as lock_stack:
         if not path.exists():
             with contextlib.suppress(OSError):  # of a folder that cannot be written to
                 path.parent.mkdir(parents=True, exist_ok=True)
-                held.enter_context(files.locked(path))
+                lock_stack.enter_context(files.locked(path))
         if path.exists():
             try:
-                with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-                    return read(stored)
+                with path.open("rb") as file, np.load(file, allow_pickle=False) as cached_arrays:
+                    return read(cached_arrays)
             except Exception as problem:  # any error of a damaged file: the result can be computed again
-                check.warn(f"cached {what} {path} cannot be read ({problem}); it is made again")
+                check.warn(f"cached {noun} {path} cannot be read ({problem}); it is made again")
         unfinished = Unfinished(path)
         try:
-            made = make(unfinished)
+            computed_item = compute(unfinished)
         except (KeyboardInterrupt, SystemExit) as interrupt:
-            if (note := unfinished.write(what)) and isinstance(interrupt, KeyboardInterrupt):
+            if (note := unfinished.write(noun)) and isinstance(interrupt, KeyboardInterrupt):
                 interrupt.args = (note,)
             raise
         try:
-            _write(path, arrays(made))
+            _write(path, arrays(computed_item))
             unfinished.remove()
         except OSError as problem:
-            check.warn(f"the {what} could not be cached in {path.parent} ({problem})")
-    return made
+            check.warn(f"the {noun} could not be cached in {path.parent} ({problem})")
+    return computed_item

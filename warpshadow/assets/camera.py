@@ -100,8 +100,8 @@ class Camera:
             intrinsics=check.array("intrinsics", intrinsics, (3, 3)),
             rotation=check.array("rotation", rotation, (3, 3)),
             translation=check.array("translation", translation, (3,)),
-            width=check.integer("width", width, what="pixels"),
-            height=check.integer("height", height, what="pixels"),
+            width=check.integer("width", width, unit="pixels"),
+            height=check.integer("height", height, unit="pixels"),
             near=check.positive("near", near),
         )
         if not np.array_equal(self.intrinsics[2], (0.0, 0.0, 1.0)):
@@ -190,8 +190,8 @@ class Camera:
         intrinsics = _centered_intrinsics(fov_y, width, height)
         # The eye (e, f) of an axis x and depth z sees a point if |x − e| ≤ t (z − f), t the tangent of half the view:
         # max(x − t z) + t f ≤ e ≤ min(x + t z) − t f. The largest f for which there is an e is nearest.
-        middle = (points.min(axis=0) + points.max(axis=0)) / 2
-        x, z = (points - middle) @ rotation[:2].T, (points - middle) @ rotation[2]
+        center = (points.min(axis=0) + points.max(axis=0)) / 2
+        x, z = (points - center) @ rotation[:2].T, (points - center) @ rotation[2]
         tangents = (1.0 - margin) * np.array([width, height]) / (2.0 * intrinsics[0, 0])
         minimum, maximum = (x - z[:, None] * tangents).max(axis=0), (x + z[:, None] * tangents).min(axis=0)
         depth = ((maximum - minimum) / (2.0 * tangents)).min()
@@ -199,7 +199,7 @@ class Camera:
             raise ValueError(f"shown: got what is a point or a line along {away.tolist()}, expected a surface")
         eye = np.array([*(minimum + maximum) / 2, depth])
         near = _NEAR * (z.min() - depth) if near is None else near
-        return cls(intrinsics, rotation, -eye - rotation @ middle, width, height, near)
+        return cls(intrinsics, rotation, -eye - rotation @ center, width, height, near)
 
     @classmethod
     def from_opencv(
@@ -338,10 +338,10 @@ class Camera:
         """
         from scipy.spatial.transform import Rotation
 
-        middle = check.array("about", about, (3,))
+        center = check.array("about", about, (3,))
         turn = Rotation.from_rotvec([0, check.number("degrees", degrees), 0], degrees=True).as_matrix()
         rotation = self.rotation @ turn.T
-        translation = self.translation + (self.rotation - rotation) @ middle
+        translation = self.translation + (self.rotation - rotation) @ center
         return Camera(self.intrinsics, rotation, translation, self.width, self.height, self.near)
 
     def around(self, shown: Placed | Iterable[Placed] | HasBodies, count: int) -> list[Camera]:
@@ -354,9 +354,9 @@ class Camera:
             count: Number of cameras; they go around once, counter-clockwise seen from above.
         """
         points = framed_points(shown)
-        middle = (points.min(axis=0) + points.max(axis=0)) / 2
-        angles = 360 * np.arange(check.integer("count", count, what="cameras")) / count
-        cameras = [self.turned(angle, middle) for angle in angles]
+        center = (points.min(axis=0) + points.max(axis=0)) / 2
+        angles = 360 * np.arange(check.integer("count", count, unit="cameras")) / count
+        cameras = [self.turned(angle, center) for angle in angles]
         if self._missing_distance(points) > 1e-6 * np.ptp(points, axis=0).max():
             return cameras
         back = np.array(
@@ -368,7 +368,7 @@ class Camera:
         ]
 
     def _missing_distance(self, points: np.ndarray, margin: float = 0.0) -> float:
-        """How much farther away, along the view, it shows all points; below 0 if it does, and may be nearer."""
+        """Distance by which it must move back along the view to show all points; negative if it may move nearer."""
         x, y, z = self.rotation @ points.T + self.translation[:, None]
         (fx, skew, cx), (_, fy, cy), _ = self.intrinsics
         edges = (1 - margin) * np.array([cx, self.width - cx, cy, self.height - cy])  # pixels to the edges
@@ -379,22 +379,22 @@ class Camera:
         return float((np.maximum(depths.max(axis=0), self.near) - z).max())
 
     def resized(self, factor: float) -> Camera:
-        """The same view on an image ``factor`` times as wide and high, rounded to whole pixels, at least one."""
+        """Scale the image of a view by ``factor``, rounded to whole pixels, at least one."""
         factor = check.positive("factor", factor)
         return self.stretched(*(max(1, round(count * factor)) for count in (self.width, self.height)))
 
     def stretched(self, width: int, height: int) -> Camera:
-        """The same view on an image of another size [pixels]; of other proportions, pixels are not square."""
+        """Stretch a view to an image of another size [pixels]; with other proportions, pixels are not square."""
         width, height = check.image_size((width, height))
         intrinsics = np.diag([width / self.width, height / self.height, 1.0]) @ self.intrinsics
         return Camera(intrinsics, self.rotation, self.translation, width, height, self.near)
 
     def clip_matrix(self) -> np.ndarray:
         """World to clip space (convention: see the module), float64, shape [4, 4]."""
-        to_ndc = np.array([[2.0 / self.width, 0.0, -1.0], [0.0, 2.0 / self.height, -1.0]])
+        ndc_matrix = np.array([[2.0 / self.width, 0.0, -1.0], [0.0, 2.0 / self.height, -1.0]])
         matrix = np.zeros((4, 4))
         world_to_camera = np.column_stack([self.rotation, self.translation])
-        matrix[:2] = to_ndc @ self.intrinsics @ world_to_camera
+        matrix[:2] = ndc_matrix @ self.intrinsics @ world_to_camera
         matrix[2, 3] = self.near
         matrix[3] = world_to_camera[2]
         return matrix

@@ -88,17 +88,17 @@ def from_pytorch3d(
     if (focal_length is None) == (fov is None):
         raise ValueError("focal_length, fov: expected exactly one of them")
     half = min(size) / 2  # NDC runs from -1 to 1 along the shorter side
-    middle = np.array(size) / 2
+    image_center = np.array(size) / 2
     if fov is not None:
         if not (check.is_number(fov) and 0 < fov < 180):
             raise ValueError(f"fov: got {check.described(fov)}, expected degrees between 0 and 180")
         focal_length, in_ndc = 1 / np.tan(np.radians(fov / 2)), True
     focal = np.broadcast_to(_shaped("focal_length", focal_length, (), (1,), (2,), (1, 2)).ravel(), 2)
     if principal_point is None:
-        center = middle
+        center = image_center
     else:
         point = _shaped("principal_point", principal_point, (2,), (1, 2)).ravel()
-        center = middle - half * point if in_ndc else point
+        center = image_center - half * point if in_ndc else point
     focal = half * focal if in_ndc else focal
     return Pinhole(intrinsics_of(*focal, *center), rotation, translation)
 

@@ -81,10 +81,11 @@ def _image_path(image: Path) -> Path:
 
 def _frame_camera(values: Mapping[str, Any], image: Path, size: tuple[int, int] | None, near: float) -> Camera:
     """A camera of the size that its intrinsics are for."""
-    bent = {key: values[key] for key in _DISTORTION if values.get(key)}
-    if bent:
+    distortion_values = {key: values[key] for key in _DISTORTION if values.get(key)}
+    if distortion_values:
         raise ValueError(
-            f"{', '.join(bent)}: got {', '.join(map(str, bent.values()))}, expected 0: the cameras here are pinholes; "
+            f"{', '.join(distortion_values)}: got {', '.join(map(str, distortion_values.values()))}, expected 0: "
+            "the cameras here are pinholes; "
             "cv2.undistort or colmap image_undistorter makes images of one"
         )
     model = str(values.get("camera_model", "OPENCV"))
@@ -94,7 +95,7 @@ def _frame_camera(values: Mapping[str, Any], image: Path, size: tuple[int, int] 
             f"{', '.join(_PINHOLES)}; colmap image_undistorter makes images of one"
         )
     if "w" in values and "h" in values:
-        width, height = (check.integer(key, int(check.number(key, values[key])), what="pixels") for key in "wh")
+        width, height = (check.integer(key, int(check.number(key, values[key])), unit="pixels") for key in "wh")
     else:
         width, height = size or _image_size(image)
     fx, fy = _focal_length("x", values, width), _focal_length("y", values, height)
@@ -102,11 +103,12 @@ def _frame_camera(values: Mapping[str, Any], image: Path, size: tuple[int, int] 
         raise ValueError("fl_x: missing, expected fl_x [pixels] or camera_angle_x [radians]")
     fy = fx if fy is None else fy
     center = (
-        check.number(*pair) for pair in (("cx", values.get("cx", width / 2)), ("cy", values.get("cy", height / 2)))
+        check.number(*argument)
+        for argument in (("cx", values.get("cx", width / 2)), ("cy", values.get("cy", height / 2)))
     )
-    to_world = check.array("transform_matrix", values.get("transform_matrix", check.NOTHING), (4, 4))
-    rotation = Y_DOWN @ to_world[:3, :3].T
-    return Camera(intrinsics_of(fx, fy, *center), rotation, -rotation @ to_world[:3, 3], width, height, near)
+    camera_to_world = check.array("transform_matrix", values.get("transform_matrix", check.NOTHING), (4, 4))
+    rotation = Y_DOWN @ camera_to_world[:3, :3].T
+    return Camera(intrinsics_of(fx, fy, *center), rotation, -rotation @ camera_to_world[:3, 3], width, height, near)
 
 
 def _focal_length(axis: str, values: Mapping[str, Any], pixels: int) -> float | None:
@@ -123,8 +125,8 @@ def _image_size(image: Path) -> tuple[int, int]:
 
     if not image.is_file():
         raise ValueError(f"w, h: missing, and there is no image {image}, expected them, or size=(width, height)")
-    with Image.open(image) as opened:
-        return opened.size
+    with Image.open(image) as image_file:
+        return image_file.size
 
 
 def _read_colmap(folder: Path, near: float) -> dict[Path, Camera]:

@@ -24,14 +24,14 @@ class CellLight(NamedTuple):
         directions: Mean directions, weighted with luminance; float32 [direction, 3].
         spots: Mean directions, weighted with the square of luminance: of a sun, where it is, for any sky around
             it; float32 [direction, 3].
-        spreads: Half-angles of the evenly bright caps whose mean vectors with that weight are as long: 0 for a point,
-            about 2/√Q for an even cell [radians]; float32 [direction]. None, as spots, where light is soft.
+        half_angles: Half-angles of the evenly bright caps whose mean vectors with that weight are as long: 0 for a
+            point, about 2/√Q for an even cell [radians]; float32 [direction]. None, as spots, where light is soft.
     """
 
     radiance: np.ndarray
     directions: np.ndarray
     spots: np.ndarray | None
-    spreads: np.ndarray | None
+    half_angles: np.ndarray | None
 
 
 def gather_cells(radiance: np.ndarray, directions: np.ndarray) -> CellLight:
@@ -47,17 +47,17 @@ def gather_cells(radiance: np.ndarray, directions: np.ndarray) -> CellLight:
     energy, moment, square, square_moment = _cell_integrals(radiance, directions)
     mean, _ = _means(moment, energy @ LUMINANCE, directions)
     spots, concentration = _means(square_moment, square, directions)
-    spreads = np.arccos(np.clip(2 * concentration - 1, -1, 1))
+    half_angles = np.arccos(np.clip(2 * concentration - 1, -1, 1))
     per_cell = energy * (len(energy) / (4 * np.pi))
-    return CellLight(*(array.astype(np.float32) for array in (per_cell, mean, spots, spreads)))
+    return CellLight(*(array.astype(np.float32) for array in (per_cell, mean, spots, half_angles)))
 
 
 def _means(moment: np.ndarray, total: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean directions [direction, 3], and lengths of the mean vectors; dark cells' as for even light."""
     length = np.linalg.norm(moment, axis=1)
-    lit = length > 0
-    mean = np.where(lit[:, None], moment / np.where(lit, length, 1)[:, None], directions)
-    return mean, np.where(lit, length / np.where(lit, total, 1), 1 - 1 / len(moment))
+    has_light = length > 0
+    mean = np.where(has_light[:, None], moment / np.where(has_light, length, 1)[:, None], directions)
+    return mean, np.where(has_light, length / np.where(has_light, total, 1), 1 - 1 / len(moment))
 
 
 def _cell_integrals(
@@ -69,22 +69,30 @@ def _cell_integrals(
     if not len(directions) or not np.allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-3):
         raise ValueError("directions: expected at least one, all unit vectors")
     count, height = len(directions), len(radiance)
-    split = _split(height, count)
-    owners = _cells_of_pixels(height * split, directions.astype(np.float32).tobytes())
-    weights, towards = sh.pixel_solid_angles(height * split), sh.equirectangular_directions(height * split)
+    pixel_split = _split(height, count)
+    cell_of_pixels = _cells_of_pixels(height * pixel_split, directions.astype(np.float32).tobytes())
+    weights, pixel_directions = (
+        sh.pixel_solid_angles(height * pixel_split),
+        sh.equirectangular_directions(height * pixel_split),
+    )
     integrals = np.zeros((10, count))
-    at_once = max(_AT_ONCE // count, 1)
-    for first in range(0, height * split, at_once):
-        rows = np.arange(first, min(first + at_once, height * split))
-        power = weights[rows, None, None] * np.repeat(radiance[rows // split], split, axis=1).astype(np.float64)
+    block_size = max(_AT_ONCE // count, 1)
+    for first in range(0, height * pixel_split, block_size):
+        rows = np.arange(first, min(first + block_size, height * pixel_split))
+        power = weights[rows, None, None] * np.repeat(radiance[rows // pixel_split], pixel_split, axis=1).astype(
+            np.float64
+        )
         luminance = (power @ LUMINANCE)[..., None]
-        squared = luminance**2 / weights[rows, None, None]
-        values = np.concatenate([power, luminance * towards[rows], squared, squared * towards[rows]], axis=2)
-        cells = (owners[rows] + count * np.arange(len(rows))[:, None]).ravel()
+        squared_luminance = luminance**2 / weights[rows, None, None]
+        values = np.concatenate(
+            [power, luminance * pixel_directions[rows], squared_luminance, squared_luminance * pixel_directions[rows]],
+            axis=2,
+        )
+        cells = (cell_of_pixels[rows] + count * np.arange(len(rows))[:, None]).ravel()
         for integral, value in zip(integrals, values.reshape(-1, 10).T, strict=True):
-            of_rows = np.bincount(cells, value, minlength=count * len(rows)).reshape(len(rows), count)
-            of_rows[0] += integral
-            integral[:] = of_rows.sum(axis=0)
+            row_sums = np.bincount(cells, value, minlength=count * len(rows)).reshape(len(rows), count)
+            row_sums[0] += integral
+            integral[:] = row_sums.sum(axis=0)
     return integrals[:3].T, integrals[3:6].T, integrals[6], integrals[7:].T
 
 
@@ -98,11 +106,11 @@ def spread_in_cells(radiance: np.ndarray, directions: np.ndarray) -> np.ndarray:
         Radiance of a map in which no pixel is split, float64 of shape [height, 2·height, 3].
     """
     height = int(np.ceil(4 * np.pi * np.sqrt(len(directions))))
-    owners = _cells_of_pixels(height, directions.astype(np.float32).tobytes())
+    cell_of_pixels = _cells_of_pixels(height, directions.astype(np.float32).tobytes())
     weights = np.repeat(sh.pixel_solid_angles(height), 2 * height)
-    solid_angles = np.bincount(owners.ravel(), weights, minlength=len(directions))
+    solid_angles = np.bincount(cell_of_pixels.ravel(), weights, minlength=len(directions))
     per_pixel = 4 * np.pi / len(directions) / np.maximum(solid_angles, weights.min())  # two equal directions: one owns
-    return (radiance * per_pixel[:, None])[owners]
+    return (radiance * per_pixel[:, None])[cell_of_pixels]
 
 
 def draw_in_cells(radiance: np.ndarray, directions: np.ndarray, cells: np.ndarray, count: int) -> np.ndarray:
@@ -115,21 +123,23 @@ def draw_in_cells(radiance: np.ndarray, directions: np.ndarray, cells: np.ndarra
     Returns:
         Unit vectors, shape [cell, count, 3].
     """
-    height, split = len(radiance), _split(len(radiance), len(directions))
-    owners = _cells_of_pixels(height * split, np.asarray(directions).astype(np.float32).tobytes())
+    height, pixel_split = len(radiance), _split(len(radiance), len(directions))
+    cell_of_pixels = _cells_of_pixels(height * pixel_split, np.asarray(directions).astype(np.float32).tobytes())
     luminance = np.abs(radiance @ LUMINANCE) * sh.pixel_solid_angles(height)[:, None]
     levels = (np.arange(count) + 0.5) / count
     jitter = (0.5 + np.outer(np.arange(count), [0.7548776662, 0.5698402910])) % 1  # Roberts' R2
-    drawn = np.empty((len(cells), count, 3))
-    for place, cell in enumerate(cells):
-        rows, columns = np.nonzero(owners == cell)
+    drawn_directions = np.empty((len(cells), count, 3))
+    for cell_index, cell in enumerate(cells):
+        rows, columns = np.nonzero(cell_of_pixels == cell)
         pixels = np.stack([rows, columns], axis=1)
         pixels = pixels[z_order_of_cells(pixels)]
-        power = np.cumsum(luminance[pixels[:, 0] // split, pixels[:, 1] // split])
-        chosen = np.minimum(np.searchsorted(power, levels * power[-1]), len(power) - 1)
-        theta, phi = (np.pi / (height * split) * (pixels[chosen] + jitter)).T
-        drawn[place] = np.stack([np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)], axis=1)
-    return drawn
+        power = np.cumsum(luminance[pixels[:, 0] // pixel_split, pixels[:, 1] // pixel_split])
+        pixel_indices = np.minimum(np.searchsorted(power, levels * power[-1]), len(power) - 1)
+        theta, phi = (np.pi / (height * pixel_split) * (pixels[pixel_indices] + jitter)).T
+        drawn_directions[cell_index] = np.stack(
+            [np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)], axis=1
+        )
+    return drawn_directions
 
 
 def without_spots(radiance: np.ndarray, spots: np.ndarray, angles: np.ndarray) -> np.ndarray:
@@ -140,10 +150,10 @@ def without_spots(radiance: np.ndarray, spots: np.ndarray, angles: np.ndarray) -
         spots: Their directions, unit vectors [spot, 3].
         angles: How far from its spot light is near [radians], [spot].
     """
-    towards, half_diagonal = sh.equirectangular_directions(len(radiance)), np.pi / len(radiance) / np.sqrt(2)
+    pixel_directions, half_diagonal = sh.equirectangular_directions(len(radiance)), np.pi / len(radiance) / np.sqrt(2)
     result = np.array(radiance)
     for direction, angle in zip(spots, angles, strict=True):
-        result[towards @ direction >= np.cos(max(angle, half_diagonal))] = 0
+        result[pixel_directions @ direction >= np.cos(max(angle, half_diagonal))] = 0
     return result
 
 

@@ -13,9 +13,9 @@ def auto_exposure(image: np.ndarray) -> float:
     Args:
         image: Linear, shape [..., 4] with coverage, or [..., 3] or [..., 1] without.
     """
-    covered = image[image[..., 3] > 0] if image.shape[-1] == 4 else image.reshape(-1, image.shape[-1])
-    bright = np.percentile(covered[:, :3].max(axis=1), 99) if len(covered) else 0.0
-    return float(-np.log2(bright)) if 0 < bright < np.inf else 0.0
+    covered_pixels = image[image[..., 3] > 0] if image.shape[-1] == 4 else image.reshape(-1, image.shape[-1])
+    bright_value = np.percentile(covered_pixels[:, :3].max(axis=1), 99) if len(covered_pixels) else 0.0
+    return float(-np.log2(bright_value)) if 0 < bright_value < np.inf else 0.0
 
 
 def filmic(color: np.ndarray) -> np.ndarray:

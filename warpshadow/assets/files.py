@@ -25,16 +25,16 @@ def atomic_write(path: AnyPath) -> Iterator[Path]:
     if not Path(path).parent.is_dir():
         raise FileNotFoundError(f"{Path(path).parent}: no such folder")
     path = Path(os.path.realpath(path))  # a link stays, and its target is written
-    unfinished = path.with_name(f".{uuid.uuid4().hex[:12]}.unfinished{path.suffix}")
+    temporary_path = path.with_name(f".{uuid.uuid4().hex[:12]}.unfinished{path.suffix}")
     try:
-        unfinished.touch(exist_ok=False)
+        temporary_path.touch(exist_ok=False)
         try:
-            yield unfinished
+            yield temporary_path
             if path.exists():
-                shutil.copymode(path, unfinished)
-            os.replace(unfinished, path)
+                shutil.copymode(path, temporary_path)
+            os.replace(temporary_path, path)
         finally:
-            unfinished.unlink(missing_ok=True)
+            temporary_path.unlink(missing_ok=True)
     except OSError as error:
         if error.errno is None:  # not the system's: the message already names its file
             raise

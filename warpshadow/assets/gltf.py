@@ -53,8 +53,8 @@ def base_color_factor(material, factors: Factors) -> tuple[float, ...] | None:
 def gloss_of(material) -> Gloss | None:
     """The roughness and metallic of a material of trimesh; None where its file says neither.
 
-    Without a texture metallic is what the file says, or else 0: glTF's own default is 1, but files that leave it out,
-    such as those of trimesh, rarely mean a metal.
+    Without a texture, metallic is the value of the file, or else 0: glTF's own default is 1, but files that leave it
+    out, such as those of trimesh, rarely mean a metal.
     """
     roughness, metallic = (getattr(material, name, None) for name in ("roughnessFactor", "metallicFactor"))
     image = getattr(material, "metallicRoughnessTexture", None)

@@ -67,17 +67,18 @@ def read_image(
         pixels = reader(path, part, max_pixels)
     except ValueError as error:
         raise ImageError(f"{path}: {error}") from error
-    developed = None if undo_exposure is False else development(path)
-    if developed is None or developed.is_plain:
+    exposure_record = None if undo_exposure is False else development(path)
+    if exposure_record is None or exposure_record.is_plain:
         return pixels
     if undo_exposure is None:
         check.warn(
-            f"{path}: warpshadow wrote it, exposed by {developed.exposure:+.2f} stops, tone {developed.tone}, and "
-            "reads it as it is shown; undo_exposure=True reads the radiance, and False the same without this warning"
+            f"{path}: warpshadow wrote it, exposed by {exposure_record.exposure:+.2f} stops, tone "
+            f"{exposure_record.tone}, and reads it as it is shown; undo_exposure=True reads the radiance, and False "
+            "the same without this warning"
         )
         return pixels
     colors = pixels[..., :3] if pixels.shape[2] > 2 else pixels[..., :1]
-    colors[...] = developed.radiance(colors)
+    colors[...] = exposure_record.radiance(colors)
     return pixels
 
 
@@ -132,8 +133,8 @@ def write_image(path: AnyPath, pixels: np.ndarray | Picture, *, layers: Mapping[
         return
     channels = _checked_layers(layers or {}, pixels)
     try:
-        with files.atomic_write(path) as unfinished:
-            _write_exr(unfinished, pixels, channels)
+        with files.atomic_write(path) as temporary_path:
+            _write_exr(temporary_path, pixels, channels)
     except RuntimeError as error:  # OpenEXR's, of a disk that is full
         raise OSError(f"{path}: {error}") from error
 
@@ -225,14 +226,14 @@ def _read_exr(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray
         parts = OpenEXR.File(str(path), header_only=True).parts
     except Exception as error:  # its messages and exception types vary with the damage
         raise ImageError(f"not an OpenEXR file, or its header is damaged ({error})") from error
-    chosen = _find_part([candidate.name() for candidate in parts], part)
-    if parts[chosen].type() in (OpenEXR.deepscanline, OpenEXR.deeptile):
+    part_index = _find_part([candidate.name() for candidate in parts], part)
+    if parts[part_index].type() in (OpenEXR.deepscanline, OpenEXR.deeptile):
         raise ImageError("got deep pixels, expected flat ones (scanline or tiled)")
     for candidate in parts:  # the library reads them all
         lower, upper = candidate.header["dataWindow"]
         width, height = (np.subtract(upper, lower, dtype=np.int64) + 1).tolist()
         _check_size(width, height, max_pixels)
-    header = {channel.name: channel for channel in parts[chosen].header["channels"]}
+    header = {channel.name: channel for channel in parts[part_index].header["channels"]}
     names = _find_channels(list(header))
     if any((channel.xSampling, channel.ySampling) != (1, 1) for channel in header.values()):
         raise ImageError(f"got subsampled channels among {', '.join(header)}, expected all at full resolution")
@@ -243,7 +244,7 @@ def _read_exr(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray
         raise ImageError(f"truncated or damaged ({error})") from error
     if len(complete) < len(parts):  # the library prints a warning and leaves a damaged part out
         raise ImageError(f"truncated or damaged: only {len(complete)} of {len(parts)} parts could be read")
-    return np.stack([complete[chosen].channels[name].pixels.astype(np.float32) for name in names], axis=-1)
+    return np.stack([complete[part_index].channels[name].pixels.astype(np.float32) for name in names], axis=-1)
 
 
 def _find_part(names: list[str], part: str | int | None) -> int:
@@ -343,20 +344,20 @@ def is_wide(picture: Any) -> bool:
 
 
 def _low_tiles(picture: Any) -> list | None:
-    """Where and how a picture's lower bytes are stored, if it has 16 bits for each of three or four colors, else None.
+    """Find the storage of a picture's lower bytes, if it has 16 bits for each of three or four colors, else None.
 
     Pillow's colors have 8 bits, the upper bytes. Read in the other order, the lower ones are in their place.
     """
     low_tiles = []
     for tile in picture.tile:
-        *place, arguments = tile
-        layout, *rest = arguments if isinstance(arguments, tuple) else (arguments,)
+        *tile_position, arguments = tile
+        layout, *other_arguments = arguments if isinstance(arguments, tuple) else (arguments,)
         color, _, order = str(layout).partition(";")
         if color not in ("RGB", "RGBX", "RGBA") or order not in _OTHER_ORDER:
             return None
         layout = f"{color};{_OTHER_ORDER[order]}"
-        arguments = (layout, *rest) if isinstance(arguments, tuple) else layout
-        low_tiles.append(getattr(tile, "_make", tuple)([*place, arguments]))  # a plain tuple before Pillow 11
+        arguments = (layout, *other_arguments) if isinstance(arguments, tuple) else layout
+        low_tiles.append(getattr(tile, "_make", tuple)([*tile_position, arguments]))  # a plain tuple before Pillow 11
     return low_tiles
 
 

@@ -21,19 +21,19 @@ def checked_distortion(value: npt.ArrayLike) -> np.ndarray:
 
 
 def distorted(points: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    """Where a lens images points of the plane z = 1 in camera space, shape [..., 2] [Brown 1966; OpenCV].
+    """Distort points of the plane z = 1 in camera space, shape [..., 2] [Brown 1966; OpenCV].
 
     x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²)
     y' = y (1 + k1 r² + k2 r⁴ + k3 r⁶) + p1 (r² + 2 y²) + 2 p2 x y
     """
     k1, k2, p1, p2, k3 = coefficients
     x, y = points[..., 0], points[..., 1]
-    squared = x * x + y * y
-    radial = 1 + squared * (k1 + squared * (k2 + squared * k3))
+    radius2 = x * x + y * y
+    radial = 1 + radius2 * (k1 + radius2 * (k2 + radius2 * k3))
     return np.stack(
         [
-            x * radial + 2 * p1 * x * y + p2 * (squared + 2 * x * x),
-            y * radial + p1 * (squared + 2 * y * y) + 2 * p2 * x * y,
+            x * radial + 2 * p1 * x * y + p2 * (radius2 + 2 * x * x),
+            y * radial + p1 * (radius2 + 2 * y * y) + 2 * p2 * x * y,
         ],
         axis=-1,
     )
@@ -52,11 +52,11 @@ def undistorted(pixels: np.ndarray, camera: Camera, coefficients: np.ndarray) ->
     height, width, channels = pixels.shape
     column, row = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     plane = np.stack([column, row, np.ones_like(row)], axis=-1) @ np.linalg.inv(camera.intrinsics).T
-    bent = distorted(plane[..., :2], coefficients)
-    source = np.concatenate([bent, np.ones_like(bent[..., :1])], axis=-1) @ camera.intrinsics.T
-    places = [source[..., 1] - 0.5, source[..., 0] - 0.5]
+    distorted_points = distorted(plane[..., :2], coefficients)
+    source = np.concatenate([distorted_points, np.ones_like(distorted_points[..., :1])], axis=-1) @ camera.intrinsics.T
+    sample_coordinates = [source[..., 1] - 0.5, source[..., 0] - 0.5]
     planes = [
-        map_coordinates(pixels[..., channel].astype(np.float64), places, order=1, mode="nearest")
+        map_coordinates(pixels[..., channel].astype(np.float64), sample_coordinates, order=1, mode="nearest")
         for channel in range(channels)
     ]
     is_seen = ((source[..., :2] > -_ROUNDING) & (source[..., :2] < (width + _ROUNDING, height + _ROUNDING))).all(

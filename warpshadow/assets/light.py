@@ -65,13 +65,14 @@ class EnvironmentMap:
         expected = "an array [height, 2·height, 3]; EnvironmentMap.read(path) reads a file"
         pixels = check.pixels("radiance", radiance, expected=expected, error=ImageError)
         _check_aspect(pixels)
-        bad = _bad_values(pixels)
-        if bad.any():
-            row, col, channel = np.argwhere(bad)[0]
+        bad_values = _bad_values(pixels)
+        if bad_values.any():
+            row, col, channel = np.argwhere(bad_values)[0]
             raise ImageError(
-                f"radiance: got {bad.sum()} NaN, Inf or negative values or such beyond {check.LARGEST:g} (first at row "
-                f"{row}, column {col}, channel {channel}: {pixels[row, col, channel]}), expected finite values of 0 "
-                "or more; sanitize='zero' or 'neighbors' repairs them on reading"
+                f"radiance: got {bad_values.sum()} NaN, Inf or negative values or such beyond "
+                f"{check.LARGEST:g} (first at row {row}, column {col}, channel {channel}: "
+                f"{pixels[row, col, channel]}), expected finite values of 0 or more; sanitize='zero' "
+                "or 'neighbors' repairs them on reading"
             )
         pixels.setflags(write=False)
         object.__setattr__(self, "radiance", pixels)
@@ -112,7 +113,7 @@ class EnvironmentMap:
     @classmethod
     def constant(cls, rgb: npt.ArrayLike = 1.0, height: int = 16) -> EnvironmentMap:
         """Make a map of the same radiance everywhere, one number or RGB."""
-        check.integer("height", height, what="rows")
+        check.integer("height", height, unit="rows")
         return cls(np.broadcast_to(_color("rgb", rgb), (height, 2 * height, 3)))
 
     def write(self, path: AnyPath) -> None:
@@ -140,11 +141,11 @@ class EnvironmentMap:
         shift = -degrees / 360 * width % width
         if abs(shift - round(shift)) < 1e-6:  # 90 degrees computed from an angle are still whole pixels
             shift = round(shift)
-        whole, fraction = divmod(shift, 1)
-        rolled = np.roll(self.radiance, int(whole), axis=1)
+        whole_columns, fraction = divmod(shift, 1)
+        rolled_radiance = np.roll(self.radiance, int(whole_columns), axis=1)
         if fraction:
-            rolled = (1 - fraction) * rolled + fraction * np.roll(rolled, 1, axis=1)
-        return EnvironmentMap(rolled)
+            rolled_radiance = (1 - fraction) * rolled_radiance + fraction * np.roll(rolled_radiance, 1, axis=1)
+        return EnvironmentMap(rolled_radiance)
 
     def scaled(self, factor: npt.ArrayLike) -> EnvironmentMap:
         """Multiply the radiance by one factor, or by one for each of R, G, B."""
@@ -154,8 +155,8 @@ class EnvironmentMap:
         """The map as notebooks draw it: at most some 512 columns, at its automatic exposure."""
         height, width, _ = self.radiance.shape
         step = max(1, height // _DRAWN_ROWS)
-        cropped = self.radiance[: height // step * step, : width // step * step].astype(np.float64)
-        blocks = cropped.reshape(height // step, step, width // step, step, 3)
+        cropped_radiance = self.radiance[: height // step * step, : width // step * step].astype(np.float64)
+        blocks = cropped_radiance.reshape(height // step, step, width // step, step, 3)
         return Picture(blocks.mean(axis=(1, 3)))._repr_png_()
 
     def towards(self, directions: np.ndarray) -> np.ndarray:
@@ -279,25 +280,25 @@ def _bad_values(radiance: np.ndarray) -> np.ndarray:
     return ~((radiance >= 0) & (radiance <= check.LARGEST))
 
 
-def _sanitized(radiance: np.ndarray, how: str) -> np.ndarray:
+def _sanitized(radiance: np.ndarray, replacement: str) -> np.ndarray:
     """Replace values that no map may hold."""
-    bad = _bad_values(radiance)
-    values = np.where(bad, 0, radiance)
-    if how == "zero" or not bad.any():
+    bad_values = _bad_values(radiance)
+    values = np.where(bad_values, 0, radiance)
+    if replacement == "zero" or not bad_values.any():
         return values
-    if bad.all(axis=(0, 1)).any():
+    if bad_values.all(axis=(0, 1)).any():
         raise ImageError("radiance: a channel has no good value, so sanitize='neighbors' has nothing to go by")
-    good = (~bad).astype(np.float32)
-    while (good == 0).any():
-        total, count = _around(values * good), _around(good)
-        fill = (good == 0) & (count > 0)
+    is_good = (~bad_values).astype(np.float32)
+    while (is_good == 0).any():
+        total, count = _around(values * is_good), _around(is_good)
+        fill = (is_good == 0) & (count > 0)
         values = np.where(fill, total / np.maximum(count, 1), values)
-        good = np.maximum(good, fill)
+        is_good = np.maximum(is_good, fill)
     return values
 
 
 def _around(image: np.ndarray) -> np.ndarray:
     """Sum over each pixel and the eight around it; columns wrap around, rows end at the poles."""
     row_sums = image + np.roll(image, 1, axis=1) + np.roll(image, -1, axis=1)
-    padded = np.pad(row_sums, ((1, 1), (0, 0), (0, 0)))
-    return padded[:-2] + padded[1:-1] + padded[2:]
+    padded_sums = np.pad(row_sums, ((1, 1), (0, 0), (0, 0)))
+    return padded_sums[:-2] + padded_sums[1:-1] + padded_sums[2:]

@@ -24,7 +24,7 @@ from warpshadow.assets.topology import (
     creases,
     draws_lines,
     is_listed_first,
-    join_at_places,
+    join_at_positions,
     join_faces,
     part_at_creases,
     rounds_edges,
@@ -88,36 +88,38 @@ class Mesh:
     ):
         if uvs is None and uv_faces is not None:
             raise MeshError("uvs: got None beside uv_faces, expected the uvs that those are indices of")
-        held: dict[str, np.ndarray | None] = {"uvs": None, "uv_faces": None, "origins": None, "colors": None}
-        held["positions"] = vertices = _coordinates("positions", positions, 3, "vertex")
-        held["faces"] = indices = checked_indices("faces", faces, len(vertices), "vertex")
+        checked_arrays: dict[str, np.ndarray | None] = {"uvs": None, "uv_faces": None, "origins": None, "colors": None}
+        checked_arrays["positions"] = vertices = _coordinates("positions", positions, 3, "vertex")
+        checked_arrays["faces"] = indices = checked_indices("faces", faces, len(vertices), "vertex")
         if uvs is not None:
-            held["uvs"] = corners = _coordinates("uvs", uvs, 2, "uv")
+            checked_arrays["uvs"] = corners = _coordinates("uvs", uvs, 2, "uv")
             if uv_faces is None and len(corners) != len(vertices):
                 raise MeshError(
                     f"uvs: got {len(corners)} for {len(vertices)} vertices, expected one for each, or uv_faces, which "
                     "say which uvs each face has"
                 )
             uv_faces = indices if uv_faces is None else uv_faces
-            held["uv_faces"] = uv_indices = checked_indices("uv_faces", uv_faces, len(corners), "uv")
+            checked_arrays["uv_faces"] = uv_indices = checked_indices("uv_faces", uv_faces, len(corners), "uv")
             if len(uv_indices) != len(indices):
                 raise MeshError(f"uv_faces: got {len(uv_indices)} faces, expected {len(indices)}")
         if origins is not None:
-            held["origins"] = copied = np.array(origins, np.int32)
-            check.shape("origins", copied.shape, (len(vertices),))
+            checked_arrays["origins"] = copied_array = np.array(origins, np.int32)
+            check.shape("origins", copied_array.shape, (len(vertices),))
         if colors is not None:
             expected = "linear RGB [vertex, 3]"
-            held["colors"] = reflectances = check.pixels("colors", colors, expected=expected, error=MeshError)
+            checked_arrays["colors"] = reflectances = check.pixels("colors", colors, expected=expected, error=MeshError)
             check.shape("colors", reflectances.shape, (len(vertices), 3))
             check.reflectance("colors", reflectances)
         is_first = is_listed_first(vertices, indices)
         if not is_first.all():
             check.warn(f"{name}: {np.sum(~is_first)} duplicate faces dropped")
-            held |= {key: values[is_first] for key in ("faces", "uv_faces") if (values := held[key]) is not None}
-        for array in held.values():
+            checked_arrays |= {
+                key: values[is_first] for key in ("faces", "uv_faces") if (values := checked_arrays[key]) is not None
+            }
+        for array in checked_arrays.values():
             if array is not None:
                 array.setflags(write=False)
-        vars(self).update(held, name=name)
+        vars(self).update(checked_arrays, name=name)
 
     def __repr__(self) -> str:
         return f"Mesh({self.name!r}, {self.vertex_count} vertices, {self.face_count} faces)"
@@ -164,7 +166,7 @@ class Mesh:
 
     @functools.cached_property
     def surface(self) -> MeshTopology:
-        """How its faces are joined."""
+        """Topology of its faces."""
         return join_faces(self.positions, self.faces, self.uv_faces)
 
     @functools.cached_property
@@ -203,8 +205,8 @@ class Mesh:
         check.shape("rotation", rotation.shape, (3, 3))
         check.shape("translation", translation.shape, (3,))
         part = MeshPart(self.positions, self.faces, self.uvs, self.uv_faces)
-        moved = moved_part(part, rotation * np.broadcast_to(scale, 3), translation)
-        return replace(self, positions=moved.positions, faces=moved.faces, uv_faces=moved.uv_faces)
+        placed_part = moved_part(part, rotation * np.broadcast_to(scale, 3), translation)
+        return replace(self, positions=placed_part.positions, faces=placed_part.faces, uv_faces=placed_part.uv_faces)
 
     def normalized(self, size: float = 1.0) -> Mesh:
         """Move the middle of its bounds to the origin, and scale their longest edge to a size [scene units]."""
@@ -236,11 +238,11 @@ class Mesh:
         their numbers: faces refer to the first at each place.
         """
         colors = [] if self.colors is None else [self.colors]
-        return replace(self, faces=join_at_places(self.positions, self.faces, *colors), origins=None)
+        return replace(self, faces=join_at_positions(self.positions, self.faces, *colors), origins=None)
 
     @functools.cached_property
     def split_count(self) -> int:
-        """How many vertices :meth:`welded` joins to others, if their normals draw lines over a smooth surface, or 0."""
+        """Count the vertices that :meth:`welded` would join, if normals draw lines over a smooth surface, or 0."""
         if self.origins is not None or not draws_lines(self.surface, self.positions):  # creased on purpose, or none
             return 0
         return len(self._used) - len(self.welded()._used)
@@ -275,8 +277,8 @@ class Mesh:
             lines += ["vt {:.9g} {:.9g}".format(*uv) for uv in self.uvs.tolist()]
             corners = np.stack([self.faces, self.uv_faces], axis=-1).reshape(-1, 6) + 1
             lines += ["f {}/{} {}/{} {}/{}".format(*corner) for corner in corners.tolist()]
-        with files.atomic_write(path) as unfinished:
-            unfinished.write_text("\n".join(lines) + "\n")
+        with files.atomic_write(path) as temporary_path:
+            temporary_path.write_text("\n".join(lines) + "\n")
 
 
 def _coordinates(name: str, array: npt.ArrayLike, width: int, item: str) -> np.ndarray:
@@ -285,11 +287,11 @@ def _coordinates(name: str, array: npt.ArrayLike, width: int, item: str) -> np.n
     values = check.numbers(name, array, expected=expected, error=MeshError)
     if values.ndim != 2 or values.shape[1] != width or len(values) == 0:
         raise MeshError(f"{name}: got shape {values.shape}, expected [{item}, {width}] with at least one {item}")
-    bad = np.flatnonzero(~(np.abs(values) <= check.LARGEST).all(axis=1))
-    if len(bad):
+    bad_indices = np.flatnonzero(~(np.abs(values) <= check.LARGEST).all(axis=1))
+    if len(bad_indices):
         raise MeshError(
-            f"{name}: got NaN, Inf or numbers beyond {check.LARGEST:g} at {len(bad)} of {len(values)} "
-            f"(first at {item} {bad[0]}: {values[bad[0]].tolist()}), expected finite numbers"
+            f"{name}: got NaN, Inf or numbers beyond {check.LARGEST:g} at {len(bad_indices)} of {len(values)} "
+            f"(first at {item} {bad_indices[0]}: {values[bad_indices[0]].tolist()}), expected finite numbers"
         )
     return values
 
@@ -303,12 +305,12 @@ def checked_indices(name: str, array: npt.ArrayLike, count: int, item: str) -> n
         raise MeshError(f"{name}: got shape {faces.shape}, expected [face, 3] with at least one face{polygons}")
     if not np.issubdtype(faces.dtype, np.integer):
         raise MeshError(f"{name}: got {faces.dtype}, expected integers, such as faces.astype(int)")
-    bad = np.argwhere((faces < 0) | (faces >= count))
-    if len(bad):
-        face, corner = bad[0]
+    bad_indices = np.argwhere((faces < 0) | (faces >= count))
+    if len(bad_indices):
+        face, corner = bad_indices[0]
         counts_from_one = faces.min() == 1 and faces.max() == count
         raise MeshError(
-            f"{name}: got {len(bad)} indices out of range "
+            f"{name}: got {len(bad_indices)} indices out of range "
             f"(first at face {face}: {item} {faces[face, corner]}), expected 0 to {count - 1}"
             f"{f'; those that count from 1 are {name} - 1 here' if counts_from_one else ''}"
         )

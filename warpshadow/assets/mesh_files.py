@@ -28,7 +28,7 @@ from warpshadow.assets.ply import ply_colors, ply_corner_uvs, ply_fault
 from warpshadow.assets.topology import (
     CREASE,
     is_listed_first,
-    join_at_places,
+    join_at_positions,
     join_faces,
     part_at_creases,
     rounds_edges,
@@ -181,11 +181,11 @@ def _read_obj(path: Path) -> list[MeshPart]:
         part = part._replace(colorless=f"colors dropped, which {len(positions) - len(colors)} vertices lack")
     elif len(colors):
         part = with_colors(part, colors)
-    missing = len(corners) - len(items.uv_corners)
-    if missing == len(corners):
+    missing_count = len(corners) - len(items.uv_corners)
+    if missing_count == len(corners):
         return [part]
-    if missing:
-        return [part._replace(remark=f"uvs dropped because {missing} of {len(corners)} corners have none")]
+    if missing_count:
+        return [part._replace(remark=f"uvs dropped because {missing_count} of {len(corners)} corners have none")]
     return [part._replace(uvs=items.uvs, uv_faces=items.uv_corners[faces])]
 
 
@@ -196,8 +196,8 @@ def _read_trimesh(path: Path) -> list[MeshPart]:
     if path.suffix.lower() == ".ply" and (fault := ply_fault(path.read_bytes())):
         raise MeshError(f"the file is cut off: {fault}")
     tree = gltf_tree(path) if path.suffix.lower() in (".gltf", ".glb") else {}
-    loaded = trimesh.load_scene(path, process=False, maintain_order=True, fix_texture=False)
-    parts = _trimesh_parts(loaded, of_file=True, factors=base_color_factors(tree))
+    loaded_scene = trimesh.load_scene(path, process=False, maintain_order=True, fix_texture=False)
+    parts = _trimesh_parts(loaded_scene, of_file=True, factors=base_color_factors(tree))
     if path.suffix.lower() == ".stl":
         if not any(len(part.faces) for part in parts):
             raise MeshError(f"faces: got none, expected at least one triangle{_stl_fault(path.read_bytes())}")
@@ -269,17 +269,17 @@ def _trimesh_part(shape, of_file: bool, factors: Factors) -> MeshPart:
     uvs = getattr(shape.visual, "uv", None)
     vertex_attributes = [] if part.colors is None else [part.colors]
     normals = _stored_normals(shape)
-    stays = shape.source.file_type in ("glb", "gltf", "stl")  # faces without normals are flat; or welded later
-    if normals is None and not stays and len(faces) and np.isfinite(positions).all():
-        checked = checked_indices("faces", faces, len(positions), "vertex")
-        welded = join_at_places(positions, checked, *vertex_attributes)
+    keeps_faces = shape.source.file_type in ("glb", "gltf", "stl")  # faces without normals are flat; or welded later
+    if normals is None and not keeps_faces and len(faces) and np.isfinite(positions).all():
+        checked_faces = checked_indices("faces", faces, len(positions), "vertex")
+        welded_vertices = join_at_positions(positions, checked_faces, *vertex_attributes)
     elif uvs is None:
         return part
     else:  # normals of meshes that were changed differ a little at seams
-        stored = [] if normals is None else [normals if of_file else joined_normals(positions, normals)]
-        welded = weld(faces, positions, *vertex_attributes, *stored)
-    lost = len(np.unique(faces)) - len(np.unique(welded))
-    return part._replace(faces=welded, uvs=uvs, uv_faces=None if uvs is None else faces, welded=lost)
+        stored_normals = [] if normals is None else [normals if of_file else joined_normals(positions, normals)]
+        welded_vertices = weld(faces, positions, *vertex_attributes, *stored_normals)
+    lost = len(np.unique(faces)) - len(np.unique(welded_vertices))
+    return part._replace(faces=welded_vertices, uvs=uvs, uv_faces=None if uvs is None else faces, welded=lost)
 
 
 def _stored_normals(shape: trimesh.Trimesh) -> np.ndarray | None:
@@ -288,8 +288,8 @@ def _stored_normals(shape: trimesh.Trimesh) -> np.ndarray | None:
 
     if "vertex_normals" not in shape._cache:
         return None
-    computed = trimesh.Trimesh(shape.vertices, shape.faces, process=False).vertex_normals
-    return None if np.allclose(shape.vertex_normals, computed, atol=1e-4) else shape.vertex_normals
+    computed_normals = trimesh.Trimesh(shape.vertices, shape.faces, process=False).vertex_normals
+    return None if np.allclose(shape.vertex_normals, computed_normals, atol=1e-4) else shape.vertex_normals
 
 
 def _trimesh_colored(part: MeshPart, shape, factors: Factors) -> MeshPart:
@@ -366,10 +366,10 @@ def _usd_part(mesh, primvars, time) -> MeshPart:
     polygons = np.repeat(np.arange(len(corner_counts)), corner_counts)
     items = {"faceVarying": np.arange(len(corners)), "vertex": corners, "varying": corners}
     color_items = items | {"uniform": polygons, "constant": np.zeros_like(corners)}
-    shown = primvars.GetPrimvar("displayColor")
-    if shown.HasValue() and shown.GetInterpolation() in color_items:
-        colors = np.array(shown.ComputeFlattened(time), dtype=np.float32)
-        part = with_colors(part, colors[color_items[shown.GetInterpolation()]][faces], linear=True)
+    display_color = primvars.GetPrimvar("displayColor")
+    if display_color.HasValue() and display_color.GetInterpolation() in color_items:
+        colors = np.array(display_color.ComputeFlattened(time), dtype=np.float32)
+        part = with_colors(part, colors[color_items[display_color.GetInterpolation()]][faces], linear=True)
     st = primvars.GetPrimvar("st")
     if st.HasValue() and st.GetInterpolation() in items:
         uvs = np.array(st.Get(time), dtype=np.float32)

@@ -10,7 +10,7 @@ import numpy as np
 from warpshadow.assets.color import GRAY, srgb_to_linear
 from warpshadow.assets.gltf import gloss_texels
 from warpshadow.assets.mesh import DIFFUSE, BaseColor, Gloss, Mesh, MeshError, MeshPart, checked_indices
-from warpshadow.assets.topology import CREASE, first_at_places, is_listed_first
+from warpshadow.assets.topology import CREASE, first_at_positions, is_listed_first
 
 
 class JoinedMesh(NamedTuple):
@@ -56,13 +56,13 @@ def join_parts(parts: list[MeshPart], name: str) -> JoinedMesh:
     pictures = [picture for part in parts for picture in part.pictures]
     is_one = mesh.uvs is not None and all(picture == pictures[0] for picture in pictures)
     if any(pictures) and not is_one:
-        why = "which need uvs" if mesh.uvs is None else "since a body takes one that all its faces have"
-        of_colors.append(f"textures dropped, {why}")
+        reason = "which need uvs" if mesh.uvs is None else "since a body takes one that all its faces have"
+        of_colors.append(f"textures dropped, {reason}")
     glosses = [part.gloss or DIFFUSE for part in parts]
     of_gloss = []
     if any(gloss.image for gloss in glosses) and (mesh.uvs is None or any(gloss != glosses[0] for gloss in glosses)):
-        why = "which need uvs" if mesh.uvs is None else "since a body takes one that all its faces have"
-        of_gloss.append(f"of textures of roughness and metallic the means count, {why}")
+        reason = "which need uvs" if mesh.uvs is None else "since a body takes one that all its faces have"
+        of_gloss.append(f"of textures of roughness and metallic the means count, {reason}")
     gloss = _joined_gloss(glosses, [len(part.positions) for part in parts], has_textures=not of_gloss)
     return JoinedMesh(mesh, pictures[0] if is_one else None, gloss, remarks, of_colors, of_gloss)
 
@@ -98,8 +98,8 @@ def stack(blocks: Iterable[tuple]) -> tuple[np.ndarray, np.ndarray]:
     """Concatenate pairs of values and faces; the faces' indices move along."""
     values, faces = zip(*blocks, strict=True)
     offsets = np.cumsum([0] + [len(block) for block in values[:-1]])
-    moved = [block + offset for block, offset in zip(faces, offsets, strict=True)]
-    return np.concatenate(values), np.concatenate(moved)
+    offset_faces = [block + offset for block, offset in zip(faces, offsets, strict=True)]
+    return np.concatenate(values), np.concatenate(offset_faces)
 
 
 def fan(corner_counts: np.ndarray) -> np.ndarray:
@@ -115,22 +115,22 @@ def fan(corner_counts: np.ndarray) -> np.ndarray:
 
 def weld(faces: np.ndarray, *attributes: np.ndarray) -> np.ndarray:
     """Let faces refer to the first of the vertices that agree in all attributes."""
-    return first_at_places(np.column_stack(attributes))[faces]
+    return first_at_positions(np.column_stack(attributes))[faces]
 
 
 def joined_normals(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Normals [vertex, 3], where vertices at one place get the first one's, unless they bend by more than a crease."""
-    _, place = np.unique(positions + 0.0, axis=0, return_inverse=True)
-    place = place.reshape(-1)
-    joined, first, left = np.array(normals), np.empty(len(place), np.int64), np.arange(len(place))
+    _, position_ids = np.unique(positions + 0.0, axis=0, return_inverse=True)
+    position_ids = position_ids.reshape(-1)
+    welded_normals, first, left = np.array(normals), np.empty(len(position_ids), np.int64), np.arange(len(position_ids))
     while len(left):
-        first[place[left[::-1]]] = left[::-1]
-        of_first = normals[first[place[left]]]
-        is_close = (normals[left] * of_first).sum(axis=1) >= np.cos(np.radians(CREASE))
-        is_close |= (first[place[left]] == left) | ~normals[left].any(axis=1)  # vertices of no face get zero
-        joined[left[is_close]] = of_first[is_close]
+        first[position_ids[left[::-1]]] = left[::-1]
+        first_normals = normals[first[position_ids[left]]]
+        is_close = (normals[left] * first_normals).sum(axis=1) >= np.cos(np.radians(CREASE))
+        is_close |= (first[position_ids[left]] == left) | ~normals[left].any(axis=1)  # vertices of no face get zero
+        welded_normals[left[is_close]] = first_normals[is_close]
         left = left[~is_close]
-    return joined
+    return welded_normals
 
 
 def with_colors(part: MeshPart, values: np.ndarray, *, linear: bool = False) -> MeshPart:
@@ -145,14 +145,14 @@ def with_colors(part: MeshPart, values: np.ndarray, *, linear: bool = False) -> 
     values = values[..., :3]
     values = values / (65535 if values.dtype == np.uint16 else 255 if values.dtype.kind in "ui" else 1.0)
     if not ((values >= 0) & (values <= 1)).all():
-        why = f"got values from {values.min():g} to {values.max():g}, expected 0 to 1"
-        return part._replace(colorless=f"colors dropped ({why})")
+        reason = f"got values from {values.min():g} to {values.max():g}, expected 0 to 1"
+        return part._replace(colorless=f"colors dropped ({reason})")
     colors = (values if linear else srgb_to_linear(values)).astype(np.float32)
     if colors.ndim == 2:
         return part._replace(colors=colors)
-    of_vertices = np.tile(np.array(GRAY, np.float32), (len(part.positions), 1))
-    of_vertices[part.faces] = colors
-    if np.array_equal(of_vertices[part.faces], colors):
-        return part._replace(colors=of_vertices)
-    why = "faces of different colors share vertices, which trimesh's unmerge_vertices() parts"
-    return part._replace(colorless=f"colors of faces dropped ({why})")
+    vertex_colors = np.tile(np.array(GRAY, np.float32), (len(part.positions), 1))
+    vertex_colors[part.faces] = colors
+    if np.array_equal(vertex_colors[part.faces], colors):
+        return part._replace(colors=vertex_colors)
+    reason = "faces of different colors share vertices, which trimesh's unmerge_vertices() parts"
+    return part._replace(colorless=f"colors of faces dropped ({reason})")

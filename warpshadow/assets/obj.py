@@ -44,8 +44,8 @@ def read_alike(text: str) -> ObjItems | None:
     """
     vertices, uvs, faces, libraries = (re.findall(rf"^{word} (.*)", text, re.M) for word in ("v", "vt", "f", "mtllib"))
     marks = re.findall(r"^(?:usemtl (.*)|(f) )", text, re.M)
-    others = re.findall(r"^(?:#|vn |s |o |g |$)", text, re.M)
-    lines = (vertices, uvs, libraries, marks, others)
+    other_lines = re.findall(r"^(?:#|vn |s |o |g |$)", text, re.M)
+    lines = (vertices, uvs, libraries, marks, other_lines)
     if sum(map(len, lines)) < text.count("\n") + 1 or not (vertices and faces):
         return None
     body = "\n".join(faces)
@@ -113,9 +113,9 @@ def read_by_line(text: str) -> ObjItems:
                     materials.add(material)
                     corner_counts.append(len(tokens))
                     for token in tokens:
-                        vertex, _, others = token.partition("/")
+                        vertex, _, other_lines = token.partition("/")
                         corners.append(_index(vertex, len(positions)))
-                        if uv := others.partition("/")[0]:
+                        if uv := other_lines.partition("/")[0]:
                             uv_corners.append(_index(uv, len(uvs)))
                 case ["v" | "vt", *coordinates]:
                     raise ValueError(f"{len(coordinates)} coordinates are too few")

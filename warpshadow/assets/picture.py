@@ -68,16 +68,16 @@ class Picture:
         if background is not None and not has_alpha:
             raise ValueError(f"background: got one behind an image of shape {linear.shape}, which covers all of it")
         color, alpha = (linear[..., :3], np.clip(linear[..., 3:], 0, 1)) if has_alpha else (linear, None)
-        behind = None if background is None else _behind(background, color.shape)
-        if alpha is not None and behind is not None and behind.ndim == 3:
-            color, alpha = color + (1 - alpha) * behind, None
+        background_pixels = None if background is None else _behind(background, color.shape)
+        if alpha is not None and background_pixels is not None and background_pixels.ndim == 3:
+            color, alpha = color + (1 - alpha) * background_pixels, None
         if alpha is not None:
             color = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0)
         color = np.clip(TONES[tone](np.maximum(color * 2.0**self.exposure, 0)), 0, 1)
-        if alpha is not None and behind is not None:
-            color, alpha = alpha * color + (1 - alpha) * behind, None
-        encoded = linear_to_srgb(color)
-        self.pixels = _codes(encoded if alpha is None else np.concatenate([encoded, alpha], axis=2))
+        if alpha is not None and background_pixels is not None:
+            color, alpha = alpha * color + (1 - alpha) * background_pixels, None
+        encoded_values = linear_to_srgb(color)
+        self.pixels = _codes(encoded_values if alpha is None else np.concatenate([encoded_values, alpha], axis=2))
         self.pixels.setflags(write=False)
 
     def __repr__(self) -> str:
@@ -106,13 +106,13 @@ class Picture:
         path = check.path("path", path)
         if path.suffix.lower() not in SUFFIXES:
             raise ValueError(f"{path}: got extension {path.suffix!r}, expected one of {', '.join(SUFFIXES)}")
-        with files.atomic_write(path) as unfinished:
+        with files.atomic_write(path) as temporary_path:
             comment = f"warpshadow: exposure {self.exposure:+.6f} stops, tone {self.tone}"
             if path.suffix.lower() == ".png":
-                _pillow(self.pixels).save(unfinished, pnginfo=_chunk(comment))
+                _pillow(self.pixels).save(temporary_path, pnginfo=_chunk(comment))
             else:
-                shown = self.opaque() if self.pixels.shape[2] == 4 else self.pixels
-                _pillow(shown).save(unfinished, quality=95, subsampling=0, comment=comment)
+                opaque_pixels = self.opaque() if self.pixels.shape[2] == 4 else self.pixels
+                _pillow(opaque_pixels).save(temporary_path, quality=95, subsampling=0, comment=comment)
 
 
 def png_bytes(codes: np.ndarray) -> bytes:
@@ -123,10 +123,10 @@ def png_bytes(codes: np.ndarray) -> bytes:
 
 
 class Development(NamedTuple):
-    """How linear values became a picture."""
+    """Exposure and tone curve by which linear values became a picture."""
 
     exposure: float
-    """In stops."""
+    """Exposure [stops]."""
 
     tone: str
     """Tone curve."""
@@ -180,11 +180,13 @@ def _behind(background: npt.ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
                 "scene.background()"
             ) from error
     expected = f"a color [3], or an image {list(shape)}"
-    behind = check.numbers("background", background, expected=expected, dtype=np.float64)
-    if behind.shape not in ((3,), shape):
-        raise ValueError(f"background: got shape {behind.shape}, expected {expected}")
-    check.finite("background", behind, minimum=0.0, maximum=1.0 if behind.ndim == 1 else check.LARGEST)
-    return behind
+    background_pixels = check.numbers("background", background, expected=expected, dtype=np.float64)
+    if background_pixels.shape not in ((3,), shape):
+        raise ValueError(f"background: got shape {background_pixels.shape}, expected {expected}")
+    check.finite(
+        "background", background_pixels, minimum=0.0, maximum=1.0 if background_pixels.ndim == 1 else check.LARGEST
+    )
+    return background_pixels
 
 
 def _pillow(pixels: np.ndarray) -> Any:
@@ -202,5 +204,5 @@ def _chunk(comment: str) -> Any:
     return chunk
 
 
-def _codes(encoded: np.ndarray) -> np.ndarray:
-    return np.floor(encoded * 255 + 0.5).astype(np.uint8)
+def _codes(encoded_values: np.ndarray) -> np.ndarray:
+    return np.floor(encoded_values * 255 + 0.5).astype(np.uint8)

@@ -4,7 +4,7 @@ import numpy as np
 
 
 def ply_fault(content: bytes) -> str:
-    """Where a PLY file is cut off, for messages; "" if its items may all be there."""
+    """Describe where a PLY file is cut off; "" if it may be complete."""
     header, mark, body = content.partition(b"end_header")
     if not mark:
         return "its header has no end" if header.startswith(b"ply") else ""

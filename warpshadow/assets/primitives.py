@@ -38,7 +38,7 @@ def plane(size: float | tuple[float, float] = 2.0, segments: int | tuple[int, in
 
 
 _INFINITE_EXTENT = 1e4
-"""How far an infinite ground goes, in sizes: seen from one size above, it ends 0.006 degrees below the horizon."""
+"""Extent of an infinite ground, in sizes: seen from one size above, it ends 0.006 degrees below the horizon."""
 
 
 def infinite_ground(size: float = 2.0, segments: int = 64) -> Mesh:
@@ -63,10 +63,10 @@ def infinite_ground(size: float = 2.0, segments: int = 64) -> Mesh:
     rim = np.stack([np.cos(angles), np.zeros(segments), -np.sin(angles)], axis=-1)
     positions = np.concatenate([np.zeros((1, 3)), (radii[:, None, None] * rim).reshape(-1, 3)])
     first = 1 + segments * np.arange(len(radii))
-    here, following = np.arange(segments), np.roll(np.arange(segments), -1)
-    fan = np.stack([np.zeros(segments, int), first[0] + here, first[0] + following], axis=-1)
-    a, b = first[:-1, None] + here, first[:-1, None] + following
-    c, d = first[1:, None] + here, first[1:, None] + following
+    indices, next_indices = np.arange(segments), np.roll(np.arange(segments), -1)
+    fan = np.stack([np.zeros(segments, int), first[0] + indices, first[0] + next_indices], axis=-1)
+    a, b = first[:-1, None] + indices, first[:-1, None] + next_indices
+    c, d = first[1:, None] + indices, first[1:, None] + next_indices
     rings = np.stack([a, c, d, a, d, b], axis=-1).reshape(-1, 3)
     return Mesh(positions, np.concatenate([fan, rings]), name="infinite_ground")
 
@@ -92,15 +92,19 @@ def icosphere(radius: float = 1.0, subdivisions: int = 3) -> Mesh:
     golden = (1 + 5**0.5) / 2
     corners = np.array([(0, y, z * golden) for y in (-1, 1) for z in (-1, 1)])
     positions = np.concatenate([np.roll(corners, shift, axis=1) for shift in range(3)])
-    near = np.isclose(np.linalg.norm(positions[:, None] - positions, axis=-1), 2)
+    is_neighbor = np.isclose(np.linalg.norm(positions[:, None] - positions, axis=-1), 2)
     triples = [
-        (a, b, c) for a in range(12) for b in range(a) for c in range(b) if near[a, b] and near[b, c] and near[a, c]
+        (a, b, c)
+        for a in range(12)
+        for b in range(a)
+        for c in range(b)
+        if is_neighbor[a, b] and is_neighbor[b, c] and is_neighbor[a, c]
     ]
     faces = np.array([t if np.linalg.det(positions[list(t)]) > 0 else t[::-1] for t in triples])
     for _ in range(subdivisions):
         edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=-1).reshape(-1, 2)
-        edges, middle = np.unique(edges, axis=0, return_inverse=True)
-        ab, bc, ca = middle.reshape(-1, 3).T + len(positions)
+        edges, middle_index = np.unique(edges, axis=0, return_inverse=True)
+        ab, bc, ca = middle_index.reshape(-1, 3).T + len(positions)
         a, b, c = faces.T
         positions = np.concatenate([positions, positions[edges].mean(axis=1)])
         faces = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)

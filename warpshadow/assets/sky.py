@@ -44,35 +44,37 @@ def synthetic_sky(
         raise ValueError("sun_direction: got a zero vector, expected a direction")
     for name, value in (("sun_strength", sun_strength), ("sun_radius", sun_radius), ("ground_albedo", ground_albedo)):
         check.nonnegative(name, value)
-    check.integer("height", height, what="rows")
+    check.integer("height", height, unit="rows")
     sun = sun / np.linalg.norm(sun)
-    towards, weights = sh.equirectangular_directions(height), sh.pixel_solid_angles(height)[:, None]
+    pixel_directions, weights = sh.equirectangular_directions(height), sh.pixel_solid_angles(height)[:, None]
     edges = np.minimum(np.pi * np.arange(height + 1) / height, np.pi / 2)
-    on_level = np.pi / height * np.diff(np.sin(edges) ** 2 / 2)[:, None]  # ∫ max(cos θ, 0) dω over a pixel of each row
-    up = towards[..., 1]
-    above = up > 0
-    sun_angle = np.arccos(np.clip(towards @ sun, -1, 1))
+    horizontal_weights = (
+        np.pi / height * np.diff(np.sin(edges) ** 2 / 2)[:, None]
+    )  # ∫ max(cos θ, 0) dω over a pixel of each row
+    heights = pixel_directions[..., 1]
+    is_above = heights > 0
+    sun_angle = np.arccos(np.clip(pixel_directions @ sun, -1, 1))
 
     sun_color = _sunlight(max(sun[1], 0.0))
     glow = 1 + 10 * (np.exp(-3 * sun_angle) - np.exp(-1.5 * np.pi)) + 0.45 * np.cos(sun_angle) ** 2
-    gradation = 1 - np.exp(-0.32 / np.maximum(up, 1e-3))
-    haze = np.exp(-5 * np.maximum(up, 0))[..., None]
+    gradation = 1 - np.exp(-0.32 / np.maximum(heights, 1e-3))
+    haze = np.exp(-5 * np.maximum(heights, 0))[..., None]
     near_sun = np.exp(-3 * sun_angle)[..., None]
     color = (1 - haze) * _chroma([0.22, 0.45, 1.0]) + haze * _chroma([0.75, 0.88, 1.0])
     color = (1 - near_sun) * color + near_sun * sun_color
-    sky = (above * glow * gradation)[..., None] * color
-    sky *= np.pi / np.sum(sky @ LUMINANCE * on_level)
+    sky = (is_above * glow * gradation)[..., None] * color
+    sky *= np.pi / np.sum(sky @ LUMINANCE * horizontal_weights)
 
     pixel = np.pi / height
     radius = max(np.radians(sun_radius), pixel / 2)
     disc = np.clip((radius + pixel / 2 - sun_angle) / pixel, 0, 1)
-    disc *= above * np.pi * sun_strength / np.sum(disc * weights)
+    disc *= is_above * np.pi * sun_strength / np.sum(disc * weights)
 
-    on_ground = np.pi + np.sum(disc * on_level) * sun_color
-    distance_haze = np.exp(np.minimum(20 * up, 0))[..., None]
+    ground_irradiance = np.pi + np.sum(disc * horizontal_weights) * sun_color
+    distance_haze = np.exp(np.minimum(20 * heights, 0))[..., None]
     horizon = sky[height // 2 - 1]
-    ground = (1 - distance_haze) * (ground_albedo / np.pi * on_ground) + distance_haze * horizon
-    return EnvironmentMap(np.where(above[..., None], sky + disc[..., None] * sun_color, ground))
+    ground = (1 - distance_haze) * (ground_albedo / np.pi * ground_irradiance) + distance_haze * horizon
+    return EnvironmentMap(np.where(is_above[..., None], sky + disc[..., None] * sun_color, ground))
 
 
 def _chroma(rgb: Sequence[float]) -> np.ndarray:

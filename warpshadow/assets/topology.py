@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from warpshadow.maths.adjacency import edge_neighbors, number_places
+from warpshadow.maths.adjacency import edge_neighbors, number_positions
 from warpshadow.maths.components import connected_components
 
 CREASE = 30.0  # edges whose faces bend by more are sharp [degrees]
@@ -18,16 +18,16 @@ def welded(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     The first of each stays, in order: so split vertices become one again.
     """
     used = np.unique(faces)
-    places = number_places(positions[used])
-    _, first, place = np.unique(places, return_index=True, return_inverse=True)
+    position_ids = number_positions(positions[used])
+    _, first, position_index = np.unique(position_ids, return_index=True, return_inverse=True)
     first_vertices = np.sort(first)
-    number = np.searchsorted(first_vertices, first)[place]
+    number = np.searchsorted(first_vertices, first)[position_index]
     renumbered = np.zeros(len(positions), np.int32)
     renumbered[used] = number
     return positions[used[first_vertices]], renumbered[faces]
 
 
-def join_at_places(positions: np.ndarray, faces: np.ndarray, *attributes: np.ndarray) -> np.ndarray:
+def join_at_positions(positions: np.ndarray, faces: np.ndarray, *attributes: np.ndarray) -> np.ndarray:
     """Let faces refer to the first of the vertices at one place that agree in all attributes.
 
     Where a mesh has many sharp edges, as boxes have, and most of them are parted, they stay so. Where angles of all
@@ -40,25 +40,25 @@ def join_at_places(positions: np.ndarray, faces: np.ndarray, *attributes: np.nda
     Returns:
         The faces by the vertices that stay, shape [face, 3].
     """
-    joined = first_at_places(np.column_stack([positions, *attributes]))
-    if (joined == np.arange(len(joined))).all():
+    first_vertices = first_at_positions(np.column_stack([positions, *attributes]))
+    if (first_vertices == np.arange(len(first_vertices))).all():
         return faces
     is_first = is_listed_first(positions, faces)  # edges of the others would have too many faces
-    once = joined[faces[is_first]].astype(np.int32)
-    surface = join_faces(positions, once, None)
+    unique_corners = first_vertices[faces[is_first]].astype(np.int32)
+    surface = join_faces(positions, unique_corners, None)
     split_surface = join_faces(positions, faces[is_first], None)
     if rounds_edges(surface, positions) and _parted_share(split_surface, positions, CREASE, 180.0) > 0.5:
-        fans, _ = part_at_creases(once, surface, positions, CREASE)
+        fans, _ = part_at_creases(unique_corners, surface, positions, CREASE)
         count = len(positions)
         fan_count = int(fans.max()) + 1
         smooth = connected_components(faces[is_first].ravel(), count + fans.ravel(), count + fan_count)[:count]
-        joined = first_at_places(smooth[:, None])
-    return joined[faces]
+        first_vertices = first_at_positions(smooth[:, None])
+    return first_vertices[faces]
 
 
-def first_at_places(rows: np.ndarray) -> np.ndarray:
+def first_at_positions(rows: np.ndarray) -> np.ndarray:
     """Index of the first row that equals each, shape [row]."""
-    group = number_places(rows)
+    group = number_positions(rows)
     first = np.empty(len(group), np.int64)
     first[group[::-1]] = np.arange(len(group))[::-1]  # the last of these assignments stays
     return first[group]
@@ -80,14 +80,14 @@ def part_at_creases(
         The faces by new vertices, int32 of shape [face, 3]; and the vertex that each new one is a copy of, int32 of
         shape [vertex]: the old ones are the first, in their order.
     """
-    places = number_places(positions)[surface.faces]
+    position_ids = number_positions(positions)[surface.faces]
     face, edge, neighbor, cosines = _bends(surface, positions, each_once=False)
     is_smooth = cosines >= np.cos(np.radians(angle))
     face, edge, neighbor = face[is_smooth], edge[is_smooth], neighbor[is_smooth]
     links = []
     for end in (1, 2):
         corner = (edge + end) % 3
-        other = (places[neighbor] == places[face, corner][:, None]).argmax(axis=1)
+        other = (position_ids[neighbor] == position_ids[face, corner][:, None]).argmax(axis=1)
         links.append((3 * face + corner, 3 * neighbor + other))
     ends, other_ends = np.concatenate(links, axis=1)
     count = 3 * len(faces)
@@ -95,10 +95,10 @@ def part_at_creases(
     is_turned = (surface.faces != faces).any(axis=1)
     keys = faces.astype(np.int64) * count + np.where(is_turned[:, None], fan[:, ::-1], fan)
     _, first, number = np.unique(keys, return_index=True, return_inverse=True)
-    owner = faces.ravel()[first]
-    is_copy = np.append(False, owner[1:] == owner[:-1])
-    vertex = np.where(is_copy, len(positions) - 1 + np.cumsum(is_copy), owner)
-    origins = np.concatenate([np.arange(len(positions)), owner[is_copy]])
+    owner_faces = faces.ravel()[first]
+    is_copy = np.append(False, owner_faces[1:] == owner_faces[:-1])
+    vertex = np.where(is_copy, len(positions) - 1 + np.cumsum(is_copy), owner_faces)
+    origins = np.concatenate([np.arange(len(positions)), owner_faces[is_copy]])
     return vertex[number].reshape(-1, 3).astype(np.int32), origins.astype(np.int32)
 
 
@@ -112,9 +112,9 @@ def rounds_edges(surface: MeshTopology, positions: np.ndarray) -> bool:
     """
     corners = positions[surface.faces].astype(np.float64)
     face, edge, neighbor, cosines = _bends(surface, positions)
-    bent = np.flatnonzero(cosines < np.cos(np.radians(20)))
-    bent = bent[~_is_parted(surface, face[bent], edge[bent], neighbor[bent])]
-    face, edge, cosines = face[bent], edge[bent], cosines[bent]
+    bent_edges = np.flatnonzero(cosines < np.cos(np.radians(20)))
+    bent_edges = bent_edges[~_is_parted(surface, face[bent_edges], edge[bent_edges], neighbor[bent_edges])]
+    face, edge, cosines = face[bent_edges], edge[bent_edges], cosines[bent_edges]
     lengths = np.linalg.norm(np.subtract(*corners[face, (edge + [[1], [2]]) % 3]), axis=1)
     diagonal = np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0))
     if lengths[cosines < np.cos(np.radians(50))].sum() <= diagonal:
@@ -122,15 +122,19 @@ def rounds_edges(surface: MeshTopology, positions: np.ndarray) -> bool:
     linked_face, edge = np.nonzero(surface.neighbors >= 0)
     pieces = connected_components(linked_face, surface.neighbors[linked_face, edge], len(surface.faces))
     count = int(pieces.max()) + 1
-    sharp, bent = (
+    sharp_lengths, bent_edges = (
         np.bincount(pieces[face], lengths * (cosines < np.cos(np.radians(angle))), count) for angle in (50, 20)
     )
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     np.minimum.at(low, pieces, corners.min(axis=1))
     np.maximum.at(high, pieces, corners.max(axis=1))
     diagonals = np.linalg.norm(high - low, axis=1)
-    is_many = (diagonals < sharp) & (sharp < 25 * diagonals) & (bent - sharp < 0.1 * sharp)
-    return bool(sharp[is_many].sum() > max(diagonal, sharp.sum() / 2))
+    is_many = (
+        (diagonals < sharp_lengths)
+        & (sharp_lengths < 25 * diagonals)
+        & (bent_edges - sharp_lengths < 0.1 * sharp_lengths)
+    )
+    return bool(sharp_lengths[is_many].sum() > max(diagonal, sharp_lengths.sum() / 2))
 
 
 def draws_lines(surface: MeshTopology, positions: np.ndarray) -> bool:
@@ -225,15 +229,15 @@ def is_listed_first(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
     Faces without area are not compared.
     """
-    places = number_places(positions)
-    sums = _scrambled(places)[faces].sum(axis=1)  # equal for the same corners, and hardly ever for others
-    rising = np.sort(sums)
-    repeated = rising[1:][rising[1:] == rising[:-1]]
+    position_ids = number_positions(positions)
+    sums = _scrambled(position_ids)[faces].sum(axis=1)  # equal for the same corners, and hardly ever for others
+    sorted_sums = np.sort(sums)
+    repeated_sums = sorted_sums[1:][sorted_sums[1:] == sorted_sums[:-1]]
     is_first = np.ones(len(faces), bool)
-    if not len(repeated):
+    if not len(repeated_sums):
         return is_first
-    candidates = np.flatnonzero(np.isin(sums, repeated))
-    corners = np.sort(places[faces[candidates]], axis=1)
+    candidates = np.flatnonzero(np.isin(sums, repeated_sums))
+    corners = np.sort(position_ids[faces[candidates]], axis=1)
     permutation = np.lexsort(corners.T)  # which keeps the order of equal ones
     is_equal = (corners[permutation[1:]] == corners[permutation[:-1]]).all(axis=1) & (
         np.diff(corners[permutation[1:]], axis=1) != 0
@@ -252,9 +256,12 @@ def _scrambled(numbers: np.ndarray) -> np.ndarray:
 
 def join_faces(positions: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | None) -> MeshTopology:
     """Join faces of which none is listed twice."""
-    places = number_places(positions)[faces]
-    neighbors = edge_neighbors(places)
-    first, last = np.roll(places, -1, axis=1), np.roll(places, -2, axis=1)  # of the edges opposite to corners
+    position_ids = number_positions(positions)[faces]
+    neighbors = edge_neighbors(position_ids)
+    first, last = (
+        np.roll(position_ids, -1, axis=1),
+        np.roll(position_ids, -2, axis=1),
+    )  # of the edges opposite to corners
     neighbor = np.maximum(neighbors, 0)
     runs_back = (first[neighbor] == last[:, :, None]) & (last[neighbor] == first[:, :, None])
     winds_alike = runs_back.any(axis=2) | (neighbors < 0)
@@ -262,19 +269,21 @@ def join_faces(positions: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | 
         is_turned = _turned(neighbors, winds_alike)
         winds_alike ^= is_turned[:, None] ^ is_turned[neighbor]
         winds_alike |= neighbors < 0
-        faces, places, neighbors = (_with_turned(values, is_turned) for values in (faces, places, neighbors))
+        faces, position_ids, neighbors = (
+            _with_turned(values, is_turned) for values in (faces, position_ids, neighbors)
+        )
         uv_faces = None if uv_faces is None else _with_turned(uv_faces, is_turned)
-    is_closed = bool(winds_alike.all()) and _is_closed(positions, faces, places, neighbors)
+    is_closed = bool(winds_alike.all()) and _is_closed(positions, faces, position_ids, neighbors)
     return MeshTopology(faces, uv_faces, neighbors, is_closed)
 
 
-def _is_closed(positions: np.ndarray, faces: np.ndarray, places: np.ndarray, neighbors: np.ndarray) -> bool:
+def _is_closed(positions: np.ndarray, faces: np.ndarray, position_ids: np.ndarray, neighbors: np.ndarray) -> bool:
     """Whether as many faces run along each edge one way as the other, and each piece encloses a positive volume.
 
     So boxes that share an edge, at which four faces meet, are closed as each of them is. Faces wind alike, and
-    ``places`` of their corners are the same where positions are.
+    ``position_ids`` of their corners are the same where positions are.
     """
-    is_proper = (places != np.roll(places, 1, axis=1)).all(axis=1)
+    is_proper = (position_ids != np.roll(position_ids, 1, axis=1)).all(axis=1)
     if (neighbors[is_proper] == -1).any():  # a border
         return False
     count = len(faces)
@@ -282,8 +291,8 @@ def _is_closed(positions: np.ndarray, faces: np.ndarray, places: np.ndarray, nei
         face, edge = np.nonzero(neighbors > np.arange(count)[:, None])
         piece = connected_components(face, neighbors[face, edge], count)
     else:
-        starts, ends = places[is_proper].ravel(), np.roll(places[is_proper], -1, axis=1).ravel()
-        lines = np.minimum(starts, ends) * (places.max(initial=0) + 1) + np.maximum(starts, ends)
+        starts, ends = position_ids[is_proper].ravel(), np.roll(position_ids[is_proper], -1, axis=1).ravel()
+        lines = np.minimum(starts, ends) * (position_ids.max(initial=0) + 1) + np.maximum(starts, ends)
         _, edge = np.unique(lines, return_inverse=True)
         if np.bincount(edge, np.where(starts < ends, 1, -1)).any():
             return False
@@ -314,6 +323,6 @@ def _turned(neighbors: np.ndarray, winds_alike: np.ndarray) -> np.ndarray:
 
 def _with_turned(values: np.ndarray, is_turned: np.ndarray) -> np.ndarray:
     """Reverse the corner order [face, 3] of some faces."""
-    turned = np.where(is_turned[:, None], values[:, ::-1], values)
-    turned.setflags(write=False)
-    return turned
+    flipped = np.where(is_turned[:, None], values[:, ::-1], values)
+    flipped.setflags(write=False)
+    return flipped

@@ -41,15 +41,15 @@ def write_video(path: AnyPath, frames: Iterable[Picture | np.ndarray], *, fps: f
     check.instance("frames", frames, Iterable, "pictures, one after another")
     if isinstance(frames, np.ndarray) and frames.ndim != 4:
         raise ValueError(f"frames: got an array of shape {frames.shape}, expected [frame, height, width, channel]")
-    shown = _shown(frames)
-    first = next(shown, None)
+    shown_frames = _shown(frames)
+    first = next(shown_frames, None)
     if first is None:
         raise ValueError("frames: got none, expected at least one picture")
-    with files.atomic_write(path) as unfinished:
+    with files.atomic_write(path) as temporary_path:
         if path.suffix.lower() == ".mp4":
-            _write_mp4(unfinished, first, shown, fps)
+            _write_mp4(temporary_path, first, shown_frames, fps)
         else:
-            _write_animation(unfinished, first, shown, fps, _STEPS[path.suffix.lower()])
+            _write_animation(temporary_path, first, shown_frames, fps, _STEPS[path.suffix.lower()])
 
 
 def check_video(path: Path, fps: float) -> None:
@@ -84,22 +84,22 @@ def _shown(frames: Iterable[Picture | np.ndarray]) -> Iterator[np.ndarray]:
         yield np.ascontiguousarray(pixels)
 
 
-def _write_mp4(path: Path, first: np.ndarray, others: Iterator[np.ndarray], fps: float) -> None:
+def _write_mp4(path: Path, first: np.ndarray, other_frames: Iterator[np.ndarray], fps: float) -> None:
     import imageio_ffmpeg
 
     height, width, _ = first.shape
-    odd = ((0, height % 2), (0, width % 2), (0, 0))  # H.264 halves its colors' size
+    odd_padding = ((0, height % 2), (0, width % 2), (0, 0))  # H.264 halves its colors' size
     size = width + width % 2, height + height % 2
     writer = imageio_ffmpeg.write_frames(str(path), size, fps=fps, quality=8, macro_block_size=1)
     try:
         writer.send(None)
-        for frame in itertools.chain([first], others):
-            writer.send(np.pad(frame, odd, mode="edge").tobytes())
+        for frame in itertools.chain([first], other_frames):
+            writer.send(np.pad(frame, odd_padding, mode="edge").tobytes())
     finally:
         writer.close()
 
 
-def _write_animation(path: Path, first: np.ndarray, others: Iterator[np.ndarray], fps: float, step: int) -> None:
+def _write_animation(path: Path, first: np.ndarray, other_frames: Iterator[np.ndarray], fps: float, step: int) -> None:
     from PIL import Image
 
     def time(frame: int) -> int:  # when it begins [ms]
@@ -108,7 +108,7 @@ def _write_animation(path: Path, first: np.ndarray, others: Iterator[np.ndarray]
     durations = [time(1)]
 
     def rest() -> Iterator[Image.Image]:
-        for number, frame in enumerate(others, start=1):
+        for number, frame in enumerate(other_frames, start=1):
             durations.append(time(number + 1) - time(number))  # Pillow looks for it once it has the frame
             yield Image.fromarray(frame)
 

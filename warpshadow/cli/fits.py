@@ -62,17 +62,19 @@ def fit(
     from warpshadow.inverse.many import is_of_many
     from warpshadow.inverse.report import SUMMARY, Report, found_values
 
-    where = file[0] if len(file) == 1 else file
-    if isinstance(where, list) or is_of_many(where):
+    fit_path = file[0] if len(file) == 1 else file
+    if isinstance(fit_path, list) or is_of_many(fit_path):
         options = {"workers": workers, "ray": ray, "device": device, "checkpoint_seconds": checkpoint_seconds}
-        _fit_many(where, output, view, is_quiet, **options)
+        _fit_many(fit_path, output, view, is_quiet, **options)
         return
     with clear_errors(), _resumable(output):
         if workers is not None or ray is not None:
-            raise ValueError(f"--workers, --ray: got the fit file {where}, expected a pattern, a folder or a .txt file")
+            raise ValueError(
+                f"--workers, --ray: got the fit file {fit_path}, expected a pattern, a folder or a .txt file"
+            )
         on = device_of(device)
         check_folder(output)
-        loaded = load_fit(where)
+        loaded_fit = load_fit(fit_path)
         output.mkdir(exist_ok=True)
         state = checkpoints.load(output / CHECKPOINT)
         was_over = state is not None and state["reason"] is not None
@@ -84,7 +86,7 @@ def fit(
         if viewer is not None:
             typer.echo(viewer.url)
             viewer.open(browser)
-        result = loaded.run(
+        result = loaded_fit.run(
             device=str(on),
             checkpoint=output / CHECKPOINT,
             checkpoint_seconds=checkpoint_seconds,
@@ -116,7 +118,7 @@ def fit(
         raise typer.Exit(DIVERGED)
 
 
-def _fit_many(where: Path | list[Path], output: Path, view: bool, is_quiet: bool, **options: Any) -> None:
+def _fit_many(fit_path: Path | list[Path], output: Path, view: bool, is_quiet: bool, **options: Any) -> None:
     """Run many fits, and list the failed ones."""
     from warpshadow.inverse.many import TABLE, find_fits, fit_many
 
@@ -124,7 +126,7 @@ def _fit_many(where: Path | list[Path], output: Path, view: bool, is_quiet: bool
         if view:
             raise ValueError("--view: got many fits, expected one, which a page can show")
         try:
-            endings = fit_many(find_fits(where), output, **options)
+            endings = fit_many(find_fits(fit_path), output, **options)
         except KeyboardInterrupt as error:
             raise interrupted("; the same command goes on from the checkpoints") from error
     for ending in endings:
@@ -175,14 +177,18 @@ def dataset(
     from warpshadow.dataset import DataSet, load_recipe, write_shards
 
     with clear_errors():
-        loaded = load_recipe(recipe)
-        data_set = DataSet(loaded, device=device_of(device))
-        start, before = time.perf_counter(), {*output.glob("*.tar")}
+        loaded_fit = load_recipe(recipe)
+        data_set = DataSet(loaded_fit, device=device_of(device))
+        start, existing_shards = time.perf_counter(), {*output.glob("*.tar")}
         try:
             shards = write_shards(data_set, output, workers=workers)
         except KeyboardInterrupt as error:
             raise interrupted(f"; the same command goes on in {output}") from error
         size = sum(shard.stat().st_size for shard in shards)
         seconds = time.perf_counter() - start
-        made = f"{seconds:.0f} s" if {*shards} - before else f"all there before; to make them anew, remove {output}"
-        note(f"{output}: {len(shards)} shards, {loaded.images} images, {size / 1e6:.3g} MB, {made}", is_quiet)
+        made_text = (
+            f"{seconds:.0f} s"
+            if {*shards} - existing_shards
+            else f"all there before; to make them anew, remove {output}"
+        )
+        note(f"{output}: {len(shards)} shards, {loaded_fit.images} images, {size / 1e6:.3g} MB, {made_text}", is_quiet)

@@ -115,9 +115,9 @@ def load(file: Path, options: MeshOptions, is_quiet: bool, **settings: Any) -> S
     if file.suffix.lower() not in MESH_SUFFIXES:
         for name, value in options._asdict().items():
             if value is not None:
-                shown = " ".join(map(str, value)) if isinstance(value, tuple) else value
+                shown_value = " ".join(map(str, value)) if isinstance(value, tuple) else value
                 option, key = f"--{name.replace('_', '-')}", _KEYS_OF_SCENES[name]
-                raise ValueError(f"{option}: got {shown} with {file}, expected a mesh; scene files have {key}")
+                raise ValueError(f"{option}: got {shown_value} with {file}, expected a mesh; scene files have {key}")
         return load_scene(file, **settings)
     body = Body(file)
     up: str | None = options.up
@@ -128,9 +128,9 @@ def load(file: Path, options: MeshOptions, is_quiet: bool, **settings: Any) -> S
     width, height = map(int, options.size or ("512", "512"))
     direction = options.direction or DIRECTION
     scene = default_scene(body, up=up, size=(width, height), light=options.light, direction=direction)
-    turned = turned_light(scene.light, options.light_rotation or 0.0, 1.0)
+    rotated_light = turned_light(scene.light, options.light_rotation or 0.0, 1.0)
     bounces = settings.pop("bounces", scene.bounces)
-    return replace(scene, light=turned, visibility=Visibility.of(settings), bounces=bounces)
+    return replace(scene, light=rotated_light, visibility=Visibility.of(settings), bounces=bounces)
 
 
 def count_of_bounces(text: str) -> Any:

@@ -37,12 +37,12 @@ def spheres(
             check_matplotlib()
         if output is not None:
             check_output(output, ".npz")
-        loaded = load_mesh(mesh)
+        loaded_mesh = load_mesh(mesh)
         if count is not None and error is not None:
             raise ValueError("--count, --error: got both, expected one of them")
-        requested = {"count": count or "auto"} if error is None else {"error": error}
-        fit = fit_spheres(loaded, seed=seed, device=device_of(device), progress=True, **requested)
-        typer.echo(f"{mesh}: {loaded.vertex_count} vertices, {loaded.face_count} faces")
+        requested_spheres = {"count": count or "auto"} if error is None else {"error": error}
+        fit = fit_spheres(loaded_mesh, seed=seed, device=device_of(device), progress=True, **requested_spheres)
+        typer.echo(f"{mesh}: {loaded_mesh.vertex_count} vertices, {loaded_mesh.face_count} faces")
         report = fit.report
         remark = ", read from the cache" if report.cached else ""
         typer.echo(f"{report.sphere_count} spheres, fitted in {report.seconds:.1f} s{remark}")
@@ -56,7 +56,7 @@ def spheres(
         if output is not None:
             fit.spheres.write(output)
         if picture is not None:
-            plot_spheres(loaded, fit.spheres, picture)
+            plot_spheres(loaded_mesh, fit.spheres, picture)
         if error is not None and report.visibility_error > error:
             raise ValueError(
                 f"--error: no fit reaches {error:g}; {report.sphere_count} spheres, the most that are tried, have "
@@ -71,8 +71,10 @@ def _judgement(report: FitReport) -> str:
     hint = "the error on the surface counts where the body deforms, else it traces its shadow on itself"
     if report.shadow_error <= RAGGED_ERROR:
         return f"the shadow on the ground is whole, as its error is below {RAGGED_ERROR:.0%}; {hint}"
-    more = f"--count {2 * report.sphere_count}" if report.sphere_count < MAX_SPHERES else 'method = "ray-traced"'
-    return f"the shadow on the ground has holes, as its error is above {RAGGED_ERROR:.0%}; {more} may mend them; {hint}"
+    advice = f"--count {2 * report.sphere_count}" if report.sphere_count < MAX_SPHERES else 'method = "ray-traced"'
+    return (
+        f"the shadow on the ground has holes, as its error is above {RAGGED_ERROR:.0%}; {advice} may mend them; {hint}"
+    )
 
 
 @app.command()
@@ -97,8 +99,8 @@ def envmap(
         check_output(sh_path, ".exr")
         light = EnvironmentMap.read(file, sanitize=sanitize)
         for name, value in light.statistics().items():
-            shown = " ".join(f"{number:.4g}" for number in np.array(value).ravel())
-            typer.echo(f"{name.replace('_', ' '):26}{shown}")
+            shown_numbers = " ".join(f"{number:.4g}" for number in np.array(value).ravel())
+            typer.echo(f"{name.replace('_', ' '):26}{shown_numbers}")
         write_image(sh_path, sh.reconstruct_map(light.sh(order), len(light.radiance)).astype(np.float32))
         note(f"{sh_path}: reconstruction from {order**2} coefficients", is_quiet)
 
@@ -148,11 +150,11 @@ def warmup(device: Device = "cpu", is_quiet: Quiet = False) -> None:
     from warpshadow.spheres import fit_spheres
 
     with clear_errors():
-        where = device_of(device)
+        warp_device = device_of(device)
         mesh = icosphere(subdivisions=1)
         start = time.perf_counter()
         with progress_bar(len(METHODS) + 1, "compiling", "stage", stays=True) as bar:
-            fit_spheres(mesh, 1, steps=100, device=where, cache=False, progress=False)
+            fit_spheres(mesh, 1, steps=100, device=warp_device, cache=False, progress=False)
             bar.update()
             for method in METHODS:
                 scene = Scene(
@@ -161,6 +163,6 @@ def warmup(device: Device = "cpu", is_quiet: Quiet = False) -> None:
                     Camera.look_at((0, 0, 5), (0, 0, 0), size=(8, 8)),
                     Visibility.of({"method": method, "samples": 16}),
                 )
-                SceneRenderer(scene, device=where).render()
+                SceneRenderer(scene, device=warp_device).render()
                 bar.update()
-        note(f"{where.alias}: ready in {time.perf_counter() - start:.1f} s", is_quiet)
+        note(f"{warp_device.alias}: ready in {time.perf_counter() - start:.1f} s", is_quiet)

@@ -30,7 +30,9 @@ class _Render(typer.core.TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Read the command line."""
         if not any(text.startswith("-o") or text.partition("=")[0] == "--output" for text in args):
-            alone = [text for before, text in itertools.pairwise(args) if not before.startswith("-")]
+            alone = [
+                text for previous_argument, text in itertools.pairwise(args) if not previous_argument.startswith("-")
+            ]
             for text in alone:
                 if Path(text).suffix.lower() in (".exr", *SUFFIXES, *VIDEO_SUFFIXES):
                     raise typer.BadParameter(f"expected -o {text}", ctx, param_hint=text)
@@ -173,31 +175,35 @@ def render(
             raise ValueError(f"--{error}{others}") from error
         arguments: dict[str, Any] = {"method": method, "samples": samples, "bounces": bounces}
         arguments = {name: value for name, value in arguments.items() if value is not None}
-        parsed = load(scene, mesh_options, is_quiet, **arguments)
-        where = device_of(device)
-        loaded = parsed
-        if parsed.visibility.method == AUTO:
-            loaded = resolved(parsed, device=where, progress=True)
-            note(f"auto: {describe(loaded)}", is_quiet)
-        loaded = for_picture(loaded if video is None or stills else loaded.with_method())
+        parsed_scene = load(scene, mesh_options, is_quiet, **arguments)
+        warp_device = device_of(device)
+        loaded_scene = parsed_scene
+        if parsed_scene.visibility.method == AUTO:
+            loaded_scene = resolved(parsed_scene, device=warp_device, progress=True)
+            note(f"auto: {describe(loaded_scene)}", is_quiet)
+        loaded_scene = for_picture(loaded_scene if video is None or stills else loaded_scene.with_method())
         start = time.perf_counter()
         if video is not None:
-            cameras = path.cameras(loaded.camera) if path is not None else loaded.camera.around(loaded, turntable or 1)
-            if not stills and (remark := remark_on_stills(parsed, len(cameras), device=where)):
+            cameras = (
+                path.cameras(loaded_scene.camera)
+                if path is not None
+                else loaded_scene.camera.around(loaded_scene, turntable or 1)
+            )
+            if not stills and (remark := remark_on_stills(parsed_scene, len(cameras), device=warp_device)):
                 note(remark, is_quiet)
-            frames = _frames(loaded, cameras, where, exposure, tone, background)
+            frames = _frames(loaded_scene, cameras, warp_device, exposure, tone, background)
             write_video(output, frames, fps=rate)
             note(f"{output}: {len(cameras)} frames, rendered in {time.perf_counter() - start:.2f} s", is_quiet)
             return
-        renderer = SceneRenderer(loaded, device=where, progress=True)
+        renderer = SceneRenderer(loaded_scene, device=warp_device, progress=True)
         image = renderer.render()
         seconds = time.perf_counter() - start
-        summary = f"{loaded.visibility.method}, {image.shape[1]} × {image.shape[0]}, {seconds:.2f} s"
+        summary = f"{loaded_scene.visibility.method}, {image.shape[1]} × {image.shape[0]}, {seconds:.2f} s"
         if output.suffix.lower() == ".exr":
             write_image(output, image, layers=renderer.layers().channels() if layers else None)
             note(f"{output}: {summary}", is_quiet)
         for file in (item for item in (output, png) if item is not None and item.suffix.lower() != ".exr"):
-            picture = Picture(image, exposure=exposure, tone=tone, background=_behind(loaded, background))
+            picture = Picture(image, exposure=exposure, tone=tone, background=_behind(loaded_scene, background))
             write_image(file, picture)
             note(f"{file}: {f'{summary}, ' * (file == output)}exposure {picture.exposure:+.2f} stops", is_quiet)
 
@@ -220,8 +226,8 @@ def _frames(
 
     def picture(camera: Camera, exposure: float | None) -> Picture:
         image = renderer.with_cameras([camera]).render()[0]
-        behind = _behind(replace(scene, camera=camera), background)
-        return Picture(image, exposure=exposure, tone=tone, background=behind)
+        background_image = _behind(replace(scene, camera=camera), background)
+        return Picture(image, exposure=exposure, tone=tone, background=background_image)
 
     first = picture(cameras[0], exposure)  # its set-up, fits and tracing, has bars of its own
     with progress_bar(len(cameras), "rendering", "frame", done=1) as bar:

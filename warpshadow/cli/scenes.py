@@ -41,9 +41,9 @@ def scene(
         if mesh is None:
             mesh = write_bunny(output.parent)
             note(f"{mesh}: Warp's bunny", is_quiet)
-        loaded = load(mesh, mesh_options, is_quiet)
+        loaded_scene = load(mesh, mesh_options, is_quiet)
         direction, rotation = mesh_options.direction or DIRECTION, mesh_options.light_rotation or 0.0
-        write_starter(output, mesh, loaded, light=mesh_options.light, direction=direction, rotation=rotation)
+        write_starter(output, mesh, loaded_scene, light=mesh_options.light, direction=direction, rotation=rotation)
         note(f"{output}: warpshadow view {output} shows it", is_quiet)
 
 
@@ -71,9 +71,9 @@ def insert(
 
     with clear_errors():
         check_output(output, ".exr", *SUFFIXES)
-        loaded, where = load_scene(scene), device_of(device)
+        loaded_scene, warp_device = load_scene(scene), device_of(device)
         start = time.perf_counter()
-        image = insert_bodies(loaded, into, exposure=exposure, device=where)
+        image = insert_bodies(loaded_scene, into, exposure=exposure, device=warp_device)
         write_image(output, image)
         height, width, _ = image.shape
         note(f"{output}: {width} × {height}, {time.perf_counter() - start:.2f} s", is_quiet)
@@ -94,9 +94,9 @@ def view(
 ) -> None:
     """Show a scene, or a mesh on a ground under a sky, in the browser, to be turned with the mouse, until Ctrl+C."""
     with clear_errors():
-        loaded = load(scene, mesh_options, is_quiet)
+        loaded_scene = load(scene, mesh_options, is_quiet)
         file = scene if scene.suffix.lower() == ".toml" else None
-        viewer = serve(loaded, host=host, port=port, device=device_of(device), path=file)
+        viewer = serve(loaded_scene, host=host, port=port, device=device_of(device), path=file)
         with contextlib.suppress(KeyboardInterrupt):  # from the first moment that a page can be seen
             typer.echo(f"{viewer.url}   (Ctrl+C ends it)")
             viewer.open(browser)
@@ -140,25 +140,26 @@ def tune(
     with clear_errors():
         if (error is None) == (ms is None):
             raise ValueError(f"--error, --ms: got {'neither' if error is None else 'both'}, expected one of them")
-        loaded = load(scene, mesh_options, is_quiet)
-        where = device_of(device)
-        tuning = tune_scene(
-            loaded, error=error, milliseconds=ms, bounces=bounces, fits=fit, device=where, progress=True
+        loaded_scene = load(scene, mesh_options, is_quiet)
+        warp_device = device_of(device)
+        tuning_result = tune_scene(
+            loaded_scene, error=error, milliseconds=ms, bounces=bounces, fits=fit, device=warp_device, progress=True
         )
-        typer.echo(f"{scene}\n{tuning}\n")
-        if not tuning.is_reached:
-            requested = f"an error of {error:g}" if ms is None else f"{ms:g} ms"
+        typer.echo(f"{scene}\n{tuning_result}\n")
+        if not tuning_result.is_reached:
+            requested_text = f"an error of {error:g}" if ms is None else f"{ms:g} ms"
             raise ValueError(
-                f"no setting reaches {requested}; nearest is {describe(tuning.scene)}, with an error of "
-                f"{tuning.error:.3g} in {tuning.milliseconds:.3g} ms; {_next_attempt(tuning, ms is None)}"
+                f"no setting reaches {requested_text}; nearest is {describe(tuning_result.scene)}, with an error of "
+                f"{tuning_result.error:.3g} in {tuning_result.milliseconds:.3g} ms; "
+                f"{_next_attempt(tuning_result, ms is None)}"
             )
-        typer.echo(tuning.toml(), nl=False)
+        typer.echo(tuning_result.toml(), nl=False)
 
 
-def _next_attempt(tuning: "Tuning", is_inaccurate: bool) -> str:
+def _next_attempt(tuning_result: "Tuning", is_inaccurate: bool) -> str:
     """Suggestions for reaching an error that no setting reached."""
     if not is_inaccurate:
         return "try a smaller image or fewer samples a pixel (supersampling = 1)"
-    if tuning.untried_counts:
-        return f"try --fit, which also fits {', '.join(map(str, tuning.untried_counts))} spheres a body"
+    if tuning_result.untried_counts:
+        return f"try --fit, which also fits {', '.join(map(str, tuning_result.untried_counts))} spheres a body"
     return 'try more spheres for the bodies that cast shadows, or rays: method = "ray-traced"'

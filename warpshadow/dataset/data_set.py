@@ -58,8 +58,8 @@ class DataSet:
 
     def __init__(self, recipe: Recipe, *, device: wp.DeviceLike = "cpu", progress: bool = True):
         check.instance("recipe", recipe, Recipe, "a Recipe; load_recipe(path) reads one")
-        where = check.device("device", device)
-        self.recipe, self.device = recipe, str(where)
+        render_device = check.device("device", device)
+        self.recipe, self.device = recipe, str(render_device)
         for split in recipe.splits:
             if not self.numbers(split):
                 raise RecipeError(f"[splits]: {split} got none of the {recipe.images} images, expected one or more")
@@ -90,10 +90,10 @@ class DataSet:
         """The assets of a split; RecipeError if there are none."""
         names = {}
         for kind, hashes in self.hashes.items():
-            owners = {name: _split_of(self.recipe, content) for name, content in hashes.items()}
-            names[kind] = tuple(name for name, owner in owners.items() if owner == split)
+            split_of_names = {name: _split_of(self.recipe, content) for name, content in hashes.items()}
+            names[kind] = tuple(name for name, name_split in split_of_names.items() if name_split == split)
             if not names[kind]:
-                counts = ", ".join(f"{item} {list(owners.values()).count(item)}" for item in self.recipe.splits)
+                counts = ", ".join(f"{item} {list(split_of_names.values()).count(item)}" for item in self.recipe.splits)
                 raise RecipeError(
                     f"[splits]: {split} got none of the {len(hashes)} {kind} ({counts}), expected one or more: try "
                     "another seed, a larger part, or more files"
@@ -103,8 +103,8 @@ class DataSet:
     def numbers(self, split: str) -> range:
         """Numbers of the images of a split; splits follow one another."""
         check.choice("split", split, self.recipe.splits)
-        ends = [round(self.recipe.images * part) for part in itertools.accumulate(self.recipe.splits.values())]
-        starts = dict(zip(self.recipe.splits, itertools.pairwise([0, *ends]), strict=True))
+        split_ends = [round(self.recipe.images * part) for part in itertools.accumulate(self.recipe.splits.values())]
+        starts = dict(zip(self.recipe.splits, itertools.pairwise([0, *split_ends]), strict=True))
         return range(*starts[split])
 
     def split_of(self, number: int) -> str:
@@ -135,9 +135,11 @@ class DataSet:
 
 def _split_of(recipe: Recipe, content: str) -> str:
     """The split that a content hash belongs to."""
-    place = int(hashlib.sha256(f"{recipe.seed} {content}".encode()).hexdigest()[:16], 16) / 16**16
-    ends = itertools.accumulate(recipe.splits.values())
-    return next((split for split, end in zip(recipe.splits, ends, strict=True) if place < end), [*recipe.splits][-1])
+    position = int(hashlib.sha256(f"{recipe.seed} {content}".encode()).hexdigest()[:16], 16) / 16**16
+    split_ends = itertools.accumulate(recipe.splits.values())
+    return next(
+        (split for split, end in zip(recipe.splits, split_ends, strict=True) if position < end), [*recipe.splits][-1]
+    )
 
 
 # ---------------------------------------------------------------------------------------------- files
@@ -152,10 +154,10 @@ class _LazyFiles(Sequence[Item], Generic[Item]):
     def __len__(self) -> int:
         return len(self._names)
 
-    def __getitem__(self, place):
+    def __getitem__(self, position):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # all warnings about a file were given when the data set was made
-            return self._read(self._folder / self._names[place])
+            return self._read(self._folder / self._names[position])
 
 
 class _ReadMesh(NamedTuple):
@@ -189,14 +191,14 @@ def _read_map(path: Path) -> EnvironmentMap:
 
 
 def _hashes(
-    folder: Path, what: str, suffixes: Sequence[str], hash_of: Callable[[Path], str], progress: bool
+    folder: Path, noun: str, suffixes: Sequence[str], hash_of: Callable[[Path], str], progress: bool
 ) -> dict[str, str]:
     """Hashes of the files below a folder, by their names in it; RecipeError names all faults."""
     paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in suffixes and path.is_file())
     if not paths:
-        raise RecipeError(f"{what}: got the folder {folder} without any, expected files {', '.join(suffixes)}")
+        raise RecipeError(f"{noun}: got the folder {folder} without any, expected files {', '.join(suffixes)}")
     hashes, faults = {}, []
-    with progress_bar(len(paths), f"reading {what}", "file", shows=progress) as bar:
+    with progress_bar(len(paths), f"reading {noun}", "file", shows=progress) as bar:
         for path in paths:
             try:
                 with check.located(str(path)):
@@ -205,7 +207,7 @@ def _hashes(
                 faults.append(str(fault).replace(f"{path}: mesh: {path}: ", f"{path}: "))
             bar.update()
     if faults:
-        more = f"\nand {len(faults) - _LISTED_FAULTS} more" * (len(faults) > _LISTED_FAULTS)
+        rest_text = f"\nand {len(faults) - _LISTED_FAULTS} more" * (len(faults) > _LISTED_FAULTS)
         listed = "\n".join(faults[:_LISTED_FAULTS])
-        raise RecipeError(f"{what}: got {len(faults)} of {len(paths)} that cannot be used:\n{listed}{more}")
+        raise RecipeError(f"{noun}: got {len(faults)} of {len(paths)} that cannot be used:\n{listed}{rest_text}")
     return hashes

@@ -27,7 +27,7 @@ Channels = dict[str, np.ndarray]  # float32 of shape [height, width], by names
 
 
 class Coding(Protocol):
-    """How the channels of a picture become codes."""
+    """Conversion of a picture's channels to codes."""
 
     def codes(self, values: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
         """Encode values [height, width, channel]; return the codes and their range."""
@@ -49,12 +49,12 @@ class Even:
     high: float = 1.0
 
     def codes(self, values: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
-        """As :class:`Coding` says."""
+        """Encode channels; see :class:`Coding`."""
         maximum = 2**self.bits - 1
         rounding = (self.high - self.low) / maximum / 2
-        minimum, largest = float(values.min()), float(values.max())
+        minimum, maximum_value = float(values.min()), float(values.max())
         low = minimum if minimum < self.low - rounding else self.low
-        high = largest if largest > self.high + rounding else self.high
+        high = maximum_value if maximum_value > self.high + rounding else self.high
         codes = np.rint((values.astype(np.float64) - low) / (high - low) * maximum).clip(0, maximum)
         return codes.astype(np.uint8 if self.bits == 8 else np.uint16), {"range": [low, high]}
 
@@ -63,14 +63,14 @@ class Srgb:
     """Color and coverage in 8 bits: sRGB, not premultiplied, exposed so that the brightest value is just white."""
 
     def codes(self, values: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
-        """As :class:`Coding` says."""
+        """Encode channels; see :class:`Coding`."""
         alpha = np.rint(values[..., 3:].astype(np.float64) * 255).clip(0, 255)
         color = np.divide(values[..., :3], values[..., 3:], out=np.zeros_like(values[..., :3]), where=alpha > 0)
-        brightest = float(color.max())
-        exposure = -float(np.log2(brightest)) if brightest > 0 else 0.0
-        encoded = linear_to_srgb((color.astype(np.float64) * 2**exposure).clip(0, 1))
+        max_radiance = float(color.max())
+        exposure = -float(np.log2(max_radiance)) if max_radiance > 0 else 0.0
+        encoded_color = linear_to_srgb((color.astype(np.float64) * 2**exposure).clip(0, 1))
         about = {"exposure": exposure, "below_zero": float((color < 0).any(axis=-1).mean())}
-        return np.concatenate([np.rint(encoded * 255), alpha], axis=-1).astype(np.uint8), about
+        return np.concatenate([np.rint(encoded_color * 255), alpha], axis=-1).astype(np.uint8), about
 
 
 def as_png(channels: Channels, coding: Coding) -> tuple[bytes, dict[str, Any]]:

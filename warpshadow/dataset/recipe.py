@@ -79,7 +79,7 @@ class Recipe:
     def __post_init__(self) -> None:
         check.integer("images", self.images)
         check.integer("seed", self.seed, minimum=0)
-        check.integer("shard", self.shard, what="images")
+        check.integer("shard", self.shard, unit="images")
         check.instance("layers", self.layers, (list, tuple), f"a list of some of {', '.join(map(repr, _LAYERS))}")
         for layer in self.layers:
             check.choice("layers", layer, _LAYERS)
@@ -173,9 +173,9 @@ def _table(values: Table, name: str) -> Table:
     with check.located(f"[{name}]"):
         table: Table = values.get(name, {})
         toml_tables.check_table(table)
-        known = _KEYS[name]
-        if known is not None:
-            check.known_keys("key", table, known)
+        known_keys = _KEYS[name]
+        if known_keys is not None:
+            check.known_keys("key", table, known_keys)
         return table
 
 

@@ -45,7 +45,7 @@ class Sample(NamedTuple):
     spheres: np.ndarray | None
     """float32 of shape [sphere, 5]: center, radius [scene units], number of the body; None where the layer is not."""
     scene: dict[str, Plain]
-    """How the scene was drawn."""
+    """Random choices of the scene."""
 
     @property
     def color(self) -> np.ndarray:
@@ -67,17 +67,17 @@ def render_sample(data_set: DataSet, number: int) -> dict[str, bytes]:
     The bits depend on the recipe, the number, and the content of the scene's meshes and maps; neither on earlier
     renders nor on the number of threads.
     """
-    recipe, drawn = data_set.recipe, data_set.draw(number)
-    shown = LazyLayers(drawn.scene, data_set.device, recipe.ranges.count[1] + 1)
-    result = {name: layer.find(shown) for name, layer in LAYERS.items() if name in recipe.layers}
-    about, files = _about(data_set, number, drawn), {}
+    recipe, drawn_scene = data_set.recipe, data_set.draw(number)
+    lazy_layers = LazyLayers(drawn_scene.scene, data_set.device, recipe.ranges.count[1] + 1)
+    result = {name: layer.find(lazy_layers) for name, layer in LAYERS.items() if name in recipe.layers}
+    about, files = _about(data_set, number, drawn_scene), {}
     if result and recipe.format == "exr":
         files["exr"] = exr_bytes({name: values for layer in result.values() for name, values in layer.items()})
     elif result:
         files, about["png"] = _pictures(result)
     if "spheres" in recipe.layers:
         stream = io.BytesIO()
-        np.save(stream, _spheres(drawn.scene))
+        np.save(stream, _spheres(drawn_scene.scene))
         files["spheres.npy"] = stream.getvalue()
     files["json"] = json.dumps(about, ensure_ascii=False).encode()
     return files
@@ -88,8 +88,8 @@ def _pictures(result: dict[str, Channels]) -> tuple[dict[str, bytes], dict[str, 
     files: dict[str, bytes] = {}
     about: dict[str, Plain] = {}
     for name, channels in result.items():
-        for ending, shown in LAYERS[name].pictures(name, channels).items():
-            files[ending], about[ending] = as_png(shown, LAYERS[name].coding)
+        for ending, png_channels in LAYERS[name].pictures(name, channels).items():
+            files[ending], about[ending] = as_png(png_channels, LAYERS[name].coding)
     return files, about
 
 
@@ -98,23 +98,23 @@ def _spheres(scene: Scene) -> np.ndarray:
     rows = [np.zeros((0, 5), np.float32)]
     for number, body in enumerate(scene.bodies):
         if isinstance(body.blockers, Spheres):
-            placed = body.blockers.transformed(
+            placed_spheres = body.blockers.transformed(
                 rotation=body.rotation_matrix(), translation=body.translation, scale=body.scale
             )
-            owner = np.full((len(placed), 1), number)
-            rows.append(np.concatenate([placed.centers, placed.radii[:, None], owner], axis=1))
+            body_numbers = np.full((len(placed_spheres), 1), number)
+            rows.append(np.concatenate([placed_spheres.centers, placed_spheres.radii[:, None], body_numbers], axis=1))
     return np.concatenate(rows).astype(np.float32)
 
 
-def _about(data_set: DataSet, number: int, drawn: DrawnScene) -> dict[str, Plain]:
-    """How a scene was drawn."""
-    scene, recipe, split = drawn.scene, data_set.recipe, data_set.split_of(number)
+def _about(data_set: DataSet, number: int, drawn_scene: DrawnScene) -> dict[str, Plain]:
+    """Random choices of a scene."""
+    scene, recipe, split = drawn_scene.scene, data_set.recipe, data_set.split_of(number)
     stock = data_set.stocks[split]
-    meshes = [stock.meshes[place] for place in drawn.prototypes]
+    meshes = [stock.meshes[prototype] for prototype in drawn_scene.prototypes]
     light: dict[str, Plain] = {}
-    if drawn.light is not None and stock.maps is not None:
-        turned = {"rotation": drawn.light.rotation, "scale": drawn.light.scale}
-        light |= {"map": stock.maps[drawn.light.number], **turned}
+    if drawn_scene.light is not None and stock.maps is not None:
+        light_placement = {"rotation": drawn_scene.light.rotation, "scale": drawn_scene.light.scale}
+        light |= {"map": stock.maps[drawn_scene.light.number], **light_placement}
     if "light" in recipe.layers and isinstance(scene.light, EnvironmentMap):
         light["sh"] = _numbers(scene.light.sh(LIGHT_ORDER))
     return {
@@ -128,8 +128,12 @@ def _about(data_set: DataSet, number: int, drawn: DrawnScene) -> dict[str, Plain
 
 def _placed(body: Body, mesh: str) -> dict[str, Plain]:
     albedo = None if body.texture is not None or body.albedo.ndim > 1 else _numbers(body.albedo)
-    place = {"rotation": body.rotation.tolist(), "translation": body.translation.tolist(), "scale": float(body.scale)}
-    return {"mesh": mesh, "albedo": albedo, **place}
+    pose_record = {
+        "rotation": body.rotation.tolist(),
+        "translation": body.translation.tolist(),
+        "scale": float(body.scale),
+    }
+    return {"mesh": mesh, "albedo": albedo, **pose_record}
 
 
 def _numbers(values: np.ndarray) -> Plain:

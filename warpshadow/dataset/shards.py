@@ -33,9 +33,9 @@ class Shard(NamedTuple):
     """A .tar file of a data set."""
 
     name: str
-    """Of the file: its split, and its number in that."""
+    """File name: the split, and the number within it."""
     numbers: range
-    """Of its images."""
+    """Numbers of its images."""
 
 
 def shards_of(data_set: DataSet) -> list[Shard]:
@@ -73,15 +73,18 @@ def write_shards(
     shards = shards_of(data_set)
     with _locked_folder(folder):
         _prepare_folder(folder, describe(data_set))
-        missing = [shard for shard in shards if not (folder / shard.name).exists()]
-        numbers = [number for shard in missing for number in shard.numbers]
-        rendered, warned = _render_all(data_set, numbers, _worker_count(data_set, workers)), set[str]()
-        with contextlib.closing(rendered), progress_bar(len(numbers), "rendering", "image", shows=progress) as bar:
-            for shard in missing:
+        missing_shards = [shard for shard in shards if not (folder / shard.name).exists()]
+        numbers = [number for shard in missing_shards for number in shard.numbers]
+        rendered_images, warned_kinds = _render_all(data_set, numbers, _worker_count(data_set, workers)), set[str]()
+        with (
+            contextlib.closing(rendered_images),
+            progress_bar(len(numbers), "rendering", "image", shows=progress) as bar,
+        ):
+            for shard in missing_shards:
                 with _new_archive(folder / shard.name) as archive:
                     for number in shard.numbers:
-                        sample, remarks = next(rendered)
-                        _warn_once(remarks, number, warned)
+                        sample, remarks = next(rendered_images)
+                        _warn_once(remarks, number, warned_kinds)
                         _add(archive, number, sample)
                         bar.update()
     return [folder / shard.name for shard in shards]
@@ -89,7 +92,7 @@ def write_shards(
 
 def _worker_count(data_set: DataSet, workers: int | None) -> int:
     if workers is not None:
-        return check.integer("workers", workers, what="processes")
+        return check.integer("workers", workers, unit="processes")
     return thread_count() if data_set.device == "cpu" else 1
 
 
@@ -110,13 +113,13 @@ def _render(data_set: DataSet, number: int) -> _Rendered:
     return _Rendered(files, [str(item.message) for item in caught])
 
 
-def _warn_once(remarks: list[str], number: int, warned: set[str]) -> None:
+def _warn_once(remarks: list[str], number: int, warned_kinds: set[str]) -> None:
     """Give each warning once for all images, ignoring names and numbers."""
     for remark in remarks:
         kinds = {re.sub(r"'[^']*'|[\d.]+", "", part) for part in remark.split("; ")}
-        if not kinds <= warned:
+        if not kinds <= warned_kinds:
             check.warn(f"image {number}: {remark}")
-        warned.update(kinds)
+        warned_kinds.update(kinds)
 
 
 def _render_all(data_set: DataSet, numbers: Sequence[int], workers: int) -> Generator[_Rendered, None, None]:
@@ -128,20 +131,23 @@ def _render_all(data_set: DataSet, numbers: Sequence[int], workers: int) -> Gene
         finally:
             gc.unfreeze()  # of a process that has other things to do
         return
-    early: dict[int, _Rendered] = {}
-    with contextlib.closing(run_tasks(render, numbers, workers=workers)) as ended:
+    early_images: dict[int, _Rendered] = {}
+    with contextlib.closing(run_tasks(render, numbers, workers=workers)) as finished_images:
         for number in numbers:
-            while number not in early:
-                done, rendered, error = next(ended)
-                if rendered is None:
-                    raise ChildProcessError(f"image {done}: {error}") from error
-                early[done] = rendered
-            yield early.pop(number)
+            while number not in early_images:
+                done_number, rendered_image, error = next(finished_images)
+                if rendered_image is None:
+                    raise ChildProcessError(f"image {done_number}: {error}") from error
+                early_images[done_number] = rendered_image
+            yield early_images.pop(number)
 
 
 @contextlib.contextmanager
 def _new_archive(path: Path) -> Iterator[tarfile.TarFile]:
-    with files.atomic_write(path) as unfinished, tarfile.open(unfinished, "w", format=tarfile.USTAR_FORMAT) as archive:
+    with (
+        files.atomic_write(path) as temporary_path,
+        tarfile.open(temporary_path, "w", format=tarfile.USTAR_FORMAT) as archive,
+    ):
         yield archive
 
 
@@ -180,9 +186,9 @@ def _locked_folder(folder: Path) -> Iterator[None]:
     """Hold a folder against other processes."""
     from filelock import Timeout
 
-    with contextlib.ExitStack() as held:
+    with contextlib.ExitStack() as lock_stack:
         try:
-            held.enter_context(files.locked(folder / INDEX, timeout=0))
+            lock_stack.enter_context(files.locked(folder / INDEX, timeout=0))
         except Timeout as error:
             raise FileExistsError(f"{folder}: another process writes into this folder") from error
         yield
@@ -201,19 +207,21 @@ def _prepare_folder(folder: Path, about: dict[str, Plain]) -> None:
     else:
         if others := sorted(item.name for item in folder.iterdir() if not item.name.startswith(".")):
             raise FileExistsError(f"{folder}: got a folder with {others[0]} in it, expected a new one or one of shards")
-        with files.atomic_write(path) as unfinished:
-            unfinished.write_text(json.dumps(about, indent=1, ensure_ascii=False), encoding="utf-8")
-    for unfinished in folder.glob(".*.unfinished.tar"):
-        unfinished.unlink(missing_ok=True)
+        with files.atomic_write(path) as temporary_path:
+            temporary_path.write_text(json.dumps(about, indent=1, ensure_ascii=False), encoding="utf-8")
+    for temporary_path in folder.glob(".*.unfinished.tar"):
+        temporary_path.unlink(missing_ok=True)
 
 
-def _difference(result: Plain, requested: Plain, where: str = "") -> str:
+def _difference(result: Plain, requested: Plain, position_text: str = "") -> str:
     """The first difference of two indices, in words; nothing if there is none."""
     if isinstance(result, dict) and isinstance(requested, dict):
         for key in [*requested, *(key for key in result if key not in requested)]:
             if key not in result or key not in requested:
-                return f"{where}{key} is {'new' if key in requested else 'gone'}"
-            if difference := _difference(result[key], requested[key], f"{where}{key}: "):
+                return f"{position_text}{key} is {'new' if key in requested else 'gone'}"
+            if difference := _difference(result[key], requested[key], f"{position_text}{key}: "):
                 return difference
         return ""
-    return "" if result == requested else f"{where}was {check.described(result)}, is {check.described(requested)}"
+    return (
+        "" if result == requested else f"{position_text}was {check.described(result)}, is {check.described(requested)}"
+    )

@@ -1,1 +1,1 @@
-"""How kernels are launched: the tape, slices on all cores, lanes, batches, constants, CUDA graphs."""
+"""Kernel launches: the tape, slices on all cores, lanes, batches, constants, CUDA graphs."""

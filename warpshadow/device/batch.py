@@ -22,11 +22,11 @@ def common_batch(arrays: Mapping[str, Any]) -> int:
     first, count = next(((name, count) for name, count in counts.items() if count != 1), ("", 1))
     for name, got in counts.items():
         if got not in (1, count):
-            item, whole = (of.replace("geometry.positions", "the poses of geometry") for of in (first, name))
+            item, second = (of.replace("geometry.positions", "the poses of geometry") for of in (first, name))
             raise ValueError(
                 f"{name}: got a batch of {got}, expected 1 or {count}, as {first} has; for all {got * count} pairs "
-                f"repeat each of {item} {got} times in a row, in torch repeat_interleave({got}, 0), and all of {whole} "
-                f"{count} times, repeat({count}, 1, …)"
+                f"repeat each of {item} {got} times in a row, in torch repeat_interleave({got}, 0), and all of "
+                f"{second} {count} times, repeat({count}, 1, …)"
             )
     return count
 
@@ -45,11 +45,11 @@ def _make_copy(dtype: type) -> wp.Kernel:
         part: wp.array2d(dtype=dtype),
         first: int,
         # out
-        whole: wp.array2d(dtype=dtype),
+        joined: wp.array2d(dtype=dtype),
     ):
         """A thread owns an item of an instance."""
         batch, item = wp.tid()
-        whole[batch, first + item] = part[instance_in(batch, part.shape[0]), instance_in(item, part.shape[1])]
+        joined[batch, first + item] = part[instance_in(batch, part.shape[0]), instance_in(item, part.shape[1])]
 
     return copy
 
@@ -65,12 +65,12 @@ def concatenate(parts: Sequence[wp.array], counts: Sequence[int], *, instances: 
     """
     if instances is None:
         instances = common_batch({f"part {number}": part for number, part in enumerate(parts)})
-    whole = empty((instances, sum(counts)), dtype=parts[0].dtype, device=parts[0].device)
+    joined = empty((instances, sum(counts)), dtype=parts[0].dtype, device=parts[0].device)
     first = 0
     for part, count in zip(parts, counts, strict=True):
-        launch(_make_copy(part.dtype), (instances, count), inputs=[part, first], outputs=[whole])
+        launch(_make_copy(part.dtype), (instances, count), inputs=[part, first], outputs=[joined])
         first += count
-    return whole
+    return joined
 
 
 def cut(array: wp.array, first: int, end: int) -> wp.array:

@@ -54,30 +54,30 @@ def run_on_ray(
             raise ConnectionError(f"ray: got {address!r}, where no cluster is reached ({reason})") from error
     head = ray.get_runtime_context().gcs_address
     remote: Any = ray.remote(num_cpus=1, num_gpus=int(is_on_gpu), max_retries=attempts - 1)(_alone)
-    remaining, pending = iter(tasks), dict[Any, Task]()
+    remaining_tasks, pending_tasks = iter(tasks), dict[Any, Task]()
     try:
         while True:
             _await(head)
             # some more than there are cores for, so that none waits for us
             maximum = workers or 2 * max(1, int(ray.cluster_resources().get("CPU", 0)))
-            for task in itertools.islice(remaining, max(0, maximum - len(pending))):
+            for task in itertools.islice(remaining_tasks, max(0, maximum - len(pending_tasks))):
                 try:
-                    pending[remote.remote(function, pack(task, ray.cloudpickle.dumps))] = task
+                    pending_tasks[remote.remote(function, pack(task, ray.cloudpickle.dumps))] = task
                 except PackError as error:
                     yield TaskResult(task, None, error)
-            if not pending:
+            if not pending_tasks:
                 return
-            for reference in ray.wait([*pending], timeout=_HEAD_TIMEOUT / 2)[0]:
-                task = pending.pop(reference)
+            for reference in ray.wait([*pending_tasks], timeout=_HEAD_TIMEOUT / 2)[0]:
+                task = pending_tasks.pop(reference)
                 try:
-                    ended = TaskResult(task, *unpack(ray.get(reference)))
+                    ended_task = TaskResult(task, *unpack(ray.get(reference)))
                 except ray.exceptions.LocalRayletDiedError as error:
                     raise ConnectionError("ray: this machine's node has died") from error
                 except ray.exceptions.RayTaskError as error:
-                    ended = TaskResult(task, None, RuntimeError(str(error).splitlines()[-1]))
+                    ended_task = TaskResult(task, None, RuntimeError(str(error).splitlines()[-1]))
                 except ray.exceptions.RayError as error:
-                    ended = TaskResult(task, None, WorkerDied(f"{str(error).splitlines()[0]} ({attempts} times)"))
-                yield ended
+                    ended_task = TaskResult(task, None, WorkerDied(f"{str(error).splitlines()[0]} ({attempts} times)"))
+                yield ended_task
     finally:
         if is_ours:
             ray.shutdown()
@@ -97,9 +97,9 @@ def _await(head: str) -> None:
             time.sleep(1)
 
 
-def _alone(function: Callable[[Any], Any], packed: bytes) -> bytes:
+def _alone(function: Callable[[Any], Any], packed_task: bytes) -> bytes:
     """Do a task on one core."""
     import ray
 
     set_up(1)
-    return answer(function, packed, ray.cloudpickle.dumps, Exception)  # other exceptions end the task for Ray
+    return answer(function, packed_task, ray.cloudpickle.dumps, Exception)  # other exceptions end the task for Ray

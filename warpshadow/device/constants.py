@@ -38,16 +38,16 @@ def cached_by_values(function: Callable[P, R]) -> Callable[P, R]:
     def cached(*args: P.args, **kwargs: P.kwargs) -> R:
         assert not kwargs
         key = tuple(map(_key, args))
-        result = results.get(key)
-        if result is None:
+        cached_result = results.get(key)
+        if cached_result is None:
             with collected() as arrays:
-                result = function(*args), arrays  # type: ignore[call-arg]
+                cached_result = function(*args), arrays  # type: ignore[call-arg]
             while len(results) >= _MAX_RESULTS:
                 results.pop(next(iter(results)), None)
-            results[key] = result
+            results[key] = cached_result
         elif _collections:
-            use(*result[1])
-        return result[0]
+            use(*cached_result[1])
+        return cached_result[0]
 
     return cached
 

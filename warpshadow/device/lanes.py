@@ -89,9 +89,9 @@ def _from_environment(name: str, choices: tuple[int, ...]) -> int | None:
 
 def register_bits() -> int:
     """Width of the vector registers that kernels with lanes are compiled for [bits]."""
-    forced = _from_environment(BITS_VARIABLE, REGISTER_BITS)
-    if forced is not None:
-        return forced
+    forced_bits = _from_environment(BITS_VARIABLE, REGISTER_BITS)
+    if forced_bits is not None:
+        return forced_bits
     features = _cpu_features() if _HOST_FLAG in _own_flags().split() else frozenset()
     return 512 if "avx512f" in features else 256 if "avx" in features else 128
 
@@ -122,10 +122,10 @@ def _accepted_flags(base: str, flags: tuple[str, ...]) -> str:
     """Join flags, without the ones that the compiler refuses, of which a warning tells."""
     if _builds(" ".join((base, *flags))):
         return " ".join((base, *flags))
-    refused = [flag for flag in flags if not _builds(f"{base} {flag}")]
-    message = f"Warp's compiler refuses {' '.join(refused)}: kernels are built without, and may be slow"
+    refused_flags = [flag for flag in flags if not _builds(f"{base} {flag}")]
+    message = f"Warp's compiler refuses {' '.join(refused_flags)}: kernels are built without, and may be slow"
     check.warn(message)
-    return " ".join((base, *(flag for flag in flags if flag not in refused)))
+    return " ".join((base, *(flag for flag in flags if flag not in refused_flags)))
 
 
 def _make_empty(flags: str) -> wp.Kernel:
@@ -371,8 +371,8 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
             root[lane] = wp.sqrt(value[lane])
         return root
 
-    made = locals()
-    return LaneFunctions(*(made[name] for name in LaneFunctions._fields))
+    functions = locals()
+    return LaneFunctions(*(functions[name] for name in LaneFunctions._fields))
 
 
 def as_chunks(rows: wp.array | None) -> wp.array | None:

@@ -1,4 +1,4 @@
-"""Launching: run kernels, and record on the tape what their gradients need.
+"""Launching: run kernels, and record their adjoints on the tape.
 
 A kernel has either Warp's own adjoint, which the tape plays back, in slices where the kernel runs in slices; or one
 written by hand as another kernel (``enable_backward=False``), which :func:`differentiable` pairs with it. Either way a
@@ -96,12 +96,12 @@ def varies(values: Iterable[Any]) -> bool:
 
 
 def without_gradient(array: wp.array) -> wp.array:
-    """The same array without a gradient."""
+    """View an array without its gradient."""
     if not array.requires_grad:
         return array
-    same = reshaped(array, array.shape)
-    same.requires_grad = False
-    return same
+    flat_array = reshaped(array, array.shape)
+    flat_array.requires_grad = False
+    return flat_array
 
 
 def _require_gradient(output: wp.array, kernel: wp.Kernel) -> None:
@@ -109,5 +109,5 @@ def _require_gradient(output: wp.array, kernel: wp.Kernel) -> None:
     if output.requires_grad or not is_real:
         return
     if is_view(output):
-        raise RuntimeError(f"{kernel.key}: got an output that is a view, whose gradient nobody else would have")
+        raise RuntimeError(f"{kernel.key}: got an output that is a view, which has no gradient of its own")
     require_gradient(output)

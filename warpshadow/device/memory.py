@@ -2,7 +2,8 @@
 
 Memory that is new to a process comes in pages of 4 kB, each of which stops the kernel that first writes to it. Of
 receivers × directions there are 100 MB: their pages took a fifth of a forward call on 64 small images, and a quarter of
-one with gradients. Huge pages, of 2 MB, take a fourth of that. Linux gives them to who asks; elsewhere nobody is asked.
+one with gradients. Huge pages, of 2 MB, take a fourth of that. Linux gives them on request; other systems are not
+asked.
 """
 
 import ctypes
@@ -31,7 +32,7 @@ def _advise() -> Callable[[int, int, int], int] | None:
 
 
 def in_huge_pages(array: wp.array) -> wp.array:
-    """Ask for huge pages for an array that nobody has written to yet, if it is large. Returns the array.
+    """Request huge pages for a large array before its first write. Returns the array.
 
     It is a request: where the system refuses, memory comes in small pages as before.
     """
@@ -43,7 +44,7 @@ def in_huge_pages(array: wp.array) -> wp.array:
 
 
 def empty(shape: int | Sequence[int], dtype: type, device: wp.DeviceLike) -> wp.array:
-    """Make an array of memory that nobody has written to: ``wp.empty``, but quicker."""
+    """Make an array of uninitialized memory: ``wp.empty``, but quicker."""
     return new_array(shape, dtype, device if isinstance(device, wp.Device) else wp.get_device(device))
 
 

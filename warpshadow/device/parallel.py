@@ -90,12 +90,12 @@ if hasattr(os, "register_at_fork"):
 
 
 @wp.func
-def scratch_place(worker: int, row: int):
+def scratch_slot(worker: int, row: int):
     """The scratch memory that a kernel's thread may use."""
-    place = worker
+    slot = worker
     if worker < 0:
-        place = row
-    return place
+        slot = row
+    return slot
 
 
 @wp.func
@@ -106,7 +106,7 @@ def split_row(row: int, count: int):
 
 
 class Scratch(NamedTuple):
-    """Memory that a kernel's thread writes to and nobody reads later, an array's row [*shape] for each."""
+    """Scratch memory of a kernel: a row [*shape] of an array for each thread, not read after the launch."""
 
     shape: tuple[int, ...]
     dtype: type
@@ -151,9 +151,17 @@ def launch_slices(
 ) -> None:
     """Launch a kernel off the tape, on a CPU in slices that threads share; see :func:`.launch.launch`."""
     rows = 0 if not scratch else thread_count() if device.is_cpu else math.prod(_shape(dim))
-    before = [*inputs, *(empty((rows, *shape), dtype=dtype, device=device) for shape, dtype in scratch), *outputs]
-    summed = {place: array for place, array in enumerate(sums, 2 + len(before)) if array is not None}
-    _launch_slices(kernel, dim, cost, [*before, *sums], summed, None, device)
+    leading_arguments = [
+        *inputs,
+        *(empty((rows, *shape), dtype=dtype, device=device) for shape, dtype in scratch),
+        *outputs,
+    ]
+    summed_arguments = {
+        argument_index: array
+        for argument_index, array in enumerate(sums, 2 + len(leading_arguments))
+        if array is not None
+    }
+    _launch_slices(kernel, dim, cost, [*leading_arguments, *sums], summed_arguments, None, device)
 
 
 def launch_adjoint_slices(
@@ -173,12 +181,12 @@ def launch_adjoint_slices(
     """
     arguments = [*inputs, *outputs]
     gradients = gradients_of(arguments)
-    summed = {
-        place: value.grad
-        for place, value in enumerate(inputs, 2)
+    summed_arguments = {
+        argument_index: value.grad
+        for argument_index, value in enumerate(inputs, 2)
         if isinstance(value, wp.array) and value.requires_grad and any(value is array for array in shared)
     }
-    _launch_slices(kernel, dim, cost, arguments, summed, gradients, device)
+    _launch_slices(kernel, dim, cost, arguments, summed_arguments, gradients, device)
 
 
 def _shape(dim: int | Sequence[int]) -> Sequence[int]:
@@ -190,42 +198,48 @@ def _launch_slices(
     dim: int | Sequence[int],
     cost: float,
     arguments: Sequence[Any],
-    summed: dict[int, wp.array],
+    summed_arguments: dict[int, wp.array],
     gradients: Sequence[wp.array | None] | None,
     device: wp.Device,
 ) -> None:
     """Launch a kernel, or its adjoint where gradients of its arguments are given.
 
     Args:
-        summed: What all rows add to, by the place of the argument that it is, or is the gradient of.
+        summed_arguments: Arrays to which all rows add, by argument index; a gradient has the index of its argument.
     """
     dim, workers = _shape(dim), thread_count()
     arguments = [0, 0 if device.is_cpu else -1, *arguments]
     gradients = None if gradients is None else [None, None, *gradients]
-    maximum, least_work = _SLICES_PER_THREAD * workers, _MIN_WORK
-    if summed:  # as many for any number of threads
-        least_work = _MIN_SUMMED_WORK
-        maximum = min(_SUMMED_SLICES, max(2, _SUMMED_SIZE // max(1, *(array.size for array in summed.values()))))
+    maximum, min_work = _SLICES_PER_THREAD * workers, _MIN_WORK
+    if summed_arguments:  # as many for any number of threads
+        min_work = _MIN_SUMMED_WORK
+        maximum = min(
+            _SUMMED_SLICES, max(2, _SUMMED_SIZE // max(1, *(array.size for array in summed_arguments.values())))
+        )
     is_divisible = device.is_cpu and not device.is_capturing
-    slice_count = min(dim[0], maximum, int(math.prod(dim) * cost / least_work)) if is_divisible else 1
+    slice_count = min(dim[0], maximum, int(math.prod(dim) * cost / min_work)) if is_divisible else 1
     launch = functools.partial(warp_internals.bound_kernel, kernel, device=device)
-    if not summed and slice_count > workers:
+    if not summed_arguments and slice_count > workers:
         slice_count -= slice_count % workers  # as many for each thread
-    if slice_count <= 1 or (not summed and workers == 1):
+    if slice_count <= 1 or (not summed_arguments and workers == 1):
         launch(arguments, gradients=gradients)(dim)
         return
     slice_sums = {
-        place: zeros((slice_count, *array.shape), array.dtype, device=device) for place, array in summed.items()
+        argument_index: zeros((slice_count, *array.shape), array.dtype, device=device)
+        for argument_index, array in summed_arguments.items()
     }
     kernel.module.load(device, 1)  # compiled here, not by each thread
     launches = [] if slice_sums else [launch(arguments, gradients=gradients)] * slice_count
     for number in range(len(launches), slice_count):
         values, adjoints = list(arguments), None if gradients is None else list(gradients)
-        for place, parts in slice_sums.items():
+        for argument_index, parts in slice_sums.items():
             if adjoints is None:
-                values[place] = parts[number]
+                values[argument_index] = parts[number]
             else:
-                values[place], adjoints[place] = _with_gradient(values[place], parts[number]), parts[number]
+                values[argument_index], adjoints[argument_index] = (
+                    _with_gradient(values[argument_index], parts[number]),
+                    parts[number],
+                )
         launches.append(launch(values, gradients=adjoints))
     starts = [dim[0] * k // slice_count for k in range(slice_count + 1)]
 
@@ -233,18 +247,18 @@ def _launch_slices(
         launches[number]((starts[number + 1] - starts[number], *dim[1:]), starts[number], worker)
 
     _share(run, slice_count, workers)
-    for place, parts in slice_sums.items():
-        summed[place].numpy()[...] += parts.numpy().sum(axis=0)
+    for argument_index, parts in slice_sums.items():
+        summed_arguments[argument_index].numpy()[...] += parts.numpy().sum(axis=0)
 
 
 def _with_gradient(array: wp.array, gradient: wp.array) -> wp.array:
-    """The same array with another gradient: to that a kernel adds where it reads a row of the array as an array."""
+    """View an array with another gradient, to which kernels add that read a row of the array as an array."""
     assert array.is_contiguous
     return wp.array(ptr=array.ptr, dtype=array.dtype, shape=array.shape, device=array.device, grad=gradient)
 
 
 def _share(run: Callable[[int, int], None], slice_count: int, workers: int) -> None:
-    """Run slices, by their numbers and those of their threads, on the calling thread and the threads of the pool.
+    """Run slices, by slice and thread index, on the calling thread and the threads of the pool.
 
     Each begins with a part of its own, the same in every launch, so that rows stay in the caches of one core from
     kernel to kernel; one that is done takes over from the end of another's part. Threads that got no core before all
@@ -254,14 +268,14 @@ def _share(run: Callable[[int, int], None], slice_count: int, workers: int) -> N
     bounds = [slice_count * worker // count for worker in range(count + 1)]
     parts = [collections.deque(range(first, end)) for first, end in itertools.pairwise(bounds)]
     absent = collections.deque(range(1, count))  # threads that have not begun
-    ends: queue.SimpleQueue[BaseException | None] = queue.SimpleQueue()
+    finished: queue.SimpleQueue[BaseException | None] = queue.SimpleQueue()
 
-    def work(worker: int) -> None:
+    def run_slices(worker: int) -> None:
         for part in (parts[worker], *parts[worker + 1 :], *parts[:worker]):
-            take = part.popleft if part is parts[worker] else part.pop
+            take_slice = part.popleft if part is parts[worker] else part.pop
             while True:
                 try:
-                    number = take()
+                    number = take_slice()
                 except IndexError:
                     break
                 run(number, worker)
@@ -273,22 +287,22 @@ def _share(run: Callable[[int, int], None], slice_count: int, workers: int) -> N
             return
         failure = None
         try:
-            work(worker)
+            run_slices(worker)
         except BaseException as error:  # the calling thread raises it
             failure = error
-        ends.put(failure)
+        finished.put(failure)
 
     offers = _pool(workers)
     for _ in range(1, count):
         offers.put(help_out)
     try:
-        work(0)
+        run_slices(0)
     finally:
         begun = count - 1
         while absent:
             with contextlib.suppress(IndexError):
                 absent.pop()
                 begun -= 1
-        failures = [failure for failure in (ends.get() for _ in range(begun)) if failure is not None]
+        failures = [failure for failure in (finished.get() for _ in range(begun)) if failure is not None]
     if failures:
         raise failures[0]

@@ -66,7 +66,7 @@ def announce(work: str, seconds: float, alternative: str, *, shows: bool = True)
     """Announce work of more than half a minute: its time, and a setting that avoids it.
 
     Args:
-        work: What is done, such as "tracing the shadow of a body on itself".
+        work: Name of the work, such as "tracing the shadow of a body on itself".
         seconds: How long it takes on one thread [s]; it runs on all.
         alternative: A setting that avoids the work, such as 'method="ray-traced" needs none'.
         shows: Whether to say it.
@@ -87,15 +87,15 @@ class Wait:
     """Work that somebody waits for, and how much of it is done.
 
     Args:
-        what: Label of the work, such as "shading".
+        label: Label of the work, such as "shading".
         total: Number of units; None where it is not known.
         unit: Unit of the count, such as "receiver"; empty where nothing is counted.
         done: Units that were done before.
         patience: Time before lines tell of it, and of work within it [s].
     """
 
-    def __init__(self, what: str = "", total: int | None = None, unit: str = "", done: int = 0, patience: float = 0.0):
-        self.what, self.total, self.unit, self.done, self.patience = what, total, unit, done, patience
+    def __init__(self, label: str = "", total: int | None = None, unit: str = "", done: int = 0, patience: float = 0.0):
+        self.label, self.total, self.unit, self.done, self.patience = label, total, unit, done, patience
         self.remark = ""
         self.bar: Any = None  # tqdm's, where it shows one
         self.outer_bar: Any = None  # or that in which its words show
@@ -103,7 +103,7 @@ class Wait:
 
     @property
     def age(self) -> float:
-        """How long it takes so far [s]."""
+        """Elapsed time [s]."""
         return time.monotonic() - self._start
 
     def update(self, count: int = 1) -> None:
@@ -112,7 +112,7 @@ class Wait:
         if self.bar is not None:
             self.bar.update(count)
         elif self.outer_bar is not None and self.age >= _DELAY:
-            self.outer_bar.set_postfix_str(self.what)
+            self.outer_bar.set_postfix_str(self.label)
             self.outer_bar = None  # said
 
     def expect(self, left: int) -> None:
@@ -126,15 +126,15 @@ class Wait:
                 self.bar.container.children[1].max = self.total
             self.bar.refresh()
 
-    def describe(self, what: str, remark: str = "") -> None:
+    def describe(self, label: str, remark: str = "") -> None:
         """Label the bar, from its next update, with the work under way and a remark on it."""
-        self.what, self.remark = what, remark
+        self.label, self.remark = label, remark
         if self.bar is not None:
-            self.bar.set_description_str(what, refresh=False)
+            self.bar.set_description_str(label, refresh=False)
             self.bar.set_postfix_str(remark, refresh=False)
 
     def line(self) -> str:
-        """How far it is, for people."""
+        """Progress, as text."""
         parts = [show_time(self.age)]
         if self.unit and self.total is not None:
             parts.insert(0, f"{self.done:,} of {self.total:,} {self.unit}s")
@@ -143,7 +143,7 @@ class Wait:
                 parts.append(f"{show_time(left)} left")
         if self.remark:
             parts.append(self.remark)
-        return f"{self.what}: {', '.join(parts)}"
+        return f"{self.label}: {', '.join(parts)}"
 
 
 class _ThreadState(threading.local):
@@ -169,9 +169,9 @@ class _Reporter:
     def begin(self, waits: list[Wait]) -> None:
         """Report the waits of a thread from now on."""
         with self._lock:
-            now = time.monotonic()
-            if not self._waits_of_threads and now - self._ended >= _LINE_INTERVAL:
-                self._reported = now
+            current_time = time.monotonic()
+            if not self._waits_of_threads and current_time - self._ended >= _LINE_INTERVAL:
+                self._reported = current_time
             self._waits_of_threads.append(waits)
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="warpshadow-progress", daemon=True)
@@ -183,7 +183,9 @@ class _Reporter:
         with self._lock:
             yield
             if not waits:
-                self._waits_of_threads = [others for others in self._waits_of_threads if others is not waits]
+                self._waits_of_threads = [
+                    other_waits for other_waits in self._waits_of_threads if other_waits is not waits
+                ]
                 self._ended = time.monotonic()
 
     def _run(self) -> None:
@@ -210,7 +212,7 @@ def _refresh(waits: list[Wait]) -> None:
     bar = next((wait.bar for wait in waits if wait.bar is not None), None)
     if bar is not None and not in_ipython():
         if waits[-1].outer_bar is bar:
-            bar.set_postfix_str(waits[-1].what, refresh=False)
+            bar.set_postfix_str(waits[-1].label, refresh=False)
         bar.refresh()
 
 
@@ -220,11 +222,11 @@ if hasattr(os, "register_at_fork"):  # a child has its lock, but not its thread
 
 
 @contextlib.contextmanager
-def waiting(what: str, *, shows: bool = True) -> Iterator[None]:
+def waiting(label: str, *, shows: bool = True) -> Iterator[None]:
     """Say in files every ten seconds that a block runs, if it lasts as long; bars within it show as without.
 
     Args:
-        what: Label of the work, such as "rendering".
+        label: Label of the work, such as "rendering".
         shows: Whether to say anything, of compiled kernels too.
     """
     if _this_thread.waits or _this_thread.is_hidden:
@@ -232,7 +234,7 @@ def waiting(what: str, *, shows: bool = True) -> Iterator[None]:
         return
     _this_thread.is_hidden = not shows
     try:
-        with _within(Wait(what, patience=_LINE_INTERVAL), shows=shows):
+        with _within(Wait(label, patience=_LINE_INTERVAL), shows=shows):
             yield
     finally:
         _this_thread.is_hidden = False
@@ -240,7 +242,7 @@ def waiting(what: str, *, shows: bool = True) -> Iterator[None]:
 
 @contextlib.contextmanager
 def progress_bar(
-    total: int | None, what: str, unit: str, *, done: int = 0, shows: bool = True, stays: bool = False
+    total: int | None, label: str, unit: str, *, done: int = 0, shows: bool = True, stays: bool = False
 ) -> Iterator[Wait]:
     """Show a bar while a block runs, if that takes longer than a second; within another bar, its words alone.
 
@@ -248,7 +250,7 @@ def progress_bar(
 
     Args:
         total: Number of units; None where it is not known.
-        what: Label of the work, such as "shading".
+        label: Label of the work, such as "shading".
         unit: Unit of the count, such as "receiver"; empty where nothing is counted.
         done: Units that were done before.
         shows: Whether to show it.
@@ -256,7 +258,7 @@ def progress_bar(
     Returns:
         On it the block calls ``update(count)``, and ``expect(left)`` where it ends early.
     """
-    wait = Wait(what, total, unit, done)
+    wait = Wait(label, total, unit, done)
     shows = shows and _bars_show
     if shows and _can_be_seen():
         wait.outer_bar = next((outer.bar for outer in _this_thread.waits if outer.bar is not None), None)
@@ -267,7 +269,7 @@ def progress_bar(
 
             only_time = {} if unit else {"bar_format": "{desc} [{elapsed}]"}
             delay = 0 if stays else _DELAY
-            wait.bar = tqdm(total=total, desc=what, unit=unit, initial=done, delay=delay, leave=stays, **only_time)
+            wait.bar = tqdm(total=total, desc=label, unit=unit, initial=done, delay=delay, leave=stays, **only_time)
     with _within(wait, shows=shows):
         yield wait
 
@@ -298,8 +300,8 @@ _module_numbers = itertools.count(1)
 
 def _compiling() -> contextlib.AbstractContextManager:
     """Say that kernels are compiled, and of which module of this process."""
-    what = f"compiling kernels, module {next(_module_numbers)}"
-    return progress_bar(None, what, "", shows=not _this_thread.is_hidden)
+    label = f"compiling kernels, module {next(_module_numbers)}"
+    return progress_bar(None, label, "", shows=not _this_thread.is_hidden)
 
 
 around_compilation(_compiling)

@@ -13,7 +13,7 @@ _STEPS = 4  # sizes for each power of two: a block is less than a fourth larger 
 
 
 class SpareMemory:
-    """Takes blocks of memory and keeps those that were given back, up to a limit.
+    """Allocates blocks of memory and caches freed blocks, up to a limit.
 
     It may be called from any thread, and by the garbage collector in the midst of a call of its own.
 
@@ -29,7 +29,7 @@ class SpareMemory:
         steps = [2**octave * (_STEPS + step) // _STEPS for octave in octaves for step in range(_STEPS)]
         self._blocks: dict[int, list[int]] = {size: [] for size in steps if size <= _MAX_BYTES}
         self._lock = threading.RLock()
-        self.cached_bytes = 0  # of blocks that nobody uses
+        self.cached_bytes = 0  # of freed blocks
 
     def take(self, size: int) -> int:
         """Take a block of at least ``size`` bytes; returns its address, 0 where there is no memory."""

@@ -22,7 +22,7 @@ def start_quietly() -> None:
     sys.stderr.flush()
     terminal = os.dup(2)
     reader, writer = os.pipe()
-    os.set_blocking(writer, False)  # should it be full, the rest is lost: nobody reads while Warp starts
+    os.set_blocking(writer, False)  # should it be full, the rest is lost: there is no reader while Warp starts
     try:
         os.dup2(writer, 2)
         wp.init()

@@ -73,7 +73,7 @@ _NO_ARRAY = _types.array_t()  # the descriptor of an argument None
 
 @functools.cache
 def _cpu_signature(kernel: wp.Kernel) -> tuple[Any, Any, list[Any], dict] | None:
-    """How a CPU kernel takes its arguments.
+    """Calling convention of a CPU kernel.
 
     Returns:
         Structs of the arguments and of their gradients; dtype and dimensions of each array, None of a struct, and ()
@@ -83,38 +83,38 @@ def _cpu_signature(kernel: wp.Kernel) -> tuple[Any, Any, list[Any], dict] | None
     if kernel.is_generic or not kernel.uses_warp_entry_point_abi:
         return None
     fields: list[tuple[str, Any]] = []
-    kinds: list[Any] = []
+    argument_types: list[Any] = []
     for number, argument in enumerate(kernel.adj.args):
         kind = argument.type
         if _types.is_array(kind):
             if type(kind) is not wp.array:
                 return None
             field = _types.array_t
-            kinds.append((kind.dtype, kind.ndim))
+            argument_types.append((kind.dtype, kind.ndim))
         elif isinstance(kind, wp._src.codegen.Struct):
             field = kind.ctype
-            kinds.append(None)
+            argument_types.append(None)
         elif isinstance(kind, type) and issubclass(kind, ctypes.Array):
             field = kind
-            kinds.append(())
+            argument_types.append(())
         elif kind in (wp.bool, wp.int32, wp.uint32, wp.int64, wp.uint64, wp.float32, wp.float64):
             field = kind._type_
-            kinds.append(())
+            argument_types.append(())
         else:
             return None
         fields.append((f"argument_{number}", field))
     arguments, gradients = (type(name, (ctypes.Structure,), {"_fields_": fields}) for name in ("Values", "Gradients"))
-    return arguments, gradients, kinds, {}
+    return arguments, gradients, argument_types, {}
 
 
-def _packed(kinds: Sequence[Any], values: Sequence[Any]) -> list[Any]:
+def _packed(argument_types: Sequence[Any], values: Sequence[Any]) -> list[Any]:
     """Values as fields of a struct of arguments.
 
     Raises:
         TypeError: for an array that is not of the dtype and dimensions.
     """
     fields = []
-    for kind, value in zip(kinds, values, strict=True):
+    for kind, value in zip(argument_types, values, strict=True):
         if kind is None:
             fields.append(value.__ctype__())
         elif not kind:
@@ -133,15 +133,19 @@ def _cpu_bounds(dim: tuple[int, ...], kernel_dimensions: int) -> Any:
     return ctypes.byref(wp._src.context._build_launch_bounds_from_tuple(dim, kernel_dimensions))
 
 
-def _cpu_hooks(kernel: wp.Kernel, loaded: dict[str, Any], device: wp.Device) -> Any:
+def _cpu_hooks(kernel: wp.Kernel, loaded_hooks: dict[str, Any], device: wp.Device) -> Any:
     """Entry points of a kernel, of its module as it was loaded or is loaded now."""
     module = kernel.module
     hasher = module.hashers.get(1)  # another one if anything of the module changed
-    if hasher is None or loaded.get("hasher") is not hasher or module.execs.get((None, 1)) is not loaded["module"]:
+    if (
+        hasher is None
+        or loaded_hooks.get("hasher") is not hasher
+        or module.execs.get((None, 1)) is not loaded_hooks["module"]
+    ):
         executable = module.load(device, 1)
         hooks = executable.get_kernel_hooks(kernel)
-        loaded.update(module=executable, hooks=hooks, hasher=module.hashers.get(1))
-    return loaded["hooks"]
+        loaded_hooks.update(module=executable, hooks=hooks, hasher=module.hashers.get(1))
+    return loaded_hooks["hooks"]
 
 
 def bound_kernel(
@@ -152,23 +156,24 @@ def bound_kernel(
     It takes the dimensions of a launch, and then values in place of the first arguments, if they are others each time.
 
     On a CPU arguments go straight to the compiled function: ``wp.launch`` takes ten times as long to look at them as
-    small kernels run. Warp launches what is unusual, such as an argument of a wrong type, of which it tells.
+    small kernels run. Warp itself launches unusual calls, such as with an argument of a wrong type, and reports the
+    error.
     """
     signature = _cpu_signature(kernel) if device.is_cpu else None
     is_plain = wp._src.context.runtime._apic_capture is None and not wp.config.print_launches
     if signature is not None and is_plain and (fields := _fields(signature, arguments, gradients)) is not None:
-        (values, *others), (_, _, _, loaded), names = fields, signature, signature[0]._fields_
+        (values, *others), (_, _, _, loaded_hooks), names = fields, signature, signature[0]._fields_
         adjoints = [ctypes.byref(other) for other in others]
 
         def run_plainly(dim: Sequence[int], *first: Any, holds: Any = (arguments, gradients)) -> None:
-            copied = values
+            copied_values = values
             if first:
-                copied = type(values).from_buffer_copy(values)
+                copied_values = type(values).from_buffer_copy(values)
                 for (name, _), value in zip(names, first, strict=False):
-                    setattr(copied, name, value)
+                    setattr(copied_values, name, value)
             if 0 not in dim:
-                hooks, bounds = _cpu_hooks(kernel, loaded, device), _cpu_bounds(tuple(dim), kernel.adj.kernel_dim)
-                (hooks.backward if adjoints else hooks.forward)(bounds, ctypes.byref(copied), *adjoints)
+                hooks, bounds = _cpu_hooks(kernel, loaded_hooks, device), _cpu_bounds(tuple(dim), kernel.adj.kernel_dim)
+                (hooks.backward if adjoints else hooks.forward)(bounds, ctypes.byref(copied_values), *adjoints)
 
         return run_plainly
 
@@ -182,15 +187,15 @@ def bound_kernel(
 
 def _fields(signature: tuple, arguments: Sequence[Any], gradients: Sequence[Any] | None) -> list[Any] | None:
     """Structs of arguments, and of their gradients if there are any; None where they are not as the kernel's are."""
-    arguments_type, gradients_type, kinds, _ = signature
-    if len(arguments) != len(kinds):
+    arguments_type, gradients_type, argument_types, _ = signature
+    if len(arguments) != len(argument_types):
         return None
     try:
-        fields = [arguments_type(*_packed(kinds, arguments))]
+        fields = [arguments_type(*_packed(argument_types, arguments))]
         if gradients is not None:
-            pairs = zip(kinds, gradients_type._fields_, gradients, strict=True)
+            pairs = zip(argument_types, gradients_type._fields_, gradients, strict=True)
             values = [field() if not kind and value is None else value for kind, (_, field), value in pairs]
-            fields.append(gradients_type(*_packed(kinds, values)))
+            fields.append(gradients_type(*_packed(argument_types, values)))
     except (TypeError, AttributeError):
         return None
     return fields
@@ -216,7 +221,7 @@ def _free(pointer: int, size: int) -> None:
 
 
 def new_array(shape: int | Sequence[int], dtype: type, device: wp.Device) -> wp.array:
-    """Make an array of memory that nobody has written to, as ``wp.empty`` does in three times the time."""
+    """Make an array of uninitialized memory, in a third of the time of ``wp.empty``."""
     runtime = wp._src.context.runtime
     if not device.is_cpu or runtime._apic_capture is not None:
         return wp.empty(shape, dtype, device=device)
@@ -295,7 +300,7 @@ def kernel_modules() -> dict[str, wp.Module]:
 
 
 def around_compilation(context: Callable[[], contextlib.AbstractContextManager]) -> None:
-    """From now on, compile modules of kernels within a context, and one that several processes need in one of them.
+    """Compile modules of kernels within a context from now on; of several processes, one compiles.
 
     The others wait, and load it from Warp's cache. Should the one be killed, its lock ends with it, and the next
     compiles. A module that was compiled before, maybe where nothing can be written, is read without.
@@ -331,7 +336,7 @@ def _locked(folder: str) -> Iterator[None]:
 
 
 def load_silently(package: str) -> None:
-    """From now on, load modules of a package's kernels without Warp's line for each.
+    """Load modules of a package's kernels from now on without Warp's line for each.
 
     Its other messages stay, and so do these where ``wp.config.log_level`` is ``wp.LOG_DEBUG``.
     """

@@ -1,7 +1,7 @@
 """Sums over warps: threads of a GPU that add to one place at the same time sum first, and one of them adds.
 
 Thousands of receivers add to the gradients of a few dozen spheres, and an atomic for each would queue up at a few
-addresses. The 32 threads of a warp reach a sphere together, so those that do need one atomic (``warp_lanes.py`` among
+addresses. The 32 threads of a warp reach a sphere together, so they need one atomic (``warp_lanes.py`` among
 the demos' tools counts them). On a CPU, whose threads have sums of their own, a sum is the value itself.
 """
 
@@ -28,7 +28,7 @@ SUM_OF_PEERS = """
 """
 """CUDA: sums[COUNT] of the threads with the same place, on the first of them, and 0 on the others.
 
-The threads that are here with one place, *peers*, halve their number in each step: those of odd rank have given their
+The threads that are here with one place, *peers*, halve their number in each step: peers of odd rank have given their
 sums to the one before and are left out.
 """
 

@@ -51,11 +51,11 @@ class _Worker(Generic[Task, Result]):
         self.has: tuple[Task, int] | None = None
         self.has_started = False
 
-    def begin(self, task: Task, packed: bytes, attempt: int) -> None:
+    def begin(self, task: Task, packed_task: bytes, attempt: int) -> None:
         """Let it do a task; should it be dead, that is noticed as if it died of the task."""
         self.has = task, attempt
         with contextlib.suppress(OSError):
-            self.connection.send_bytes(packed)
+            self.connection.send_bytes(packed_task)
 
     def end(self) -> int | None:
         """End the process, and return its exit status."""
@@ -89,20 +89,22 @@ def run_tasks(
         ChildProcessError: where no process can start.
     """
     threads = threads or max(1, thread_count() // workers)
-    untried, again = ((task, 1) for task in tasks), deque[tuple[Task, int]]()
+    new_tasks, repeated_tasks = ((task, 1) for task in tasks), deque[tuple[Task, int]]()
     idle: list[_Worker[Task, Result]] = []
     busy: dict[object, _Worker[Task, Result]] = {}  # by their connections
     try:
         while True:
-            while len(busy) < workers and (following := again.popleft() if again else next(untried, None)):
-                task, attempt = following
+            while len(busy) < workers and (
+                next_task := repeated_tasks.popleft() if repeated_tasks else next(new_tasks, None)
+            ):
+                task, attempt = next_task
                 try:
-                    packed = pack(task)
+                    packed_task = pack(task)
                 except PackError as failure:
                     yield TaskResult(task, None, failure)
                     continue
                 worker = idle.pop() if idle else _Worker(function, threads)
-                worker.begin(task, packed, attempt)
+                worker.begin(task, packed_task, attempt)
                 busy[worker.connection] = worker
             if not busy:
                 return
@@ -111,13 +113,13 @@ def run_tasks(
                 assert worker.has is not None
                 task, attempt = worker.has
                 try:
-                    packed = worker.connection.recv_bytes()
+                    packed_task = worker.connection.recv_bytes()
                     if not worker.has_started:  # the first that it says
                         worker.has_started = True
                         busy[connection] = worker
                         continue
                     idle.append(worker)
-                    result, error = unpack(packed)
+                    result, error = unpack(packed_task)
                 except (EOFError, OSError):
                     status = worker.end()
                     if not worker.has_started and status is not None and status >= 0:
@@ -126,7 +128,7 @@ def run_tasks(
                             'does under if __name__ == "__main__":'
                         ) from None
                     if attempt < attempts:
-                        again.append((task, attempt + 1))
+                        repeated_tasks.append((task, attempt + 1))
                         continue
                     result, error = None, WorkerDied(f"its process ended {_in_words(status)}, {attempts} times")
                 yield TaskResult(task, result, error)
@@ -158,13 +160,13 @@ def pack(task: object, dumps: Dumps = pickle.dumps) -> bytes:
 
 def answer(
     function: Callable[[Any], Any],
-    packed: bytes,
+    packed_task: bytes,
     dumps: Dumps = pickle.dumps,
     caught: type[BaseException] = BaseException,
 ) -> bytes:
     """Do a task that was packed, and pickle its result and its error; that of sys.exit(), too, is only the task's."""
     try:
-        result = function(pickle.loads(packed))
+        result = function(pickle.loads(packed_task))
     except caught as error:
         return pickle.dumps((None, _sendable(error)))
     try:
@@ -173,10 +175,10 @@ def answer(
         return pickle.dumps((None, PackError(f"the result cannot be pickled ({_described(error)})")))
 
 
-def unpack(answered: bytes) -> tuple[Any, Exception | None]:
+def unpack(answer: bytes) -> tuple[Any, Exception | None]:
     """The result and the error of a task that was answered."""
     try:
-        return pickle.loads(answered)
+        return pickle.loads(answer)
     except Exception as error:
         return None, PackError(f"the result cannot be unpickled ({_described(error)})")
 
@@ -206,10 +208,10 @@ def _serve(connection: Connection, function: Callable[[Task], Result], threads: 
     connection.send_bytes(b"")
     while True:
         try:
-            packed = connection.recv_bytes()
+            packed_task = connection.recv_bytes()
         except EOFError:
             return
-        connection.send_bytes(answer(function, packed))
+        connection.send_bytes(answer(function, packed_task))
 
 
 def set_up(threads: int) -> None:

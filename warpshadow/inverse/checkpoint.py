@@ -59,8 +59,8 @@ def save(path: AnyPath, state: Mapping[str, object]) -> None:
     buffer = io.BytesIO()
     torch.save(state, buffer)
     payload = buffer.getvalue()
-    with files.atomic_write(path) as unfinished:
-        with unfinished.open("wb") as file:
+    with files.atomic_write(path) as temporary_path:
+        with temporary_path.open("wb") as file:
             file.write(_FILE_HEADER + hashlib.sha256(payload).digest() + payload)
             file.flush()
             os.fsync(file.fileno())
@@ -124,5 +124,5 @@ def _state(path: Path, payload: bytes) -> dict[str, Any]:
 
 
 def previous_path(path: Path) -> Path:
-    """Where the checkpoint before the last is kept."""
+    """Path of the previous checkpoint."""
     return path.with_name(f"{path.name}.previous")

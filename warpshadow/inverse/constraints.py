@@ -68,23 +68,23 @@ class PoseConstraint:
         return torch.as_tensor(self.shifts).to(values).T @ values
 
     def touching(
-        self, middle: torch.Tensor, rotation: torch.Tensor, scale: torch.Tensor, center: torch.Tensor
+        self, pivot: torch.Tensor, rotation: torch.Tensor, scale: torch.Tensor, center: torch.Tensor
     ) -> torch.Tensor:
         """The body's middle in the world, moved until the lowest vertex touches the plane.
 
         Args:
-            middle: In the world, shape [3].
+            pivot: In the world, shape [3].
             rotation: Of the body, [3, 3].
             scale: Of the body, [].
             center: The same middle in the body's own space, [3].
 
-        Differentiable: middle, rotation, scale.
+        Differentiable: pivot, rotation, scale.
         """
         if self.plane is None or self.onto is None or self.hull is None:
-            return middle
-        normal, onto, hull = (torch.as_tensor(part).to(middle) for part in (self.plane.normal, self.onto, self.hull))
-        below = ((hull - center) @ (rotation.T @ normal)).amin() * scale
-        return middle + onto * (self.plane.offset - below - normal @ middle)
+            return pivot
+        normal, onto, hull = (torch.as_tensor(part).to(pivot) for part in (self.plane.normal, self.onto, self.hull))
+        lowest_point = ((hull - center) @ (rotation.T @ normal)).amin() * scale
+        return pivot + onto * (self.plane.offset - lowest_point - normal @ pivot)
 
 
 def remaining(removed: list[np.ndarray]) -> np.ndarray:
@@ -154,8 +154,8 @@ def stable_rotation(mesh: Mesh, rotation: np.ndarray, normal: np.ndarray) -> np.
     tetrahedra = np.abs(np.linalg.det(corners - apex))
     centroid = (tetrahedra[:, None] * (corners.sum(axis=1) + apex) / 4).sum(axis=0) / tetrahedra.sum()
     is_stable = _project_into(corners, centroid)
-    down = -rotation.T @ normal
-    best = downwards[is_stable][np.argmax(downwards[is_stable] @ down)]
+    local_down = -rotation.T @ normal
+    best = downwards[is_stable][np.argmax(downwards[is_stable] @ local_down)]
     return turn_onto(rotation @ best, -normal) @ rotation
 
 

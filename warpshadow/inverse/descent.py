@@ -51,7 +51,7 @@ class _Diverged(Exception):
 
 
 class _Candidate(NamedTuple):
-    """Where a run begins."""
+    """Start of a run."""
 
     values: dict[str, Values]
     curvature: Curvature | None  # that a QuasiNewton found in the stage before
@@ -96,19 +96,19 @@ class _Descent:
         # The optimizer is identified by an instance of it: a partial or a lambda has no name that tells all of it.
         state = self.optimizer.state_dict()
         groups = [{key: value for key, value in group.items() if key != "params"} for group in state["param_groups"]]
-        made = f"{type(self.optimizer).__qualname__} {groups!r} {state['state']!r}"
+        optimizer_text = f"{type(self.optimizer).__qualname__} {groups!r} {state['state']!r}"
         self.fingerprints = problem.fingerprints() | {
             "stages": repr(stages),
             "tolerance": repr(tolerance),
             "seed": repr(seed),
-            "optimizer": made,
+            "optimizer": optimizer_text,
         }
 
     def _candidates_of_stage(self, best: list[_Candidate]) -> list[_Candidate]:
         """The candidates of a stage: the best so far, and others scattered around the first where it wants more."""
         count = 1 if self.is_found else self.stages[self.stage].candidates
-        scattered = self._perturbed_candidates(best[0].values, count - len(best))
-        return [*best[:count], *(_Candidate(values, None) for values in scattered)]
+        perturbed = self._perturbed_candidates(best[0].values, count - len(best))
+        return [*best[:count], *(_Candidate(values, None) for values in perturbed)]
 
     def _perturbed_candidates(self, values: Mapping[str, Values], count: int) -> list[dict[str, Values]]:
         if count > 0 and self.stages[self.stage].scatter == "flat":
@@ -161,25 +161,27 @@ class _Descent:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state."""
         others = state.get("fingerprints")
-        changed = [
+        changed_fields = [
             name
             for name, fingerprint in self.fingerprints.items()
             if others is not None and others.get(name) != fingerprint
         ]
-        if others is None or changed:
-            of_other = f"of another fit (other {', '.join(changed)})" if changed else "of no fit of this version"
+        if others is None or changed_fields:
+            of_other = (
+                f"of another fit (other {', '.join(changed_fields)})" if changed_fields else "of no fit of this version"
+            )
             raise checkpoints.CheckpointError(
                 f"checkpoint: got one {of_other}, expected one of this fit; "
                 f"{checkpoints.OTHER_FILE_REMEDY}, or remove it"
             )
         device = self.setting.device
         self.stage = state["stage"]
-        self.candidates = [_Candidate(_copied(values, device), *rest) for values, *rest in state["candidates"]]
+        self.candidates = [_Candidate(_copied(values, device), *fields) for values, *fields in state["candidates"]]
         self.is_found = state["is_found"]
         self.begin_stage()
         self._begin_run(_Candidate(_copied(state["values"], device), None))
         self.optimizer.load_state_dict(state["optimizer"])
-        self.ended = [_FinishedRun(loss, _copied(best, device), *rest) for loss, best, *rest in state["ended"]]
+        self.ended = [_FinishedRun(loss, _copied(best, device), *fields) for loss, best, *fields in state["ended"]]
         self.best, self.failure = _copied(state["best"], device), state["failure"]
         self.losses, self.descents, self.reason = state["losses"], state["descents"], state["reason"]
 
@@ -214,20 +216,24 @@ class _Descent:
             self.losses.append([])
             self.descents[-1] += 1
             return True
-        ranked = [_Candidate(run.best, run.curvature) for run in sorted(self.ended, key=lambda run: run.loss)]
+        ranked_candidates = [
+            _Candidate(run.best, run.curvature) for run in sorted(self.ended, key=lambda run: run.loss)
+        ]
         is_last = self.stage + 1 == len(self.stages)
         if all(run.failure for run in self.ended):
             self.reason = self.ended[0].failure
         elif is_last:
             self.reason = "converged" if has_converged else "finished"
         if self.reason is not None:
-            self.best = ranked[0].values
+            self.best = ranked_candidates[0].values
             return False
         stages = self.stages[self.stage : self.stage + 2]
         if len({tuple(free.name for free in self.problem.free if _descends(free, item)) for item in stages}) > 1:
-            ranked = [candidate._replace(curvature=None) for candidate in ranked]  # of other parameters
+            ranked_candidates = [
+                candidate._replace(curvature=None) for candidate in ranked_candidates
+            ]  # of other parameters
         self.stage += 1
-        self.candidates, self.ended = self._candidates_of_stage(ranked), []
+        self.candidates, self.ended = self._candidates_of_stage(ranked_candidates), []
         self.begin_stage()
         return True
 
@@ -235,9 +241,11 @@ class _Descent:
         """The most that may follow."""
         if self.reason is not None:
             return 0
-        stage, *later = self.stages[self.stage :]
-        in_turn = (len(self.candidates) - len(self.ended)) * stage.iterations - len(self.losses[-1])
-        return in_turn + sum((1 if self.is_found else item.candidates) * item.iterations for item in later)
+        stage, *later_stages = self.stages[self.stage :]
+        remaining_iterations = (len(self.candidates) - len(self.ended)) * stage.iterations - len(self.losses[-1])
+        return remaining_iterations + sum(
+            (1 if self.is_found else item.candidates) * item.iterations for item in later_stages
+        )
 
     def _has_converged(self) -> bool:
         """Whether the loss has stopped falling by more than the tolerance; the optimizer decides where it can."""
@@ -247,8 +255,8 @@ class _Descent:
         if losses and isinstance(self.optimizer, QuasiNewton):
             return self.optimizer.has_converged(tolerance)
         # means, as the least loss may be the luck of a passing iterate
-        last, before = losses[-CONVERGENCE_WINDOW:], losses[-2 * CONVERGENCE_WINDOW : -CONVERGENCE_WINDOW]
-        return len(before) == CONVERGENCE_WINDOW and sum(last) >= (1 - tolerance) * sum(before)
+        last, earlier = losses[-CONVERGENCE_WINDOW:], losses[-2 * CONVERGENCE_WINDOW : -CONVERGENCE_WINDOW]
+        return len(earlier) == CONVERGENCE_WINDOW and sum(last) >= (1 - tolerance) * sum(earlier)
 
     def _is_clearly_best(self, run: _FinishedRun) -> bool:
         """Whether a run's loss is far below the losses at perturbed values around its result."""
@@ -283,34 +291,34 @@ class _Descent:
         stage = self.stages[self.stage]
         for group in self.optimizer.param_groups:
             group["lr"] = stage.rate(len(self.losses[-1]))
-        evaluated: list[float] = []
-        before: dict[str, Values] = {}
+        evaluated_losses: list[float] = []
+        earlier: dict[str, Values] = {}
 
         def closure() -> float:
             self.optimizer.zero_grad()
             try:
                 loss, images = self.model.loss(self.values)
             except ValueError as error:
-                if not self.losses[0] and not evaluated:
+                if not self.losses[0] and not evaluated_losses:
                     raise  # values that were bad from the beginning
                 raise _Diverged(str(error)) from error
-            if not evaluated:  # with the light that was solved for there
-                before.update(_copied(self.values))
+            if not evaluated_losses:  # with the light that was solved for there
+                earlier.update(_copied(self.values))
             self.images = None if images is None else images.detach()
             _check_finite({"the images": images, "the loss": loss})
             loss.backward()
             _check_finite({f"the gradient of {name}": tensor.grad for name, tensor in self.tensors.items()})
-            evaluated.append(float(loss.detach()))
-            return evaluated[-1]
+            evaluated_losses.append(float(loss.detach()))
+            return evaluated_losses[-1]
 
         self.optimizer.step(closure)
         with torch.no_grad():
             for free in self.problem.free:
                 free.project(self.values[free.name])
         losses = self.losses[-1]
-        losses.append(evaluated[0])
+        losses.append(evaluated_losses[0])
         if losses[-1] == min(losses):
-            self.best = before
+            self.best = earlier
         _check_finite(self.tensors)
 
 
@@ -397,13 +405,13 @@ def fit(
             f"optimizer: got {check.described(optimizer)}, expected what makes one of tensors and lr, such as "
             "torch.optim.Adam"
         )
-    where = torch.device(wp.device_to_torch(check.device("device", str(device))))
+    torch_device = torch.device(wp.device_to_torch(check.device("device", str(device))))
     check_part("tolerance", tolerance, "of the loss")
     for name, file in (("checkpoint", checkpoint), ("preview", preview)):
         if file is not None and not Path(file).parent.is_dir():
             raise ValueError(f"{name}: got {str(file)!r}, expected a file in a folder that is there")
     with checkpoints.exclusive(checkpoint), watching(view, progress=progress) as watch:
-        descent = _Descent(problem, stages, optimizer, tolerance, seed, where, progress)
+        descent = _Descent(problem, stages, optimizer, tolerance, seed, torch_device, progress)
         durations = _descend(descent, checkpoint, checkpoint_seconds, preview, preview_seconds, progress, watch)
         reason = descent.reason or "stopped"
         if watch is not None:
@@ -440,22 +448,22 @@ def _descend(
         if checkpoint is not None:
             checkpoints.save(checkpoint, descent.state())
 
-    saved = previewed = time.perf_counter()
+    save_time = preview_time = time.perf_counter()
     durations: list[float] = []
     done = sum(map(len, descent.losses))
-    total, what = done + descent.iterations_left(), "preparing: kernels, shadows, form factors"
-    with progress_bar(total, what, "it", done=done, shows=progress, stays=True) as bar:
+    total, label = done + descent.iterations_left(), "preparing: kernels, shadows, form factors"
+    with progress_bar(total, label, "it", done=done, shows=progress, stays=True) as bar:
         start = time.perf_counter()
         for _ in descent.run():
-            now = time.perf_counter()
-            durations = [*durations[-99:], now - start]
-            if now - saved >= checkpoint_seconds:
+            current_time = time.perf_counter()
+            durations = [*durations[-99:], current_time - start]
+            if current_time - save_time >= checkpoint_seconds:
                 save()
-                saved = time.perf_counter()
-            if preview is not None and now - previewed >= preview_seconds:
+                save_time = time.perf_counter()
+            if preview is not None and current_time - preview_time >= preview_seconds:
                 with torch.no_grad():
                     write_preview(preview, descent.model.targets, descent.model.images(descent.values))
-                previewed = time.perf_counter()
+                preview_time = time.perf_counter()
             bar.describe("fitting", f"stage {descent.stage + 1}, loss {descent.losses[-1][-1]:.3e}")
             bar.update()
             bar.expect(descent.iterations_left())

@@ -159,8 +159,8 @@ def read_linear(path: AnyPath, encoding: Encoding, tone: str = "clip") -> np.nda
     if pixels.shape[2] < 3:
         pixels = np.concatenate([np.repeat(pixels[..., :1], 3, axis=2), pixels[..., 1:]], axis=2)
     is_integer = Path(path).suffix.lower() in INTEGER_SUFFIXES
-    stored = "srgb" if is_integer else "linear"  # as read_image takes them
-    if encoding != stored or tone != "clip":
+    stored_encoding = "srgb" if is_integer else "linear"  # as read_image takes them
+    if encoding != stored_encoding or tone != "clip":
         codes = linear_to_srgb(pixels[..., :3]) if is_integer else pixels[..., :3]
         pixels[..., :3] = decoded(codes, encoding, tone)
     if pixels.shape[2] == 4 and is_integer:
@@ -171,12 +171,12 @@ def read_linear(path: AnyPath, encoding: Encoding, tone: str = "clip") -> np.nda
 def decoded(codes: np.ndarray, encoding: Encoding, tone: str = "clip") -> np.ndarray:
     """Linear radiance of codes from 0 to 1."""
     if isinstance(encoding, ResponseCurve):
-        bent = encoding.radiance(codes)
+        nonlinear_radiance = encoding.radiance(codes)
     elif encoding == "linear":
-        bent = codes
+        nonlinear_radiance = codes
     else:
-        bent = srgb_to_linear(codes) if encoding == "srgb" else np.maximum(codes, 0) ** float(encoding)
-    return unfilmic(bent) if tone == "filmic" else bent
+        nonlinear_radiance = srgb_to_linear(codes) if encoding == "srgb" else np.maximum(codes, 0) ** float(encoding)
+    return unfilmic(nonlinear_radiance) if tone == "filmic" else nonlinear_radiance
 
 
 def read_mask(path: AnyPath) -> np.ndarray:

@@ -169,8 +169,8 @@ def _check_framing(path: Path, problem: Problem) -> None:
     names = dict.fromkeys(problem.scene.bodies[item.number].called for item in moving)
     camera, points = problem.scene.camera, framed_points(problem.scene)
     forward = camera.rotation[2]
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    target = camera.eye + forward @ (middle - camera.eye) * forward
+    center = (points.min(axis=0) + points.max(axis=0)) / 2
+    target = camera.eye + forward @ (center - camera.eye) * forward
     eye, target = (np.round(point, 4).tolist() for point in (camera.eye, target))
     check.warn(
         f'{path}: the camera is framed on the start (framing = "auto"), but {" and ".join(names)} may have been '

@@ -56,7 +56,7 @@ class FoundLight:
 
     @property
     def determined(self) -> np.ndarray:
-        """Which directions the images determined, bool of shape [height, 2·height]."""
+        """Whether the images determined a direction, bool of shape [height, 2·height]."""
         return self.influence >= MIN_INFLUENCE
 
     @property
@@ -66,13 +66,15 @@ class FoundLight:
 
     def picture(self) -> Picture:
         """The light at the automatic exposure of its determined part; gray stripes over the rest."""
-        bright = np.maximum(self.radiance, 0)
-        shown = bright[self.determined] if self.determined.any() else bright
-        linear = np.clip(bright * 2 ** auto_exposure(shown), 0, 1)
-        large, known = (item.repeat(_MAGNIFICATION, 0).repeat(_MAGNIFICATION, 1) for item in (linear, self.determined))
-        rows, columns = np.indices(known.shape)
-        is_stripe = ~known & ((rows + columns) // _STRIPE_WIDTH % 2 == 0)
-        return Picture(np.where(is_stripe[..., None], 0.2, large), exposure=0.0)
+        positive_radiance = np.maximum(self.radiance, 0)
+        displayed = positive_radiance[self.determined] if self.determined.any() else positive_radiance
+        linear = np.clip(positive_radiance * 2 ** auto_exposure(displayed), 0, 1)
+        enlarged, is_determined = (
+            item.repeat(_MAGNIFICATION, 0).repeat(_MAGNIFICATION, 1) for item in (linear, self.determined)
+        )
+        rows, columns = np.indices(is_determined.shape)
+        is_stripe = ~is_determined & ((rows + columns) // _STRIPE_WIDTH % 2 == 0)
+        return Picture(np.where(is_stripe[..., None], 0.2, enlarged), exposure=0.0)
 
     def _repr_png_(self) -> bytes:
         return self.picture()._repr_png_()
@@ -93,14 +95,14 @@ def found_light(
         values: Free parameters by name.
     """
     radiance = map_of(light)
-    towards = equirectangular_directions(len(radiance))
-    cells = CellBasis(fibonacci(_CELLS)).functions(towards.reshape(-1, 3))
+    pixel_directions = equirectangular_directions(len(radiance))
+    cells = CellBasis(fibonacci(_CELLS)).functions(pixel_directions.reshape(-1, 3))
     influence = cells @ influence_of_cells(problem, setting, values)
-    return FoundLight(radiance.astype(np.float32), influence.reshape(towards.shape[:2]).astype(np.float32))
+    return FoundLight(radiance.astype(np.float32), influence.reshape(pixel_directions.shape[:2]).astype(np.float32))
 
 
 def influence_of_cells(problem: Problem, setting: Setting, values: Mapping[str, Values]) -> np.ndarray:
-    """How much light from each of 512 cells matters to the images, 1 on the average, shape [cell]."""
+    """Find the influence of each of 512 cells' light on the images, 1 on average, shape [cell]."""
     cells = Light(None, directions=_CELLS)
     free = [cells if isinstance(item, Light) else item for item in problem.free]
     by_cells = Problem(problem.scene, problem.targets, free, problem.loss, problem.still)

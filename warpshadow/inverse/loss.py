@@ -13,7 +13,7 @@ REDUCTIONS = ("mean", "sum")
 
 @dataclass(frozen=True)
 class Loss:
-    """How a difference of images counts.
+    """Loss of a difference between images.
 
     Differences are in units of the targets' root mean square, so that no weight or rate depends on exposure.
 

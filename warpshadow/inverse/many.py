@@ -52,7 +52,7 @@ _LOCK_TIMEOUT = 60.0
 
 @dataclass(frozen=True)
 class Ending:
-    """How one of many fits ended.
+    """Outcome of one of many fits.
 
     Args:
         name: Of the fit, and of its folder.
@@ -129,7 +129,7 @@ def fit_many(
         raise FileExistsError(f"{folder}: got the folder of one fit, expected a new one or that of many")
     if isinstance(fits, Mapping):
         _check_names(fits)
-    named = fits.items() if isinstance(fits, Mapping) else ((f"{k:06}", item) for k, item in enumerate(fits))
+    named_fits = fits.items() if isinstance(fits, Mapping) else ((f"{k:06}", item) for k, item in enumerate(fits))
     folder.mkdir(exist_ok=True)
     names: list[str] = []
     endings: dict[str, Ending] = {}
@@ -147,7 +147,7 @@ def fit_many(
             bar.update()
 
         def jobs() -> Iterator[_FitJob]:
-            for name, source in named:
+            for name, source in named_fits:
                 names.append(name)
                 item = source
                 if isinstance(item, Problem):
@@ -167,17 +167,17 @@ def fit_many(
 
         try:
             if ray is not None:
-                ended = run_on_ray(_run_job, jobs(), ray, workers=workers, attempts=_ATTEMPTS, is_on_gpu=is_on_gpu)
+                ended_jobs = run_on_ray(_run_job, jobs(), ray, workers=workers, attempts=_ATTEMPTS, is_on_gpu=is_on_gpu)
             else:
                 few = min(workers or (1 if is_on_gpu else thread_count()), total or math.inf)
-                ended = run_tasks(_run_job, jobs(), workers=int(few), attempts=_ATTEMPTS)
-            with contextlib.closing(ended):
-                for job, ending, error in ended:
+                ended_jobs = run_tasks(_run_job, jobs(), workers=int(few), attempts=_ATTEMPTS)
+            with contextlib.closing(ended_jobs):
+                for job, ending, error in ended_jobs:
                     note(ending or Ending(job.name, "failed", str(error)))
         finally:
-            in_order = [endings[name] for name in names if name in endings]
-            write_table(in_order, folder / TABLE)
-    return in_order
+            ordered_endings = [endings[name] for name in names if name in endings]
+            write_table(ordered_endings, folder / TABLE)
+    return ordered_endings
 
 
 # ------------------------------------------------------------------------------------------------ one of them
@@ -199,7 +199,7 @@ class _FitJob:
         return self.results / self.name
 
     def recorded(self) -> Ending | None:
-        """How it ended before."""
+        """Its previous outcome."""
         path = self.folder / _RECORD
         if not path.exists():
             return None
@@ -211,9 +211,9 @@ class _FitJob:
 
     def record(self, ending: Ending) -> None:
         """Note how it ended."""
-        with files.atomic_write(self.folder / _RECORD) as unfinished:
+        with files.atomic_write(self.folder / _RECORD) as temporary_path:
             record = {"of": self.digest, "ending": dataclasses.asdict(ending)}
-            unfinished.write_text(json.dumps(record, indent=1), encoding="utf-8")
+            temporary_path.write_text(json.dumps(record, indent=1), encoding="utf-8")
 
 
 def _digest(fit: Fit | Path) -> str:
@@ -233,13 +233,13 @@ def _file_stamps(file: Path) -> Iterator[str]:
     except ValueError:  # which the fit says, too
         return
     for name in sorted(set(_strings_in(table))):
-        named = file.parent / name
+        named_fits = file.parent / name
         with contextlib.suppress(OSError, ValueError):  # a text that is no name of a file
-            if named.is_file():
-                status = named.stat()
+            if named_fits.is_file():
+                status = named_fits.stat()
                 yield f"{name} {status.st_size} {status.st_mtime_ns}"
-                if named.suffix == ".toml" and named != file:
-                    yield from _file_stamps(named)
+                if named_fits.suffix == ".toml" and named_fits != file:
+                    yield from _file_stamps(named_fits)
 
 
 def _strings_in(value: object) -> Iterator[str]:
@@ -271,8 +271,8 @@ def _failed_ending(name: str, error: Exception) -> Ending:
     """An ending with the error, and with its place unless it is a mistake in the input."""
     message = str(error) if error.args else type(error).__name__
     if not isinstance(error, (ValueError, OSError, ImportError)):
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        message = f"{type(error).__name__}: {error} ({place.filename}, line {place.lineno})"
+        trace_entry = traceback.extract_tb(error.__traceback__)[-1]
+        message = f"{type(error).__name__}: {error} ({trace_entry.filename}, line {trace_entry.lineno})"
     return Ending(name, "failed", message)
 
 
@@ -280,13 +280,13 @@ def _run_fit(job: _FitJob) -> Ending:
     """Do a fit, in its folder."""
     from filelock import Timeout
 
-    loaded = load_fit(job.fit) if isinstance(job.fit, Path) else job.fit
+    loaded_fit = load_fit(job.fit) if isinstance(job.fit, Path) else job.fit
     job.folder.parent.mkdir(parents=True, exist_ok=True)
     check_folder(job.folder)
     job.folder.mkdir(exist_ok=True)
     try:
         with files.locked(job.folder / _RECORD, timeout=_LOCK_TIMEOUT):
-            result = loaded.run(
+            result = loaded_fit.run(
                 device=job.device,
                 checkpoint=job.folder / CHECKPOINT,
                 checkpoint_seconds=job.checkpoint_seconds,
@@ -321,7 +321,7 @@ def write_table(endings: Sequence[Ending], path: AnyPath) -> None:
             row |= {f"{name}[{k}]" if len(numbers) > 1 else name: number for k, number in enumerate(numbers)}
         rows.append(row | {"warnings": "; ".join(messages)})
     columns = [column for column in dict.fromkeys(itertools.chain.from_iterable(rows)) if column != "warnings"]
-    with files.atomic_write(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
+    with files.atomic_write(path) as temporary_path, temporary_path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, [*columns, "warnings"])
         writer.writeheader()
         writer.writerows(rows)
@@ -372,29 +372,31 @@ def find_fits(where: AnyPath | Sequence[AnyPath]) -> dict[str, Path]:
 
 def _names_of_files(files: Iterable[Path], start: Path, last: str) -> dict[str, Path]:
     """Map each file to its path relative to `start`, without the last component."""
-    named: dict[str, Path] = {}
+    named_fits: dict[str, Path] = {}
     for file in files:
         relative = PurePath(os.path.relpath(file, start))
         inner = relative.parent if file.name == last else relative.with_suffix("")
         name = "/".join(part for part in inner.parts if part != "..") or start.resolve().name
-        if name in named:
-            raise ValueError(f"got {named[name]} and {file}, whose results would both be called {name!r}")
-        named[name] = file
-    _check_names(named)
-    return named
+        if name in named_fits:
+            raise ValueError(f"got {named_fits[name]} and {file}, whose results would both be called {name!r}")
+        named_fits[name] = file
+    _check_names(named_fits)
+    return named_fits
 
 
 def _check_names(names: Collection[str]) -> None:
     """Raise ValueError unless each name is that of a folder of its own."""
-    named: dict[PurePath, str] = {}
+    named_fits: dict[PurePath, str] = {}
     for name in names:
         path = PurePath(name)
         if not path.parts or path.is_absolute() or ".." in path.parts or path == PurePath(TABLE):
             raise ValueError(f"fits: got the name {name!r}, expected that of a folder in the folder of results")
-        if path in named:
-            raise ValueError(f"fits: got the names {named[path]!r} and {name!r} of one folder")
-        named[path] = name
-    for path, name in named.items():
+        if path in named_fits:
+            raise ValueError(f"fits: got the names {named_fits[path]!r} and {name!r} of one folder")
+        named_fits[path] = name
+    for path, name in named_fits.items():
         for outer in path.parents:
-            if outer in named:
-                raise ValueError(f"fits: got the names {named[outer]!r} and {name!r}, of which one is in the other")
+            if outer in named_fits:
+                raise ValueError(
+                    f"fits: got the names {named_fits[outer]!r} and {name!r}, of which one is in the other"
+                )

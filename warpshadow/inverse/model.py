@@ -78,8 +78,8 @@ class Model:
         total, images = torch.zeros((), device=self.setting.device), None
         if self.compares_images:
             images = world.images()
-            compared = bounded(images, self.targets, self.saturated)
-            total = self.problem.loss(compared, self.targets, self.weights, self.setting.unit)
+            bounded_images = bounded(images, self.targets, self.saturated)
+            total = self.problem.loss(bounded_images, self.targets, self.weights, self.setting.unit)
         if self.outlines is not None:
             masks, weight = world.masks(), self.problem.loss.coverage
             total = total + weight * self.outlines.loss(masks, world.outline_offsets)
@@ -87,7 +87,7 @@ class Model:
 
 
 class LightModel(Model):
-    """The same where light alone is free and differences are squared: a quadratic form, computed without images.
+    """Model where light alone is free and differences are squared: a quadratic form, computed without images.
 
     Images are linear in the light, I_c = J_c L_c for each color c, so the loss is Σ_c L_cᵀ G_c L_c − 2 g_c·L_c + const
     with G_c = J_cᵀ W J_c and g_c = J_cᵀ W t_c, W the pixels' shares in the loss. Sums are float64: near the
@@ -103,12 +103,14 @@ class LightModel(Model):
         with torch.no_grad():
             columns = torch.cat([(image[..., :3] * roots).reshape(1, -1, 3) for image in self._images_of_units()])
             target = (self.targets[..., :3] * roots).reshape(-1, 3)
-            dark = self.renderer(torch.zeros(light.basis.size, 3, device=setting.device))
-            alike = torch.cat([self.targets[..., :3], dark[..., 3:]], dim=-1)  # but for coverage
-            coverage = problem.loss(alike, self.targets, self.weights, setting.unit).double()
+            black_image = self.renderer(torch.zeros(light.basis.size, 3, device=setting.device))
+            covered_targets = torch.cat([self.targets[..., :3], black_image[..., 3:]], dim=-1)  # but for coverage
+            coverage = problem.loss(covered_targets, self.targets, self.weights, setting.unit).double()
         columns, target = columns.permute(2, 0, 1), target.T[..., None]  # [color, coefficient, pixel]
         self._form = torch.stack([_product(column, column.T) for column in columns])
-        self._slope = torch.stack([_product(column, want) for column, want in zip(columns, target, strict=True)])
+        self._slope = torch.stack(
+            [_product(column, unit_color) for column, unit_color in zip(columns, target, strict=True)]
+        )
         self._constant = coverage + target.double().square().sum()
 
     @staticmethod

@@ -48,18 +48,18 @@ class Outlines:
 
 def outlines_of(targets: Sequence[Target], scene: Scene, scale: float, device: torch.device) -> Outlines | None:
     """The outlines of targets; None where they have none."""
-    painted = [
+    painted_outlines = [
         (view, scene.body_number(body, "outlines"), mask)
         for view, target in enumerate(targets)
         for body, mask in target.outlines.items()
     ]
-    if not painted:
+    if not painted_outlines:
         return None
-    views, bodies, masks = zip(*painted, strict=True)
+    views, bodies, masks = zip(*painted_outlines, strict=True)
     distances = np.stack([signed_distances(mask) for mask in masks])
-    down, width_means = (area_means(count, max(1, round(count * scale))) for count in distances.shape[1:])
-    small = torch.einsum("ih,ohw,jw->oij", down, torch.from_numpy(distances), width_means)
-    return Outlines(views, bodies, small.contiguous().to(device), scale)
+    height_means, width_means = (area_means(count, max(1, round(count * scale))) for count in distances.shape[1:])
+    small_distances = torch.einsum("ih,ohw,jw->oij", height_means, torch.from_numpy(distances), width_means)
+    return Outlines(views, bodies, small_distances.contiguous().to(device), scale)
 
 
 def signed_distances(mask: np.ndarray) -> np.ndarray:
@@ -72,7 +72,7 @@ def signed_distances(mask: np.ndarray) -> np.ndarray:
     is_inside = mask >= 0.5
     if is_inside.all() or not is_inside.any():
         return np.full(mask.shape, np.hypot(*mask.shape) * (1 if is_inside.all() else -1), np.float32)
-    far = distance_transform_edt(is_inside) - distance_transform_edt(~is_inside)
-    far -= 0.5 * np.sign(far)
-    crosses = np.abs(far) <= 0.5
-    return np.where(crosses, mask - 0.5, far).astype(np.float32)
+    signed_distance = distance_transform_edt(is_inside) - distance_transform_edt(~is_inside)
+    signed_distance -= 0.5 * np.sign(signed_distance)
+    crosses = np.abs(signed_distance) <= 0.5
+    return np.where(crosses, mask - 0.5, signed_distance).astype(np.float32)

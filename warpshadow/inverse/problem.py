@@ -124,7 +124,7 @@ class Problem:
 
     @property
     def visibility(self) -> Visibility:
-        """How the fit computes visibility."""
+        """Visibility settings of the fit."""
         return self.scene.visibility if self.moves or self.still is None else self.still
 
     @property
@@ -133,7 +133,7 @@ class Problem:
         return next((free.basis for free in self.free if isinstance(free, Light)), None)
 
     def cameras(self) -> list[Camera]:
-        """Where each target was taken."""
+        """Camera of each target."""
         height, width, _ = self.targets[0].image.shape
         return [target.camera or _fitted(self.scene.camera, width, height) for target in self.targets]
 

@@ -74,9 +74,9 @@ class QuasiNewton(torch.optim.Optimizer):
         else:
             self._accept_or_reject(loss, place, gradient)
         direction, bound = self._direction(), memory["bound"]
-        longest, slope = _read(direction.abs().max(), _dot(memory["gradient"], direction))
-        if longest > bound or not self.curvature[0]:  # a gradient alone does not tell how far
-            factor = bound / longest if longest > 0 else 0.0
+        longest_step, slope = _read(direction.abs().max(), _dot(memory["gradient"], direction))
+        if longest_step > bound or not self.curvature[0]:  # a gradient alone does not tell how far
+            factor = bound / longest_step if longest_step > 0 else 0.0
             direction, slope = factor * direction, factor * slope
         memory["hoped"] = -slope
         memory["aim"] = memory["place"] + direction
@@ -103,10 +103,10 @@ class QuasiNewton(torch.optim.Optimizer):
         self._memory.update(loss=loss, place=place, gradient=gradient, sides=sides)
 
     def _sides(self, place: torch.Tensor) -> torch.Tensor:
-        """On which side of a value its bound is, ±1, where it was clamped to one; 0 elsewhere."""
+        """Side of the bound to which a value was clamped, ±1; 0 for other values."""
         memory = self._memory
-        stays = torch.where(place == memory["place"], memory["sides"], 0.0)
-        return torch.where(place == memory["aim"], stays, torch.sign(memory["aim"] - place))
+        unchanged_sides = torch.where(place == memory["place"], memory["sides"], 0.0)
+        return torch.where(place == memory["aim"], unchanged_sides, torch.sign(memory["aim"] - place))
 
     def _accept_or_reject(self, loss: float, place: torch.Tensor, gradient: torch.Tensor) -> None:
         """Keep the last step or take it back, and bound the next."""
@@ -116,16 +116,16 @@ class QuasiNewton(torch.optim.Optimizer):
         slope, length, *products = _read(*numbers)
         if _has_positive_curvature(*products):
             self._add_curvature_pair(step, change)
-        rise = loss - memory["loss"]
-        if rise >= 0 and length > 0:
-            lowest = (
-                -slope / (2 * (rise - slope)) if rise > slope else _MAX_BOUND_FACTOR
+        loss_increase = loss - memory["loss"]
+        if loss_increase >= 0 and length > 0:
+            lower_bound = (
+                -slope / (2 * (loss_increase - slope)) if loss_increase > slope else _MAX_BOUND_FACTOR
             )  # of the parabola through both
-            memory["bound"] = length * min(max(lowest, _MIN_BOUND_FACTOR), _MAX_BOUND_FACTOR)
+            memory["bound"] = length * min(max(lower_bound, _MIN_BOUND_FACTOR), _MAX_BOUND_FACTOR)
             return
         if length > 0.8 * memory["bound"]:
             memory["bound"] = min(_BOUND_GROWTH * memory["bound"], _MAX_BOUND * self._rate)
-        memory["gained"] = -rise
+        memory["gained"] = -loss_increase
         self._keep(loss, place, gradient, self._sides(place))
 
     def _add_curvature_pair(self, step: torch.Tensor, change: torch.Tensor) -> None:
@@ -141,11 +141,11 @@ class QuasiNewton(torch.optim.Optimizer):
         [Chen et al. 2014, Large-scale L-BFGS using MapReduce], whose dot products are read all at once.
         """
         memory, (steps, changes) = self._memory, self.curvature
-        moves = (memory["sides"] * memory["gradient"] >= 0).to(memory["gradient"])
-        downhill = -memory["gradient"] * moves
+        is_movable = (memory["sides"] * memory["gradient"] >= 0).to(memory["gradient"])
+        downhill = -memory["gradient"] * is_movable
         if not steps:
             return downhill
-        vectors = torch.stack([*steps, *changes, downhill]).double() * moves
+        vectors = torch.stack([*steps, *changes, downhill]).double() * is_movable
         products = np.array(_read(*(vectors @ vectors.T)))
         count = len(steps)
         pairs = [(k, count + k) for k in range(count)]
@@ -168,9 +168,9 @@ def _products(step: T, change: T) -> tuple[tuple[T, T], ...]:
     return (step, change), (step, step), (change, change)
 
 
-def _has_positive_curvature(mixed: float, step: float, change: float) -> bool:
+def _has_positive_curvature(mixed_product: float, step: float, change: float) -> bool:
     """Whether the loss curves upwards over a step, by its :func:`_products` with how the gradient changed."""
-    return mixed > _MIN_CURVATURE_COSINE * math.sqrt(step * change)
+    return mixed_product > _MIN_CURVATURE_COSINE * math.sqrt(step * change)
 
 
 def _dot(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:

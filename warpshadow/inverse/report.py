@@ -76,8 +76,8 @@ class Report:
         values: dict[str, Any] = {
             f"{name}.{key}": item.cpu().numpy() for name, parts in result.values.items() for key, item in parts.items()
         }
-        with files.atomic_write(folder / "parameters.npz") as unfinished:
-            np.savez(unfinished, **values)
+        with files.atomic_write(folder / "parameters.npz") as temporary_path:
+            np.savez(temporary_path, **values)
         written.append(folder / "parameters.npz")
         written += [*self._write_pictures(folder), *plot_losses(result, folder / "loss.png")]
         toml_tables.write(folder / SUMMARY, self._summary())
@@ -104,17 +104,17 @@ class Report:
         for image, gains in zip(images, fitted.white_balances, strict=False):  # none unless they were free
             image["white_balance"] = list(gains)
         light = self.result.light
-        known = {} if light is None else {"light": {"undetermined": round(light.undetermined_share, 4)}}
+        known_entries = {} if light is None else {"light": {"undetermined": round(light.undetermined_share, 4)}}
         unsure = self._uncertainty_table()
-        return {"fit": fit, **known, **unsure, "view": views, "image": images}
+        return {"fit": fit, **known_entries, **unsure, "view": views, "image": images}
 
     def _uncertainty_table(self) -> toml_tables.Table:
         """Standard deviations of poses, light and exposures; a warning for each body that hardly is where it is."""
-        known = self.result.uncertainty
-        if known is None:
+        uncertainty = self.result.uncertainty
+        if uncertainty is None:
             return {}
         table: toml_tables.Table = {}
-        for name, pose in known.poses.items():
+        for name, pose in uncertainty.poses.items():
             table[name] = {"shift": pose.shift.tolist(), "turn": pose.turn, "least": str(pose)}
             if pose.is_flat:
                 check.warn(
@@ -123,10 +123,10 @@ class Report:
                     "(stands_on), a prior or another view would tell more",
                     DiagnosticWarning,
                 )
-        if known.light is not None:
-            table["light"] = known.light
-        if known.stops:
-            table["stops"] = known.stops
+        if uncertainty.light is not None:
+            table["light"] = uncertainty.light
+        if uncertainty.stops:
+            table["stops"] = uncertainty.stops
         return {"uncertainty": table} if table else {}
 
     def _write_pictures(self, folder: Path) -> list[Path]:
@@ -165,14 +165,14 @@ def _stems(scene: Scene) -> list[str]:
 
 
 def found_values(result: Result) -> list[str]:
-    """Describe in a line each what a fit changed: poses, colors, exposures, and where light is strongest."""
+    """Describe the changes of a fit, a line each: poses, colors, exposures, and where light is strongest."""
     lines, start, scene = [], result.problem.scene, result.scene
     for before, after in zip(start.bodies, scene.bodies, strict=True):
         for name, unit in (("translation", ""), ("rotation", "°"), ("scale", ""), ("albedo", "")):
             values = np.asarray(getattr(after, name))
             if not np.array_equal(values, getattr(before, name)) and values.size <= 3:
-                shown = ", ".join(f"{value:.4g}" for value in values.ravel())
-                lines.append(f"{after.called}: {name} ({shown}){unit}")
+                rounded_text = ", ".join(f"{value:.4g}" for value in values.ravel())
+                lines.append(f"{after.called}: {name} ({rounded_text}){unit}")
     if scene.light is not start.light:
         radiance = map_of(scene.light)
         x, y, z = EnvironmentMap(np.maximum(radiance, 0)).directions().reshape(-1, 3)[radiance.sum(axis=2).argmax()]
@@ -206,7 +206,7 @@ def plot_losses(result: Result, path: AnyPath) -> list[Path]:
         first += len(losses)
     axes.set_xlabel("iteration (a color for each candidate of each stage)")
     axes.set_ylabel(f"loss ({result.problem.loss.kind})")
-    with files.atomic_write(path) as unfinished:
-        figure.savefig(unfinished, dpi=120)
+    with files.atomic_write(path) as temporary_path:
+        figure.savefig(temporary_path, dpi=120)
     pyplot.close(figure)
     return [Path(path)]

@@ -67,7 +67,7 @@ class Result:
 
     @functools.cached_property
     def uncertainty(self) -> Uncertainty | None:
-        """How well it knows its few numbers, such as poses and exposures; None where it has none."""
+        """Uncertainty of its few parameters, such as poses and exposures; None without any."""
         return uncertainty(self.problem, self.setting, self.values, self.found)
 
     @property

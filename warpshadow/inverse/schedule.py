@@ -97,9 +97,9 @@ def stages_for(stages: object, problem: Problem) -> tuple[Stage, ...]:
     if isinstance(stages, str):
         check.choice("stages", stages, READY_STAGES)
         return READY_STAGES[stages](problem)
-    chosen = tuple(stages) if isinstance(stages, Iterable) else (stages,)
-    check_stages(chosen, problem)
-    return chosen
+    stage_tuple = tuple(stages) if isinstance(stages, Iterable) else (stages,)
+    check_stages(stage_tuple, problem)
+    return stage_tuple
 
 
 def check_stages(stages: Sequence[Stage], problem: Problem) -> None:
@@ -130,14 +130,14 @@ def pose_stages(problem: Problem) -> tuple[Stage, ...]:
     does not stand out so, on images of some 32 pixels, others start turned by 30° fourteen ways, until one does.
     Soft shadows have fewer wrong poses; under a sun firm ones lead nearer, past bumps of its shadow's edge.
     """
-    small, middle, large = (_scale(problem, size) for size in (32, 64, 512))
+    small_scale, middle_scale, large_scale = (_scale(problem, size) for size in (32, 64, 512))
     soft, firm = _soft(problem, 1.0), _soft(problem, 0.5)
     alone: dict[str, Any] = {"standout": 0.08, "tolerance": 0.01}
     return (
-        Stage(30, 0.1, small, candidates=15, **alone, **soft),
-        Stage(20, 0.03, small, candidates=4, **alone, **firm),
-        Stage(20, 0.02, middle, candidates=2, **alone),
-        Stage(40, 0.01, large),
+        Stage(30, 0.1, small_scale, candidates=15, **alone, **soft),
+        Stage(20, 0.03, small_scale, candidates=4, **alone, **firm),
+        Stage(20, 0.02, middle_scale, candidates=2, **alone),
+        Stage(40, 0.01, large_scale),
     )
 
 
@@ -147,11 +147,11 @@ def deformation_stages(problem: Problem) -> tuple[Stage, ...]:
     The last stage goes on as long as the loss falls: on six bends of three meshes (five under a bare sun) 40 iterations
     end at a mean MDE of 2.4%, 150 at 2.2%. With 0.4 of the regularization they end farther off.
     """
-    middle, large = (_scale(problem, size) for size in (64, 128))
+    middle_scale, large_scale = (_scale(problem, size) for size in (64, 128))
     return (
-        Stage(50, 0.06, middle, supersampling=1, regularization=4.0, **_soft(problem, 0.7)),
-        Stage(100, 0.04, middle, supersampling=1, regularization=2.0),
-        Stage(150, 0.02, large),
+        Stage(50, 0.06, middle_scale, supersampling=1, regularization=4.0, **_soft(problem, 0.7)),
+        Stage(100, 0.04, middle_scale, supersampling=1, regularization=2.0),
+        Stage(150, 0.02, large_scale),
     )
 
 
@@ -170,12 +170,12 @@ def photograph_stages(problem: Problem) -> tuple[Stage, ...]:
             Stage(20, 0.03, side[64], candidates=2, **first),
             Stage(20, 0.01, side[160], **first),
         ]
-    solved: dict[str, Any] = {"solves_light": problem.basis is not None, "supersampling": 1}
+    solved_settings: dict[str, Any] = {"solves_light": problem.basis is not None, "supersampling": 1}
     scatter = "flat" if stages else "turned"
     return (
         *stages,
-        Stage(12, 0.03, side[96], candidates=5, scatter=scatter, tolerance=0.01, **solved),
-        Stage(20, 0.01, side[160], tolerance=1e-3, **solved),
+        Stage(12, 0.03, side[96], candidates=5, scatter=scatter, tolerance=0.01, **solved_settings),
+        Stage(20, 0.01, side[160], tolerance=1e-3, **solved_settings),
     )
 
 

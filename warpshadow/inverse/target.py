@@ -66,21 +66,21 @@ class Target:
         outlines: Mapping[BodyLike, npt.ArrayLike | AnyPath] | None = None,
         distortion: npt.ArrayLike | None = None,
     ):
-        checked = None if encoding is None else checked_encoding(encoding)
-        vars(self).update(image=image, mask=mask, camera=camera, encoding=checked or "linear")
+        checked_curve = None if encoding is None else checked_encoding(encoding)
+        vars(self).update(image=image, mask=mask, camera=camera, encoding=checked_curve or "linear")
         stops, tone = 0.0 if exposure is None else check.number("exposure", exposure), "clip"
         if check.is_path(image):
             path = check.file("image", image)
-            developed = development(path)
-            if developed is not None:
-                tone = developed.tone
-                stops = developed.exposure if exposure is None else stops
+            exposure_record = development(path)
+            if exposure_record is not None:
+                tone = exposure_record.tone
+                stops = exposure_record.exposure if exposure is None else stops
                 saturation = 1.0 if saturation is None else saturation
             with check.located("image"):
-                object.__setattr__(self, "encoding", checked or guess_encoding(path))
+                object.__setattr__(self, "encoding", checked_curve or guess_encoding(path))
                 object.__setattr__(self, "image", read_linear(path, self.encoding, tone))
-        elif checked not in (None, "linear"):
-            raise ValueError(f"encoding: got {checked!r} for an array, expected a file, or linear values")
+        elif checked_curve not in (None, "linear"):
+            raise ValueError(f"encoding: got {checked_curve!r} for an array, expected a file, or linear values")
         if check.is_path(mask):
             path = check.file("mask", mask)
             with check.located("mask"):
@@ -132,19 +132,21 @@ class Target:
         coefficients = checked_distortion(distortion)
         if self.camera is None:
             raise ValueError("distortion: got it without a camera, expected one with the intrinsics of the calibration")
-        both = undistorted(np.concatenate([image, self.weights()[..., None]], axis=-1), self.camera, coefficients)
-        is_seen = np.isfinite(both).all(axis=-1)
+        image_and_weights = undistorted(
+            np.concatenate([image, self.weights()[..., None]], axis=-1), self.camera, coefficients
+        )
+        is_seen = np.isfinite(image_and_weights).all(axis=-1)
         if self.saturated is not None:
             spread = undistorted(self.saturated.astype(np.float32), self.camera, coefficients)
             object.__setattr__(self, "saturated", spread > 0)
         for body, outline in self.outlines.items():
             self.outlines[body] = np.nan_to_num(undistorted(outline[..., None], self.camera, coefficients)[..., 0])
-        both[~is_seen] = 0
-        object.__setattr__(self, "mask", np.clip(both[..., -1], 0, 1))
-        return np.ascontiguousarray(both[..., :-1])
+        image_and_weights[~is_seen] = 0
+        object.__setattr__(self, "mask", np.clip(image_and_weights[..., -1], 0, 1))
+        return np.ascontiguousarray(image_and_weights[..., :-1])
 
     def weights(self) -> np.ndarray:
-        """How much each pixel counts, float32 of shape [height, width]."""
+        """Weights of the pixels, float32 of shape [height, width]."""
         return np.ones(self.image.shape[:2], np.float32) if self.mask is None else self.mask
 
 
@@ -194,24 +196,26 @@ def stacked(targets: Sequence[Target], scale: float, device: torch.device) -> St
     """Targets at the size of a camera resized."""
     images = np.stack([target.image for target in targets])
     weights = np.stack([target.weights() for target in targets])[..., None]
-    down, width_means = (area_means(count, max(1, round(count * scale))).to(device) for count in images.shape[1:3])
+    height_means, width_means = (
+        area_means(count, max(1, round(count * scale))).to(device) for count in images.shape[1:3]
+    )
 
-    def resized(pixels: np.ndarray) -> torch.Tensor:
-        return torch.einsum("ih,vhwc,jw->vijc", down, torch.from_numpy(pixels).to(device), width_means)
+    def resize(pixels: np.ndarray) -> torch.Tensor:
+        return torch.einsum("ih,vhwc,jw->vijc", height_means, torch.from_numpy(pixels).to(device), width_means)
 
-    weight = resized(weights)
-    image = resized(images * weights) / torch.where(weight > 0, weight, 1)  # masked-out pixels bleed into nothing
+    weight = resize(weights)
+    image = resize(images * weights) / torch.where(weight > 0, weight, 1)  # masked-out pixels bleed into nothing
     saturated = None
     if any(target.saturated is not None for target in targets):
         none = np.zeros((*images.shape[1:3], 3), bool)
         flags = [none if target.saturated is None else target.saturated for target in targets]
-        saturated = resized(np.stack(flags).astype(np.float32)) > 0
+        saturated = resize(np.stack(flags).astype(np.float32)) > 0
     return Stacked(image.contiguous(), weight[..., 0].contiguous(), saturated)
 
 
-def area_means(count: int, fewer: int) -> torch.Tensor:
-    """Averages of a row of pixels by area, [fewer, count]; ``fewer`` need not be a part of ``count``."""
-    edges, coarse_edges = np.arange(count + 1), np.arange(fewer + 1) * (count / fewer)
+def area_means(count: int, coarse_count: int) -> torch.Tensor:
+    """Averages of a row of pixels by area, [fewer, count]; ``coarse_count`` need not be a part of ``count``."""
+    edges, coarse_edges = np.arange(count + 1), np.arange(coarse_count + 1) * (count / coarse_count)
     ends = np.minimum(edges[1:], coarse_edges[1:, None])
     starts = np.maximum(edges[:-1], coarse_edges[:-1, None])
-    return torch.from_numpy((np.maximum(ends - starts, 0) * (fewer / count)).astype(np.float32))
+    return torch.from_numpy((np.maximum(ends - starts, 0) * (coarse_count / count)).astype(np.float32))

@@ -65,18 +65,20 @@ class PoseUncertainty:
     @property
     def is_flat(self) -> bool:
         """Whether the body is uncertain by more than 2% of its diagonal."""
-        turned = np.radians(self.least_turn) * self.diagonal / 2
-        return float(np.hypot(np.linalg.norm(self.least), turned)) > MAX_POSE_UNCERTAINTY * self.diagonal
+        turn_distance = np.radians(self.least_turn) * self.diagonal / 2
+        return float(np.hypot(np.linalg.norm(self.least), turn_distance)) > MAX_POSE_UNCERTAINTY * self.diagonal
 
     def __str__(self) -> str:
         length = np.linalg.norm(self.least)
-        where = "along the view" if self.along_view > 0.9 else f"along {np.round(self.least / max(length, 1e-12), 2)}"
-        return f"known least: ±{length:.2g} {where}, turned by ±{self.least_turn:.2g}°"
+        direction_text = (
+            "along the view" if self.along_view > 0.9 else f"along {np.round(self.least / max(length, 1e-12), 2)}"
+        )
+        return f"known least: ±{length:.2g} {direction_text}, turned by ±{self.least_turn:.2g}°"
 
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """How well a fit knows its few parameters.
+    """Uncertainty of a fit's few parameters.
 
     Args:
         names: Of the numbers, as "pose[0].shift[1]".
@@ -97,7 +99,7 @@ class Uncertainty:
 
     @property
     def stops(self) -> list[float]:
-        """Of the exposures of the views."""
+        """Standard deviations of the views' exposures."""
         return [sd / np.log(2.0) for name, sd in self.deviations.items() if name.startswith("exposure.log[")]
 
 
@@ -162,11 +164,11 @@ class NormalMatrix:
 
     def posed(self, free: Pose) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Rotation, middle in the world, and scale of a body, its plane moved."""
-        rotation, middle, scale = free.moved(self.values[free.name], self.setting)
+        rotation, center, scale = free.moved(self.values[free.name], self.setting)
         plane = self.plane(free)
         if plane is not None:
-            rotation, middle = plane.moved(self.values[plane.name], self.setting, rotation, middle)
-        return rotation, middle, scale
+            rotation, center = plane.moved(self.values[plane.name], self.setting, rotation, center)
+        return rotation, center, scale
 
     def slopes(self, free: Pose, rows: Sequence[int]) -> np.ndarray:
         """Derivatives of a body's middle [scene units] and turn [radians] by some of the numbers, [6, row]."""
@@ -177,8 +179,8 @@ class NormalMatrix:
             ends = []
             for step in (_STEP, -_STEP):
                 parts[key].view(-1)[number] += step
-                rotation, middle, _ = self.posed(free)
-                ends.append((rotation.double().numpy(force=True), middle.double().numpy(force=True)))
+                rotation, center, _ = self.posed(free)
+                ends.append((rotation.double().numpy(force=True), center.double().numpy(force=True)))
                 parts[key].view(-1)[number] -= step
             turn = (ends[0][0] @ ends[1][0].T - ends[1][0] @ ends[0][0].T) / 2  # of small turns
             slopes[:, column] = [*(ends[0][1] - ends[1][1]), turn[2, 1], turn[0, 2], turn[1, 0]]
@@ -191,15 +193,15 @@ class NormalMatrix:
         """
         model, loss = self.model, self.problem.loss
         world = model.world(self.values)
-        compared = bounded(world.images(), model.targets, model.saturated)
-        kinds = [(compared[..., :3] - model.targets[..., :3]) / self.setting.unit]
+        bounded_images = bounded(world.images(), model.targets, model.saturated)
+        residuals = [(bounded_images[..., :3] - model.targets[..., :3]) / self.setting.unit]
         if model.targets.shape[-1] == 4:
-            kinds.append(compared[..., 3:] - model.targets[..., 3:])
+            residuals.append(bounded_images[..., 3:] - model.targets[..., 3:])
         if not self.roots:
             share = loss.pixel_shares(model.weights)[..., None]
             factors = (1.0, loss.coverage)
-            self.roots = [(f * share * loss.pixel_weights(x)).sqrt() for f, x in zip(factors, kinds, strict=False)]
-        parts = [roots * x for roots, x in zip(self.roots, kinds, strict=True)]
+            self.roots = [(f * share * loss.pixel_weights(x)).sqrt() for f, x in zip(factors, residuals, strict=False)]
+        parts = [roots * x for roots, x in zip(self.roots, residuals, strict=True)]
         if model.outlines is not None:
             gaps = model.outlines.differences(world.masks(), world.outline_offsets)
             pixels = gaps.new_zeros(len(model.cameras), *gaps.shape[1:], len(gaps))
@@ -210,12 +212,12 @@ class NormalMatrix:
 
     def _difference(self, direction: np.ndarray) -> np.ndarray:
         """Derivative of the residuals along a direction of the numbers."""
-        start, both = self.values, []
+        start, slope_pair = self.values, []
         for values in (self.moved(_STEP * direction), self.moved(-_STEP * direction)):
             self.values = values
-            both.append(self._residuals())
+            slope_pair.append(self._residuals())
         self.values = start
-        return (both[0] - both[1]) / (2 * _STEP)
+        return (slope_pair[0] - slope_pair[1]) / (2 * _STEP)
 
     def _project_light(self) -> float:
         """Take the best change of the light out of the columns; the relative deviation of its total."""
@@ -282,7 +284,7 @@ def _by_tiles(pixels: np.ndarray) -> np.ndarray:
 def uncertainty(
     problem: Problem, setting: Setting, values: Mapping[str, Values], fitted: FittedScene
 ) -> Uncertainty | None:
-    """How well a fit knows its few parameters; None where it has none.
+    """Find the uncertainty of a fit's few parameters; None without any.
 
     Args:
         problem, setting, values: Of the result.
@@ -308,21 +310,21 @@ def _pose_uncertainty(free: Pose, normal: NormalMatrix, covariance: np.ndarray) 
     plane = normal.plane(free)
     names = {free.name} if plane is None else {free.name, plane.name}
     rows = [index for index, (name, _, _) in enumerate(normal.parameter_entries) if name in names]
-    _, middle, scale = normal.posed(free)
+    _, center, scale = normal.posed(free)
     half = setting.extent(free.number) * float(scale)
-    both = normal.slopes(free, rows)
-    cov = both @ covariance[np.ix_(rows, rows)] @ both.T
+    slope_pair = normal.slopes(free, rows)
+    cov = slope_pair @ covariance[np.ix_(rows, rows)] @ slope_pair.T
     units = np.array([1.0] * 3 + [half] * 3)  # a turn by a radian moves vertices about as far
     sizes, directions = np.linalg.eigh(cov * units[:, None] * units)
-    weakest = np.sqrt(max(sizes[-1], 0.0)) * directions[:, -1]
-    view = middle.double().numpy(force=True) - setting.cameras[0].eye
-    length = float(np.linalg.norm(weakest[:3]))
-    view_share = abs(float(weakest[:3] @ view)) / (length * float(np.linalg.norm(view))) if length else 0.0
+    weakest_direction = np.sqrt(max(sizes[-1], 0.0)) * directions[:, -1]
+    view = center.double().numpy(force=True) - setting.cameras[0].eye
+    length = float(np.linalg.norm(weakest_direction[:3]))
+    view_share = abs(float(weakest_direction[:3] @ view)) / (length * float(np.linalg.norm(view))) if length else 0.0
     return PoseUncertainty(
         np.sqrt(np.diag(cov)[:3]),
         float(np.degrees(np.sqrt(np.trace(cov[3:, 3:])))),
-        weakest[:3],
-        float(np.degrees(np.linalg.norm(weakest[3:]) / half)),
+        weakest_direction[:3],
+        float(np.degrees(np.linalg.norm(weakest_direction[3:]) / half)),
         view_share,
         2 * half,
     )
@@ -336,12 +338,15 @@ def candidates_along_flat_direction(
     """
     normal = NormalMatrix(problem, setting, values)
     poses = [index for index, (name, _, _) in enumerate(normal.parameter_entries) if name.startswith(f"{Pose.key}[")]
-    weakest = np.zeros(len(normal.parameter_entries))
+    weakest_direction = np.zeros(len(normal.parameter_entries))
     if poses:
         moving = normal.directions[poses].any(axis=0)
         spread = np.linalg.inv(normal.normal_matrix)[np.ix_(moving, moving)]
-        weakest = normal.directions[:, moving] @ np.linalg.eigh(spread)[1][:, -1]
-    return [normal.moved(CANDIDATE_SPACING * (number // 2 + 1) * (-1) ** number * weakest) for number in range(count)]
+        weakest_direction = normal.directions[:, moving] @ np.linalg.eigh(spread)[1][:, -1]
+    return [
+        normal.moved(CANDIDATE_SPACING * (number // 2 + 1) * (-1) ** number * weakest_direction)
+        for number in range(count)
+    ]
 
 
 def _few_number_entries(values: Mapping[str, Values]) -> list[tuple[str, str, int]]:

@@ -70,9 +70,9 @@ class ProjectedModel(Model):
         weights, radiance = share.expand_as(target), np.zeros((3, design.shape[1]))
         for _ in range(1 if self.problem.loss.kind == "l2" and self.saturated is None else _REWEIGHTINGS):
             for color in range(3):
-                weighted = design[color] * weights[color]
-                form = (weighted @ design[color].T).double().cpu().numpy() + prior
-                slope = (weighted @ target[color]).double().cpu().numpy()
+                weighted_design = design[color] * weights[color]
+                form = (weighted_design @ design[color].T).double().cpu().numpy() + prior
+                slope = (weighted_design @ target[color]).double().cpu().numpy()
                 radiance[color] = nonnegative_least_squares(form, slope)
             images = torch.einsum("cap,ca->cp", design, torch.from_numpy(radiance).to(design))
             weights = share * self._reweighted(images, target)
@@ -103,10 +103,10 @@ class ProjectedModel(Model):
     def _store(self, radiance: np.ndarray, values: Values) -> None:
         """Write radiance of atoms, [atom, 3], into the light's values."""
         if isinstance(self.light.basis, CellBasis):
-            stored = {"log_radiance": np.log(np.maximum(radiance, _MIN_RADIANCE))}
+            stored_values = {"log_radiance": np.log(np.maximum(radiance, _MIN_RADIANCE))}
         else:
-            stored = {"coefficients": self.atoms.T @ radiance / np.sqrt(4 * np.pi)}
-        for key, numbers in stored.items():
+            stored_values = {"coefficients": self.atoms.T @ radiance / np.sqrt(4 * np.pi)}
+        for key, numbers in stored_values.items():
             values[key].copy_(self.setting.tensor(numbers))
 
 

@@ -87,8 +87,8 @@ class Watch:
             self._page.show(" · ".join(words), losses, fit.stage, fit.stages[fit.stage].candidates)
             self._page.show_pictures(pictures(fit))
             self._page.fail(None)
-        now = time.perf_counter()
-        self._next = now + max(_MIN_INTERVAL, (now - start) / _MAX_TIME_SHARE)
+        current_time = time.perf_counter()
+        self._next = current_time + max(_MIN_INTERVAL, (current_time - start) / _MAX_TIME_SHARE)
 
     @contextlib.contextmanager
     def _report_page_errors(self) -> Iterator[None]:
@@ -118,10 +118,10 @@ def pictures(fit: Watched) -> np.ndarray:
             images = fit.model.images(fit.values)
     width = 3 * images.shape[2]
     step, factor = max(1, width // _PICTURE_WIDTH), max(1, _PICTURE_WIDTH // width)
-    shown = side_by_side(fit.model.targets[:, ::step, ::step], images[:, ::step, ::step])
-    shown = shown.repeat(factor, axis=0).repeat(factor, axis=1).astype(np.float32)
-    opaque = np.ones((*shown.shape[:2], 1), np.float32)
-    return picture(np.concatenate([shown, opaque], axis=-1), 0.0, np.zeros(3))
+    comparison = side_by_side(fit.model.targets[:, ::step, ::step], images[:, ::step, ::step])
+    comparison = comparison.repeat(factor, axis=0).repeat(factor, axis=1).astype(np.float32)
+    opaque = np.ones((*comparison.shape[:2], 1), np.float32)
+    return picture(np.concatenate([comparison, opaque], axis=-1), 0.0, np.zeros(3))
 
 
 @contextlib.contextmanager

@@ -49,16 +49,16 @@ class Setting:
 
     @functools.cached_property
     def distances(self) -> np.ndarray:
-        """From the middle of the scene to the eye of each view, shape [view, 1]: the unit of the eye's shifts."""
+        """Distance from the scene's middle to the eye of each view, [view, 1]: the unit of the eye's shifts."""
         low, high = zip(*(body.world_mesh().bounds for body in self.scene.bodies), strict=True)
-        middle = (np.min(low, axis=0) + np.max(high, axis=0)) / 2
-        return np.linalg.norm([camera.eye - middle for camera in self.cameras], axis=1, keepdims=True)
+        center = (np.min(low, axis=0) + np.max(high, axis=0)) / 2
+        return np.linalg.norm([camera.eye - center for camera in self.cameras], axis=1, keepdims=True)
 
     def graph(self, body: int, count: int) -> DeformationGraph:
         """The deformation graph of a body, whose nodes are its spheres, even if the method casts no shadows."""
         if (body, count) not in self._graphs:
-            shadowed = replace(self.scene, visibility=Visibility())
-            centers = scene_blockers(shadowed, device=str(self.device))[body].centers
+            shadowed_scene = replace(self.scene, visibility=Visibility())
+            centers = scene_blockers(shadowed_scene, device=str(self.device))[body].centers
             points = self.scene.bodies[body].mesh.positions
             self._graphs[body, count] = DeformationGraph.bind(points, centers, count=count, device=str(self.device))
         return self._graphs[body, count]

@@ -25,28 +25,30 @@ def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np
         and has no neighbors itself.
     """
     check.shape("faces", faces.shape, ("face", 3))
-    faces = faces.astype(np.int64) if positions is None else number_places(positions)[faces]
+    faces = faces.astype(np.int64) if positions is None else number_positions(positions)[faces]
     neighbor = np.full(faces.shape, -1, np.int32)
     proper = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
-    ends = np.sort(np.stack([np.roll(faces[proper], -1, axis=1), np.roll(faces[proper], -2, axis=1)], axis=-1), axis=-1)
-    first, last = ends.reshape(-1, 2).T
-    lines, owner = first * (faces.max(initial=0) + 1) + last, np.repeat(proper, 3)
+    edge_ends = np.sort(
+        np.stack([np.roll(faces[proper], -1, axis=1), np.roll(faces[proper], -2, axis=1)], axis=-1), axis=-1
+    )
+    first, last = edge_ends.reshape(-1, 2).T
+    lines, owners = first * (faces.max(initial=0) + 1) + last, np.repeat(proper, 3)
     order = np.argsort(lines)
     is_next = np.zeros(len(lines) + 2, bool)  # of the same edge as the one before
     is_next[1:-2] = lines[order[1:]] == lines[order[:-1]]
-    result = np.full(len(lines), -1, np.int32)
-    result[order[is_next[:-2] | is_next[1:-1]]] = _NOT_MANIFOLD
-    pair = np.flatnonzero(~is_next[:-2] & is_next[1:-1] & ~is_next[2:])
-    one, other = order[pair], order[pair + 1]
-    result[one], result[other] = owner[other], owner[one]
-    neighbor[proper] = result.reshape(-1, 3)
+    neighbors = np.full(len(lines), -1, np.int32)
+    neighbors[order[is_next[:-2] | is_next[1:-1]]] = _NOT_MANIFOLD
+    pair_starts = np.flatnonzero(~is_next[:-2] & is_next[1:-1] & ~is_next[2:])
+    one, other = order[pair_starts], order[pair_starts + 1]
+    neighbors[one], neighbors[other] = owners[other], owners[one]
+    neighbor[proper] = neighbors.reshape(-1, 3)
     return neighbor
 
 
-def number_places(positions: np.ndarray) -> np.ndarray:
+def number_positions(positions: np.ndarray) -> np.ndarray:
     """Number the distinct positions of vertices, or rows of any width: equal ones share a number, shape [vertex]."""
     permutation = np.lexsort(positions.T)
     is_new = (np.diff(positions[permutation], axis=0) != 0).any(axis=1)
-    places = np.zeros(len(positions), np.int64)
-    places[permutation[1:]] = np.cumsum(is_new)
-    return places
+    position_ids = np.zeros(len(positions), np.int64)
+    position_ids[permutation[1:]] = np.cumsum(is_new)
+    return position_ids

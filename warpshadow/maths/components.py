@@ -17,10 +17,10 @@ def connected_components(ends: np.ndarray, other_ends: np.ndarray, count: int) -
     """
     label = np.arange(count)
     while (label[ends] != label[other_ends]).any():
-        lowest = label.copy()
-        np.minimum.at(lowest, label[ends], label[other_ends])
-        np.minimum.at(lowest, label[other_ends], label[ends])
-        label = lowest
+        lowest_labels = label.copy()
+        np.minimum.at(lowest_labels, label[ends], label[other_ends])
+        np.minimum.at(lowest_labels, label[other_ends], label[ends])
+        label = lowest_labels
         while (label[label] != label).any():
             label = label[label]
     return (np.cumsum(label == np.arange(count)) - 1)[label]

@@ -38,7 +38,7 @@ class ConvexPart(NamedTuple):
     faces: np.ndarray
     """Three corners of each face, counterclockwise from outside, numbers among the corners, shape [face, 3]."""
     edges: np.ndarray
-    """Where each edge begins and ends, numbers among the corners, and the faces to its left and right, [edge, 4]."""
+    """Ends of each edge, indices of corners, and the faces to its left and right, [edge, 4]."""
     is_seam: bool = False
     """Whether it is the face that two prisms share: seen at a slant both cover it, so it is to be taken off."""
 
@@ -68,12 +68,12 @@ def find_convex_parts(
     points, solids, sheets = positions.astype(np.float64)[first], [], []
     piece = _pieces(triangles)
     for number in range(piece.max() + 1):
-        some = triangles[piece == number]
-        if _is_open(some):
-            sheets.append(some)
+        piece_triangles = triangles[piece == number]
+        if _is_open(piece_triangles):
+            sheets.append(piece_triangles)
             continue
-        solid = _solid(points, some)
-        prisms = _prisms(points, some) if solid is None else [solid]
+        solid = _solid(points, piece_triangles)
+        prisms = _prisms(points, piece_triangles) if solid is None else [solid]
         if prisms is None:
             return None
         solids += prisms
@@ -90,10 +90,10 @@ def _find_panels(points: np.ndarray, sheets: list[np.ndarray], tolerances: Seque
     for tolerance in tolerances:
         panels: list[np.ndarray] = []
         for sheet in sheets:
-            more = find_panels(points, sheet, tolerance * size, MAX_PANELS - len(panels))
-            if more is None:
+            new_panels = find_panels(points, sheet, tolerance * size, MAX_PANELS - len(panels))
+            if new_panels is None:
                 break
-            panels += more
+            panels += new_panels
         else:
             return panels
     return None
@@ -117,8 +117,8 @@ def _is_open(triangles: np.ndarray) -> bool:
 def _panel(corners: np.ndarray) -> ConvexPart:
     """A panel, given its corners in order."""
     count = len(corners)
-    third, two_thirds = count // 3, 2 * count // 3
-    sides = np.array([[0, third, two_thirds], [0, two_thirds, third]])
+    one_third, two_thirds = count // 3, 2 * count // 3
+    sides = np.array([[0, one_third, two_thirds], [0, two_thirds, one_third]])
     begin = np.arange(count)
     edges = np.stack([begin, np.roll(begin, -1), np.zeros(count, int), np.ones(count, int)], axis=1)
     return ConvexPart(corners, sides, edges)
@@ -132,17 +132,17 @@ def _solid(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
     triangle_at = {(a, b): number % count for number, (a, b) in enumerate(edges.tolist())}
     if len(triangle_at) != len(edges) or not all((b, a) in triangle_at for a, b in triangle_at):
         return None
-    used = np.unique(triangles)
-    corners = points[triangles] - points[used].mean(axis=0)
+    used_vertices = np.unique(triangles)
+    corners = points[triangles] - points[used_vertices].mean(axis=0)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    volume, size = (normals * corners[:, 0]).sum() / 6, np.ptp(points[used], axis=0).max()
+    volume, size = (normals * corners[:, 0]).sum() / 6, np.ptp(points[used_vertices], axis=0).max()
     if volume < 0:
         return _solid(points, triangles[:, ::-1])
     lengths = np.linalg.norm(normals, axis=1)
     if volume <= _FLATNESS**2 * size**3 or not lengths.all():
         return None
     units = normals / lengths[:, None]
-    heights = (points[used] - points[triangles[:, 0]][:, None]) @ units[..., None]  # [triangle, vertex, 1]
+    heights = (points[used_vertices] - points[triangles[:, 0]][:, None]) @ units[..., None]  # [triangle, vertex, 1]
     if heights.max() > _FLATNESS * size:
         return None
     right = np.array([triangle_at[b, a] for a, b in edges.tolist()])
@@ -153,9 +153,9 @@ def _solid(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
     face_count = face.max() + 1
     if face_count > MAX_FACES:
         return None
-    largest = [np.flatnonzero(face == number)[lengths[face == number].argmax()] for number in range(face_count)]
-    from_plane = points[triangles] - points[triangles[largest, 0]][face][:, None]
-    if np.abs(from_plane @ units[largest][face][..., None]).max() > _FLATNESS * size:
+    largest_faces = [np.flatnonzero(face == number)[lengths[face == number].argmax()] for number in range(face_count)]
+    plane_offsets = points[triangles] - points[triangles[largest_faces, 0]][face][:, None]
+    if np.abs(plane_offsets @ units[largest_faces][face][..., None]).max() > _FLATNESS * size:
         return None  # small bends add up to a curve
     runs: dict[tuple[int, int], list[list[int]]] = {}
     for (a, b), f, g in zip(edges.tolist(), face[left].tolist(), face[right].tolist(), strict=True):
@@ -170,7 +170,11 @@ def _solid(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
         if _bulge(points[[*starts | ends]], points[begin], points[end]) > _FLATNESS * size:
             return None
         straight.append([begin, end, f, g])
-    return ConvexPart(used, np.searchsorted(used, triangles[largest]), _renumbered(np.array(straight), used))
+    return ConvexPart(
+        used_vertices,
+        np.searchsorted(used_vertices, triangles[largest_faces]),
+        _renumbered(np.array(straight), used_vertices),
+    )
 
 
 def _prisms(points: np.ndarray, triangles: np.ndarray) -> list[ConvexPart] | None:
@@ -196,16 +200,20 @@ def _prisms_along(
     """The convex prisms with bases across an axis."""
     from scipy.spatial import cKDTree
 
-    used = np.unique(triangles)
-    heights, size = points @ axis, np.ptp(points[used], axis=0).max()
-    low, high = heights[used].min(), heights[used].max()
+    used_vertices = np.unique(triangles)
+    heights, size = points @ axis, np.ptp(points[used_vertices], axis=0).max()
+    low, high = heights[used_vertices].min(), heights[used_vertices].max()
     is_high, is_low = (np.abs(heights - level) < _FLATNESS * size for level in (high, low))
     on_top, on_bottom = is_high[triangles].all(axis=1), is_low[triangles].all(axis=1)
-    rises = np.abs(normals @ axis) > _FLATNESS * size**2
-    if high - low < 2 * _FLATNESS * size or not (is_high | is_low)[used].all() or rises[~(on_top | on_bottom)].any():
+    is_side = np.abs(normals @ axis) > _FLATNESS * size**2
+    if (
+        high - low < 2 * _FLATNESS * size
+        or not (is_high | is_low)[used_vertices].all()
+        or is_side[~(on_top | on_bottom)].any()
+    ):
         return None
-    aside = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-    plane = points @ np.stack([aside, np.cross(axis, aside)]).T / np.linalg.norm(aside)
+    tangent = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    plane = points @ np.stack([tangent, np.cross(axis, tangent)]).T / np.linalg.norm(tangent)
     polygons = cut_outline(plane, find_outline(plane, triangles[on_top]), MAX_PRISMS)
     bottom = np.unique(find_outline(plane, triangles[on_bottom]))
     if not polygons or max(map(len, polygons)) > MAX_FACES - 2 or not len(bottom):
@@ -222,19 +230,21 @@ def _prisms_along(
 def _shared_sides(plane: np.ndarray, polygons: Sequence[np.ndarray]) -> list[tuple[int, int]]:
     """Where pairs of polygons in a plane touch along their sides: the points at both ends, numbers."""
     ends = np.concatenate([np.stack([polygon, np.roll(polygon, -1)], axis=1) for polygon in polygons])
-    starts, along = plane[ends[:, 0]], plane[ends[:, 1]] - plane[ends[:, 0]]
-    lengths = np.linalg.norm(along, axis=1)
+    starts, side_vectors = plane[ends[:, 0]], plane[ends[:, 1]] - plane[ends[:, 0]]
+    lengths = np.linalg.norm(side_vectors, axis=1)
     offsets = plane[ends] - starts[:, None, None]  # [side, other side, end, 2]
-    units = along / lengths[:, None]
-    places = np.einsum("sotx,sx->sot", offsets, units)
+    units = side_vectors / lengths[:, None]
+    positions = np.einsum("sotx,sx->sot", offsets, units)
     heights = np.abs(offsets[..., 0] * units[:, None, None, 1] - offsets[..., 1] * units[:, None, None, 0]).max(axis=2)
     size = lengths.max()
-    first, last = np.maximum(places[..., 1], 0), np.minimum(places[..., 0], lengths[:, None])
-    is_shared = (heights < _FLATNESS * size) & (places[..., 0] > places[..., 1]) & (last - first > _FLATNESS * size)
+    first, last = np.maximum(positions[..., 1], 0), np.minimum(positions[..., 0], lengths[:, None])
+    is_shared = (
+        (heights < _FLATNESS * size) & (positions[..., 0] > positions[..., 1]) & (last - first > _FLATNESS * size)
+    )
     seams = set()
     for side, other in np.argwhere(is_shared).tolist():
-        begin = ends[side, 0] if places[side, other, 1] <= _FLATNESS * size else ends[other, 1]
-        end = ends[side, 1] if places[side, other, 0] >= lengths[side] - _FLATNESS * size else ends[other, 0]
+        begin = ends[side, 0] if positions[side, other, 1] <= _FLATNESS * size else ends[other, 1]
+        end = ends[side, 1] if positions[side, other, 0] >= lengths[side] - _FLATNESS * size else ends[other, 0]
         seams.add((int(min(begin, end)), int(max(begin, end))))
     return sorted(seams)
 
@@ -242,9 +252,12 @@ def _shared_sides(plane: np.ndarray, polygons: Sequence[np.ndarray]) -> list[tup
 def _prism(top: np.ndarray, bottom: np.ndarray) -> ConvexPart:
     """A prism, given the corners of its top, counterclockwise from above, and the corners below them."""
     count = len(top)
-    begin, third = np.arange(count), count // 3
+    begin, one_third = np.arange(count), count // 3
     end = np.roll(begin, -1)
-    face, bases = begin + 2, np.array([[0, third, 2 * third], [count, count + 2 * third, count + third]])
+    face, bases = (
+        begin + 2,
+        np.array([[0, one_third, 2 * one_third], [count, count + 2 * one_third, count + one_third]]),
+    )
     sides = np.stack([count + begin, count + end, end], axis=1)
     around_top = np.stack([begin, end, np.zeros_like(begin), face], axis=1)
     around_bottom = np.stack([count + begin, count + end, face, np.ones_like(begin)], axis=1)
@@ -259,6 +272,6 @@ def _bulge(points: np.ndarray, begin: np.ndarray, end: np.ndarray) -> float:
     return float(np.linalg.norm(np.cross(points - begin, direction), axis=1).max())
 
 
-def _renumbered(edges: np.ndarray, used: np.ndarray) -> np.ndarray:
+def _renumbered(edges: np.ndarray, used_vertices: np.ndarray) -> np.ndarray:
     """Edges whose corners are numbers among the used ones."""
-    return np.concatenate([np.searchsorted(used, edges[:, :2]), edges[:, 2:]], axis=1)
+    return np.concatenate([np.searchsorted(used_vertices, edges[:, :2]), edges[:, 2:]], axis=1)

@@ -70,22 +70,22 @@ def falloff_width(softness: float, count: int) -> float:
     return width
 
 
-def brightest_chunk(power: np.ndarray, is_chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def brightest_chunk(power: np.ndarray, is_candidate: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The 16 brightest of the chosen cells; where there are fewer, each fills several places among 16.
 
     Args:
         power: Light of each cell [direction].
-        is_chosen: Whether a cell may be among them, bool of shape [direction].
+        is_candidate: Whether a cell may be among them, bool of shape [direction].
     Returns:
         Their numbers, ascending, [cell]; which of them fills each place, [16]; and the first place of each of all
         cells, −1 for the others, [direction].
     """
-    cells = np.flatnonzero(is_chosen)
+    cells = np.flatnonzero(is_candidate)
     cells = np.sort(cells[np.argsort(-power[cells], kind="stable")[:CHUNK]])
-    repeated = np.arange(CHUNK) * len(cells) // CHUNK
-    places = np.full(len(power), -1, np.int32)
-    places[cells] = np.searchsorted(repeated, np.arange(len(cells)))
-    return cells, repeated, places
+    repeated_cells = np.arange(CHUNK) * len(cells) // CHUNK
+    slots = np.full(len(power), -1, np.int32)
+    slots[cells] = np.searchsorted(repeated_cells, np.arange(len(cells)))
+    return cells, repeated_cells, slots
 
 
 class BundleCones(NamedTuple):

@@ -27,11 +27,11 @@ def find_outline(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     has_area = np.abs(areas) > _SLIVER * np.ptp(points, axis=0).max(initial=0.0) ** 2
     is_turned = np.where(has_area, areas, areas.sum()) < 0
     corners = np.where(is_turned[:, None], triangles[:, ::-1], triangles)
-    begins, ends = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
-    pairs, number = np.unique(np.sort([begins, ends], axis=0), axis=1, return_inverse=True)
-    excess = np.bincount(number.reshape(-1), np.where(begins < ends, 1, -1), pairs.shape[1]).astype(int)
-    directed = np.where(excess > 0, pairs, pairs[::-1])
-    return _without_straight(points, np.repeat(directed, np.abs(excess), axis=1).T)
+    begins, edge_ends = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
+    pairs, number = np.unique(np.sort([begins, edge_ends], axis=0), axis=1, return_inverse=True)
+    excess = np.bincount(number.reshape(-1), np.where(begins < edge_ends, 1, -1), pairs.shape[1]).astype(int)
+    directed_edges = np.where(excess > 0, pairs, pairs[::-1])
+    return _without_straight(points, np.repeat(directed_edges, np.abs(excess), axis=1).T)
 
 
 def _without_straight(points: np.ndarray, edges: np.ndarray) -> np.ndarray:
@@ -45,14 +45,20 @@ def _without_straight(points: np.ndarray, edges: np.ndarray) -> np.ndarray:
     for corner in sorted(outgoing):
         if len(outgoing[corner]) != 1 or len(incoming[corner]) != 1:
             continue
-        (after,), (before,) = outgoing[corner], incoming[corner]
-        side, offset = points[after] - points[before], points[corner] - points[before]
+        (next_vertex,), (previous_vertex,) = outgoing[corner], incoming[corner]
+        side, offset = points[next_vertex] - points[previous_vertex], points[corner] - points[previous_vertex]
         length = np.hypot(*side)
-        if before != after and abs(_cross(side, offset)) <= tolerance * length and 0 < offset @ side < length**2:
+        if (
+            previous_vertex != next_vertex
+            and abs(_cross(side, offset)) <= tolerance * length
+            and 0 < offset @ side < length**2
+        ):
             del outgoing[corner], incoming[corner]
-            outgoing[before][outgoing[before].index(corner)] = after
-            incoming[after][incoming[after].index(corner)] = before
-    return np.array([[begin, end] for begin, others in outgoing.items() for end in others], int).reshape(-1, 2)
+            outgoing[previous_vertex][outgoing[previous_vertex].index(corner)] = next_vertex
+            incoming[next_vertex][incoming[next_vertex].index(corner)] = previous_vertex
+    return np.array([[begin, end] for begin, end_vertices in outgoing.items() for end in end_vertices], int).reshape(
+        -1, 2
+    )
 
 
 def is_convex(edges: np.ndarray) -> bool:
@@ -77,10 +83,12 @@ def cut_outline(points: np.ndarray, edges: np.ndarray, maximum: int) -> list[np.
         Corners of each polygon, numbers of points counterclockwise, int of shape [corner]; None where there are more,
         or where the outline touches or crosses itself.
     """
-    after, before = dict(edges.tolist()), dict(edges[:, ::-1].tolist())
-    if not len(after) == len(before) == len(edges):
+    next_vertex, previous_vertex = dict(edges.tolist()), dict(edges[:, ::-1].tolist())
+    if not len(next_vertex) == len(previous_vertex) == len(edges):
         return None
-    reflex = {corner for corner in after if _is_reflex(points, before[corner], corner, after[corner])}
+    reflex = {
+        corner for corner in next_vertex if _is_reflex(points, previous_vertex[corner], corner, next_vertex[corner])
+    }
     if len(reflex) > 2 * maximum:
         return None
     cuts = _Cuts(points, edges)
@@ -102,23 +110,23 @@ class _Cuts:
 
     def __init__(self, points: np.ndarray, edges: np.ndarray):
         self._points, self._lines = points, edges
-        before = dict(edges[:, ::-1].tolist())
-        self._ends = {corner: [after, before[corner]] for corner, after in edges.tolist()}
+        previous_vertex = dict(edges[:, ::-1].tolist())
+        self._ends = {corner: [next_vertex, previous_vertex[corner]] for corner, next_vertex in edges.tolist()}
 
     def reflex_sector(self, corner: int) -> tuple[int, int] | None:
         """Ends of two lines from a corner between which it is reflex."""
-        ends = self._ends[corner]
-        sectors = zip(ends[:-1], ends[1:], strict=True)
+        edge_ends = self._ends[corner]
+        sectors = zip(edge_ends[:-1], edge_ends[1:], strict=True)
         return next((sector for sector in sectors if _is_reflex(self._points, sector[1], corner, sector[0])), None)
 
     def best_end(self, corner: int, sector: tuple[int, int], reflex: set[int]) -> int | None:
         """The corner to which a line in a reflex sector goes; None where none is seen."""
         first, last = sector
-        to_first, to_last = self._points[[first, last]] - self._points[corner]
+        first_offset, last_offset = self._points[[first, last]] - self._points[corner]
 
         def is_seen(end: int) -> bool:
-            to_end = self._points[end] - self._points[corner]
-            is_outside = _cross(to_last, to_end) >= 0 and _cross(to_end, to_first) >= 0
+            end_offset = self._points[end] - self._points[corner]
+            is_outside = _cross(last_offset, end_offset) >= 0 and _cross(end_offset, first_offset) >= 0
             return not is_outside and not self._crosses(corner, end)
 
         def cost(end: int) -> tuple[bool, bool, float]:
@@ -142,51 +150,51 @@ class _Cuts:
         """Cut from one corner to another."""
         self._lines = np.concatenate([self._lines, [[corner, end]]])
         for one, other in ((corner, end), (end, corner)):
-            ends = self._ends[one]
-            offsets = self._points[[*ends, other]] - self._points[one]
+            edge_ends = self._ends[one]
+            offsets = self._points[[*edge_ends, other]] - self._points[one]
             *angles, angle = np.arctan2(_cross(offsets[0], offsets), offsets @ offsets[0]) % (2 * np.pi)
-            ends.insert(1 + sum(other_angle < angle for other_angle in angles[1:-1]), other)
+            edge_ends.insert(1 + sum(other_angle < angle for other_angle in angles[1:-1]), other)
 
     def leave_out_needless(self) -> None:
         """Take lines away, in the order in which they came, that leave no corner reflex where they are not."""
         for line in self._lines[len(self._ends) :].tolist():
             sectors = []
             for corner, end in (line, line[::-1]):
-                ends = self._ends[corner]
-                place = ends.index(end)
-                sectors.append((ends[place + 1], corner, ends[place - 1]))
+                edge_ends = self._ends[corner]
+                position = edge_ends.index(end)
+                sectors.append((edge_ends[position + 1], corner, edge_ends[position - 1]))
             if not any(_is_reflex(self._points, *sector) for sector in sectors):
                 for corner, end in (line, line[::-1]):
                     self._ends[corner].remove(end)
 
     def polygons(self) -> list[np.ndarray] | None:
         """Walk around each polygon; None where one is not convex."""
-        steps = {(corner, end) for corner, ends in self._ends.items() for end in ends[:-1]}
-        result = []
+        steps = {(corner, end) for corner, edge_ends in self._ends.items() for end in edge_ends[:-1]}
+        closed_polygons = []
         while steps:
             corner, end = start = min(steps)
             polygon = []
             while (corner, end) in steps:
                 steps.remove((corner, end))
                 polygon.append(corner)
-                ends = self._ends[end]
-                corner, end = end, ends[ends.index(corner) - 1]
-            turns = _turns(self._points[polygon])
-            if (corner, end) != start or turns.min() < -_STRAIGHT:
+                edge_ends = self._ends[end]
+                corner, end = end, edge_ends[edge_ends.index(corner) - 1]
+            turn_angles = _turns(self._points[polygon])
+            if (corner, end) != start or turn_angles.min() < -_STRAIGHT:
                 return None
-            result.append(np.array(polygon)[turns > _STRAIGHT])
-        return result
+            closed_polygons.append(np.array(polygon)[turn_angles > _STRAIGHT])
+        return closed_polygons
 
 
-def _is_reflex(points: np.ndarray, before: int, corner: int, after: int) -> bool:
+def _is_reflex(points: np.ndarray, previous_vertex: int, corner: int, next_vertex: int) -> bool:
     """Whether a way turns right at a corner."""
-    return bool(_turns(points[[before, corner, after]])[1] < -_STRAIGHT)
+    return bool(_turns(points[[previous_vertex, corner, next_vertex]])[1] < -_STRAIGHT)
 
 
 def _turns(polygon: np.ndarray) -> np.ndarray:
     """Sine of the angle by which the way around a polygon turns left at each corner, [corner]."""
-    inward, onward = polygon - np.roll(polygon, 1, axis=0), np.roll(polygon, -1, axis=0) - polygon
-    return _cross(inward, onward) / (np.linalg.norm(inward, axis=1) * np.linalg.norm(onward, axis=1))
+    inward, next_end = polygon - np.roll(polygon, 1, axis=0), np.roll(polygon, -1, axis=0) - polygon
+    return _cross(inward, next_end) / (np.linalg.norm(inward, axis=1) * np.linalg.norm(next_end, axis=1))
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

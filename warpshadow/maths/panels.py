@@ -61,10 +61,12 @@ def find_panels(points: np.ndarray, triangles: np.ndarray, tolerance: float, max
         if max(deviations, default=0.0) <= tolerance:
             panels = _joined(points, regions, tolerance)
             return exact + [_outline(points, panel, tolerance / 2) for panel in panels]
-        worst = int(np.argmax(deviations))
-        halves = min(_cuts(points, regions[worst]), key=lambda cut: max(_deviation(points, half) for half in cut))
-        regions[worst : worst + 1] = halves
-        deviations[worst : worst + 1] = [_deviation(points, half) for half in halves]
+        worst_region = int(np.argmax(deviations))
+        halves = min(
+            _cuts(points, regions[worst_region]), key=lambda cut: max(_deviation(points, half) for half in cut)
+        )
+        regions[worst_region : worst_region + 1] = halves
+        deviations[worst_region : worst_region + 1] = [_deviation(points, half) for half in halves]
     return None
 
 
@@ -85,37 +87,37 @@ def _smooth_regions(points: np.ndarray, triangles: np.ndarray) -> list[np.ndarra
 
 def _flat_polygons(points: np.ndarray, region: np.ndarray, maximum: int) -> list[np.ndarray] | None:
     """Corners of the convex polygons into which a region of a plane is cut; None if it lies in none, or of more."""
-    used, faces = np.unique(region, return_inverse=True)
-    if not is_flat(points[used]):
+    used_vertices, faces = np.unique(region, return_inverse=True)
+    if not is_flat(points[used_vertices]):
         return None
-    flat = points[used] @ _principal_axes(points[used])[:2].T
+    flat = points[used_vertices] @ _principal_axes(points[used_vertices])[:2].T
     polygons = cut_outline(flat, find_outline(flat, faces.reshape(region.shape)), maximum)
-    return None if polygons is None else [used[polygon] for polygon in polygons]
+    return None if polygons is None else [used_vertices[polygon] for polygon in polygons]
 
 
-def _principal_axes(places: np.ndarray) -> np.ndarray:
+def _principal_axes(local_points: np.ndarray) -> np.ndarray:
     """Unit vectors along which places spread, the longest first, shape [3, 3]."""
-    centered = places - places.mean(axis=0)
-    return np.linalg.eigh(centered.T @ centered)[1].T[::-1]
+    centered_points = local_points - local_points.mean(axis=0)
+    return np.linalg.eigh(centered_points.T @ centered_points)[1].T[::-1]
 
 
 def _cuts(points: np.ndarray, region: np.ndarray) -> list[list[np.ndarray]]:
     """Halves of a region, across each of its principal axes."""
-    middles = points[region].mean(axis=1)
-    order = np.argsort(middles @ _principal_axes(middles).T, axis=0, kind="stable")
+    centroids = points[region].mean(axis=1)
+    order = np.argsort(centroids @ _principal_axes(centroids).T, axis=0, kind="stable")
     return [[region[half] for half in np.array_split(column, 2)] for column in order.T]
 
 
 def _deviation(points: np.ndarray, region: np.ndarray) -> float:
-    """How far a region is from a panel: its thickness, or the mean width by which a convex outline is larger."""
+    """Deviation of a region from a panel: its thickness, or the mean width by which a convex outline is larger."""
     from scipy.spatial import ConvexHull
 
-    places = points[region] @ _principal_axes(points[np.unique(region)]).T
-    flat = places[..., :2]
+    local_points = points[region] @ _principal_axes(points[np.unique(region)]).T
+    flat = local_points[..., :2]
     outline = ConvexHull(flat.reshape(-1, 2))
     u, v = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
     area = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum() / 2
-    return float(max(np.ptp(places[..., 2]), (outline.volume - area) / np.ptp(flat[..., 0])))
+    return float(max(np.ptp(local_points[..., 2]), (outline.volume - area) / np.ptp(flat[..., 0])))
 
 
 def _joined(points: np.ndarray, regions: list[np.ndarray], tolerance: float) -> list[np.ndarray]:
@@ -123,9 +125,9 @@ def _joined(points: np.ndarray, regions: list[np.ndarray], tolerance: float) -> 
     panels: list[np.ndarray] = []
     for region in regions:
         for number, panel in enumerate(panels):
-            both = np.concatenate([panel, region])
-            if len(np.intersect1d(panel, region)) > 1 and _deviation(points, both) <= tolerance:
-                panels[number] = both
+            merged_region = np.concatenate([panel, region])
+            if len(np.intersect1d(panel, region)) > 1 and _deviation(points, merged_region) <= tolerance:
+                panels[number] = merged_region
                 break
         else:
             panels.append(region)
@@ -136,15 +138,15 @@ def _outline(points: np.ndarray, region: np.ndarray, tolerance: float) -> np.nda
     """Corners around a region, but for corners that stand out by less than the tolerance."""
     from scipy.spatial import ConvexHull
 
-    used = np.unique(region)
-    flat = points[used] @ _principal_axes(points[used])[:2].T
+    used_vertices = np.unique(region)
+    flat = points[used_vertices] @ _principal_axes(points[used_vertices])[:2].T
     rim = ConvexHull(flat).vertices
-    chosen = np.array([flat[rim, 0].argmin(), flat[rim, 0].argmax()])  # of the rim, in order
+    rim_ends = np.array([flat[rim, 0].argmin(), flat[rim, 0].argmax()])  # of the rim, in order
     while True:
-        corners = flat[rim[np.sort(chosen)]]
+        corners = flat[rim[np.sort(rim_ends)]]
         sides = np.roll(corners, -1, axis=0) - corners
         outward = np.stack([sides[:, 1], -sides[:, 0]], axis=1) / np.linalg.norm(sides, axis=1, keepdims=True)
         heights = ((flat[rim][:, None] - corners) * outward).sum(axis=-1).max(axis=1)
-        if len(chosen) > 2 and heights.max() <= tolerance:
-            return used[rim[np.sort(chosen)]]
-        chosen = np.append(chosen, heights.argmax())
+        if len(rim_ends) > 2 and heights.max() <= tolerance:
+            return used_vertices[rim[np.sort(rim_ends)]]
+        rim_ends = np.append(rim_ends, heights.argmax())

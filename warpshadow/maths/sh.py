@@ -42,10 +42,10 @@ def schmidt_recurrence(order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     for m in range(1, order):
         diagonal[m] = diagonal[m - 1] * np.sqrt((2 * m - 1) / (2 * m)) * (np.sqrt(2) if m == 1 else 1)
     band, degree = np.tril_indices(order)
-    rise = np.sqrt((band + 1.0) ** 2 - degree**2)
+    sqrt_term = np.sqrt((band + 1.0) ** 2 - degree**2)
     up, back = np.zeros((2, order, order))
-    up[band, degree] = (2 * band + 1) / rise
-    back[band, degree] = np.sqrt(band**2.0 - degree**2) / rise
+    up[band, degree] = (2 * band + 1) / sqrt_term
+    back[band, degree] = np.sqrt(band**2.0 - degree**2) / sqrt_term
     return diagonal, up, back
 
 
@@ -106,8 +106,8 @@ def equirectangular_directions(height: int) -> np.ndarray:
     """
     theta = np.pi * (np.arange(height) + 0.5)[:, None] / height
     phi = np.pi * (np.arange(2 * height) + 0.5)[None, :] / height
-    ring = np.sin(theta)
-    return np.stack(np.broadcast_arrays(np.sin(phi) * ring, np.cos(theta), -np.cos(phi) * ring), axis=-1)
+    sine = np.sin(theta)
+    return np.stack(np.broadcast_arrays(np.sin(phi) * sine, np.cos(theta), -np.cos(phi) * sine), axis=-1)
 
 
 def pixel_solid_angles(height: int) -> np.ndarray:
@@ -198,8 +198,8 @@ def rotation_matrix(order: int, rotation: np.ndarray) -> np.ndarray:
         Shape [order², order²]: if f' = M f, then f'(R d) = f(d).
     """
     directions, weights = quadrature(2 * order - 2)
-    turned = evaluate(order, directions @ np.asarray(rotation, np.float64).T)
-    return (turned * weights[:, None]).T @ evaluate(order, directions)
+    rotated_values = evaluate(order, directions @ np.asarray(rotation, np.float64).T)
+    return (rotated_values * weights[:, None]).T @ evaluate(order, directions)
 
 
 @functools.cache
@@ -217,9 +217,9 @@ def rotation_generators(order: int) -> np.ndarray:
     degree = np.arange(order**2) - band**2 - band
     about_z = np.zeros((order**2, order**2))
     about_z[np.arange(order**2) - 2 * degree, np.arange(order**2)] = degree
-    to_axis = np.roll(np.eye(3), 1, axis=0), np.roll(np.eye(3), 2, axis=0), np.eye(3)  # z to x, to y, and to z
-    turns = [rotation_matrix(order, turn) for turn in to_axis]
-    return np.stack([turn @ about_z @ turn.T for turn in turns])
+    axis_rotations = np.roll(np.eye(3), 1, axis=0), np.roll(np.eye(3), 2, axis=0), np.eye(3)  # z to x, to y, and to z
+    basis_rotations = [rotation_matrix(order, turn) for turn in axis_rotations]
+    return np.stack([turn @ about_z @ turn.T for turn in basis_rotations])
 
 
 # ---------------------------------------------------------------------------------------------- products

@@ -19,8 +19,8 @@ def compact_order(points: np.ndarray, *, runs: tuple[int, ...] = (16, 4)) -> np.
         return np.arange(count)
     _, axes = np.linalg.eigh(np.cov(points.T))
     axis_order = np.argsort(points @ axes[:, -1], kind="stable")
-    middle = -(-count // unit) // 2 * unit
-    halves = axis_order[:middle], axis_order[middle:]
+    split = -(-count // unit) // 2 * unit
+    halves = axis_order[:split], axis_order[split:]
     return np.concatenate([half[compact_order(points[half], runs=runs)] for half in halves])
 
 
@@ -45,7 +45,7 @@ def z_order_of_cells(cells: np.ndarray) -> np.ndarray:
     return np.argsort(codes, kind="stable")
 
 
-def _spread(numbers: np.ndarray) -> np.ndarray:
+def _spread(integers: np.ndarray) -> np.ndarray:
     """Put two zeros between all bits of numbers of 21 bits."""
     for shift, mask in (
         (32, 0x1F00000000FFFF),
@@ -54,5 +54,5 @@ def _spread(numbers: np.ndarray) -> np.ndarray:
         (4, 0x10C30C30C30C30C3),
         (2, 0x1249249249249249),
     ):
-        numbers = (numbers | (numbers << np.uint64(shift))) & np.uint64(mask)
-    return numbers
+        integers = (integers | (integers << np.uint64(shift))) & np.uint64(mask)
+    return integers

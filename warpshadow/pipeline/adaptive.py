@@ -15,8 +15,8 @@ from warpshadow.pipeline.by_spheres import SphereMethod
 from warpshadow.pipeline.lighting import LitPoints
 from warpshadow.stages.quadtree import Quadtree, find_quadtree, keys_of, probe_grid
 from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.receivers import points_seen
-from warpshadow.stages.sample_receivers import see_samples
+from warpshadow.stages.receivers import points_of_fragments
+from warpshadow.stages.sample_receivers import fragments_of_samples
 
 
 def find_squares(
@@ -55,8 +55,10 @@ def find_squares(
             if not columns.shape[1]:
                 continue
             samples = np.where(columns < 0, -1, probes[columns])
-            seen = see_samples(fragments, samples)
-            facing = points_seen(without_gradient(positions), without_gradient(normals), merged_scene.faces, seen)
+            seen = fragments_of_samples(fragments, samples)
+            facing = points_of_fragments(
+                without_gradient(positions), without_gradient(normals), merged_scene.faces, seen
+            )
             group = blockers.around_plane(*facing, body)
             portions = [method.sharp_share(portion) for portion in group.portions()]
             known = [portion for portion in portions if portion is not None]

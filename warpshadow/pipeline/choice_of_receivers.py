@@ -192,9 +192,9 @@ def _has_sun(scene: Scene) -> bool:
     if scene.visibility.method != "directional":
         return False
     cells = as_light(scene.light).cells(fibonacci(scene.visibility.directions))
-    if cells.spots is None or cells.spreads is None:
+    if cells.spots is None or cells.half_angles is None:
         return False
-    return find_sharp_cells(cells.radiance @ LUMINANCE, cells.spots, cells.spreads) is not None
+    return find_sharp_cells(cells.radiance @ LUMINANCE, cells.spots, cells.half_angles) is not None
 
 
 def receiver_notes(scene: Scene, choices: Sequence[ReceiverChoice], bulging: Collection[int] = ()) -> list[str]:

@@ -67,7 +67,7 @@ class SceneConvexParts:
             chosen = [
                 ConvexBody(self.parts[number], int(starts[number]), number in blocking_bodies) for number in bodies
             ]
-            self._blockers[key] = ConvexBlockers.of(chosen, int(starts[-1]), device=device)
+            self._blockers[key] = ConvexBlockers.from_bodies(chosen, int(starts[-1]), device=device)
         return self._blockers[key]
 
     def placed(self, bodies: tuple[int, ...], positions: wp.array) -> PlacedParts:

@@ -30,9 +30,9 @@ from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.pipeline.self_visibility import SelfVisibilityLookup
 from warpshadow.pipeline.static import StaticBodies, VertexRows
 from warpshadow.scene.blockers import blocking_planes
-from warpshadow.stages.cached_cells import CachedRows, cell_transfer, light_cells
+from warpshadow.stages.cached_cells import CachedRows, cell_transfer, shade_cached_cells
 from warpshadow.stages.gloss.reflection import blocked_radiance
-from warpshadow.stages.gloss.transmittance import transmittance_towards
+from warpshadow.stages.gloss.transmittance import transmittance_of_directions
 from warpshadow.stages.joint_coverage import transmittance_past
 from warpshadow.stages.light_samples import CellSamples, cell_samples, even_samples, sample_map
 from warpshadow.stages.planes.coverage import plane_coverage
@@ -47,8 +47,8 @@ from warpshadow.stages.transfer import directional_transfer
 from warpshadow.stages.visibility import directional
 from warpshadow.stages.visibility.directional import SOFTNESS
 from warpshadow.stages.visibility.sharp_cells import (
-    SHARP_CELL_RADII,
-    WIDEST_PAST_PLANES,
+    MAX_RADIUS_PAST_PLANES,
+    RADII_PER_HALF_ANGLE,
     SharpCells,
     blend_sharp_cells,
     find_sharp_cells,
@@ -102,17 +102,17 @@ class Directional(SphereMethod):
         """Cells that look to where their light comes from: a sun is rarely in the middle of one."""
         known = as_light(light)
         cells = known.cells(self._directions)
-        if cells.spots is None or cells.spreads is None:
+        if cells.spots is None or cells.half_angles is None:
             return ProjectedCells(cells.directions, self._on_device(cells.radiance), cells.directions)
         power, softness = cells.radiance @ LUMINANCE, self.visibility.softness
-        find = functools.partial(find_sharp_cells, power, cells.spots, cells.spreads, softness)
+        find = functools.partial(find_sharp_cells, power, cells.spots, cells.half_angles, softness)
         draw = functools.partial(draw_in_cells, known.radiance, self._directions)
         sun = find_sun_cells(power, draw) if self.self_visibility.wants_rays else None
-        sharp_cells = find(), find(WIDEST_PAST_PLANES)
+        sharp_cells = find(), find(MAX_RADIUS_PAST_PLANES)
         rest, rest_light, directions, spot_shares = known.radiance, cells, cells.directions, np.ones(len(power))
         if sharp_cells[0] is not None and sharp_cells[1] is not None:
-            is_sharp = (sharp_cells[0].places >= 0) & (sharp_cells[1].places >= 0)
-            rest = without_spots(known.radiance, cells.spots[is_sharp], _NEAR_SPOT * cells.spreads[is_sharp])
+            is_sharp = (sharp_cells[0].slots >= 0) & (sharp_cells[1].slots >= 0)
+            rest = without_spots(known.radiance, cells.spots[is_sharp], _NEAR_SPOT * cells.half_angles[is_sharp])
             rest_light = gather_cells(rest, self._directions)
             directions = np.where(is_sharp[:, None], rest_light.directions, directions)
             spot_shares[is_sharp] = 1 - (rest_light.radiance @ LUMINANCE)[is_sharp] / power[is_sharp]
@@ -123,7 +123,7 @@ class Directional(SphereMethod):
             coefficients,
             cells.directions,
             cells.spots,
-            cells.spreads,
+            cells.half_angles,
             *sharp_cells,
             spot_shares=spot_shares,
             samples=samples,
@@ -192,18 +192,18 @@ class Directional(SphereMethod):
         sharp_cells = projected_light.sharp_cells_past_planes
         if sharp_cells is None or coverages.sharp_cells is None:
             return transmittance_past(transmittance, coverages.cells, of_others[0])
-        passing = blend_sharp_cells(
+        blended = blend_sharp_cells(
             transmittance_past(None, coverages.cells, of_others[0]),
             transmittance_past(None, coverages.sharp_cells, of_others[1]),
-            sharp_cells.places,
+            sharp_cells.slots,
             projected_light.spot_shares,
         )
-        return passing if transmittance is None else multiply_transmittances(transmittance, passing)
+        return blended if transmittance is None else multiply_transmittances(transmittance, blended)
 
     def _edge_radius(self, sharp_cells: SharpCells) -> float:
         """Radius of the disc by which planes and convex parts cover sharp cells [rad]: the sun's, for κ = 0.35."""
         softness = self.visibility.softness / SOFTNESS
-        return softness * sharp_cells.scale * cell_radius(len(sharp_cells.directions)) / SHARP_CELL_RADII
+        return softness * sharp_cells.scale * cell_radius(len(sharp_cells.directions)) / RADII_PER_HALF_ANGLE
 
     def _past_spheres(
         self, group: Group, horizon_normals: wp.array | None, projected_light: ProjectedCells
@@ -236,7 +236,7 @@ class Directional(SphereMethod):
     ) -> GroupVisibility:
         """Transmittance past the flat bodies around a group, too."""
         planes = group.planes
-        if planes is None or not group.points.size or not set(planes.planes.blocking) - {planes.skip}:
+        if planes is None or not group.points.size or not set(planes.planes.is_blocking) - {planes.skip}:
             return visibility
         horizon_normals = group.normals if group.cached_rows is None else None
         points, fronts = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
@@ -270,7 +270,7 @@ class Directional(SphereMethod):
             )
         assert group.body is not None
         of_sun = trace_sun_cells(rays[0], group.probe_weights, rays[1], group.body, projected_light.sun)
-        return blend_sharp_cells(transmittance_self, of_sun, projected_light.sun.places)
+        return blend_sharp_cells(transmittance_self, of_sun, projected_light.sun.slots)
 
     def transfer(self, visibility: GroupVisibility, group: Group, projected_light: ProjectedCells) -> wp.array:
         """Transfer vectors; the transmittance as it is where cached cells hold known light."""
@@ -284,7 +284,7 @@ class Directional(SphereMethod):
     def shade_transfer(self, transfer: wp.array, group: Group, projected_light: ProjectedCells) -> wp.array:
         """Shading of a portion, vec3 of shape [batch, receiver]."""
         if group.cached_rows is not None and _has_light(group.cached_rows):
-            return light_cells(transfer, group.cached_rows)
+            return shade_cached_cells(transfer, group.cached_rows)
         return super().shade_transfer(transfer, group, projected_light)
 
     def shade_transmittance(
@@ -333,7 +333,7 @@ class Directional(SphereMethod):
         if group.convex_parts_around is not None:
             coverages.append(group.convex_parts_around.coverage(points, normals, directions, radius))
         planes = group.planes
-        if planes is not None and set(planes.planes.blocking) - {planes.skip}:
+        if planes is not None and set(planes.planes.is_blocking) - {planes.skip}:
             lifted, fronts = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
             options: dict[str, Any] = {"radius": radius, "horizon_normals": normals, "fronts": fronts}
             coverages.append(
@@ -443,7 +443,7 @@ def _towards(
     if not directions.size:
         return wp.empty(directions.shape, dtype=wp.float32, device=directions.device)
     transmittance = _joined_cells(cells, count)
-    return transmittance_towards(transmittance, receivers.normals, directions, projected_light.facing)
+    return transmittance_of_directions(transmittance, receivers.normals, directions, projected_light.facing)
 
 
 def _joined_cells(cells: list[wp.array], count: int) -> wp.array:

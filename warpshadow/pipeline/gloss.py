@@ -26,7 +26,7 @@ from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sample_receivers import Span
 from warpshadow.stages.textures.footprint import Footprints
-from warpshadow.stages.textures.numbers import as_colors, as_numbers, means_of_receivers
+from warpshadow.stages.textures.numbers import as_colors, as_scalars, means_of_receivers
 from warpshadow.stages.textures.pyramid import Textures
 from warpshadow.stages.textures.sample import sample_albedo
 
@@ -113,7 +113,7 @@ class GlossyPoints(LitPoints):
 
     def _sample(self, fragments: Fragments, values: wp.array, textures: Textures, footprints: Footprints) -> wp.array:
         """Numbers of the view's samples: of textures and, on bodies without one, of vertices."""
-        return as_numbers(sample_albedo(fragments, self.merged_scene.faces, as_colors(values), textures, footprints))
+        return as_scalars(sample_albedo(fragments, self.merged_scene.faces, as_colors(values), textures, footprints))
 
     def _prefiltered(self, light: Input) -> Node:
         """Node of the texels of light, vec3 of shape [batch, texel]."""

@@ -46,7 +46,7 @@ class Group(NamedTuple):
     self_lookup: SelfVisibilityLookup | SelfVisibilityLobes | None = None
     planes: GroupPlanes | None = None  # bodies that block as planes; None without any
     convex_parts_around: GroupConvexParts | None = None  # bodies that block as convex parts; None without any
-    nearest_blockers: NearestBlockers | None = None  # None where they are not sources of light
+    nearest_blockers: NearestBlockers | None = None  # None where receivers are not patch samples
     corners: wp.array | None = None  # of the body, vec3 of shape [batch, corner]; None where it is not known
     skip: tuple[int, int] = (0, 0)  # spheres that do not block: the first, and the one after the last
     clusters: ClusterTree | None = None  # of the spheres, where they are found already
@@ -241,7 +241,7 @@ def _groups_that_move(
 
 
 def _nearest_blockers(numbers: np.ndarray | None, blockers: Blockers) -> NearestBlockers | None:
-    """The blockers nearest to the receivers; None where these are not sources."""
+    """The blockers nearest to the receivers; None where these are not patch samples."""
     if numbers is None:
         return None
     merged_scene = blockers.merged_scene

@@ -57,7 +57,7 @@ class ScenePlanes:
         if key not in self._blockers:
             chosen = [self._body(number)._replace(blocks=number in blocking_bodies) for number in bodies]
             vertex_count = int(self._merged_scene.first_vertex[-1])
-            self._blockers[key] = PlaneBlockers.of(chosen, 0, vertex_count, device=self._merged_scene.device)
+            self._blockers[key] = PlaneBlockers.from_bodies(chosen, 0, vertex_count, device=self._merged_scene.device)
         return self._blockers[key]
 
     def frames(self, bodies: tuple[int, ...], positions: wp.array) -> wp.array:
@@ -93,7 +93,7 @@ class ScenePlanes:
         columns = np.concatenate([first + corners for first, corners in zip(starts[:-1], self._corners, strict=True)])
         entries = np.ones(len(columns)), (np.arange(len(columns)), columns)
         matrix = csr_matrix(entries, shape=(len(columns), int(starts[-1])))
-        return SparseMatrix.of(matrix, device=self._merged_scene.device)
+        return SparseMatrix.from_matrix(matrix, device=self._merged_scene.device)
 
     def _body(self, number: int) -> PlaneBody:
         if number not in self._bodies:

@@ -66,27 +66,27 @@ class Rays(Method):
 
             arguments = direct, meshes, points, light, materials
             return path_traced(*arguments, samples=self._sample_count, progress=self.progress)
-        sources = self._bounces.sources(points, materials)
+        patch_samples = self._bounces.patch_samples(points, materials)
 
-        def shaded_sources() -> Node:
+        def shaded_patch_samples() -> Node:
             shade = self._shade_shared if self.shares_directions else self._shade
-            return Node("", shade, self._blockers(points, sources), sources, light)
+            return Node("", shade, self._blockers(points, patch_samples), patch_samples, light)
 
-        at_sources = points.cached("direct at sources", (light, sources), shaded_sources)
-        return self._bounces.add_bounces(direct, at_sources, points, materials)
+        at_patch_samples = points.cached("direct at patch samples", (light, patch_samples), shaded_patch_samples)
+        return self._bounces.add_bounces(direct, at_patch_samples, points, materials)
 
     def free_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
         """Shading of points in free light."""
         direct = super().free_shading(points, light, materials)
         if not self.merged_scene.scene.bounces:
             return direct
-        sources = self._bounces.sources(points, materials)
+        patch_samples = self._bounces.patch_samples(points, materials)
 
         def transfers() -> Node:
-            return Node("", self._transfer, self._meshes_for(points, sources), sources)
+            return Node("", self._transfer, self._meshes_for(points, patch_samples), patch_samples)
 
-        at_sources = points.cached("transfer of sources", sources, transfers)
-        return self._bounces.add_free_bounces(direct, at_sources, light, points, materials)
+        at_patch_samples = points.cached("transfer of patch samples", patch_samples, transfers)
+        return self._bounces.add_free_bounces(direct, at_patch_samples, light, points, materials)
 
     @functools.cached_property
     def _bounces(self) -> "StaticBounces":

@@ -30,7 +30,7 @@ from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.ray_packets import FaceTree, build_face_tree
 from warpshadow.stages.receivers import Receivers, Span
 from warpshadow.stages.self_visibility.buried import find_buried, find_dilation
-from warpshadow.stages.self_visibility.lobes import BodyRotation, find_turned, project_rows
+from warpshadow.stages.self_visibility.lobes import BodyRotation, find_body_rotation, project_rows
 from warpshadow.stages.self_visibility.lookup import (
     ResamplingKernels,
     ResamplingWeights,
@@ -45,7 +45,14 @@ from warpshadow.stages.self_visibility.probes import (
     longest_edge,
 )
 from warpshadow.stages.self_visibility.sun_cells import RayProbes
-from warpshadow.stages.self_visibility.trace import RAYS, RUN, VisibilityRows, ray_count, trace_rows, trace_seconds
+from warpshadow.stages.self_visibility.trace import (
+    RAYS,
+    RAYS_PER_CELL,
+    VisibilityRows,
+    ray_count,
+    trace_rows,
+    trace_seconds,
+)
 
 VERSION = 4  # part of the key of cached rows: raise it whenever they would come out differently
 
@@ -87,7 +94,8 @@ class SelfVisibility:
 
     Args:
         merged_scene: The bodies.
-        samples_receive: Bodies on which samples are receivers, bool of shape [body]: they have probes within faces.
+        has_sample_receivers: Bodies on which samples are receivers, bool of shape [body]: they have probes within
+            faces.
     """
 
     def __init__(self, merged_scene: MergedScene, samples_receive: np.ndarray, *, progress: bool = False):
@@ -142,7 +150,7 @@ class SelfVisibility:
                 points = from_numpy(positions[None], dtype=wp.vec3, device=device)
                 normals = vertex_normals(points, from_numpy(faces, dtype=wp.vec3i, device=device)).numpy()[0]
                 samples_receive = bool(self._samples_receive[body])
-                longest = longest_edge(positions, faces, samples_receive=samples_receive)
+                longest = longest_edge(positions, faces, has_sample_receivers=samples_receive)
                 if not samples_receive or mesh.smooth_pieces.max() == 0:
                     return find_probes(positions, normals, faces, longest)
                 whole = wp.Mesh(points.flatten(), from_numpy(faces.ravel(), dtype=wp.int32, device=device))
@@ -237,7 +245,7 @@ class SelfVisibility:
         """The lobes of bodies in bands of spherical harmonics, and how they are turned. Differentiable: rotations."""
         self._announce(bodies)
         return {
-            body: SelfVisibilityLobes(self._lobes_of(body, order), find_turned(rotations, body, order))
+            body: SelfVisibilityLobes(self._lobes_of(body, order), find_body_rotation(rotations, body, order))
             for body in bodies
             if not self._merged_scene.is_flat[body]
         }
@@ -317,7 +325,7 @@ class SelfVisibility:
             )
 
         def read(stored: Mapping[str, np.ndarray]) -> VisibilityRows:
-            for name, dtype, width in (("bits", np.uint32, count // 32), ("cells", np.uint8, count // RUN)):
+            for name, dtype, width in (("bits", np.uint32, count // 32), ("cells", np.uint8, count // RAYS_PER_CELL)):
                 check.shape(name, stored[name].shape, (self._row_count(body), width))
                 if stored[name].dtype != dtype:
                     raise ValueError(f"{name}: got {stored[name].dtype}, expected {np.dtype(dtype)}")
@@ -339,8 +347,8 @@ class SelfVisibility:
                     places,
                     normals,
                     count,
-                    before=unfinished.before.get("bits"),
-                    keep=keep,
+                    cached_bits=unfinished.before.get("bits"),
+                    store_bits=keep,
                     progress=self._progress,
                 )
                 is_buried = find_buried(whole, places, normals, len(probes.positions), rows)
@@ -351,5 +359,5 @@ class SelfVisibility:
             read,
             trace,
             lambda rows: {name: array.numpy() for name, array in rows._asdict().items()},
-            what="self-shadow",
+            noun="self-shadow",
         )

@@ -23,7 +23,7 @@ def shading_ratio(view: View, call: Call) -> np.ndarray:
     device, scene = view.merged_scene.device, view.merged_scene.scene
     bodies = tuple(replace(body, blockers=0) for body in scene.bodies)
     without_blockers = make_method(MergedScene(replace(scene, bodies=bodies), device=device), None)
-    receivers = Node("", Receivers.without_owners, view.receivers_node)
+    receivers = Node("", Receivers.without_bodies, view.receivers_node)
     spheres = Input("spheres", tuple(empty((1, 0), dtype=dtype, device=device) for dtype in (wp.vec3, wp.float32)))
     free = LitPoints(without_blockers, view.materials, view.vertices, spheres, receivers, call)
     images = (view.white_image(item.shading(None)).value(call) for item in (view, free))

@@ -266,7 +266,7 @@ class View(LitPoints):
             unshadowed, catches: As for :func:`warpshadow.stages.photograph.find_ratio_image`.
             light, materials: As for :meth:`image`.
         """
-        from warpshadow.stages.photograph import compose, find_ratio_image, over_nothing
+        from warpshadow.stages.photograph import compose, composite_alone, find_ratio_image
 
         shading, reflectance = self.shading(light, materials), self.reflectance(materials)
 
@@ -287,7 +287,7 @@ class View(LitPoints):
         films = [self._averaged(samples, is_moving=self._is_moving) for samples in surfaces]
         films.append(self._averaged(base_factor))
         if photograph is None:
-            return Node("photograph", over_nothing, *films, caches=False)
+            return Node("photograph", composite_alone, *films, caches=False)
         return Node("photograph", compose, photograph, *films, caches=False)
 
     def white(self, light: Light | None, materials: Materials) -> Node:

@@ -79,7 +79,7 @@ def load_scene(path: AnyPath, *, bounces: Bounces | None = None, **settings: obj
 
 def _scene(scene: Table, folder: Path, bounces: Bounces | None, settings: Table) -> Scene:
     with check.located("the scene"):
-        _check_keys("", scene, ("camera", "light", "visibility", "body"), what="table")
+        _check_keys("", scene, ("camera", "light", "visibility", "body"), noun="table")
     for name in ("camera", "light", "body"):
         if name not in scene:
             raise ValueError(f"[{name}] is missing; a scene has [camera], [light] and at least one [[body]]")
@@ -117,7 +117,7 @@ def _framing(table: Table, bodies: Sequence[Body]) -> Camera:
     return toml_tables.make(functools.partial(Camera.framing, bodies), table)
 
 
-def _check_keys(name: str, table: Table, known: Iterable[str] = (), *, what: str = "key") -> None:
+def _check_keys(name: str, table: Table, known: Iterable[str] = (), *, noun: str = "key") -> None:
     """Raise ValueError for a key that is not known in a table; where others have it the message names them."""
     known = tuple(known) or _KEYS[name]
     for key in table:
@@ -126,8 +126,8 @@ def _check_keys(name: str, table: Table, known: Iterable[str] = (), *, what: str
         if key not in known and others and name not in others:
             raise ValueError(f"got {key}, expected it in {' or '.join(others)}")
         if key not in known and LIKELY_MISTAKES.get(key) in known:
-            raise ValueError(f"{what}: unknown key {key!r} (did you mean {LIKELY_MISTAKES[key]!r}?)")
-    check.known_keys(what, table, known)
+            raise ValueError(f"{noun}: unknown key {key!r} (did you mean {LIKELY_MISTAKES[key]!r}?)")
+    check.known_keys(noun, table, known)
 
 
 def parse_camera(table: Table) -> Camera:

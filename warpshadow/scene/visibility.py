@@ -134,7 +134,7 @@ class Visibility:
         check.choice("self_shadows", self.self_shadows, SELF_SHADOWS)
         check.choice("sampling", self.sampling, SAMPLINGS)
         if self.samples is not None:
-            check.integer("samples", self.samples, what="directions")
+            check.integer("samples", self.samples, unit="directions")
         if not (check.is_number(self.error) and self.error > 0):
             raise ValueError(f"error: got {self.error!r}, expected a positive number such as 0.05, which is 5%")
         falloff_width(self.softness, self.directions)

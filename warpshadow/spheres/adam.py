@@ -18,6 +18,6 @@ class Adam:
         self.age += 1
         self.mean += 0.1 * (gradient - self.mean)
         self.square += 0.01 * (gradient**2 - self.square)
-        move = self.mean / (1 - 0.9**self.age) / (np.sqrt(self.square / (1 - 0.99**self.age)) + 1e-12)
-        spheres[:, :3] -= rate * move[:, :3]
-        spheres[:, 3] *= np.exp(-RADIUS_RATE * rate * move[:, 3])
+        update = self.mean / (1 - 0.9**self.age) / (np.sqrt(self.square / (1 - 0.99**self.age)) + 1e-12)
+        spheres[:, :3] -= rate * update[:, :3]
+        spheres[:, 3] *= np.exp(-RADIUS_RATE * rate * update[:, 3])

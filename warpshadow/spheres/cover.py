@@ -39,19 +39,19 @@ def medial_balls(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> 
 
     A ball that touches the surface at p shrinks until it contains no other point of it.
     """
-    touching, normals = mesh.sample(count, rng)
+    tangent_points, normals = mesh.sample(count, rng)
     radii = np.full(count, 0.5)
     for _ in range(12):
-        centers = touching - radii[:, None] * normals
+        centers = tangent_points - radii[:, None] * normals
         nearest = mesh.nearest(centers)
-        chord = nearest - touching
+        chord = nearest - tangent_points
         depth = np.maximum(-2 * (chord * normals).sum(axis=1), 1e-9)
         shrinks = np.linalg.norm(nearest - centers, axis=1) < 0.98 * radii - 1e-5
         shrinks &= np.linalg.norm(chord, axis=1) > 1e-4
         if not shrinks.any():
             break
         radii = np.where(shrinks, np.minimum(radii, np.maximum((chord**2).sum(axis=1) / depth, 1e-3)), radii)
-    centers = touching - radii[:, None] * normals
+    centers = tangent_points - radii[:, None] * normals
     radii = -mesh.signed_distances(centers)[0]
     return np.column_stack([centers, radii])[radii > 1e-3]
 
@@ -62,31 +62,31 @@ def greedy_cover(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> 
     Balls of the medial axis fill solid parts, balls on the surface cover thin or open parts.
     """
     spacing = np.sqrt(mesh.area / count)
-    on_surface, _ = mesh.sample(600 + 2 * count, rng)
-    flat = np.column_stack([on_surface, np.full(len(on_surface), 0.35 * spacing)])
+    surface_samples, _ = mesh.sample(600 + 2 * count, rng)
+    flat = np.column_stack([surface_samples, np.full(len(surface_samples), 0.35 * spacing)])
     balls = np.concatenate([medial_balls(mesh, 800 + 4 * count, rng), flat])
-    in_box = mesh.low + rng.uniform(size=(6000, 3)) * (mesh.high - mesh.low)
-    in_volume = in_box[mesh.signed_distances(in_box)[0] < 0][: 1500 + count]
-    samples = np.concatenate([in_volume, on_surface])
-    shares = [np.full(len(part), 0.5 / max(len(part), 1)) for part in (in_volume, on_surface)]
+    box_samples = mesh.low + rng.uniform(size=(6000, 3)) * (mesh.high - mesh.low)
+    volume_samples = box_samples[mesh.signed_distances(box_samples)[0] < 0][: 1500 + count]
+    samples = np.concatenate([volume_samples, surface_samples])
+    shares = [np.full(len(part), 0.5 / max(len(part), 1)) for part in (volume_samples, surface_samples)]
     left = np.concatenate(shares).astype(np.float32)
 
-    reach = balls[:, 3] + 0.1 * spacing
+    cover_radii = balls[:, 3] + 0.1 * spacing
     squares = (samples**2).sum(axis=1)[:, None] + (balls[:, :3] ** 2).sum(axis=1) - 2 * samples @ balls[:, :3].T
-    covers = (squares < reach**2).astype(np.float32)  # [sample, ball]
-    gain = left @ covers
-    picked = np.zeros(len(balls), bool)
-    chosen = []
+    is_covering = (squares < cover_radii**2).astype(np.float32)  # [sample, ball]
+    gain = left @ is_covering
+    is_picked = np.zeros(len(balls), bool)
+    picked_balls = []
     for _ in range(min(count, len(balls))):
-        best = int(np.argmax(np.where(picked, -1.0, gain)))
-        if gain[best] < 1e-4:  # nothing left to cover: descent will find work for the rest
-            best = int(rng.choice(np.flatnonzero(~picked)))
-        picked[best] = True
-        chosen.append(best)
-        covered = np.flatnonzero(covers[:, best])
-        gain -= 0.9 * left[covered] @ covers[covered]
-        left[covered] *= 0.1
-    return balls[chosen]
+        best_ball = int(np.argmax(np.where(is_picked, -1.0, gain)))
+        if gain[best_ball] < 1e-4:  # nothing left to cover: descent will find work for the rest
+            best_ball = int(rng.choice(np.flatnonzero(~is_picked)))
+        is_picked[best_ball] = True
+        picked_balls.append(best_ball)
+        covered_samples = np.flatnonzero(is_covering[:, best_ball])
+        gain -= 0.9 * left[covered_samples] @ is_covering[covered_samples]
+        left[covered_samples] *= 0.1
+    return balls[picked_balls]
 
 
 # ------------------------------------------------------------------------------------------------- descent
@@ -116,12 +116,12 @@ def _outside_volume(
     share = 4.0 / 3.0 * wp.pi * radius * radius * radius / float(samples.shape[0])
     depth = distance / (EDGE * radius)  # from −1, inside, to 1, outside
     t = wp.clamp(0.5 + 0.5 * depth, 0.0, 1.0)
-    outside = share * t * t * (3.0 - 2.0 * t)
-    rise = share * 3.0 * t * (1.0 - t)  # by the depth
-    by_center = rise / (EDGE * radius) * slope
-    volumes[sphere, sample] = outside
-    by_radius = 3.0 * outside + wp.dot(by_center, offset) - rise * depth
-    gradient[sphere, sample] = wp.vec4(by_center[0], by_center[1], by_center[2], by_radius)
+    outside_volume = share * t * t * (3.0 - 2.0 * t)
+    volume_slope = share * 3.0 * t * (1.0 - t)  # by the depth
+    adj_center = volume_slope / (EDGE * radius) * slope
+    volumes[sphere, sample] = outside_volume
+    adj_radius = 3.0 * outside_volume + wp.dot(adj_center, offset) - volume_slope * depth
+    gradient[sphere, sample] = wp.vec4(adj_center[0], adj_center[1], adj_center[2], adj_radius)
 
 
 @wp.kernel(enable_backward=False)
@@ -137,21 +137,21 @@ def _bare_gaps(
     """Each thread owns a point of the surface: the gap to the sphere nearest to it, 0 if that covers the point."""
     i = wp.tid()
     gap = float(1.0e30)
-    chosen = int(0)
+    nearest_ball = int(0)
     for sphere in range(spheres.shape[0]):
         ball = spheres[sphere]
         excess = wp.length(points[i] - wp.vec3(ball[0], ball[1], ball[2])) - ball[3]
         if excess < gap:
             gap = excess
-            chosen = sphere
-    ball = spheres[chosen]
-    toward = wp.vec4(0.0)
+            nearest_ball = sphere
+    ball = spheres[nearest_ball]
+    gap_gradient = wp.vec4(0.0)
     if gap > 0.0:
         away = wp.normalize(wp.vec3(ball[0], ball[1], ball[2]) - points[i])
-        toward = wp.vec4(away[0], away[1], away[2], -ball[3])
+        gap_gradient = wp.vec4(away[0], away[1], away[2], -ball[3])
     gaps[i] = wp.max(gap, 0.0)
-    nearest[i] = chosen
-    gradient[i] = toward
+    nearest[i] = nearest_ball
+    gradient[i] = gap_gradient
 
 
 def cover_energy(
@@ -171,28 +171,28 @@ def cover_energy(
     balls = wp.array(spheres.astype(np.float32), dtype=wp.vec4, device=device)
     shape = (len(spheres), len(samples))
     volumes = empty(shape, dtype=wp.float32, device=device)
-    by_volume = empty(shape, dtype=wp.vec4, device=device)
+    adj_volumes = empty(shape, dtype=wp.vec4, device=device)
     inputs = [mesh.mesh.id, mesh.is_sheet, balls, wp.array(samples.astype(np.float32), dtype=wp.vec3, device=device)]
-    launch(_outside_volume, shape, inputs=inputs, outputs=[volumes, by_volume], cost=_QUERY_COST)
+    launch(_outside_volume, shape, inputs=inputs, outputs=[volumes, adj_volumes], cost=_QUERY_COST)
 
     gaps = empty(len(points), dtype=wp.float32, device=device)
     nearest = empty(len(points), dtype=wp.int32, device=device)
-    by_gap = empty(len(points), dtype=wp.vec4, device=device)
+    adj_gaps = empty(len(points), dtype=wp.vec4, device=device)
     inputs = [wp.array(points.astype(np.float32), dtype=wp.vec3, device=device), balls]
-    launch(_bare_gaps, len(points), inputs=inputs, outputs=[gaps, nearest, by_gap])
+    launch(_bare_gaps, len(points), inputs=inputs, outputs=[gaps, nearest, adj_gaps])
 
     bare = BARE * mesh.area / len(points)
     energy = volumes.numpy().sum(dtype=np.float64) + bare * gaps.numpy().sum(dtype=np.float64)
-    gradient = by_volume.numpy().sum(axis=1, dtype=np.float64)
-    np.add.at(gradient, nearest.numpy(), bare * by_gap.numpy())
+    gradient = adj_volumes.numpy().sum(axis=1, dtype=np.float64)
+    np.add.at(gradient, nearest.numpy(), bare * adj_gaps.numpy())
     return float(energy), gradient
 
 
 def ball_samples(count: int, rng: np.random.Generator) -> np.ndarray:
     """Points evenly in the unit ball, turned at random, shape [count, 3]."""
-    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     shells = ((rng.permutation(count) + 0.5) / count) ** (1 / 3)
-    return shells[:, None] * (fibonacci(count) @ turn)
+    return shells[:, None] * (fibonacci(count) @ rotation)
 
 
 def descend_cover(

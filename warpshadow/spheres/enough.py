@@ -1,4 +1,4 @@
-"""As many spheres as a body needs: from short fits of a few counts."""
+"""Number of spheres that a body needs, from short fits of a few counts."""
 
 from __future__ import annotations
 
@@ -38,55 +38,56 @@ def enough_spheres(
     mesh: NormalizedMesh,
     receivers: FitReceivers,
     seed: int,
-    known: Sequence[Sequence[float]] = (),
-    keep: Callable[[list[Sequence[float]]], None] = lambda errors: None,
+    cached_errors: Sequence[Sequence[float]] = (),
+    store_errors: Callable[[list[Sequence[float]]], None] = lambda errors: None,
 ) -> int:
-    """How many spheres a body needs, a power of two from 8 to 1024.
+    """Find the number of spheres that a body needs, a power of two from 8 to 1024.
 
     The error of short fits of 8, 32, 128 and 512 spheres falls with their number. Taken is where it is small enough, or
     where it falls no longer and the shadow is whole.
 
     Args:
         mesh, receivers, seed: The mesh to fit, its receivers, and the seed of random choices.
-        known: Errors of the first short fits, where an interrupted call found them.
-        keep: Gets the known fits, after each short fit.
+        cached_errors: Errors of the first short fits, where an interrupted call found them.
+        store_errors: Gets the known fits, after each short fit.
     """
     judges = FitReceivers(mesh, _TEST_RECEIVERS, np.random.default_rng(seed + 1), sharpness=0.0)
-    before = np.inf, np.inf
-    errors = list(known)
+    previous_error = np.inf, np.inf
+    errors = list(cached_errors)
     for number, count in enumerate(TRIED_COUNTS):
         if number == len(errors):
             rng = np.random.default_rng(seed)
             start = greedy_cover(mesh, count, rng)
             *_, last = Refinement(mesh, receivers, rng).run(start, _STEPS + int(_STEPS_MORE * count))
             errors.append(_errors(Refinement(mesh, judges, rng), last.spheres))
-            keep(errors)
+            store_errors(errors)
         error, shadow_error = errors[number]
         if error <= _MAX_ERROR:
-            return _where(count, before[0], error)
-        stalls = error > _MIN_ERROR_RATIO * before[0]
-        if stalls and before[1] <= RAGGED_ERROR:
+            return _find_count(count, previous_error[0], error)
+        stalls = error > _MIN_ERROR_RATIO * previous_error[0]
+        if stalls and previous_error[1] <= RAGGED_ERROR:
             return count // 2
-        before = error, shadow_error
-    return TRIED_COUNTS[-1] if stalls and before[1] <= RAGGED_ERROR else MAX_SPHERES
+        previous_error = error, shadow_error
+    return TRIED_COUNTS[-1] if stalls and previous_error[1] <= RAGGED_ERROR else MAX_SPHERES
 
 
 def _errors(judge: Refinement, spheres: np.ndarray) -> tuple[float, float]:
     """Error at receivers that are not on the mesh, relative to the light there and to the light that is missing."""
     judges = judge.receivers
-    chosen = judges.off_surface
-    visibility = judges.visibility[chosen]
-    wrong = judge.transmittance(spheres, chosen, judge.WIDTHS[1]) - visibility
+    off_surface = judges.off_surface
+    visibility = judges.visibility[off_surface]
+    total_error = judge.transmittance(spheres, off_surface, judge.WIDTHS[1]) - visibility
     parts = [
-        np.sum(judges.weights[chosen] * (part @ judges.metric) * part) for part in (wrong, visibility, 1 - visibility)
+        np.sum(judges.weights[off_surface] * (part @ judges.metric) * part)
+        for part in (total_error, visibility, 1 - visibility)
     ]
-    wrong, seen, missing = np.sqrt(parts)
-    return float(wrong / max(seen, 1e-9)), float(wrong / max(missing, 1e-9))
+    total_error, lit_error, missing = np.sqrt(parts)
+    return float(total_error / max(lit_error, 1e-9)), float(total_error / max(missing, 1e-9))
 
 
-def _where(count: int, before: float, error: float) -> int:
-    """Where, from a quarter of the count on, the error becomes small enough; it falls with a power of the count."""
+def _find_count(count: int, previous_error: float, error: float) -> int:
+    """Estimate the count, from a quarter of ``count`` on, at which the error is small enough: it falls with a power."""
     if count == TRIED_COUNTS[0]:
         return count
-    part = np.log(before / _MAX_ERROR) / max(np.log(before / error), 1e-6)
+    part = np.log(previous_error / _MAX_ERROR) / max(np.log(previous_error / error), 1e-6)
     return count // 4 * 2 ** int(np.clip(np.ceil(2 * part - 0.25), 1, 2))

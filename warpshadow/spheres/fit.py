@@ -28,7 +28,7 @@ from warpshadow.spheres.enough import AUTO, MAX_SPHERES, enough_spheres
 from warpshadow.spheres.measure import FitReport, measure
 from warpshadow.spheres.normalized_mesh import NormalizedMesh, normalize
 from warpshadow.spheres.receivers import FitReceivers
-from warpshadow.spheres.refine import Descended, Refinement
+from warpshadow.spheres.refine import DescentState, Refinement
 from warpshadow.spheres.sphere_set import Spheres
 
 ALGORITHM_VERSION = 11
@@ -49,7 +49,7 @@ BAD_SHADOW = 0.18
 0.27; a ring and rocks, whose shadows are small but whole, 0.16; man, monkey, cow, teapot and bunny 0.02 to 0.07."""
 
 MIN_GROUND_ERROR = 0.01
-"""Error of a ground below which nobody sees how ragged a shadow is: of a slab that lies on it, 0.004. Chair, fence and
+"""Error of a ground below which ragged shadows are not visible: of a slab that lies on it, 0.004. Chair, fence and
 table have 0.02 to 0.05."""
 
 BAD_AIR = 0.45
@@ -126,18 +126,18 @@ def fit_spheres(
         count = MANY
     if error is not None:
         check.positive("error", error)
-    where = check.device("device", device)
-    key = count, error, seed, steps if refine else 0, where.alias, cache_folder()
+    fit_device = check.device("device", device)
+    key = count, error, seed, steps if refine else 0, fit_device.alias, cache_folder()
     if cache and key in _FITS.get(mesh, ()):
         return _FITS[mesh][key]
-    job, middle, diagonal = _job(mesh, seed, steps if refine else 0, where)
-    fit = partial(_cached_fit if cache else _fit, job, progress)
+    fit_key, center, diagonal = _find_fit_key(mesh, seed, steps if refine else 0, fit_device)
+    fit_count = partial(_cached_fit if cache else _fit, fit_key, progress)
     with unrecorded():
-        balls, report = fit(count) if error is None else _search(fit, error)
+        balls, report = fit_count(count) if error is None else _search(fit_count, error)
     if error is None and refine and warns:
         _warn_of_holes(mesh, count, report)
     balls = balls[compact_order(balls[:, :3])]  # neighbors are culled together
-    spheres = Spheres(balls[:, :3] * diagonal + middle, balls[:, 3] * diagonal)
+    spheres = Spheres(balls[:, :3] * diagonal + center, balls[:, 3] * diagonal)
     if cache:
         _FITS.setdefault(mesh, {})[key] = SphereFit(spheres, replace(report, cached=True))
     return SphereFit(spheres, report)
@@ -154,64 +154,67 @@ def _warn_of_holes(mesh: Mesh, count: int | str, report: FitReport) -> None:
             report.surface_error > BAD_SURFACE
         ),
     }
-    wrong = next((words for words, is_wrong in wrongs.items() if is_wrong), None)
+    fault = next((words for words, is_wrong in wrongs.items() if is_wrong), None)
     number = report.sphere_count if isinstance(count, str) else count
-    if wrong is None or number < MANY or mesh in _warned or mesh.is_flat:
+    if fault is None or number < MANY or mesh in _warned or mesh.is_flat:
         return
     _warned.add(mesh)
-    more = "" if count == AUTO else 'blockers = "auto" takes as many as it needs, and '
+    auto_advice = "" if count == AUTO else 'blockers = "auto" takes as many as it needs, and '
     parts = "parts of it that are bodies of their own have spheres each"
-    closed = "closed with walls and a bottom, where nothing is behind it, it has room for them"
+    closing_advice = "closed with walls and a bottom, where nothing is behind it, it has room for them"
     check.warn(
-        f"{mesh.name!r} is thin for {number} spheres: {wrong}; {more}{parts if mesh.surface.is_closed else closed}, "
+        f"{mesh.name!r} is thin for {number} spheres: {fault}; {auto_advice}"
+        f"{parts if mesh.surface.is_closed else closing_advice}, "
         'and method = "ray-traced" has the shadow of the mesh'
     )
 
 
 def is_fitted(mesh: Mesh, count: int | str, *, device: wp.DeviceLike = "cpu") -> bool:
     """Whether the cache has the fit of :func:`fit_spheres` for a mesh and a count."""
-    job, *_ = _job(mesh, 0, STEPS, wp.get_device(device))
-    return _cache_path(job, count).exists()
+    fit_key, *_ = _find_fit_key(mesh, 0, STEPS, wp.get_device(device))
+    return _cache_path(fit_key, count).exists()
 
 
 def fit_seconds(count: int | str) -> float:
-    """How long a fit takes, about, on one thread [s].
+    """Estimate the time of a fit on one thread [s].
 
     Measured on a bunny and a Zen 4: 2.1 s for 64 spheres, 4.9 for 256, 14.5 for 1024; "auto", which takes 256, 8.4.
     """
     return 8.4 if isinstance(count, str) else 1.3 + 0.013 * count
 
 
-def _job(mesh: Mesh, seed: int, steps: int, device: wp.Device) -> tuple[_SphereFitKey, np.ndarray, float]:
+def _find_fit_key(mesh: Mesh, seed: int, steps: int, device: wp.Device) -> tuple[_SphereFitKey, np.ndarray, float]:
     """Key of a fit; the middle of the mesh's bounds and their diagonal."""
     positions, faces = welded(mesh.positions, mesh.faces)  # parted at creases or not, a mesh has the same spheres
     positions = positions.astype(np.float64)
     corners = positions[faces]
     if not np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).any():
         raise ValueError("mesh: got only faces without area, expected a surface")
-    normalized, middle, diagonal = normalize(positions)
-    return _SphereFitKey(normalized, faces, seed, steps, device), middle, diagonal
+    normalized, center, diagonal = normalize(positions)
+    return _SphereFitKey(normalized, faces, seed, steps, device), center, diagonal
 
 
-def _search(fit: Callable[[int], tuple[np.ndarray, FitReport]], error: float) -> tuple[np.ndarray, FitReport]:
+def _search(
+    fit_spheres_of_count: Callable[[int], tuple[np.ndarray, FitReport]], error: float
+) -> tuple[np.ndarray, FitReport]:
     """Find the least number of spheres, within an eighth, whose error is met."""
-    failed, count = 0, 16
-    best = fit(count)
-    while best[1].visibility_error > error and count < MAX_SPHERES:
-        failed, count = count, 2 * count
-        best = fit(count)
-    if best[1].visibility_error > error:
-        message = f"error: {error} is not met with {count} spheres; the fit has {best[1].visibility_error:.4f}"
+    too_few, count = 0, 16
+    best_fit = fit_spheres_of_count(count)
+    while best_fit[1].visibility_error > error and count < MAX_SPHERES:
+        too_few, count = count, 2 * count
+        best_fit = fit_spheres_of_count(count)
+    if best_fit[1].visibility_error > error:
+        message = f"error: {error} is not met with {count} spheres; the fit has {best_fit[1].visibility_error:.4f}"
         check.warn(message)
-        return best
-    while count - failed > max(count // 8, 1):
-        middle = (failed + count) // 2
-        attempt = fit(middle)
-        if attempt[1].visibility_error <= error:
-            best, count = attempt, middle
+        return best_fit
+    while count - too_few > max(count // 8, 1):
+        middle_count = (too_few + count) // 2
+        middle_fit = fit_spheres_of_count(middle_count)
+        if middle_fit[1].visibility_error <= error:
+            best_fit, count = middle_fit, middle_count
         else:
-            failed = middle
-    return best
+            too_few = middle_count
+    return best_fit
 
 
 @dataclass(frozen=True)
@@ -227,27 +230,27 @@ class _SphereFitKey:
     def key(self, count: int | str) -> str:
         """Hash of all of it."""
         kind = "cpu" if self.device.is_cpu else "cuda"
-        numbers = [ALGORITHM_VERSION, count, self.seed, self.steps, kind, self.positions.shape]
-        key = hashlib.sha256(json.dumps(numbers).encode())
+        key_numbers = [ALGORITHM_VERSION, count, self.seed, self.steps, kind, self.positions.shape]
+        key = hashlib.sha256(json.dumps(key_numbers).encode())
         key.update(self.positions.tobytes())
         key.update(self.faces.tobytes())
         return key.hexdigest()
 
 
 def _fit(
-    job: _SphereFitKey, progress: bool, count: int | str, unfinished: Unfinished | None = None
+    fit_key: _SphereFitKey, progress: bool, count: int | str, unfinished: Unfinished | None = None
 ) -> tuple[np.ndarray, FitReport]:
     """Fit spheres [sphere, 4] to a normalized mesh, from where an interrupt left them."""
     from threadpoolctl import threadpool_limits
 
-    before = {} if unfinished is None else unfinished.before
-    began = time.perf_counter() - float(before.get("seconds", 0.0))
-    mesh = NormalizedMesh(job.positions, job.faces, job.device)
-    spheres = before.get("spheres", np.zeros((0, 4)))
-    total, done = (job.steps or COVER_STEPS) if count else 0, int(before.get("step_count", 0))
-    what = f"fitting {'as many spheres as it takes' if count == AUTO else f'{count} spheres'}"
+    cached_arrays = {} if unfinished is None else unfinished.before
+    began = time.perf_counter() - float(cached_arrays.get("seconds", 0.0))
+    mesh = NormalizedMesh(fit_key.positions, fit_key.faces, fit_key.device)
+    spheres = cached_arrays.get("spheres", np.zeros((0, 4)))
+    total, done_steps = (fit_key.steps or COVER_STEPS) if count else 0, int(cached_arrays.get("step_count", 0))
+    label = f"fitting {'as many spheres as it takes' if count == AUTO else f'{count} spheres'}"
 
-    def keep(part: str, **arrays: np.ndarray) -> None:
+    def store_part(part: str, **arrays: np.ndarray) -> None:
         if unfinished is None:
             return
         seconds = np.array(time.perf_counter() - began)
@@ -255,12 +258,12 @@ def _fit(
 
     # threads for products of such small matrices wait for each other, for seconds where cores are busy
     with (
-        progress_bar(total, what, "step", done=done, shows=progress) as bar,
+        progress_bar(total, label, "step", done=done_steps, shows=progress) as bar,
         threadpool_limits(limits=1),
     ):
         if count:
-            for descended in _descend(mesh, job, count, before, keep):
-                spheres = descended
+            for descent_state in _descend(mesh, fit_key, count, cached_arrays, store_part):
+                spheres = descent_state
                 bar.update()
         spheres = spheres[spheres[:, 3] > 1e-4].astype(np.float32)
         return spheres, measure(mesh, spheres.astype(np.float64), time.perf_counter() - began)
@@ -268,62 +271,62 @@ def _fit(
 
 def _descend(
     mesh: NormalizedMesh,
-    job: _SphereFitKey,
+    fit_key: _SphereFitKey,
     count: int | str,
-    before: Mapping[str, np.ndarray],
-    keep: Callable[..., None],
+    cached_arrays: Mapping[str, np.ndarray],
+    store_part: Callable[..., None],
 ) -> Iterator[np.ndarray]:
     """Fit one sphere or more; yields them after every step.
 
     Args:
-        mesh, job, count: The mesh, its key, and the number of spheres.
-        before: Arrays that an interrupted call left.
-        keep: Gets how far it is in words, and arrays from which a later call goes on.
+        mesh, fit_key, count: The mesh, its key, and the number of spheres.
+        cached_arrays: Arrays that an interrupted call left.
+        store_part: Gets how far it is in words, and arrays from which a later call goes on.
     """
-    rng = np.random.default_rng(job.seed)
-    if job.steps or isinstance(count, str):
+    rng = np.random.default_rng(fit_key.seed)
+    if fit_key.steps or isinstance(count, str):
         receivers = FitReceivers(mesh, RECEIVERS, rng)
-    start: np.ndarray | Descended
-    if "spheres" in before:
-        start = Descended(**{name: before[name] for name in Descended._fields})
+    start: np.ndarray | DescentState
+    if "spheres" in cached_arrays:
+        start = DescentState(**{name: cached_arrays[name] for name in DescentState._fields})
     else:
         if isinstance(count, str):
 
-            def keep_errors(errors: list[Sequence[float]]) -> None:
-                keep(f"{len(errors)} short fits", errors=np.array(errors))
+            def store_errors(errors: list[Sequence[float]]) -> None:
+                store_part(f"{len(errors)} short fits", errors=np.array(errors))
 
-            count = enough_spheres(mesh, receivers, job.seed, [*before.get("errors", ())], keep_errors)
+            count = enough_spheres(mesh, receivers, fit_key.seed, [*cached_arrays.get("errors", ())], store_errors)
         start = greedy_cover(mesh, count, rng)
-        if not job.steps:
+        if not fit_key.steps:
             yield from descend_cover(mesh, start, COVER_STEPS, rng)
             return
-    for descended in Refinement(mesh, receivers, rng).run(start, job.steps):
-        keep(f"{descended.step_count} of {job.steps} steps", **descended._asdict())
-        yield descended.spheres
+    for descent_state in Refinement(mesh, receivers, rng).run(start, fit_key.steps):
+        store_part(f"{descent_state.step_count} of {fit_key.steps} steps", **descent_state._asdict())
+        yield descent_state.spheres
 
 
 # -------------------------------------------------------------------------------- cache
 
 
-def _cache_path(job: _SphereFitKey, count: int | str) -> Path:
-    return cache_path("spheres", job.key(count))
+def _cache_path(fit_key: _SphereFitKey, count: int | str) -> Path:
+    return cache_path("spheres", fit_key.key(count))
 
 
-def _cached_fit(job: _SphereFitKey, progress: bool, count: int | str) -> tuple[np.ndarray, FitReport]:
+def _cached_fit(fit_key: _SphereFitKey, progress: bool, count: int | str) -> tuple[np.ndarray, FitReport]:
     """Read a fit from the cache, or make it and write it there."""
 
-    def read(stored: Mapping[str, np.ndarray]) -> tuple[np.ndarray, FitReport]:
-        spheres, report = stored["spheres"], FitReport(**json.loads(str(stored["report"])))
+    def read(cached_arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, FitReport]:
+        spheres, report = cached_arrays["spheres"], FitReport(**json.loads(str(cached_arrays["report"])))
         check.shape("spheres", spheres.shape, (report.sphere_count, 4))
         return spheres, replace(report, cached=True)
 
     def arrays(fit: tuple[np.ndarray, FitReport]) -> dict[str, np.ndarray]:
         return {"spheres": fit[0], "report": np.array(json.dumps(asdict(fit[1])))}
 
-    path = _cache_path(job, count)
+    path = _cache_path(fit_key, count)
     if path in _UNWRITTEN and not path.exists():
         return _UNWRITTEN[path]
-    fit = load_or_compute(path, read, partial(_fit, job, progress, count), arrays, what="fit")
+    fit = load_or_compute(path, read, partial(_fit, fit_key, progress, count), arrays, noun="fit")
     if not path.exists():
         _UNWRITTEN[path] = fit[0], replace(fit[1], cached=True)
     return fit

@@ -1,4 +1,4 @@
-"""How well spheres stand in for a mesh."""
+"""Errors of the spheres that approximate a mesh."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DIRECTIONS = 512  # rays from each of them
 
 @dataclass(frozen=True)
 class FitReport:
-    """How well spheres stand in for a mesh.
+    """Errors of the spheres that approximate a mesh.
 
     The errors are ‖E_spheres − E_mesh‖ / ‖E_mesh‖ over receivers, E the irradiance under a sky with a sun of
     10°, for four azimuths of the sun. Receivers whose hemisphere is less than 5% open, which hardly any
@@ -34,11 +34,11 @@ class FitReport:
     outside_volume: float
     """Share of the union's volume that lies outside the mesh, the air of a cavity included; 1 for a sheet."""
     ground_error: float
-    """On a square of 2.5 times the bounding box's longest side at the height of the lowest point, y up."""
+    """Error on a square of 2.5 times the bounding box's longest side at the height of the lowest point, y up."""
     surface_error: float
-    """On the mesh's own vertices, weighted by area; on both sides of an open mesh, for any winding."""
+    """Error on the mesh's own vertices, weighted by area; on both sides of an open mesh, for any winding."""
     nearby_error: float
-    """In the air around it and in its cavities, most of it close to the mesh, on receivers that look anywhere."""
+    """Error in the air around it and in its cavities, mostly close to the mesh, on receivers of random normals."""
     shadow_error: float
     """The error on the ground relative to the shadow there, ‖E_spheres − E_mesh‖ / ‖E_unshadowed − E_mesh‖."""
     seconds: float
@@ -68,13 +68,13 @@ def _errors(mesh: NormalizedMesh, spheres: np.ndarray, points: np.ndarray, norma
     visible = trace_visibility(mesh.mesh, receivers, array(normals[None].astype(np.float32)), rays).numpy()[0]
     centers = array(spheres[None, :, :3].astype(np.float32))
     radii = wp.array(spheres[None, :, 3].astype(np.float32), dtype=wp.float32, device=mesh.device)
-    passing = 1 - exact_occlusion(receivers, rays, centers, radii).numpy()[0]
+    transmittance = 1 - exact_occlusion(receivers, rays, centers, radii).numpy()[0]
     cosine = np.maximum(normals @ directions.T, 0)
     light = np.stack([_sky(directions, azimuth) for azimuth in np.pi / 2 * np.arange(4)], axis=1)
-    seen = 2 * visible.mean(axis=1) >= 0.05
-    expected = (cosine * visible)[seen] @ light
-    missing, wrong = 1.0 - visible, 1.0 * passing - visible
-    error, shadow = (float(np.linalg.norm((cosine * part)[seen] @ light)) for part in (wrong, missing))
+    is_lit = 2 * visible.mean(axis=1) >= 0.05
+    expected = (cosine * visible)[is_lit] @ light
+    missing_shadow, wrong_shadow = 1.0 - visible, 1.0 * transmittance - visible
+    error, shadow = (float(np.linalg.norm((cosine * part)[is_lit] @ light)) for part in (wrong_shadow, missing_shadow))
     return error / max(float(np.linalg.norm(expected)), 1e-15), error / max(shadow, 1e-15)
 
 
@@ -84,21 +84,21 @@ def measure(mesh: NormalizedMesh, spheres: np.ndarray, seconds: float) -> FitRep
     grid = (np.arange(GROUND) + 0.5) / GROUND - 0.5
     x, z = np.meshgrid(2.5 * mesh.longest * grid, 2.5 * mesh.longest * grid)
     ground = np.column_stack([x.ravel(), np.full(x.size, mesh.low[1] - 1e-5), z.ravel()])
-    up = np.tile([0.0, 1.0, 0.0], (len(ground), 1))
+    up_normals = np.tile([0.0, 1.0, 0.0], (len(ground), 1))
 
     outside_volume = 0.0
     if (spheres[:, 3] > 0).any():
         samples = ball_samples(16 * max(1, 512 // len(spheres)), rng)
         points = spheres[:, None, :3] + spheres[:, None, 3:] * samples
         shares = np.broadcast_to(spheres[:, 3:] ** 3, points.shape[:2]) / _containing(spheres, points)
-        outside = mesh.signed_distances(points.reshape(-1, 3))[0].reshape(shares.shape) > 0
-        outside_volume = float(shares[outside].sum() / shares.sum())
+        is_outside = mesh.signed_distances(points.reshape(-1, 3))[0].reshape(shares.shape) > 0
+        outside_volume = float(shares[is_outside].sum() / shares.sum())
     surface, _ = mesh.sample(4000, rng)
     grown = spheres + [0, 0, 0, 0.01]
     air, _ = around(mesh, NEARBY, rng)
-    turned = rng.normal(size=air.shape)
-    nearby = air, turned / np.linalg.norm(turned, axis=1, keepdims=True)
-    ground_error, shadow_error = _errors(mesh, spheres, ground, up)
+    random_directions = rng.normal(size=air.shape)
+    nearby = air, random_directions / np.linalg.norm(random_directions, axis=1, keepdims=True)
+    ground_error, shadow_error = _errors(mesh, spheres, ground, up_normals)
     return FitReport(
         sphere_count=len(spheres),
         coverage=float((_containing(grown, surface) > 0).mean()),

@@ -86,8 +86,8 @@ def normalize(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         Vertices of float32, the middle of the bounds, and their diagonal.
     """
     low, high = positions.min(axis=0), positions.max(axis=0)
-    middle, diagonal = (low + high) / 2, float(np.linalg.norm(high - low))
-    return (np.round((positions - middle) / diagonal * 2**18) / 2**18).astype(np.float32), middle, diagonal
+    center, diagonal = (low + high) / 2, float(np.linalg.norm(high - low))
+    return (np.round((positions - center) / diagonal * 2**18) / 2**18).astype(np.float32), center, diagonal
 
 
 class NormalizedMesh:
@@ -140,13 +140,13 @@ class NormalizedMesh:
         points = self.low + rng.uniform(size=(1024, 3)) * (self.high - self.low)
         if not self.is_open:
             return _volume(self.positions, self.faces) <= 0
-        inside = points[self.signed_distances(points)[0] < 0]
-        if not len(inside):
+        inner_points = points[self.signed_distances(points)[0] < 0]
+        if not len(inner_points):
             return True
-        counts = empty(len(inside), dtype=wp.int32, device=self.device)
+        counts = empty(len(inner_points), dtype=wp.int32, device=self.device)
         array = partial(wp.array, dtype=wp.vec3, device=self.device)
-        inputs = [self.mesh.id, array(inside.astype(np.float32)), array(fibonacci(_RAYS).astype(np.float32))]
-        launch(_count_escaping, len(inside), inputs=inputs, outputs=[counts])
+        inputs = [self.mesh.id, array(inner_points.astype(np.float32)), array(fibonacci(_RAYS).astype(np.float32))]
+        launch(_count_escaping, len(inner_points), inputs=inputs, outputs=[counts])
         return bool((counts.numpy() <= 1).mean() < ENCLOSED)
 
     def _on_sides(self, normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -156,20 +156,20 @@ class NormalizedMesh:
     def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Draw points evenly from the surface: positions and interpolated normals, both [count, 3]."""
         shares = np.cumsum(self.face_areas) / self.area
-        chosen = np.searchsorted(shares, (np.arange(count) + rng.uniform(size=count)) / count)
-        chosen = np.minimum(chosen, len(shares) - 1)
+        face_indices = np.searchsorted(shares, (np.arange(count) + rng.uniform(size=count)) / count)
+        face_indices = np.minimum(face_indices, len(shares) - 1)
         u, v = np.sqrt(rng.uniform(size=count)), rng.uniform(size=count)
         weights = np.stack([1 - u, u * (1 - v), u * v], axis=1)[:, :, None]
-        corners = self.faces[chosen]
+        corners = self.faces[face_indices]
         normals = (weights * self.normals[corners]).sum(axis=1)
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-        normals = np.where(lengths > 1e-3, normals / np.maximum(lengths, 1e-3), self.face_normals[chosen])
+        normals = np.where(lengths > 1e-3, normals / np.maximum(lengths, 1e-3), self.face_normals[face_indices])
         return (weights * self.positions[corners]).sum(axis=1), self._on_sides(normals, rng)
 
     def sample_vertices(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Draw vertices in proportion to the area around them: positions and normals, both [count, 3]."""
-        chosen = rng.choice(len(self.positions), count, p=self.vertex_shares)
-        return self.positions[chosen].astype(np.float64), self._on_sides(self.normals[chosen], rng)
+        face_indices = rng.choice(len(self.positions), count, p=self.vertex_shares)
+        return self.positions[face_indices].astype(np.float64), self._on_sides(self.normals[face_indices], rng)
 
     def nearest(self, points: np.ndarray) -> np.ndarray:
         """Points of the surface nearest to others [point, 3]."""

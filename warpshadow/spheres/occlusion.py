@@ -30,24 +30,26 @@ def _exact_occlusion(
     """Each thread owns one ray: a receiver and a direction."""
     row, direction = wp.tid()
     batch, vertex = split_row(first_row + row, points.shape[1])
-    blocked = wp.uint8(0)
+    is_blocked = wp.uint8(0)
     for sphere in range(radii.shape[1]):
         radius = radii[batch, sphere]
-        toward = centers[batch, sphere] - points[batch, vertex]
-        axial = wp.dot(toward, directions[direction])
+        center_offset = centers[batch, sphere] - points[batch, vertex]
+        axial = wp.dot(center_offset, directions[direction])
         if axial > 0.0 and radius > 0.0:
-            distance = wp.length(toward)
+            distance = wp.length(center_offset)
             if distance >= (1.0 + BLEND) * radius:  # the cone is exact, and this test needs no root
-                closest = wp.length_sq(toward - axial * directions[direction])
-                if closest < radius * radius:
-                    blocked = wp.uint8(1)
+                distance2 = wp.length_sq(center_offset - axial * directions[direction])
+                if distance2 < radius * radius:
+                    is_blocked = wp.uint8(1)
                     break
             else:
-                cone = _cone(_Vectors(_Lane(toward[0]), _Lane(toward[1]), _Lane(toward[2])), 1.0 / radius)
+                cone = _cone(
+                    _Vectors(_Lane(center_offset[0]), _Lane(center_offset[1]), _Lane(center_offset[2])), 1.0 / radius
+                )
                 if cone.weight[0] > 0.5 and axial > cone.cosine[0] * distance:
-                    blocked = wp.uint8(1)
+                    is_blocked = wp.uint8(1)
                     break
-    occlusion[batch, vertex, direction] = blocked
+    occlusion[batch, vertex, direction] = is_blocked
 
 
 def exact_occlusion(points: wp.array, directions: wp.array, centers: wp.array, radii: wp.array) -> wp.array:

@@ -41,8 +41,8 @@ def _trace_frames(
     receiver = first_row + row
     frame = frames[receiver]
     start = points[receiver] + 1.0e-4 * frame[2]
-    blocked = wp.mesh_query_ray_anyhit(mesh, start, wp.transpose(frame) * directions[direction], 1.0e30)
-    visibility[receiver, direction] = wp.uint8(wp.where(blocked, 0, 1))
+    is_blocked = wp.mesh_query_ray_anyhit(mesh, start, wp.transpose(frame) * directions[direction], 1.0e30)
+    visibility[receiver, direction] = wp.uint8(wp.where(is_blocked, 0, 1))
 
 
 def hemisphere(count: int) -> np.ndarray:
@@ -60,7 +60,7 @@ class FitReceivers:
         mesh: The body.
         count: How many.
         rng: Draws them.
-        sharpness: Weight of errors under a sun next to those under each wider light.
+        sharpness: Weight of errors under a sun relative to errors under each wider light.
 
     A receiver sees 128 directions of a hemisphere. Receivers on a mesh look along its normals, to both sides of an open
     one. Of the receivers in the space around a body and within its bounds, half look toward the nearest surface, and
@@ -82,8 +82,8 @@ class FitReceivers:
         parts.append(_around(mesh, count - ground - surface, rng))
         points, normals = (np.concatenate(item) for item in zip(*parts, strict=True))
         frames = _frames(normals, rng)
-        self.places = np.column_stack([points, frames.reshape(-1, 9)]).T.astype(np.float32)
-        """Where they are: points, and the rows of frames, [12, receiver]."""
+        self.frame_rows = np.column_stack([points, frames.reshape(-1, 9)]).T.astype(np.float32)
+        """Points, and the rows of frames, [12, receiver]."""
         self.directions = hemisphere(self.DIRECTIONS)
         """Directions in the frame of each receiver [direction, 3]."""
         self.metric = _light_metric(self.directions, sharpness)
@@ -100,29 +100,29 @@ class FitReceivers:
         openness = (self.visibility / self.directions[:, 2]).mean(axis=1) / 2
         floor = self.VISIBLE_FLOOR
         self.weights = (floor + (1 - floor) * np.minimum(openness, 1)).astype(np.float32)[:, None]
-        """How much errors at receivers count [receiver, 1]."""
+        """Weights of the errors at receivers [receiver, 1]."""
         if mesh.is_sheet:
             self.weights[:surface] *= self.SHEET
         self.off_surface = np.arange(surface, count)  # receivers that are not on the mesh
 
     def __len__(self) -> int:
-        """How many."""
+        """Number of receivers."""
         return len(self.visibility)
 
 
 def _on_surface(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Half at vertices, where renderers shade, half between them."""
     parts = mesh.sample_vertices(count // 2, rng), mesh.sample(count - count // 2, rng)
-    points, normals = (np.concatenate(pair) for pair in zip(*parts, strict=True))
+    points, normals = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     return points, normals
 
 
 def _on_grounds(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """On grounds at and below the lowest point."""
+    """Draw receivers on grounds at and below the lowest point."""
     square = rng.uniform(-1, 1, size=(count, 2))
     square *= 1.25 * mesh.longest * np.abs(square).max(axis=1, keepdims=True) ** 0.5  # denser near the body
-    drop = np.where(rng.uniform(size=count) < 0.25, 0.3 * mesh.longest, 0.0) * rng.uniform(size=count)
-    points = np.column_stack([square[:, 0], mesh.low[1] - 1e-5 - drop, square[:, 1]])
+    depth = np.where(rng.uniform(size=count) < 0.25, 0.3 * mesh.longest, 0.0) * rng.uniform(size=count)
+    points = np.column_stack([square[:, 0], mesh.low[1] - 1e-5 - depth, square[:, 1]])
     return points, np.tile([0.0, 1.0, 0.0], (count, 1))
 
 
@@ -131,18 +131,18 @@ def around(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[
     shell_count = count - count // 3
     away = rng.normal(size=(shell_count, 3))
     away *= rng.uniform(size=(shell_count, 1)) ** 2 * 0.5 * mesh.longest / np.linalg.norm(away, axis=1, keepdims=True)
-    within = mesh.low + rng.uniform(size=(count // 3, 3)) * (mesh.high - mesh.low)
-    points = np.concatenate([mesh.sample(shell_count, rng)[0] + away, within])
+    box_points = mesh.low + rng.uniform(size=(count // 3, 3)) * (mesh.high - mesh.low)
+    points = np.concatenate([mesh.sample(shell_count, rng)[0] + away, box_points])
     distances, slopes = mesh.signed_distances(points)
-    inside = distances < 0  # and from there out of it
-    points[inside] -= (distances[inside, None] - 1e-3) * slopes[inside]
+    is_inside = distances < 0  # and from there out of it
+    points[is_inside] -= (distances[is_inside, None] - 1e-3) * slopes[is_inside]
     return points, -slopes
 
 
 def _around(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    points, toward = around(mesh, count, rng)
-    toward = 0.5 * rng.normal(size=(count, 3)) + np.where(rng.uniform(size=(count, 1)) < 0.5, toward, 0.0)
-    return points, toward / np.linalg.norm(toward, axis=1, keepdims=True)
+    points, bias = around(mesh, count, rng)
+    bias = 0.5 * rng.normal(size=(count, 3)) + np.where(rng.uniform(size=(count, 1)) < 0.5, bias, 0.0)
+    return points, bias / np.linalg.norm(bias, axis=1, keepdims=True)
 
 
 def _frames(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -151,8 +151,8 @@ def _frames(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     x = np.cross(helper, normals)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     y = np.cross(normals, x)
-    turn = rng.uniform(0, 2 * np.pi, size=(len(normals), 1))
-    rows = [np.cos(turn) * x + np.sin(turn) * y, np.cos(turn) * y - np.sin(turn) * x, normals]
+    angles = rng.uniform(0, 2 * np.pi, size=(len(normals), 1))
+    rows = [np.cos(angles) * x + np.sin(angles) * y, np.cos(angles) * y - np.sin(angles) * x, normals]
     return np.stack(rows, axis=1).astype(np.float32)
 
 

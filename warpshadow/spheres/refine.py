@@ -43,48 +43,54 @@ _PAIR_COST = 0.1  # nanoseconds that a sphere costs for a receiver and a directi
 
 _Bundle = lane_type(FIT_BUNDLE)
 _Sums = wp.types.vector(length=6, dtype=wp.float32)
-_PLACE = 12  # numbers that say where a receiver is: its point, and the rows of its frame
+_FRAME_ROWS = 12  # numbers that say where a receiver is: its point, and the rows of its frame
 
 # ------------------------------------------------------------------------------------------------- cones
 
 
 @functools.cache
-def _make_see(lanes: int) -> wp.Function:
+def _make_view_sphere(lanes: int) -> wp.Function:
     """Make the kernel function of a sphere as a block of receivers sees it, in their frames."""
     Lane, Vectors, SphereView = lane_type(lanes), vectors_type(lanes), sphere_view_type(lanes)
     cone_of = make_cone(lanes)
 
     @wp.func(inline=True)
-    def see(places: wp.array2d(dtype=Lane), block: int, ball: wp.vec4):
-        x = Lane(ball[0]) - places[0, block]
-        y = Lane(ball[1]) - places[1, block]
-        z = Lane(ball[2]) - places[2, block]
+    def view_sphere(frame_rows: wp.array2d(dtype=Lane), block: int, ball: wp.vec4):
+        x = Lane(ball[0]) - frame_rows[0, block]
+        y = Lane(ball[1]) - frame_rows[1, block]
+        z = Lane(ball[2]) - frame_rows[2, block]
         offset = Vectors(
-            wp.cw_mul(places[3, block], x) + wp.cw_mul(places[4, block], y) + wp.cw_mul(places[5, block], z),
-            wp.cw_mul(places[6, block], x) + wp.cw_mul(places[7, block], y) + wp.cw_mul(places[8, block], z),
-            wp.cw_mul(places[9, block], x) + wp.cw_mul(places[10, block], y) + wp.cw_mul(places[11, block], z),
+            wp.cw_mul(frame_rows[3, block], x)
+            + wp.cw_mul(frame_rows[4, block], y)
+            + wp.cw_mul(frame_rows[5, block], z),
+            wp.cw_mul(frame_rows[6, block], x)
+            + wp.cw_mul(frame_rows[7, block], y)
+            + wp.cw_mul(frame_rows[8, block], z),
+            wp.cw_mul(frame_rows[9, block], x)
+            + wp.cw_mul(frame_rows[10, block], y)
+            + wp.cw_mul(frame_rows[11, block], z),
         )
-        seen = SphereView()
-        seen.offset = offset
-        seen.curvature = 1.0 / ball[3]
-        seen.cone = cone_of(offset, seen.curvature)
-        seen.share = Lane(1.0)
-        return seen
+        sphere_view = SphereView()
+        sphere_view.offset = offset
+        sphere_view.curvature = 1.0 / ball[3]
+        sphere_view.cone = cone_of(offset, sphere_view.curvature)
+        sphere_view.share = Lane(1.0)
+        return sphere_view
 
-    return see
+    return view_sphere
 
 
 @functools.cache
 def _make_project(lanes: int) -> wp.Kernel:
     Lane = lane_type(lanes)
-    see, falloff, sqrt = _make_see(lanes), make_falloff(lanes), make_lane_functions(lanes).sqrt
+    view_sphere, falloff, sqrt = _make_view_sphere(lanes), make_falloff(lanes), make_lane_functions(lanes).sqrt
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def project(
         first_row: int,
         worker: int,
         # in
-        places: wp.array2d(dtype=Lane),
+        frame_rows: wp.array2d(dtype=Lane),
         balls: wp.array(dtype=wp.vec4),
         cos_width: float,
         sin_width: float,
@@ -97,8 +103,8 @@ def _make_project(lanes: int) -> wp.Kernel:
         """A thread owns a block of receivers and a sphere: its direction; lo, 1/(hi − lo), opacity; bundles reached."""
         row, sphere = wp.tid()
         block = first_row + row
-        seen = see(places, block, balls[sphere])
-        cone = seen.cone
+        sphere_view = view_sphere(frame_rows, block, balls[sphere])
+        cone = sphere_view.cone
         sine = sqrt(cone.sine2)
         low = cos_width * cone.cosine - sin_width * sine
         outer = cos_width * sine + sin_width * cone.cosine
@@ -122,7 +128,7 @@ def _make_project(lanes: int) -> wp.Kernel:
 @functools.cache
 def _make_project_adjoint(lanes: int) -> wp.Kernel:
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
-    see, sphere_adjoint = _make_see(lanes), make_sphere_adjoint(lanes)
+    view_sphere, sphere_adjoint = _make_view_sphere(lanes), make_sphere_adjoint(lanes)
     fn = make_lane_functions(lanes)
     sqrt, total = fn.sqrt, fn.total
 
@@ -131,7 +137,7 @@ def _make_project_adjoint(lanes: int) -> wp.Kernel:
         first_row: int,
         worker: int,
         # in
-        places: wp.array2d(dtype=Lane),
+        frame_rows: wp.array2d(dtype=Lane),
         balls: wp.array(dtype=wp.vec4),
         cos_width: float,
         sin_width: float,
@@ -143,9 +149,9 @@ def _make_project_adjoint(lanes: int) -> wp.Kernel:
         """A thread owns a block of receivers and a sphere, and sums up the gradients of all of the block."""
         row, sphere = wp.tid()
         block = first_row + row
-        seen = see(places, block, balls[sphere])
-        sine = sqrt(seen.cone.sine2)
-        low = cos_width * seen.cone.cosine - sin_width * sine
+        sphere_view = view_sphere(frame_rows, block, balls[sphere])
+        sine = sqrt(sphere_view.cone.sine2)
+        low = cos_width * sphere_view.cone.cosine - sin_width * sine
         x = Lane()
         y = Lane()
         z = Lane()
@@ -166,23 +172,23 @@ def _make_project_adjoint(lanes: int) -> wp.Kernel:
             adj_opacity[lane] = -gradient[5]
             slope[lane] = edge[1]
         adj_offset, adj_radius, _ = sphere_adjoint(
-            seen, sine, low, cos_width, sin_width, slope, adj_opacity, sum_, sum_t, Vectors(x, y, z)
+            sphere_view, sine, low, cos_width, sin_width, slope, adj_opacity, sum_, sum_t, Vectors(x, y, z)
         )
         adj_balls[block, sphere] = wp.vec4(
             total(
-                wp.cw_mul(places[3, block], adj_offset.x)
-                + wp.cw_mul(places[6, block], adj_offset.y)
-                + wp.cw_mul(places[9, block], adj_offset.z)
+                wp.cw_mul(frame_rows[3, block], adj_offset.x)
+                + wp.cw_mul(frame_rows[6, block], adj_offset.y)
+                + wp.cw_mul(frame_rows[9, block], adj_offset.z)
             ),
             total(
-                wp.cw_mul(places[4, block], adj_offset.x)
-                + wp.cw_mul(places[7, block], adj_offset.y)
-                + wp.cw_mul(places[10, block], adj_offset.z)
+                wp.cw_mul(frame_rows[4, block], adj_offset.x)
+                + wp.cw_mul(frame_rows[7, block], adj_offset.y)
+                + wp.cw_mul(frame_rows[10, block], adj_offset.z)
             ),
             total(
-                wp.cw_mul(places[5, block], adj_offset.x)
-                + wp.cw_mul(places[8, block], adj_offset.y)
-                + wp.cw_mul(places[11, block], adj_offset.z)
+                wp.cw_mul(frame_rows[5, block], adj_offset.x)
+                + wp.cw_mul(frame_rows[8, block], adj_offset.y)
+                + wp.cw_mul(frame_rows[11, block], adj_offset.z)
             ),
             total(adj_radius),
         )
@@ -305,14 +311,14 @@ def _transmit_adjoint(
 class _View(NamedTuple):
     """Spheres as the receivers of a batch see them."""
 
-    places: wp.array  # [12, block] lanes
+    frame_rows: wp.array  # [12, block] lanes
     balls: wp.array  # [sphere] vec4
     axes: wp.array  # [receiver, sphere] vec3
     edges: wp.array  # [receiver, sphere] vec3
     reached: wp.array  # [receiver, sphere] int32: a bit for each bundle
 
 
-class Descended(NamedTuple):
+class DescentState(NamedTuple):
     """A refinement after some of its steps: all that it goes on from, to the same bits."""
 
     spheres: np.ndarray  # [sphere, 4]
@@ -323,7 +329,9 @@ class Descended(NamedTuple):
     random: np.ndarray  # state of the generator, JSON
 
     @classmethod
-    def at(cls, spheres: np.ndarray, adam: Adam, queue: np.ndarray, rng: np.random.Generator) -> Descended:
+    def from_optimizer(
+        cls, spheres: np.ndarray, adam: Adam, queue: np.ndarray, rng: np.random.Generator
+    ) -> DescentState:
         """Copy it."""
         random = np.array(json.dumps(rng.bit_generator.state))
         return cls(spheres.copy(), adam.mean.copy(), adam.square.copy(), np.array(adam.age), queue, random)
@@ -344,24 +352,24 @@ class Refinement:
         caps = np.column_stack(bundle_cones(receivers.directions, max(self.WIDTHS), FIT_BUNDLE))
         self.caps = wp.array(caps, dtype=wp.float32, device=self.device)
 
-    def _project(self, spheres: np.ndarray, chosen: np.ndarray, width: float) -> _View:
+    def _project(self, spheres: np.ndarray, receiver_indices: np.ndarray, width: float) -> _View:
         lanes = lane_count(self.device)
-        padded = np.pad(chosen, (0, -len(chosen) % lanes), mode="edge")
-        places = np.ascontiguousarray(self.receivers.places[:, padded]).reshape(_PLACE, -1, lanes)
-        placed = wp.array(places, dtype=lane_type(lanes), device=self.device)
+        padded_indices = np.pad(receiver_indices, (0, -len(receiver_indices) % lanes), mode="edge")
+        frame_rows = np.ascontiguousarray(self.receivers.frame_rows[:, padded_indices]).reshape(_FRAME_ROWS, -1, lanes)
+        frame_lanes = wp.array(frame_rows, dtype=lane_type(lanes), device=self.device)
         balls = wp.array(spheres.astype(np.float32), dtype=wp.vec4, device=self.device)
-        shape = len(padded), len(spheres)
+        shape = len(padded_indices), len(spheres)
         outputs = [empty(shape, dtype=dtype, device=self.device) for dtype in (wp.vec3, wp.vec3, wp.int32)]
         launch(
             _make_project(lanes),
-            (placed.shape[1], len(spheres)),
-            inputs=[placed, balls, np.cos(width), np.sin(width), self.caps],
+            (frame_lanes.shape[1], len(spheres)),
+            inputs=[frame_lanes, balls, np.cos(width), np.sin(width), self.caps],
             outputs=outputs,
             cost=_SPHERE_COST * lanes,
         )
-        return _View(placed, balls, *outputs)
+        return _View(frame_lanes, balls, *outputs)
 
-    def _see_through(self, view: _View) -> np.ndarray:
+    def _find_transmittance(self, view: _View) -> np.ndarray:
         count, sphere_count = view.axes.shape
         transmittance = empty((count, self.directions.shape[1]), dtype=_Bundle, device=self.device)
         launch(
@@ -373,33 +381,35 @@ class Refinement:
         )
         return transmittance.numpy().reshape(count, -1)
 
-    def transmittance(self, spheres: np.ndarray, chosen: np.ndarray, width: float) -> np.ndarray:
+    def transmittance(self, spheres: np.ndarray, receiver_indices: np.ndarray, width: float) -> np.ndarray:
         """Transmittance of spheres [sphere, 4] at the chosen receivers, [receiver, direction]."""
-        return self._see_through(self._project(spheres, chosen, width))[: len(chosen)]
+        return self._find_transmittance(self._project(spheres, receiver_indices, width))[: len(receiver_indices)]
 
-    def _loss(self, transmittance: np.ndarray, chosen: np.ndarray) -> tuple[float, np.ndarray]:
+    def _loss(self, transmittance: np.ndarray, receiver_indices: np.ndarray) -> tuple[float, np.ndarray]:
         """Loss of a batch, and its gradient by the transmittance."""
-        errors = transmittance - self.receivers.visibility[chosen]
-        weighted = (errors @ self.receivers.metric) * (self.receivers.weights[chosen] / len(chosen))
-        return float(np.vdot(weighted, errors)), 2 * weighted
+        errors = transmittance - self.receivers.visibility[receiver_indices]
+        weighted_errors = (errors @ self.receivers.metric) * (
+            self.receivers.weights[receiver_indices] / len(receiver_indices)
+        )
+        return float(np.vdot(weighted_errors, errors)), 2 * weighted_errors
 
-    def gradient(self, spheres: np.ndarray, chosen: np.ndarray, width: float) -> tuple[float, np.ndarray]:
+    def gradient(self, spheres: np.ndarray, receiver_indices: np.ndarray, width: float) -> tuple[float, np.ndarray]:
         """Loss over the chosen receivers, and its gradient by centers and logarithms of radii [sphere, 4]."""
-        view = self._project(spheres, chosen, width)
-        transmittance = self._see_through(view)
+        view = self._project(spheres, receiver_indices, width)
+        transmittance = self._find_transmittance(view)
         upstream = np.zeros_like(transmittance)
-        passing = transmittance[: len(chosen)]
-        loss, adj_transmittance = self._loss(passing, chosen)
-        upstream[: len(chosen)] = adj_transmittance * passing
+        passing = transmittance[: len(receiver_indices)]
+        loss, adj_transmittance = self._loss(passing, receiver_indices)
+        upstream[: len(receiver_indices)] = adj_transmittance * passing
         adj_logs = wp.array(upstream.reshape(len(upstream), -1, FIT_BUNDLE), dtype=_Bundle, device=self.device)
         sums = empty(view.axes.shape, dtype=_Sums, device=self.device)
         inputs = [view.axes, view.edges, view.reached, self.directions, adj_logs]
         cost = 2 * _PAIR_COST * len(self.receivers.directions)
         launch(_transmit_adjoint, sums.shape, inputs=inputs, outputs=[sums], cost=cost)
         # every block of receivers has a gradient of its own: sums in a fixed order give the same bits on every run
-        shape = view.places.shape[1], len(spheres)
+        shape = view.frame_rows.shape[1], len(spheres)
         adj_balls = empty(shape, dtype=wp.vec4, device=self.device)
-        inputs = [view.places, view.balls, np.cos(width), np.sin(width), view.edges, sums]
+        inputs = [view.frame_rows, view.balls, np.cos(width), np.sin(width), view.edges, sums]
         lanes = lane_count(self.device)
         launch(_make_project_adjoint(lanes), shape, inputs=inputs, outputs=[adj_balls], cost=2 * _SPHERE_COST * lanes)
         gradient = adj_balls.numpy().sum(axis=0, dtype=np.float64)
@@ -412,23 +422,27 @@ class Refinement:
         excess = np.maximum(distances - TOUCH * spheres[:, 3], 0.0)
         spheres[:, :3] -= excess[:, None] * slopes
 
-    def run(self, start: np.ndarray | Descended, steps: int) -> Iterator[Descended]:
+    def run(self, start: np.ndarray | DescentState, steps: int) -> Iterator[DescentState]:
         """Refine spheres [sphere, 4] by Adam, or go on with that; yields where it is after every step."""
-        resumed = start if isinstance(start, Descended) else None
-        spheres = np.array(start if resumed is None else resumed.spheres, np.float64)
+        resumed_state = start if isinstance(start, DescentState) else None
+        spheres = np.array(start if resumed_state is None else resumed_state.spheres, np.float64)
         adam, queue = Adam(len(spheres)), np.zeros(0, int)
-        if resumed is not None:
-            adam.mean, adam.square, adam.age = resumed.mean.copy(), resumed.square.copy(), int(resumed.step_count)
-            queue, self.rng.bit_generator.state = resumed.queue, json.loads(str(resumed.random))
+        if resumed_state is not None:
+            adam.mean, adam.square, adam.age = (
+                resumed_state.mean.copy(),
+                resumed_state.square.copy(),
+                int(resumed_state.step_count),
+            )
+            queue, self.rng.bit_generator.state = resumed_state.queue, json.loads(str(resumed_state.random))
         first_rate = self.RATE * min(1.0, np.sqrt(64 / len(spheres)))
         for step in range(adam.age, steps):
-            done = step / steps
-            width = self.WIDTHS[0] * (self.WIDTHS[1] / self.WIDTHS[0]) ** min(1.0, 1.3 * done)
+            progress_share = step / steps
+            width = self.WIDTHS[0] * (self.WIDTHS[1] / self.WIDTHS[0]) ** min(1.0, 1.3 * progress_share)
             if len(queue) < self.BATCH:
                 queue = self.rng.permutation(len(self.receivers))
-            chosen, queue = queue[: self.BATCH], queue[self.BATCH :]
-            _, gradient = self.gradient(spheres, chosen, width)
-            adam.step(spheres, gradient, first_rate * 0.5 * (1 + np.cos(np.pi * done)))
+            receiver_indices, queue = queue[: self.BATCH], queue[self.BATCH :]
+            _, gradient = self.gradient(spheres, receiver_indices, width)
+            adam.step(spheres, gradient, first_rate * 0.5 * (1 + np.cos(np.pi * progress_share)))
             if step % RETURN_INTERVAL == 0 or step == steps - 1:
                 self._return_to_body(spheres)
-            yield Descended.at(spheres, adam, queue, self.rng)
+            yield DescentState.from_optimizer(spheres, adam, queue, self.rng)

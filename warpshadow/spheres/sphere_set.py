@@ -65,7 +65,7 @@ class Spheres:
         return len(self.radii)
 
     def __repr__(self) -> str:
-        """How many."""
+        """Number of spheres."""
         return f"Spheres({len(self)})"
 
     def transformed(

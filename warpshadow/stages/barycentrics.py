@@ -7,7 +7,7 @@ from warpshadow.device.batch import rows
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import run_length, split_row
-from warpshadow.stages.screen import center, relative, relative_adjoint, volumes
+from warpshadow.stages.screen import center, ray_volumes, relative_to_ray, relative_to_ray_adjoint
 
 TINY_VOLUME = 1.0e-36  # below this the volumes of a face are subnormal numbers, which have no reciprocal in float32
 
@@ -21,13 +21,13 @@ def _weights(a: wp.vec4, b: wp.vec4, c: wp.vec4, ray: wp.vec2):
     That holds for vertices behind the eye, too, so no clipping is needed; and relative to the ray nothing cancels when
     a face is small.
     """
-    spanned = volumes(relative(a, ray), relative(b, ray), relative(c, ray))
-    sign = wp.sign(spanned[0] + spanned[1] + spanned[2])
+    abc_volumes = ray_volumes(relative_to_ray(a, ray), relative_to_ray(b, ray), relative_to_ray(c, ray))
+    sign = wp.sign(abc_volumes[0] + abc_volumes[1] + abc_volumes[2])
     # A center may lie outside of the face by as much as the vertices moved when they snapped.
-    inside = wp.max(sign * spanned, wp.vec3(0.0, 0.0, 0.0))
-    total = inside[0] + inside[1] + inside[2]
-    if total > TINY_VOLUME:
-        return inside / total
+    clamped_volumes = wp.max(sign * abc_volumes, wp.vec3(0.0, 0.0, 0.0))
+    volume_sum = clamped_volumes[0] + clamped_volumes[1] + clamped_volumes[2]
+    if volume_sum > TINY_VOLUME:
+        return clamped_volumes / volume_sum
     return wp.vec3(1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0)  # edge-on, drawn only because its vertices snapped
 
 
@@ -40,25 +40,31 @@ def _weights_adjoint(a: wp.vec4, b: wp.vec4, c: wp.vec4, ray: wp.vec2, adj_weigh
     there. An attribute that is equal at all corners does not depend on the weights, whose sum is 1.
     """
     if adj_weights[0] != adj_weights[1] or adj_weights[1] != adj_weights[2]:
-        at_a = relative(a, ray)
-        at_b = relative(b, ray)
-        at_c = relative(c, ray)
-        spanned = volumes(at_a, at_b, at_c)
-        sign = wp.sign(spanned[0] + spanned[1] + spanned[2])
-        inside = wp.max(sign * spanned, wp.vec3(0.0, 0.0, 0.0))
-        total = inside[0] + inside[1] + inside[2]
-        if total > TINY_VOLUME:
-            scale = sign / total
-            mean = wp.dot(inside, adj_weights) / total
-            adj_a = wp.where(sign * spanned[0] < 0.0, 0.0, scale * (adj_weights[0] - mean))
-            adj_b = wp.where(sign * spanned[1] < 0.0, 0.0, scale * (adj_weights[1] - mean))
-            adj_c = wp.where(sign * spanned[2] < 0.0, 0.0, scale * (adj_weights[2] - mean))
-            adj_at_a = wp.vec3(adj_c * at_b[1] - adj_b * at_c[1], adj_b * at_c[0] - adj_c * at_b[0], 0.0)
-            adj_at_b = wp.vec3(adj_a * at_c[1] - adj_c * at_a[1], adj_c * at_a[0] - adj_a * at_c[0], 0.0)
-            adj_at_c = wp.vec3(adj_b * at_a[1] - adj_a * at_b[1], adj_a * at_b[0] - adj_b * at_a[0], 0.0)
-            wp.adjoint[a] += relative_adjoint(ray, adj_at_a)
-            wp.adjoint[b] += relative_adjoint(ray, adj_at_b)
-            wp.adjoint[c] += relative_adjoint(ray, adj_at_c)
+        relative_a = relative_to_ray(a, ray)
+        relative_b = relative_to_ray(b, ray)
+        relative_c = relative_to_ray(c, ray)
+        abc_volumes = ray_volumes(relative_a, relative_b, relative_c)
+        sign = wp.sign(abc_volumes[0] + abc_volumes[1] + abc_volumes[2])
+        clamped_volumes = wp.max(sign * abc_volumes, wp.vec3(0.0, 0.0, 0.0))
+        volume_sum = clamped_volumes[0] + clamped_volumes[1] + clamped_volumes[2]
+        if volume_sum > TINY_VOLUME:
+            scale = sign / volume_sum
+            mean = wp.dot(clamped_volumes, adj_weights) / volume_sum
+            adj_a = wp.where(sign * abc_volumes[0] < 0.0, 0.0, scale * (adj_weights[0] - mean))
+            adj_b = wp.where(sign * abc_volumes[1] < 0.0, 0.0, scale * (adj_weights[1] - mean))
+            adj_c = wp.where(sign * abc_volumes[2] < 0.0, 0.0, scale * (adj_weights[2] - mean))
+            adj_relative_a = wp.vec3(
+                adj_c * relative_b[1] - adj_b * relative_c[1], adj_b * relative_c[0] - adj_c * relative_b[0], 0.0
+            )
+            adj_relative_b = wp.vec3(
+                adj_a * relative_c[1] - adj_c * relative_a[1], adj_c * relative_a[0] - adj_a * relative_c[0], 0.0
+            )
+            adj_relative_c = wp.vec3(
+                adj_b * relative_a[1] - adj_a * relative_b[1], adj_a * relative_b[0] - adj_b * relative_a[0], 0.0
+            )
+            wp.adjoint[a] += relative_to_ray_adjoint(ray, adj_relative_a)
+            wp.adjoint[b] += relative_to_ray_adjoint(ray, adj_relative_b)
+            wp.adjoint[c] += relative_to_ray_adjoint(ray, adj_relative_c)
 
 
 @wp.kernel

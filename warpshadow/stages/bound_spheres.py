@@ -30,7 +30,7 @@ _SPREAD_SOFTENING = 1e-6  # squares of radii by which spreads differ from 0, whe
 @wp.kernel
 def _move_centers(
     # in
-    first: wp.array(dtype=wp.int32),
+    item_starts: wp.array(dtype=wp.int32),
     vertices: wp.array(dtype=wp.int32),
     weights: wp.array(dtype=wp.float32),
     positions: wp.array2d(dtype=wp.vec3),
@@ -44,7 +44,7 @@ def _move_centers(
     position_batch = instance_in(instance, positions.shape[0])
     rest_batch = instance_in(instance, rest_positions.shape[0])
     shift = wp.vec3()
-    for item in range(first[sphere], first[sphere + 1]):
+    for item in range(item_starts[sphere], item_starts[sphere + 1]):
         vertex = vertices[item]
         shift += weights[item] * (positions[position_batch, vertex] - rest_positions[rest_batch, vertex])
     centers[instance, sphere] = rest_centers[instance_in(instance, rest_centers.shape[0]), sphere] + shift
@@ -53,7 +53,7 @@ def _move_centers(
 @wp.kernel
 def _sum_spreads(
     # in
-    first: wp.array(dtype=wp.int32),
+    item_starts: wp.array(dtype=wp.int32),
     vertices: wp.array(dtype=wp.int32),
     shares: wp.array(dtype=wp.float32),
     positions: wp.array2d(dtype=wp.vec3),
@@ -66,7 +66,7 @@ def _sum_spreads(
     position_batch = instance_in(instance, positions.shape[0])
     center = centers[instance_in(instance, centers.shape[0]), sphere]
     total = float(0.0)
-    for item in range(first[sphere], first[sphere + 1]):
+    for item in range(item_starts[sphere], item_starts[sphere + 1]):
         total += shares[item] * wp.length_sq(positions[position_batch, vertices[item]] - center)
     spreads[instance, sphere] = total
 
@@ -94,13 +94,13 @@ class SphereBinding:
     """Spheres bound to the vertices around them.
 
     Args:
-        first: Where the items of each sphere begin, and the end of the last, int32 of shape [sphere + 1].
+        item_starts: Where the items of each sphere begin, and the end of the last, int32 of shape [sphere + 1].
         vertices: Of each item, int32 of shape [item].
         weights: w, by which centers follow, float32 of shape [item].
         shares: a, whose sum is 1 for each sphere, float32 of shape [item].
     """
 
-    first: wp.array
+    item_starts: wp.array
     vertices: wp.array
     weights: wp.array
     shares: wp.array
@@ -119,19 +119,19 @@ class SphereBinding:
         """
         from scipy.spatial import cKDTree
 
-        places = points[vertices].astype(np.float64)
-        tree = cKDTree(places)
-        distances = tree.query(centers, k=min(_MIN_VERTICES, len(places)))[0].reshape(len(centers), -1)
-        reaches = np.maximum(_BINDING_RADIUS * np.maximum(distances[:, 0], radii), 1.1 * distances[:, -1])
-        near = tree.query_ball_point(centers, reaches, return_sorted=True)
+        candidate_positions = points[vertices].astype(np.float64)
+        tree = cKDTree(candidate_positions)
+        distances = tree.query(centers, k=min(_MIN_VERTICES, len(candidate_positions)))[0].reshape(len(centers), -1)
+        binding_radii = np.maximum(_BINDING_RADIUS * np.maximum(distances[:, 0], radii), 1.1 * distances[:, -1])
+        bound_items = tree.query_ball_point(centers, binding_radii, return_sorted=True)
         rows = [
-            _weights(places[bound_vertices], *sphere)
-            for bound_vertices, *sphere in zip(near, centers, reaches, strict=True)
+            _weights(candidate_positions[bound_vertices], *sphere)
+            for bound_vertices, *sphere in zip(bound_items, centers, binding_radii, strict=True)
         ]
         weights, shares = (np.concatenate(column) for column in zip(*rows, strict=True))
         return SphereBinding(
-            wp.array(np.cumsum([0, *map(len, near)]), dtype=wp.int32, device=device),
-            wp.array(vertices[np.concatenate(near)], dtype=wp.int32, device=device),
+            wp.array(np.cumsum([0, *map(len, bound_items)]), dtype=wp.int32, device=device),
+            wp.array(vertices[np.concatenate(bound_items)], dtype=wp.int32, device=device),
             wp.array(weights, dtype=wp.float32, device=device),
             wp.array(shares, dtype=wp.float32, device=device),
         )
@@ -153,10 +153,10 @@ class SphereBinding:
         """
         arguments = {"positions": positions, "rest": rest_positions, "centers": rest_centers, "radii": rest_radii}
         check.finite_arrays(arguments)
-        shape, device = (common_batch(arguments), len(self.first) - 1), positions.device
-        bound = [self.first, self.vertices]
+        shape, device = (common_batch(arguments), len(self.item_starts) - 1), positions.device
+        binding = [self.item_starts, self.vertices]
         centers = empty(shape, dtype=wp.vec3, device=device)
-        inputs = [*bound, self.weights, positions, rest_positions, rest_centers]
+        inputs = [*binding, self.weights, positions, rest_positions, rest_centers]
         launch(_move_centers, shape, inputs=inputs, outputs=[centers])
         rest_spreads = self._spreads(rest_positions, rest_centers)
         radii = empty(shape, dtype=wp.float32, device=device)
@@ -168,17 +168,19 @@ class SphereBinding:
         """Mean square distances of vertices from centers, float32 of shape [batch, sphere]."""
         shape = max(len(positions), len(centers)), centers.shape[1]
         spreads = empty(shape, dtype=wp.float32, device=positions.device)
-        inputs = [self.first, self.vertices, self.shares, positions, centers]
+        inputs = [self.item_starts, self.vertices, self.shares, positions, centers]
         launch(_sum_spreads, shape, inputs=inputs, outputs=[spreads])
         return spreads
 
 
-def _weights(places: np.ndarray, center: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+def _weights(
+    candidate_positions: np.ndarray, center: np.ndarray, binding_radius: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Weights and shares of vertices [vertex, 3] around a center."""
-    shares = (1.0 - ((places - center) ** 2).sum(axis=1) / reach**2).clip(0.0) ** 2
+    shares = (1.0 - ((candidate_positions - center) ** 2).sum(axis=1) / binding_radius**2).clip(0.0) ** 2
     shares /= shares.sum()
-    mean = shares @ places
-    offsets = places - mean
+    mean = shares @ candidate_positions
+    offsets = candidate_positions - mean
     spread = (shares[:, None] * offsets).T @ offsets
     slopes = np.linalg.solve(spread + (_RIDGE * np.trace(spread) + 1e-30) * np.eye(3), center - mean)
     return shares * (1.0 + offsets @ slopes), shares

@@ -17,19 +17,19 @@ class CachedRows(NamedTuple):
 
 
 @wp.func
-def _light(t: Chunk, red: Chunk, green: Chunk, blue: Chunk):
+def _sum_cells(transmittance: Chunk, red: Chunk, green: Chunk, blue: Chunk):
     """Light of a chunk of cells:  Σ_q T_q S_q."""
-    return wp.vec3(wp.dot(t, red), wp.dot(t, green), wp.dot(t, blue))
+    return wp.vec3(wp.dot(transmittance, red), wp.dot(transmittance, green), wp.dot(transmittance, blue))
 
 
-@wp.func_grad(_light)
-def _light_adjoint(t: Chunk, red: Chunk, green: Chunk, blue: Chunk, adj: wp.vec3):
+@wp.func_grad(_sum_cells)
+def _sum_cells_adjoint(transmittance: Chunk, red: Chunk, green: Chunk, blue: Chunk, adj_light: wp.vec3):
     """The gradient to transmittance alone, by the vector units:  T̄_q = S_q · B̄."""
-    wp.adjoint[t] += adj[0] * red + adj[1] * green + adj[2] * blue
+    wp.adjoint[transmittance] += adj_light[0] * red + adj_light[1] * green + adj_light[2] * blue
 
 
 @wp.kernel
-def _light_cells(
+def _shade_cells(
     # in
     transmittance: wp.array3d(dtype=Chunk),
     index: wp.array(dtype=wp.int32),
@@ -40,15 +40,15 @@ def _light_cells(
     """A thread owns a receiver."""
     batch, receiver = wp.tid()
     row = index[receiver]
-    total = wp.vec3()
+    irradiance = wp.vec3()
     for chunk in range(cells.shape[2]):
-        total += _light(
+        irradiance += _sum_cells(
             transmittance[batch, receiver, chunk], cells[row, 0, chunk], cells[row, 1, chunk], cells[row, 2, chunk]
         )
-    shading[batch, receiver] = total
+    shading[batch, receiver] = irradiance
 
 
-def light_cells(transmittance: wp.array, cached: CachedRows) -> wp.array:
+def shade_cached_cells(transmittance: wp.array, cached: CachedRows) -> wp.array:
     """Light receivers on static bodies by known light, which static and moving bodies shadow.
 
     Args:
@@ -62,7 +62,7 @@ def light_cells(transmittance: wp.array, cached: CachedRows) -> wp.array:
     use_vector_registers(__name__, device)
     shading = empty(transmittance.shape[:2], dtype=wp.vec3, device=device)
     inputs = [as_chunks(transmittance), cached.index, as_chunks(cached.rows)]
-    launch(_light_cells, shading.shape, inputs=inputs, outputs=[shading])
+    launch(_shade_cells, shading.shape, inputs=inputs, outputs=[shading])
     return shading
 
 
@@ -103,7 +103,7 @@ def cell_transfer(transmittance: wp.array, cached: CachedRows) -> wp.array:
 
 
 @wp.kernel(enable_backward=False)
-def _add_rows(
+def _add_cached_rows(
     # in
     index: wp.array(dtype=wp.int32),
     rows: wp.array3d(dtype=wp.float32),
@@ -128,4 +128,4 @@ def add_rows(cached: CachedRows, sums: wp.array, channel: int = 0) -> None:
         sums: Float32 of shape [batch, receiver, item], which no recorded launch has read yet.
         channel: Which is added.
     """
-    launch(_add_rows, sums.shape[:2], inputs=[cached.index, cached.rows, channel], outputs=[sums])
+    launch(_add_cached_rows, sums.shape[:2], inputs=[cached.index, cached.rows, channel], outputs=[sums])

@@ -29,7 +29,7 @@ share the disc. Shapes that meet at an edge share the cells there without a rema
 
 import warp as wp
 
-_LEAST = wp.constant(1.0e-12)
+_MIN_DISTANCE = wp.constant(1.0e-12)
 """The least distance of an edge from ω."""
 
 
@@ -68,66 +68,68 @@ class Chord:
 
 
 @wp.func
-def _along_line(end: wp.vec3, axis: wp.vec3, direction: wp.vec3, half: float, behind: float):
-    """Where an end of an edge lies on its line, up to the disc's border; ``behind`` if it is behind the receiver."""
-    ahead = wp.dot(end, direction)
-    if ahead <= 0.0:
-        return behind
-    aside = wp.dot(end, axis)
-    if ahead * half <= wp.abs(aside):
-        return wp.where(aside > 0.0, half, -half)
-    return aside / ahead
+def _position_on_line(end: wp.vec3, axis: wp.vec3, direction: wp.vec3, half_chord: float, position_behind: float):
+    """Position s of an end of an edge on its line, clamped to the disc; ``position_behind`` behind the receiver."""
+    forward_component = wp.dot(end, direction)
+    if forward_component <= 0.0:
+        return position_behind
+    lateral_component = wp.dot(end, axis)
+    if forward_component * half_chord <= wp.abs(lateral_component):
+        return wp.where(lateral_component > 0.0, half_chord, -half_chord)
+    return lateral_component / forward_component
 
 
 @wp.func
-def _find_chord(edges: wp.array(dtype=ViewedEdge), e: int, cosine: float, direction: wp.vec3, radius: float):
+def _find_chord(edges: wp.array(dtype=ViewedEdge), edge: int, cosine: float, direction: wp.vec3, radius: float):
     """Find the chord of an edge, m·ω = ``cosine``."""
     chord = Chord()
     chord.scale = 1.0 / wp.sqrt(wp.max(0.0, 1.0 - cosine * cosine))
     chord.distance = cosine * chord.scale
-    half2 = radius * radius - chord.distance * chord.distance
-    a = edges[e].begin
-    b = edges[e].end
-    if half2 > 0.0 and (wp.dot(a, direction) > 0.0 or wp.dot(b, direction) > 0.0):
-        half = wp.sqrt(half2)
-        chord.tangent = chord.scale * wp.cross(direction, edges[e].normal)
-        chord.begin = _along_line(b, chord.tangent, direction, half, -half)
-        chord.end = _along_line(a, chord.tangent, direction, half, half)
+    half_chord2 = radius * radius - chord.distance * chord.distance
+    a = edges[edge].begin
+    b = edges[edge].end
+    if half_chord2 > 0.0 and (wp.dot(a, direction) > 0.0 or wp.dot(b, direction) > 0.0):
+        half_chord = wp.sqrt(half_chord2)
+        chord.tangent = chord.scale * wp.cross(direction, edges[edge].normal)
+        chord.begin = _position_on_line(b, chord.tangent, direction, half_chord, -half_chord)
+        chord.end = _position_on_line(a, chord.tangent, direction, half_chord, half_chord)
     return chord
 
 
 @wp.func
-def _toward_shape(edge: ViewedEdge, cosine: float, direction: wp.vec3, chord: Chord):
+def _line_normal(edge: ViewedEdge, cosine: float, direction: wp.vec3, chord: Chord):
     """Unit vector n̂ from an edge's line towards the shape, in the plane that touches the sphere of directions."""
     return chord.scale * (edge.normal - cosine * direction)
 
 
 @wp.func
-def _coverage_past_edges(edges: wp.array(dtype=ViewedEdge), first: int, count: int, direction: wp.vec3, radius: float):
+def _coverage_within_edges(
+    edges: wp.array(dtype=ViewedEdge), first: int, count: int, direction: wp.vec3, radius: float
+):
     """Share of a cell between its edges and its border, h − w, and the moment μ."""
     area = float(0.0)
     moment = wp.vec3()
     product = wp.vec2(1.0, 0.0)
-    turn_count = float(0.0)
-    for e in range(first, first + count):
-        cosine = wp.dot(edges[e].normal, direction)
+    branch_crossings = float(0.0)
+    for edge in range(first, first + count):
+        cosine = wp.dot(edges[edge].normal, direction)
         if wp.abs(cosine) < radius:
-            chord = _find_chord(edges, e, cosine, direction, radius)
+            chord = _find_chord(edges, edge, cosine, direction, radius)
             if chord.end > chord.begin:
                 length = chord.end - chord.begin
-                d = wp.where(cosine > 0.0, chord.distance, wp.min(chord.distance, -_LEAST))  # of 0, turns by +π
+                d = wp.where(cosine > 0.0, chord.distance, wp.min(chord.distance, -_MIN_DISTANCE))  # of 0, turns by +π
                 area += 0.5 * d * length
-                across = (radius * radius - d * d) * _toward_shape(edges[e], cosine, direction, chord)
-                moment += length * (across + (0.5 * d * (chord.begin + chord.end)) * chord.tangent)
+                normal_part = (radius * radius - d * d) * _line_normal(edges[edge], cosine, direction, chord)
+                moment += length * (normal_part + (0.5 * d * (chord.begin + chord.end)) * chord.tangent)
                 x, y = d * d + chord.begin * chord.end, d * length
                 scale = 1.0 / wp.max(wp.abs(x), wp.abs(y))
-                before = product[1]
-                product = scale * wp.vec2(product[0] * x + before * y, before * x - product[0] * y)
-                if y > 0.0 and before < 0.0 and product[1] >= 0.0:
-                    turn_count -= 1.0
-                if y < 0.0 and before >= 0.0 and product[1] < 0.0:
-                    turn_count += 1.0
-    area += 0.5 * radius * radius * (wp.atan2(product[1], product[0]) + 2.0 * wp.pi * turn_count)
+                imaginary_part = product[1]
+                product = scale * wp.vec2(product[0] * x + imaginary_part * y, imaginary_part * x - product[0] * y)
+                if y > 0.0 and imaginary_part < 0.0 and product[1] >= 0.0:
+                    branch_crossings -= 1.0
+                if y < 0.0 and imaginary_part >= 0.0 and product[1] < 0.0:
+                    branch_crossings += 1.0
+    area += 0.5 * radius * radius * (wp.atan2(product[1], product[0]) + 2.0 * wp.pi * branch_crossings)
     per_area = 1.0 / (wp.pi * radius * radius)
     moment = (per_area / (3.0 * radius)) * moment
     return wp.vec4(area * per_area, moment[0], moment[1], moment[2])
@@ -144,15 +146,16 @@ def convex_coverage(edges: wp.array(dtype=ViewedEdge), first: int, count: int, d
     """Coverage (h, μ) of a cell by a convex outline of ``count`` edges from ``first`` on; it is 0 without edges."""
     if count == 0:
         return wp.vec4()
-    nearest = radius
-    for e in range(first, first + count):
-        nearest = wp.min(nearest, wp.dot(edges[e].normal, direction))
-        if nearest <= -radius:
+    min_cosine = radius
+    for edge in range(first, first + count):
+        min_cosine = wp.min(min_cosine, wp.dot(edges[edge].normal, direction))
+        if min_cosine <= -radius:
             return wp.vec4()
-    if nearest >= radius:
+    if min_cosine >= radius:
         return wp.vec4(1.0, 0.0, 0.0, 0.0)
-    past_edges = _coverage_past_edges(edges, first, count, direction, radius)
-    return _with_share(past_edges, wp.where(nearest > 0.0, 1.0, 0.0) + past_edges[0])
+    winding = wp.where(min_cosine > 0.0, 1.0, 0.0)
+    within_edges = _coverage_within_edges(edges, first, count, direction, radius)
+    return _with_share(within_edges, winding + within_edges[0])
 
 
 @wp.func
@@ -160,51 +163,51 @@ def outline_coverage(
     edges: wp.array(dtype=ViewedEdge),
     first: int,
     count: int,
-    down: wp.vec3,
+    plane_normal: wp.vec3,
     axis: wp.vec3,
     direction: wp.vec3,
     radius: float,
 ):
     """Coverage (h, μ) of a cell by any outline of a plane, given its normal away from the receiver and one axis."""
     winding = int(0)
-    nearest = radius
-    is_ahead = wp.dot(down, direction) > 0.0
+    min_abs_cosine = radius
+    is_ahead = wp.dot(plane_normal, direction) > 0.0
     side = wp.cross(direction, axis)
-    for e in range(first, first + count):
-        cosine = wp.dot(edges[e].normal, direction)
-        nearest = wp.min(nearest, wp.abs(cosine))
-        begins_below = wp.dot(edges[e].begin, side) <= 0.0
-        ends_below = wp.dot(edges[e].end, side) <= 0.0
+    for edge in range(first, first + count):
+        cosine = wp.dot(edges[edge].normal, direction)
+        min_abs_cosine = wp.min(min_abs_cosine, wp.abs(cosine))
+        begins_below = wp.dot(edges[edge].begin, side) <= 0.0
+        ends_below = wp.dot(edges[edge].end, side) <= 0.0
         if is_ahead and begins_below and not ends_below and cosine > 0.0:
             winding += 1
         if is_ahead and ends_below and not begins_below and cosine <= 0.0:
             winding -= 1
-    past_edges = wp.vec4()
-    if nearest < radius:
-        past_edges = _coverage_past_edges(edges, first, count, direction, radius)
-    return _with_share(past_edges, float(winding) + past_edges[0])
+    within_edges = wp.vec4()
+    if min_abs_cosine < radius:
+        within_edges = _coverage_within_edges(edges, first, count, direction, radius)
+    return _with_share(within_edges, float(winding) + within_edges[0])
 
 
 @wp.func
 def coverage_adjoint(
-    edges: wp.array(dtype=ViewedEdge), first: int, count: int, direction: wp.vec3, radius: float, adj: wp.vec4
+    edges: wp.array(dtype=ViewedEdge), first: int, count: int, direction: wp.vec3, radius: float, adj_coverage: wp.vec4
 ):
     """Add to the gradients of the edges' normals, of either function, by those of h and μ."""
     per_area = 1.0 / (wp.pi * radius * radius)
-    adj_moment = (per_area / radius) * wp.vec3(adj[1], adj[2], adj[3])
-    for e in range(first, first + count):
-        cosine = wp.dot(edges[e].normal, direction)
+    adj_moment = (per_area / radius) * wp.vec3(adj_coverage[1], adj_coverage[2], adj_coverage[3])
+    for edge in range(first, first + count):
+        cosine = wp.dot(edges[edge].normal, direction)
         if wp.abs(cosine) < radius:
-            chord = _find_chord(edges, e, cosine, direction, radius)
+            chord = _find_chord(edges, edge, cosine, direction, radius)
             if chord.end > chord.begin:
-                foot = -chord.distance * _toward_shape(edges[e], cosine, direction, chord)
-                # ∫ (at_foot + s slope) (ω + foot + s t) ds
-                at_foot = per_area * adj[0] + wp.dot(adj_moment, foot)
+                line_foot = -chord.distance * _line_normal(edges[edge], cosine, direction, chord)
+                # ∫ (foot_value + s slope) (ω + line_foot + s t) ds
+                foot_value = per_area * adj_coverage[0] + wp.dot(adj_moment, line_foot)
                 slope = wp.dot(adj_moment, chord.tangent)
                 length = chord.end - chord.begin
                 first_integral = 0.5 * (chord.end * chord.end - chord.begin * chord.begin)
                 second_integral = (chord.end * chord.end * chord.end - chord.begin * chord.begin * chord.begin) / 3.0
-                along_foot = at_foot * length + slope * first_integral
-                along_line = at_foot * first_integral + slope * second_integral
-                adj_normal = along_foot * (direction + foot) + along_line * chord.tangent
-                edges[e].adj_normal = edges[e].adj_normal + chord.scale * adj_normal
+                foot_weight = foot_value * length + slope * first_integral
+                tangent_weight = foot_value * first_integral + slope * second_integral
+                adj_normal = foot_weight * (direction + line_foot) + tangent_weight * chord.tangent
+                edges[edge].adj_normal = edges[edge].adj_normal + chord.scale * adj_normal

@@ -28,13 +28,13 @@ def _deform_points(
 ):
     """A thread owns a point of an instance: the weighted mean of where its nodes would take it."""
     batch, point = wp.tid()
-    total = wp.vec3()
+    blended_point = wp.vec3()
     for k in range(nodes.shape[1]):
         node = nodes[point, k]
         center = node_positions[node]
-        moved = matrices[batch, node] * (rest[point] - center) + center + translations[batch, node]
-        total += weights[point, k] * moved
-    deformed[batch, point] = total
+        moved_point = matrices[batch, node] * (rest[point] - center) + center + translations[batch, node]
+        blended_point += weights[point, k] * moved_point
+    deformed[batch, point] = blended_point
 
 
 @wp.kernel
@@ -43,11 +43,11 @@ def _move_nodes(
     node_positions: wp.array(dtype=wp.vec3),
     translations: wp.array2d(dtype=wp.vec3),
     # out
-    moved: wp.array2d(dtype=wp.vec3),
+    moved_centers: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a node of an instance."""
     batch, node = wp.tid()
-    moved[batch, node] = node_positions[node] + translations[batch, node]
+    moved_centers[batch, node] = node_positions[node] + translations[batch, node]
 
 
 @wp.kernel
@@ -61,11 +61,11 @@ def _sum_rigidity(
     energy: wp.array(dtype=wp.float32),
 ):
     """A thread owns a node and one of its neighbors: where the node would take it, against where it goes."""
-    batch, pair = wp.tid()
-    node = neighbors[pair][0]
-    other = neighbors[pair][1]
-    edge = node_positions[other] - node_positions[node]
-    gap = matrices[batch, node] * edge - edge + translations[batch, node] - translations[batch, other]
+    batch, pair_index = wp.tid()
+    node = neighbors[pair_index][0]
+    neighbor = neighbors[pair_index][1]
+    edge = node_positions[neighbor] - node_positions[node]
+    gap = matrices[batch, node] * edge - edge + translations[batch, node] - translations[batch, neighbor]
     wp.atomic_add(energy, batch, wp.dot(gap, gap))
 
 
@@ -125,16 +125,16 @@ class DeformationGraph:
             raise ValueError(f"count: got {count!r} for {len(nodes)} nodes, expected 1 to {len(nodes) - 1}")
         tree = cKDTree(nodes)
         distances, nearest = tree.query(points, k=count + 1)
-        reach = np.maximum(distances[:, -1:], 1e-30)
-        weights = (1 - distances[:, :-1] / reach) ** 2 + 1e-9  # a point as far from all of them is carried by all
+        radius = np.maximum(distances[:, -1:], 1e-30)
+        weights = (1 - distances[:, :-1] / radius) ** 2 + 1e-9  # a point as far from all of them is carried by all
         weights /= weights.sum(axis=1, keepdims=True)
         nearest = nearest[:, :-1]
-        shared = np.zeros((len(nodes), len(nodes)))
+        shared_points = np.zeros((len(nodes), len(nodes)))
         for i, j in itertools.product(range(count), repeat=2):
-            np.add.at(shared, (nearest[:, i], nearest[:, j]), np.sqrt(weights[:, i] * weights[:, j]))
-        are_neighbors = shared > _SHARED_POINTS_RATIO * len(points) / len(nodes)
-        _, others = tree.query(nodes, k=count + 1)
-        are_neighbors[np.arange(len(nodes))[:, None], others] = True
+            np.add.at(shared_points, (nearest[:, i], nearest[:, j]), np.sqrt(weights[:, i] * weights[:, j]))
+        are_neighbors = shared_points > _SHARED_POINTS_RATIO * len(points) / len(nodes)
+        _, nearest_nodes = tree.query(nodes, k=count + 1)
+        are_neighbors[np.arange(len(nodes))[:, None], nearest_nodes] = True
         are_neighbors |= are_neighbors.T
         np.fill_diagonal(are_neighbors, False)
         return DeformationGraph(
@@ -164,12 +164,12 @@ class DeformationGraph:
 
     @one_at_a_time
     def centers(self, translations: wp.array) -> wp.array:
-        """Where the nodes themselves go: vec3 of shape [batch, node]. Differentiable: translations."""
+        """Displaced positions of the nodes: vec3 of shape [batch, node]. Differentiable: translations."""
         check.shape("translations", translations.shape, ("batch", self.node_positions.shape[0]))
         check.finite_arrays({"translations": translations})
-        moved = wp.empty_like(translations, requires_grad=False)
-        launch(_move_nodes, moved.shape, inputs=[self.node_positions, translations], outputs=[moved])
-        return moved
+        moved_centers = wp.empty_like(translations, requires_grad=False)
+        launch(_move_nodes, moved_centers.shape, inputs=[self.node_positions, translations], outputs=[moved_centers])
+        return moved_centers
 
     @one_at_a_time
     def rigidity(self, matrices: wp.array, translations: wp.array) -> wp.array:
@@ -181,17 +181,17 @@ class DeformationGraph:
         """
         self._check(matrices, translations)
         inputs = [self.node_positions, self.neighbors, matrices, translations]
-        return _energy("matrices, translations", _sum_rigidity, (len(matrices), len(self.neighbors)), inputs)
+        return _sum_energy("matrices, translations", _sum_rigidity, (len(matrices), len(self.neighbors)), inputs)
 
     @one_at_a_time
     def shear(self, matrices: wp.array) -> wp.array:
-        """How far the matrices are from rotations, Σ |MᵀM − I|² (as E_rot of Sumner): float32 of shape [batch].
+        """Distance of the matrices from rotations, Σ |MᵀM − I|² (as E_rot of Sumner): float32 of shape [batch].
 
         Differentiable: matrices.
         """
         check.shape("matrices", matrices.shape, ("batch", self.node_positions.shape[0]))
         check.finite_arrays({"matrices": matrices})
-        return _energy("matrices", _sum_shear, matrices.shape, [matrices])
+        return _sum_energy("matrices", _sum_shear, matrices.shape, [matrices])
 
     def _check(self, matrices: wp.array, translations: wp.array) -> None:
         check.shape("matrices", matrices.shape, ("batch", self.node_positions.shape[0]))
@@ -199,7 +199,7 @@ class DeformationGraph:
         check.finite_arrays({"matrices": matrices, "translations": translations})
 
 
-def _energy(names: str, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list[wp.array]) -> wp.array:
+def _sum_energy(names: str, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list[wp.array]) -> wp.array:
     """Launch a kernel whose threads add to the energy of their instance; ValueError where that is no float32."""
     energy = zeros(dim[0], dtype=wp.float32, device=inputs[0].device)
     launch(kernel, dim, inputs=inputs, outputs=[energy])

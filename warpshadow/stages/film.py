@@ -7,14 +7,14 @@ from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import find_run, run_dimensions, run_length
-from warpshadow.stages.interpolation import at_point
+from warpshadow.stages.interpolation import interpolate_at
 from warpshadow.stages.rasterization import Fragments
 
 _COST = 5.0  # nanoseconds that a sample takes
 
 
 @wp.kernel
-def _radiance(
+def _sample_radiance(
     first_row: int,
     worker: int,
     # in
@@ -31,14 +31,14 @@ def _radiance(
     row, column = wp.tid()
     batch, thread = find_run(worker, first_row + row, column)
     fragment_batch = instance_in(batch, face_ids.shape[0])
-    of_receivers = shading[instance_in(batch, shading.shape[0])]
-    of_samples = albedo[instance_in(batch, albedo.shape[0])]
+    receiver_shading = shading[instance_in(batch, shading.shape[0])]
+    sample_albedo = albedo[instance_in(batch, albedo.shape[0])]
     for sample in range(thread * run, (thread + 1) * run):
         face = face_ids[fragment_batch, sample]
         if face >= 0:
-            received = at_point(of_receivers, faces[face], barycentrics[fragment_batch, sample])
-            color = wp.cw_mul(received, of_samples[sample])
-            samples[batch, sample] = wp.vec4(color[0], color[1], color[2], 1.0)
+            irradiance = interpolate_at(receiver_shading, faces[face], barycentrics[fragment_batch, sample])
+            radiance = wp.cw_mul(irradiance, sample_albedo[sample])
+            samples[batch, sample] = wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
         else:
             samples[batch, sample] = wp.vec4()
 
@@ -63,7 +63,7 @@ def sample_radiance(fragments: Fragments, faces: wp.array, shading: wp.array, al
     run = run_length(shading.device, width)
     samples = empty((count, height * width), dtype=wp.vec4, device=shading.device)
     launch(
-        _radiance,
+        _sample_radiance,
         run_dimensions(shading.device, height * width // run, count),
         cost=_COST * run,
         inputs=[*fragments.rows, faces, shading, rows(albedo), run],
@@ -74,7 +74,7 @@ def sample_radiance(fragments: Fragments, faces: wp.array, shading: wp.array, al
 
 
 @wp.kernel
-def _sum(
+def _sum_radiance(
     # in
     first: wp.array2d(dtype=wp.vec4),
     second: wp.array2d(dtype=wp.vec4),
@@ -83,9 +83,14 @@ def _sum(
 ):
     """A thread owns a sample."""
     batch, sample = wp.tid()
-    a = first[instance_in(batch, first.shape[0]), sample]
-    b = second[instance_in(batch, second.shape[0]), sample]
-    sums[batch, sample] = wp.vec4(a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3])
+    first_radiance = first[instance_in(batch, first.shape[0]), sample]
+    second_radiance = second[instance_in(batch, second.shape[0]), sample]
+    sums[batch, sample] = wp.vec4(
+        first_radiance[0] + second_radiance[0],
+        first_radiance[1] + second_radiance[1],
+        first_radiance[2] + second_radiance[2],
+        first_radiance[3],
+    )
 
 
 def sum_radiance(first: wp.array, second: wp.array) -> wp.array:
@@ -101,10 +106,10 @@ def sum_radiance(first: wp.array, second: wp.array) -> wp.array:
     """
     if not first.size:
         return first
-    count = common_batch({"first": first, "second": second})
-    sums = wp.empty((count, first[0].size), dtype=wp.vec4, device=first.device)
-    launch(_sum, sums.shape, inputs=[rows(first), rows(second)], outputs=[sums])
-    return sums.reshape((count, *first.shape[1:]))
+    batch_count = common_batch({"first": first, "second": second})
+    sums = wp.empty((batch_count, first[0].size), dtype=wp.vec4, device=first.device)
+    launch(_sum_radiance, sums.shape, inputs=[rows(first), rows(second)], outputs=[sums])
+    return sums.reshape((batch_count, *first.shape[1:]))
 
 
 @wp.kernel
@@ -138,6 +143,6 @@ def average(samples: wp.array, supersampling: int) -> wp.array:
         return samples
     batch_count, height, width = samples.shape[0], samples.shape[1] // supersampling, samples.shape[2] // supersampling
     pixels = empty((batch_count * height, width), dtype=wp.vec4, device=samples.device)
-    parts = samples.reshape((batch_count * height, supersampling, width, supersampling))
-    launch(_average, pixels.shape, inputs=[parts, supersampling], outputs=[pixels])
+    sample_grid = samples.reshape((batch_count * height, supersampling, width, supersampling))
+    launch(_average, pixels.shape, inputs=[sample_grid, supersampling], outputs=[pixels])
     return pixels.reshape((batch_count, height, width))

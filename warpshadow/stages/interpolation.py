@@ -21,35 +21,39 @@ _COST = 5.0  # nanoseconds that a sample takes
 
 
 @wp.func
-def at_point(values: wp.array(dtype=Any), corners: wp.vec3i, weights: wp.vec3):
+def interpolate_at(values: wp.array(dtype=Any), corners: wp.vec3i, weights: wp.vec3):
     """A value of the vertices at a point of a face."""
     return weights[0] * values[corners[0]] + weights[1] * values[corners[1]] + weights[2] * values[corners[2]]
 
 
 @wp.func
-def add_to_corners(adj_values: wp.array(dtype=Any), corners: wp.vec3i, weights: wp.vec3, adj: Any):
-    """The adjoint of `at_point` by the values."""
-    wp.atomic_add(adj_values, corners[0], weights[0] * adj)
-    wp.atomic_add(adj_values, corners[1], weights[1] * adj)
-    wp.atomic_add(adj_values, corners[2], weights[2] * adj)
+def interpolate_values_adjoint(adj_values: wp.array(dtype=Any), corners: wp.vec3i, weights: wp.vec3, adj_point: Any):
+    """The adjoint of `interpolate_at` by the values."""
+    wp.atomic_add(adj_values, corners[0], weights[0] * adj_point)
+    wp.atomic_add(adj_values, corners[1], weights[1] * adj_point)
+    wp.atomic_add(adj_values, corners[2], weights[2] * adj_point)
 
 
 @wp.func
-def inner(a: float, b: float):
+def inner_product(a: float, b: float):
     """Inner product of attributes of any dtype."""
     return a * b
 
 
 @wp.func  # type: ignore[no-redef]
-def inner(a: Any, b: Any):  # noqa: F811
+def inner_product(a: Any, b: Any):  # noqa: F811
     """Inner product of attributes of any dtype."""
     return wp.dot(a, b)
 
 
 @wp.func
-def adj_weights(values: wp.array(dtype=Any), corners: wp.vec3i, adj: Any):
-    """The adjoint of `at_point` by the weights."""
-    return wp.vec3(inner(adj, values[corners[0]]), inner(adj, values[corners[1]]), inner(adj, values[corners[2]]))
+def interpolate_weights_adjoint(values: wp.array(dtype=Any), corners: wp.vec3i, adj_point: Any):
+    """The adjoint of `interpolate_at` by the weights."""
+    return wp.vec3(
+        inner_product(adj_point, values[corners[0]]),
+        inner_product(adj_point, values[corners[1]]),
+        inner_product(adj_point, values[corners[2]]),
+    )
 
 
 @functools.cache
@@ -73,11 +77,13 @@ def _make_interpolate(dtype: type) -> wp.Kernel:
         row, column = wp.tid()
         instance, thread = find_run(worker, first_row + row, column)
         fragment_batch = instance_in(instance, face_ids.shape[0])
-        values = attributes[instance_in(instance, attributes.shape[0])]
+        instance_attributes = attributes[instance_in(instance, attributes.shape[0])]
         for sample in range(thread * run, (thread + 1) * run):
             face = face_ids[fragment_batch, sample]
             if face >= 0:
-                image[instance, sample] = at_point(values, faces[face], barycentrics[fragment_batch, sample])
+                image[instance, sample] = interpolate_at(
+                    instance_attributes, faces[face], barycentrics[fragment_batch, sample]
+                )
             else:
                 image[instance, sample] = dtype(0.0)
 
@@ -98,18 +104,18 @@ def interpolate(fragments: Fragments, faces: wp.array, attributes: wp.array) -> 
     """
     face_ids = fragments.face_ids
     check.shape("attributes", attributes.shape, ("batch", "attribute"))
-    instances = common_batch({"fragments": face_ids, "attributes": attributes})
+    batch_count = common_batch({"fragments": face_ids, "attributes": attributes})
     if scalar_type(attributes.dtype) is not wp.float32:
         raise ValueError(f"attributes: got dtype {attributes.dtype.__name__}, expected float32 or a vector of them")
     device, width = face_ids.device, face_ids.shape[2]
     run = run_length(device, width)
-    image = empty((instances, face_ids[0].size), dtype=attributes.dtype, device=device)
+    image = empty((batch_count, face_ids[0].size), dtype=attributes.dtype, device=device)
     launch(
         _make_interpolate(attributes.dtype),
-        run_dimensions(device, face_ids[0].size // run, instances),
+        run_dimensions(device, face_ids[0].size // run, batch_count),
         cost=_COST * run,
         inputs=[*fragments.rows, faces, attributes, run],
         outputs=[image],
         shared=[attributes],
     )
-    return image.reshape((instances, *face_ids.shape[1:]))
+    return image.reshape((batch_count, *face_ids.shape[1:]))

@@ -27,7 +27,7 @@ from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 
-_LEAST_BOUNDS = wp.constant(1.0e-6)
+_MIN_BOUNDS = wp.constant(1.0e-6)
 """Σ ν ν below which blockers count as independent: such a product is of the size of its rounding."""
 
 _PASS_COST = 1.0  # time of a cell [ns]
@@ -79,27 +79,27 @@ def with_blocker(sums: BlockerSums, coverage: wp.vec4):
     share = wp.clamp(coverage[0], 0.0, 1.0)
     moment = _moment_of(coverage)
     bound = _moment_bound(share)
-    more = sums
-    more.total = sums.total + share
-    more.product = sums.product * (1.0 - share)
-    more.largest = wp.max(sums.largest, share)
-    more.moment = sums.moment + moment
-    more.squares = sums.squares + wp.dot(moment, moment)
-    more.bounds = sums.bounds + bound
-    more.bound_squares = sums.bound_squares + bound * bound
-    return more
+    new_sums = sums
+    new_sums.total = sums.total + share
+    new_sums.product = sums.product * (1.0 - share)
+    new_sums.largest = wp.max(sums.largest, share)
+    new_sums.moment = sums.moment + moment
+    new_sums.squares = sums.squares + wp.dot(moment, moment)
+    new_sums.bounds = sums.bounds + bound
+    new_sums.bound_squares = sums.bound_squares + bound * bound
+    return new_sums
 
 
 @wp.func
 def _relation(sums: BlockerSums):
     """k, before it is clamped."""
     pairs = wp.dot(sums.moment, sums.moment) - sums.squares
-    return pairs / (sums.bounds * sums.bounds - sums.bound_squares + _LEAST_BOUNDS)
+    return pairs / (sums.bounds * sums.bounds - sums.bound_squares + _MIN_BOUNDS)
 
 
 @wp.func
 def _open_if_related(sums: BlockerSums, relation: float):
-    """What is open if blockers are beside each other, for k < 0, or behind each other."""
+    """The share that is open if blockers are beside each other, for k < 0, or behind each other."""
     return wp.where(relation < 0.0, wp.max(0.0, 1.0 - sums.total), 1.0 - sums.largest)
 
 
@@ -114,23 +114,23 @@ def open_share(sums: BlockerSums):
 @wp.func
 def open_share_adjoint(sums: BlockerSums, adj_open: float):
     """Gradients of the sums, given that of T."""
-    adj = BlockerSums()
+    adj_sums = BlockerSums()
     relation = _relation(sums)
     weight = wp.min(wp.abs(relation), 1.0)
-    adj.product = (1.0 - weight) * adj_open
+    adj_sums.product = (1.0 - weight) * adj_open
     if relation < 0.0:
-        adj.total = wp.where(sums.total < 1.0, -weight * adj_open, 0.0)
+        adj_sums.total = wp.where(sums.total < 1.0, -weight * adj_open, 0.0)
     else:
-        adj.largest = -weight * adj_open
+        adj_sums.largest = -weight * adj_open
     if weight < 1.0:
         adj_relation = wp.sign(relation) * adj_open * (_open_if_related(sums, relation) - sums.product)
-        per_bounds = 1.0 / (sums.bounds * sums.bounds - sums.bound_squares + _LEAST_BOUNDS)
+        per_bounds = 1.0 / (sums.bounds * sums.bounds - sums.bound_squares + _MIN_BOUNDS)
         adj_pairs = adj_relation * per_bounds
-        adj.moment = (2.0 * adj_pairs) * sums.moment
-        adj.squares = -adj_pairs
-        adj.bounds = -2.0 * adj_pairs * relation * sums.bounds
-        adj.bound_squares = adj_pairs * relation
-    return adj
+        adj_sums.moment = (2.0 * adj_pairs) * sums.moment
+        adj_sums.squares = -adj_pairs
+        adj_sums.bounds = -2.0 * adj_pairs * relation * sums.bounds
+        adj_sums.bound_squares = adj_pairs * relation
+    return adj_sums
 
 
 @wp.func
@@ -148,41 +148,43 @@ def joint_coverage_adjoint(sums: BlockerSums, adj_coverage: wp.vec4):
     """Gradients of the sums, given that of the joint coverage."""
     adj_moment = _moment_of(adj_coverage)
     share = 1.0 - open_share(sums)
-    along = float(0.0)
+    adj_scale = float(0.0)
     scale = float(0.0)
     if share > 0.0:
         scale = share / sums.total
-        along = wp.dot(adj_moment, sums.moment) / sums.total
-    adj = open_share_adjoint(sums, -(adj_coverage[0] + along))
-    adj.total = adj.total - along * scale
-    adj.moment = adj.moment + scale * adj_moment
-    return adj
+        adj_scale = wp.dot(adj_moment, sums.moment) / sums.total
+    adj_sums = open_share_adjoint(sums, -(adj_coverage[0] + adj_scale))
+    adj_sums.total = adj_sums.total - adj_scale * scale
+    adj_sums.moment = adj_sums.moment + scale * adj_moment
+    return adj_sums
 
 
 @wp.func
-def blocker_adjoint(sums: BlockerSums, adj: BlockerSums, coverage: wp.vec4):
+def blocker_adjoint(sums: BlockerSums, adj_sums: BlockerSums, coverage: wp.vec4):
     """Gradient of the coverage (h, μ) of one blocker, given those of the sums; 0 where that covers all or nothing."""
     share = coverage[0]
     if share <= 0.0 or share >= 1.0:
         return wp.vec4()
-    adj_share = adj.total - adj.product * sums.product / (1.0 - share)
+    adj_share = adj_sums.total - adj_sums.product * sums.product / (1.0 - share)
     if share == sums.largest:
-        adj_share += adj.largest
-    adj_share += (adj.bounds + 2.0 * _moment_bound(share) * adj.bound_squares) * _moment_bound_slope(share)
-    adj_moment = adj.moment + (2.0 * adj.squares) * _moment_of(coverage)
+        adj_share += adj_sums.largest
+    adj_share += (adj_sums.bounds + 2.0 * _moment_bound(share) * adj_sums.bound_squares) * _moment_bound_slope(share)
+    adj_moment = adj_sums.moment + (2.0 * adj_sums.squares) * _moment_of(coverage)
     return wp.vec4(adj_share, adj_moment[0], adj_moment[1], adj_moment[2])
 
 
 @wp.func
-def _of_both(coverages: wp.array3d(dtype=wp.vec4), others: wp.array3d(dtype=wp.vec4), b: int, receiver: int, q: int):
-    sums = with_blocker(no_blockers(), coverages[b, receiver, q])
+def _sums_of_both(
+    coverages: wp.array3d(dtype=wp.vec4), others: wp.array3d(dtype=wp.vec4), batch: int, receiver: int, q: int
+):
+    sums = with_blocker(no_blockers(), coverages[batch, receiver, q])
     if others:
-        sums = with_blocker(sums, others[b, receiver, q])
+        sums = with_blocker(sums, others[batch, receiver, q])
     return sums
 
 
 @wp.kernel(enable_backward=False)
-def _pass(
+def _attenuate(
     first_row: int,
     worker: int,
     # in
@@ -190,47 +192,47 @@ def _pass(
     coverages: wp.array3d(dtype=wp.vec4),
     others: wp.array3d(dtype=wp.vec4),
     # out
-    passing: wp.array3d(dtype=wp.float32),
+    attenuated: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a receiver."""
-    batch, receiver = split_row(first_row + wp.tid(), passing.shape[1])
-    for q in range(passing.shape[2]):
+    batch, receiver = split_row(first_row + wp.tid(), attenuated.shape[1])
+    for q in range(attenuated.shape[2]):
         share = wp.max(0.0, 1.0 - coverages[batch, receiver, q][0])
         if others and share > 0.0:
-            share = open_share(_of_both(coverages, others, batch, receiver, q))
+            share = open_share(_sums_of_both(coverages, others, batch, receiver, q))
         if transmittance:
             share *= transmittance[batch, receiver, q]
-        passing[batch, receiver, q] = share
+        attenuated[batch, receiver, q] = share
 
 
 @wp.kernel(enable_backward=False)
-def _pass_adjoint(
+def _attenuate_adjoint(
     first_row: int,
     worker: int,
     # in
     transmittance: wp.array3d(dtype=wp.float32),
     coverages: wp.array3d(dtype=wp.vec4),
     others: wp.array3d(dtype=wp.vec4),
-    adj_passing: wp.array3d(dtype=wp.float32),
+    adj_attenuated: wp.array3d(dtype=wp.float32),
     # out
     adj_transmittance: wp.array3d(dtype=wp.float32),
     adj_coverages: wp.array3d(dtype=wp.vec4),
     adj_others: wp.array3d(dtype=wp.vec4),
 ):
     """A thread owns a receiver; cells that are covered wholly have no gradient."""
-    batch, receiver = split_row(first_row + wp.tid(), adj_passing.shape[1])
-    for q in range(adj_passing.shape[2]):
-        adj = adj_passing[batch, receiver, q]
-        if adj != 0.0 and coverages[batch, receiver, q][0] < 1.0:
-            sums = _of_both(coverages, others, batch, receiver, q)
+    batch, receiver = split_row(first_row + wp.tid(), adj_attenuated.shape[1])
+    for q in range(adj_attenuated.shape[2]):
+        adj_cell = adj_attenuated[batch, receiver, q]
+        if adj_cell != 0.0 and coverages[batch, receiver, q][0] < 1.0:
+            sums = _sums_of_both(coverages, others, batch, receiver, q)
             share = open_share(sums)
             if share > 0.0:
                 factor = float(1.0)
                 if transmittance:
                     factor = transmittance[batch, receiver, q]
                 if adj_transmittance:
-                    adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + adj * share
-                adj_sums = open_share_adjoint(sums, adj * factor)
+                    adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + adj_cell * share
+                adj_sums = open_share_adjoint(sums, adj_cell * factor)
                 if adj_coverages:
                     adj_coverages[batch, receiver, q] = adj_coverages[batch, receiver, q] + blocker_adjoint(
                         sums, adj_sums, coverages[batch, receiver, q]
@@ -261,11 +263,11 @@ def transmittance_past(transmittance: wp.array | None, coverages: wp.array, othe
     shape = count, *coverages.shape[1:]
     rows, cost = shape[0] * shape[1], _PASS_COST * shape[2]
     return differentiable(
-        lambda passing: launch(_pass, rows, inputs=inputs, outputs=[passing], cost=cost),
-        lambda adj_passing: launch(
-            _pass_adjoint,
+        lambda attenuated: launch(_attenuate, rows, inputs=inputs, outputs=[attenuated], cost=cost),
+        lambda adj_attenuated: launch(
+            _attenuate_adjoint,
             rows,
-            inputs=[*inputs, adj_passing],
+            inputs=[*inputs, adj_attenuated],
             outputs=[None if array is None else array.grad for array in inputs],
             cost=2 * cost,
         ),

@@ -52,23 +52,25 @@ def sample_map(radiance: np.ndarray, count: int, *, seed: int = 0) -> LightSampl
     probability /= probability.sum()
 
     # a low-discrepancy sequence (Roberts' R2), shifted for each set, through the inverse of the distribution function
-    ratio = 1.32471795724474602596
+    plastic_number = 1.32471795724474602596
     shifts = np.random.default_rng(seed).random((SET_COUNT, 1, 2))
-    points = (shifts + np.arange(1, count + 1)[:, None] / np.array([ratio, ratio**2])) % 1
-    rows, v = _invert(np.cumsum(probability.sum(axis=1)), points[..., 0])
+    points = (shifts + np.arange(1, count + 1)[:, None] / np.array([plastic_number, plastic_number**2])) % 1
+    rows, v = _invert_distribution(np.cumsum(probability.sum(axis=1)), points[..., 0])
     conditional = np.cumsum(probability, axis=1)
     conditional /= conditional[:, -1:]
-    flat, u = _invert((conditional + np.arange(height)[:, None]).ravel(), points[..., 1] + rows)
-    columns = flat - rows * width
-    drawn = radiance[rows, columns] * (solid_angle / (count * probability))[rows, columns, None]
-    return LightSamples(_map_directions(rows, v, columns + u, height), drawn)
+    flat_indices, u = _invert_distribution((conditional + np.arange(height)[:, None]).ravel(), points[..., 1] + rows)
+    columns = flat_indices - rows * width
+    drawn_radiance = radiance[rows, columns] * (solid_angle / (count * probability))[rows, columns, None]
+    return LightSamples(_map_directions(rows, v, columns + u, height), drawn_radiance)
 
 
-def _invert(distribution: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _invert_distribution(distribution: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Interval of a rising distribution function that each value falls into, and where in it, from 0 to 1."""
-    index = np.minimum(np.searchsorted(distribution, values, side="right"), len(distribution) - 1)
-    start = np.where(index > 0, distribution[index - 1], 0.0)
-    return index, np.clip((values - start) / np.maximum(distribution[index] - start, 1e-300), 0, 1)
+    interval = np.minimum(np.searchsorted(distribution, values, side="right"), len(distribution) - 1)
+    interval_start = np.where(interval > 0, distribution[interval - 1], 0.0)
+    return interval, np.clip(
+        (values - interval_start) / np.maximum(distribution[interval] - interval_start, 1e-300), 0, 1
+    )
 
 
 def _map_directions(rows: np.ndarray, v: np.ndarray, columns: np.ndarray, height: int) -> np.ndarray:
@@ -98,52 +100,52 @@ def cut_map(
             Where given, importance, but for suns', goes to directions that receivers see, in a second cut: to a room's
             window.
     """
-    radiance = _of_size(np.asarray(radiance, np.float64))
+    radiance = _resize_map(np.asarray(radiance, np.float64))
     height, width, _ = radiance.shape
     solid_angle = np.repeat(sh.pixel_solid_angles(height)[:, None], width, axis=1)
     brightness = np.abs(radiance).mean(axis=2)
     power = brightness * solid_angle
     importance = _UNIFORM_SHARE * solid_angle / (4 * np.pi)
-    total = power.sum()
-    is_sun = brightness > _SUN_BRIGHTNESS * total / (4 * np.pi)
+    total_power = power.sum()
+    is_sun = brightness > _SUN_BRIGHTNESS * total_power / (4 * np.pi)
     if brightness.any():
-        power /= total
-        share = power[is_sun].sum()
-        power[is_sun] *= min(_SUN_SHARE / max(share, _SUN_SHARE), 1.0)
+        power /= total_power
+        sun_share = power[is_sun].sum()
+        power[is_sun] *= min(_SUN_SHARE / max(sun_share, _SUN_SHARE), 1.0)
         importance += (1 - _UNIFORM_SHARE) * power / power.sum()
 
-    def cut(importance: np.ndarray) -> np.ndarray:
+    def cut_halves(importance: np.ndarray) -> np.ndarray:
         table = np.zeros((height + 1, width + 1))
         table[1:, 1:] = importance.cumsum(axis=0).cumsum(axis=1)
         horizon, all_columns = height / 2, np.array([0.0, width])
-        above = np.clip(round(count * _between(table, horizon)[-1] / table[-1, -1]), 1, count - 1)
-        upper = _cut(table, np.array([0.0, horizon]), all_columns, above)
-        lower = _cut(table, np.array([horizon, height]), all_columns, count - above)
-        return np.array([*upper, *lower])
+        upper_count = np.clip(round(count * _interpolate_axis(table, horizon)[-1] / table[-1, -1]), 1, count - 1)
+        upper_cuts = _cut_rectangle(table, np.array([0.0, horizon]), all_columns, upper_count)
+        lower_cuts = _cut_rectangle(table, np.array([horizon, height]), all_columns, count - upper_count)
+        return np.array([*upper_cuts, *lower_cuts])
 
-    cuts = cut(importance)
-    samples = _mean_light(radiance, solid_angle, cuts)
+    cuts = cut_halves(importance)
+    samples = _mean_samples(radiance, solid_angle, cuts)
     if find_shares is not None:
-        weighted = importance.copy()
+        visible_importance = importance.copy()
         pixels = cuts.round().astype(int).reshape(-1, 4).tolist()
-        for (top, bottom, left, right), share in zip(pixels, find_shares(samples), strict=True):
-            weighted[top:bottom, left:right] *= _UNSEEN_SHARE + (1 - _UNSEEN_SHARE) * count * share
-        weighted *= importance[~is_sun].sum() / max(weighted[~is_sun].sum(), 1e-300)
-        samples = _mean_light(radiance, solid_angle, cut(np.where(is_sun, importance, weighted)))
-    order = compact_order(samples.directions[0], runs=(CHUNK, BUNDLE))
-    return LightSamples(samples.directions[:, order], samples.radiance[:, order])
+        for (top, bottom, left, right), sun_share in zip(pixels, find_shares(samples), strict=True):
+            visible_importance[top:bottom, left:right] *= _UNSEEN_SHARE + (1 - _UNSEEN_SHARE) * count * sun_share
+        visible_importance *= importance[~is_sun].sum() / max(visible_importance[~is_sun].sum(), 1e-300)
+        samples = _mean_samples(radiance, solid_angle, cut_halves(np.where(is_sun, importance, visible_importance)))
+    permutation = compact_order(samples.directions[0], runs=(CHUNK, BUNDLE))
+    return LightSamples(samples.directions[:, permutation], samples.radiance[:, permutation])
 
 
-def _of_size(radiance: np.ndarray) -> np.ndarray:
+def _resize_map(radiance: np.ndarray) -> np.ndarray:
     """The map with :data:`_MIN_ROWS` or more: pixels are cut; and with not many more, where they are averaged."""
     height = len(radiance)
     if height < _MIN_ROWS:
-        times = -(-_MIN_ROWS // height)
-        return radiance.repeat(times, axis=0).repeat(times, axis=1)
-    step = height // _MAX_ROWS
-    if step < 2:
+        repeat_count = -(-_MIN_ROWS // height)
+        return radiance.repeat(repeat_count, axis=0).repeat(repeat_count, axis=1)
+    pixel_step = height // _MAX_ROWS
+    if pixel_step < 2:
         return radiance
-    rows = height // step
+    rows = height // pixel_step
     weights = sh.pixel_solid_angles(height)[:, None, None]
     starts = np.arange(rows) * height // rows, np.arange(2 * rows) * height // rows
     sums = np.add.reduceat(np.add.reduceat(radiance * weights, starts[0], axis=0), starts[1], axis=1)
@@ -151,7 +153,7 @@ def _of_size(radiance: np.ndarray) -> np.ndarray:
     return sums / (sh.pixel_solid_angles(rows)[:, None, None])
 
 
-def _cut(
+def _cut_rectangle(
     table: np.ndarray, rows: np.ndarray, columns: np.ndarray, count: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Cut a rectangle of a map, from one place to another along each axis, into a number of equal importance.
@@ -164,55 +166,63 @@ def _cut(
     if count == 1:
         yield rows, columns
         return
-    step = np.pi / (len(table) - 1)
-    middle = np.clip((len(table) - 1) / 2, *rows)
-    is_tall = np.ptp(rows) > np.ptp(columns) * np.sin(step * middle)
-    axis_ends, table_along, ends = (rows, table, columns) if is_tall else (columns, table.T, rows)
-    low, high = (_between(table_along.T, end) for end in ends)
-    sums = high - low
-    first, last = _between(sums, axis_ends[0]), _between(sums, axis_ends[1])
-    half = count // 2
-    cut_sum = first + (last - first) * half / count
-    place = float(np.interp(cut_sum, sums, np.arange(len(sums)))) if last > first else np.nan
-    if not axis_ends[0] < place < axis_ends[1]:
-        place = axis_ends[0] + (axis_ends[1] - axis_ends[0]) * half / count
-    for part, parts in (np.array([axis_ends[0], place]), half), (np.array([place, axis_ends[1]]), count - half):
-        yield from _cut(table, *((part, columns) if is_tall else (rows, part)), parts)
+    row_angle = np.pi / (len(table) - 1)
+    middle_row = np.clip((len(table) - 1) / 2, *rows)
+    is_tall = np.ptp(rows) > np.ptp(columns) * np.sin(row_angle * middle_row)
+    cut_axis_ends, cut_axis_table, rectangle_ends = (rows, table, columns) if is_tall else (columns, table.T, rows)
+    lower_sums, upper_sums = (_interpolate_axis(cut_axis_table.T, end) for end in rectangle_ends)
+    sums = upper_sums - lower_sums
+    first_sum, last_sum = _interpolate_axis(sums, cut_axis_ends[0]), _interpolate_axis(sums, cut_axis_ends[1])
+    half_count = count // 2
+    cut_sum = first_sum + (last_sum - first_sum) * half_count / count
+    position = float(np.interp(cut_sum, sums, np.arange(len(sums)))) if last_sum > first_sum else np.nan
+    if not cut_axis_ends[0] < position < cut_axis_ends[1]:
+        position = cut_axis_ends[0] + (cut_axis_ends[1] - cut_axis_ends[0]) * half_count / count
+    for rows_or_columns, rectangle_count in (
+        (np.array([cut_axis_ends[0], position]), half_count),
+        (np.array([position, cut_axis_ends[1]]), count - half_count),
+    ):
+        yield from _cut_rectangle(
+            table, *((rows_or_columns, columns) if is_tall else (rows, rows_or_columns)), rectangle_count
+        )
 
 
-def _between(values: np.ndarray, place: float) -> np.ndarray:
+def _interpolate_axis(values: np.ndarray, position: float) -> np.ndarray:
     """Values of the first axis at a place between its items."""
-    item = min(int(place), len(values) - 2)
-    return values[item] + (place - item) * (values[item + 1] - values[item])
+    item = min(int(position), len(values) - 2)
+    return values[item] + (position - item) * (values[item + 1] - values[item])
 
 
-def _mean_light(radiance: np.ndarray, solid_angle: np.ndarray, cuts: np.ndarray) -> LightSamples:
+def _mean_samples(radiance: np.ndarray, solid_angle: np.ndarray, cuts: np.ndarray) -> LightSamples:
     """The mean direction of the light of each rectangle of a map, and its light in that direction, ∫ L d·ω dω.
 
     Args:
         radiance, solid_angle: Of the pixels, [row, column, 3] and [row, column].
         cuts: Where the rows and the columns of each rectangle begin and end, [rectangle, 2, 2].
     """
-    (first_row, first_column), ends = np.floor(cuts[..., 0]).T.astype(int), np.ceil(cuts[..., 1]).astype(int)
-    tall, wide = (ends - np.floor(cuts[..., 0]).astype(int)).T
-    starts = np.cumsum(tall * wide) - tall * wide
-    rectangle = np.repeat(np.arange(len(cuts)), tall * wide)
-    place = np.arange(len(rectangle)) - starts[rectangle]
-    row, column = first_row[rectangle] + place // wide[rectangle], first_column[rectangle] + place % wide[rectangle]
+    (first_row, first_column), rectangle_ends = np.floor(cuts[..., 0]).T.astype(int), np.ceil(cuts[..., 1]).astype(int)
+    row_counts, column_counts = (rectangle_ends - np.floor(cuts[..., 0]).astype(int)).T
+    starts = np.cumsum(row_counts * column_counts) - row_counts * column_counts
+    rectangle = np.repeat(np.arange(len(cuts)), row_counts * column_counts)
+    position = np.arange(len(rectangle)) - starts[rectangle]
+    row, column = (
+        first_row[rectangle] + position // column_counts[rectangle],
+        first_column[rectangle] + position % column_counts[rectangle],
+    )
     # the parts of pixels in rectangles
-    low = np.maximum(cuts[rectangle, :, 0], np.stack([row, column], axis=-1))
-    high = np.minimum(cuts[rectangle, :, 1], np.stack([row + 1, column + 1], axis=-1))
-    middle = (low + high) / 2
-    directions = _map_directions(row, middle[:, 0] - row, middle[:, 1], len(radiance))
-    weights = (high - low).prod(axis=1) * solid_angle[row, column]
+    lower_bounds = np.maximum(cuts[rectangle, :, 0], np.stack([row, column], axis=-1))
+    upper_bounds = np.minimum(cuts[rectangle, :, 1], np.stack([row + 1, column + 1], axis=-1))
+    centers = (lower_bounds + upper_bounds) / 2
+    directions = _map_directions(row, centers[:, 0] - row, centers[:, 1], len(radiance))
+    weights = (upper_bounds - lower_bounds).prod(axis=1) * solid_angle[row, column]
     light = radiance[row, column] * weights[:, None]
     moments = np.add.reduceat(directions[:, :, None] * light[:, None, :], starts)
     brightness = np.abs(light).mean(axis=1)
     is_dark = np.add.reduceat(brightness, starts) == 0
     brightness = np.where(is_dark[rectangle], weights, brightness)
-    means = np.add.reduceat(directions * brightness[:, None], starts)
-    means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-300)
-    return LightSamples(means[None], np.einsum("rk,rkc->rc", means, moments)[None])
+    mean_directions = np.add.reduceat(directions * brightness[:, None], starts)
+    mean_directions /= np.maximum(np.linalg.norm(mean_directions, axis=1, keepdims=True), 1e-300)
+    return LightSamples(mean_directions[None], np.einsum("rk,rkc->rc", mean_directions, moments)[None])
 
 
 class CellSamples(NamedTuple):
@@ -240,7 +250,7 @@ def cell_samples(samples: LightSamples, directions: np.ndarray, *, device: wp.De
     """
     return CellSamples(
         wp.array(samples.directions, dtype=wp.vec3, device=device),
-        wp.array(_nearest(samples.directions, directions), device=device),
+        wp.array(_nearest_cells(samples.directions, directions), device=device),
         wp.array(samples.radiance.astype(np.float32), device=device),
         len(directions),
     )
@@ -256,15 +266,15 @@ def even_samples(count: int, directions: np.ndarray) -> LightSamples:
         count: Number of samples that are even.
         directions: Of the cells, unit vectors of shape [direction, 3].
     """
-    even = fibonacci(-(-count // CHUNK) * CHUNK)
-    is_empty = np.bincount(_nearest(even, directions), minlength=len(directions)) == 0
-    samples = np.concatenate([even, directions[is_empty]])
-    cells = _nearest(samples, directions)
+    even_directions = fibonacci(-(-count // CHUNK) * CHUNK)
+    is_empty = np.bincount(_nearest_cells(even_directions, directions), minlength=len(directions)) == 0
+    samples = np.concatenate([even_directions, directions[is_empty]])
+    cells = _nearest_cells(samples, directions)
     weights = 4 * np.pi / len(directions) / np.bincount(cells)
     return LightSamples(samples[None], weights[cells][None, :, None])
 
 
-def _nearest(samples: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def _nearest_cells(samples: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Cell that each sample belongs to, int32."""
     cells = np.argmax(samples.astype(np.float32) @ directions.T.astype(np.float32), axis=-1)
     return cells.astype(np.int32)

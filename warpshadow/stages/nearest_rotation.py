@@ -15,17 +15,17 @@ def _nearest_rotations(
     matrices: wp.array2d(dtype=wp.mat33),
     # out
     rotations: wp.array2d(dtype=wp.mat33),
-    cached: wp.array2d(dtype=wp.mat33),
+    left_factors: wp.array2d(dtype=wp.mat33),
 ):
     """A thread owns a rotation, U diag(1, 1, det UVᵀ) Vᵀ of the singular value decomposition M = U Σ Vᵀ."""
     batch, body = wp.tid()
     m = wp.mat33d(matrices[batch, body])
     u, _s, v = wp.svd3(m / wp.sqrt(wp.ddot(m, m)))
     one = wp.float64(1.0)
-    middle = wp.diag(wp.vec3d(one, one, wp.sign(wp.determinant(u) * wp.determinant(v))))
-    rotation = wp.mat33(u * middle * wp.transpose(v))
+    sign_matrix = wp.diag(wp.vec3d(one, one, wp.sign(wp.determinant(u) * wp.determinant(v))))
+    rotation = wp.mat33(u * sign_matrix * wp.transpose(v))
     rotations[batch, body] = rotation
-    cached[batch, body] = rotation
+    left_factors[batch, body] = rotation
 
 
 @wp.kernel(enable_backward=False)
@@ -47,8 +47,8 @@ def _nearest_rotations_adjoint(
     s = wp.transpose(r) * wp.mat33d(matrices[batch, body])
     g = wp.transpose(r) * wp.mat33d(adj_rotations[batch, body])
     axial = wp.vec3d(g[2, 1] - g[1, 2], g[0, 2] - g[2, 0], g[1, 0] - g[0, 1])
-    turn = wp.inverse(wp.trace(s) * wp.identity(n=3, dtype=wp.float64) - s) * axial
-    adj_matrices[batch, body] = adj_matrices[batch, body] + wp.mat33(r * wp.skew(turn))
+    rotation_vector = wp.inverse(wp.trace(s) * wp.identity(n=3, dtype=wp.float64) - s) * axial
+    adj_matrices[batch, body] = adj_matrices[batch, body] + wp.mat33(r * wp.skew(rotation_vector))
 
 
 def nearest_rotations(matrices: wp.array) -> wp.array:
@@ -61,13 +61,13 @@ def nearest_rotations(matrices: wp.array) -> wp.array:
     Differentiable: matrices.
     """
     # the caller may overwrite the gradients that it gets
-    cached = empty(matrices.shape, dtype=wp.mat33, device=matrices.device)
+    left_factors = empty(matrices.shape, dtype=wp.mat33, device=matrices.device)
 
     def forward(rotations: wp.array) -> None:
-        launch(_nearest_rotations, matrices.shape, inputs=[matrices], outputs=[rotations, cached])
+        launch(_nearest_rotations, matrices.shape, inputs=[matrices], outputs=[rotations, left_factors])
 
     def adjoint(adj_rotations: wp.array) -> None:
-        inputs = [matrices, cached, adj_rotations]
+        inputs = [matrices, left_factors, adj_rotations]
         launch(_nearest_rotations_adjoint, matrices.shape, inputs=inputs, outputs=[matrices.grad])
 
-    return differentiable(forward, adjoint, result=wp.empty_like(cached), variables=[matrices])
+    return differentiable(forward, adjoint, result=wp.empty_like(left_factors), variables=[matrices])

@@ -15,15 +15,15 @@ _FACE_COST, _VERTEX_COST = 15.0, 6.0  # nanoseconds that a face and a vertex tak
 
 
 @wp.func
-def _edges(positions: wp.array(dtype=wp.vec3), corners: wp.vec3i):
-    """From the first corner of a face to the others."""
+def _edge_vectors(positions: wp.array(dtype=wp.vec3), corners: wp.vec3i):
+    """Edge vectors from the first corner of a face to the others."""
     origin = wp.vec3d(positions[corners[0]])
     return wp.vec3d(positions[corners[1]]) - origin, wp.vec3d(positions[corners[2]]) - origin
 
 
 @wp.func
-def _has_area(along_j: wp.vec3d, along_k: wp.vec3d, normal: wp.vec3d):
-    longest2 = wp.max(wp.dot(along_j, along_j), wp.dot(along_k, along_k))
+def _has_area(edge_j: wp.vec3d, edge_k: wp.vec3d, normal: wp.vec3d):
+    longest2 = wp.max(wp.dot(edge_j, edge_j), wp.dot(edge_k, edge_k))
     is_long = longest2 > wp.float64(_MIN_EDGE * _MIN_EDGE)
     return is_long and wp.length(normal) > wp.float64(_MIN_HEIGHT) * longest2
 
@@ -42,9 +42,9 @@ def _sum_face_normals(
     row, face = wp.tid()
     batch = first_row + row
     corners = faces[face]
-    along_j, along_k = _edges(positions[batch], corners)
-    normal = wp.cross(along_j, along_k)
-    if _has_area(along_j, along_k, normal):
+    edge_j, edge_k = _edge_vectors(positions[batch], corners)
+    normal = wp.cross(edge_j, edge_k)
+    if _has_area(edge_j, edge_k, normal):
         for corner in range(3):
             wp.atomic_add(sums, batch, corners[corner], normal)
 
@@ -64,14 +64,14 @@ def _sum_face_normals_adjoint(
     row, face = wp.tid()
     batch = first_row + row
     corners = faces[face]
-    along_j, along_k = _edges(positions[batch], corners)
-    if _has_area(along_j, along_k, wp.cross(along_j, along_k)):
-        adj = adj_sums[batch, corners[0]] + adj_sums[batch, corners[1]] + adj_sums[batch, corners[2]]
-        adj_j = wp.cross(along_k, adj)
-        adj_k = wp.cross(adj, along_j)
-        wp.atomic_sub(adj_positions, batch, corners[0], wp.vec3(adj_j + adj_k))
-        wp.atomic_add(adj_positions, batch, corners[1], wp.vec3(adj_j))
-        wp.atomic_add(adj_positions, batch, corners[2], wp.vec3(adj_k))
+    edge_j, edge_k = _edge_vectors(positions[batch], corners)
+    if _has_area(edge_j, edge_k, wp.cross(edge_j, edge_k)):
+        adj_normal = adj_sums[batch, corners[0]] + adj_sums[batch, corners[1]] + adj_sums[batch, corners[2]]
+        adj_edge_j = wp.cross(edge_k, adj_normal)
+        adj_edge_k = wp.cross(adj_normal, edge_j)
+        wp.atomic_sub(adj_positions, batch, corners[0], wp.vec3(adj_edge_j + adj_edge_k))
+        wp.atomic_add(adj_positions, batch, corners[1], wp.vec3(adj_edge_j))
+        wp.atomic_add(adj_positions, batch, corners[2], wp.vec3(adj_edge_k))
 
 
 @wp.kernel(enable_backward=False)
@@ -102,14 +102,14 @@ def _normalize_adjoint(
     """A thread owns a vertex:  s̄ = (n̄ − n n·n̄) / |s|, zero where s is."""
     row, vertex = wp.tid()
     batch = first_row + row
-    total = sums[batch, vertex]
-    adj = wp.vec3d()
-    length = wp.length(total)
+    normal_sum = sums[batch, vertex]
+    adj_normal = wp.vec3d()
+    length = wp.length(normal_sum)
     if length > wp.float64(0.0):
-        normal = total / length
-        adj = wp.vec3d(adj_normals[batch, vertex])
-        adj = (adj - wp.dot(normal, adj) * normal) / length
-    adj_sums[batch, vertex] = adj
+        normal = normal_sum / length
+        adj_normal = wp.vec3d(adj_normals[batch, vertex])
+        adj_normal = (adj_normal - wp.dot(normal, adj_normal) * normal) / length
+    adj_sums[batch, vertex] = adj_normal
 
 
 def vertex_normals(positions: wp.array, faces: wp.array) -> wp.array:
@@ -132,16 +132,16 @@ def vertex_normals(positions: wp.array, faces: wp.array) -> wp.array:
     check.finite_arrays({"positions": positions})
     device, shape = positions.device, positions.shape
     sums = zeros(shape, dtype=wp.vec3d, device=device)
-    by_face, by_vertex = (shape[0], faces.shape[0]), shape
+    face_dim, vertex_dim = (shape[0], faces.shape[0]), shape
 
     def forward(normals: wp.array) -> None:
-        launch(_sum_face_normals, by_face, inputs=[positions, faces], outputs=[sums], cost=_FACE_COST)
-        launch(_normalize, by_vertex, inputs=[sums], outputs=[normals], cost=_VERTEX_COST)
+        launch(_sum_face_normals, face_dim, inputs=[positions, faces], outputs=[sums], cost=_FACE_COST)
+        launch(_normalize, vertex_dim, inputs=[sums], outputs=[normals], cost=_VERTEX_COST)
 
     def adjoint(adj_normals: wp.array) -> None:
         adj_sums = empty(shape, dtype=wp.vec3d, device=device)
-        launch(_normalize_adjoint, by_vertex, inputs=[sums, adj_normals], outputs=[adj_sums], cost=_VERTEX_COST)
+        launch(_normalize_adjoint, vertex_dim, inputs=[sums, adj_normals], outputs=[adj_sums], cost=_VERTEX_COST)
         inputs = [positions, faces, adj_sums]
-        launch(_sum_face_normals_adjoint, by_face, inputs=inputs, outputs=[positions.grad], cost=2 * _FACE_COST)
+        launch(_sum_face_normals_adjoint, face_dim, inputs=inputs, outputs=[positions.grad], cost=2 * _FACE_COST)
 
     return differentiable(forward, adjoint, empty(shape, dtype=wp.vec3, device=device), variables=[positions])

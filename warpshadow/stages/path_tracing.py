@@ -19,11 +19,11 @@ import warp as wp
 
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.stages.interpolation import at_point
+from warpshadow.stages.interpolation import interpolate_at
 from warpshadow.stages.light_samples import LightSamples
-from warpshadow.stages.ray_tracing import RAY_COST, escapes, mesh_id, nearest, parts
+from warpshadow.stages.ray_tracing import RAY_COST, escapes, first_hit, mesh_id, progress_slices
 from warpshadow.stages.textures.pyramid import Textures
-from warpshadow.stages.textures.sample import at_uv
+from warpshadow.stages.textures.sample import interpolate_uv
 
 _SEED = 29
 
@@ -36,7 +36,7 @@ class PathSurfaces(NamedTuple):
 
     Args:
         mesh: All bodies.
-        casting: Mesh that blocks direct light, None for none.
+        blocker_mesh: Mesh that blocks direct light, None for none.
         faces: Vertex indices of the mesh, vec3i of shape [face].
         normals: Unit normals of the vertices, vec3 of shape [vertex].
         vertex_albedo: Reflectance of the vertices, vec3 of shape [vertex].
@@ -47,7 +47,7 @@ class PathSurfaces(NamedTuple):
     """
 
     mesh: wp.Mesh
-    casting: wp.Mesh | None
+    blocker_mesh: wp.Mesh | None
     faces: wp.array
     normals: wp.array
     vertex_albedo: wp.array
@@ -59,10 +59,10 @@ class PathSurfaces(NamedTuple):
 
 @wp.struct
 class _SurfaceArrays:
-    """The same in kernels."""
+    """Surfaces of a path tracer, as kernels take them."""
 
     mesh: wp.uint64
-    casting: wp.uint64
+    blocker_mesh: wp.uint64
     positions: wp.array(dtype=wp.vec3)
     faces: wp.array(dtype=wp.vec3i)
     normals: wp.array(dtype=wp.vec3)
@@ -79,12 +79,14 @@ def _albedo(surfaces: _SurfaceArrays, face: int, weights: wp.vec3):
     """Reflectance at a point of a face: bilinear in the finest level of its texture, or between vertices."""
     texture = surfaces.texture_of_face[face]
     if texture < 0:
-        return at_point(surfaces.vertex_albedo, surfaces.faces[face], weights)
-    return at_uv(surfaces.texels, surfaces.levels[texture, 0], at_point(surfaces.uvs, surfaces.uv_faces[face], weights))
+        return interpolate_at(surfaces.vertex_albedo, surfaces.faces[face], weights)
+    return interpolate_uv(
+        surfaces.texels, surfaces.levels[texture, 0], interpolate_at(surfaces.uvs, surfaces.uv_faces[face], weights)
+    )
 
 
 @wp.func
-def _toward(normal: wp.vec3, u: float, v: float):
+def _cosine_direction(normal: wp.vec3, u: float, v: float):
     """A direction of the hemisphere, with a probability in proportion to the cosine for even u and v in [0, 1).
 
     The normal and a point of the unit sphere add up to it [Shirley et al. 2019, "Sampling Transformations Zoo",
@@ -97,7 +99,7 @@ def _toward(normal: wp.vec3, u: float, v: float):
 
 
 @wp.func
-def _spread(shift: wp.uint32, step: wp.uint32, number: int):
+def _quasi_random(shift: wp.uint32, step: wp.uint32, number: int):
     """A number of a low-discrepancy sequence, from 0 to 1."""
     return float((shift + step * wp.uint32(number)) >> wp.uint32(8)) / 16777216.0
 
@@ -127,23 +129,23 @@ def _trace_bounces(
     for path in range(path_count):
         point = points[receiver]
         normal = normals[receiver]
-        u = _spread(shift_u, _STEP_U, path)
-        v = _spread(shift_v, _STEP_V, path)
-        reflected = wp.vec3(1.0)
+        u = _quasi_random(shift_u, _STEP_U, path)
+        v = _quasi_random(shift_v, _STEP_V, path)
+        throughput = wp.vec3(1.0)
         for _bounce in range(bounce_count):
-            toward = _toward(normal, u, v)
-            hit = nearest(surfaces.mesh, point, normal, toward)
+            ray_direction = _cosine_direction(normal, u, v)
+            hit = first_hit(surfaces.mesh, point, normal, ray_direction)
             if hit.face < 0:
                 break
             corners = surfaces.faces[hit.face]
-            point = at_point(surfaces.positions, corners, hit.weights)
-            normal = wp.normalize(at_point(surfaces.normals, corners, hit.weights))
+            point = interpolate_at(surfaces.positions, corners, hit.weights)
+            normal = wp.normalize(interpolate_at(surfaces.normals, corners, hit.weights))
             normal = wp.where(hit.is_back, -normal, normal)
-            reflected = wp.cw_mul(reflected, _albedo(surfaces, hit.face, hit.weights))
-            drawn = int(wp.randu(state) % wp.uint32(directions.shape[0]))
-            cosine = wp.dot(normal, directions[drawn])
-            if cosine > 0.0 and escapes(surfaces.casting, point, normal, directions[drawn]):
-                total += cosine * wp.cw_mul(reflected, radiance[drawn])
+            throughput = wp.cw_mul(throughput, _albedo(surfaces, hit.face, hit.weights))
+            sample_set = int(wp.randu(state) % wp.uint32(directions.shape[0]))
+            cosine = wp.dot(normal, directions[sample_set])
+            if cosine > 0.0 and escapes(surfaces.blocker_mesh, point, normal, directions[sample_set]):
+                total += cosine * wp.cw_mul(throughput, radiance[sample_set])
             u = wp.randf(state)
             v = wp.randf(state)
     light[receiver] = total / float(path_count)
@@ -180,21 +182,30 @@ def trace_bounces(
     directions = wp.array(samples.directions.reshape(-1, 3), dtype=wp.vec3, device=device)
     radiance = wp.array(count / np.pi * samples.radiance.reshape(-1, 3), dtype=wp.vec3, device=device)
     light = empty(points.shape, dtype=wp.vec3, device=device)
-    traced, cost = _struct(surfaces), 2 * bounces * paths
-    for part in parts(points.shape[0], 2**20 // cost, progress):
+    surface_arrays, cost = _surface_arrays(surfaces), 2 * bounces * paths
+    for receivers in progress_slices(points.shape[0], 2**20 // cost, progress):
         launch(
             _trace_bounces,
-            part.stop - part.start,
-            inputs=[traced, points[part], normals[part], part.start, directions, radiance, bounces, paths],
-            outputs=[light[part]],
+            receivers.stop - receivers.start,
+            inputs=[
+                surface_arrays,
+                points[receivers],
+                normals[receivers],
+                receivers.start,
+                directions,
+                radiance,
+                bounces,
+                paths,
+            ],
+            outputs=[light[receivers]],
             cost=RAY_COST * cost,
         )
     return light
 
 
-def _struct(surfaces: PathSurfaces) -> _SurfaceArrays:
+def _surface_arrays(surfaces: PathSurfaces) -> _SurfaceArrays:
     struct = _SurfaceArrays()
-    struct.mesh, struct.casting = mesh_id(surfaces.mesh), mesh_id(surfaces.casting)
+    struct.mesh, struct.blocker_mesh = mesh_id(surfaces.mesh), mesh_id(surfaces.blocker_mesh)
     struct.positions, struct.faces, struct.normals = surfaces.mesh.points, surfaces.faces, surfaces.normals
     struct.vertex_albedo, struct.texture_of_face = surfaces.vertex_albedo, surfaces.texture_of_face
     struct.uvs, struct.uv_faces = surfaces.uvs, surfaces.uv_faces

@@ -27,9 +27,9 @@ def _pose_points(
     batch, point = wp.tid()
     body = bodies[point]
     pose_batch = instance_in(batch, scales.shape[0])
-    at_rest = rest[instance_in(batch, rest.shape[0]), point]
-    turned = rotations[pose_batch, body] * at_rest
-    posed[batch, point] = scales[pose_batch, body] * turned + translations[pose_batch, body]
+    rest_value = rest[instance_in(batch, rest.shape[0]), point]
+    rotated = rotations[pose_batch, body] * rest_value
+    posed[batch, point] = scales[pose_batch, body] * rotated + translations[pose_batch, body]
 
 
 @wp.kernel
@@ -48,17 +48,17 @@ def _pose_radii(
 
 
 @wp.kernel
-def _turn(
+def _compose_rotations(
     # in
     rest: wp.array2d(dtype=wp.mat33),
     rotations: wp.array2d(dtype=wp.mat33),
     # out
-    turned: wp.array2d(dtype=wp.mat33),
+    rotated: wp.array2d(dtype=wp.mat33),
 ):
     """A thread owns a body of an instance."""
     batch, body = wp.tid()
-    at_rest = rest[instance_in(batch, rest.shape[0]), body]
-    turned[batch, body] = rotations[instance_in(batch, rotations.shape[0]), body] * at_rest
+    rest_value = rest[instance_in(batch, rest.shape[0]), body]
+    rotated[batch, body] = rotations[instance_in(batch, rotations.shape[0]), body] * rest_value
 
 
 @wp.kernel
@@ -70,13 +70,13 @@ def _move_pivots(
     scales: wp.array2d(dtype=wp.float32),
     sign: float,
     # out
-    moved: wp.array2d(dtype=wp.vec3),
+    moved_translations: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a body of an instance."""
     batch, body = wp.tid()
     pose_batch = instance_in(batch, scales.shape[0])
-    arm = rotations[pose_batch, body] * pivots[instance_in(batch, pivots.shape[0]), body]
-    moved[batch, body] = translations[pose_batch, body] + sign * scales[pose_batch, body] * arm
+    rotated_pivot = rotations[pose_batch, body] * pivots[instance_in(batch, pivots.shape[0]), body]
+    moved_translations[batch, body] = translations[pose_batch, body] + sign * scales[pose_batch, body] * rotated_pivot
 
 
 @dataclass(frozen=True)
@@ -118,13 +118,18 @@ class Poses:
         return self._shifted(pivots, 1.0)
 
     def _shifted(self, pivots: wp.array, sign: float) -> "Poses":
-        count = common_batch({"pivot": pivots, "scales": self.scales})
+        batch_count = common_batch({"pivot": pivots, "scales": self.scales})
         check.shape("pivot", pivots.shape, ("batch", self.scales.shape[1]))
         arrays = {"rotations": self.rotations, "translations": self.translations, "scales": self.scales}
         check.finite_arrays(arrays | {"pivot": pivots})
-        moved = empty((count, pivots.shape[1]), dtype=wp.vec3, device=pivots.device)
-        launch(_move_pivots, moved.shape, inputs=[pivots, *arrays.values(), sign], outputs=[moved])
-        return Poses(expand(self.rotations, count), moved, expand(self.scales, count))
+        moved_translations = empty((batch_count, pivots.shape[1]), dtype=wp.vec3, device=pivots.device)
+        launch(
+            _move_pivots,
+            moved_translations.shape,
+            inputs=[pivots, *arrays.values(), sign],
+            outputs=[moved_translations],
+        )
+        return Poses(expand(self.rotations, batch_count), moved_translations, expand(self.scales, batch_count))
 
     def points(self, rest: wp.array, bodies: wp.array) -> wp.array:
         """Move points with their bodies.
@@ -149,11 +154,11 @@ class Poses:
         return posed
 
     def turned(self, rest: wp.array) -> wp.array:
-        """Turn bodies that are turned already, mat33 of shape [batch, body]. Differentiable: rest, rotations."""
-        count = common_batch({"rest": rest, "rotations": self.rotations})
-        turned = empty((count, rest.shape[1]), dtype=wp.mat33, device=rest.device)
-        launch(_turn, turned.shape, inputs=[rest, self.rotations], outputs=[turned])
-        return turned
+        """Compose rotations with rotations at rest, mat33 of shape [batch, body]. Differentiable: rest, rotations."""
+        batch_count = common_batch({"rest": rest, "rotations": self.rotations})
+        rotated = empty((batch_count, rest.shape[1]), dtype=wp.mat33, device=rest.device)
+        launch(_compose_rotations, rotated.shape, inputs=[rest, self.rotations], outputs=[rotated])
+        return rotated
 
     def _shape(self, rest: wp.array, bodies: wp.array) -> tuple[int, int]:
         """Shape of the moving arrays."""

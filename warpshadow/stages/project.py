@@ -27,12 +27,12 @@ def _compose_clip_matrices(
     camera = wp.tid()
     rotation = rotations[instance_in(camera, rotations.shape[0])]
     translation = translations[instance_in(camera, translations.shape[0])]
-    project = to_ndc * intrinsics[instance_in(camera, intrinsics.shape[0])]
-    r = project * rotation
-    t = project * translation
+    ndc_intrinsics = to_ndc * intrinsics[instance_in(camera, intrinsics.shape[0])]
+    rotation_rows = ndc_intrinsics * rotation
+    translation_rows = ndc_intrinsics * translation
     clip_matrices[camera] = wp.mat44(
-        r[0, 0], r[0, 1], r[0, 2], t[0],
-        r[1, 0], r[1, 1], r[1, 2], t[1],
+        rotation_rows[0, 0], rotation_rows[0, 1], rotation_rows[0, 2], translation_rows[0],
+        rotation_rows[1, 0], rotation_rows[1, 1], rotation_rows[1, 2], translation_rows[1],
         0.0, 0.0, 0.0, near,
         rotation[2, 0], rotation[2, 1], rotation[2, 2], translation[2],
     )  # fmt: skip
@@ -111,13 +111,15 @@ def check_clip_space(clip_matrices: wp.array) -> None:
         return
     check.finite_arrays({"clip_matrices": clip_matrices})
     matrices = clip_matrices.numpy()
-    slopes, depths = (np.linalg.norm(matrices[:, row, :3], axis=1) for row in (2, 3))
-    other = np.flatnonzero((slopes > 0.5 * depths) | (matrices[:, 2, 3] <= 0.0) | (depths == 0.0))
-    if len(other):
-        z, w = matrices[other[0], 2:].tolist()
+    depth_row_slopes, depth_slopes = (np.linalg.norm(matrices[:, row, :3], axis=1) for row in (2, 3))
+    other_indices = np.flatnonzero(
+        (depth_row_slopes > 0.5 * depth_slopes) | (matrices[:, 2, 3] <= 0.0) | (depth_slopes == 0.0)
+    )
+    if len(other_indices):
+        row_z, row_w = matrices[other_indices[0], 2:].tolist()
         raise ValueError(
-            f"clip_matrices: got one with rows z = {z} and w = {w} (number {other[0]}), expected z = [0, 0, 0, near] "
-            "and w = depth, as Camera.clip_matrix() and TorchRenderer.clip_matrices(…) have them, y/w from -1 at the "
-            "top to 1 at the bottom: those of OpenGL and nvdiffrast are "
+            f"clip_matrices: got one with rows z = {row_z} and w = {row_w} (number {other_indices[0]}), expected "
+            "z = [0, 0, 0, near] and w = depth, as Camera.clip_matrix() and TorchRenderer.clip_matrices(…) have them, "
+            "y/w from -1 at the top to 1 at the bottom: those of OpenGL and nvdiffrast are "
             "warpshadow.torch.clip_matrices_from_opengl(matrices), or Camera.from_opengl(view, projection)"
         )

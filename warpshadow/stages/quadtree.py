@@ -59,11 +59,11 @@ def probe_grid(size: tuple[int, int], supersampling: int) -> tuple[np.ndarray, n
     """
     spacing = probe_spacing(size, supersampling)
     counts = (MAX_SIDE // spacing * -(-length // (supersampling * MAX_SIDE)) + 1 for length in size)
-    rows_, columns = (
+    rows, columns = (
         np.minimum(spacing * supersampling * np.arange(count), length - 1)
         for count, length in zip(counts, size, strict=True)
     )
-    return rows_, columns
+    return rows, columns
 
 
 @wp.func
@@ -81,16 +81,18 @@ def _has_key(keys: wp.array2d(dtype=wp.int32), row: int, column: int, key: int):
 
 
 @wp.func
-def _bend(shares: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.int32), row: int, column: int):
+def _curvature_error(shares: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.int32), row: int, column: int):
     """Error of linear interpolation over a distance of probes beside a probe: an eighth of the second difference."""
     key = keys[row, column]
-    bend = float(0.0)
-    for way in range(2):
-        i = 1 - way
-        if _has_key(keys, row - i, column - way, key) and _has_key(keys, row + i, column + way, key):
-            second = shares[row - i, column - way] - 2.0 * shares[row, column] + shares[row + i, column + way]
-            bend = wp.max(bend, wp.abs(second) / 8.0)
-    return bend
+    curvature_error = float(0.0)
+    for axis in range(2):
+        i = 1 - axis
+        if _has_key(keys, row - i, column - axis, key) and _has_key(keys, row + i, column + axis, key):
+            second_difference = (
+                shares[row - i, column - axis] - 2.0 * shares[row, column] + shares[row + i, column + axis]
+            )
+            curvature_error = wp.max(curvature_error, wp.abs(second_difference) / 8.0)
+    return curvature_error
 
 
 @wp.func
@@ -102,22 +104,22 @@ def _is_one_side(keys: wp.array2d(dtype=wp.int32), row: int, column: int, side: 
 
 
 @wp.func
-def _gap(shares: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.int32), row: int, column: int, side: int):
+def _probe_error(shares: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.int32), row: int, column: int, side: int):
     """Error of interpolation between the corners of a square, at the probes in it that see the same."""
     a = shares[row, column]
     b = shares[row, column + side]
     c = shares[row + side, column]
     d = shares[row + side, column + side]
-    gap = float(0.0)
+    probe_error = float(0.0)
     for i in range(side + 1):
         for j in range(side + 1):
             if keys[row + i, column + j] == keys[row, column]:
                 down, right = float(i) / float(side), float(j) / float(side)
-                between = a + right * (b - a) + down * (c - a)
+                interpolated_share = a + right * (b - a) + down * (c - a)
                 if i + j > side:
-                    between = d + (1.0 - right) * (c - d) + (1.0 - down) * (b - d)
-                gap = wp.max(gap, wp.abs(shares[row + i, column + j] - between))
-    return gap
+                    interpolated_share = d + (1.0 - right) * (c - d) + (1.0 - down) * (b - d)
+                probe_error = wp.max(probe_error, wp.abs(shares[row + i, column + j] - interpolated_share))
+    return probe_error
 
 
 @wp.func
@@ -125,15 +127,17 @@ def _holds_between_probes(
     shares: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.int32), row: int, column: int, tolerance: float
 ):
     """Whether a square of neighboring probes holds, by how much the light bends at these."""
-    low = wp.min(shares[row, column], shares[row, column + 1])
-    low = wp.min(low, wp.min(shares[row + 1, column], shares[row + 1, column + 1]))
-    high = wp.max(shares[row, column], shares[row, column + 1])
-    high = wp.max(high, wp.max(shares[row + 1, column], shares[row + 1, column + 1]))
-    bend = float(0.0)
-    if high - low > tolerance:
+    min_share = wp.min(shares[row, column], shares[row, column + 1])
+    min_share = wp.min(min_share, wp.min(shares[row + 1, column], shares[row + 1, column + 1]))
+    max_share = wp.max(shares[row, column], shares[row, column + 1])
+    max_share = wp.max(max_share, wp.max(shares[row + 1, column], shares[row + 1, column + 1]))
+    curvature_error = float(0.0)
+    if max_share - min_share > tolerance:
         for corner in range(4):
-            bend = wp.max(bend, _bend(shares, keys, row + corner / 2, column + corner % 2))
-    return bend <= tolerance
+            curvature_error = wp.max(
+                curvature_error, _curvature_error(shares, keys, row + corner / 2, column + corner % 2)
+            )
+    return curvature_error <= tolerance
 
 
 @wp.kernel(enable_backward=False)
@@ -155,22 +159,23 @@ def _cut_squares(
     """
     side = 4 / spacing  # of the largest squares, in probes
     view, i = split_row(first_row + wp.tid(), probe_keys.shape[1] / side)
-    near = probe_keys[view]
+    view_keys = probe_keys[view]
     shares = probe_shares[view]
-    for j in range(near.shape[1] / side):
+    for j in range(view_keys.shape[1] / side):
         row = side * i
         column = side * j
-        holds = _is_one_side(near, row, column, side) and _gap(shares, near, row, column, side) <= tolerance
+        holds = _is_one_side(view_keys, row, column, side)
+        holds = holds and _probe_error(shares, view_keys, row, column, side) <= tolerance
         for quarter in range(4):
             size = int(4)
             top = row + quarter / 2 * (side / 2)
             left = column + quarter % 2 * (side / 2)
             if not holds:
                 size = 0
-                if _is_one_side(near, top, left, side / 2):
-                    if spacing == 1 and _gap(shares, near, top, left, 2) <= tolerance:
+                if _is_one_side(view_keys, top, left, side / 2):
+                    if spacing == 1 and _probe_error(shares, view_keys, top, left, 2) <= tolerance:
                         size = 2
-                    if spacing == 2 and _holds_between_probes(shares, near, top, left, tolerance):
+                    if spacing == 2 and _holds_between_probes(shares, view_keys, top, left, tolerance):
                         size = 2
             for pixel in range(4):
                 y = spacing * top + pixel / 2
@@ -211,12 +216,12 @@ def find_quadtree(
         inputs=[*inputs, spacing, tolerance],
         outputs=[sizes, is_first],
     )
-    first = np.flatnonzero(is_first.numpy())
+    first_pixels = np.flatnonzero(is_first.numpy())
     numbers = np.zeros(shape, np.int32)
-    numbers.ravel()[first] = np.arange(len(first))
-    view_and_row, column = np.divmod(first, shape[2])
-    view, row = np.divmod(view_and_row, shape[1])
-    side = sizes.numpy().ravel()[first]
+    numbers.ravel()[first_pixels] = np.arange(len(first_pixels))
+    view_rows, column = np.divmod(first_pixels, shape[2])
+    view, row = np.divmod(view_rows, shape[1])
+    side = sizes.numpy().ravel()[first_pixels]
     top, bottom = (np.minimum(end * supersampling, height - 1) for end in (row, row + side))
     left, right = (np.minimum(end * supersampling, width - 1) for end in (column, column + side))
     top, bottom = ((view * height + end) * width for end in (top, bottom))
@@ -229,5 +234,5 @@ def find_quadtree(
 def keys_of(sides: wp.array, keys: np.ndarray, supersampling: int) -> np.ndarray:
     """The keys of the sides that probes see, −1 for none, int of shape [view, row, column]."""
     row, column = probe_grid(sides.shape[1:], supersampling)
-    seen = sides.numpy()[:, row[:, None], column]
-    return np.where(seen < 0, -1, keys[seen]) if len(keys) else np.full(seen.shape, -1)
+    view_sides = sides.numpy()[:, row[:, None], column]
+    return np.where(view_sides < 0, -1, keys[view_sides]) if len(keys) else np.full(view_sides.shape, -1)

@@ -73,7 +73,7 @@ class Fragments:
 
 
 @wp.kernel(enable_backward=False)
-def _snap(
+def _snap_vertices(
     first_row: int,
     worker: int,
     # in
@@ -83,14 +83,14 @@ def _snap(
     # out
     corners: wp.array2d(dtype=wp.vec2i),
     depths: wp.array2d(dtype=float),
-    faults: wp.array2d(dtype=int),
+    fault_counts: wp.array2d(dtype=int),
 ):
     """One thread owns one vertex: its fixed-point position and its depth z/w."""
     row, vertex = wp.tid()
     instance = first_row + row
     p = clip_positions[instance, vertex]
     if not (wp.isfinite(p[0]) and wp.isfinite(p[1]) and wp.isfinite(p[2]) and wp.isfinite(p[3])):
-        wp.atomic_add(faults, instance, 0, 1)
+        wp.atomic_add(fault_counts, instance, 0, 1)
     corner = wp.vec2i(_CLIPPED, _CLIPPED)
     depth = 0.0
     if p[3] > 0.0:
@@ -113,7 +113,7 @@ def _edge(a: wp.vec2i, b: wp.vec2i):
 
 
 @wp.func
-def _homogeneous(p: wp.vec4, width: int, height: int):
+def _to_homogeneous(p: wp.vec4, width: int, height: int):
     """Clip position to homogeneous fixed-point coordinates."""
     w = wp.float64(p[3])
     x = (wp.float64(p[0]) + w) * wp.float64(width * _HALF)
@@ -131,9 +131,9 @@ def _clipped_edge(a: wp.vec3d, b: wp.vec3d, a_corner: wp.vec2i, b_corner: wp.vec
     """
     if a_corner[0] != _CLIPPED and b_corner[0] != _CLIPPED:
         return _edge(a_corner, b_corner)
-    swap = a[0] > b[0] or (a[0] == b[0] and (a[1] > b[1] or (a[1] == b[1] and a[2] > b[2])))
-    line = wp.where(swap, wp.cross(b, a), wp.cross(a, b))
-    sign = wp.where(swap, wp.int64(-1), wp.int64(1))
+    is_swapped = a[0] > b[0] or (a[0] == b[0] and (a[1] > b[1] or (a[1] == b[1] and a[2] > b[2])))
+    line = wp.where(is_swapped, wp.cross(b, a), wp.cross(a, b))
+    sign = wp.where(is_swapped, wp.int64(-1), wp.int64(1))
     slope = wp.max(wp.abs(line[0]), wp.abs(line[1]))
     # The point of the line that is nearest to the origin; the line misses the screen if that is far.
     offset = wp.float64(0.0)
@@ -165,29 +165,29 @@ def _first_index(fixed: int):
 
 
 @wp.func
-def _at_centers(edge: _Edge, sign: wp.int64):
+def _shift_to_centers(edge: _Edge, sign: wp.int64):
     """Edge function of sample indices instead of positions, non-negative exactly on the samples inside.
 
     Top-left rule: a center on the line is inside if the inside lies to the right of the line or straight below it.
     """
     x = sign * edge[0]
     y = sign * edge[1]
-    at_origin = sign * edge[2] + (x + y) * wp.int64(_HALF)
+    origin_value = sign * edge[2] + (x + y) * wp.int64(_HALF)
     if not (x > wp.int64(0) or (x == wp.int64(0) and y > wp.int64(0))):
-        at_origin -= wp.int64(1)
-    return _Edge(x * wp.int64(_ONE), y * wp.int64(_ONE), at_origin)
+        origin_value -= wp.int64(1)
+    return _Edge(x * wp.int64(_ONE), y * wp.int64(_ONE), origin_value)
 
 
 @wp.func
-def _trim(span: wp.vec2i, step: wp.int64, value: wp.int64):
+def _trim(columns: wp.vec2i, step: wp.int64, value: wp.int64):
     """Shrink a span of columns to where an edge function may be non-negative, with a column to spare."""
     if step == wp.int64(0):
-        return span
-    root = -wp.float64(value) / wp.float64(step)
-    column = int(wp.clamp(root, wp.float64(-2.0), wp.float64(MAX_SIZE)))
+        return columns
+    zero_crossing = -wp.float64(value) / wp.float64(step)
+    column = int(wp.clamp(zero_crossing, wp.float64(-2.0), wp.float64(MAX_SIZE)))
     if step > wp.int64(0):
-        return wp.vec2i(wp.max(span[0], column - 1), span[1])
-    return wp.vec2i(span[0], wp.min(span[1], column + 1))
+        return wp.vec2i(wp.max(columns[0], column - 1), columns[1])
+    return wp.vec2i(columns[0], wp.min(columns[1], column + 1))
 
 
 @wp.func
@@ -196,10 +196,10 @@ def _unclipped_plane(
 ):
     """Depth of a face as a linear function of sample indices: plane0 column + plane1 row + plane2."""
     scale = wp.float64(_ONE) / wp.float64(area)
-    ab = wp.float64(depth_b - depth_a) * scale
-    ac = wp.float64(depth_c - depth_a) * scale
-    x = ab * wp.float64(c[1] - a[1]) - ac * wp.float64(b[1] - a[1])
-    y = ac * wp.float64(b[0] - a[0]) - ab * wp.float64(c[0] - a[0])
+    depth_step_ab = wp.float64(depth_b - depth_a) * scale
+    depth_step_ac = wp.float64(depth_c - depth_a) * scale
+    x = depth_step_ab * wp.float64(c[1] - a[1]) - depth_step_ac * wp.float64(b[1] - a[1])
+    y = depth_step_ac * wp.float64(b[0] - a[0]) - depth_step_ab * wp.float64(c[0] - a[0])
     column = wp.float64(a[0] - _HALF) / wp.float64(_ONE)
     row = wp.float64(a[1] - _HALF) / wp.float64(_ONE)
     return wp.vec3d(x, y, wp.float64(depth_a) - x * column - y * row)
@@ -208,15 +208,15 @@ def _unclipped_plane(
 @wp.func
 def _clipped_plane(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, z: wp.vec3d):
     """`_unclipped_plane` for a face with vertices behind the eye or far away."""
-    ab = wp.cross(a, b)
-    plane = (z[0] * wp.cross(b, c) + z[1] * wp.cross(c, a) + z[2] * ab) / wp.dot(ab, c)
+    cross_ab = wp.cross(a, b)
+    plane = (z[0] * wp.cross(b, c) + z[1] * wp.cross(c, a) + z[2] * cross_ab) / wp.dot(cross_ab, c)
     half = wp.float64(_HALF)
     one = wp.float64(_ONE)
     return wp.vec3d(plane[0] * one, plane[1] * one, plane[2] + (plane[0] + plane[1]) * half)
 
 
 @wp.func
-def _outside(a: wp.vec4, b: wp.vec4, c: wp.vec4):
+def _is_outside(a: wp.vec4, b: wp.vec4, c: wp.vec4):
     """Whether all of a face lies beyond one side of the view frustum."""
     return (
         (a[0] > a[3] and b[0] > b[3] and c[0] > c[3])
@@ -229,7 +229,7 @@ def _outside(a: wp.vec4, b: wp.vec4, c: wp.vec4):
 
 
 @wp.kernel(enable_backward=False)
-def _cover(
+def _rasterize_faces(
     first_row: int,
     worker: int,
     # in
@@ -239,41 +239,44 @@ def _cover(
     faces: wp.array(dtype=wp.vec3i),
     width: int,
     height: int,
-    strips: int,
-    layers: int,
+    strip_step: int,
+    layer_count: int,
     # out
     keys: wp.array3d(dtype=wp.int64),
-    faults: wp.array2d(dtype=int),
+    fault_counts: wp.array2d(dtype=int),
 ):
-    """One thread owns every ``strips``-th row of one face and offers the face to the samples of a layer there.
+    """One thread owns every ``strip_step``-th row of one face and offers the face to the samples of a layer there.
 
     A sample keeps the largest key: nearest depth above, lowest face below. Zero is the background. An image has several
     layers, each with a part of the faces, so that threads can share it.
     """
-    row_of_layer, number, strip = wp.tid()
-    at = first_row + row_of_layer
-    instance, layer = split_row(at, layers)
+    row_of_layer, face_in_layer, strip = wp.tid()
+    layer_index = first_row + row_of_layer
+    instance, layer = split_row(layer_index, layer_count)
     face_count = faces.shape[0]
-    face = layer * face_count / layers + number
-    if face >= (layer + 1) * face_count / layers:
+    face = layer * face_count / layer_count + face_in_layer
+    if face >= (layer + 1) * face_count / layer_count:
         return
-    i = faces[face][0]
-    j = faces[face][1]
-    k = faces[face][2]
-    if wp.min(i, wp.min(j, k)) < 0 or wp.max(i, wp.max(j, k)) >= corners.shape[1]:
+    vertex_a = faces[face][0]
+    vertex_b = faces[face][1]
+    vertex_c = faces[face][2]
+    if (
+        wp.min(vertex_a, wp.min(vertex_b, vertex_c)) < 0
+        or wp.max(vertex_a, wp.max(vertex_b, vertex_c)) >= corners.shape[1]
+    ):
         if strip == 0:
-            wp.atomic_add(faults, at, 1, 1)
+            wp.atomic_add(fault_counts, layer_index, 1, 1)
         return
-    a = corners[instance, i]
-    b = corners[instance, j]
-    c = corners[instance, k]
-    clipped = a[0] == _CLIPPED or b[0] == _CLIPPED or c[0] == _CLIPPED
+    a = corners[instance, vertex_a]
+    b = corners[instance, vertex_b]
+    c = corners[instance, vertex_c]
+    is_clipped = a[0] == _CLIPPED or b[0] == _CLIPPED or c[0] == _CLIPPED
 
     left = 0
     right = width - 1
     top = 0
     bottom = height - 1
-    if not clipped:
+    if not is_clipped:
         left = wp.max(left, _first_index(wp.min(a[0], wp.min(b[0], c[0]))))
         right = wp.min(right, _first_index(wp.max(a[0], wp.max(b[0], c[0])) + 1) - 1)
         top = wp.max(top, _first_index(wp.min(a[1], wp.min(b[1], c[1]))))
@@ -285,18 +288,18 @@ def _cover(
     edge_b = _edge(c, a)
     edge_c = _edge(a, b)
     plane = wp.vec3d()
-    farthest = 0
-    nearest = int(_DEPTH_ONE + 1)
+    min_depth_bits = 0
+    max_depth_bits = int(_DEPTH_ONE + 1)
     sign = wp.int64(1)
-    if clipped:
-        clip_a = clip_positions[instance, i]
-        clip_b = clip_positions[instance, j]
-        clip_c = clip_positions[instance, k]
-        if _outside(clip_a, clip_b, clip_c):
+    if is_clipped:
+        clip_a = clip_positions[instance, vertex_a]
+        clip_b = clip_positions[instance, vertex_b]
+        clip_c = clip_positions[instance, vertex_c]
+        if _is_outside(clip_a, clip_b, clip_c):
             return
-        fixed_a = _homogeneous(clip_a, width, height)
-        fixed_b = _homogeneous(clip_b, width, height)
-        fixed_c = _homogeneous(clip_c, width, height)
+        fixed_a = _to_homogeneous(clip_a, width, height)
+        fixed_b = _to_homogeneous(clip_b, width, height)
+        fixed_c = _to_homogeneous(clip_c, width, height)
         volume = wp.dot(wp.cross(fixed_a, fixed_b), fixed_c)
         if volume == wp.float64(0.0):
             return
@@ -311,52 +314,52 @@ def _cover(
         if area == wp.int64(0):
             return
         sign = wp.where(area > wp.int64(0), wp.int64(1), wp.int64(-1))
-        depth_a = depths[instance, i]
-        depth_b = depths[instance, j]
-        depth_c = depths[instance, k]
+        depth_a = depths[instance, vertex_a]
+        depth_b = depths[instance, vertex_b]
+        depth_c = depths[instance, vertex_c]
         plane = _unclipped_plane(a, b, c, area, depth_a, depth_b, depth_c)
         # Rounding must not carry the depth of a sliver beyond that of its vertices.
-        farthest = wp.cast(wp.min(depth_a, wp.min(depth_b, depth_c)), wp.int32)
-        nearest = wp.cast(wp.max(depth_a, wp.max(depth_b, depth_c)), wp.int32)
-    edge_a = _at_centers(edge_a, sign)
-    edge_b = _at_centers(edge_b, sign)
-    edge_c = _at_centers(edge_c, sign)
+        min_depth_bits = wp.cast(wp.min(depth_a, wp.min(depth_b, depth_c)), wp.int32)
+        max_depth_bits = wp.cast(wp.max(depth_a, wp.max(depth_b, depth_c)), wp.int32)
+    edge_a = _shift_to_centers(edge_a, sign)
+    edge_b = _shift_to_centers(edge_b, sign)
+    edge_c = _shift_to_centers(edge_c, sign)
 
-    low = wp.int64(_INT32_MASK) - wp.int64(face)
+    face_bits = wp.int64(_INT32_MASK) - wp.int64(face)
     row = top + strip
     while row <= bottom:
         y = wp.int64(row)
-        in_a = edge_a[1] * y + edge_a[2]
-        in_b = edge_b[1] * y + edge_b[2]
-        in_c = edge_c[1] * y + edge_c[2]
-        span = wp.vec2i(left, right)
+        inside_a = edge_a[1] * y + edge_a[2]
+        inside_b = edge_b[1] * y + edge_b[2]
+        inside_c = edge_c[1] * y + edge_c[2]
+        columns = wp.vec2i(left, right)
         if right - left >= _TRIM_WIDTH:
-            span = _trim(span, edge_a[0], in_a)
-            span = _trim(span, edge_b[0], in_b)
-            span = _trim(span, edge_c[0], in_c)
-        column = span[0]
+            columns = _trim(columns, edge_a[0], inside_a)
+            columns = _trim(columns, edge_b[0], inside_b)
+            columns = _trim(columns, edge_c[0], inside_c)
+        column = columns[0]
         x = wp.int64(column)
-        in_a += edge_a[0] * x
-        in_b += edge_b[0] * x
-        in_c += edge_c[0] * x
+        inside_a += edge_a[0] * x
+        inside_b += edge_b[0] * x
+        inside_c += edge_c[0] * x
         depth_of_row = plane[1] * wp.float64(row) + plane[2]
-        while column <= span[1]:
-            if (in_a | in_b | in_c) >= wp.int64(0):
+        while column <= columns[1]:
+            if (inside_a | inside_b | inside_c) >= wp.int64(0):
                 depth = float(plane[0] * wp.float64(column) + depth_of_row)
-                bits = wp.clamp(wp.cast(depth, wp.int32), farthest, nearest)
+                bits = wp.clamp(wp.cast(depth, wp.int32), min_depth_bits, max_depth_bits)
                 if bits > 0 and bits <= _DEPTH_ONE:
-                    key = (wp.int64(bits) << wp.int64(32)) | low
-                    if key > keys[at, row, column]:
-                        wp.atomic_max(keys, at, row, column, key)
-            in_a += edge_a[0]
-            in_b += edge_b[0]
-            in_c += edge_c[0]
+                    key = (wp.int64(bits) << wp.int64(32)) | face_bits
+                    if key > keys[layer_index, row, column]:
+                        wp.atomic_max(keys, layer_index, row, column, key)
+            inside_a += edge_a[0]
+            inside_b += edge_b[0]
+            inside_c += edge_c[0]
             column += 1
-        row += strips
+        row += strip_step
 
 
 @wp.kernel(enable_backward=False)
-def _resolve(
+def _resolve_layers(
     first_row: int,
     worker: int,
     # in
@@ -408,38 +411,38 @@ def _visible_faces(clip_positions: wp.array, faces: wp.array, width: int, height
     """Nearest face over each sample, -1 where there is none, int32, shape [batch, height, width]."""
     device = clip_positions.device
     batch_count, vertex_count = clip_positions.shape
-    layers, strips, run = 1, strip_count(device), run_length(device, width)
+    layer_count, strip_step, run = 1, strip_count(device), run_length(device, width)
     if device.is_cpu and batch_count:  # layers for threads that have no image of their own
-        worth = _FACE_COST * faces.shape[0] / (_MIN_FACES_COST * width * height)
-        layers = max(1, min(thread_count() // batch_count, int(worth)))
+        layer_bound = _FACE_COST * faces.shape[0] / (_MIN_FACES_COST * width * height)
+        layer_count = max(1, min(thread_count() // batch_count, int(layer_bound)))
     corners = empty((batch_count, vertex_count), dtype=wp.vec2i, device=device)
     depths = empty((batch_count, vertex_count), dtype=float, device=device)
-    keys = zeros((batch_count * layers, height, width), dtype=wp.int64, device=device)
+    keys = zeros((batch_count * layer_count, height, width), dtype=wp.int64, device=device)
     face_ids = empty((batch_count, height, width), dtype=wp.int32, device=device)
-    faults = zeros((batch_count * layers, 2), dtype=int, device=device)
+    fault_counts = zeros((batch_count * layer_count, 2), dtype=int, device=device)
     launch(
-        _snap,
+        _snap_vertices,
         clip_positions.shape,
         cost=_VERTEX_COST,
         inputs=[clip_positions, width, height],
-        outputs=[corners, depths, faults],
+        outputs=[corners, depths, fault_counts],
     )
     launch(
-        _cover,
-        (batch_count * layers, -(-faces.shape[0] // layers), strips),
+        _rasterize_faces,
+        (batch_count * layer_count, -(-faces.shape[0] // layer_count), strip_step),
         cost=_FACE_COST,
-        inputs=[clip_positions, corners, depths, faces, width, height, strips, layers],
-        outputs=[keys, faults],
+        inputs=[clip_positions, corners, depths, faces, width, height, strip_step, layer_count],
+        outputs=[keys, fault_counts],
     )
     launch(
-        _resolve,
+        _resolve_layers,
         face_ids.size // run,
-        cost=_SAMPLE_COST * layers * run,
-        inputs=[keys.reshape((batch_count, layers, height * width)), run],
+        cost=_SAMPLE_COST * layer_count * run,
+        inputs=[keys.reshape((batch_count, layer_count, height * width)), run],
         outputs=[rows(face_ids)],
     )
     if not device.is_capturing:
-        bad_vertex_count, bad_face_count = faults.numpy().sum(axis=0).tolist()
+        bad_vertex_count, bad_face_count = fault_counts.numpy().sum(axis=0).tolist()
         if bad_vertex_count:
             raise ValueError(f"clip_positions: got {bad_vertex_count} with NaN or Inf, expected finite numbers")
         if bad_face_count:

@@ -23,7 +23,7 @@ PACKET = CHUNK  # rays of a packet
 _LEAF = 4  # faces of a leaf at most
 
 _SLACK = 2.0**-20
-"""How far leaves reach beyond their faces, as a part of their largest coordinate: points lie on faces to rounding.
+"""Margin of leaves around their faces, as a share of their largest coordinate: points lie on faces to rounding.
 
 Of the largest of all faces it would be too far: an infinite ground's reach 10⁵ times as far as the bodies on it."""
 
@@ -47,31 +47,33 @@ def build_face_tree(positions: np.ndarray, faces: np.ndarray, device: wp.DeviceL
     """
     corners = np.asarray(positions, np.float32)[np.asarray(faces)]
     face_count, depth = len(corners), max(int(np.ceil(np.log2(max(len(corners), 1) / _LEAF))), 0)
-    lowest, highest = (np.ascontiguousarray(end(corners, axis=1).T) for end in (np.min, np.max))  # [3, face]
-    middles, permutation = (lowest + highest) / 2, np.arange(face_count)
+    lower_corners, upper_corners = (
+        np.ascontiguousarray(end(corners, axis=1).T) for end in (np.min, np.max)
+    )  # [3, face]
+    centers, permutation = (lower_corners + upper_corners) / 2, np.arange(face_count)
     for level in range(depth):
         bounds, halves = _bounds(face_count, level), _bounds(face_count, level + 1)[1::2]
-        low, high = (end.reduceat(middles, bounds[:-1], axis=1) for end in (np.minimum, np.maximum))
-        longest_axis = np.argmax(high - low, axis=0)
+        leaf_lowers, leaf_uppers = (end.reduceat(centers, bounds[:-1], axis=1) for end in (np.minimum, np.maximum))
+        longest_axis = np.argmax(leaf_uppers - leaf_lowers, axis=0)
         sizes = np.stack([np.diff(bounds), halves - bounds[:-1]], axis=1)  # faces, and those of the first half
         for size, half in np.unique(sizes, axis=0):
             boxes = np.flatnonzero((sizes == (size, half)).all(axis=1))
-            places = bounds[boxes, None] + np.arange(size)
-            parted = np.argpartition(middles[longest_axis[boxes, None], places], half, axis=1)
-            parted += bounds[boxes, None]
-            permutation[places], middles[:, places] = permutation[parted], middles[:, parted]
+            face_positions = bounds[boxes, None] + np.arange(size)
+            partitioned = np.argpartition(centers[longest_axis[boxes, None], face_positions], half, axis=1)
+            partitioned += bounds[boxes, None]
+            permutation[face_positions], centers[:, face_positions] = permutation[partitioned], centers[:, partitioned]
     corners, leaf_count = corners[permutation], 1 << depth
     lowers, uppers = np.zeros((2, 2 * leaf_count, 3), np.float32)
     if face_count:
         starts = _bounds(face_count, depth)[:-1]
-        low = np.minimum.reduceat(lowest[:, permutation], starts, axis=1).T
-        high = np.maximum.reduceat(highest[:, permutation], starts, axis=1).T
-        slack = np.float32(_SLACK) * np.maximum(-low, high).max(axis=1, keepdims=True)
-        lowers[leaf_count:], uppers[leaf_count:] = low - slack, high + slack
+        leaf_lowers = np.minimum.reduceat(lower_corners[:, permutation], starts, axis=1).T
+        leaf_uppers = np.maximum.reduceat(upper_corners[:, permutation], starts, axis=1).T
+        slack = np.float32(_SLACK) * np.maximum(-leaf_lowers, leaf_uppers).max(axis=1, keepdims=True)
+        lowers[leaf_count:], uppers[leaf_count:] = leaf_lowers - slack, leaf_uppers + slack
     for level in reversed(range(depth)):
-        box, below = slice(1 << level, 2 << level), slice(2 << level, 4 << level)
-        lowers[box] = lowers[below].reshape(-1, 2, 3).min(axis=1)
-        uppers[box] = uppers[below].reshape(-1, 2, 3).max(axis=1)
+        parents, children = slice(1 << level, 2 << level), slice(2 << level, 4 << level)
+        lowers[parents] = lowers[children].reshape(-1, 2, 3).min(axis=1)
+        uppers[parents] = uppers[children].reshape(-1, 2, 3).max(axis=1)
     tree = FaceTree()
     tree.corners, tree.lowers, tree.uppers = (
         wp.array(values, dtype=wp.vec3, device=device) for values in (corners.reshape(-1, 3, 3), lowers, uppers)
@@ -86,7 +88,7 @@ def packets_of(directions: np.ndarray) -> np.ndarray:
 
 
 def _bounds(count: int, level: int) -> np.ndarray:
-    """Where the boxes of a level have their first faces, and the end of the last: each has as many, but for one."""
+    """First faces of the boxes of a level, and the end of the last: their counts differ by at most one."""
     return np.arange((1 << level) + 1) * count >> level
 
 
@@ -101,9 +103,9 @@ def make_find_open() -> wp.Function:
     const int face_count = corners.shape[0];
     float x[{PACKET}], y[{PACKET}], z[{PACKET}], a[{PACKET}], b[{PACKET}], c[{PACKET}], open[{PACKET}];
     for (int lane = 0; lane < {PACKET}; ++lane) {{
-        x[lane] = toward.x.c[lane];
-        y[lane] = toward.y.c[lane];
-        z[lane] = toward.z.c[lane];
+        x[lane] = ray_directions.x.c[lane];
+        y[lane] = ray_directions.y.c[lane];
+        z[lane] = ray_directions.z.c[lane];
         a[lane] = 1.0f / (x[lane] == 0.0f ? 1.0e-20f : x[lane]);
         b[lane] = 1.0f / (y[lane] == 0.0f ? 1.0e-20f : y[lane]);
         c[lane] = 1.0f / (z[lane] == 0.0f ? 1.0e-20f : z[lane]);
@@ -157,10 +159,10 @@ def make_find_open() -> wp.Function:
         }}
         is_left = is_left_now;
         if (is_blocked)
-            last = face;
+            last_face = face;
     }};
-    if (last >= 0 && is_left)
-        meet(last);
+    if (last_face >= 0 && is_left)
+        meet(last_face);
     for (int box = is_left ? 1 : 0; box > 0;) {{
         const wp::vec3 lower = wp::index(lowers, box) - point, upper = wp::index(uppers, box) - point;
         float top = 0.0f;
@@ -199,7 +201,7 @@ def make_find_open() -> wp.Function:
     unsigned found = 0;
     for (int lane = 0; lane < {PACKET}; ++lane)
         found |= open[lane] > 0.0f ? 1u << lane : 0u;
-    return wp::vec_t<2, int>((int)found, last);
+    return wp::vec_t<2, int>((int)found, last_face);
     """)
     def find_open(  # type: ignore[empty-body]
         corners: wp.array2d(dtype=wp.vec3),
@@ -208,20 +210,20 @@ def make_find_open() -> wp.Function:
         leaf_count: int,
         point: wp.vec3,
         normal: wp.vec3,
-        toward: Vectors,
+        ray_directions: Vectors,
         facing_rays: wp.int32,
-        last: int,
+        last_face: int,
     ) -> wp.vec2i:
         """Find which rays of a packet meet no face.
 
         Args:
             corners, lowers, uppers, leaf_count: The faces, a :class:`FaceTree`.
             point, normal: The receiver; none of these rays goes below its horizon.
-            toward: Directions of the rays.
+            ray_directions: Directions of the rays.
             facing_rays: Bits of the rays to trace, which are above the horizon.
-            last: A face that is likely to block them, −1 for none.
+            last_face: A face that is likely to block them, −1 for none.
         Returns:
-            Bits of the rays that escape; and a face that blocked some, or ``last``.
+            Bits of the rays that escape; and a face that blocked some, or ``last_face``.
         """
         ...
 

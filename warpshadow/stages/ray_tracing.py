@@ -16,7 +16,7 @@ from warpshadow.stages.light_samples import CellSamples, LightSamples
 RAY_COST = 200.0  # nanoseconds that a ray takes
 
 ROUNDING = 2.0**-21
-"""How far a point interpolated in float32 may lie off its face: a part of the face's largest coordinate, by axis."""
+"""Distance of a point, interpolated in float32, from its face, at most: a share of its largest coordinate, by axis."""
 
 WALL_COSINE = 1.0e-3
 """Cosine between a face's normal and a receiver's below which the face is a wall at whose foot the receiver lies: it is
@@ -28,7 +28,7 @@ MIN_HIT_HEIGHT = 1.0e-4
 
 
 @wp.func
-def _seen_from(mesh: wp.uint64, face: int, point: wp.vec3, normal: wp.vec3):
+def _face_from_receiver(mesh: wp.uint64, face: int, point: wp.vec3, normal: wp.vec3):
     """A face as a receiver sees it: corners relative to it and their normal, in float64, where they are exact.
 
     A receiver on a face, to float32's rounding, is put slightly above it, on the side of its own normal. It so gets no
@@ -45,73 +45,73 @@ def _seen_from(mesh: wp.uint64, face: int, point: wp.vec3, normal: wp.vec3):
     b = wp.vec3d(corner_b) - wp.vec3d(point)
     c = wp.vec3d(corner_c) - wp.vec3d(point)
     face_normal = wp.cross(b - a, c - a)
-    drop = wp.dot(face_normal, a)  # from the plane to the receiver, times |face_normal|
-    largest = wp.max(wp.max(wp.abs(corner_a), wp.abs(corner_b)), wp.max(wp.abs(corner_c), wp.abs(point)))
-    lies_on = bool(False)
-    if wp.abs(drop) <= wp.float64(ROUNDING) * wp.dot(wp.abs(face_normal), wp.vec3d(largest)):
+    plane_offset = wp.dot(face_normal, a)  # from the plane to the receiver, times |face_normal|
+    coordinate_bound = wp.max(wp.max(wp.abs(corner_a), wp.abs(corner_b)), wp.max(wp.abs(corner_c), wp.abs(point)))
+    is_on_face = bool(False)
+    if wp.abs(plane_offset) <= wp.float64(ROUNDING) * wp.dot(wp.abs(face_normal), wp.vec3d(coordinate_bound)):
         length = wp.length(face_normal)
-        upward = wp.dot(face_normal, wp.vec3d(normal))
-        lies_on = wp.abs(upward) >= wp.float64(WALL_COSINE) * length
-        height = wp.where(upward < wp.float64(-WALL_COSINE) * length, -MIN_HIT_HEIGHT, MIN_HIT_HEIGHT)
-        move = (drop / length + wp.float64(height) * wp.sqrt(length)) / length * face_normal
-        a -= move
-        b -= move
-        c -= move
-    return a, b, c, face_normal, lies_on
+        normal_component = wp.dot(face_normal, wp.vec3d(normal))
+        is_on_face = wp.abs(normal_component) >= wp.float64(WALL_COSINE) * length
+        height = wp.where(normal_component < wp.float64(-WALL_COSINE) * length, -MIN_HIT_HEIGHT, MIN_HIT_HEIGHT)
+        shift = (plane_offset / length + wp.float64(height) * wp.sqrt(length)) / length * face_normal
+        a -= shift
+        b -= shift
+        c -= shift
+    return a, b, c, face_normal, is_on_face
 
 
 @wp.func
-def _volumes(toward: wp.vec3, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
+def _volumes(ray_direction: wp.vec3, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
     """Barycentrics of where a line meets the plane of a face, not normalized: of one sign where it meets the face."""
-    ray = wp.vec3d(toward)
+    ray = wp.vec3d(ray_direction)
     return wp.vec3d(wp.dot(ray, wp.cross(c, b)), wp.dot(ray, wp.cross(a, c)), wp.dot(ray, wp.cross(b, a)))
 
 
 @wp.func
-def _meets(toward: wp.vec3, a: wp.vec3d, face_normal: wp.vec3d, volumes: wp.vec3d):
+def _is_hit(ray_direction: wp.vec3, a: wp.vec3d, face_normal: wp.vec3d, volumes: wp.vec3d):
     """Whether a ray meets a face."""
     is_inside = wp.min(volumes) >= wp.float64(0.0) or wp.max(volumes) <= wp.float64(0.0)
-    return is_inside and wp.dot(face_normal, a) * wp.dot(face_normal, wp.vec3d(toward)) > wp.float64(0.0)
+    return is_inside and wp.dot(face_normal, a) * wp.dot(face_normal, wp.vec3d(ray_direction)) > wp.float64(0.0)
 
 
 @wp.func
-def _slope(toward: wp.vec3):
+def _nonzero_direction(ray_direction: wp.vec3):
     """A ray's direction for the boxes, whose slabs need a slope."""
     return wp.vec3(
-        wp.where(toward[0] == 0.0, 1.0e-20, toward[0]),
-        wp.where(toward[1] == 0.0, 1.0e-20, toward[1]),
-        wp.where(toward[2] == 0.0, 1.0e-20, toward[2]),
+        wp.where(ray_direction[0] == 0.0, 1.0e-20, ray_direction[0]),
+        wp.where(ray_direction[1] == 0.0, 1.0e-20, ray_direction[1]),
+        wp.where(ray_direction[2] == 0.0, 1.0e-20, ray_direction[2]),
     )
 
 
 @wp.func
-def is_met(mesh: wp.uint64, face: int, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
+def meets_face(mesh: wp.uint64, face: int, point: wp.vec3, normal: wp.vec3, ray_direction: wp.vec3):
     """Whether a ray from a receiver meets a face of a mesh."""
-    a, b, c, face_normal, _lies_on = _seen_from(mesh, face, point, normal)
-    return _meets(toward, a, face_normal, _volumes(toward, a, b, c))
+    a, b, c, face_normal, _is_on_face = _face_from_receiver(mesh, face, point, normal)
+    return _is_hit(ray_direction, a, face_normal, _volumes(ray_direction, a, b, c))
 
 
 @wp.func
-def find_blocker(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
+def any_hit(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, ray_direction: wp.vec3):
     """Find a face of a mesh that a ray from a receiver meets, not always the first, -1 for none; mesh 0 has none."""
     if mesh == wp.uint64(0):
         return int(-1)
-    query = wp.bvh_query_ray(wp.mesh_get_bvh(mesh), point, _slope(toward))
+    query = wp.bvh_query_ray(wp.mesh_get_bvh(mesh), point, _nonzero_direction(ray_direction))
     face = int(0)
     while wp.bvh_query_next(query, face):
-        if is_met(mesh, face, point, normal, toward):
+        if meets_face(mesh, face, point, normal, ray_direction):
             return face
     return int(-1)
 
 
 @wp.func
-def escapes(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
+def escapes(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, ray_direction: wp.vec3):
     """Whether a ray from a receiver meets no face of a mesh; 0 is the mesh that has none."""
-    return find_blocker(mesh, point, normal, toward) < 0
+    return any_hit(mesh, point, normal, ray_direction) < 0
 
 
 @wp.struct
-class Hit:
+class RayHit:
     """First hit of a ray."""
 
     face: int  # number of the face, -1 for none
@@ -120,25 +120,25 @@ class Hit:
 
 
 @wp.func
-def nearest(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
+def first_hit(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, ray_direction: wp.vec3):
     """First hit of a ray from a receiver; none where it leaves below the face that the receiver lies on.
 
     Smooth normals, which lean away from faces, have such rays. Direct light has none from there, too.
     """
-    hit = Hit()
+    hit = RayHit()
     hit.face = -1
     distance = float(wp.inf)
-    query = wp.bvh_query_ray(wp.mesh_get_bvh(mesh), point, _slope(toward))
+    query = wp.bvh_query_ray(wp.mesh_get_bvh(mesh), point, _nonzero_direction(ray_direction))
     face = int(0)
     while wp.bvh_query_next(query, face, distance):
-        a, b, c, face_normal, lies_on = _seen_from(mesh, face, point, normal)
-        volumes = _volumes(toward, a, b, c)
-        if _meets(toward, a, face_normal, volumes):
-            slope = wp.dot(face_normal, wp.vec3d(toward))
-            reached = float(wp.dot(face_normal, a) / slope)
-            if reached < distance:
-                distance = reached
-                hit.face = wp.where(lies_on, -1, face)
+        a, b, c, face_normal, is_on_face = _face_from_receiver(mesh, face, point, normal)
+        volumes = _volumes(ray_direction, a, b, c)
+        if _is_hit(ray_direction, a, face_normal, volumes):
+            slope = wp.dot(face_normal, wp.vec3d(ray_direction))
+            hit_distance = float(wp.dot(face_normal, a) / slope)
+            if hit_distance < distance:
+                distance = hit_distance
+                hit.face = wp.where(is_on_face, -1, face)
                 hit.weights = wp.vec3(volumes / (volumes[0] + volumes[1] + volumes[2]))
                 hit.is_back = slope > wp.float64(0.0)
     return hit
@@ -160,9 +160,9 @@ def _trace_visibility(
     row, direction = wp.tid()
     batch, vertex = split_row(first_row + row, points.shape[1])
     normal = normals[batch, vertex]
-    toward = directions[direction]
+    ray_direction = directions[direction]
     is_seen = wp.uint8(0)
-    if wp.dot(normal, toward) > 0.0 and escapes(mesh, points[batch, vertex], normal, toward):
+    if wp.dot(normal, ray_direction) > 0.0 and escapes(mesh, points[batch, vertex], normal, ray_direction):
         is_seen = wp.uint8(1)
     visibility[batch, vertex, direction] = is_seen
 
@@ -212,15 +212,15 @@ def _trace_shading(
 ):
     """A thread owns a receiver."""
     receiver = first_row + wp.tid()
-    chosen = int(wp.rand_init(17, receiver) % wp.uint32(directions.shape[0]))
+    sample_set = int(wp.rand_init(17, receiver) % wp.uint32(directions.shape[0]))
     point = points[receiver]
     normal = normals[receiver]
     total = wp.vec3()
     for sample in range(directions.shape[1]):
-        toward = directions[chosen, sample]
-        cosine = wp.dot(normal, toward)
-        if cosine > 0.0 and escapes(mesh, point, normal, toward):
-            total += cosine * radiance[chosen, sample]
+        ray_direction = directions[sample_set, sample]
+        cosine = wp.dot(normal, ray_direction)
+        if cosine > 0.0 and escapes(mesh, point, normal, ray_direction):
+            total += cosine * radiance[sample_set, sample]
     shading[receiver] = total / wp.pi
 
 
@@ -242,12 +242,12 @@ def trace_shading(
     directions = wp.array(samples.directions, dtype=wp.vec3, device=device)
     radiance = wp.array(samples.radiance, dtype=wp.vec3, device=device)
     shading = empty(points.shape, dtype=wp.vec3, device=device)
-    for part in parts(points.shape[0], 2**20 // samples.directions.shape[1], progress):
+    for receivers in progress_slices(points.shape[0], 2**20 // samples.directions.shape[1], progress):
         launch(
             _trace_shading,
-            part.stop - part.start,
-            inputs=[mesh_id(mesh), points[part], normals[part], directions, radiance],
-            outputs=[shading[part]],
+            receivers.stop - receivers.start,
+            inputs=[mesh_id(mesh), points[receivers], normals[receivers], directions, radiance],
+            outputs=[shading[receivers]],
             cost=RAY_COST * directions.shape[1],
         )
     return shading
@@ -261,7 +261,7 @@ def _trace_cells(
     mesh: wp.uint64,
     points: wp.array[wp.vec3],
     normals: wp.array[wp.vec3],
-    numbers: wp.array[wp.int32],
+    receiver_ids: wp.array[wp.int32],
     directions: wp.array2d[wp.vec3],
     cells: wp.array2d[wp.int32],
     radiance: wp.array3d[wp.float32],
@@ -270,17 +270,17 @@ def _trace_cells(
 ):
     """A thread owns a receiver, whose cells are zero before."""
     receiver = first_row + wp.tid()
-    chosen = int(wp.rand_init(17, numbers[receiver]) % wp.uint32(directions.shape[0]))
+    sample_set = int(wp.rand_init(17, receiver_ids[receiver]) % wp.uint32(directions.shape[0]))
     point = points[receiver]
     normal = normals[receiver]
     for sample in range(directions.shape[1]):
-        toward = directions[chosen, sample]
-        cosine = wp.dot(normal, toward) / wp.pi
-        if cosine > 0.0 and escapes(mesh, point, normal, toward):
-            cell = cells[chosen, sample]
+        ray_direction = directions[sample_set, sample]
+        cosine = wp.dot(normal, ray_direction) / wp.pi
+        if cosine > 0.0 and escapes(mesh, point, normal, ray_direction):
+            cell = cells[sample_set, sample]
             for channel in range(light.shape[1]):
                 light[receiver, channel, cell] = (
-                    light[receiver, channel, cell] + cosine * radiance[chosen, sample, channel]
+                    light[receiver, channel, cell] + cosine * radiance[sample_set, sample, channel]
                 )
 
 
@@ -288,7 +288,7 @@ def trace_cells(
     mesh: wp.Mesh | None,
     points: wp.array,
     normals: wp.array,
-    numbers: wp.array,
+    receiver_ids: wp.array,
     samples: CellSamples,
     *,
     progress: bool = False,
@@ -297,7 +297,8 @@ def trace_cells(
 
     Args:
         mesh, points, normals: As for :func:`trace_shading`.
-        numbers: Identifiers of the receivers, int32 of shape [receiver]: a receiver gets the same rays in any company.
+        receiver_ids: Identifiers of the receivers, int32 of shape [receiver]: a receiver gets the same rays in any
+            company.
         samples: Directions drawn from the light.
     Returns:
         ∫ L V max(n·ω, 0) dω / π over each cell, float32 of shape [receiver, channel, cell].
@@ -305,24 +306,26 @@ def trace_cells(
     """
     shape = points.shape[0], samples.radiance.shape[2], samples.cell_count
     light = zeros(shape, dtype=wp.float32, device=points.device)
-    for part in parts(points.shape[0], 2**20 // samples.directions.shape[1], progress):
+    for receivers in progress_slices(points.shape[0], 2**20 // samples.directions.shape[1], progress):
         launch(
             _trace_cells,
-            part.stop - part.start,
-            inputs=[mesh_id(mesh), points[part], normals[part], numbers[part], *samples[:3]],
-            outputs=[light[part]],
+            receivers.stop - receivers.start,
+            inputs=[mesh_id(mesh), points[receivers], normals[receivers], receiver_ids[receivers], *samples[:3]],
+            outputs=[light[receivers]],
             cost=RAY_COST * samples.directions.shape[1],
         )
     return light
 
 
-def parts(total: int, size: int, progress: bool, what: str = "tracing rays", *, first: int = 0) -> Iterator[slice]:
+def progress_slices(
+    total: int, size: int, progress: bool, label: str = "tracing rays", *, first: int = 0
+) -> Iterator[slice]:
     """Cut a range into slices of at most ``size``, with a labeled progress bar over them.
 
     Rows before ``first`` count as done.
     """
     size = max(size, 1)
-    with progress_bar(total, what, "point", done=first, shows=progress) as bar:
+    with progress_bar(total, label, "point", done=first, shows=progress) as bar:
         for start in range(first, total, size):
             stop = min(start + size, total)
             yield slice(start, stop)

@@ -15,10 +15,10 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, from_numpy, zeros
 from warpshadow.device.parallel import run_length
-from warpshadow.stages.interpolation import at_point
+from warpshadow.stages.interpolation import interpolate_at
 from warpshadow.stages.quadtree import Quadtree
 from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.sample_receivers import SeenSurface, Span, find_sample_receivers, spans_of
+from warpshadow.stages.sample_receivers import Span, VisibleSurface, find_sample_receivers, spans_of
 from warpshadow.stages.sides import split_side, split_sides
 from warpshadow.stages.silhouettes.find import Silhouettes
 
@@ -44,25 +44,27 @@ class Receivers(NamedTuple):
     vertices: wp.array | None = None  # int32, the vertex or back of each vertex receiver, [vertex receiver]
     sample_fragments: Fragments | None = None  # side and barycentrics of each sample receiver, [batch, sample receiver]
 
-    def without_owners(self) -> "Receivers":
-        """The same receivers, as points of which nobody knows the body."""
+    def without_bodies(self) -> "Receivers":
+        """Drop the bodies of receivers."""
         return self._replace(spans=(), vertices=None, sample_fragments=None)
 
 
-_SMOOTH, _SHARP = 0.866, 0.707
+_FULL_RISE_COSINE, _NO_RISE_COSINE = 0.866, 0.707
 """Least cosine between a face and its vertices' normals from which its points rise in full (30°), and not at all (45°):
 such normals round the edges of a box, whose points would rise into its neighbors."""
 
 
 @wp.func
-def _rise(positions: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3), corners: wp.vec3i, weights: wp.vec3):
-    """How much points rise from a face, seen from its front and its back, towards the surface that its normals round.
+def _rise_to_smooth_surface(
+    positions: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3), corners: wp.vec3i, weights: wp.vec3
+):
+    """Offsets of a point from its face, seen from front and back, towards the surface that smooth normals describe.
 
     Each corner's tangent plane, where it is above the point, raises it [Hanika 2021, "Hacking the shadow terminator"]:
     to twice the height of a sphere through the corners. With half of that a bunny of 3,500 vertices keeps some of the
     dark specks where light grazes its normals, which come from flat faces in their own shadow.
     """
-    point = at_point(positions, corners, weights)
+    point = interpolate_at(positions, corners, weights)
     # of unit length, so that no product of three leaves the range of float32
     edge = wp.normalize(positions[corners[1]] - positions[corners[0]])
     other_edge = wp.normalize(positions[corners[2]] - positions[corners[0]])
@@ -76,19 +78,19 @@ def _rise(positions: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3), 
         front += wp.max(height, 0.0) * normal
         back += wp.min(height, 0.0) * normal
         cosine = wp.min(cosine, wp.abs(wp.dot(normal, face_normal)))
-    share = wp.smoothstep(_SHARP, _SMOOTH, cosine)
+    share = wp.smoothstep(_NO_RISE_COSINE, _FULL_RISE_COSINE, cosine)
     return share * front, share * back
 
 
 @wp.kernel
-def _gather(
+def _gather_points(
     # in
     positions: wp.array2d(dtype=wp.vec3),
     normals: wp.array2d(dtype=wp.vec3),
     faces: wp.array(dtype=wp.vec3i),
     vertices: wp.array(dtype=wp.int32),
-    seen_sides: wp.array2d(dtype=wp.int32),
-    seen_barycentrics: wp.array2d(dtype=wp.vec3),
+    fragment_sides: wp.array2d(dtype=wp.int32),
+    fragment_barycentrics: wp.array2d(dtype=wp.vec3),
     rises: bool,
     # out
     points: wp.array2d(dtype=wp.vec3),
@@ -103,15 +105,17 @@ def _gather(
         points[batch, receiver] = positions[position_batch, vertex]
         point_normals[batch, receiver] = wp.where(is_back, -1.0, 1.0) * normals[position_batch, vertex]
     else:
-        fragment_batch = instance_in(batch, seen_sides.shape[0])
-        weights = seen_barycentrics[fragment_batch, fragment]
-        face, is_back = split_side(wp.max(seen_sides[fragment_batch, fragment], 0), faces.shape[0])
-        point = at_point(positions[position_batch], faces[face], weights)
+        fragment_batch = instance_in(batch, fragment_sides.shape[0])
+        weights = fragment_barycentrics[fragment_batch, fragment]
+        face, is_back = split_side(wp.max(fragment_sides[fragment_batch, fragment], 0), faces.shape[0])
+        point = interpolate_at(positions[position_batch], faces[face], weights)
         if rises:
-            front, back = _rise(positions[position_batch], normals[position_batch], faces[face], weights)
+            front, back = _rise_to_smooth_surface(
+                positions[position_batch], normals[position_batch], faces[face], weights
+            )
             point += wp.where(is_back, back, front)
         points[batch, receiver] = point
-        normal = wp.normalize(at_point(normals[position_batch], faces[face], weights))
+        normal = wp.normalize(interpolate_at(normals[position_batch], faces[face], weights))
         point_normals[batch, receiver] = wp.where(is_back, -1.0, 1.0) * normal
 
 
@@ -133,7 +137,7 @@ def _add_faces(
 
 
 class Numbering(NamedTuple):
-    """Which vertices are receivers, and their numbers."""
+    """Vertices that are receivers, and their indices."""
 
     vertices: (
         wp.array | None
@@ -178,16 +182,16 @@ def number_receivers(
         return Numbering(None, np.empty(0, int), faces, of_vertices)
     is_static = np.zeros(vertex_count, bool) if is_static is None else is_static
     sequence = np.arange(vertex_count) if sequence is None else sequence
-    shifts = vertex_count * np.arange(side_count)
-    sequence = (sequence + shifts[:, None]).ravel()
+    side_offsets = vertex_count * np.arange(side_count)
+    sequence = (sequence + side_offsets[:, None]).ravel()
     if bodies is not None:
         bodies = np.tile(bodies, side_count)
         sequence = sequence[np.argsort(bodies[sequence], kind="stable")]
-    stays, moves = (keeps_vertex & is_static).ravel(), (keeps_vertex & ~is_static).ravel()
-    on_static, vertices = sequence[stays[sequence]], sequence[moves[sequence]]
+    is_static_receiver, is_moving_receiver = (keeps_vertex & is_static).ravel(), (keeps_vertex & ~is_static).ravel()
+    on_static, vertices = sequence[is_static_receiver[sequence]], sequence[is_moving_receiver[sequence]]
     of_vertices = np.full(keeps_vertex.size, -1, np.int32)
     of_vertices[np.concatenate([on_static, vertices])] = np.arange(len(on_static) + len(vertices))
-    corners = of_vertices[faces.numpy() + shifts[:, None, None]].reshape(-1, 3)
+    corners = of_vertices[faces.numpy() + side_offsets[:, None, None]].reshape(-1, 3)
     return Numbering(
         from_numpy(vertices, dtype=wp.int32, device=device),
         on_static,
@@ -225,7 +229,7 @@ def find_receivers(
         supersampling: Supersampling, the samples of a pixel across and down: samples of a pixel with the same face
             share a receiver.
         quadtree: Squares in which samples of faces that want them interpolate; None for none.
-        smooth_pieces: Smooth piece of each face, int32 of shape [face], where those that see different faces of one
+        smooth_pieces: Smooth piece of each face, int32 of shape [face], where samples that see different faces of one
             share a receiver, too; None where they do not.
         rises: Whether samples' receivers rise from their faces towards the surface that normals round, for rays.
     Returns:
@@ -241,12 +245,12 @@ def find_receivers(
     if wants_samples.any():
         batch_count = common_batch({"positions": positions, "fragments": sides})
         side_count, receiver_count = len(receiver_faces), numbering.receiver_count
-        keys = np.zeros(len(faces), int) if bodies is None else bodies
+        body_keys = np.zeros(len(faces), int) if bodies is None else bodies
         surface = None
         if smooth_pieces is not None and len(positions) == 1:
-            seen_points = points_seen(positions, normals, faces, Fragments(*receiver_fragments.rows))
-            surface = SeenSurface(*seen_points, positions[0], faces, smooth_pieces)
-        arguments = receiver_fragments, side_count, wants_samples, keys, supersampling, quadtree, surface
+            visible_points = points_of_fragments(positions, normals, faces, Fragments(*receiver_fragments.rows))
+            surface = VisibleSurface(*visible_points, positions[0], faces, smooth_pieces)
+        arguments = receiver_fragments, side_count, wants_samples, body_keys, supersampling, quadtree, surface
         sample_receivers = find_sample_receivers(*arguments)
         receiver_fragments, sample_fragments = sample_receivers.fragments, sample_receivers.sample_fragments
         moving_count = numbering.moving_count
@@ -265,16 +269,16 @@ def find_receivers(
     elif vertices is None:
         return Receivers(positions, normals, receiver_faces, of_vertices, receiver_fragments)
     vertices = of_vertices if vertices is None else vertices
-    points = _points(batch_count, positions, normals, faces, vertices, sample_fragments, rises=rises)
-    result = Receivers(*points, receiver_faces, of_vertices, receiver_fragments, on_static)
+    points = _gather_receiver_points(batch_count, positions, normals, faces, vertices, sample_fragments, rises=rises)
+    receivers = Receivers(*points, receiver_faces, of_vertices, receiver_fragments, on_static)
     if bodies is None:
-        return result
+        return receivers
     if sample_fragments and not sample_fragments.face_ids.size:
         sample_fragments = None
-    return result._replace(spans=spans, vertices=vertices, sample_fragments=sample_fragments)
+    return receivers._replace(spans=spans, vertices=vertices, sample_fragments=sample_fragments)
 
 
-def _points(
+def _gather_receiver_points(
     count: int,
     positions: wp.array,
     normals: wp.array,
@@ -291,7 +295,7 @@ def _points(
     shape = count, vertices.size + sample_fragments.face_ids.shape[1]
     points, point_normals = (empty(shape, dtype=wp.vec3, device=device) for _ in range(2))
     inputs = [positions, normals, faces, vertices, sample_fragments.face_ids, sample_fragments.barycentrics, rises]
-    launch(_gather, shape, inputs=inputs, outputs=[points, point_normals])
+    launch(_gather_points, shape, inputs=inputs, outputs=[points, point_normals])
     return points, point_normals
 
 
@@ -317,26 +321,34 @@ def receivers_on_faces(
     """
     device = positions.device
     sample_fragments = Fragments(constant(sides[None], wp.int32, device), constant(barycentrics[None], wp.vec3, device))
-    points = points_seen(positions, normals, faces, sample_fragments)
-    none = constant(np.empty(0, int), wp.int32, device)
+    points = points_of_fragments(positions, normals, faces, sample_fragments)
+    no_vertices = constant(np.empty(0, int), wp.int32, device)
     spans = () if bodies is None else spans_of(bodies)
     return Receivers(
-        *points, faces, none, sample_fragments, spans=spans, vertices=none, sample_fragments=sample_fragments
+        *points,
+        faces,
+        no_vertices,
+        sample_fragments,
+        spans=spans,
+        vertices=no_vertices,
+        sample_fragments=sample_fragments,
     )
 
 
-def points_seen(positions: wp.array, normals: wp.array, faces: wp.array, seen: Fragments) -> tuple[wp.array, wp.array]:
+def points_of_fragments(
+    positions: wp.array, normals: wp.array, faces: wp.array, fragments: Fragments
+) -> tuple[wp.array, wp.array]:
     """Points and normals of fragments, sides and barycentrics [view, receiver]: vec3 of shape [batch, receiver].
 
     Differentiable: positions, normals, barycentrics.
     """
-    count = common_batch({"positions": positions, "seen": seen.face_ids})
-    none = constant(np.empty(0, int), wp.int32, positions.device)
-    return _points(count, positions, normals, faces, none, seen)
+    count = common_batch({"positions": positions, "fragments": fragments.face_ids})
+    no_vertices = constant(np.empty(0, int), wp.int32, positions.device)
+    return _gather_receiver_points(count, positions, normals, faces, no_vertices, fragments)
 
 
 @wp.kernel(enable_backward=False)
-def _mark_corners(
+def _mark_visible_corners(
     first_row: int,
     worker: int,
     # in
@@ -344,19 +356,19 @@ def _mark_corners(
     faces: wp.array(dtype=wp.vec3i),
     run: int,
     # out
-    takes_part: wp.array2d(dtype=wp.bool),
+    is_visible: wp.array2d(dtype=wp.bool),
 ):
     """A thread owns a run of samples: it marks the corners of the sides that they see."""
     thread = first_row + wp.tid()
-    last = int(-1)
+    last_side = int(-1)
     for sample in range(thread * run, (thread + 1) * run):
         side = sides[sample]
-        if side != last and side >= 0:
+        if side != last_side and side >= 0:
             face, is_back = split_side(side, faces.shape[0])
             corners = faces[face]
             for k in range(3):
-                takes_part[wp.where(is_back, 1, 0), corners[k]] = True
-        last = side
+                is_visible[wp.where(is_back, 1, 0), corners[k]] = True
+        last_side = side
 
 
 def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: int) -> np.ndarray:
@@ -376,18 +388,18 @@ def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: 
     corners = zeros((side_count, vertex_count), dtype=wp.bool, device=device)
     run = run_length(device, sides.shape[2])
     launch(
-        _mark_corners,
+        _mark_visible_corners,
         sides.size // run,
         cost=_MARK_COST * run,
         inputs=[sides.flatten(), silhouettes.faces, run],
         outputs=[corners],
     )
-    takes_part, edges = corners.numpy(), silhouettes.edges.numpy()
+    is_visible, edges = corners.numpy(), silhouettes.edges.numpy()
     is_edge = edges >= 0
     side_of_edge = np.zeros(edges.shape, int)
     if side_count == 2:
         # an edge is seen from the side that one of the samples beside it sees, each of which has an entry for it
         _, is_back = split_sides(sides.numpy().ravel()[silhouettes.samples.numpy()], face_count)
         side_of_edge[:] = is_back[:, None, None]
-    takes_part[side_of_edge[is_edge], edges[is_edge]] = True
-    return takes_part
+    is_visible[side_of_edge[is_edge], edges[is_edge]] = True
+    return is_visible

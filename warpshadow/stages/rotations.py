@@ -27,8 +27,8 @@ def _rotate_by_quaternions(
 ):
     """A thread owns a rotation."""
     batch, body = wp.tid()
-    q = wp.vec4(wp.normalize(wp.vec4d(quaternions[batch, body])))  # whose length squared may not be a float32
-    rotations[batch, body] = wp.quat_to_matrix(wp.quat(q[0], q[1], q[2], q[3]))
+    quaternion = wp.vec4(wp.normalize(wp.vec4d(quaternions[batch, body])))  # whose length squared may not be a float32
+    rotations[batch, body] = wp.quat_to_matrix(wp.quat(quaternion[0], quaternion[1], quaternion[2], quaternion[3]))
 
 
 @wp.kernel
@@ -40,17 +40,23 @@ def _rotate_by_axis_angles(
 ):
     """A thread owns a rotation: R = I + sin θ/θ K + (1 − cos θ)/θ² K², by series near θ = 0."""
     batch, body = wp.tid()
-    v = vectors[batch, body]
-    t = wp.dot(v, v)
-    s = wp.min(t, 0.25)  # the series' adjoints run for all angles, and must not overflow
-    a = 1.0 - s / 6.0 * (1.0 - s / 20.0 * (1.0 - s / 42.0 * (1.0 - s / 72.0)))
-    b = 0.5 - s / 24.0 * (1.0 - s / 30.0 * (1.0 - s / 56.0 * (1.0 - s / 90.0)))
-    if t > 0.25:
-        angle = wp.sqrt(t)
-        a = wp.sin(angle) / angle
-        b = (1.0 - wp.cos(angle)) / t
-    k = wp.skew(v)
-    rotations[batch, body] = wp.identity(n=3, dtype=wp.float32) + a * k + b * (k * k)
+    axis_angle = vectors[batch, body]
+    angle2 = wp.dot(axis_angle, axis_angle)
+    series_angle2 = wp.min(angle2, 0.25)  # the series' adjoints run for all angles, and must not overflow
+    sine_ratio = 1.0 - series_angle2 / 6.0 * (
+        1.0 - series_angle2 / 20.0 * (1.0 - series_angle2 / 42.0 * (1.0 - series_angle2 / 72.0))
+    )
+    cosine_ratio = 0.5 - series_angle2 / 24.0 * (
+        1.0 - series_angle2 / 30.0 * (1.0 - series_angle2 / 56.0 * (1.0 - series_angle2 / 90.0))
+    )
+    if angle2 > 0.25:
+        angle = wp.sqrt(angle2)
+        sine_ratio = wp.sin(angle) / angle
+        cosine_ratio = (1.0 - wp.cos(angle)) / angle2
+    cross_matrix = wp.skew(axis_angle)
+    rotations[batch, body] = (
+        wp.identity(n=3, dtype=wp.float32) + sine_ratio * cross_matrix + cosine_ratio * (cross_matrix * cross_matrix)
+    )
 
 
 @wp.kernel
@@ -62,9 +68,9 @@ def _rotate_by_columns(
 ):
     """A thread owns a rotation: Gram–Schmidt of its first two columns, in float64 as they may be nearly parallel."""
     batch, body = wp.tid()
-    c = columns[batch, body]
-    x = wp.normalize(wp.vec3d(wp.vec3(c[0], c[1], c[2])))
-    y = wp.vec3d(wp.vec3(c[3], c[4], c[5]))
+    entries = columns[batch, body]
+    x = wp.normalize(wp.vec3d(wp.vec3(entries[0], entries[1], entries[2])))
+    y = wp.vec3d(wp.vec3(entries[3], entries[4], entries[5]))
     y = wp.normalize(y - wp.dot(x, y) * x)
     rotations[batch, body] = wp.matrix_from_cols(wp.vec3(x), wp.vec3(y), wp.vec3(wp.cross(x, y)))
 
@@ -120,26 +126,28 @@ def _check_rotations(parameters: wp.array) -> None:
         return
     values = parameters.numpy().astype(np.float64)
     if parameters.dtype is wp.vec4:
-        _refuse(np.linalg.norm(values, axis=-1) < MIN_LENGTH, f"quaternions shorter than {MIN_LENGTH:g}")
+        _refuse_faults(np.linalg.norm(values, axis=-1) < MIN_LENGTH, f"quaternions shorter than {MIN_LENGTH:g}")
         return
     if parameters.dtype is wp.mat33:
         largest, middle, smallest = np.moveaxis(np.linalg.svd(values, compute_uv=False), -1, 0)
-        _refuse(largest < MIN_LENGTH, f"matrices smaller than {MIN_LENGTH:g}")
+        _refuse_faults(largest < MIN_LENGTH, f"matrices smaller than {MIN_LENGTH:g}")
         gaps = middle + np.sign(np.linalg.det(values / largest[..., None, None])) * smallest
-        _refuse(gaps < MIN_ANGLE * largest, "matrices as near to several rotations, as mirrored ones are,")
+        _refuse_faults(gaps < MIN_ANGLE * largest, "matrices as near to several rotations, as mirrored ones are,")
         return
     x, y = values[..., :3], values[..., 3:]
     lengths = np.linalg.norm(x, axis=-1), np.linalg.norm(y, axis=-1)
-    _refuse(np.minimum(*lengths) < MIN_LENGTH, f"columns shorter than {MIN_LENGTH:g}")
+    _refuse_faults(np.minimum(*lengths) < MIN_LENGTH, f"columns shorter than {MIN_LENGTH:g}")
     areas = np.linalg.norm(np.cross(x, y), axis=-1)
-    _refuse(areas < MIN_ANGLE * lengths[0] * lengths[1], "pairs of parallel columns")
+    _refuse_faults(areas < MIN_ANGLE * lengths[0] * lengths[1], "pairs of parallel columns")
 
 
-def _refuse(faults: np.ndarray, what: str) -> None:
+def _refuse_faults(is_faulty: np.ndarray, fault: str) -> None:
     """Raise ValueError where there are faults [batch, body]."""
-    if faults.any():
-        place = tuple(int(i) for i in np.argwhere(faults)[0])
-        raise ValueError(f"parameters: got {int(faults.sum())} {what} (first at index {place}), expected rotations")
+    if is_faulty.any():
+        first_index = tuple(int(i) for i in np.argwhere(is_faulty)[0])
+        raise ValueError(
+            f"parameters: got {int(is_faulty.sum())} {fault} (first at index {first_index}), expected rotations"
+        )
 
 
 def check_orthonormal(matrices: np.ndarray) -> None:
@@ -147,11 +155,12 @@ def check_orthonormal(matrices: np.ndarray) -> None:
     check.finite("rotations", matrices)
     products = np.swapaxes(matrices, -1, -2) @ matrices
     gaps, determinants = np.abs(products - np.eye(3)).max(axis=(-1, -2)), np.linalg.det(matrices)
-    faults = (gaps > NOT_ORTHONORMAL) | (determinants < 0)
-    if faults.any():
-        place = tuple(int(i) for i in np.argwhere(faults)[0])
+    is_faulty = (gaps > NOT_ORTHONORMAL) | (determinants < 0)
+    if is_faulty.any():
+        first_index = tuple(int(i) for i in np.argwhere(is_faulty)[0])
         raise ValueError(
-            f"rotations: got {int(faults.sum())} matrices that are no rotations (first at index {place}: det R = "
-            f"{determinants[place]:.3g}, |RᵀR − I| = {gaps[place]:.3g}), expected det R > 0 and |RᵀR − I| up to "
-            f"{NOT_ORTHONORMAL}, as rotation_matrices makes them of any nine numbers; to resize bodies there are scales"
+            f"rotations: got {int(is_faulty.sum())} matrices that are no rotations (first at index {first_index}: "
+            f"det R = {determinants[first_index]:.3g}, |RᵀR − I| = {gaps[first_index]:.3g}), expected det R > 0 and "
+            f"|RᵀR − I| up to {NOT_ORTHONORMAL}, as rotation_matrices makes them of any nine numbers; to resize bodies "
+            "there are scales"
         )

@@ -1,7 +1,7 @@
 """Sample receivers: points that samples see, at which light is evaluated for them.
 
 Samples of a pixel that see the same side share one, at the mean of their points: with four samples a pixel that is 1.1
-to 1.5 receivers a pixel, where faces have 400 to 10 pixels. In stills those that see different faces share one, too, if
+to 1.5 receivers a pixel, where faces have 400 to 10 pixels. In stills samples of different faces share one, too, if
 these belong to one smooth piece and the surface is even: shared by two slats of a bench, it lay in the gap or in the
 leg behind, and was black. (Stills of the cage of demos/kinds.py, 128², were 3.5% off, and are 2.5%.) In squares of a
 quadtree there is one at each corner, and samples interpolate in triangles of these.
@@ -23,8 +23,10 @@ from warpshadow.stages.rasterization import Fragments
 
 TILE = 16  # pixels of a side of the tiles whose receivers follow each other
 
-ALIKE = 0.9  # cosine between normals of samples of a pixel from which they may share a receiver …
-LEVEL = 0.3  # … where a line from one to the other is not steeper than that: the sine of its angle to the surface
+MIN_SHARED_COSINE = 0.9  # cosine between normals of samples of a pixel from which they may share a receiver …
+MAX_SHARED_SLOPE = (
+    0.3  # … where a line from one to the other is not steeper than that: the sine of its angle to the surface
+)
 
 _SHARING_COST, _SAMPLE_COST = 12.0, 3.5  # nanoseconds of a sample, to find whose receiver it shares and to get it
 
@@ -38,13 +40,13 @@ class Span(NamedTuple):
 
 
 def spans_of(bodies: np.ndarray) -> tuple[Span, ...]:
-    """Runs of the same body."""
+    """Split a list of bodies into spans of the same body."""
     changes = np.flatnonzero(np.diff(bodies)) + 1
     bounds = [0, *changes.tolist(), len(bodies)] if len(bodies) else []
     return tuple(Span(int(bodies[first]), first, end) for first, end in itertools.pairwise(bounds))
 
 
-class SeenSurface(NamedTuple):
+class VisibleSurface(NamedTuple):
     """The points that samples see."""
 
     points: wp.array  # [view, sample] vec3
@@ -67,12 +69,14 @@ class SampleReceivers(NamedTuple):
 def _is_one_surface(points: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3), sample: int, other: int):
     """Whether two samples see one smooth surface, which is not steep between them."""
     normal = normals[sample]
-    step = points[other] - points[sample]
-    return wp.dot(normal, normals[other]) > ALIKE and wp.abs(wp.dot(normal, step)) <= LEVEL * wp.length(step)
+    offset = points[other] - points[sample]
+    return wp.dot(normal, normals[other]) > MIN_SHARED_COSINE and wp.abs(
+        wp.dot(normal, offset)
+    ) <= MAX_SHARED_SLOPE * wp.length(offset)
 
 
 @wp.kernel(enable_backward=False)
-def _find_sharing(
+def _find_owner_samples(
     first_row: int,
     worker: int,
     # in
@@ -83,7 +87,7 @@ def _find_sharing(
     barycentrics: wp.array2d(dtype=wp.vec3),
     wants_samples: wp.array(dtype=wp.bool),
     sizes: wp.array3d(dtype=wp.int32),
-    numbers: wp.array3d(dtype=wp.int32),
+    receiver_numbers: wp.array3d(dtype=wp.int32),
     is_corner: wp.array2d(dtype=wp.bool),
     keys: wp.array(dtype=wp.int32),
     width: int,
@@ -110,19 +114,21 @@ def _find_sharing(
         square = int(0)
         square_key = int(-1)
         corner_key = int(-1)
-        low = wp.vec2()  # of the pixel in the square, from 0 to 1
-        step = wp.vec2()  # of a sample
+        square_position = wp.vec2()  # of the pixel in the square, from 0 to 1
+        sample_step = wp.vec2()  # of a sample
         if sizes:
             size = sizes[view, row, column]
             if size > 0:
                 top = row & -size
                 left = column & -size
-                square = -2 - 2 * numbers[view, top, left]
+                square = -2 - 2 * receiver_numbers[view, top, left]
                 square_key = keys[sides[view, sample_at(top, left, supersampling, height, width)]]
-                wide = wp.min((left + size) * supersampling, width - 1) - left * supersampling
-                tall = wp.min((top + size) * supersampling, height - 1) - top * supersampling
-                step = wp.vec2(1.0 / float(wp.max(wide, 1)), 1.0 / float(wp.max(tall, 1)))
-                low = float(supersampling) * wp.vec2(float(column - left) * step[0], float(row - top) * step[1])
+                square_width = wp.min((left + size) * supersampling, width - 1) - left * supersampling
+                square_height = wp.min((top + size) * supersampling, height - 1) - top * supersampling
+                sample_step = wp.vec2(1.0 / float(wp.max(square_width, 1)), 1.0 / float(wp.max(square_height, 1)))
+                square_position = float(supersampling) * wp.vec2(
+                    float(column - left) * sample_step[0], float(row - top) * sample_step[1]
+                )
             if is_corner[view, corner]:
                 corner_key = keys[sides[view, corner]]
         for i in range(supersampling):
@@ -130,122 +136,122 @@ def _find_sharing(
                 sample = corner + i * width + j
                 side = sides[view, sample]
                 weight = barycentrics[view, sample]
-                owner = int(-1)
+                owner_sample = int(-1)
                 key = int(-1)
                 if sizes and side >= 0:
                     key = keys[side]
                 if key >= 0 and key == square_key:
-                    u = low[0] + float(j) * step[0]
-                    v = low[1] + float(i) * step[1]
-                    owner = square
+                    u = square_position[0] + float(j) * sample_step[0]
+                    v = square_position[1] + float(i) * sample_step[1]
+                    owner_sample = square
                     weight = wp.vec3(1.0 - u - v, u, v)
                     if u + v > 1.0:
-                        owner -= 1
+                        owner_sample -= 1
                         weight = wp.vec3(u + v - 1.0, 1.0 - u, 1.0 - v)
                 elif key >= 0 and key == corner_key:
-                    owner = corner
+                    owner_sample = corner
                     weight = wp.vec3(1.0, 0.0, 0.0)
                 elif side >= 0 and wants_samples[side % wants_samples.shape[0]]:
-                    owner = sample
+                    owner_sample = sample
                     weight = wp.vec3(1.0, 0.0, 0.0)
                     for k in range(i * supersampling + j):
                         other = corner + k // supersampling * width + k % supersampling
-                        if owner == sample and sides[view, other] == side:
-                            owner = owner_samples[view, other]
+                        if owner_sample == sample and sides[view, other] == side:
+                            owner_sample = owner_samples[view, other]
                         # (kernels evaluate both sides of "and")
-                        if points and owner == sample and owner_samples[view, other] == other:
+                        if points and owner_sample == sample and owner_samples[view, other] == other:
                             other_side = sides[view, other]
                             # (two slats are no surface, however even they are)
                             if pieces[side % pieces.shape[0]] == pieces[other_side % pieces.shape[0]]:  # noqa: SIM102
                                 if _is_one_surface(points[view], normals[view], sample, other):
-                                    owner = other
-                owner_samples[view, sample] = owner
+                                    owner_sample = other
+                owner_samples[view, sample] = owner_sample
                 weights[view, sample] = weight
-                has_receiver = owner == sample
+                has_receiver = owner_sample == sample
                 if sizes:
                     has_receiver = has_receiver or is_corner[view, sample]
                 is_owner[view, sample] = has_receiver
 
 
 @wp.kernel(enable_backward=False)
-def _see_fragments(
+def _number_fragments(
     first_row: int,
     worker: int,
     # in
     sides: wp.array2d(dtype=wp.int32),
     owner_samples: wp.array2d(dtype=wp.int32),
     is_owner: wp.array2d(dtype=wp.bool),
-    numbers: wp.array2d(dtype=wp.int32),
+    receiver_numbers: wp.array2d(dtype=wp.int32),
     body_ranks: wp.array(dtype=wp.int32),
     side_count: int,
     run: int,
     # out
-    own_sides: wp.array2d(dtype=wp.int32),
+    receiver_sides: wp.array2d(dtype=wp.int32),
     samples: wp.array2d(dtype=wp.int32),
 ):
     """A thread owns a run of samples.
 
-    ``numbers`` are the receivers' numbers; where they cannot be read (a capture), each body gets a range with a place
-    for every sample.
+    ``receiver_numbers`` are the receivers' numbers; where they cannot be read (a capture), each body gets a range with
+    a place for every sample.
     """
     view, thread = split_row(first_row + wp.tid(), sides.shape[1] // run)
     for sample in range(thread * run, (thread + 1) * run):
         side = sides[view, sample]
-        owner = owner_samples[view, sample]
+        owner_sample = owner_samples[view, sample]
         first_number = int(0)
-        if not numbers and side >= 0:
+        if not receiver_numbers and side >= 0:
             first_number = body_ranks[side % body_ranks.shape[0]] * sides.shape[1]
-        if owner >= 0:
-            number = first_number + owner
-            if numbers:
-                number = numbers[view, owner]
+        if owner_sample >= 0:
+            number = first_number + owner_sample
+            if receiver_numbers:
+                number = receiver_numbers[view, owner_sample]
             side = side_count + number
-        elif owner < -1:
-            side = side_count + samples.shape[1] - 2 - owner
-        own_sides[view, sample] = side
+        elif owner_sample < -1:
+            side = side_count + samples.shape[1] - 2 - owner_sample
+        receiver_sides[view, sample] = side
         if is_owner[view, sample]:
             number = first_number + sample
-            if numbers:
-                number = numbers[view, sample]
+            if receiver_numbers:
+                number = receiver_numbers[view, sample]
             samples[view, number] = sample
 
 
 @wp.func
-def _shares(
+def _shares_receiver(
     owner_samples: wp.array(dtype=wp.int32), sides: wp.array(dtype=wp.int32), is_corner: bool, sample: int, other: int
 ):
-    """Whether an owner's receiver takes the mean with another sample: of its face, and not at squares' corners."""
+    """Whether two samples average their barycentrics: on one face, and not at the corner of a square."""
     return other == sample or (owner_samples[other] == sample and sides[other] == sides[sample] and not is_corner)
 
 
 @wp.func
 def _nearest_on_edge(start: wp.vec3, end: wp.vec3, point: wp.vec3):
-    """How far along an edge the point on it is that is nearest to a point, from 0 to 1."""
-    step = end - start
-    return wp.clamp(wp.dot(point - start, step) / wp.max(wp.length_sq(step), 1.0e-37), 0.0, 1.0)
+    """Position on an edge, 0 to 1, of the point that is nearest to a given point."""
+    edge_vector = end - start
+    return wp.clamp(wp.dot(point - start, edge_vector) / wp.max(wp.length_sq(edge_vector), 1.0e-37), 0.0, 1.0)
 
 
 @wp.func
-def _nearest(point: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+def _nearest_on_face(point: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
     """Barycentrics of the point on a face that is nearest to a point."""
     doubled_normal = wp.cross(b - a, c - a)
-    doubled = wp.max(wp.length_sq(doubled_normal), 1.0e-37)
-    v = wp.dot(wp.cross(a - c, point - c), doubled_normal) / doubled
-    w = wp.dot(wp.cross(b - a, point - a), doubled_normal) / doubled
+    squared_length = wp.max(wp.length_sq(doubled_normal), 1.0e-37)
+    v = wp.dot(wp.cross(a - c, point - c), doubled_normal) / squared_length
+    w = wp.dot(wp.cross(b - a, point - a), doubled_normal) / squared_length
     weights = wp.vec3(1.0 - v - w, v, w)
     if wp.min(weights) < 0.0:
-        nearest = float(wp.inf)
+        min_distance = float(wp.inf)
         corners = wp.matrix_from_rows(a, b, c)
         for k in range(3):
             start = corners[k]
             end = corners[(k + 1) % 3]
-            part = _nearest_on_edge(start, end, point)
-            distance = wp.length_sq(start + part * (end - start) - point)
-            if distance < nearest:
-                nearest = distance
+            edge_share = _nearest_on_edge(start, end, point)
+            distance = wp.length_sq(start + edge_share * (end - start) - point)
+            if distance < min_distance:
+                min_distance = distance
                 weights = wp.vec3()
-                weights[k] = 1.0 - part
-                weights[(k + 1) % 3] = part
+                weights[k] = 1.0 - edge_share
+                weights[(k + 1) % 3] = edge_share
     return weights
 
 
@@ -263,7 +269,7 @@ def _find_means(
     width: int,
     supersampling: int,
     # out
-    seen_sides: wp.array2d(dtype=wp.int32),
+    fragment_sides: wp.array2d(dtype=wp.int32),
     means: wp.array2d(dtype=wp.vec3),
     counts: wp.array2d(dtype=wp.int32),
 ):
@@ -275,29 +281,29 @@ def _find_means(
     count = int(0)
     if sample >= 0:
         side = sides[view, sample]
-        at_corner = bool(False)
+        is_at_corner = bool(False)
         if is_corner:
-            at_corner = is_corner[view, sample]
-        total = wp.vec3()
+            is_at_corner = is_corner[view, sample]
+        barycentric_sum = wp.vec3()
         corner = (sample // width // supersampling * width + sample % width // supersampling) * supersampling
         for i in range(supersampling * supersampling):
             other = corner + i // supersampling * width + i % supersampling
-            if _shares(owner_samples[view], sides[view], at_corner, sample, other):
-                total += barycentrics[view, other]
+            if _shares_receiver(owner_samples[view], sides[view], is_at_corner, sample, other):
+                barycentric_sum += barycentrics[view, other]
                 count += 1
-        mean = total / float(count)
+        mean = barycentric_sum / float(count)
         if points:
             # the mean point of all faces that share, or the point nearest to it on one of them
-            middle = wp.vec3()
-            shared = int(0)
+            mean_point = wp.vec3()
+            shared_count = int(0)
             for i in range(supersampling * supersampling):
                 other = corner + i // supersampling * width + i % supersampling
                 if owner_samples[view, other] == sample:
-                    middle += points[view, other]
-                    shared += 1
-            if shared > count:
-                middle = middle / float(shared)
-                nearest = float(wp.inf)
+                    mean_point += points[view, other]
+                    shared_count += 1
+            if shared_count > count:
+                mean_point = mean_point / float(shared_count)
+                min_distance = float(wp.inf)
                 for i in range(supersampling * supersampling):
                     other = corner + i // supersampling * width + i % supersampling
                     if owner_samples[view, other] == sample:
@@ -305,13 +311,13 @@ def _find_means(
                         a = positions[face[0]]
                         b = positions[face[1]]
                         c = positions[face[2]]
-                        weights = _nearest(middle, a, b, c)
-                        distance = wp.length_sq(weights[0] * a + weights[1] * b + weights[2] * c - middle)
-                        if distance < nearest:
-                            nearest = distance
+                        weights = _nearest_on_face(mean_point, a, b, c)
+                        distance = wp.length_sq(weights[0] * a + weights[1] * b + weights[2] * c - mean_point)
+                        if distance < min_distance:
+                            min_distance = distance
                             side = sides[view, other]
                             mean = weights
-    seen_sides[view, receiver] = side
+    fragment_sides[view, receiver] = side
     means[view, receiver] = mean
     counts[view, receiver] = count
 
@@ -334,14 +340,14 @@ def _find_means_adjoint(
     view, receiver = wp.tid()
     sample = samples[view, receiver]
     if sample >= 0:
-        at_corner = bool(False)
+        is_at_corner = bool(False)
         if is_corner:
-            at_corner = is_corner[view, sample]
+            is_at_corner = is_corner[view, sample]
         adj = adj_means[view, receiver] / float(counts[view, receiver])
         corner = (sample // width // supersampling * width + sample % width // supersampling) * supersampling
         for i in range(supersampling * supersampling):
             other = corner + i // supersampling * width + i % supersampling
-            if _shares(owner_samples[view], sides[view], at_corner, sample, other):
+            if _shares_receiver(owner_samples[view], sides[view], is_at_corner, sample, other):
                 wp.atomic_add(adj_barycentrics, view, other, adj)
 
 
@@ -352,11 +358,11 @@ def find_sample_receivers(
     bodies: np.ndarray,
     supersampling: int,
     quadtree: Quadtree | None = None,
-    surface: SeenSurface | None = None,
+    surface: VisibleSurface | None = None,
 ) -> SampleReceivers:
     """Find the receivers of samples.
 
-    They come body by body. While a graph is captured nobody knows how many there are, and each body has room for one at
+    They come body by body. While a graph is captured their number is unknown, and each body has room for one at
     every sample.
 
     Args:
@@ -366,7 +372,7 @@ def find_sample_receivers(
         bodies: Body of each face, −1 for faces that need not be told apart, shape [face].
         supersampling: Samples of a pixel across and down.
         quadtree: Squares at whose corners there are receivers; None for none.
-        surface: What samples see, of one instance, where those of a pixel share a receiver that see different faces
+        surface: Visible surface of one instance, where samples of a pixel share a receiver if they see different faces
             of one smooth surface, too; None where they do not.
     Differentiable: barycentrics, where receivers see them.
     """
@@ -377,12 +383,12 @@ def find_sample_receivers(
     if quadtree is not None:
         sizes, squares, keys = quadtree.sizes, quadtree.numbers, quadtree.keys
         is_corner = from_numpy(quadtree.is_corner, dtype=wp.bool, device=device)
-    owner_samples, own_sides = (empty(sides.shape, dtype=wp.int32, device=device) for _ in range(2))
+    owner_samples, receiver_sides = (empty(sides.shape, dtype=wp.int32, device=device) for _ in range(2))
     weights = empty(sides.shape, dtype=wp.vec3, device=device)
     is_owner = empty(sides.shape, dtype=wp.bool, device=device)
     run = run_length(device, width // supersampling)
     launch(
-        _find_sharing,
+        _find_owner_samples,
         view_count * (sample_count // supersampling**2 // run),
         cost=_SHARING_COST * supersampling**2 * run,
         inputs=[
@@ -400,37 +406,39 @@ def find_sample_receivers(
         ],
         outputs=[owner_samples, weights, is_owner],
     )
-    names, body_ranks, ranks_on_device = _body_ranks(bodies, wants_samples, device)
+    body_ids, body_ranks, ranks_on_device = _body_ranks(bodies, wants_samples, device)
     triangles = np.empty((0, 3), np.int32)
-    numbers, ends = None, sample_count * np.arange(len(names) + 1)
+    receiver_numbers, ends = None, sample_count * np.arange(len(body_ids) + 1)
     if not device.is_capturing:
-        chosen = np.flatnonzero(is_owner.numpy())
-        rank = body_ranks[sides.numpy().ravel()[chosen] % len(bodies)]
+        owner_indices = np.flatnonzero(is_owner.numpy())
+        ranks = body_ranks[sides.numpy().ravel()[owner_indices] % len(bodies)]
         if quadtree is not None:
             # in tiles: light is found fastest where neighbors follow each other
-            tile = chosen // width // (TILE * supersampling) * width + chosen % width // (TILE * supersampling)
-            permutation = np.argsort(tile, kind="stable")
-            chosen, rank = chosen[permutation], rank[permutation]
-        numbers_of_chosen, ends = _packed_by_body(chosen // sample_count, rank, view_count, len(names))
-        numbers_of = np.empty(sides.size, np.int32)
-        numbers_of[chosen] = numbers_of_chosen
-        numbers = from_numpy(numbers_of.reshape(sides.shape), dtype=wp.int32, device=device)
+            tiles = owner_indices // width // (TILE * supersampling) * width + owner_indices % width // (
+                TILE * supersampling
+            )
+            permutation = np.argsort(tiles, kind="stable")
+            owner_indices, ranks = owner_indices[permutation], ranks[permutation]
+        owner_numbers, ends = _number_by_body(owner_indices // sample_count, ranks, view_count, len(body_ids))
+        number_of_samples = np.empty(sides.size, np.int32)
+        number_of_samples[owner_indices] = owner_numbers
+        receiver_numbers = from_numpy(number_of_samples.reshape(sides.shape), dtype=wp.int32, device=device)
         if quadtree is not None:
-            triangles = numbers_of[quadtree.triangles]
+            triangles = number_of_samples[quadtree.triangles]
     samples = wp.full((view_count, int(ends[-1])), -1, dtype=wp.int32, device=device)
     run = run_length(device, width)
     launch(
-        _see_fragments,
+        _number_fragments,
         view_count * (sample_count // run),
         cost=_SAMPLE_COST * run,
-        inputs=[sides, owner_samples, is_owner, numbers, ranks_on_device, side_count, run],
-        outputs=[own_sides, samples],
+        inputs=[sides, owner_samples, is_owner, receiver_numbers, ranks_on_device, side_count, run],
+        outputs=[receiver_sides, samples],
     )
-    seen_sides, counts = (empty(samples.shape, dtype=wp.int32, device=device) for _ in range(2))
-    on_surface = (surface.points, surface.positions, surface.faces) if surface else (None, None, None)
-    inputs = [*on_surface, sides, barycentrics, owner_samples, is_corner, samples, width, supersampling]
+    fragment_sides, counts = (empty(samples.shape, dtype=wp.int32, device=device) for _ in range(2))
+    surface_arrays = (surface.points, surface.positions, surface.faces) if surface else (None, None, None)
+    inputs = [*surface_arrays, sides, barycentrics, owner_samples, is_corner, samples, width, supersampling]
     means = differentiable(
-        lambda means: launch(_find_means, samples.shape, inputs=inputs, outputs=[seen_sides, means, counts]),
+        lambda means: launch(_find_means, samples.shape, inputs=inputs, outputs=[fragment_sides, means, counts]),
         lambda adj_means: launch(
             _find_means_adjoint,
             samples.shape,
@@ -441,12 +449,12 @@ def find_sample_receivers(
         variables=[barycentrics],
     )
     return SampleReceivers(
-        Fragments(own_sides.reshape(shape), weights.reshape(shape)),
-        Fragments(seen_sides, means),
+        Fragments(receiver_sides.reshape(shape), weights.reshape(shape)),
+        Fragments(fragment_sides, means),
         triangles,
         tuple(
-            Span(name, first, end)
-            for name, (first, end) in zip(names.tolist(), itertools.pairwise(ends.tolist()), strict=True)
+            Span(body_id, first, end)
+            for body_id, (first, end) in zip(body_ids.tolist(), itertools.pairwise(ends.tolist()), strict=True)
             if end > first
         ),
     )
@@ -457,43 +465,44 @@ def _body_ranks(
     bodies: np.ndarray, wants_samples: np.ndarray, device: wp.DeviceLike
 ) -> tuple[np.ndarray, np.ndarray, wp.array]:
     """The bodies whose samples have receivers, and the rank among them of each face's body; that on the device, too."""
-    names = np.unique(bodies[wants_samples])
-    body_ranks = np.searchsorted(names, bodies)
-    return names, body_ranks, constant(body_ranks, wp.int32, device)
+    body_ids = np.unique(bodies[wants_samples])
+    body_ranks = np.searchsorted(body_ids, bodies)
+    return body_ids, body_ranks, constant(body_ranks, wp.int32, device)
 
 
-def _packed_by_body(
-    view: np.ndarray, rank: np.ndarray, view_count: int, body_count: int
+def _number_by_body(
+    views: np.ndarray, ranks: np.ndarray, view_count: int, body_count: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Number receivers body by body, with as many numbers for a body as the view with the most of its receivers has.
 
     Args:
-        view, rank: View and body of each receiver.
+        views, ranks: View and body of each receiver.
         view_count, body_count: Numbers of them.
     Returns:
         The number of each; and where the bodies begin, and the last ends.
     """
-    view_and_body = view * body_count + rank
+    view_and_body = views * body_count + ranks
     counts = np.bincount(view_and_body, minlength=view_count * body_count)
     ends = np.concatenate([[0], np.cumsum(counts.reshape(view_count, body_count).max(axis=0))])
-    places = np.empty(len(view_and_body), int)
+    positions_in_body = np.empty(len(view_and_body), int)
     permutation = np.argsort(view_and_body, kind="stable")
-    places[permutation] = np.arange(len(view_and_body)) - np.repeat(np.cumsum(counts) - counts, counts)
-    return places + ends[rank], ends
+    positions_in_body[permutation] = np.arange(len(view_and_body)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return positions_in_body + ends[ranks], ends
 
 
-def see_samples(fragments: Fragments, samples: np.ndarray) -> Fragments:
-    """Fragments of some samples: sides and barycentrics [view, sample], without a gradient.
+def fragments_of_samples(fragments: Fragments, samples: np.ndarray) -> Fragments:
+    """Select the fragments of some samples: sides and barycentrics [view, sample], without a gradient.
 
     Args:
         fragments: The fragments of all samples.
         samples: Which, int of shape [view, sample], −1 for none.
     """
     sides = rows(fragments.face_ids if fragments.sides is None else fragments.sides)
-    view = np.arange(len(samples))[:, None]
-    seen_sides = np.where(samples < 0, -1, sides.numpy()[view, samples])
-    seen = rows(fragments.barycentrics).numpy()[view, samples]
+    views = np.arange(len(samples))[:, None]
+    fragment_sides = np.where(samples < 0, -1, sides.numpy()[views, samples])
+    fragment_barycentrics = rows(fragments.barycentrics).numpy()[views, samples]
     device = sides.device
     return Fragments(
-        from_numpy(seen_sides, dtype=wp.int32, device=device), from_numpy(seen, dtype=wp.vec3, device=device)
+        from_numpy(fragment_sides, dtype=wp.int32, device=device),
+        from_numpy(fragment_barycentrics, dtype=wp.vec3, device=device),
     )

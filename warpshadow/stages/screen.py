@@ -1,13 +1,13 @@
 """Screen: where samples, lines and planes lie in an image.
 
 An image consists of *samples*: its pixels, or the parts of pixels at which a supersampled image is evaluated. All
-stages that ask where something lies in an image agree on this:
+stages that locate points in an image agree on this:
 
     sample        number row · width + column, from the top left; in flat images of a batch, instances follow each other
     position      (x, y) from −1 to 1, x to the right and y downwards: the x/w and y/w of clip space
     center        of the sample at (column, row): ((2 column + 1) / width − 1, (2 row + 1) / height − 1)
     vertex        its (x, y, w) in clip space; z is for depth alone
-    relative      (x − w x₀, y − w y₀, w), relative to the ray through a position (x₀, y₀): nothing cancels near the ray
+    to a ray      (x − w x₀, y − w y₀, w), relative to the ray through a position (x₀, y₀): nothing cancels near the ray
     line          ℓ with ℓ·(x, y, 1) = 0; a × b is the line through vertices a and b
     plane         n with n·(x, y, w) = 1; relative to a ray, n_w is the 1/w at which the ray meets it
     direction     from a sample's center to that of a neighbor: 0 right, 1 left, 2 below, 3 above
@@ -50,7 +50,7 @@ def neighbor(sample: int, direction: int, width: int):
 
 @wp.func
 def has_neighbor(sample: int, direction: int, width: int, height: int):
-    """Whether the image goes on in that direction."""
+    """Whether a sample has a neighbor in a direction."""
     row = sample / width
     place = wp.where(direction < 2, sample - row * width, row % height)
     last = wp.where(direction < 2, width, height) - 1
@@ -64,7 +64,7 @@ def opposite(direction: int):
 
 
 @wp.func
-def sense(direction: int):
+def direction_sign(direction: int):
     """1 where a direction leads to larger positions, else −1."""
     return 1.0 - 2.0 * float(direction % 2)
 
@@ -73,14 +73,14 @@ def sense(direction: int):
 
 
 @wp.func
-def relative(vertex: wp.vec4, position: wp.vec2):
+def relative_to_ray(vertex: wp.vec4, position: wp.vec2):
     """A vertex relative to the ray through a position."""
     return wp.vec3(vertex[0] - position[0] * vertex[3], vertex[1] - position[1] * vertex[3], vertex[3])
 
 
 @wp.func
-def relative_adjoint(position: wp.vec2, adj_relative: wp.vec3):
-    """The adjoint of `relative`, by the vertex."""
+def relative_to_ray_adjoint(position: wp.vec2, adj_relative: wp.vec3):
+    """The adjoint of `relative_to_ray`, by the vertex."""
     return wp.vec4(
         adj_relative[0],
         adj_relative[1],
@@ -90,24 +90,24 @@ def relative_adjoint(position: wp.vec2, adj_relative: wp.vec3):
 
 
 @wp.func
-def volumes(a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """Volumes spanned by a ray with two vertices each, given relative to it: all of one sign inside of the face abc."""
+def ray_volumes(a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    """Volumes spanned by a ray and two vertices each, relative to the ray: of one sign where the ray meets face abc."""
     return wp.vec3(b[0] * c[1] - b[1] * c[0], c[0] * a[1] - c[1] * a[0], a[0] * b[1] - a[1] * b[0])
 
 
 @wp.func
 def orientation(a: wp.vec4, b: wp.vec4, c: wp.vec4):
-    """Volume that the eye spans with a face: its sign says which way around the face is seen."""
+    """Volume that the eye spans with a face; its sign is the winding of the face on screen."""
     origin = wp.vec3(a[0], a[1], a[3])
     return wp.dot(wp.cross(wp.vec3(b[0], b[1], b[3]) - origin, wp.vec3(c[0], c[1], c[3]) - origin), origin)
 
 
 @wp.func
-def plane(corners: wp.vec3i, position: wp.vec2, clip_positions: wp.array(dtype=wp.vec4)):
+def face_plane(corners: wp.vec3i, position: wp.vec2, clip_positions: wp.array(dtype=wp.vec4)):
     """Plane of a face, relative to the ray through a position."""
-    a = relative(clip_positions[corners[0]], position)
-    b = relative(clip_positions[corners[1]], position)
-    c = relative(clip_positions[corners[2]], position)
+    a = relative_to_ray(clip_positions[corners[0]], position)
+    b = relative_to_ray(clip_positions[corners[1]], position)
+    c = relative_to_ray(clip_positions[corners[2]], position)
     normal = wp.cross(b - a, c - a)
     return normal / wp.dot(normal, a)
 
@@ -116,15 +116,15 @@ def plane(corners: wp.vec3i, position: wp.vec2, clip_positions: wp.array(dtype=w
 
 
 @wp.func
-def distance(line: wp.vec3, direction: int, half: wp.vec2):
+def line_distance(line: wp.vec3, direction: int, half: wp.vec2):
     """Distance at which a line, relative to a sample's center, crosses a direction; ``half`` is `half_size`."""
     axis = direction / 2
-    return -sense(direction) * half[axis] * line[2] / line[axis]
+    return -direction_sign(direction) * half[axis] * line[2] / line[axis]
 
 
 @wp.func
-def lean(line: wp.vec3, direction: int, half: wp.vec2):
-    """How far along a direction a line moves from one row (or column) of samples to the next [samples]."""
+def line_slope(line: wp.vec3, direction: int, half: wp.vec2):
+    """Slope of a line: by how much it moves along a direction from one row (or column) to the next [samples]."""
     axis = direction / 2
     return wp.abs(line[1 - axis] / line[axis]) * half[axis] / half[1 - axis]
 
@@ -132,4 +132,4 @@ def lean(line: wp.vec3, direction: int, half: wp.vec2):
 @wp.func
 def ends_before(line: wp.vec3, direction: int):
     """Whether a line, positive on the surface that ends there, bounds the surface of the sample, not its neighbor."""
-    return -sense(direction) * line[direction / 2] > 0.0
+    return -direction_sign(direction) * line[direction / 2] > 0.0

@@ -28,15 +28,15 @@ def _make_recurrence(order: int) -> tuple[wp.Function, wp.Function, wp.Function]
     def values(table: np.ndarray) -> str:
         return f"static const float values[] = {{{', '.join(f'{float(np.float32(x))!r}f' for x in table.ravel())}}};"
 
-    of_diagonal, of_up, of_back = map(values, schmidt_recurrence(order))
+    diagonal_code, up_code, back_code = map(values, schmidt_recurrence(order))
 
-    @wp.func_native(f"{of_diagonal} return values[m];")
+    @wp.func_native(f"{diagonal_code} return values[m];")
     def diagonal(m: int) -> float: ...  # type: ignore[empty-body]
 
-    @wp.func_native(f"{of_up} return values[{order} * band + m];")
+    @wp.func_native(f"{up_code} return values[{order} * band + m];")
     def up(band: int, m: int) -> float: ...  # type: ignore[empty-body]
 
-    @wp.func_native(f"{of_back} return values[{order} * band + m];")
+    @wp.func_native(f"{back_code} return values[{order} * band + m];")
     def back(band: int, m: int) -> float: ...  # type: ignore[empty-body]
 
     return diagonal, up, back
@@ -62,12 +62,12 @@ def make_add_rotated_zonal(order: int, lanes: int) -> wp.Function:
                 coefficients[center + m] = coefficients[center + m] + wp.cw_mul(weight, cosine)
                 if m > 0:
                     coefficients[center - m] = coefficients[center - m] + wp.cw_mul(weight, sine)
-                above = up(band, m) * wp.cw_mul(direction.z, legendre) - back(band, m) * previous
+                next_legendre = up(band, m) * wp.cw_mul(direction.z, legendre) - back(band, m) * previous
                 previous = legendre
-                legendre = above
-            turned = wp.cw_mul(cosine, direction.x) - wp.cw_mul(sine, direction.y)
+                legendre = next_legendre
+            next_cosine = wp.cw_mul(cosine, direction.x) - wp.cw_mul(sine, direction.y)
             sine = wp.cw_mul(cosine, direction.y) + wp.cw_mul(sine, direction.x)
-            cosine = turned
+            cosine = next_cosine
 
     return add_rotated_zonal
 
@@ -99,27 +99,31 @@ def make_rotated_zonal_adjoint(order: int, lanes: int) -> wp.Function:
             slope = Lane(0.0)
             for band in range(m, order):
                 center = band * band + band
-                even = adj_coefficients[center + m]
-                odd = Lane(0.0)
+                even_coefficient = adj_coefficients[center + m]
+                odd_coefficient = Lane(0.0)
                 if m > 0:
-                    odd = adj_coefficients[center - m]
-                adj_m = wp.cw_mul(even, cosine) + wp.cw_mul(odd, sine)
+                    odd_coefficient = adj_coefficients[center - m]
+                adj_m = wp.cw_mul(even_coefficient, cosine) + wp.cw_mul(odd_coefficient, sine)
                 adj_zonal[band] = adj_zonal[band] + wp.cw_mul(legendre, adj_m)
                 adj_z += wp.cw_mul(zonal[band], wp.cw_mul(slope, adj_m))
                 weight = float(m) * wp.cw_mul(zonal[band], legendre)
-                adj_x += wp.cw_mul(weight, wp.cw_mul(even, cosine_below) + wp.cw_mul(odd, sine_below))
-                adj_y += wp.cw_mul(weight, wp.cw_mul(odd, cosine_below) - wp.cw_mul(even, sine_below))
-                above = up(band, m) * wp.cw_mul(direction.z, legendre) - back(band, m) * previous
+                adj_x += wp.cw_mul(
+                    weight, wp.cw_mul(even_coefficient, cosine_below) + wp.cw_mul(odd_coefficient, sine_below)
+                )
+                adj_y += wp.cw_mul(
+                    weight, wp.cw_mul(odd_coefficient, cosine_below) - wp.cw_mul(even_coefficient, sine_below)
+                )
+                next_legendre = up(band, m) * wp.cw_mul(direction.z, legendre) - back(band, m) * previous
                 slope_above = up(band, m) * (legendre + wp.cw_mul(direction.z, slope)) - back(band, m) * slope_previous
                 previous = legendre
-                legendre = above
+                legendre = next_legendre
                 slope_previous = slope
                 slope = slope_above
             cosine_below = cosine
             sine_below = sine
-            turned = wp.cw_mul(cosine, direction.x) - wp.cw_mul(sine, direction.y)
+            next_cosine = wp.cw_mul(cosine, direction.x) - wp.cw_mul(sine, direction.y)
             sine = wp.cw_mul(cosine, direction.y) + wp.cw_mul(sine, direction.x)
-            cosine = turned
+            cosine = next_cosine
         return Vectors(adj_x, adj_y, adj_z), adj_zonal
 
     return adjoint

@@ -15,7 +15,7 @@ from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK
 from warpshadow.stages.transfer import cell_inputs, spread, transfer_chunk
 
-_SLAB = 256  # receivers whose gradients to light a thread sums before it adds them to the others'
+_SLICE = 256  # receivers whose gradients to light a thread sums before it adds them to the others'
 _COEFFICIENT_COST, _RECEIVER_COST = 0.4, 30.0  # nanoseconds that a coefficient of a receiver takes, and a receiver
 
 
@@ -47,7 +47,7 @@ def _join_channels(
 
 
 @wp.func
-def _sum(values: Chunk):
+def _sum_chunk(values: Chunk):
     total = float(0.0)
     for i in range(CHUNK):
         total += values[i]
@@ -78,12 +78,12 @@ def _shade(
         red += wp.cw_mul(t, light_chunks[light_batch, 0, chunk])
         green += wp.cw_mul(t, light_chunks[light_batch, 1, chunk])
         blue += wp.cw_mul(t, light_chunks[light_batch, 2, chunk])
-    total = wp.vec3(_sum(red), _sum(green), _sum(blue))
+    irradiance = wp.vec3(_sum_chunk(red), _sum_chunk(green), _sum_chunk(blue))
     for k in range(CHUNK * transfer_chunks.shape[2], transfer.shape[2]):
-        total += transfer[transfer_batch, vertex, k] * wp.vec3(
+        irradiance += transfer[transfer_batch, vertex, k] * wp.vec3(
             light[light_batch, 0, k], light[light_batch, 1, k], light[light_batch, 2, k]
         )
-    shading[batch, vertex] = total
+    shading[batch, vertex] = irradiance
 
 
 @wp.kernel(enable_backward=False)
@@ -106,17 +106,17 @@ def _shade_adjoint_transfer(
         end = adj_shading.shape[0]
     for batch in range(begin, end):
         light_batch = instance_in(batch, light.shape[0])
-        adj = adj_shading[batch, vertex]
+        adj_vertex = adj_shading[batch, vertex]
         for chunk in range(light_chunks.shape[2]):
             adj_transfer_chunks[transfer_batch, vertex, chunk] = (
                 adj_transfer_chunks[transfer_batch, vertex, chunk]
-                + adj[0] * light_chunks[light_batch, 0, chunk]
-                + adj[1] * light_chunks[light_batch, 1, chunk]
-                + adj[2] * light_chunks[light_batch, 2, chunk]
+                + adj_vertex[0] * light_chunks[light_batch, 0, chunk]
+                + adj_vertex[1] * light_chunks[light_batch, 1, chunk]
+                + adj_vertex[2] * light_chunks[light_batch, 2, chunk]
             )
         for k in range(CHUNK * light_chunks.shape[2], light.shape[2]):
             adj_transfer[transfer_batch, vertex, k] = adj_transfer[transfer_batch, vertex, k] + wp.dot(
-                adj, wp.vec3(light[light_batch, 0, k], light[light_batch, 1, k], light[light_batch, 2, k])
+                adj_vertex, wp.vec3(light[light_batch, 0, k], light[light_batch, 1, k], light[light_batch, 2, k])
             )
 
 
@@ -132,34 +132,34 @@ def _shade_adjoint_light(
     adj_light: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a chunk of coefficients, the last one the remainder, and a slab of receivers:  L̄ = Σ T s̄."""
-    row, batch, slab = wp.tid()
+    row, batch, slice_index = wp.tid()
     chunk = first_row + row
     transfer_batch = instance_in(batch, transfer.shape[0])
     light_batch = instance_in(batch, adj_light.shape[0])
-    begin = slab * _SLAB
-    end = wp.min(begin + _SLAB, transfer.shape[1])
-    first = chunk * CHUNK
+    begin = slice_index * _SLICE
+    end = wp.min(begin + _SLICE, transfer.shape[1])
+    first_direction = chunk * CHUNK
     if chunk < transfer_chunks.shape[2]:
         red = Chunk(0.0)
         green = Chunk(0.0)
         blue = Chunk(0.0)
         for vertex in range(begin, end):
-            adj = adj_shading[batch, vertex]
+            adj_vertex = adj_shading[batch, vertex]
             t = transfer_chunks[transfer_batch, vertex, chunk]
-            red += adj[0] * t
-            green += adj[1] * t
-            blue += adj[2] * t
+            red += adj_vertex[0] * t
+            green += adj_vertex[1] * t
+            blue += adj_vertex[2] * t
         for i in range(CHUNK):
-            wp.atomic_add(adj_light, light_batch, 0, first + i, red[i])
-            wp.atomic_add(adj_light, light_batch, 1, first + i, green[i])
-            wp.atomic_add(adj_light, light_batch, 2, first + i, blue[i])
+            wp.atomic_add(adj_light, light_batch, 0, first_direction + i, red[i])
+            wp.atomic_add(adj_light, light_batch, 1, first_direction + i, green[i])
+            wp.atomic_add(adj_light, light_batch, 2, first_direction + i, blue[i])
     else:
-        for k in range(first, transfer.shape[2]):
-            total = wp.vec3()
+        for k in range(first_direction, transfer.shape[2]):
+            adj_coefficient = wp.vec3()
             for vertex in range(begin, end):
-                total += transfer[transfer_batch, vertex, k] * adj_shading[batch, vertex]
+                adj_coefficient += transfer[transfer_batch, vertex, k] * adj_shading[batch, vertex]
             for channel in range(3):
-                wp.atomic_add(adj_light, light_batch, channel, k, total[channel])
+                wp.atomic_add(adj_light, light_batch, channel, k, adj_coefficient[channel])
 
 
 def _channels(light: wp.array) -> wp.array:
@@ -207,10 +207,10 @@ def shade(transfer: wp.array, light: wp.array, *, maximum: float = check.LARGEST
             adj_channels = wp.zeros_like(channels)
             launch(
                 _shade_adjoint_light,
-                (-(-count // CHUNK), instances, -(-transfer.shape[1] // _SLAB)),
+                (-(-count // CHUNK), instances, -(-transfer.shape[1] // _SLICE)),
                 inputs=[*transfer_inputs, adj_shading],
                 outputs=[adj_channels],
-                cost=_COEFFICIENT_COST * CHUNK * _SLAB,
+                cost=_COEFFICIENT_COST * CHUNK * _SLICE,
             )
             launch(_join_channels, light.shape, inputs=[adj_channels], outputs=[light.grad])
 
@@ -228,14 +228,14 @@ def shade(transfer: wp.array, light: wp.array, *, maximum: float = check.LARGEST
 
 
 @wp.func
-def _lit(transfer: Chunk, light: Chunk):
+def _light_of_chunk(transfer: Chunk, light: Chunk):
     return wp.cw_mul(transfer, light)
 
 
-@wp.func_grad(_lit)
-def _lit_adjoint(transfer: Chunk, light: Chunk, adj: Chunk):
+@wp.func_grad(_light_of_chunk)
+def _light_of_chunk_adjoint(transfer: Chunk, light: Chunk, adj_light: Chunk):
     """The gradient to transfer alone: light is known."""
-    wp.adjoint[transfer] += wp.cw_mul(light, adj)
+    wp.adjoint[transfer] += wp.cw_mul(light, adj_light)
 
 
 @wp.kernel
@@ -263,10 +263,10 @@ def _shade_cells(
         y = directions[1, chunk]
         z = directions[2, chunk]
         transfer = transfer_chunk(1.0, nx, ny, nz, x, y, z, transmittance[batch, receiver, chunk])
-        red += _lit(transfer, light[light_batch, 0, chunk])
-        green += _lit(transfer, light[light_batch, 1, chunk])
-        blue += _lit(transfer, light[light_batch, 2, chunk])
-    shading[batch, receiver] = weight * wp.vec3(_sum(red), _sum(green), _sum(blue))
+        red += _light_of_chunk(transfer, light[light_batch, 0, chunk])
+        green += _light_of_chunk(transfer, light[light_batch, 1, chunk])
+        blue += _light_of_chunk(transfer, light[light_batch, 2, chunk])
+    shading[batch, receiver] = weight * wp.vec3(_sum_chunk(red), _sum_chunk(green), _sum_chunk(blue))
 
 
 def shade_cells(

@@ -8,9 +8,9 @@ Some receivers tell where light comes from, so that most directions go there (:f
 Rays go through the scene in packets of 16 that are close to each other (:mod:`.ray_packets`).
 
 Neighbors in an image mostly see the same light. So all rays of receivers at the corners of squares of pixels are traced
-(:func:`find_corners`). Receivers within a square take over what its corners agree on, interpolate the visibility of
-doubtful rays that bring little light, and trace the others. So edges of shadows are as sharp as if all were traced;
-but a shadow that falls between the corners is missed.
+(:func:`find_corners`). Receivers within a square take over the visibility on which its corners agree, interpolate the
+visibility of doubtful rays that bring little light, and trace the others. So edges of shadows are as sharp as if all
+were traced; but a shadow that falls between the corners is missed.
 """
 
 import functools
@@ -25,9 +25,9 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
 from warpshadow.stages.light_samples import LightSamples
 from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open, packets_of
-from warpshadow.stages.ray_tracing import parts
+from warpshadow.stages.ray_tracing import progress_slices
 from warpshadow.stages.receivers import Receivers
-from warpshadow.stages.sample_receivers import ALIKE, LEVEL
+from warpshadow.stages.sample_receivers import MAX_SHARED_SLOPE, MIN_SHARED_COSINE
 
 _PACKET_COST = 2000.0  # nanoseconds that a packet takes
 _PILOT_RECEIVERS = 256  # receivers that stand for all, where directions are chosen
@@ -73,7 +73,7 @@ def _make_trace() -> wp.Kernel:
     return shares;
     """)
     def interpolate(a: int, b: int, c: int, d: int, weights: wp.vec4) -> Lane:  # type: ignore[empty-body]
-        """Share of corners that each ray escapes at, among corners that know."""
+        """Share of corners at which each ray escapes, among corners at which its visibility is known."""
         ...
 
     @wp.kernel(module="unique", module_options=module_options(PACKET), enable_backward=False)
@@ -86,80 +86,89 @@ def _make_trace() -> wp.Kernel:
         normals: wp.array(dtype=wp.vec3),
         directions: wp.array2d(dtype=Lane),
         light: wp.array2d(dtype=Lane),
-        chosen: wp.array(dtype=wp.int32),
+        receiver_indices: wp.array(dtype=wp.int32),
         corners: wp.array(dtype=wp.vec4i),
         weights: wp.array(dtype=wp.vec4),
         tolerances: wp.array(dtype=float),
-        known: wp.array2d(dtype=wp.int32),
+        corner_visibility: wp.array2d(dtype=wp.int32),
         # out
         shading: wp.array(dtype=wp.vec3),
         open_lanes: wp.array2d(dtype=wp.int32),
-        received: wp.array3d(dtype=wp.float32),
+        ray_light: wp.array3d(dtype=wp.float32),
     ):
-        """A thread owns a chosen receiver: it traces the rays that its corners leave open.
+        """A thread owns a receiver of ``receiver_indices``: it traces the rays whose visibility its corners do not
+        tell.
 
         Where there is room, it stores which rays of each packet escape, in the low half of a word, and which meet
         something, in the high half; and its light from each direction.
         """
         row = first_row + wp.tid()
         receiver = row
-        corner = wp.vec4i(-1)
+        corner_rows = wp.vec4i(-1)
         tolerance = float(0.0)
-        if chosen:
-            receiver = chosen[row]
+        if receiver_indices:
+            receiver = receiver_indices[row]
         if corners:
-            corner = corners[receiver]
+            corner_rows = corners[receiver]
             tolerance = tolerances[receiver]
         point = points[receiver]
         normal = normals[receiver]
-        total = wp.vec3()
-        last = int(-1)
+        irradiance = wp.vec3()
+        last_face = int(-1)
         for packet in range(directions.shape[0]):
-            toward = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
-            cosine = dot_direction(normal, toward)
+            ray_directions = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
+            cosine = dot_direction(normal, ray_directions)
             facing_rays = bits_above(cosine, 0.0)
             open_rays = int(0)
             if facing_rays != 0:
                 color = Vectors(light[packet, 0], light[packet, 1], light[packet, 2])
                 rays = facing_rays
-                if corner[0] >= 0:
-                    a = known[corner[0], packet]
-                    b = known[corner[1], packet]
-                    c = known[corner[2], packet]
-                    d = known[corner[3], packet]
-                    agreed = a & b & c & d
-                    open_rays = facing_rays & agreed
-                    rays = facing_rays & ~(agreed | (agreed >> PACKET))
-                    some = a | b | c | d
-                    if rays != 0 and rays & ~(some | (some >> PACKET)) == 0:
-                        doubtful = wp.abs(sum_open(rays, cosine, color))
-                        brightness = doubtful[0] + doubtful[1] + doubtful[2]
+                if corner_rows[0] >= 0:
+                    a = corner_visibility[corner_rows[0], packet]
+                    b = corner_visibility[corner_rows[1], packet]
+                    c = corner_visibility[corner_rows[2], packet]
+                    d = corner_visibility[corner_rows[3], packet]
+                    agreed_rays = a & b & c & d
+                    open_rays = facing_rays & agreed_rays
+                    rays = facing_rays & ~(agreed_rays | (agreed_rays >> PACKET))
+                    known_rays = a | b | c | d
+                    if rays != 0 and rays & ~(known_rays | (known_rays >> PACKET)) == 0:
+                        doubtful_light = wp.abs(sum_open(rays, cosine, color))
+                        brightness = doubtful_light[0] + doubtful_light[1] + doubtful_light[2]
                         if brightness <= tolerance:
                             tolerance -= brightness
                             shares = interpolate(a, b, c, d, weights[receiver])
-                            total += sum_open(rays, wp.cw_mul(shares, cosine), color)
+                            irradiance += sum_open(rays, wp.cw_mul(shares, cosine), color)
                             rays = 0
                 if rays != 0:
-                    result = find_open(
-                        tree.corners, tree.lowers, tree.uppers, tree.leaf_count, point, normal, toward, rays, last
+                    open_and_face = find_open(
+                        tree.corners,
+                        tree.lowers,
+                        tree.uppers,
+                        tree.leaf_count,
+                        point,
+                        normal,
+                        ray_directions,
+                        rays,
+                        last_face,
                     )
-                    open_rays = open_rays | result[0]
-                    last = result[1]
-                total += sum_open(open_rays, cosine, color)
-                if received.shape[0] > 0:
+                    open_rays = open_rays | open_and_face[0]
+                    last_face = open_and_face[1]
+                irradiance += sum_open(open_rays, cosine, color)
+                if ray_light.shape[0] > 0:
                     for lane in range(PACKET):
                         if (open_rays >> lane) % 2 == 1:
                             brightness = wp.length(wp.vec3(color.x[lane], color.y[lane], color.z[lane]))
-                            received[receiver, packet, lane] = cosine[lane] * brightness
+                            ray_light[receiver, packet, lane] = cosine[lane] * brightness
             if open_lanes.shape[0] > 0:
                 open_lanes[row, packet] = open_rays | ((facing_rays & ~open_rays) << PACKET)
-        shading[receiver] = total / wp.pi
+        shading[receiver] = irradiance / wp.pi
 
     return trace_shared
 
 
 def find_shares(tree: FaceTree, points: wp.array, normals: wp.array, samples: LightSamples) -> np.ndarray:
-    """Find what share of receivers' light comes from each direction, on average over receivers, dim and bright ones.
+    """Find the share of receivers' light that comes from each direction, on average over dim and bright receivers.
 
     Args:
         tree: The blockers.
@@ -171,14 +180,16 @@ def find_shares(tree: FaceTree, points: wp.array, normals: wp.array, samples: Li
     Differentiable: no.
     """
     count = points.shape[0]
-    chosen = np.arange(min(count, _PILOT_RECEIVERS)) * count // max(min(count, _PILOT_RECEIVERS), 1)
-    at, facing = (wp.array(rows.numpy()[chosen], dtype=wp.vec3, device=points.device) for rows in (points, normals))
-    shape = len(chosen), samples.directions.shape[1] // PACKET, PACKET
-    received = zeros(shape, dtype=wp.float32, device=at.device)
-    _Tracing(tree, at, facing, samples).trace(received=received)
-    light = received.numpy().reshape(len(chosen), -1)
+    pilot_receivers = np.arange(min(count, _PILOT_RECEIVERS)) * count // max(min(count, _PILOT_RECEIVERS), 1)
+    pilot_points, pilot_normals = (
+        wp.array(rows.numpy()[pilot_receivers], dtype=wp.vec3, device=points.device) for rows in (points, normals)
+    )
+    shape = len(pilot_receivers), samples.directions.shape[1] // PACKET, PACKET
+    direction_light = zeros(shape, dtype=wp.float32, device=pilot_points.device)
+    _Tracing(tree, pilot_points, pilot_normals, samples).trace(ray_light=direction_light)
+    light = direction_light.numpy().reshape(len(pilot_receivers), -1)
     light /= np.maximum(light.sum(axis=1, keepdims=True), 1e-12)
-    return light.sum(axis=0) / max(len(chosen), 1)
+    return light.sum(axis=0) / max(len(pilot_receivers), 1)
 
 
 class Corners(NamedTuple):
@@ -187,7 +198,7 @@ class Corners(NamedTuple):
     receivers: np.ndarray
     """Four for each receiver, −1 for none, int of shape [receiver, 4]; these four have none themselves."""
     weights: np.ndarray
-    """Of the bilinear interpolation between them, [receiver, 4]."""
+    """Bilinear weights of the corners, [receiver, 4]."""
 
     @classmethod
     def none(cls, count: int) -> "Corners":
@@ -218,26 +229,26 @@ def trace_shared(
         Shading, vec3 of shape [receiver].
     Differentiable: no.
     """
-    tracing, size = _Tracing(tree, points, normals, samples), 2**24 // samples.directions.shape[1]
+    tracing, block_size = _Tracing(tree, points, normals, samples), 2**24 // samples.directions.shape[1]
     if corners is None:
         corners = Corners.none(len(points))
     has_corners = corners.receivers[:, 0] >= 0
-    at_corners, rows_of_corners = np.unique(corners.receivers[has_corners], return_inverse=True)
-    if has_corners[at_corners].any():
+    corner_receivers, corner_indices = np.unique(corners.receivers[has_corners], return_inverse=True)
+    if has_corners[corner_receivers].any():
         raise ValueError("corners: got receivers at corners that have corners themselves, expected none")
-    known = empty((len(at_corners), tracing.packet_count), dtype=wp.int32, device=points.device)
-    for part in parts(len(at_corners), size, progress):
-        tracing.trace(at_corners[part], open_lanes=known[part])
-    if len(at_corners):
-        rows = np.full(corners.receivers.shape, -1)
-        rows[has_corners] = rows_of_corners.reshape(-1, 4)
-        light = np.zeros(len(points), np.float32)  # of corners; the others are not traced yet
-        light[at_corners] = np.abs(tracing.shading.numpy()[at_corners]).sum(axis=1)
-        light = (light[corners.receivers] * corners.weights).sum(axis=1)
-        tracing.take_over(known, rows, corners.weights, TOLERANCE * np.pi * light)
-    others = np.setdiff1d(np.arange(len(points)), at_corners, assume_unique=True)
-    for part in parts(len(others), size, progress):
-        tracing.trace(others[part])
+    corner_visibility = empty((len(corner_receivers), tracing.packet_count), dtype=wp.int32, device=points.device)
+    for block in progress_slices(len(corner_receivers), block_size, progress):
+        tracing.trace(corner_receivers[block], open_lanes=corner_visibility[block])
+    if len(corner_receivers):
+        row_table = np.full(corners.receivers.shape, -1)
+        row_table[has_corners] = corner_indices.reshape(-1, 4)
+        corner_light = np.zeros(len(points), np.float32)  # of corners; the others are not traced yet
+        corner_light[corner_receivers] = np.abs(tracing.shading.numpy()[corner_receivers]).sum(axis=1)
+        corner_light = (corner_light[corners.receivers] * corners.weights).sum(axis=1)
+        tracing.take_over(corner_visibility, row_table, corners.weights, TOLERANCE * np.pi * corner_light)
+    other_receivers = np.setdiff1d(np.arange(len(points)), corner_receivers, assume_unique=True)
+    for block in progress_slices(len(other_receivers), block_size, progress):
+        tracing.trace(other_receivers[block])
     return tracing.shading
 
 
@@ -252,37 +263,50 @@ def find_corners(receivers: Receivers, instance: int, supersampling: int) -> Cor
         supersampling: Samples of a pixel across and down.
     """
     count = receivers.points.shape[1]
-    result = Corners.none(count)
+    corners = Corners.none(count)
     triangles, face_ids = receivers.faces.numpy(), receivers.fragments.face_ids.numpy()
     face_ids = face_ids[min(instance, len(face_ids) - 1)]
     pixel_faces = triangles[face_ids]
     pixel_faces = np.where(
         (face_ids >= 0) & (pixel_faces == pixel_faces[..., :1]).all(axis=-1), pixel_faces[..., 0], -1
     )
-    of_pixel = pixel_faces[::supersampling, ::supersampling]
-    square = 1 << max(min(of_pixel.shape) // SQUARES, 1).bit_length() - 1
-    if square == 1:
-        return result
-    places = np.full((count + 1, 2), -1)
-    places[pixel_faces] = np.moveaxis(np.indices(pixel_faces.shape), 0, -1) // supersampling
-    places = places[:-1]  # the last item was for samples without a receiver
-    inside = np.flatnonzero(places[:, 0] >= 0)
-    first = places[inside] // square * square
-    last = np.minimum(first + square, np.array(of_pixel.shape) - 1)
-    rows, columns = np.stack([first, last]).transpose(2, 1, 0)  # each [receiver, 2]
-    corners = of_pixel[rows[:, [0, 0, 1, 1]], columns[:, [0, 1, 0, 1]]]
+    pixel_receivers = pixel_faces[::supersampling, ::supersampling]
+    square_size = 1 << max(min(pixel_receivers.shape) // SQUARES, 1).bit_length() - 1
+    if square_size == 1:
+        return corners
+    pixel_coordinates = np.full((count + 1, 2), -1)
+    pixel_coordinates[pixel_faces] = np.moveaxis(np.indices(pixel_faces.shape), 0, -1) // supersampling
+    pixel_coordinates = pixel_coordinates[:-1]  # the last item was for samples without a receiver
+    visible_receivers = np.flatnonzero(pixel_coordinates[:, 0] >= 0)
+    square_starts = pixel_coordinates[visible_receivers] // square_size * square_size
+    square_ends = np.minimum(square_starts + square_size, np.array(pixel_receivers.shape) - 1)
+    rows, columns = np.stack([square_starts, square_ends]).transpose(2, 1, 0)  # each [receiver, 2]
+    corner_receivers = pixel_receivers[rows[:, [0, 0, 1, 1]], columns[:, [0, 1, 0, 1]]]
     points, normals = (item.numpy()[min(instance, len(item) - 1)] for item in (receivers.points, receivers.normals))
-    steps = points[corners] - points[inside, None]
-    climbs = np.abs(np.einsum("rcd,rd->rc", steps, normals[inside]))
-    is_one = np.einsum("rcd,rd->rc", normals[corners], normals[inside]) > ALIKE
-    is_one &= (corners >= 0) & (climbs <= LEVEL * np.linalg.norm(steps, axis=-1))
-    is_one |= corners == inside[:, None]
-    is_one = is_one.all(axis=1)
-    down, right = ((places[inside] - first) / np.maximum(last - first, 1)).T
-    weights = np.stack([(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right], axis=1)
-    result.receivers[inside[is_one]], result.weights[inside[is_one]] = corners[is_one], weights[is_one]
-    result.receivers[np.unique(corners[is_one])] = -1
-    return result
+    offsets = points[corner_receivers] - points[visible_receivers, None]
+    heights = np.abs(np.einsum("rcd,rd->rc", offsets, normals[visible_receivers]))
+    is_one_surface = np.einsum("rcd,rd->rc", normals[corner_receivers], normals[visible_receivers]) > MIN_SHARED_COSINE
+    is_one_surface &= (corner_receivers >= 0) & (heights <= MAX_SHARED_SLOPE * np.linalg.norm(offsets, axis=-1))
+    is_one_surface |= corner_receivers == visible_receivers[:, None]
+    is_one_surface = is_one_surface.all(axis=1)
+    row_shares, column_shares = (
+        (pixel_coordinates[visible_receivers] - square_starts) / np.maximum(square_ends - square_starts, 1)
+    ).T
+    weights = np.stack(
+        [
+            (1 - row_shares) * (1 - column_shares),
+            (1 - row_shares) * column_shares,
+            row_shares * (1 - column_shares),
+            row_shares * column_shares,
+        ],
+        axis=1,
+    )
+    corners.receivers[visible_receivers[is_one_surface]], corners.weights[visible_receivers[is_one_surface]] = (
+        corner_receivers[is_one_surface],
+        weights[is_one_surface],
+    )
+    corners.receivers[np.unique(corner_receivers[is_one_surface])] = -1
+    return corners
 
 
 class _Tracing:
@@ -299,24 +323,33 @@ class _Tracing:
         self._inputs = tree, points, normals, directions, light
         self.shading = empty(points.shape, dtype=wp.vec3, device=device)
 
-    def take_over(self, known: wp.array, rows: np.ndarray, weights: np.ndarray, tolerances: np.ndarray) -> None:
-        """From now on receivers take over the visibility of their corners, whose rows of ``known`` are given."""
-        dtypes = zip((rows, weights, tolerances), (wp.vec4i, wp.vec4, wp.float32), strict=True)
-        self._corners = *(wp.array(values, dtype=dtype, device=known.device) for values, dtype in dtypes), known
+    def take_over(
+        self, corner_visibility: wp.array, corner_rows: np.ndarray, weights: np.ndarray, tolerances: np.ndarray
+    ) -> None:
+        """Let receivers take over the visibility of their corners, by row, in later calls."""
+        dtypes = zip((corner_rows, weights, tolerances), (wp.vec4i, wp.vec4, wp.float32), strict=True)
+        self._corners = (
+            *(wp.array(values, dtype=dtype, device=corner_visibility.device) for values, dtype in dtypes),
+            corner_visibility,
+        )
 
     def trace(
-        self, chosen: np.ndarray | None = None, *, open_lanes: wp.array | None = None, received: wp.array | None = None
+        self,
+        receiver_indices: np.ndarray | None = None,
+        *,
+        open_lanes: wp.array | None = None,
+        ray_light: wp.array | None = None,
     ) -> None:
         """Trace chosen receivers, or all, into :attr:`shading`."""
         device = self.shading.device
-        count = len(self.shading) if chosen is None else len(chosen)
-        numbers = None if chosen is None else wp.array(chosen, dtype=wp.int32, device=device)
+        count = len(self.shading) if receiver_indices is None else len(receiver_indices)
+        index_array = None if receiver_indices is None else wp.array(receiver_indices, dtype=wp.int32, device=device)
         open_lanes = empty((0, 0), dtype=wp.int32, device=device) if open_lanes is None else open_lanes
-        received = empty((0, 0, 0), dtype=wp.float32, device=device) if received is None else received
+        ray_light = empty((0, 0, 0), dtype=wp.float32, device=device) if ray_light is None else ray_light
         launch(
             _make_trace(),
             count,
-            inputs=[*self._inputs, numbers, *self._corners],
-            outputs=[self.shading, open_lanes, received],
+            inputs=[*self._inputs, index_array, *self._corners],
+            outputs=[self.shading, open_lanes, ray_light],
             cost=_PACKET_COST * self.packet_count,
         )

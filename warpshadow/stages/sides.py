@@ -22,7 +22,7 @@ _FACE_RUN = 1024  # faces that a thread owns on a CPU, so that it finds the came
 
 @wp.func
 def split_side(number: int, count: int):
-    """Which of ``count`` faces or vertices a number is, and whether it is seen from behind."""
+    """Split the number of a side into the index of ``count`` faces or vertices, and whether it is the back."""
     is_back = number >= count
     return wp.where(is_back, number - count, number), is_back
 
@@ -40,14 +40,16 @@ def split_sides(numbers: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray
 
 
 @wp.func
-def _eye(clip_matrix: wp.mat44):
-    """Where a camera is: the point whose x, y and w in clip space are zero."""
+def _eye_position(clip_matrix: wp.mat44):
+    """Eye of a camera: the point whose x, y and w in clip space are zero."""
     x = wp.vec3d(wp.vec3(clip_matrix[0, 0], clip_matrix[0, 1], clip_matrix[0, 2]))
     y = wp.vec3d(wp.vec3(clip_matrix[1, 0], clip_matrix[1, 1], clip_matrix[1, 2]))
     w = wp.vec3d(wp.vec3(clip_matrix[3, 0], clip_matrix[3, 1], clip_matrix[3, 2]))
-    at_origin = wp.vec3d(wp.vec3(clip_matrix[0, 3], clip_matrix[1, 3], clip_matrix[3, 3]))
-    shifted = at_origin[0] * wp.cross(y, w) + at_origin[1] * wp.cross(w, x) + at_origin[2] * wp.cross(x, y)
-    return -shifted / wp.dot(x, wp.cross(y, w))
+    origin_values = wp.vec3d(wp.vec3(clip_matrix[0, 3], clip_matrix[1, 3], clip_matrix[3, 3]))
+    determinant_vector = (
+        origin_values[0] * wp.cross(y, w) + origin_values[1] * wp.cross(w, x) + origin_values[2] * wp.cross(x, y)
+    )
+    return -determinant_vector / wp.dot(x, wp.cross(y, w))
 
 
 @wp.kernel(enable_backward=False)
@@ -55,12 +57,12 @@ def _find_backs(
     # in
     positions: wp.array2d(dtype=wp.vec3),
     faces: wp.array(dtype=wp.vec3i),
-    two_sided: wp.array(dtype=wp.int32),
+    two_sided_faces: wp.array(dtype=wp.int32),
     clip_matrices: wp.array(dtype=wp.mat44),
     run: int,
     # out
     shows_back: wp.array2d(dtype=wp.bool),
-    is_any: wp.array(dtype=wp.bool),
+    has_back: wp.array(dtype=wp.bool),
 ):
     """A thread owns a run of two-sided faces of a view: which of them the eye sees from behind; false before.
 
@@ -68,36 +70,36 @@ def _find_backs(
     """
     view, thread = wp.tid()
     position_batch = instance_in(view, positions.shape[0])
-    eye = _eye(clip_matrices[instance_in(view, clip_matrices.shape[0])])
-    for i in range(thread * run, wp.min((thread + 1) * run, two_sided.shape[0])):
-        face = two_sided[i]
+    eye = _eye_position(clip_matrices[instance_in(view, clip_matrices.shape[0])])
+    for i in range(thread * run, wp.min((thread + 1) * run, two_sided_faces.shape[0])):
+        face = two_sided_faces[i]
         corners = faces[face]
         a = wp.vec3d(positions[position_batch, corners[0]])
         b = wp.vec3d(positions[position_batch, corners[1]])
         c = wp.vec3d(positions[position_batch, corners[2]])
         if wp.dot(wp.cross(b - a, c - a), a - eye) > wp.float64(0.0):
             shows_back[view, face] = True
-            is_any[0] = True
+            has_back[0] = True
 
 
 @wp.kernel(enable_backward=False)
-def _see_sides(
+def _find_sides(
     # in
     face_ids: wp.array2d(dtype=wp.int32),
     shows_back: wp.array2d(dtype=wp.bool),
     run: int,
     # out
     sides: wp.array2d(dtype=wp.int32),
-    is_any: wp.array(dtype=wp.bool),
+    has_back: wp.array(dtype=wp.bool),
 ):
-    """A thread owns a run of samples; ``is_any`` is false before."""
+    """A thread owns a run of samples; ``has_back`` is false before."""
     view, thread = wp.tid()
     for sample in range(thread * run, (thread + 1) * run):
         face = face_ids[view, sample]
         is_back = shows_back[view, wp.max(face, 0)] and face >= 0
         sides[view, sample] = join_side(face, is_back, shows_back.shape[1])
         if is_back:
-            is_any[0] = True
+            has_back[0] = True
 
 
 def find_sides(
@@ -118,26 +120,26 @@ def find_sides(
     Not differentiable: which side is seen changes where a face is seen edge-on.
     """
     device = positions.device
-    views, height, width = fragments.face_ids.shape
-    shows_back = zeros((views, faces.shape[0]), dtype=wp.bool, device=device)
-    is_any = zeros(2, dtype=wp.bool, device=device)
+    view_count, height, width = fragments.face_ids.shape
+    shows_back = zeros((view_count, faces.shape[0]), dtype=wp.bool, device=device)
+    has_back = zeros(2, dtype=wp.bool, device=device)
     run = run_length(device, _FACE_RUN)
     launch(
         _find_backs,
-        (views, -(-two_sided.shape[0] // run)),
+        (view_count, -(-two_sided.shape[0] // run)),
         inputs=[positions, faces, two_sided, clip_matrices, run],
-        outputs=[shows_back, is_any[:1]],
+        outputs=[shows_back, has_back[:1]],
     )
-    if not device.is_capturing and not is_any.numpy()[0]:
+    if not device.is_capturing and not has_back.numpy()[0]:
         return fragments
     sides = empty(fragments.face_ids.shape, dtype=wp.int32, device=device)
     run = run_length(device, width)
     launch(
-        _see_sides,
-        (views, height * width // run),
+        _find_sides,
+        (view_count, height * width // run),
         inputs=[rows(fragments.face_ids), shows_back, run],
-        outputs=[rows(sides), is_any[1:]],
+        outputs=[rows(sides), has_back[1:]],
     )
-    if not device.is_capturing and not is_any.numpy()[1]:
+    if not device.is_capturing and not has_back.numpy()[1]:
         return fragments
     return replace(fragments, sides=sides)

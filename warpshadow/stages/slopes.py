@@ -21,18 +21,18 @@ from warpshadow.device.launch import launch, without_gradient
 from warpshadow.device.parallel import run_length
 from warpshadow.device.tape import record_adjoint
 from warpshadow.stages.film import sample_radiance
-from warpshadow.stages.interpolation import add_to_corners, adj_weights, interpolate
+from warpshadow.stages.interpolation import interpolate, interpolate_values_adjoint, interpolate_weights_adjoint
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.screen import (
-    distance,
+    direction_sign,
     ends_before,
     half_size,
     has_neighbor,
+    line_distance,
     neighbor,
-    relative,
-    relative_adjoint,
+    relative_to_ray,
+    relative_to_ray_adjoint,
     sample_center,
-    sense,
 )
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
 from warpshadow.stages.silhouettes.find import Silhouettes
@@ -44,25 +44,25 @@ _COST = 20.0  # nanoseconds that a sample takes
 
 
 @wp.func
-def _slope_of_face(values: wp.vec3, corners: wp.vec3i, center: wp.vec2, clip_positions: wp.array(dtype=wp.vec4)):
+def _face_slope(values: wp.vec3, corners: wp.vec3i, center: wp.vec2, clip_positions: wp.array(dtype=wp.vec4)):
     """Gradient by position, at a point of a face, of an attribute of its corners.
 
     Barycentrics are to each other as the last components of these normals of the planes through the eye and an edge.
     """
-    a = relative(clip_positions[corners[0]], center)
-    b = relative(clip_positions[corners[1]], center)
-    c = relative(clip_positions[corners[2]], center)
+    a = relative_to_ray(clip_positions[corners[0]], center)
+    b = relative_to_ray(clip_positions[corners[1]], center)
+    c = relative_to_ray(clip_positions[corners[2]], center)
     normal_a = wp.cross(b, c)
     normal_b = wp.cross(c, a)
     normal_c = wp.cross(a, b)
-    total = normal_a + normal_b + normal_c
+    normal_sum = normal_a + normal_b + normal_c
     slope = values[0] * normal_a + values[1] * normal_b + values[2] * normal_c
-    slope = (slope - slope[2] / total[2] * total) / total[2]
+    slope = (slope - slope[2] / normal_sum[2] * normal_sum) / normal_sum[2]
     return wp.vec2(slope[0], slope[1])
 
 
 @wp.kernel(enable_backward=False)
-def _add_slopes(
+def _add_shading_gradients(
     first_row: int,
     worker: int,
     # in
@@ -82,19 +82,19 @@ def _add_slopes(
     # out
     adj_clip_positions: wp.array2d(dtype=wp.vec4),
 ):
-    """A thread owns a run of samples of all instances; ``at`` is a sample's number in the flat images that are seen."""
-    first = (first_row + wp.tid()) * run
+    """A thread owns a run of samples of all instances; ``fragment`` is the index of a sample in flat images."""
+    first_sample = (first_row + wp.tid()) * run
     width = fragments.width
-    half = half_size(width, fragments.height)
+    samples_per_unit = half_size(width, fragments.height)
     for batch in range(adj_samples.shape[0]):
         fragment_batch = instance_in(batch, receiver_face_ids.shape[0])
         albedo_batch = instance_in(batch, albedo.shape[0])
-        of_receivers = shading[instance_in(batch, shading.shape[0])]
+        receiver_shading = shading[instance_in(batch, shading.shape[0])]
         light_batch = instance_in(batch, light.shape[0])
         clip = fragments.clip_positions[fragment_batch]
-        for sample in range(first, first + run):
-            at = fragment_batch * adj_samples.shape[1] + sample
-            face = fragments.face_ids[at]
+        for sample in range(first_sample, first_sample + run):
+            fragment = fragment_batch * adj_samples.shape[1] + sample
+            face = fragments.face_ids[fragment]
             adj_sample = adj_samples[batch, sample]
             adj_color = wp.vec3(adj_sample[0], adj_sample[1], adj_sample[2])
             receivers = wp.vec3i()
@@ -103,16 +103,16 @@ def _add_slopes(
             # A sample with receivers that samples see has the gradient of their points instead.
             if face >= 0 and receiver_face_ids[fragment_batch, sample] < first_own and wp.length_sq(adj_color) > 0.0:
                 adj_light = wp.cw_mul(adj_color, albedo[albedo_batch, sample])
-                here = light[light_batch, sample]
+                sample_light = light[light_batch, sample]
                 color = samples[batch, sample]
-                center = sample_center(at, width, fragments.height)
-                entry = entries[at]
+                center = sample_center(fragment, width, fragments.height)
+                entry = entries[fragment]
                 is_flat = entry < 0
                 for direction in range(4):
-                    if has_neighbor(at, direction, width, fragments.height):
-                        is_flat = is_flat and fragments.face_ids[neighbor(at, direction, width)] == face
-                rises = wp.vec2()
-                spans = wp.vec2()  # lengths over which the differences were measured [samples]
+                    if has_neighbor(fragment, direction, width, fragments.height):
+                        is_flat = is_flat and fragments.face_ids[neighbor(fragment, direction, width)] == face
+                weighted_slopes = wp.vec2()
+                distances = wp.vec2()  # lengths over which the differences were measured [samples]
                 if not is_flat:
                     for direction in range(4):
                         edge = wp.vec2i(NOTHING, NOTHING)
@@ -120,36 +120,36 @@ def _add_slopes(
                             edge = edges[entry, direction]
                         if edge[0] >= 0:
                             line = edge_line(edge, center, clip)
-                            t = distance(line, direction, half)
+                            t = line_distance(line, direction, samples_per_unit)
                             if ends_before(line, direction) and t > MIN_DISTANCE and t <= 1.0:
                                 # entries are of all views; where one view serves all images, each has its
                                 # own colors
-                                rise = edge_colors[batch - fragment_batch, entry, direction] - color
-                                span = wp.min(t, 0.5)
-                                total = wp.dot(adj_color, wp.vec3(rise[0], rise[1], rise[2]))
-                                rises[direction / 2] += sense(direction) * span / t * total
-                                spans[direction / 2] += span
-                        elif edge[0] == NOTHING and has_neighbor(at, direction, width, fragments.height):
-                            other = neighbor(sample, direction, width)
-                            if receiver_face_ids[fragment_batch, other] >= 0:
-                                rise_of_light = wp.dot(adj_light, light[light_batch, other] - here)
-                                rises[direction / 2] += sense(direction) * 0.5 * rise_of_light
-                                spans[direction / 2] += 0.5
-                slope = wp.cw_mul(wp.cw_div(rises, spans), half)
+                                color_step = edge_colors[batch - fragment_batch, entry, direction] - color
+                                distance = wp.min(t, 0.5)
+                                adj_step = wp.dot(adj_color, wp.vec3(color_step[0], color_step[1], color_step[2]))
+                                weighted_slopes[direction / 2] += direction_sign(direction) * distance / t * adj_step
+                                distances[direction / 2] += distance
+                        elif edge[0] == NOTHING and has_neighbor(fragment, direction, width, fragments.height):
+                            neighbor_sample = neighbor(sample, direction, width)
+                            if receiver_face_ids[fragment_batch, neighbor_sample] >= 0:
+                                light_step = wp.dot(adj_light, light[light_batch, neighbor_sample] - sample_light)
+                                weighted_slopes[direction / 2] += direction_sign(direction) * 0.5 * light_step
+                                distances[direction / 2] += 0.5
+                slope = wp.cw_mul(wp.cw_div(weighted_slopes, distances), samples_per_unit)
                 corners = fragments.faces[face]
-                if wp.min(spans) == 0.0:
-                    receiver_slope = _slope_of_face(
-                        adj_weights(of_receivers, receivers, adj_light), corners, center, clip
+                if wp.min(distances) == 0.0:
+                    receiver_slope = _face_slope(
+                        interpolate_weights_adjoint(receiver_shading, receivers, adj_light), corners, center, clip
                     )
                     slope = wp.vec2(
-                        wp.where(spans[0] == 0.0, receiver_slope[0], slope[0]),
-                        wp.where(spans[1] == 0.0, receiver_slope[1], slope[1]),
+                        wp.where(distances[0] == 0.0, receiver_slope[0], slope[0]),
+                        wp.where(distances[1] == 0.0, receiver_slope[1], slope[1]),
                     )
-                weights = fragments.barycentrics[at]
+                weights = fragments.barycentrics[fragment]
                 depth = wp.dot(weights, wp.vec3(clip[corners[0]][3], clip[corners[1]][3], clip[corners[2]][3]))
-                adj_clip = relative_adjoint(center, wp.vec3(-slope[0], -slope[1], 0.0)) / depth
+                adj_clip = relative_to_ray_adjoint(center, wp.vec3(-slope[0], -slope[1], 0.0)) / depth
                 if wp.isfinite(adj_clip):
-                    add_to_corners(adj_clip_positions[fragment_batch], corners, weights, adj_clip)
+                    interpolate_values_adjoint(adj_clip_positions[fragment_batch], corners, weights, adj_clip)
 
 
 def moving_radiance(
@@ -188,7 +188,7 @@ def moving_radiance(
         light = interpolate(fragments, faces, without_gradient(shading))
         run = run_length(samples.device, samples.shape[2])
         launch(
-            _add_slopes,
+            _add_shading_gradients,
             light[0].size // run,
             cost=_COST * run * samples.shape[0],
             inputs=[

@@ -1,4 +1,4 @@
-"""Sparse matrices multiplied with colors: patches from sources, receivers from patches, patches from texels."""
+"""Sparse matrices multiplied with colors: patches from patch samples, receivers from patches, patches from texels."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _RUN = 32  # rows that a thread owns on a CPU, where starting one takes longer t
 class Entries(NamedTuple):
     """Entries of a sparse matrix, row after row."""
 
-    starts: wp.array  # [row + 1] int32
+    row_starts: wp.array  # [row + 1] int32
     columns: wp.array  # [entry] int32
     weights: wp.array  # [entry] float32
 
 
 @dataclass(frozen=True, eq=False)
 class SparseMatrix:
-    """A matrix by its rows, and by its columns for the adjoint, which so needs no sums across threads.
+    """A sparse matrix in compressed rows (CSR), and its transpose for the adjoint, which needs no sums across threads.
 
     Args:
         shape: Number of rows and columns.
@@ -44,19 +44,19 @@ class SparseMatrix:
     columns: Entries
 
     @staticmethod
-    def of(matrix: np.ndarray | spmatrix | sparray, *, device: wp.DeviceLike) -> SparseMatrix:
-        """Give a matrix of SciPy, or NumPy, to a device, without its zeros."""
+    def from_matrix(matrix: np.ndarray | spmatrix | sparray, *, device: wp.DeviceLike) -> SparseMatrix:
+        """Copy a matrix of SciPy or NumPy to a device, without its zeros."""
         from scipy.sparse import csr_matrix
 
         by_rows = csr_matrix(matrix, copy=True)
         return SparseMatrix(by_rows.shape, _entries(by_rows, device), _entries(by_rows.T.tocsr(), device))
 
-    def on_host(self) -> csr_matrix:
-        """The matrix of SciPy."""
+    def to_scipy(self) -> csr_matrix:
+        """Copy it to a matrix of SciPy."""
         from scipy.sparse import csr_matrix
 
-        starts, columns, weights = (array.numpy() for array in self.rows)
-        return csr_matrix((weights, columns, starts), self.shape)
+        row_starts, columns, weights = (array.numpy() for array in self.rows)
+        return csr_matrix((weights, columns, row_starts), self.shape)
 
 
 def _entries(matrix: csr_matrix, device: wp.DeviceLike) -> Entries:
@@ -73,62 +73,62 @@ def _multiply(
     first_row: int,
     worker: int,
     # in
-    starts: wp.array(dtype=wp.int32),
+    row_starts: wp.array(dtype=wp.int32),
     columns: wp.array(dtype=wp.int32),
     weights: wp.array(dtype=wp.float32),
-    values: wp.array2d(dtype=wp.vec3),
-    plus: wp.array2d(dtype=wp.vec3),
+    factor_batches: wp.array2d(dtype=wp.vec3),
+    addend: wp.array2d(dtype=wp.vec3),
     run: int,
     # out
     products: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a run of rows of an instance: their products, added to a term, which may be the previous values."""
-    row_count = starts.shape[0] - 1
+    row_count = row_starts.shape[0] - 1
     batch, thread = split_row(first_row + wp.tid(), (row_count + run - 1) // run)
-    of_instance = values[batch]
+    factors = factor_batches[batch]
     for row in range(thread * run, wp.min((thread + 1) * run, row_count)):
-        total = wp.vec3()
-        if plus:
-            total = plus[batch, row]
-        for entry in range(starts[row], starts[row + 1]):
-            total += weights[entry] * of_instance[columns[entry]]
-        products[batch, row] = total
+        product = wp.vec3()
+        if addend:
+            product = addend[batch, row]
+        for entry in range(row_starts[row], row_starts[row + 1]):
+            product += weights[entry] * factors[columns[entry]]
+        products[batch, row] = product
 
 
-def multiply(matrix: SparseMatrix, values: wp.array, *, plus: wp.array | None = None) -> wp.array:
+def multiply(matrix: SparseMatrix, values: wp.array, *, addend: wp.array | None = None) -> wp.array:
     """Multiply a sparse matrix with colors.
 
     Args:
         matrix: Of shape [row, column].
         values: vec3 of shape [batch, column].
-        plus: Added to the product, vec3 of shape [batch, row].
+        addend: Added to the product, vec3 of shape [batch, row].
             Either batch may be 1 and then serves every instance of the other.
     Returns:
         vec3 of shape [batch, row].
-    Differentiable: values, plus. Exact, being linear. Not: the matrix.
+    Differentiable: values, addend. Exact, being linear. Not: the matrix.
     """
     check.shape("values", values.shape, ("batch", matrix.shape[1]))
-    if plus is not None:
-        check.shape("plus", plus.shape, ("batch", matrix.shape[0]))
-        count = common_batch({"values": values, "plus": plus})
-        values, plus = expand(values, count), expand(plus, count)
+    if addend is not None:
+        check.shape("addend", addend.shape, ("batch", matrix.shape[0]))
+        count = common_batch({"values": values, "addend": addend})
+        values, addend = expand(values, count), expand(addend, count)
 
-    def times(entries: Entries, factors: wp.array, plus: wp.array | None, products: wp.array) -> None:
+    def multiply_entries(entries: Entries, factors: wp.array, addend: wp.array | None, products: wp.array) -> None:
         batch_count, row_count = products.shape
         run = 1 if products.device.is_cuda else _RUN
         cost = run * (_ENTRY_COST * entries.columns.size / max(row_count, 1) + _ROW_COST)
-        inputs = [*entries, factors, plus, run]
+        inputs = [*entries, factors, addend, run]
         launch(_multiply, batch_count * -(-row_count // run), inputs=inputs, outputs=[products], cost=cost)
 
     def adjoint(adj_products: wp.array) -> None:
         if values.requires_grad:
-            times(matrix.columns, adj_products, values.grad, values.grad)
-        if plus is not None and plus.requires_grad:
-            accumulate(adj_products, plus.grad)
+            multiply_entries(matrix.columns, adj_products, values.grad, values.grad)
+        if addend is not None and addend.requires_grad:
+            accumulate(adj_products, addend.grad)
 
     return differentiable(
-        lambda products: times(matrix.rows, values, plus, products),
+        lambda products: multiply_entries(matrix.rows, values, addend, products),
         adjoint,
         result=empty((values.shape[0], matrix.shape[0]), dtype=wp.vec3, device=values.device),
-        variables=[values, plus],
+        variables=[values, addend],
     )

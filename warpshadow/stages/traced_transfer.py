@@ -11,7 +11,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.directions import CHUNK, fibonacci
 from warpshadow.stages.ray_packets import PACKET, FaceTree, build_face_tree, make_find_open, packets_of
-from warpshadow.stages.ray_tracing import parts
+from warpshadow.stages.ray_tracing import progress_slices
 
 _RAY_COST = 60.0  # nanoseconds that a ray takes
 
@@ -37,20 +37,28 @@ def _make_trace_cosines() -> wp.Kernel:
         receiver = first_row + wp.tid()
         point = points[receiver]
         normal = normals[receiver]
-        last = int(-1)
+        last_face = int(-1)
         for packet in range(directions.shape[0]):
-            toward = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
-            cosine = dot_direction(normal, toward)
+            ray_directions = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
+            cosine = dot_direction(normal, ray_directions)
             facing_rays = bits_above(cosine, 0.0)
-            escaping = int(0)
+            open_rays = int(0)
             if facing_rays != 0:
-                result = find_open(
-                    tree.corners, tree.lowers, tree.uppers, tree.leaf_count, point, normal, toward, facing_rays, last
+                open_and_face = find_open(
+                    tree.corners,
+                    tree.lowers,
+                    tree.uppers,
+                    tree.leaf_count,
+                    point,
+                    normal,
+                    ray_directions,
+                    facing_rays,
+                    last_face,
                 )
-                escaping = result[0]
-                last = result[1]
+                open_rays = open_and_face[0]
+                last_face = open_and_face[1]
             for lane in range(PACKET):
-                is_open = ((escaping & facing_rays) >> lane) & 1
+                is_open = ((open_rays & facing_rays) >> lane) & 1
                 cosines[receiver, PACKET * packet + lane] = wp.where(is_open == 1, cosine[lane], 0.0)
 
     return trace_cosines
@@ -88,10 +96,10 @@ def trace_transfer(
     values = (4 / len(directions) * functions(directions)).astype(np.float32)
     transfer = np.empty((points.shape[0], values.shape[1]), np.float32)
     tree = _tree(mesh, points.device)
-    for part in parts(points.shape[0], 2**22 // len(directions), progress):
-        shape = part.stop - part.start, len(directions)
+    for receivers in progress_slices(points.shape[0], 2**22 // len(directions), progress):
+        shape = receivers.stop - receivers.start, len(directions)
         cosines = empty(shape, dtype=wp.float32, device=points.device)
-        inputs = [tree, points[part], normals[part], packets]
+        inputs = [tree, points[receivers], normals[receivers], packets]
         launch(_make_trace_cosines(), shape[0], inputs=inputs, outputs=[cosines], cost=_RAY_COST * shape[1])
-        transfer[part] = cosines.numpy() @ values
+        transfer[receivers] = cosines.numpy() @ values
     return wp.array(transfer, device=points.device)

@@ -25,7 +25,7 @@ from warpshadow.device.lanes import (
 )
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty, require_gradient, zeros
-from warpshadow.device.parallel import Scratch, scratch_place, split_row
+from warpshadow.device.parallel import Scratch, scratch_slot, split_row
 from warpshadow.maths import sh
 from warpshadow.maths.directions import CHUNK, check_count
 from warpshadow.stages.sh_kernels import (
@@ -67,8 +67,8 @@ def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
         """A thread owns a block of receivers: the SH product of their visibility and clamped cosine."""
         row = first_row + wp.tid()
         batch, block = find_block(row, normals.shape[1])
-        place = scratch_place(worker, row)
-        cosine = scratch[place, 0]
+        slot = scratch_slot(worker, row)
+        cosine = scratch[slot, 0]
         for i in range(wp.static(order**2)):
             cosine[i] = Lane(0.0)
         normal = load(normals[batch], block)
@@ -79,8 +79,8 @@ def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
             zonal[band] = COSINE[band] * is_there
         add_rotated_zonal(normal, zonal, cosine)
         if wp.static(is_shadowed):
-            factor = scratch[place, 1]
-            product = scratch[place, 2]
+            factor = scratch[slot, 1]
+            product = scratch[slot, 2]
             load_rows(visibility[batch], block, factor)
             multiply(factor, cosine, table, product)
             store_rows(product, block, transfer[batch])
@@ -118,10 +118,10 @@ def _sh_transfer_adjoint_kernel(order: int, is_shadowed: bool, lanes: int) -> wp
         """A thread owns a block of receivers. Γ is symmetric:  T = V * H  has  V̄ = H * T̄  and  H̄ = V * T̄."""
         row = first_row + wp.tid()
         batch, block = find_block(row, normals.shape[1])
-        place = scratch_place(worker, row)
-        adj_row = scratch[place, 0]
-        factor = scratch[place, 1]
-        product = scratch[place, 2]
+        slot = scratch_slot(worker, row)
+        adj_row = scratch[slot, 0]
+        factor = scratch[slot, 1]
+        product = scratch[slot, 2]
         normal = load(normals[batch], block)
         is_there = wp.min(dot(normal, normal) * 1.0e30, Lane(1.0))
         zonal = Zonal()
@@ -220,10 +220,10 @@ def _sh_product_kernel(order: int, lanes: int) -> wp.Kernel:
         """A thread owns a block of receivers, to whose products it adds. Factors may have bands 0 … n' < n only."""
         row = first_row + wp.tid()
         batch, block = find_block(row, products.shape[1])
-        place = scratch_place(worker, row)
-        first = scratch[place, 0]
-        second = scratch[place, 1]
-        product = scratch[place, 2]
+        slot = scratch_slot(worker, row)
+        first = scratch[slot, 0]
+        second = scratch[slot, 1]
+        product = scratch[slot, 2]
         for i in range(second_factor.shape[2], wp.static(order**2)):
             second[i] = Lane(0.0)
         load_rows(first_factor[batch], block, first)

@@ -109,21 +109,21 @@ class Arguments:
         self, function: Callable[[dict[str, Any]], Geometry[wp.array]], inputs: dict[str, Any]
     ) -> Geometry[torch.Tensor]:
         """Apply a function that makes a geometry."""
-        made: list[Geometry[wp.array]] = []
+        geometries: list[Geometry[wp.array]] = []
 
         def make(inputs: dict[str, Any]) -> tuple[wp.array, ...]:
-            made.append(function(inputs))
-            rotations = made[0].rotations
-            return (*made[0].arrays().values(), *([] if rotations is None else [rotations]))
+            geometries.append(function(inputs))
+            rotations = geometries[0].rotations
+            return (*geometries[0].arrays().values(), *([] if rotations is None else [rotations]))
 
         positions, centers, radii, *rotations = self.apply(make, inputs)
         return Geometry(
             positions,
             centers,
             radii,
-            moving=made[0].moving,
+            moving=geometries[0].moving,
             rotations=rotations[0] if rotations else None,
-            deformed=made[0].deformed,
+            deformed=geometries[0].deformed,
         )
 
     def _common_batch(self) -> int:

@@ -27,14 +27,14 @@ def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
     """
 
     @functools.wraps(function)
-    def called(*args: P.args, **kwargs: P.kwargs) -> R:
+    def recorded_call(*args: P.args, **kwargs: P.kwargs) -> R:
         if torch.compiler.is_compiling():  # only while this very line is traced
-            return torch.compiler.disable(called)(*args, **kwargs)
+            return torch.compiler.disable(recorded_call)(*args, **kwargs)
         return function(*args, **kwargs)
 
     # code of its own, since the compiler gives up on code of which it has compiled eight variants
-    called.__code__ = called.__code__.replace(co_name=function.__name__)  # type: ignore[attr-defined]
-    return called
+    recorded_call.__code__ = recorded_call.__code__.replace(co_name=function.__name__)  # type: ignore[attr-defined]
+    return recorded_call
 
 
 @overload
@@ -91,9 +91,9 @@ def apply(
     wp.init()
     if torch.get_num_threads() > 1:
         _let_waiting_threads_sleep()
-    wants = tuple(tensor.requires_grad and torch.is_grad_enabled() for tensor in tensors)
+    requires_grad = tuple(tensor.requires_grad and torch.is_grad_enabled() for tensor in tensors)
     call = _Call(function, tuple(dtypes), device or tensors[0].device, tuple(names), frozenset(affine))
-    results = _WarpFunction.apply(call, wants, *tensors)
+    results = _WarpFunction.apply(call, requires_grad, *tensors)
     return results if len(results) > 1 else results[0]
 
 
@@ -111,16 +111,16 @@ def _let_waiting_threads_sleep() -> None:
     if is_set or sys.platform != "linux" or not torch.backends.openmp.is_available():
         return
     others = torch.get_num_threads() - 1  # that a team has beside the thread that begins it
-    started = [threading.Event() for _ in range(-(-len(os.sched_getaffinity(0)) // others))]
+    started_events = [threading.Event() for _ in range(-(-len(os.sched_getaffinity(0)) // others))]
 
     def begin_team(is_started: threading.Event) -> None:
         torch.zeros(1 << 17).add_(1.0)
         is_started.set()
         threading.Event().wait()  # a team ends with the thread that began it
 
-    for event in started:
+    for event in started_events:
         threading.Thread(target=begin_team, args=(event,), name="warpshadow-sleeper", daemon=True).start()
-    for event in started:
+    for event in started_events:
         event.wait()
 
 
@@ -135,10 +135,10 @@ def as_array(tensor: torch.Tensor, dtype: type) -> wp.array:
 def _of_memory(tensor: torch.Tensor, dtype: type) -> wp.array:
     """A contiguous tensor as an array of the same memory, as ``wp.from_torch`` makes one."""
     shape, item = tuple(tensor.shape), item_shape(dtype)
-    leading = shape[: len(shape) - len(item)]
-    if tensor.device.type != "cpu" or not tensor.numel() or shape[len(leading) :] != item or not leading:
+    leading_shape = shape[: len(shape) - len(item)]
+    if tensor.device.type != "cpu" or not tensor.numel() or shape[len(leading_shape) :] != item or not leading_shape:
         return wp.from_torch(tensor, dtype=dtype, requires_grad=False)
-    return array_at(tensor.data_ptr(), leading, dtype, owner=tensor)
+    return array_at(tensor.data_ptr(), leading_shape, dtype, owner=tensor)
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class _Call:
     affine: frozenset[str]
 
     def moved(self, tensors: Sequence[torch.Tensor], directions: Sequence[torch.Tensor | None]) -> list[torch.Tensor]:
-        """How the results change as tensors move in directions: Σ f(…, direction, …) − f(…, 0, …), exact if affine.
+        """Change of the results as tensors move in directions: Σ f(…, direction, …) − f(…, 0, …), exact if affine.
 
         Differentiable: tensors, directions.
         """
@@ -161,10 +161,11 @@ class _Call:
             if direction is None:
                 continue
             if name not in self.affine:
-                known = ", ".join(item for item in self.names if item in self.affine)
+                affine_names = ", ".join(item for item in self.names if item in self.affine)
                 raise NotImplementedError(
                     f"{name}: got asked for a second derivative (create_graph=True, hessian or functional.jvp), "
-                    f"expected one of first order{f'; of second order there are those of {known}' if known else ''}"
+                    "expected one of first order"
+                    f"{f'; of second order there are those of {affine_names}' if affine_names else ''}"
                 )
             ends = (self._at(tensors, number, end) for end in (direction, torch.zeros_like(direction)))
             change = [one - other for one, other in zip(*ends, strict=True)]
@@ -174,8 +175,8 @@ class _Call:
     def _at(self, tensors: Sequence[torch.Tensor], number: int, value: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """The results where one tensor has another value."""
         arguments = [*tensors[:number], value, *tensors[number + 1 :]]
-        wants = tuple(tensor.requires_grad and torch.is_grad_enabled() for tensor in arguments)
-        return _WarpFunction.apply(self, wants, *arguments)
+        requires_grad = tuple(tensor.requires_grad and torch.is_grad_enabled() for tensor in arguments)
+        return _WarpFunction.apply(self, requires_grad, *arguments)
 
 
 class _Playback:
@@ -205,17 +206,17 @@ class _WarpFunction(torch.autograd.Function):
     """Records Warp launches on a tape in forward and plays it back in backward."""
 
     @staticmethod
-    def forward(ctx, call: _Call, wants: tuple[bool, ...], *tensors: torch.Tensor):
+    def forward(ctx, call: _Call, requires_grad: tuple[bool, ...], *tensors: torch.Tensor):
         arguments = [as_array(*pair) for pair in zip(tensors, call.dtypes, strict=True)]
         # streams are the device's, as Warp has it, not a thread's
-        with one_call, _current_stream(call.device), recorded() if any(wants) else unrecorded() as tape:
-            for argument, needs_gradient in zip(arguments, wants, strict=True):
+        with one_call, _current_stream(call.device), recorded() if any(requires_grad) else unrecorded() as tape:
+            for argument, needs_gradient in zip(arguments, requires_grad, strict=True):
                 if needs_gradient:
                     require_gradient(argument)  # here, so that a graph that is captured zeroes the gradient
             results = call.function(*arguments)
         results = results if isinstance(results, tuple) else (results,)
         outputs = tuple(_as_tensor(result, call.device) for result in results)
-        if any(wants):
+        if any(requires_grad):
             ctx.save_for_backward(*tensors)  # torch then notices if they change before backward
             ctx.call, ctx.playback = call, _Playback(tape, arguments, results)
             pairs = zip(outputs, results, strict=True)
@@ -262,7 +263,7 @@ class _WarpAdjoint(torch.autograd.Function):
 def _current_stream(device: torch.device) -> wp.ScopedStream:
     """Launch on torch's current stream, which while it is captured must not wait for streams that are not.
 
-    Else Warp's stream waits for it at the end: there Warp frees what has been used, once nobody holds it.
+    Else Warp's stream waits for it at the end: there Warp frees memory that has no reference left.
     """
     is_cuda = device.type == "cuda"
     stream = wp.stream_from_torch(torch.cuda.current_stream(device)) if is_cuda else None

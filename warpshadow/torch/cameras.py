@@ -31,8 +31,8 @@ def clip_matrices_from_opengl(matrices: torch.Tensor) -> torch.Tensor:
         slope = (z * w)[..., :3].sum(-1) / lengths  # z = slope w + offset
         offset = z[..., 3] - slope * w[..., 3]
         near = -offset / (slope + 1)
-        rest = (z - slope[..., None] * w)[..., :3].square().sum(-1)
-        if not ((near > 0) & (rest <= _ROUNDING**2 * lengths * slope.square())).all():
+        residual = (z - slope[..., None] * w)[..., :3].square().sum(-1)
+        if not ((near > 0) & (residual <= _ROUNDING**2 * lengths * slope.square())).all():
             raise ValueError(
                 f"matrices: got {check.described(matrices)} whose third and fourth rows are no perspective of OpenGL, "
                 "expected projection @ view: z/w from -1 at the near plane, w the depth"

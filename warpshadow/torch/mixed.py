@@ -64,7 +64,7 @@ class MixedRenderer(torch.nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where its tensors are."""
+        """Device of its tensors."""
         return self._renderer(0).device
 
     @uncompiled
@@ -105,17 +105,17 @@ class MixedRenderer(torch.nn.Module):
             for body, texture in self._by_body("textures", textures).items()
         }
         geometries = batch.of_scenes(geometry)
-        drawn = {}
+        images_of_scenes = {}
         for scene in batch.rows:
             counts = self._vertex_counts[scene]
-            drawn[scene] = self._renderer(scene)(
+            images_of_scenes[scene] = self._renderer(scene)(
                 lights(scene),
                 albedo={body: _cut(of(scene), 2, counts[body]) for body, of in colors.items() if body in counts},
                 textures={body: of(scene) for body, of in maps.items() if body in counts},
                 geometry=geometries[scene],
                 clip_matrices=cameras(scene),
             )
-        return batch.join(drawn)
+        return batch.join(images_of_scenes)
 
     @uncompiled
     def placed(
@@ -133,7 +133,7 @@ class MixedRenderer(torch.nn.Module):
         Args:
             which: Scene of each image, from 0, whole numbers of shape [batch].
             rotations, translations, scales: As of a TorchRenderer, of as many bodies as the scene with the most has.
-            moving: Bodies that the poses move, as of a TorchRenderer; a scene passes over those that it has not.
+            moving: Bodies that the poses move, as of a TorchRenderer; a scene ignores bodies that it does not have.
             pivot: "center", or None, as of a TorchRenderer.
         Returns:
             For each scene the geometry of its images, None where it has none.
@@ -204,10 +204,10 @@ class MixedRenderer(torch.nn.Module):
         """Numbers and names of bodies, checked: some scene has each."""
         if not isinstance(bodies, Iterable) or isinstance(bodies, str):
             raise ValueError(f"{argument}: got {check.described(bodies)}, expected a list of bodies, such as [0]")
-        known = list(bodies)
-        for body in known:
+        known_bodies = list(bodies)
+        for body in known_bodies:
             check.choice(argument, body, self._maximum_vertices)
-        return known
+        return known_bodies
 
     def _by_body(self, argument: str, tensors: PerBody[torch.Tensor] | None) -> dict[Any, torch.Tensor]:
         """Arguments for bodies, by their numbers or names."""
@@ -252,7 +252,7 @@ class MixedRenderer(torch.nn.Module):
 
 
 class _Batch:
-    """Which images of a batch are of which scene."""
+    """Scenes of the images of a batch."""
 
     def __init__(self, which: torch.Tensor | Sequence[int], scene_count: int):
         numbers = which.tolist() if isinstance(which, torch.Tensor) else which
@@ -307,14 +307,16 @@ class _Batch:
                 )
         return dict(enumerate(geometry))
 
-    def join(self, drawn: Mapping[int, torch.Tensor]) -> torch.Tensor:
+    def join(self, images_of_scenes: Mapping[int, torch.Tensor]) -> torch.Tensor:
         """The images of all scenes, in the order of the batch."""
-        images = {scene: image.expand(len(self.rows[scene]), *image.shape[-3:]) for scene, image in drawn.items()}
+        images = {
+            scene: image.expand(len(self.rows[scene]), *image.shape[-3:]) for scene, image in images_of_scenes.items()
+        }
         if len(images) == 1:
             return next(iter(images.values())).contiguous()
         rows = itertools.chain.from_iterable(self.rows[scene] for scene in images)
-        in_order = dict(zip(rows, itertools.chain.from_iterable(images.values()), strict=True))
-        return torch.stack([in_order[row] for row in range(self.count)])
+        ordered_images = dict(zip(rows, itertools.chain.from_iterable(images.values()), strict=True))
+        return torch.stack([ordered_images[row] for row in range(self.count)])
 
 
 def _instances(geometry: Geometry[torch.Tensor]) -> int:
@@ -332,18 +334,18 @@ def _cut(tensor: Any, ndim: int, count: int) -> Any:
 def _as_batch(renderers: Iterable[TorchRenderer]) -> list[TorchRenderer]:
     """Renderers whose images are a batch, checked."""
     check.instance("renderers", renderers, Iterable, "a list of TorchRenderers, one for each scene")
-    checked = list(renderers)
-    if not checked:
+    checked_renderers = list(renderers)
+    if not checked_renderers:
         raise ValueError("renderers: got none, expected at least one")
-    for number, renderer in enumerate(checked):
+    for number, renderer in enumerate(checked_renderers):
         name = f"renderers[{number}]"
         check.instance(name, renderer, TorchRenderer, "a TorchRenderer")
         if renderer.warp.has_camera_batch:
             raise ValueError(f"{name}: got one with cameras of its own, expected one that has its scene's camera")
-        got, expected = _batch_description(renderer), _batch_description(checked[0])
-        if got != expected or not _is_same_basis(renderer.basis, checked[0].basis):
+        got, expected = _batch_description(renderer), _batch_description(checked_renderers[0])
+        if got != expected or not _is_same_basis(renderer.basis, checked_renderers[0].basis):
             raise ValueError(f"{name}: got {got}, expected {expected}, as the first has")
-    return checked
+    return checked_renderers
 
 
 def _batch_description(renderer: TorchRenderer) -> str:

@@ -121,7 +121,7 @@ class TorchRenderer(torch.nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where its tensors are."""
+        """Device of its tensors."""
         return torch.device(wp.device_to_torch(self.warp.device))
 
     def _apply(self, fn: Callable[[torch.Tensor], torch.Tensor], recurse: bool = True) -> "TorchRenderer":
@@ -149,9 +149,9 @@ class TorchRenderer(torch.nn.Module):
 
     def set_extra_state(self, state: torch.Tensor) -> None:
         """Raise ValueError unless a ``state_dict`` is of a renderer whose tensors mean the same."""
-        stored, expected = (bytes(item.tolist()).decode() for item in (state, self.get_extra_state()))
-        if stored != expected:
-            raise ValueError(f"state_dict: got that of a TorchRenderer with {stored}, expected {expected}")
+        stored_meaning, expected = (bytes(item.tolist()).decode() for item in (state, self.get_extra_state()))
+        if stored_meaning != expected:
+            raise ValueError(f"state_dict: got that of a TorchRenderer with {stored_meaning}, expected {expected}")
 
     @uncompiled
     @check.keywords(**_ELSEWHERE)
@@ -199,8 +199,8 @@ class TorchRenderer(torch.nn.Module):
         )
 
         def draw(inputs: dict[str, Any]) -> wp.array:
-            seen = inputs.pop("geometry"), inputs.pop("clip_matrices")
-            return self.warp.draw(**inputs, view=self.warp.view(*seen))
+            geometry_and_cameras = inputs.pop("geometry"), inputs.pop("clip_matrices")
+            return self.warp.draw(**inputs, view=self.warp.view(*geometry_and_cameras))
 
         is_affine = {"light": True, "albedo": not self.scene.bounces, "textures": not self.scene.bounces}
         affine = [name for name in arguments.names if is_affine.get(name.partition("[")[0])]
@@ -211,7 +211,7 @@ class TorchRenderer(torch.nn.Module):
     def layers(
         self, *, geometry: Geometry[torch.Tensor] | None = None, clip_matrices: torch.Tensor | None = None
     ) -> LayerTensors:
-        """Find depth, normals, bodies and their masks: what images show beside color.
+        """Find layers beside color: depth, normals, bodies and their masks.
 
         Args:
             geometry, clip_matrices: As for :meth:`forward`.
@@ -302,13 +302,13 @@ class TorchRenderer(torch.nn.Module):
         arguments = Arguments(self.device, cameras=self.cameras if has_cameras else None)
         inputs: dict[str, Any] = {"light": light, "geometry": None, "clip_matrices": None}
         if isinstance(light, torch.Tensor):
-            what = describe_coefficients(self.basis, light.shape[-2] if light.ndim > 1 else 0)
+            description = describe_coefficients(self.basis, light.shape[-2] if light.ndim > 1 else 0)
             if light.ndim == 3 and light.shape[1] == 2 * light.shape[0]:
-                what += (
+                description += (
                     "; of a map [height, width, 3] that is known, light=EnvironmentMap(map.numpy()); its coefficients "
                     "are torch.as_tensor(renderer.basis.coefficients(EnvironmentMap(map.numpy())), dtype=torch.float32)"
                 )
-            inputs["light"] = arguments.add("light", light, wp.vec3, (self.basis.size,), what)
+            inputs["light"] = arguments.add("light", light, wp.vec3, (self.basis.size,), description)
         elif isinstance(light, np.ndarray):  # which a renderer takes for known light
             raise ValueError("light: got ndarray, expected a tensor of torch.float32: torch.as_tensor makes one")
         if geometry is not None:
@@ -320,8 +320,8 @@ class TorchRenderer(torch.nn.Module):
             for number, tensor in enumerate(self.scene.per_body(values, name)):
                 if tensor is not None:
                     message_name = self._item_name(name, values, number)
-                    of_body = self._body_rows(name, number, tensor)
-                    slots[number] = arguments.add(f"{name}[{number}]", *of_body, message_name=message_name)
+                    body_rows = self._body_rows(name, number, tensor)
+                    slots[number] = arguments.add(f"{name}[{number}]", *body_rows, message_name=message_name)
             (inputs.setdefault("gloss", {}) if name in GLOSS_ARGUMENTS else inputs)[name] = slots
         return arguments, inputs
 
@@ -432,9 +432,9 @@ class TorchRenderer(torch.nn.Module):
             intrinsics [camera, 3, 3]; [3, 3], [3] and [3, 3] of the scene's own camera.
         """
         names = "rotation", "translation", "intrinsics"
-        stacked = (np.stack([getattr(camera, name) for camera in self.cameras]) for name in names)
-        of_cameras = (torch.tensor(item, dtype=torch.float32, device=self.device) for item in stacked)
-        R, t, K = of_cameras if self.warp.has_camera_batch else (item[0] for item in of_cameras)
+        stacked_arrays = (np.stack([getattr(camera, name) for camera in self.cameras]) for name in names)
+        camera_tensors = (torch.tensor(item, dtype=torch.float32, device=self.device) for item in stacked_arrays)
+        R, t, K = camera_tensors if self.warp.has_camera_batch else (item[0] for item in camera_tensors)
         return R, t, K
 
     @uncompiled

@@ -57,28 +57,28 @@ def insert(
     photo = wp.array(pixels[None] / gain, dtype=wp.vec3, device=renderer.device)
     with unrecorded():
         image: np.ndarray = renderer.insert(photo).numpy()[0] * np.float32(gain)
-    drawn = [number for number in range(len(scene.bodies)) if number not in scene.catchers]
-    if remark := _overexposure(image, pixels, renderer.layers().masks[drawn].sum(axis=0), exposure):
+    drawn_bodies = [number for number in range(len(scene.bodies)) if number not in scene.catchers]
+    if remark := _overexposure(image, pixels, renderer.layers().masks[drawn_bodies].sum(axis=0), exposure):
         check.warn(remark)
     return image
 
 
-def _overexposure(image: np.ndarray, photograph: np.ndarray, covered: np.ndarray, exposure: float) -> str | None:
+def _overexposure(image: np.ndarray, photograph: np.ndarray, coverage: np.ndarray, exposure: float) -> str | None:
     """Say how much of the bodies is brighter than white, where that is a tenth more than of the photograph.
 
     Args:
         image: With the bodies, linear RGB.
         photograph: Without; one with values above 1 has no white.
-        covered: Part of each pixel that the bodies cover.
+        coverage: Part of each pixel that the bodies cover.
         exposure: Theirs [stops].
     """
-    bright = image.max(axis=2)[covered > _COVERED_SHARE]
-    if not len(bright) or photograph.max() > 1:
+    bright_values = image.max(axis=2)[coverage > _COVERED_SHARE]
+    if not len(bright_values) or photograph.max() > 1:
         return None
-    share, usual = float((bright > 1).mean()), float((photograph >= 1).any(axis=2).mean())
+    share, usual = float((bright_values > 1).mean()), float((photograph >= 1).any(axis=2).mean())
     if share <= usual + _MAX_WHITE_SHARE:
         return None
-    stops = math.floor(10 * (exposure - math.log2(np.percentile(bright, 99)))) / 10
+    stops = math.floor(10 * (exposure - math.log2(np.percentile(bright_values, 99)))) / 10
     return (
         f"{share:.0%} of what is inserted is brighter than white, as is {usual:.0%} of the photograph; with exposure = "
         f"{stops:.1f} (--exposure {stops:.1f}) 1% is, or scale the light by {2 ** (stops - exposure):.2g}"

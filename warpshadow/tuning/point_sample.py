@@ -64,15 +64,15 @@ class PointSample:
         stage = SceneRenderer(bare, device=device)
         self._view = stage.view()
         face_ids = self._view.fragments.face_ids.numpy()[0]
-        chosen = _spread(face_ids >= 0, count, seed)
-        if not len(chosen):
+        chosen_samples = _spread(face_ids >= 0, count, seed)
+        if not len(chosen_samples):
             raise ValueError("scene: the camera sees no body, expected one in the image")
         positions = stage.geometry().positions.numpy()[0]
         normals = vertex_normals(stage.geometry().positions, stage.merged_scene.faces).numpy()[0]
         # the backs of vertices are numbered after them
         self._positions, self._normals = np.tile(positions, (2, 1)), np.concatenate([normals, -normals])
-        self._sides, self._vertices, self._weights = seen_on_faces(self._view, chosen)
-        self.bodies = stage.merged_scene.body_of_face[face_ids.ravel()[chosen]]
+        self._sides, self._vertices, self._weights = seen_on_faces(self._view, chosen_samples)
+        self.bodies = stage.merged_scene.body_of_face[face_ids.ravel()[chosen_samples]]
         self._scene = scene
         self._chosen = [body.receivers for body in stage.scene.bodies]
         if not self.reference.any():
@@ -125,14 +125,14 @@ class PointSample:
             of_bodies: Receivers of each body: at "vertex" points are interpolated, else they are receivers themselves.
         """
         is_own = np.array([receivers != "vertex" for receivers in of_bodies])[self.bodies]
-        of_receivers, weights, corners = places_of_receivers(self._vertices, self._weights, is_own)
+        receiver_rows, weights, corners = places_of_receivers(self._vertices, self._weights, is_own)
         points, normals = (
-            np.einsum("pk,pkc->pc", weights, values[self._vertices[of_receivers]])
+            np.einsum("pk,pkc->pc", weights, values[self._vertices[receiver_rows]])
             for values in (self._positions, self._normals)
         )
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         shares = np.where(is_own[:, None], np.array([1, 0, 0], np.float32), self._weights)
-        return PointReceivers(points, normals, self._sides[of_receivers], weights, corners, shares)
+        return PointReceivers(points, normals, self._sides[receiver_rows], weights, corners, shares)
 
     def error(self, shading: np.ndarray) -> float:
         """Relative L2 error ‖B − B_mesh‖ / ‖B_mesh‖ of shading [point, 3] against rays."""
@@ -145,20 +145,20 @@ class PointSample:
         return np.sqrt(sums) / np.linalg.norm(self.reference)
 
 
-def seen_on_faces(view: View, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where samples of the first image of a view lie on faces.
+def seen_on_faces(view: View, chosen_samples: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Positions on faces of samples of a view's first image.
 
     Args:
-        chosen: Flat indices of samples that see a face, shape [point].
+        chosen_samples: Flat indices of samples that see a face, shape [point].
     Returns:
         Faces, after the last of which backs are numbered, [point]; their vertices, or the backs of these, numbered
         likewise, [point, 3]; and barycentric coordinates, [point, 3].
     """
     fragments, merged_scene = view.fragments, view.merged_scene
-    face_ids = fragments.face_ids.numpy()[0].ravel()[chosen]
-    sides = face_ids if fragments.sides is None else fragments.sides.numpy()[0].ravel()[chosen]
+    face_ids = fragments.face_ids.numpy()[0].ravel()[chosen_samples]
+    sides = face_ids if fragments.sides is None else fragments.sides.numpy()[0].ravel()[chosen_samples]
     vertices = merged_scene.faces.numpy()[face_ids] + merged_scene.first_vertex[-1] * (sides != face_ids)[:, None]
-    return sides, vertices, fragments.barycentrics.numpy()[0].reshape(-1, 3)[chosen]
+    return sides, vertices, fragments.barycentrics.numpy()[0].reshape(-1, 3)[chosen_samples]
 
 
 def places_of_receivers(
@@ -174,10 +174,10 @@ def places_of_receivers(
         of each point, shape [point, 3].
     """
     themselves = np.flatnonzero(is_own)
-    unique, places, corners = np.unique(vertices[~is_own], return_index=True, return_inverse=True)
+    unique, vertex_places, corners = np.unique(vertices[~is_own], return_index=True, return_inverse=True)
     # a vertex lies on the face of a point of which it is a corner
-    points = np.concatenate([np.flatnonzero(~is_own)[places // 3], themselves])
-    weights = np.concatenate([np.eye(3, dtype=np.float32)[places % 3], barycentrics[themselves]])
+    points = np.concatenate([np.flatnonzero(~is_own)[vertex_places // 3], themselves])
+    weights = np.concatenate([np.eye(3, dtype=np.float32)[vertex_places % 3], barycentrics[themselves]])
     receivers = np.repeat(len(unique) + np.cumsum(is_own)[:, None] - 1, 3, axis=1)
     receivers[~is_own] = corners.reshape(-1, 3)
     return points, weights, receivers

@@ -51,7 +51,7 @@ def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = True
 
     Where the scene names no method, and no settings or spheres that "directional" alone reads, this is by rays that all
     pixels share (:func:`warpshadow.pipeline.choice_of_receivers.for_picture`): nothing is fitted or tabulated first,
-    and the image does not depend on what the cache holds. Light that bounces goes between patches, by rays, too. A
+    and the image does not depend on the content of the cache. Light that bounces goes between patches, by rays, too. A
     :class:`Renderer` is by "directional" then, and its images differ from this by that method's error, of which
     pipeline/README.md has figures. A method that is named gives the same method in both: ``Visibility("directional")``,
     or ``Visibility("ray-traced", sampling="shared")``, which this takes.

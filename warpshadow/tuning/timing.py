@@ -41,13 +41,15 @@ def image_times(
     firsts = dict(zip(reversed(keys), reversed(scenes), strict=True))
     stages = {key: _SharedTiming(scene, device) for key, scene in firsts.items()}
     functions = [stages[key].sampled_shading(scene) for key, scene in zip(keys, scenes, strict=True)]
-    of_stages = [function for stage in stages.values() for function in (stage.draw, stage.sampled_shading(stage.scene))]
-    times = median_times([*functions, *of_stages], runs, progress=progress)
+    stage_functions = [
+        function for stage in stages.values() for function in (stage.draw, stage.sampled_shading(stage.scene))
+    ]
+    times = median_times([*functions, *stage_functions], runs, progress=progress)
     unshadowed = dict(zip(stages, zip(times[len(scenes) :: 2], times[len(scenes) + 1 :: 2], strict=True), strict=True))
     estimates = []
     for key, milliseconds in zip(keys, times, strict=False):
-        whole, sampled = unshadowed[key]
-        estimates.append(whole + stages[key].extrapolation * max(milliseconds - sampled, 0.0))
+        whole_time, sampled_time = unshadowed[key]
+        estimates.append(whole_time + stages[key].extrapolation * max(milliseconds - sampled_time, 0.0))
     return estimates
 
 
@@ -100,24 +102,32 @@ class _SharedTiming:
     """
 
     def __init__(self, scene: Scene, device: wp.DeviceLike):
-        shadowed = SceneRenderer(scene, device=device)
-        self.scene = replace(shadowed.scene, visibility=scene.visibility.by("none"))
+        shadowed_renderer = SceneRenderer(scene, device=device)
+        self.scene = replace(shadowed_renderer.scene, visibility=scene.visibility.by("none"))
         self._renderer = SceneRenderer(self.scene, device=device)
         self._view = self._renderer.view()
         self.draw = whole_image(self._renderer)
-        seen = np.flatnonzero(self._view.fragments.face_ids.numpy()[0] >= 0)
-        sides, vertices, barycentrics = seen_on_faces(self._view, seen[:: scene.supersampling**2])  # one a pixel
+        visible_samples = np.flatnonzero(self._view.fragments.face_ids.numpy()[0] >= 0)
+        sides, vertices, barycentrics = seen_on_faces(
+            self._view, visible_samples[:: scene.supersampling**2]
+        )  # one a pixel
         merged_scene = self._renderer.merged_scene
         bodies = merged_scene.body_of_face[sides % len(merged_scene.body_of_face)]
         samples_receive = np.array([body.receivers != "vertex" for body in self._renderer.scene.bodies])
-        at, weights, _ = places_of_receivers(vertices, barycentrics, samples_receive[bodies])
-        corners = self._renderer.geometry().positions.numpy()[0][vertices[at] % merged_scene.first_vertex[-1]]
-        chosen = _neighborhoods(np.einsum("rk,rkc->rc", weights, corners))
-        chosen = chosen[np.argsort(bodies[at[chosen]], kind="stable")]  # as on_faces wants them
-        self._sample = sides[at[chosen]], weights[chosen]
-        is_adaptive = any(body.receivers == "adaptive" for body in shadowed.scene.bodies)
-        result = (shadowed.view() if is_adaptive else self._view).receivers  # adaptive ones are where shadows end
-        self.extrapolation = result.points.shape[1] / len(chosen)
+        receiver_rows, weights, _ = places_of_receivers(vertices, barycentrics, samples_receive[bodies])
+        corners = self._renderer.geometry().positions.numpy()[0][
+            vertices[receiver_rows] % merged_scene.first_vertex[-1]
+        ]
+        neighborhoods = _neighborhoods(np.einsum("rk,rkc->rc", weights, corners))
+        neighborhoods = neighborhoods[
+            np.argsort(bodies[receiver_rows[neighborhoods]], kind="stable")
+        ]  # as on_faces wants them
+        self._sample = sides[receiver_rows[neighborhoods]], weights[neighborhoods]
+        is_adaptive = any(body.receivers == "adaptive" for body in shadowed_renderer.scene.bodies)
+        result = (
+            shadowed_renderer.view() if is_adaptive else self._view
+        ).receivers  # adaptive ones are where shadows end
+        self.extrapolation = result.points.shape[1] / len(neighborhoods)
 
     def sampled_shading(self, scene: Scene) -> Callable[[], object]:
         """Make the function that shades the sample as a scene does."""
@@ -129,8 +139,8 @@ class _SharedTiming:
 def _neighborhoods(points: np.ndarray) -> np.ndarray:
     """Draw TIMED_RECEIVERS of points [point, 3], the nearest to a few of them: near points are culled together."""
     size = min(NEIGHBORS, len(points))
-    middles = np.random.default_rng(0).choice(points, min(TIMED_RECEIVERS, len(points)) // size, replace=False)
-    nearest = [np.argpartition(((points - middle) ** 2).sum(axis=1), size - 1)[:size] for middle in middles]
+    centers = np.random.default_rng(0).choice(points, min(TIMED_RECEIVERS, len(points)) // size, replace=False)
+    nearest = [np.argpartition(((points - center) ** 2).sum(axis=1), size - 1)[:size] for center in centers]
     return np.sort(nearest, axis=1).ravel()  # in the order of receivers
 
 
@@ -141,11 +151,11 @@ def whole_image(renderer: SceneRenderer) -> Callable[[], wp.array]:
     """
     poses = renderer.scene_poses()
     extent = np.abs(renderer.geometry().positions.numpy()).max() + np.linalg.norm(renderer.scene.camera.eye)
-    places = itertools.cycle(
+    positions_cycle = itertools.cycle(
         replace(
             poses,
             translations=wp.array(poses.translations.numpy() + shift * extent, dtype=wp.vec3, device=renderer.device),
         )
         for shift in (1e-5, 2e-5)
     )
-    return lambda: renderer.draw(view=renderer.view(renderer.placed(next(places))))
+    return lambda: renderer.draw(view=renderer.view(renderer.placed(next(positions_cycle))))

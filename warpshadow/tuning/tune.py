@@ -41,7 +41,7 @@ EQUAL_TIME_SHARE = 0.1
 Where none is accurate enough, the same holds of their errors; then the faster is better.
 """
 
-ERROR_STEP = 0.003  # errors that differ by less than this count as equal, too: nobody sees it
+ERROR_STEP = 0.003  # errors that differ by less than this count as equal, too: it is not visible
 # error of interpolation between a body's vertices from which on its pixels are tried as receivers
 COARSE_FACES_ERROR = 0.005
 
@@ -93,19 +93,21 @@ class Tuning:
     def untried_counts(self) -> tuple[int, ...]:
         """Numbers of spheres that were not tried, since no fit of them is cached: ``fits=True`` makes them."""
         fitted = fitted_counts(self.given)
-        tried = {trial.scene.bodies[number].blockers for trial in self.trials for number in fitted}
-        return tuple(count for count in SPHERE_COUNTS if fitted and count not in tried)
+        tried_counts = {trial.scene.bodies[number].blockers for trial in self.trials for number in fitted}
+        return tuple(count for count in SPHERE_COUNTS if fitted and count not in tried_counts)
 
     def __str__(self) -> str:
         """The table, the units of its errors and times, and the meaning of its marks."""
         camera, samples = self.given.camera, self.given.supersampling
-        sampled = f"; but for times marked *, shadows timed on {TIMED_RECEIVERS} of its receivers, extrapolated to all"
-        sampled *= not any(trial.scene.bounces for trial in self.trials)
+        sample_text = (
+            f"; but for times marked *, shadows timed on {TIMED_RECEIVERS} of its receivers, extrapolated to all"
+        )
+        sample_text *= not any(trial.scene.bounces for trial in self.trials)
         mark = "chosen" if self.is_reached else "nearest"
         return (
             "error: of the shading at points of the image, relative, against rays\n"
             f"image: time of a warm one of {camera.width} × {camera.height}, {samples} × {samples} samples a pixel, "
-            f"after all bodies have moved{sampled}\n"
+            f"after all bodies have moved{sample_text}\n"
             f"{self.table()}\n* no other is both faster and more accurate    > {mark}"
         )
 
@@ -169,7 +171,7 @@ def _bounces(scene: Scene) -> str:
 
 
 def _spheres(scene: Scene, fitted: Iterable[int]) -> str:
-    """How many spheres are fitted to each of some bodies, and how many others are given."""
+    """Numbers of spheres that are fitted to bodies, and of given ones."""
     if scene.visibility.method not in SPHERE_METHODS:
         return "–"
     counts = [scene.bodies[number].blockers for number in fitted]
@@ -240,8 +242,8 @@ def tune(
     counts: Sequence[Bounces] = (scene.bounces,)
     if bounces is not None:
         counts = (*BOUNCE_COUNTS, "all") if bounces == "all" else [count for count in BOUNCE_COUNTS if count <= bounces]
-    bounced = [replace(scene, bounces=count) for count in counts]
-    settings = [setting for item in bounced for setting in _settings(item, fine, fits, device)]
+    scenes_with_bounces = [replace(scene, bounces=count) for count in counts]
+    settings = [setting for item in scenes_with_bounces for setting in _settings(item, fine, fits, device)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a setting's warnings show in its error
         errors = []
@@ -252,28 +254,30 @@ def tune(
         if progress:  # timing takes as long again, and may be interrupted
             print(_error_table(settings, errors, fitted_counts(scene)), file=sys.stderr)
         times = image_times(settings, device=device, progress=progress)
-        if not any(item.bounces for item in bounced):
+        if not any(item.bounces for item in scenes_with_bounces):
             _time_front(settings, errors, times, device=device, progress=progress)
     trials = sorted(map(Trial, settings, errors, times), key=lambda trial: trial.milliseconds)
     if milliseconds is None:
-        reaching = [trial for trial in trials if trial.error <= requested]
-        chosen = _cheapest(reaching) if reaching else _nearest(trials)
+        accurate_trials = [trial for trial in trials if trial.error <= requested]
+        chosen = _cheapest(accurate_trials) if accurate_trials else _nearest(trials)
     else:
-        reaching = [trial for trial in trials if trial.milliseconds <= requested]
-        chosen = min(reaching, key=lambda trial: trial.error) if reaching else _cheapest(trials)
-    return Tuning(scene, chosen, bool(reaching), tuple(trials))
+        accurate_trials = [trial for trial in trials if trial.milliseconds <= requested]
+        chosen = min(accurate_trials, key=lambda trial: trial.error) if accurate_trials else _cheapest(trials)
+    return Tuning(scene, chosen, bool(accurate_trials), tuple(trials))
 
 
 def _time_front(
     settings: Sequence[Scene], errors: Sequence[float], times: list[float], *, device: wp.Device, progress: bool
 ) -> None:
     """Replace estimates by times of whole images, until all on the Pareto front are such."""
-    timed: set[int] = set()
-    while untimed := sorted(set(pareto_front(list(zip(times, errors, strict=True)))) - timed):
-        whole = whole_image_times([settings[number] for number in untimed], device=device, progress=progress)
-        for number, milliseconds in zip(untimed, whole, strict=True):
+    timed_settings: set[int] = set()
+    while untimed_settings := sorted(set(pareto_front(list(zip(times, errors, strict=True)))) - timed_settings):
+        image_milliseconds = whole_image_times(
+            [settings[number] for number in untimed_settings], device=device, progress=progress
+        )
+        for number, milliseconds in zip(untimed_settings, image_milliseconds, strict=True):
             times[number] = milliseconds
-        timed.update(untimed)
+        timed_settings.update(untimed_settings)
 
 
 def _warn_if_busy() -> None:
@@ -289,8 +293,8 @@ def _warn_if_busy() -> None:
 
 def _cheapest(trials: Sequence[Trial]) -> Trial:
     """The fastest trial, or the most accurate of trials that are about as fast."""
-    longest = (1 + EQUAL_TIME_SHARE) * min(trial.milliseconds for trial in trials)
-    return min((trial for trial in trials if trial.milliseconds <= longest), key=lambda trial: trial.error)
+    longest_time = (1 + EQUAL_TIME_SHARE) * min(trial.milliseconds for trial in trials)
+    return min((trial for trial in trials if trial.milliseconds <= longest_time), key=lambda trial: trial.error)
 
 
 def _nearest(trials: Sequence[Trial]) -> Trial:
@@ -342,12 +346,12 @@ def resolved(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = Fa
 def _resolve(scene: Scene, device: wp.DeviceLike, progress: bool) -> Scene:
     accepted_error = scene.visibility.error
     sample = PointSample(scene, device=device, progress=progress)
-    tried: list[tuple[float, Scene]] = []
+    tried_scenes: list[tuple[float, Scene]] = []
     for setting in _by_work(scene, sample):
-        tried.append((sample.error(sample.shading(setting)), setting))
-        if tried[-1][0] <= accepted_error:
+        tried_scenes.append((sample.error(sample.shading(setting)), setting))
+        if tried_scenes[-1][0] <= accepted_error:
             return setting
-    error, nearest = min(tried, key=lambda item: item[0])
+    error, nearest = min(tried_scenes, key=lambda item: item[0])
     interpolation_error = _interpolation_error(scene, sample)
     reason = f"; interpolation between vertices alone has {interpolation_error:.3f}: receivers = 'pixel'"
     reason *= interpolation_error >= accepted_error
@@ -375,8 +379,8 @@ def _by_work(scene: Scene, sample: PointSample) -> Iterator[Scene]:
     }
     factor, maximum = 2, max(counts.values(), default=SPHERE_COUNTS[-1])
     while factor * maximum <= SPHERE_COUNTS[-1] and _interpolation_error(scene, sample) < scene.visibility.error:
-        more = change_bodies(scene, "blockers", {number: factor * count for number, count in counts.items()})
-        yield from _all_directions(more)
+        next_scene = change_bodies(scene, "blockers", {number: factor * count for number, count in counts.items()})
+        yield from _all_directions(next_scene)
         factor *= 2
 
 
@@ -390,12 +394,12 @@ def _all_directions(scene: Scene) -> Iterator[Scene]:
 def _settings(scene: Scene, fine: Sequence[str], fits: bool, device: wp.DeviceLike) -> Iterator[Scene]:
     """Trials, a variant of the scene each: with its own receivers, and with fine ones."""
     for receivers in dict.fromkeys((_receivers(scene), tuple(fine))):
-        placed = change_bodies(scene, "receivers", dict(enumerate(receivers)))
+        scene_with_receivers = change_bodies(scene, "receivers", dict(enumerate(receivers)))
         if not scene.bounces:
-            yield replace(placed, visibility=scene.visibility.by("none"))
-        for more in _sphere_variants(placed, fits, device):
+            yield replace(scene_with_receivers, visibility=scene.visibility.by("none"))
+        for variant in _sphere_variants(scene_with_receivers, fits, device):
             for visibility in (*_directional(scene.visibility), *_harmonic(scene.visibility)):
-                yield replace(more, visibility=visibility)
+                yield replace(variant, visibility=visibility)
 
 
 def _sphere_variants(scene: Scene, fits: bool, device: wp.DeviceLike) -> Iterator[Scene]:

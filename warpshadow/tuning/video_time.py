@@ -20,7 +20,7 @@ _STILL_PIXEL_SECONDS = 2.8e-5
 
 
 def setup_seconds(scene: Scene, *, device: wp.DeviceLike = "cpu") -> float:
-    """How long a kept renderer takes before its first image, about, on one thread [s]: fits and self-visibility.
+    """Estimate the time of a renderer before its first image, on one thread [s]: fits and self-visibility.
 
     Both are on disk for a mesh whose spheres are.
     """
@@ -32,7 +32,7 @@ def setup_seconds(scene: Scene, *, device: wp.DeviceLike = "cpu") -> float:
 
 
 def still_seconds(scene: Scene) -> float:
-    """How long a still by shared rays takes, about, on one thread [s]; without bounces."""
+    """Estimate the time of a still by shared rays on one thread [s]; without bounces."""
     faces = sum(body.mesh.face_count for body in scene.bodies if not body.mesh.is_flat)
     pixels = scene.camera.width * scene.camera.height
     rays = for_picture(scene).visibility.ray_count / SHARED_DIRECTIONS

@@ -87,8 +87,8 @@ class ViewerApp:
 
     def _look_for_now(self, viewer_state: ViewerState) -> ViewerState:
         """Shown until spheres, tables and kernels are there: the same by rays, as stills, which need none."""
-        by_rays = not self._is_prepared and viewer_state.method in SPHERE_METHODS
-        return replace(viewer_state, method="ray-traced", sampling="shared") if by_rays else viewer_state
+        uses_rays = not self._is_prepared and viewer_state.method in SPHERE_METHODS
+        return replace(viewer_state, method="ray-traced", sampling="shared") if uses_rays else viewer_state
 
     def _note(self, text: str) -> None:
         """Name on all pages the work under way; paint again when all is done."""
@@ -125,7 +125,7 @@ class ViewerApp:
         """Move a page's view, unless its message is no camera."""
         camera = client.camera
         try:
-            seen = PageCamera(
+            seen_camera = PageCamera(
                 tuple(camera.wxyz),
                 tuple(camera.position),
                 float(np.degrees(camera.fov)),
@@ -135,7 +135,7 @@ class ViewerApp:
         except (ValueError, TypeError) as error:
             self._pages[client.client_id].fail(f"camera: {error}")
         else:
-            self.loop.look_from(client.client_id, seen)
+            self.loop.look_from(client.client_id, seen_camera)
 
     async def _let_go(self, client: viser.ClientHandle) -> None:
         self.loop.leave(client.client_id)
@@ -191,17 +191,19 @@ class _ViserPage:
     def _ask(self, frame: Frame, request_time: float) -> None:
         with contextlib.suppress(RuntimeError, TimeoutError):  # RuntimeError: gone, or its storage is blocked
             self._client.local_storage.get_item("taken", timeout=_PICTURE_TIMEOUT)
-        now = time.monotonic()
-        if not self._message and (now - self._last_status > _STATUS_SECONDS or not frame.quality.is_moving):
-            self._last_status = now
+        current_time = time.monotonic()
+        if not self._message and (current_time - self._last_status > _STATUS_SECONDS or not frame.quality.is_moving):
+            self._last_status = current_time
             height, width, _ = frame.rgb.shape
             delay = (
-                f"{1e3 * (now - request_time):.0f} ms from mouse to picture" if frame.quality.is_moving else "at rest"
+                f"{1e3 * (current_time - request_time):.0f} ms from mouse to picture"
+                if frame.quality.is_moving
+                else "at rest"
             )
             error = "" if frame.error is None else f"<br>error against rays {frame.error:.2%}"
             self._write(f"{delay}<br>{width} × {height}, {frame.cells}, {1e3 * frame.seconds:.0f} ms{error}")
 
     def _write(self, content: str) -> None:
         self._content = content
-        both = "<br>".join(filter(None, (content, html.escape(self._prepared))))
-        self._status.content = f'<div style="{_CORNER}">{both}</div>' if both else ""
+        content_and_notes = "<br>".join(filter(None, (content, html.escape(self._prepared))))
+        self._status.content = f'<div style="{_CORNER}">{content_and_notes}</div>' if content_and_notes else ""

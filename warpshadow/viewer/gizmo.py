@@ -23,17 +23,17 @@ def radius(body: Body) -> float:
 
 
 def handle_of(pose: BodyPose, body: Body, page_scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where the handles of a body are: quaternion, w first, and position [page units]."""
-    turned = Rotation.from_rotvec(pose.rotation, degrees=True)
-    return quaternion(turned), page_scale * (turned.apply(middle(body)) + pose.translation)
+    """Pose of a body's handles: quaternion, w first, and position [page units]."""
+    body_rotation = Rotation.from_rotvec(pose.rotation, degrees=True)
+    return quaternion(body_rotation), page_scale * (body_rotation.apply(middle(body)) + pose.translation)
 
 
 def pose_of(wxyz: np.ndarray, position: np.ndarray, body: Body, page_scale: float) -> BodyPose:
-    """Where a body is that was dragged by its handles.
+    """Pose of a body that was dragged by its handles.
 
     Raises:
         ValueError: for numbers that are not finite, and for a quaternion of 0.
     """
-    turned = rotation(wxyz)
-    translation = np.asarray(position, np.float64) / page_scale - turned.apply(middle(body))
-    return BodyPose(tuple(turned.as_rotvec(degrees=True).tolist()), tuple(translation.tolist()))
+    body_rotation = rotation(wxyz)
+    translation = np.asarray(position, np.float64) / page_scale - body_rotation.apply(middle(body))
+    return BodyPose(tuple(body_rotation.as_rotvec(degrees=True).tolist()), tuple(translation.tolist()))

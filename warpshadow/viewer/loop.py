@@ -116,7 +116,7 @@ class Loop:
             self._ask(*self._clients.values())
 
     def camera_of(self, name: Hashable) -> PageCamera | None:
-        """From where a page looks; None where it is gone, or has not said."""
+        """Camera of a page; None where the page is gone or has sent none."""
         with self._changed:
             client = self._clients.get(name)
             return None if client is None else client.camera
@@ -167,17 +167,17 @@ class Loop:
                 if client.request_time is not None and client.camera is not None:
                     request_time, client.request_time, client.is_content = client.request_time, None, False
                     return client.camera, frame_rate.moving(), request_time
-                better = None
+                better_image = None
                 if last is not None:
                     camera, quality, seconds = last
-                    better = frame_rate.better(quality, seconds, camera.width * camera.height)
-                client.is_content = better is None
-                if better is None:
+                    better_image = frame_rate.better(quality, seconds, camera.width * camera.height)
+                client.is_content = better_image is None
+                if better_image is None:
                     self._changed.wait()
                     continue
                 left = self._last_request + self._rest - time.monotonic()
                 if left <= 0:
-                    return camera, better, time.monotonic()
+                    return camera, better_image, time.monotonic()
                 self._changed.wait(left)
         return None
 

@@ -50,7 +50,7 @@ class PageCamera:
         if not _NARROWEST <= check.number("fov_y", self.fov_y) <= _WIDEST:
             raise ValueError(f"fov_y: got {self.fov_y:g}, expected {_NARROWEST:g} to {_WIDEST:g} degrees")
         for name in ("width", "height"):
-            if check.integer(name, getattr(self, name), what="pixels") > LARGEST_CANVAS:
+            if check.integer(name, getattr(self, name), unit="pixels") > LARGEST_CANVAS:
                 raise ValueError(f"{name}: got {getattr(self, name)}, expected at most {LARGEST_CANVAS} pixels")
         object.__setattr__(self, "wxyz", tuple((wxyz / np.linalg.norm(wxyz)).tolist()))
         object.__setattr__(self, "position", tuple(position.tolist()))

@@ -46,11 +46,11 @@ class Frame:
     Args:
         rgb: The picture, sRGB, uint8 of shape [height, width, 3].
         depth: Distance along the view [page units], float32 of shape [row, column], which may be fewer; None where
-            nobody asked for it.
+            it was not requested.
         quality: The quality it was made with.
         seconds: How long it took.
         cells: Its cells, in words.
-        error: Relative L2 error of the bodies' pixels against rays; None where nobody asked for it.
+        error: Relative L2 error of the bodies' pixels against rays; None where it was not requested.
     """
 
     rgb: np.ndarray
@@ -100,7 +100,7 @@ class Painter:
             error = relative_error(image, reference)
             rgb = error_picture(image, reference)
         else:
-            rgb = picture(image, viewer_state.stops, behind=self._behind(viewer_state, camera, quality))
+            rgb = picture(image, viewer_state.stops, background=self._behind(viewer_state, camera, quality))
         depths = None
         if depth:
             depths = self.page_scale * distances(renderer, view)
@@ -138,10 +138,10 @@ class Painter:
         page = PageCamera((1, 0, 0, 0), (0, 0, 0), 60, camera.width, camera.height)
         quality = Quality(128**2, cells=64, rays=16, supersampling=1, is_moving=True)
         _, renderer = self._renderer(viewer_state, quality)
-        sized = camera.stretched(*page.size(quality.pixels))
-        matrix = wp.array([sized.clip_matrix()], dtype=wp.mat44, device=renderer.device)
-        small = renderer.with_cameras([sized])
-        return round(auto_exposure(small.draw(view=small.view(clip_matrices=matrix)).numpy()[0]), 1)
+        resized_camera = camera.stretched(*page.size(quality.pixels))
+        matrix = wp.array([resized_camera.clip_matrix()], dtype=wp.mat44, device=renderer.device)
+        small_renderer = renderer.with_cameras([resized_camera])
+        return round(auto_exposure(small_renderer.draw(view=small_renderer.view(clip_matrices=matrix)).numpy()[0]), 1)
 
     @one_at_a_time
     def _drawn(
@@ -150,11 +150,11 @@ class Painter:
         size = page.size(quality.pixels)
         camera = page.camera(size, page_scale=self.page_scale, near=self.scene.camera.near)
         key, renderer = self._renderer(viewer_state, quality)
-        sized = self._sized.get((key, size), lambda: renderer.with_cameras([camera]))
+        sized_renderer = self._sized.get((key, size), lambda: renderer.with_cameras([camera]))
         matrix = wp.array([camera.clip_matrix()], dtype=wp.mat44, device=renderer.device)
-        view = sized.view(self._geometry(key, renderer, viewer_state), matrix)
+        view = sized_renderer.view(self._geometry(key, renderer, viewer_state), matrix)
         light = self._light_of(viewer_state, quality)
-        return sized, view, camera, sized.draw(light, view=view).numpy()[0]
+        return sized_renderer, view, camera, sized_renderer.draw(light, view=view).numpy()[0]
 
     def _renderer(self, viewer_state: ViewerState, quality: Quality) -> tuple[Hashable, Renderer]:
         """The renderer of the current state, and its key."""
@@ -167,17 +167,17 @@ class Painter:
         return key, self._renderers.get(key, lambda: Renderer(scene, device=self._device, progress=self._progress))
 
     def _geometry(self, key: Hashable, renderer: Renderer, viewer_state: ViewerState) -> Geometry | None:
-        """Where bodies are; None where the scene has them."""
+        """Placed bodies; None where they are as in the scene."""
         if not viewer_state.has_moved(self.scene):
             return None
-        turned = [Rotation.from_rotvec(pose.rotation, degrees=True).as_matrix() for pose in viewer_state.poses]
+        rotations = [Rotation.from_rotvec(pose.rotation, degrees=True).as_matrix() for pose in viewer_state.poses]
         moved = [pose.translation for pose in viewer_state.poses]
         scales = [body.scale for body in self.scene.bodies]
 
         def placed() -> Geometry:
             return renderer.placed(
                 Poses(
-                    wp.array(np.array(turned)[None], dtype=wp.mat33, device=renderer.device),
+                    wp.array(np.array(rotations)[None], dtype=wp.mat33, device=renderer.device),
                     wp.array(np.array(moved)[None], dtype=wp.vec3, device=renderer.device),
                     wp.array(np.array(scales)[None], dtype=wp.float32, device=renderer.device),
                 )
@@ -242,22 +242,22 @@ def coarse(light: EnvironmentMap | np.ndarray) -> EnvironmentMap | np.ndarray:
     return EnvironmentMap((weights * blocks).sum(axis=(1, 3)) / (step * weights.sum(axis=(1, 3))))
 
 
-def picture(image: np.ndarray, stops: float, behind: np.ndarray) -> np.ndarray:
+def picture(image: np.ndarray, stops: float, background: np.ndarray) -> np.ndarray:
     """The picture of an image for a page: as :class:`warpshadow.Picture` makes it, in a tenth of the time.
 
     Args:
         image: Linear RGB, premultiplied, and coverage, shape [height, width, 4].
         stops: Exposure.
-        behind: Linear RGB of the background: a color of the picture [3], or radiance [height, width, 3], which is
+        background: Linear RGB of the background: a color of the picture [3], or radiance [height, width, 3], which is
             exposed like the rest.
     Returns:
         uint8 of shape [height, width, 3], but for a code the same.
     """
     color, alpha, factor = image[..., :3], image[..., 3:], np.float32(2.0**stops)
-    if behind.ndim == 1:
-        linear = np.clip(factor * color, 0, 1) + (1 - alpha) * behind
+    if background.ndim == 1:
+        linear = np.clip(factor * color, 0, 1) + (1 - alpha) * background
     else:
-        linear = factor * (color + (1 - alpha) * behind)
+        linear = factor * (color + (1 - alpha) * background)
     codes = np.sqrt(np.clip(linear, 0, 1))  # which spreads a table's entries about as sRGB does
     return _SRGB[(codes * (len(_SRGB) - 1) + 0.5).astype(np.int32)]
 
@@ -267,13 +267,13 @@ _SRGB = np.round(255 * linear_to_srgb(np.linspace(0, 1, 4096) ** 2)).astype(np.u
 
 def relative_error(image: np.ndarray, reference: np.ndarray) -> float | None:
     """Relative L2 error of color over pixels that are wholly covered in both; None where there is none."""
-    covered = (image[..., 3] == 1) & (reference[..., 3] == 1)
-    size = np.linalg.norm(reference[covered, :3])
-    return float(np.linalg.norm((image - reference)[covered, :3]) / size) if size > 0 else None
+    is_covered = (image[..., 3] == 1) & (reference[..., 3] == 1)
+    size = np.linalg.norm(reference[is_covered, :3])
+    return float(np.linalg.norm((image - reference)[is_covered, :3]) / size) if size > 0 else None
 
 
 def error_picture(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """How far an image is from the reference, a fifth of its mean as full red (too bright) or blue (too dark).
+    """Difference of an image from the reference, a fifth of its mean as full red (too bright) or blue (too dark).
 
     Args:
         image: Linear RGB and coverage, shape [height, width, 4].
@@ -281,8 +281,8 @@ def error_picture(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     Returns:
         uint8 of shape [height, width, 3].
     """
-    covered = reference[reference[..., 3] > 0, :3]
-    mean = float(covered.mean()) if len(covered) else 0.0
+    is_covered = reference[reference[..., 3] > 0, :3]
+    mean = float(is_covered.mean()) if len(is_covered) else 0.0
     excess = (
         np.clip((image - reference)[..., :3].mean(axis=-1) / (0.2 * mean), -1, 1) if mean > 0 else 0 * image[..., 0]
     )

@@ -106,14 +106,14 @@ class Panel:
         gui = self._server.gui
         self._names = [f"{number}: {body.called}" for number, body in enumerate(self._scene.bodies)]
         with gui.add_folder("Bodies"):
-            dragged = gui.add_dropdown("Drag", (_NOTHING, *self._names))
+            dragged_input = gui.add_dropdown("Drag", (_NOTHING, *self._names))
             self._balls = balls = gui.add_checkbox("Show spheres", False)
             back = gui.add_button("Put back", hint="Bodies and settings as the scene has them")
 
-        @dragged.on_update
+        @dragged_input.on_update
         async def _(event: viser.GuiEvent) -> None:
-            if dragged.value in (_NOTHING, *self._names):
-                self._drag(None if dragged.value == _NOTHING else self._names.index(dragged.value))
+            if dragged_input.value in (_NOTHING, *self._names):
+                self._drag(None if dragged_input.value == _NOTHING else self._names.index(dragged_input.value))
 
         @balls.on_update
         def _(event: viser.GuiEvent) -> None:  # in a thread of its own: spheres may have to be fitted
@@ -173,10 +173,10 @@ class Panel:
         light = viewer_state.light(self._painter.coarse_light)
         assert isinstance(light, EnvironmentMap)
         step = max(1, light.radiance.shape[1] // _MAP_COLUMNS)
-        small = light.radiance[::step, ::step]
-        alpha = np.ones((*small.shape[:2], 1), np.float32)
-        stops = -float(np.log2(max(np.percentile(small.max(axis=-1), 95), 1e-12)))
-        return picture(np.concatenate([small, alpha], axis=-1), stops, np.zeros(3))
+        thumbnail = light.radiance[::step, ::step]
+        alpha = np.ones((*thumbnail.shape[:2], 1), np.float32)
+        stops = -float(np.log2(max(np.percentile(thumbnail.max(axis=-1), 95), 1e-12)))
+        return picture(np.concatenate([thumbnail, alpha], axis=-1), stops, np.zeros(3))
 
     def _save(self, event: viser.GuiEvent) -> None:
         client = event.client

@@ -81,11 +81,11 @@ class Preparation:
         with contextlib.suppress(OSError):
             self._process.stdin.close()
 
-    def _follow(self, packed: bytes) -> None:
+    def _follow(self, packed_progress: bytes) -> None:
         process = self._process
         assert process.stdin is not None and process.stderr is not None
         with contextlib.suppress(OSError, ValueError):  # it ended, or was closed
-            process.stdin.write(packed)
+            process.stdin.write(packed_progress)
             process.stdin.flush()
         for line in process.stderr:
             if not self.is_over:

@@ -1,4 +1,4 @@
-"""How good an image is made: few pixels and cells while something moves, then better ones while it rests."""
+"""Quality of images: few pixels and cells while something moves, then more while it rests."""
 
 from __future__ import annotations
 
@@ -58,10 +58,10 @@ class FrameRate:
         Returns:
             None where no better one can be seen, or would take too long.
         """
-        goal = min(FULL, canvas)
+        target_quality = min(FULL, canvas)
         if last.is_moving:
-            return Quality(min(goal, 256**2), cells=1 << 16, rays=1 << 16, supersampling=16, is_moving=False)
-        pixels = min(goal, 4 * last.pixels, int(last.pixels * STILL_SECONDS / max(seconds, 1e-3)))
-        if last.pixels >= goal or pixels < min(goal, _STEP * last.pixels):
+            return Quality(min(target_quality, 256**2), cells=1 << 16, rays=1 << 16, supersampling=16, is_moving=False)
+        pixels = min(target_quality, 4 * last.pixels, int(last.pixels * STILL_SECONDS / max(seconds, 1e-3)))
+        if last.pixels >= target_quality or pixels < min(target_quality, _STEP * last.pixels):
             return None
         return Quality(pixels, last.cells, last.rays, last.supersampling, is_moving=False)

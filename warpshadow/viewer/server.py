@@ -57,9 +57,9 @@ class Server(viser.ViserServer):
         if loop is not None:
             with contextlib.suppress(concurrent.futures.TimeoutError, RuntimeError):  # busy, or closed already
                 asyncio.run_coroutine_threadsafe(asyncio.sleep(_LAST_SECONDS), loop).result(1.0)
-        stopping = threading.Thread(target=self.stop, daemon=True)
-        stopping.start()
-        stopping.join(1.0)  # it lets nobody in from now on, but waits six seconds for connections that browsers keep
+        stop_thread = threading.Thread(target=self.stop, daemon=True)
+        stop_thread.start()
+        stop_thread.join(1.0)  # it waits six seconds for connections that browsers keep
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         """Open no tunnel."""

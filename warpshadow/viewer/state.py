@@ -32,7 +32,7 @@ PICTURE, ERROR = "picture", "error against rays"
 
 @dataclass(frozen=True)
 class BodyPose:
-    """Where a body is: turned by a rotation, then moved.
+    """Pose of a body: a rotation, then a translation.
 
     Args:
         rotation: Axis-angle vector [degrees].
@@ -96,7 +96,7 @@ class ViewerState:
             raise ValueError(f"directions: got {self.directions}, expected at most {MAX_CELLS}")
         within("softness", self.softness, 0.05, 1.5)
         if self.spheres is not None:
-            check.integer("spheres", self.spheres, what="spheres")
+            check.integer("spheres", self.spheres, unit="spheres")
             within("spheres", self.spheres, 1, MAX_SPHERES)
         check.choice("receivers", self.receivers, (AS_GIVEN, *RECEIVERS))
         check_bounces(self.bounces)
@@ -130,19 +130,22 @@ class ViewerState:
         """The settings of a scene, as they are changed; no better than a quality asks for."""
         names = "method", "sampling", "directions", "softness"
         settings = {name: getattr(visibility, name) for name in METHODS_OF_SETTING}
-        requested = Visibility.of(settings | {name: getattr(self, name) for name in names})
+        requested_visibility = Visibility.of(settings | {name: getattr(self, name) for name in names})
         if quality is None:
-            return requested
-        rays = quality.cells if requested.sampling == "shared" else quality.rays
-        bounded = {"directions": min(requested.directions, quality.cells), "samples": min(requested.ray_count, rays)}
-        return Visibility.of(vars(requested) | bounded)
+            return requested_visibility
+        rays = quality.cells if requested_visibility.sampling == "shared" else quality.rays
+        bounded_settings = {
+            "directions": min(requested_visibility.directions, quality.cells),
+            "samples": min(requested_visibility.ray_count, rays),
+        }
+        return Visibility.of(vars(requested_visibility) | bounded_settings)
 
     def bodies(self, bodies: tuple[Body, ...]) -> tuple[Body, ...]:
         """Bodies with the spheres and receivers that are asked for, where the scene has them."""
-        changed: dict[str, object] = {} if self.receivers == AS_GIVEN else {"receivers": self.receivers}
+        changed_settings: dict[str, object] = {} if self.receivers == AS_GIVEN else {"receivers": self.receivers}
         counts = {} if self.spheres is None else {"blockers": self.spheres}
         return tuple(
-            dataclasses.replace(body, **changed, **(counts if body.casts_shadow else {}))  # type: ignore[arg-type]
+            dataclasses.replace(body, **changed_settings, **(counts if body.casts_shadow else {}))  # type: ignore[arg-type]
             for body in bodies
         )
 

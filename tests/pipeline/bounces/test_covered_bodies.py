@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import warpshadow as ws
-from warpshadow.pipeline.bounces.covered import find_covers
+from warpshadow.pipeline.bounces.covered import find_overlays
 from warpshadow.pipeline.bounces.patches import ScenePatches
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.reflectance import Materials
@@ -32,7 +32,7 @@ def covers(*bodies):
     scene = ws.Scene([*bodies], ws.synthetic_sky(), ws.Camera.look_at((0, 3, 8), (0, 1, 0), size=(8, 8)))
     merged_scene = MergedScene(scene)
     senders = ScenePatches(merged_scene).senders(Materials.of_scene(merged_scene))
-    return senders, find_covers(senders, np.full(len(senders.areas), 0.5))
+    return senders, find_overlays(senders, np.full(len(senders.areas), 0.5))
 
 
 @pytest.mark.parametrize("rotation", [(0, 0, 0), (180, 0, 0)])

@@ -42,11 +42,11 @@ def test_flat_bodies_have_a_grid_whose_back_nobody_sees(merged_scene):
     assert patches.of_body(0).grid is None
 
 
-def test_sources_lie_on_the_bodies_and_face_outwards(merged_scene):
+def test_patch_samples_lie_on_the_bodies_and_face_outwards(merged_scene):
     senders = ScenePatches(merged_scene).senders(Materials.of_scene(merged_scene))
     positions = merged_scene.scene_geometry.positions
     normals = wp.array(_normals(merged_scene)[None], dtype=wp.vec3)
-    found = senders.sources(positions, normals)
+    found = senders.patch_samples(positions, normals)
     assert [span.body for span in found.spans] == [0, 1]
     _, first, end = found.spans[0]
     on_ball, outward = (array.numpy()[0, first:end] for array in (found.points, found.normals))
@@ -124,9 +124,9 @@ def test_many_bodies_share_a_scenes_patches_by_their_areas():
     bodies = [ws.Body(ball, blockers=1, scale=scale, name=f"{number}") for number, scale in enumerate(scales)]
     few, many = (ScenePatches(MergedScene(ws.Scene(tuple(some), light, camera))) for some in (bodies[:2], bodies))
     assert few.of_body(0).count == 256
-    assert len(few.of_body(0).sources.patches) > 3 * 256
+    assert len(few.of_body(0).patch_samples.patches) > 3 * 256
     assert [many.of_body(number).count for number in (0, 19)] == [64, 32]
-    assert len(many.of_body(0).sources.patches) == 3 * 64
+    assert len(many.of_body(0).patch_samples.patches) == 3 * 64
 
 
 def test_closed_patches_have_the_nearest_open_one_of_their_body_for_a_stand_in(merged_scene):

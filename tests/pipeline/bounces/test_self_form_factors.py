@@ -35,13 +35,13 @@ def dented(depth: float) -> ws.Mesh:
 def traced(monkeypatch, tmp_path) -> list[int]:
     """How many probes were traced, by call; nothing is known from before."""
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
-    counts, trace = [], self_form_factors.trace_factors
+    counts, trace = [], self_form_factors.trace_form_factors
 
     def counted(*args, **kwargs):
         counts.append(len(args[3]))
         return trace(*args, **kwargs)
 
-    monkeypatch.setattr(self_form_factors, "trace_factors", counted)
+    monkeypatch.setattr(self_form_factors, "trace_form_factors", counted)
     return counts
 
 

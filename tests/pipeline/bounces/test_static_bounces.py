@@ -13,7 +13,7 @@ import warpshadow as ws
 from warpshadow.pipeline import rays
 from warpshadow.pipeline.bounces import static_bounces
 from warpshadow.pipeline.bounces.patches import ScenePatches
-from warpshadow.stages.bounces.irradiance_cache import choose_cache_points, interpolation
+from warpshadow.stages.bounces.irradiance_cache import choose_cache_points, interpolation_matrix
 from warpshadow.torch import TorchRenderer
 
 SEED = 2
@@ -156,13 +156,13 @@ def test_black_bodies_send_nothing(renderer, direct):
 @pytest.mark.parametrize("given", ["light", "light and colors"])
 def test_iterations_are_those_of_a_twin_in_float64(given, method, monkeypatch):
     """B = a M (S + F B) and I = W F B, of the form factors F that rays find; some go on where patches share a body."""
-    traced, find = [], static_bounces.scaled_to_sky
+    traced, find = [], static_bounces.scale_to_sky
 
     def listed(*arguments):
         traced.append(find(*arguments))
         return traced[-1]
 
-    monkeypatch.setattr(static_bounces, "scaled_to_sky", listed)
+    monkeypatch.setattr(static_bounces, "scale_to_sky", listed)
     scene = ball_on_ground()
     scene = replace(scene, bodies=(replace(scene.bodies[0], mesh=bowl()), *scene.bodies[1:]))
     scene = replace(scene, visibility=ws.Visibility(method, samples=512))
@@ -179,7 +179,9 @@ def test_iterations_are_those_of_a_twin_in_float64(given, method, monkeypatch):
     patches = ScenePatches(engine.merged_scene)
     senders = patches.senders(view.materials)
     albedo = patches.albedo(view.materials, senders.bodies).value(view.call).numpy()[0].astype(np.float64)
-    (transfers,) = (node for name, (_, node) in view._cached.items() if name in ("transfer", "transfer of sources"))
+    (transfers,) = (
+        node for name, (_, node) in view._cached.items() if name in ("transfer", "transfer of patch samples")
+    )
     transfer = np.concatenate([each.numpy()[0] for each in transfers.value(view.call)]).astype(np.float64)
 
     def dense(matrix) -> np.ndarray:
@@ -189,14 +191,14 @@ def test_iterations_are_those_of_a_twin_in_float64(given, method, monkeypatch):
         return result
 
     mean, (between, of_nodes) = dense(senders.mean), [each.factors.toarray().astype(np.float64) for each in traced]
-    at_sources = transfer @ light.numpy()[0].astype(np.float64)
+    at_patch_samples = transfer @ light.numpy()[0].astype(np.float64)
     of_bodies = np.repeat(np.arange(len(senders.bodies)), np.diff(senders.first))
-    is_own = of_bodies[senders.patch_of_source][:, None] == of_bodies
+    is_own = of_bodies[senders.patch_of_sample][:, None] == of_bodies
     assert (between * is_own).sum(axis=1).max() > 0.3
-    once = albedo * (mean @ at_sources)
-    radiosity = albedo * (mean @ (at_sources + between @ once))
+    once = albedo * (mean @ at_patch_samples)
+    radiosity = albedo * (mean @ (at_patch_samples + between @ once))
     for _ in range(static_bounces.SELF_BOUNCES):
-        past = at_sources + (between * ~is_own) @ once
+        past = at_patch_samples + (between * ~is_own) @ once
         radiosity = albedo * (mean @ (past + (between * is_own) @ radiosity))
     expected = dense(factors.receiver_weights) @ (of_nodes @ radiosity)
     rows = np.concatenate([each.numpy()[0] for each in view.transfers.value(view.call)]).astype(np.float64)
@@ -221,8 +223,8 @@ def test_white_balls_in_a_white_furnace_are_white(gap):
     np.testing.assert_allclose(seen[:, :3], 1, atol=0.03)
 
 
-def test_what_sticks_out_of_another_body_has_the_light_of_sources_outside():
-    """A ball shows a cap that is smaller than its patches: all sources of these lie in the box."""
+def test_what_sticks_out_of_another_body_has_the_light_of_patch_samples_outside():
+    """A ball shows a cap that is smaller than its patches: all patch samples of these lie in the box."""
     box = trimesh.creation.box((2, 1, 2))
     bodies = [
         ws.Body(ws.icosphere(0.5, 3), albedo=(1, 1, 1), translation=(0, 0.06, 0)),
@@ -235,13 +237,13 @@ def test_what_sticks_out_of_another_body_has_the_light_of_sources_outside():
     shading = view.shading(None)
     shading.value(view.call)
     (factors,) = (node for name, (_, node) in view._cached.items() if name == "form factors")
-    means = factors.value(view.call).source_means.on_host()
+    means = factors.value(view.call).patch_sample_means.to_scipy()
     senders = ScenePatches(engine.merged_scene).senders(view.materials)
-    points = senders.sources(view.vertices.value(view.call), view.normals.value(view.call)).points.numpy()[0]
+    points = senders.patch_samples(view.vertices.value(view.call), view.normals.value(view.call)).points.numpy()[0]
     is_outside = points[:, 1] > 0.5
-    of_ball = senders.body_of_patch[senders.patch_of_source] == 0
+    of_ball = senders.body_of_patch[senders.patch_of_sample] == 0
     is_closed = senders.body_of_patch == 0
-    is_closed &= np.bincount(senders.patch_of_source, of_ball & is_outside, len(senders.areas)) == 0
+    is_closed &= np.bincount(senders.patch_of_sample, of_ball & is_outside, len(senders.areas)) == 0
     assert 0 < (of_ball & is_outside).sum() < 0.1 * of_ball.sum() and is_closed.sum() > 50
     outside_parts = means @ (of_ball & is_outside).astype(np.float32)
     np.testing.assert_allclose(outside_parts[senders.body_of_patch == 0], 1, atol=1e-5)
@@ -295,7 +297,7 @@ def test_no_ray_is_traced_in_an_iteration(renderer, monkeypatch):
         def refuse(*_, **__):
             raise AssertionError("rays are traced")
 
-        for module, name in ((static_bounces, "trace_factors"), (rays, "trace_shading"), (rays, "trace_transfer")):
+        for module, name in ((static_bounces, "trace_form_factors"), (rays, "trace_shading"), (rays, "trace_transfer")):
             monkeypatch.setattr(module, name, refuse)
         again = renderer(light, albedo={"wall": wall}), renderer(albedo={"wall": wall})
         renderer(2 * light, albedo={"wall": 0.5 * wall})
@@ -313,7 +315,7 @@ def test_what_is_interpolated_between_nodes_is_near_what_it_was():
     points = normals + [1.0, 0, 0]
     nodes = choose_cache_points(points, 400)
     assert len(np.unique(nodes)) == 400
-    matrix = interpolation(points, normals, nodes)
+    matrix = interpolation_matrix(points, normals, nodes)
     np.testing.assert_allclose(matrix.sum(axis=1), 1, atol=1e-6)
     assert matrix.data.min() >= 0
     np.testing.assert_allclose(matrix[nodes].toarray(), np.eye(400), atol=1e-6)
@@ -328,7 +330,7 @@ def test_nodes_are_not_those_of_the_other_side():
     points[1::2] = points[::2]
     normals = np.tile([1.0, 0, 0], (3000, 1)) * np.where(np.arange(3000) % 2, -1, 1)[:, None]
     nodes = choose_cache_points(points, 1001)
-    matrix = interpolation(points, normals, nodes)
+    matrix = interpolation_matrix(points, normals, nodes)
     np.testing.assert_allclose(matrix @ normals[nodes, 0], normals[:, 0], atol=1e-6)
 
 
@@ -337,5 +339,5 @@ def test_a_few_receivers_are_all_nodes():
     normals = points / np.linalg.norm(points, axis=1, keepdims=True)
     nodes = choose_cache_points(points)
     assert sorted(nodes) == [0, 1, 2]
-    np.testing.assert_allclose((interpolation(points, normals, nodes) @ points[nodes]), points, atol=1e-6)
-    assert interpolation(points[:1], normals[:1], np.array([0])).toarray() == [[1.0]]
+    np.testing.assert_allclose((interpolation_matrix(points, normals, nodes) @ points[nodes]), points, atol=1e-6)
+    assert interpolation_matrix(points[:1], normals[:1], np.array([0])).toarray() == [[1.0]]

@@ -53,7 +53,7 @@ class Case:
     def of_rows(self) -> np.ndarray:
         """S of each row, [batch, receiver, direction, lookup, corner]."""
         indices = self.lookup.indices.numpy()
-        of_rays = self.kernels.looks_at_rays.numpy() == 1
+        of_rays = self.kernels.uses_rays.numpy() == 1
         assert of_rays.any() and not of_rays.all()
         row = self.numbers[:, :, None, None, :]
         index = indices[:, None, :, :, None]

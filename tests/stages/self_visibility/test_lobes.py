@@ -8,7 +8,7 @@ import warp as wp
 from warpshadow.device.tape import recorded
 from warpshadow.maths import sh
 from warpshadow.maths.directions import fibonacci
-from warpshadow.stages.self_visibility.lobes import find_turned, project_rows, self_visibility_lobes
+from warpshadow.stages.self_visibility.lobes import find_body_rotation, project_rows, self_visibility_lobes
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.self_visibility.trace import VisibilityRows
 from warpshadow.stages.transfer import sh_product
@@ -60,7 +60,7 @@ class Case:
         self.order, self.rows = order, wp.array(self.lobes, dtype=wp.float32, device=device)
 
     def found(self, bands=None) -> wp.array:
-        turned = find_turned(self.on_device, 1, self.order)
+        turned = find_body_rotation(self.on_device, 1, self.order)
         return self_visibility_lobes(self.rows, self.places, turned, order=self.order, bands=bands)
 
     def expected(self, rotations: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import warp as wp
 from warpshadow.device.tape import recorded
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.stages.self_visibility.lookup import find_resampling_kernels, find_resampling_weights
-from warpshadow.stages.self_visibility.trace import RUN
+from warpshadow.stages.self_visibility.trace import RAYS_PER_CELL
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -29,16 +29,16 @@ def spreads() -> np.ndarray:
     return np.linspace(0, 1.2 * cell_radius(CELLS), CELLS)
 
 
-def twin(rotation: np.ndarray, directions: np.ndarray, looks_at_rays: np.ndarray, reaches: np.ndarray) -> np.ndarray:
+def twin(rotation: np.ndarray, directions: np.ndarray, uses_rays: np.ndarray, cos_radii: np.ndarray) -> np.ndarray:
     """Weights [direction, ray or coarse cell] in float64."""
     rays = fibonacci(RAYS)
-    cells = rays.reshape(-1, RUN, 3).mean(axis=1)
+    cells = rays.reshape(-1, RAYS_PER_CELL, 3).mean(axis=1)
     cells /= np.linalg.norm(cells, axis=1, keepdims=True)
     cells = np.concatenate([cells, np.full((RAYS - len(cells), 3), np.nan)])
-    candidates = np.where(looks_at_rays[:, None, None], rays, cells)
+    candidates = np.where(uses_rays[:, None, None], rays, cells)
     towards = directions @ rotation
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    heights = (np.einsum("qcx,qx->qc", candidates, towards) - reaches[:, None]) / (1 - reaches[:, None])
+    heights = (np.einsum("qcx,qx->qc", candidates, towards) - cos_radii[:, None]) / (1 - cos_radii[:, None])
     heights = np.where(heights > 0, heights, 0)
     return heights**2 / (heights**2).sum(axis=1, keepdims=True)
 
@@ -56,7 +56,7 @@ def looked_up(matrices: np.ndarray, device, requires_grad=False):
     directions = fibonacci(CELLS)
     kernels = find_resampling_kernels(directions, spreads(), RAYS, wp.get_device(device))
     rotations = wp.array(matrices, dtype=wp.mat33, device=device, requires_grad=requires_grad)
-    described = directions, kernels.looks_at_rays.numpy() == 1, kernels.reaches.numpy().astype(np.float64)
+    described = directions, kernels.uses_rays.numpy() == 1, kernels.cos_radii.numpy().astype(np.float64)
     return rotations, find_resampling_weights(rotations, 0, kernels), kernels, described
 
 
@@ -76,10 +76,10 @@ def test_there_is_room_for_what_any_rotation_looks_up(device):
 
 
 def test_light_of_a_narrow_cell_looks_at_few_rays_and_that_of_an_even_one_at_coarse_cells(device):
-    _, lookup, _, (_, looks_at_rays, reaches) = looked_up(rotations_of(20), device)
-    angles = np.arccos(reaches)
-    assert looks_at_rays[0] and angles[0] < 2.5 * cell_radius(RAYS)
-    assert not looks_at_rays[-1]
+    _, lookup, _, (_, uses_rays, cos_radii) = looked_up(rotations_of(20), device)
+    angles = np.arccos(cos_radii)
+    assert uses_rays[0] and angles[0] < 2.5 * cell_radius(RAYS)
+    assert not uses_rays[-1]
     assert 3 < lookup.counts.numpy().mean() < 24
 
 

@@ -6,7 +6,13 @@ import warp as wp
 
 import warpshadow as ws
 from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.self_visibility.probes import _ENTRY, ProbeTable, VisibilityProbes, find_probes, longest_edge
+from warpshadow.stages.self_visibility.probes import (
+    _ENTRY_RATIO,
+    ProbeTable,
+    VisibilityProbes,
+    find_probes,
+    longest_edge,
+)
 
 # Interpolated float32 positions of size 1.
 FLOAT32 = 1e-6
@@ -56,7 +62,7 @@ def test_edges_that_enter_another_part_are_cut_finer_and_faces_agree(longest):
     lengths = np.linalg.norm(probes.positions[ends[:, 0]] - probes.positions[ends[:, 1]], axis=1)
     inside = is_inside(probes.positions)
     enters = inside[ends[:, 0]] != inside[ends[:, 1]]
-    assert enters.any() and lengths[enters].max() <= _ENTRY * longest and lengths.max() <= longest
+    assert enters.any() and lengths[enters].max() <= _ENTRY_RATIO * longest and lengths.max() <= longest
     assert len(probes.positions) - len(ends) + counts.sum() // 3 == 1
     without = find_probes(POSITIONS, NORMALS, FACES, longest)
     assert len(without.positions) <= len(probes.positions) < len(without.positions) + 60
@@ -66,8 +72,8 @@ def test_a_long_rail_is_cut_and_the_small_faces_beside_it_are_not():
     ball, rail = ws.icosphere(1.0, 5), np.array([(2, 0, 0), (6, 0, 0), (2, 0.01, 0), (6, 0.01, 0)])
     points = np.concatenate([ball.positions, rail]).astype(np.float32)
     faces = np.concatenate([ball.faces, FACES + len(ball.positions)])
-    for samples_receive in (False, True):
-        longest = longest_edge(points, faces, samples_receive=samples_receive)
+    for has_sample_receivers in (False, True):
+        longest = longest_edge(points, faces, has_sample_receivers=has_sample_receivers)
         new = find_probes(points, np.tile(NORMALS[:1], (len(points), 1)), faces, longest).positions[len(points) :]
         assert 20 < len(new) < 1000 and (new[:, 0] > 2).all()
 

@@ -35,16 +35,16 @@ def test_rays_go_to_where_the_light_of_their_cell_is(height):
     cells, known = sun_cells(light), light.cells(fibonacci(CELLS))
     assert cells is not None and cells.directions.shape == (16, PACKET, 3)
     np.testing.assert_allclose(np.linalg.norm(cells.directions, axis=2), 1)
-    bright = np.flatnonzero(cells.places >= 0)
+    bright = np.flatnonzero(cells.slots >= 0)
     assert 1 <= len(bright) < 16
     power = known.radiance @ LUMINANCE
     np.testing.assert_array_equal(np.sort(np.argsort(-power)[: len(bright)]), bright)
     for cell in bright:
-        rays = cells.directions[cells.places[cell]]
+        rays = cells.directions[cells.slots[cell]]
         mean = rays.mean(axis=0)
         assert np.linalg.norm(mean / np.linalg.norm(mean) - known.directions[cell]) < 0.03
         spread = np.arccos(2 * np.linalg.norm(mean) - 1)
-        assert 0.75 < spread / known.spreads[cell] < 1.35  # of all light; a cell's is that of its brightest part
+        assert 0.75 < spread / known.half_angles[cell] < 1.35  # of all light; a cell's is that of its brightest part
 
 
 def test_even_light_has_no_sun_cells():

@@ -7,7 +7,7 @@ import warpshadow as ws
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.stages.ray_packets import build_face_tree
 from warpshadow.stages.self_visibility import trace
-from warpshadow.stages.self_visibility.trace import MAX_MEMORY, MIN_RAYS, RAYS, RUN, ray_count, trace_rows
+from warpshadow.stages.self_visibility.trace import MAX_MEMORY, MIN_RAYS, RAYS, RAYS_PER_CELL, ray_count, trace_rows
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -64,7 +64,7 @@ def test_bits_are_what_rays_meet_also_mirrored_ones(device):
     probes, normals, rows = traced(device)
     assert rows.ray_count == COUNT
     directions = fibonacci(COUNT)
-    lowest = np.sin(3.5 * cell_radius(COUNT // RUN))
+    lowest = np.sin(3.5 * cell_radius(COUNT // RAYS_PER_CELL))
     blocked = 0
     for probe, normal, bits in zip(probes, normals, bits_of(rows), strict=True):
         cosines = directions @ normal
@@ -82,8 +82,8 @@ def test_bits_are_what_rays_meet_also_mirrored_ones(device):
 def test_cells_are_means_of_their_bits_weighted_with_cosines(device):
     _, normals, rows = traced(device)
     cosines = np.abs(np.einsum("rx,dx->rd", normals, fibonacci(COUNT)))
-    is_cached = np.einsum("rx,dx->rd", normals, fibonacci(COUNT)) > -np.sin(3.5 * cell_radius(COUNT // RUN))
-    weights = (cosines * is_cached).reshape(len(normals), -1, RUN)
+    is_cached = np.einsum("rx,dx->rd", normals, fibonacci(COUNT)) > -np.sin(3.5 * cell_radius(COUNT // RAYS_PER_CELL))
+    weights = (cosines * is_cached).reshape(len(normals), -1, RAYS_PER_CELL)
     totals = weights.sum(axis=2)
     sums = (weights * bits_of(rows).reshape(weights.shape)).sum(axis=2)
     expected = np.where(totals > 0, sums / np.maximum(totals, 1e-12), 1)

@@ -35,7 +35,7 @@ class Free(abc.ABC):
         return self.key
 
     def numbered(self, scene: Scene) -> Free:
-        """The same, its body by number where it was by name; ValueError where a scene has no such body."""
+        """Replace the name of its body by the number; ValueError where a scene has no such body."""
         return self
 
     def check_scene(self, scene: Scene) -> None:
@@ -110,5 +110,5 @@ class FreeOfBody(Free):
         return body_name if names.count(body_name) == 1 else f"body_{self.number}"
 
     def numbered(self, scene: Scene) -> FreeOfBody:
-        """The same of the body's number."""
+        """Replace the name of its body by the number."""
         return replace(self, body=scene.body_number(self.body))

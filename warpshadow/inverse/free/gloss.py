@@ -94,13 +94,13 @@ class _Gloss(FreeOfBody):
 
 @dataclass(frozen=True)
 class Roughness(_Gloss):
-    """How rough a body is that shines."""
+    """Roughness of a glossy body."""
 
     key = "roughness"
 
 
 @dataclass(frozen=True)
 class Metallic(_Gloss):
-    """How much of a body that shines is metal."""
+    """Metallic share of a glossy body."""
 
     key = "metallic"

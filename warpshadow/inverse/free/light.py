@@ -83,8 +83,8 @@ class Light(Free):
             return self.smoothness * (radiance[first] - radiance[second]).square().mean() if self.smoothness else None
         if not self.nonnegativity:
             return None
-        towards = np.sqrt(4 * np.pi) * self.basis.functions(fibonacci(512))
-        radiance = setting.tensor(towards) @ values["coefficients"]
+        basis_values = np.sqrt(4 * np.pi) * self.basis.functions(fibonacci(512))
+        radiance = setting.tensor(basis_values) @ values["coefficients"]
         return self.nonnegativity * torch.relu(-radiance).square().mean()
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:

@@ -65,7 +65,7 @@ class Plane(FreeOfBody):
         object.__setattr__(self, "carries", tuple(self.carries))
 
     def numbered(self, scene: Scene) -> Plane:
-        """The same of the bodies' numbers."""
+        """Replace names of bodies by their numbers."""
         carries = tuple(scene.body_number(body, "carries") for body in self.carries)
         return replace(self, body=scene.body_number(self.body), carries=carries)
 
@@ -93,7 +93,7 @@ class Plane(FreeOfBody):
         return plane.normal, foot, float(np.mean([bodies[n].scale * setting.extent(n) for n in others]))
 
     def start(self, setting: Setting) -> Values:
-        """Where the scene has it, or the plane nearest to the points."""
+        """Plane of the scene, or the plane nearest to the points."""
         tilt, height = np.zeros(2), 0.0
         if self.points is not None:
             from scipy.spatial.transform import Rotation
@@ -111,7 +111,7 @@ class Plane(FreeOfBody):
     def moved(
         self, values: Values, setting: Setting, rotation: torch.Tensor, point: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Where a rotation and a point of the start are when the plane has moved. Differentiable: all but setting."""
+        """Move a rotation and a point along with the plane. Differentiable: all but setting."""
         normal, foot, unit = self._start(setting)
         about = setting.tensor(constraints.remaining([normal]))
         turn = rotation_matrices(about.T @ values["tilt"])
@@ -163,14 +163,14 @@ def with_planes_last(free: Sequence[Free]) -> tuple[Free, ...]:
     """
     planes = []
     for plane in (item for item in free if isinstance(item, Plane)):
-        standing = [pose for pose in free if isinstance(pose, Pose) and pose.stands_on == plane.number]
-        for pose in standing:
+        standing_poses = [pose for pose in free if isinstance(pose, Pose) and pose.stands_on == plane.number]
+        for pose in standing_poses:
             if pose.distance is not None:
                 raise ValueError(
                     f"{pose.name}: got a distance beside a free {plane.name}, expected priors of the plane"
                 )
         if any(isinstance(pose, Pose) and pose.number == plane.number for pose in free):
             raise ValueError(f"{plane.name}: got a free pose of the same body, expected one of them")
-        carried = {*plane._moving()[1:], *(pose.number for pose in standing)}
-        planes.append(replace(plane, carries=tuple(sorted(carried))))
+        carried_bodies = {*plane._moving()[1:], *(pose.number for pose in standing_poses)}
+        planes.append(replace(plane, carries=tuple(sorted(carried_bodies))))
     return (*(item for item in free if not isinstance(item, Plane)), *planes)

@@ -86,13 +86,15 @@ class Pose(FreeOfBody):
             check.choice("fixed", coordinate, constraints.AXES)
         if self.axis is not None:
             object.__setattr__(self, "axis", constraints.checked_axis(self.axis))
-        turning = [name for name in ("upright", "axis") if getattr(self, name)]
+        rotation_limits = [name for name in ("upright", "axis") if getattr(self, name)]
         if self.stands_on is not None and self.resting != "free":
-            turning.append("stands_on")
-        if len(turning) > 1:
-            raise ValueError(f"{turning[0]}: got it beside {turning[1]}, expected one axis to turn about")
-        if turning and self.rotation != "axis-angle":
-            raise ValueError(f'rotation: got {self.rotation!r} beside {turning[0]}, expected "axis-angle"')
+            rotation_limits.append("stands_on")
+        if len(rotation_limits) > 1:
+            raise ValueError(
+                f"{rotation_limits[0]}: got it beside {rotation_limits[1]}, expected one axis to turn about"
+            )
+        if rotation_limits and self.rotation != "axis-angle":
+            raise ValueError(f'rotation: got {self.rotation!r} beside {rotation_limits[0]}, expected "axis-angle"')
 
     def _check_priors(self) -> None:
         for name in ("distance", "size"):
@@ -104,11 +106,11 @@ class Pose(FreeOfBody):
             raise ValueError("size: got a prior of a size that is not free, expected scale = true beside it")
 
     def numbered(self, scene: Scene) -> Pose:
-        """The same of the bodies' numbers."""
-        numbered = replace(self, body=scene.body_number(self.body))
+        """Replace names of bodies by their numbers."""
+        numbered_pose = replace(self, body=scene.body_number(self.body))
         if self.stands_on is None:
-            return numbered
-        return replace(numbered, stands_on=scene.body_number(self.stands_on, "stands_on"))
+            return numbered_pose
+        return replace(numbered_pose, stands_on=scene.body_number(self.stands_on, "stands_on"))
 
     def check_scene(self, scene: Scene) -> None:
         """Raise ValueError for a body that stands on itself, or on one that is not flat, or cannot move onto it."""
@@ -128,9 +130,9 @@ class Pose(FreeOfBody):
         rotation = body.rotation_matrix()
         axis = constraints.UP if self.upright else self.axis
         turns = np.eye(3) if axis is None else np.array([axis])
-        stays = [np.eye(3)[constraints.AXES[coordinate]] for coordinate in self.fixed]
+        fixed_axes = [np.eye(3)[constraints.AXES[coordinate]] for coordinate in self.fixed]
         if self.stands_on is None:
-            return PoseConstraint(turns, constraints.remaining(stays), rotation)
+            return PoseConstraint(turns, constraints.remaining(fixed_axes), rotation)
         ground = setting.scene.bodies[setting.scene.body_number(self.stands_on, "stands_on")]
         plane = constraints.plane_below(ground, self._start_middle(setting))
         if self.resting != "free":
@@ -138,7 +140,7 @@ class Pose(FreeOfBody):
         if self.resting == "stable":
             rotation = constraints.stable_rotation(body.mesh, rotation, plane.normal)
             self._warn_of_turn(rotation @ body.rotation_matrix().T, body.called)
-        shifts = constraints.remaining([plane.normal, *stays])
+        shifts = constraints.remaining([plane.normal, *fixed_axes])
         onto = constraints.onto_plane(plane.normal, self.fixed)
         return PoseConstraint(turns, shifts, rotation, plane, onto, constraints.hull_points(body.mesh))
 
@@ -154,7 +156,7 @@ class Pose(FreeOfBody):
             )
 
     def start(self, setting: Setting) -> Values:
-        """Where the body is."""
+        """Pose of the body."""
         possible = self.constraint(setting)
         turn = np.zeros(len(possible.turns)) if self.rotation == "axis-angle" else _NO_TURN[self.rotation]
         values = {"turn": setting.tensor(turn), "shift": setting.tensor(np.zeros(len(possible.shifts)))}
@@ -167,22 +169,22 @@ class Pose(FreeOfBody):
         copies = super().scattered(values, number, generator)
         if values["turn"].numel() == 1:  # either way, and farther and farther
             return copies | {"turn": copies["turn"] + self.spread * (number // 2 + 1) * (-1) ** number}
-        known = number < len(_TURNS)
-        axis = _TURNS[number] if known else torch.randn(3, generator=generator).numpy().astype(np.float64)
+        is_listed = number < len(_TURNS)
+        axis = _TURNS[number] if is_listed else torch.randn(3, generator=generator).numpy().astype(np.float64)
         turn = Rotation.from_rotvec(self.spread * axis / np.linalg.norm(axis))
         start = values["turn"].cpu().numpy()
         if self.rotation == "axis-angle":
-            turned = (turn * Rotation.from_rotvec(start)).as_rotvec()
+            turned_vector = (turn * Rotation.from_rotvec(start)).as_rotvec()
         elif self.rotation == "quaternion":
-            turned = (turn * Rotation.from_quat(start)).as_quat()
+            turned_vector = (turn * Rotation.from_quat(start)).as_quat()
         else:
-            turned = turn.apply(start.reshape(2, 3)).ravel()
-        return copies | {"turn": torch.tensor(turned, dtype=torch.float32, device=values["turn"].device)}
+            turned_vector = turn.apply(start.reshape(2, 3)).ravel()
+        return copies | {"turn": torch.tensor(turned_vector, dtype=torch.float32, device=values["turn"].device)}
 
     def _posed(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Rotation, translation and scale of the body: it turns about its middle m, which moves by the shift."""
-        rotation, middle, scale = self.moved(values, setting)
-        return rotation, middle - scale * rotation @ setting.tensor(setting.middle(self.number)), scale
+        rotation, center, scale = self.moved(values, setting)
+        return rotation, center - scale * rotation @ setting.tensor(setting.middle(self.number)), scale
 
     def moved(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Rotation, middle in the world, and scale of the body. Differentiable: values."""
@@ -191,28 +193,28 @@ class Pose(FreeOfBody):
         rotation = rotation_matrices(turn) @ setting.tensor(possible.rotation)
         scale = setting.tensor(body.scale) * (values["log_scale"].exp() if self.scale else 1)
         shift = body.scale * setting.extent(self.number) * possible.shift(values["shift"])
-        middle = setting.tensor(self._start_middle(setting)) + shift
-        return rotation, possible.touching(middle, rotation, scale, setting.tensor(setting.middle(self.number))), scale
+        center = setting.tensor(self._start_middle(setting)) + shift
+        return rotation, possible.touching(center, rotation, scale, setting.tensor(setting.middle(self.number))), scale
 
     def _start_middle(self, setting: Setting) -> np.ndarray:
-        """Where the body's middle is at the start, in the world."""
+        """Initial position of the body's middle in the world."""
         return setting.scene.bodies[self.number].to_world(setting.middle(self.number))
 
     def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
         """Squared distances from the priors, in standard deviations."""
         body = setting.scene.bodies[self.number]
-        rotation, middle, scale = self.moved(values, setting)
+        rotation, center, scale = self.moved(values, setting)
         squares = []
         if self.distance is not None:
             mean, deviation = self.distance
-            gap = (middle - setting.tensor(setting.cameras[0].eye)).norm() - mean
+            gap = (center - setting.tensor(setting.cameras[0].eye)).norm() - mean
             squares.append((gap / deviation).square())
         if self.size is not None:
             mean, deviation = self.size
             squares.append(((2 * setting.extent(self.number) * scale - mean) / deviation).square())
         if self.covariance is not None:
             turn = _rotation_vector(rotation @ setting.tensor(body.rotation_matrix()).T)
-            away = torch.cat([turn, middle - setting.tensor(self._start_middle(setting))])
+            away = torch.cat([turn, center - setting.tensor(self._start_middle(setting))])
             squares.append(away @ setting.tensor(np.linalg.inv(np.asarray(self.covariance, np.float64))) @ away)
         return PRIOR * torch.stack(squares).sum() if squares else None
 

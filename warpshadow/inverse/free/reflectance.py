@@ -154,8 +154,8 @@ class Texture(FreeOfBody):
         shares = (torch.arange(self.colors, device=texels.device) + 0.5) / self.colors
         if flat.std(dim=0).max() < _MAX_PLAIN_DEVIATION:
             return shares[:, None].expand(-1, 3).contiguous()
-        ranked = flat[flat.sum(dim=1).argsort()]
-        return ranked[(shares * len(flat)).long()]
+        ranked_colors = flat[flat.sum(dim=1).argsort()]
+        return ranked_colors[(shares * len(flat)).long()]
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Cover the body."""
@@ -185,6 +185,6 @@ class Texture(FreeOfBody):
         """Cover the body; texels that no view sees get the color of the nearest one that is seen."""
         texels = values["texels"].cpu().numpy()
         fitted.change_body(self.number, texture=texels)
-        unshadowed = replace(fitted.scene, visibility=Visibility(method="none"), bounces=0)
-        renderer = SceneRenderer(unshadowed, cameras=fitted.cameras, device=str(setting.device))
+        unshadowed_scene = replace(fitted.scene, visibility=Visibility(method="none"), bounces=0)
+        renderer = SceneRenderer(unshadowed_scene, cameras=fitted.cameras, device=str(setting.device))
         fitted.change_body(self.number, texture=fill_unseen(texels, renderer.seen_texels(self.number)))

@@ -57,7 +57,7 @@ class Deformation(FreeOfBody):
         super().__post_init__()
         for name in ("rigidity", "firmness", "smoothness"):
             check.nonnegative(name, getattr(self, name))
-        check.integer("count", self.count, what="nodes")
+        check.integer("count", self.count, unit="nodes")
 
     def check_scene(self, scene: Scene) -> None:
         """Raise ValueError for a body with too few spheres."""

@@ -63,7 +63,7 @@ class Exposure(Free):
 
 @dataclass(frozen=True)
 class OutlineOffset(Free):
-    """By how much the painted outlines of each view lie inside the true ones, since no mask is right to the pixel.
+    """Distance by which painted outlines of each view lie inside the true ones: no mask is right to the pixel.
 
     Args:
         deviation: Standard deviation of its prior [pixels].
@@ -99,7 +99,7 @@ class OutlineOffset(Free):
 
 @dataclass(frozen=True)
 class CameraPose(Free):
-    """Where each view was taken: the eye, how it looks, and maybe the focal length.
+    """Camera pose of each view: eye, rotation and, if free, focal length.
 
     Args:
         focal: Whether the focal length is free, too.
@@ -125,13 +125,13 @@ class CameraPose(Free):
         """R, t and K of the views; shifts of the eye are in units of its distance from the scene."""
         rotations = rotation_matrices(values["turn"]) @ setting.tensor([camera.rotation for camera in cameras])
         eyes = setting.tensor([camera.eye for camera in cameras])
-        moved = eyes + setting.tensor(setting.distances) * values["shift"]
+        moved_eyes = eyes + setting.tensor(setting.distances) * values["shift"]
         intrinsics = setting.tensor([camera.intrinsics for camera in cameras])
         if self.focal:
             zoom = torch.ones_like(intrinsics)
             zoom[:, :2, :2] = values["log_focal"].exp()[:, None, None]
             intrinsics = intrinsics * zoom
-        return rotations, -(rotations @ moved[..., None])[..., 0], intrinsics
+        return rotations, -(rotations @ moved_eyes[..., None])[..., 0], intrinsics
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Move the cameras."""

@@ -4,9 +4,9 @@ Patches of bodies have a radiosity B, reflected from direct light S and bounced 
 
     B = a (S + I),   I = G[B],
 
-and G is applied as often as light bounces: first at the sources, points where patches are lit, at last at the receivers
-of the image. G has three parts, each a stage of its own: light from a body's own patches, light from plane bodies, and
-light from bodies represented by spheres. A blocked part of a cell sends light of one of the three.
+and G is applied as often as light bounces: first at the patch samples, points where patches are lit, at last at the
+receivers of the image. G has three parts, each a stage of its own: light from a body's own patches, light from plane
+bodies, and light from bodies represented by spheres. A blocked part of a cell sends light of one of the three.
 
 Between patches of one body the first part is a small matrix that does not change. After the last bounce between bodies,
 light within each body bounces ``SELF_BOUNCES`` times more, since hollow bodies keep it long.
@@ -40,17 +40,17 @@ from warpshadow.pipeline.lighting import LitPoints, joined, receiver_text
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.scene.scene import Bounces
-from warpshadow.stages.bounces.open_sources import Openness, find_openness, open_shares
+from warpshadow.stages.bounces.openness import Openness, find_openness, open_shares
 from warpshadow.stages.bounces.radiosity import patch_radiosity
 from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.receivers import Receivers
 
-_OF_SOURCES = " of sources"  # put after the names of stages
+_OF_PATCH_SAMPLES = " of patch samples"  # put after the names of stages
 
 
-def _source_text(senders: Senders) -> str:
-    """Number of sources, in words."""
-    return f"{len(senders.sides):,} sources"
+def _patch_sample_text(senders: Senders) -> str:
+    """Number of patch samples, in words."""
+    return f"{len(senders.sides):,} patch samples"
 
 
 class PortionVisibility(NamedTuple):
@@ -128,15 +128,15 @@ class PortionedDirectLight(Node):
 
 
 def _openness(senders: Senders, visibility: list[PortionVisibility]) -> Openness:
-    """How open sources and patches are."""
+    """How open patch samples and patches are."""
     portions = [find_openness(portion.group.normals, *portion.cells) for portion in visibility]
-    return open_shares(joined(portions), senders.mean, senders.patch_of_source)
+    return open_shares(joined(portions), senders.mean, senders.patch_of_sample)
 
 
 class PatchSampleNodes(NamedTuple):
     """Nodes of the points at which patches are lit."""
 
-    visibility: PortionedVisibility  # of the sources, for any light
+    visibility: PortionedVisibility  # of the patch samples, for any light
     frames: Node  # of flat bodies
     projected_patches: Node  # patches as receivers see them
     openness: Node  # how open they are, and their patches
@@ -153,9 +153,9 @@ class Radiosity(Node):
         gathering: Gathering,
         lit: Node,
         albedo: Node,
-        sources: PatchSampleNodes,
+        patch_samples: PatchSampleNodes,
     ):
-        _, frames, projected_patches, openness = sources
+        _, frames, projected_patches, openness = patch_samples
         self._count, self._proxies, self._self_form_factors, self._gathering = (
             count,
             proxies,
@@ -205,7 +205,7 @@ class Radiosity(Node):
         )
 
     def _light(self, call: Call, portion: PortionDirectLight, outgoing: OutgoingRadiance) -> wp.array:
-        """Light of a portion of the sources past its own body, from the sky and from others."""
+        """Light of a portion of the patch samples past its own body, from the sky and from others."""
         return total_light([portion.direct, *self._gathering.run(call, portion.group, portion.cells, outgoing)])
 
 
@@ -296,46 +296,48 @@ class SphereBounces:
         )
         key, is_cached = None if is_free else light, is_free or materials is not points.materials
         visibility = points.cached("visibility", (key, is_cached), lambda: make_visibility(points, caches=is_cached))
-        of_sources = points.cached(
-            "of sources", (key, senders), lambda: self._sources(make_visibility, proxies, points)
+        of_patch_samples = points.cached(
+            "of patch samples", (key, senders), lambda: self._patch_samples(make_visibility, proxies, points)
         )
-        radiosity = self._radiosity(of_sources, projected_light, proxies, materials)
+        radiosity = self._radiosity(of_patch_samples, projected_light, proxies, materials)
         item_text = functools.partial(receiver_text, points)
         at_points = self._gathering(senders, (points.receivers_node, radiosity), item_text)
         return BouncedShading(visibility, projected_light, item_text, radiosity, at_points)
 
-    def _sources(
+    def _patch_samples(
         self, make_visibility: Callable[..., PortionedVisibility], proxies: Proxies, points: LitPoints
     ) -> PatchSampleNodes:
-        """Sources among the bodies among which points are."""
+        """Patch samples among the bodies among which points are."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
 
-        def project(sources: Receivers, visibility: list[PortionVisibility], *arguments: Any) -> ProjectedPatches:
-            return proxies.projected_patches(sources, [portion.cells for portion in visibility], *arguments)
+        def project(patch_samples: Receivers, visibility: list[PortionVisibility], *arguments: Any) -> ProjectedPatches:
+            return proxies.projected_patches(patch_samples, [portion.cells for portion in visibility], *arguments)
 
-        make = functools.partial(Node, "sources", senders.sources, points.vertices, points.normals)
-        sources = points.cached("sources", senders, lambda: make(items=_source_text(senders)))
+        make = functools.partial(Node, "patch samples", senders.patch_samples, points.vertices, points.normals)
+        patch_samples = points.cached("patch samples", senders, lambda: make(items=_patch_sample_text(senders)))
         visibility = make_visibility(
-            self._at(sources, points, points.materials, proxies.blocker_of_source), where=_OF_SOURCES
+            self._at(patch_samples, points, points.materials, proxies.blocker_of_sample), where=_OF_PATCH_SAMPLES
         )
         frames = Node("", planes.all.frames if planes else lambda _: None, points.vertices)
-        projected_patches = Node("", project, sources, visibility, spheres, frames)
+        projected_patches = Node("", project, patch_samples, visibility, spheres, frames)
         return PatchSampleNodes(
             visibility, frames, projected_patches, Node("", functools.partial(_openness, senders), visibility)
         )
 
     def _radiosity(
-        self, sources: PatchSampleNodes, projected_light: Node, proxies: Proxies, materials: Materials
+        self, patch_samples: PatchSampleNodes, projected_light: Node, proxies: Proxies, materials: Materials
     ) -> Radiosity:
-        """Radiosity of the patches, given the light at their sources."""
+        """Radiosity of the patches, given the light at their patch samples."""
         senders, why_not = proxies.senders, "light bounces once" if self._count == 1 else ""
-        lit = PortionedDirectLight(sources.visibility, projected_light, _source_text(senders), _OF_SOURCES)
-        albedo = self._patches.albedo(materials, senders.bodies)
-        arguments = lit, albedo, sources.frames
-        among_senders = self._gathering(
-            senders, arguments, _source_text(senders), _OF_SOURCES, why_not, only_others=True
+        lit = PortionedDirectLight(
+            patch_samples.visibility, projected_light, _patch_sample_text(senders), _OF_PATCH_SAMPLES
         )
-        return Radiosity(self._count, proxies, self._self_form_factors, among_senders, lit, albedo, sources)
+        albedo = self._patches.albedo(materials, senders.bodies)
+        arguments = lit, albedo, patch_samples.frames
+        among_senders = self._gathering(
+            senders, arguments, _patch_sample_text(senders), _OF_PATCH_SAMPLES, why_not, only_others=True
+        )
+        return Radiosity(self._count, proxies, self._self_form_factors, among_senders, lit, albedo, patch_samples)
 
     def _gathering(self, senders: Senders, *arguments: Any, **options: Any) -> Gathering:
         return Gathering(self._method.visibility, senders, self._self_form_factors, *arguments, **options)
@@ -343,37 +345,41 @@ class SphereBounces:
     def cached_bounced_shading(
         self, points: LitPoints, projected_light: Any, light: Input, materials: Materials
     ) -> Node:
-        """The same for static points: their and the sources' visibility is cached, and so are form factors by rays."""
-        sources, at_sources = self._cached_sources(points, materials)
+        """The same for static points: visibility of receivers and patch samples is cached, as are form factors."""
+        patch_samples, at_patch_samples = self._cached_patch_samples(points, materials)
         direct = points.cached(
             "direct", light, lambda: PortionedShading(self._method, points, projected_light, light, joined)
         )
         make = functools.partial(
-            PortionedShading, self._method, at_sources, projected_light, light, joined, where=_OF_SOURCES
+            PortionedShading, self._method, at_patch_samples, projected_light, light, joined, where=_OF_PATCH_SAMPLES
         )
-        lit = points.cached("direct at sources", (light, sources), make)
+        lit = points.cached("direct at patch samples", (light, patch_samples), make)
         return self._static_bounces.add_bounces(direct, lit, points, materials)
 
     def cached_bounced_free_shading(self, direct: Node, points: LitPoints, light: Input, materials: Materials) -> Node:
         """The same in free light, given a node of the direct shading of the receivers."""
-        sources, at_sources = self._cached_sources(points, materials)
-        transfers = points.cached("transfer", sources, lambda: self._method.transfers(at_sources, _OF_SOURCES))
+        patch_samples, at_patch_samples = self._cached_patch_samples(points, materials)
+        transfers = points.cached(
+            "transfer", patch_samples, lambda: self._method.transfers(at_patch_samples, _OF_PATCH_SAMPLES)
+        )
         return self._static_bounces.add_free_bounces(direct, transfers, light, points, materials)
 
-    def _cached_sources(self, points: LitPoints, materials: Materials) -> tuple[Node, LitPoints]:
-        """Node of the static sources, and the same sources as lit points."""
-        sources = self._static_bounces.sources(points, materials)
-        return sources, points.cached("lit sources", sources, lambda: self._at(sources, points, materials))
+    def _cached_patch_samples(self, points: LitPoints, materials: Materials) -> tuple[Node, LitPoints]:
+        """Node of the static patch samples, and the same patch samples as lit points."""
+        patch_samples = self._static_bounces.patch_samples(points, materials)
+        return patch_samples, points.cached(
+            "lit patch samples", patch_samples, lambda: self._at(patch_samples, points, materials)
+        )
 
     @functools.cached_property
     def _static_bounces(self) -> StaticBounces:
         return StaticBounces(self._patches, self._count, progress=self._method.progress)
 
     def _at(
-        self, sources: Node, points: LitPoints, materials: Materials, blocker_of_point: np.ndarray | None = None
+        self, patch_samples: Node, points: LitPoints, materials: Materials, blocker_of_point: np.ndarray | None = None
     ) -> LitPoints:
-        """Make lit points of sources, among the same bodies as other points."""
-        arguments = self._method, materials, points.vertices, points.spheres, sources, points.call
+        """Make lit points of patch samples, among the same bodies as other points."""
+        arguments = self._method, materials, points.vertices, points.spheres, patch_samples, points.call
         return LitPoints(
             *arguments, normals=points.normals, blocker_kinds=points.blocker_kinds, blocker_of_point=blocker_of_point
         )

@@ -18,14 +18,14 @@ _HIDDEN = 0.5  # part of the area of a covered patch that it hides, at least
 _REACH = 0.01  # how far bodies reach out before it that may see it, in units of its size
 
 
-class Covers(NamedTuple):
+class Overlays(NamedTuple):
     """Texels before covered patches."""
 
     before: csr_matrix  # their weights, [patch, patch]
     distances: np.ndarray  # how far they are from the patches' proxies, 0 for patches that nothing covers, [patch]
 
 
-def find_covers(senders: Senders, depths: np.ndarray) -> Covers | None:
+def find_overlays(senders: Senders, depths: np.ndarray) -> Overlays | None:
     """Find the patches that flat bodies cover where the scene has them; None without any.
 
     Args:
@@ -70,4 +70,4 @@ def find_covers(senders: Senders, depths: np.ndarray) -> Covers | None:
     before = csr_matrix((weights[:, 2] / totals[rows], (rows, columns)), shape=(len(radii), len(radii)))
     proxies = centers - (depths * radii)[:, None] * normals
     gaps = np.linalg.norm(proxies - before @ proxies, axis=1)
-    return Covers(before, np.where(totals > 0, np.maximum(gaps, radii), 0).astype(np.float32))
+    return Overlays(before, np.where(totals > 0, np.maximum(gaps, radii), 0).astype(np.float32))

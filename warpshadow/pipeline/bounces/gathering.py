@@ -16,7 +16,7 @@ import warp as wp
 from warpshadow.device.batch import common_batch, concatenate, cut, expand, expand_rows
 from warpshadow.device.constants import constant
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.bounces.covered import find_covers
+from warpshadow.pipeline.bounces.covered import find_overlays
 from warpshadow.pipeline.bounces.patches import Senders
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.by_spheres import SphereMethod
@@ -25,10 +25,10 @@ from warpshadow.pipeline.groups import Group, GroupVisibility, nonplanar_bodies
 from warpshadow.pipeline.lighting import joined
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.scene.visibility import Visibility
-from warpshadow.stages.bounces.covers import cover
+from warpshadow.stages.bounces.overlays import overlaid_radiosity
 from warpshadow.stages.bounces.plane_light import plane_light
 from warpshadow.stages.bounces.plane_texels import find_texels
-from warpshadow.stages.bounces.projected_areas import find_projected_areas, turn_from_planes
+from warpshadow.stages.bounces.projected_areas import find_projected_areas, tilt_normals_off_planes
 from warpshadow.stages.bounces.proxies import find_depths, place_proxies
 from warpshadow.stages.bounces.proxy_radiance import find_proxy_radiance, patches_of_clusters
 from warpshadow.stages.bounces.self_light import self_light
@@ -149,7 +149,7 @@ class Proxies:
             starts = int(merged_scene.first_vertex[number]), int(senders.first[place])
             bodies.append(PlaneBody(grid, body.mesh.positions, body.mesh.surface.faces, *starts, body.casts_shadow))
         counts = len(senders.areas), int(merged_scene.first_vertex[-1])
-        planes = PlaneBlockers.of(bodies, *counts, device=merged_scene.device)
+        planes = PlaneBlockers.from_bodies(bodies, *counts, device=merged_scene.device)
         return SenderPlanes(planes, {number: k for k, number in enumerate(numbers)})
 
     @functools.cached_property
@@ -163,12 +163,12 @@ class Proxies:
         return [body for body in self.nonplanar_bodies if body not in self.senders.bodies]
 
     @functools.cached_property
-    def covers(self) -> tuple[SparseMatrix, np.ndarray] | None:
+    def overlays(self) -> tuple[SparseMatrix, np.ndarray] | None:
         """Texels before the patches that flat bodies cover, and how far away they are; None without any."""
-        covers = find_covers(self.senders, self._depths)
-        if covers is None:
+        overlays = find_overlays(self.senders, self._depths)
+        if overlays is None:
             return None
-        return SparseMatrix.of(covers.before, device=self.merged_scene.device), covers.distances
+        return SparseMatrix.from_matrix(overlays.before, device=self.merged_scene.device), overlays.distances
 
     def span_of(self, body: int | None) -> tuple[int, int]:
         """Where the proxies of a body begin and end."""
@@ -210,13 +210,13 @@ class Proxies:
         return np.concatenate([find_depths(item.centers, item.normals, item.areas) for item in self.senders.patches])
 
     @functools.cached_property
-    def blocker_of_source(self) -> np.ndarray:
-        """The blocker nearest to the patch of each source, among spheres of bodies that are not flat; −1 for none."""
-        return self._blockers[0][self.senders.patch_of_source]
+    def blocker_of_sample(self) -> np.ndarray:
+        """Sphere nearest to the patch of each patch sample, −1 for none: int32 of shape [patch sample]."""
+        return self._blockers[0][self.senders.patch_of_sample]
 
     def projected_patches(
         self,
-        sources: Receivers,
+        patch_samples: Receivers,
         cells: list[CellTransmittance],
         spheres: tuple[wp.array, wp.array],
         frames: wp.array | None,
@@ -224,20 +224,20 @@ class Proxies:
         """Patches as receivers see them.
 
         Args:
-            sources: Where they are lit.
-            cells: Transmittance of the sources, in portions.
+            patch_samples: Where they are lit.
+            cells: Transmittance of the patch samples, in portions.
             spheres: Centers and radii of all spheres.
             frames: Where flat bodies are.
         """
-        normals, planes, senders = sources.normals, self.planes, self.senders
+        normals, planes, senders = patch_samples.normals, self.planes, self.senders
         centers, radii = self.merged_scene.spheres_of(self.nonplanar_bodies, spheres)
         if planes is not None:
-            numbers, points, device = self.blocker_of_source, sources.points, normals.device
-            of_sources = NearestBlockers(centers, radii, constant(numbers, wp.int32, device))
-            fronts = find_fronts(points, normals, None, of_sources, frames, planes.all)
-            if self.covers is not None:
-                numbers = np.where(self.covers[1][senders.patch_of_source] > 0, np.int32(-1), numbers)
-            normals = turn_from_planes(points, normals, radii, numbers, fronts, frames, planes.all)
+            numbers, points, device = self.blocker_of_sample, patch_samples.points, normals.device
+            of_patch_samples = NearestBlockers(centers, radii, constant(numbers, wp.int32, device))
+            fronts = find_fronts(points, normals, None, of_patch_samples, frames, planes.all)
+            if self.overlays is not None:
+                numbers = np.where(self.overlays[1][senders.patch_of_sample] > 0, np.int32(-1), numbers)
+            normals = tilt_normals_off_planes(points, normals, radii, numbers, fronts, frames, planes.all)
         rows = [
             wp.full_like(portion.transmittance_spheres, 1.0, requires_grad=False)
             if portion.transmittance_self is None
@@ -247,7 +247,7 @@ class Proxies:
         transmittance = joined([row.reshape((len(row), -1)) for row in rows])
         directions = cells[0].directions
         transmittance = transmittance.reshape((len(transmittance), len(senders.sides), len(directions)))
-        placed = place_proxies(sources, senders.mean, radii, *self._blockers, self._depths)
+        placed = place_proxies(patch_samples, senders.mean, radii, *self._blockers, self._depths)
         if self.black_bodies:
             others = self.merged_scene.spheres_of(self.black_bodies, spheres)
             counts = [len(senders.areas), others[1].shape[1]]
@@ -287,8 +287,8 @@ class OutgoingRadiance:
     def proxy_radiance(self) -> wp.array:
         """Light that proxies of patches send towards cells, vec4 of shape [batch, node, cell]."""
         proxies, radiosity, patches = self.proxies, self.radiosity, self.projected_patches
-        if proxies.covers is not None:
-            radiosity = cover(radiosity, cut(patches.centers, 0, radiosity.shape[1]), *proxies.covers)
+        if proxies.overlays is not None:
+            radiosity = overlaid_radiosity(radiosity, cut(patches.centers, 0, radiosity.shape[1]), *proxies.overlays)
         return find_proxy_radiance(
             radiosity, patches.areas, self.open_weights, self.senders.areas, *proxies.patches_of_clusters
         )

@@ -1,4 +1,4 @@
-"""Patches of a scene: the bodies that send bounced light, their sources, and their reflectance."""
+"""Patches of a scene: the bodies that send bounced light, their patch samples, and their reflectance."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from warpshadow.pipeline.node import Node
 from warpshadow.pipeline.planes import ScenePlanes
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.albedo import mean_over_texels, mean_over_vertices
-from warpshadow.stages.bounces.patches import MAX_PATCHES, SOURCES, Patches, find_patches, find_plane_patches
-from warpshadow.stages.bounces.radiosity import mean_over_sources
+from warpshadow.stages.bounces.patches import MAX_PATCHES, SAMPLES_PER_PATCH, Patches, find_patches, find_plane_patches
+from warpshadow.stages.bounces.radiosity import mean_over_patch_samples
 from warpshadow.stages.receivers import Receivers, receivers_on_faces
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
@@ -32,7 +32,7 @@ _FACES_OF_PATCH = 8
 
 _SCENE_PATCHES = 2048  # patches of a scene of more than 8 bodies, but no fewer than _MIN_BODY_PATCHES of each
 _MIN_BODY_PATCHES = 32  # patches of each of many bodies, at least: a side of a box has some
-_SCENE_SOURCES = 4096  # sources of the patches of a scene, but at least one of each
+_SCENE_PATCH_SAMPLES = 4096  # patch samples of the patches of a scene, but at least one of each
 
 
 def _area(mesh: Mesh) -> float:
@@ -84,8 +84,8 @@ class ScenePatches:
                 self._of_body[number] = find_plane_patches(*corners, is_two_sided=is_two_sided, others=points)
             else:
                 counts = self._counts
-                sources = max(1, min(SOURCES, _SCENE_SOURCES // sum(counts.values())))
-                options = {"count": counts[number], "sources": sources, "device": self.merged_scene.device}
+                patch_samples = max(1, min(SAMPLES_PER_PATCH, _SCENE_PATCH_SAMPLES // sum(counts.values())))
+                options = {"count": counts[number], "patch_samples": patch_samples, "device": self.merged_scene.device}
                 self._of_body[number] = find_patches(*corners, is_two_sided=is_two_sided, **options)
         return self._of_body[number]
 
@@ -133,7 +133,7 @@ class ScenePatches:
                 mean = self._mean(
                     number, bodies, reflectance[number].shape[1], None if image is None else image.shape[1:]
                 )
-                total = multiply(mean, reflectance[number], plus=total)
+                total = multiply(mean, reflectance[number], addend=total)
             return total
 
         return Node("patch albedo", means, materials.albedo, materials.textures, items=f"{sum(counts):,} patches")
@@ -155,7 +155,7 @@ class ScenePatches:
                 means = mean_over_vertices(patches, *shape)
             others = {other: csr_matrix((self.of_body(other).count, color_count)) for other in bodies}
             matrix = vstack([*(others | {number: means}).values()])
-            self._means[key] = SparseMatrix.of(matrix, device=self.merged_scene.device)
+            self._means[key] = SparseMatrix.from_matrix(matrix, device=self.merged_scene.device)
         return self._means[key]
 
 
@@ -170,11 +170,11 @@ class Senders:
         merged_scene, bodies, patches: As given.
         first: Where the patches of each begin, and the end of the last, NumPy of shape [body + 1].
         areas: Of all patches where the scene has their bodies [scene units²], float32 of shape [patch].
-        sides: Side of a face that each source lies on, int32 of shape [source].
-        barycentrics: And where on it, float32 of shape [source, 3].
-        patch_of_source: The patch that it belongs to, int32 of shape [source].
+        sides: Side of a face that each patch sample lies on, int32 of shape [patch sample].
+        barycentrics: And where on it, float32 of shape [patch sample, 3].
+        patch_of_sample: The patch that it belongs to, int32 of shape [patch sample].
         body_of_patch: The body that it belongs to, by number, of shape [patch].
-        mean: The matrix of means over sources, [patch, source].
+        mean: The matrix of means over patch samples, [patch, patch sample].
     """
 
     def __init__(self, merged_scene: MergedScene, bodies: tuple[int, ...], patches: list[Patches]):
@@ -182,23 +182,25 @@ class Senders:
         self.first = np.cumsum([0, *(item.count for item in patches)])
         face_count = int(merged_scene.first_face[-1])
         sides = [
-            item.sources.faces + int(merged_scene.first_face[number]) + face_count * item.sources.is_back
+            item.patch_samples.faces + int(merged_scene.first_face[number]) + face_count * item.patch_samples.is_back
             for number, item in zip(bodies, patches, strict=True)
         ]
-        owners = [item.sources.patches + first for item, first in zip(patches, self.first[:-1], strict=True)]
+        owners = [item.patch_samples.patches + first for item, first in zip(patches, self.first[:-1], strict=True)]
         self.sides = _joined(sides, np.int32)
-        self.barycentrics = _joined([item.sources.barycentrics for item in patches], np.float32).reshape(-1, 3)
+        self.barycentrics = _joined([item.patch_samples.barycentrics for item in patches], np.float32).reshape(-1, 3)
         scales = [merged_scene.scene.bodies[number].scale for number in bodies]
         areas = [scale**2 * item.areas for scale, item in zip(scales, patches, strict=True)]
         self.areas = _joined(areas, np.float32)
-        self.patch_of_source = _joined(owners, np.int32)
-        weights = _joined([item.sources.weights for item in patches], np.float32)
+        self.patch_of_sample = _joined(owners, np.int32)
+        weights = _joined([item.patch_samples.weights for item in patches], np.float32)
         self.body_of_patch = np.repeat(bodies, np.diff(self.first))
         self._bodies = np.repeat(bodies, [len(item) for item in sides])
-        self.mean = mean_over_sources(self.patch_of_source, weights, int(self.first[-1]), device=merged_scene.device)
+        self.mean = mean_over_patch_samples(
+            self.patch_of_sample, weights, int(self.first[-1]), device=merged_scene.device
+        )
 
-    def sources(self, positions: wp.array, normals: wp.array) -> Receivers:
-        """The sources as receivers. Differentiable: positions and normals of all vertices, vec3 [batch, vertex]."""
+    def patch_samples(self, positions: wp.array, normals: wp.array) -> Receivers:
+        """Patch samples as receivers, of all vertices, vec3 [batch, vertex]. Differentiable: positions, normals."""
         return receivers_on_faces(
             positions, normals, self.merged_scene.faces, self.sides, self.barycentrics, self._bodies
         )

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.scene.scene import Bounces
-from warpshadow.stages.bounces.tail import TERM_COUNT, with_tail
+from warpshadow.stages.bounces.tail import TERM_COUNT, add_tail
 
 SELF_BOUNCES = 8  # how often a body's light for itself goes on: in a bowl of albedo 0.75 less than 1% is left then
 
@@ -48,7 +48,7 @@ def after_bounces(
             for _ in range(max(self_bounces, 1 if bounce else 0)):
                 radiosity = reflect(bounced_light, radiosity)
             terms.append(radiosity)
-        return with_tail(terms, areas)
+        return add_tail(terms, areas)
     for bounce in range(1, bounces + self_bounces):
         if bounce < bounces:
             bounced_light = light(radiosity)

@@ -14,7 +14,7 @@ from warpshadow.assets.cache import Unfinished, cache_path, load_or_compute
 from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
 from warpshadow.pipeline.groups import Group
 from warpshadow.pipeline.self_visibility import SelfVisibility
-from warpshadow.stages.bounces.factors import patch_mesh, trace_factors
+from warpshadow.stages.bounces.form_factors import patch_mesh, trace_form_factors
 from warpshadow.stages.bounces.patches import Patches
 from warpshadow.stages.sparse import SparseMatrix
 
@@ -48,28 +48,28 @@ class SelfFormFactors:
             vertices = probes.positions[: len(mesh.positions)]
             arguments = self._patches.of_body(body), vertices, mesh.surface.faces, points, normals
             form_factors = self_form_factors(*arguments, device=merged_scene.device, progress=self._progress)
-            self._of_body[body] = SparseMatrix.of(form_factors, device=merged_scene.device)
+            self._of_body[body] = SparseMatrix.from_matrix(form_factors, device=merged_scene.device)
         return self._of_body[body]
 
-    def between_patches(self, senders: Senders, sources: Sequence[Group]) -> SparseMatrix:
-        """Form factors of each patch to other patches of its body, averaged over its sources."""
+    def between_patches(self, senders: Senders, patch_samples: Sequence[Group]) -> SparseMatrix:
+        """Form factors of each patch to other patches of its body, averaged over its patch samples."""
         if senders not in self._between:
             from scipy.sparse import vstack
 
-            of_sources = vstack([self._of_group(senders, group) for group in sources])
-            between = senders.mean.on_host() @ of_sources
-            self._between[senders] = SparseMatrix.of(between, device=senders.merged_scene.device)
+            of_patch_samples = vstack([self._of_group(senders, group) for group in patch_samples])
+            between = senders.mean.to_scipy() @ of_patch_samples
+            self._between[senders] = SparseMatrix.from_matrix(between, device=senders.merged_scene.device)
         return self._between[senders]
 
     def _of_group(self, senders: Senders, group: Group) -> csr_matrix:
-        """Form factors of each source of a group to the patches of its body, among all patches."""
+        """Form factors of each patch sample of a group to the patches of its body, among all patches."""
         from scipy.sparse import csr_matrix
 
         shape, body = (group.points.shape[1], len(senders.areas)), group.body
         if body not in senders.bodies or senders.merged_scene.is_flat[body]:
             return csr_matrix(shape, dtype=np.float32)
         assert body is not None and group.probe_weights is not None
-        factors, (probes, weights) = self.of(body).on_host(), (item.numpy()[0] for item in group.probe_weights)
+        factors, (probes, weights) = self.of(body).to_scipy(), (item.numpy()[0] for item in group.probe_weights)
         starts = np.arange(0, probes.size + 1, 3)
         of_patches = csr_matrix((weights.ravel(), probes.ravel(), starts), (shape[0], factors.shape[0])) @ factors
         first = senders.first[senders.bodies.index(body)]
@@ -94,10 +94,10 @@ def self_form_factors(
         points: Its probes, shape [probe, 3].
         normals: Unit normals, shape [probe, 3].
     Returns:
-        As :func:`~warpshadow.stages.bounces.factors.trace_factors` does.
+        As :func:`~warpshadow.stages.bounces.form_factors.trace_form_factors` does.
     """
     key = hashlib.sha256(json.dumps([VERSION, _RAYS, patches.count, len(points)]).encode())
-    for array in (patches.pieces.positions(positions, faces), patches.of_pieces, points, normals):
+    for array in (patches.pieces.positions(positions, faces), patches.patch_of_pieces, points, normals):
         key.update(np.ascontiguousarray(array).tobytes())
 
     def read(stored: Mapping[str, np.ndarray]) -> csr_matrix:
@@ -109,13 +109,13 @@ def self_form_factors(
 
     def trace(_: Unfinished) -> csr_matrix:
         mesh = patch_mesh(patches, positions, faces, device=device)
-        arguments = patches.of_pieces, patches.count, points, normals
-        return trace_factors(mesh, *arguments, rays=_RAYS, progress=progress)
+        arguments = patches.patch_of_pieces, patches.count, points, normals
+        return trace_form_factors(mesh, *arguments, rays=_RAYS, progress=progress)
 
     return load_or_compute(
         cache_path("form_factors", key.hexdigest()),
         read,
         trace,
         lambda form_factors: {name: getattr(form_factors, name) for name in ("data", "indices", "indptr")},
-        what="form factors",
+        noun="form factors",
     )

@@ -1,9 +1,9 @@
 """Bounces where geometry does not move: rays once, then small matrices in each iteration, by any method that lights.
 
-Of patches p, points x on them at which they are lit (sources s), and receivers, rays find the form factors F once.
-With direct shading S and albedo a an iteration finds the radiosity of patches after n − 1 bounces, or after all,
+Of patches p, points x on them at which they are lit (patch samples s), and receivers, rays find the form factors F
+once. With direct shading S and albedo a an iteration finds the radiosity of patches after n − 1 bounces, or after all,
 
-    B = a (M S + M F B),  M the mean over sources outside of other bodies,        starting from B = a M S,
+    B = a (M S + M F B),  M the mean over patch samples outside of other bodies,        starting from B = a M S,
 
 and receivers gather F B. Light that a body sends to itself may go on for longer than that.
 Receivers of an image are many: F is found at some of them, and interpolated.
@@ -11,9 +11,10 @@ Receivers of an image are many: F is found at some of them, and interpolated.
 Direct light and form factors must agree on how much of a hemisphere is open: where spheres block a part 1 − s of an
 even sky, and rays hit bodies in a part f, F is scaled by (1 − s) / f. Otherwise light is gained and lost: eighteen
 white balls in a white furnace were 0.91 to 1.06 bright. Points inside another body see its inside; they count neither
-in means over the sources of a patch nor as cache points. A patch that has no other sources sticks out between them, if
-it is seen: it has the light of the nearest patch of its body. The radiosity is linear in light: of free light among
-bodies whose colors are known all of it is one matrix, which is cached. Differentiable in light and albedo.
+in means over the patch samples of a patch nor as cache points. A patch that has no other patch samples sticks out
+between them, if it is seen: it has the light of the nearest patch of its body. The radiosity is linear in light: of
+free light among bodies whose colors are known all of it is one matrix, which is cached. Differentiable in light and
+albedo.
 """
 
 from __future__ import annotations
@@ -32,17 +33,17 @@ from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.colored import ColoredTransfer, colored_light
-from warpshadow.stages.bounces.factors import (
+from warpshadow.stages.bounces.form_factors import (
     BLACK_ENTRIES,
     PatchFormFactors,
     loose_mesh,
     mean_outside,
-    ratios,
-    scaled,
-    scaled_to_sky,
-    trace_factors,
+    scale_rows,
+    scale_to_sky,
+    scaling_factors,
+    trace_form_factors,
 )
-from warpshadow.stages.bounces.irradiance_cache import choose_cache_points, interpolation
+from warpshadow.stages.bounces.irradiance_cache import choose_cache_points, interpolation_matrix
 from warpshadow.stages.bounces.radiosity import reflect
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
@@ -51,7 +52,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 
-RAYS = 1024  # rays of a cache point or source, which find its form factors …
+RAYS = 1024  # rays of a cache point or patch sample, which find its form factors …
 
 STILL_RAYS = 256
 """… and those of a still, which has no time to spare: of the table of demos/kinds.py (128²) it has an error of 1.95%
@@ -61,8 +62,8 @@ against paths with these, and of 1.93% with 1024, in 3.1 and 7.1 s of CPU time."
 class _GeometryFactors(NamedTuple):
     """Cached results of a geometry."""
 
-    source_means: SparseMatrix  # [patch, source], means over the sources that lie in no other body
-    within_bodies: SparseMatrix  # [patch, patch] of the same body, means over the sources of the first
+    patch_sample_means: SparseMatrix  # [patch, patch sample], means over the patch samples that lie in no other body
+    within_bodies: SparseMatrix  # [patch, patch] of the same body, means over the patch samples of the first
     between_bodies: SparseMatrix  # [patch, patch] of different ones, likewise
     to_cache_points: SparseMatrix  # [cache point, patch], those of each view after one another
     receiver_weights: SparseMatrix  # [receiver, cache point]
@@ -71,14 +72,14 @@ class _GeometryFactors(NamedTuple):
     def to_receivers(self, direct: wp.array, bounced: wp.array) -> wp.array:
         """Add bounced light of cache points to direct shading, vec3 [batch, receiver]. Differentiable: both."""
         if self.shape[0] == 1:
-            return multiply(self.receiver_weights, bounced, plus=direct)
+            return multiply(self.receiver_weights, bounced, addend=direct)
         if len(bounced) > 1:
             raise ValueError(
                 f"light, albedo, textures: got a batch of {len(bounced)} for {self.shape[0]} views by "
                 'method "ray-traced" with bounces, expected one for them all; method = "directional" takes '
                 "batches"
             )
-        return multiply(self.receiver_weights, bounced, plus=direct.reshape((1, -1))).reshape(self.shape)
+        return multiply(self.receiver_weights, bounced, addend=direct.reshape((1, -1))).reshape(self.shape)
 
 
 class StaticBounces:
@@ -87,31 +88,35 @@ class StaticBounces:
     Args:
         patches: Of the scene.
         bounces: How often, 1 or more; "all" until nothing is left.
-        rays: Of a cache point or source.
+        rays: Of a cache point or patch sample.
     """
 
     def __init__(self, patches: ScenePatches, bounces: Bounces, *, rays: int = RAYS, progress: bool = False):
         self._patches, self._progress, self._bounces, self._rays = patches, progress, bounces, rays
 
-    def sources(self, points: LitPoints, materials: Materials) -> Node:
+    def patch_samples(self, points: LitPoints, materials: Materials) -> Node:
         """Node of the points of patches that are lit, of one instance."""
         senders = self._patches.senders(materials)
-        return points.cached("sources", senders, lambda: Node("", senders.sources, points.vertices, points.normals))
+        return points.cached(
+            "patch samples", senders, lambda: Node("", senders.patch_samples, points.vertices, points.normals)
+        )
 
-    def add_bounces(self, direct: Node, at_sources: Node, points: LitPoints, materials: Materials) -> Node:
+    def add_bounces(self, direct: Node, at_patch_samples: Node, points: LitPoints, materials: Materials) -> Node:
         """Add bounces to direct shading.
 
         Args:
             direct: Node of the direct shading of the receivers, vec3 of shape [batch, receiver].
-            at_sources: Node of that of :meth:`sources`, vec3 of shape [batch, source].
+            at_patch_samples: Node of that of :meth:`patch_samples`, vec3 of shape [batch, patch sample].
             points: The receivers.
             materials: Reflectance of the bodies.
         """
         senders = self._patches.senders(materials)
         if not senders.bodies:
             return direct
-        make = functools.partial(Node, "", _light_on_patches, at_sources, self._factors(points, materials, senders))
-        return self._shading(direct, points.cached("light of patches", at_sources, make), points, materials)
+        make = functools.partial(
+            Node, "", _light_on_patches, at_patch_samples, self._factors(points, materials, senders)
+        )
+        return self._shading(direct, points.cached("light of patches", at_patch_samples, make), points, materials)
 
     def add_free_bounces(
         self, direct: Node, transfers: Node, light: Input, points: LitPoints, materials: Materials
@@ -120,7 +125,7 @@ class StaticBounces:
 
         Args:
             direct: As above.
-            transfers: Node of the transfer vectors of the sources, [1, source, coefficient], in portions.
+            transfers: Node of the transfer vectors of the patch samples, [1, patch sample, coefficient], in portions.
             light: The coefficients.
             points: The receivers.
             materials: Reflectance of the bodies.
@@ -170,11 +175,11 @@ class StaticBounces:
 
         def light_of_others(radiosity: wp.array | None) -> wp.array:
             """Light on patches from the sky and from other bodies."""
-            return patch_light if radiosity is None else multiply(factors.between_bodies, radiosity, plus=patch_light)
+            return patch_light if radiosity is None else multiply(factors.between_bodies, radiosity, addend=patch_light)
 
         def reflect_all(by_others: wp.array, radiosity: wp.array | None) -> wp.array:
             return reflect(
-                albedo, by_others if radiosity is None else multiply(factors.within_bodies, radiosity, plus=by_others)
+                albedo, by_others if radiosity is None else multiply(factors.within_bodies, radiosity, addend=by_others)
             )
 
         arguments = self._bounces, light_of_others, reflect_all, senders.areas
@@ -186,9 +191,9 @@ class StaticBounces:
     def _factors(self, points: LitPoints, materials: Materials, senders: Senders) -> Node:
         def find(
             positions: wp.array,
-            sources: Receivers,
+            patch_samples: Receivers,
             receivers: Receivers,
-            sky_at_sources: wp.array | None,
+            sky_at_patch_samples: wp.array | None,
             sky_at_receivers: wp.array | None,
         ) -> _GeometryFactors:
             from scipy.sparse import block_diag, coo_matrix, vstack
@@ -204,8 +209,8 @@ class StaticBounces:
             def trace(points: np.ndarray, normals: np.ndarray, sky: np.ndarray | None) -> PatchFormFactors:
                 count = len(senders.areas)
                 arguments = mesh, of_faces, count + len(BLACK_ENTRIES), points, normals
-                form_factors = trace_factors(*arguments, rays=self._rays, progress=self._progress)
-                return scaled_to_sky(
+                form_factors = trace_form_factors(*arguments, rays=self._rays, progress=self._progress)
+                return scale_to_sky(
                     form_factors, np.append(casts[senders.body_of_patch], [True] * len(BLACK_ENTRIES)), sky
                 )
 
@@ -219,47 +224,49 @@ class StaticBounces:
                 )
                 is_cache_point = ~form_factors.is_buried | form_factors.is_buried.all()
                 cache_points = cache_points[is_cache_point]
-                means = interpolation(points, normals, cache_points)
+                means = interpolation_matrix(points, normals, cache_points)
                 if sky is not None:
-                    means = scaled(means, ratios(1 - sky, means @ (1 - sky[cache_points])))
+                    means = scale_rows(means, scaling_factors(1 - sky, means @ (1 - sky[cache_points])))
                 return means, form_factors.factors[is_cache_point]
 
             at, facing, device = receivers.points.numpy(), receivers.normals.numpy(), positions.device
-            skies = [None if sky is None else sky.numpy()[..., 0] for sky in (sky_at_sources, sky_at_receivers)]
-            at_source = None if skies[0] is None else skies[0][0]
+            skies = [None if sky is None else sky.numpy()[..., 0] for sky in (sky_at_patch_samples, sky_at_receivers)]
+            at_patch_sample = None if skies[0] is None else skies[0][0]
             at_receivers = [None] * len(at) if skies[1] is None else np.broadcast_to(skies[1], at.shape[:2])
-            seen_by_sources = trace(sources.points.numpy()[0], sources.normals.numpy()[0], at_source)
+            seen_by_patch_samples = trace(
+                patch_samples.points.numpy()[0], patch_samples.normals.numpy()[0], at_patch_sample
+            )
             receiver_weights, to_cache_points = zip(*map(find_cache_points, at, facing, at_receivers), strict=True)
-            means, is_buried = senders.mean.on_host(), seen_by_sources.is_buried
+            means, is_buried = senders.mean.to_scipy(), seen_by_patch_samples.is_buried
             mean = mean_outside(means, is_buried)[senders.nearest_open_patches(means @ ~is_buried > 0)]
-            between = (mean @ seen_by_sources.factors).tocoo()
+            between = (mean @ seen_by_patch_samples.factors).tocoo()
             is_same_body = np.equal(*(senders.body_of_patch[patches] for patches in between.coords))
             within_bodies, between_bodies = (
                 coo_matrix((between.data[which], (between.row[which], between.col[which])), between.shape)
                 for which in (is_same_body, ~is_same_body)
             )
             return _GeometryFactors(
-                SparseMatrix.of(mean, device=device),
-                SparseMatrix.of(within_bodies, device=device),
-                SparseMatrix.of(between_bodies, device=device),
-                SparseMatrix.of(vstack(to_cache_points), device=device),
-                SparseMatrix.of(block_diag(receiver_weights), device=device),
+                SparseMatrix.from_matrix(mean, device=device),
+                SparseMatrix.from_matrix(within_bodies, device=device),
+                SparseMatrix.from_matrix(between_bodies, device=device),
+                SparseMatrix.from_matrix(vstack(to_cache_points), device=device),
+                SparseMatrix.from_matrix(block_diag(receiver_weights), device=device),
                 at.shape[:2],
             )
 
         def make() -> Node:
-            sources = self.sources(points, materials)
-            arguments = points.method, materials, points.vertices, points.spheres, sources, points.call
-            at_sources = LitPoints(*arguments, normals=points.normals, blocker_kinds=points.blocker_kinds)
-            skies = [points.method.openness(item) for item in (at_sources, points)]
+            patch_samples = self.patch_samples(points, materials)
+            arguments = points.method, materials, points.vertices, points.spheres, patch_samples, points.call
+            at_patch_samples = LitPoints(*arguments, normals=points.normals, blocker_kinds=points.blocker_kinds)
+            skies = [points.method.openness(item) for item in (at_patch_samples, points)]
             return Node(
                 "form factors",
                 find,
                 points.vertices,
-                sources,
+                patch_samples,
                 points.receivers_node,
                 *skies,
-                items=lambda: f"{len(senders.sides):,} sources × {len(senders.areas):,} patches",
+                items=lambda: f"{len(senders.sides):,} patch samples × {len(senders.areas):,} patches",
                 has_adjoint=False,
             )
 
@@ -279,7 +286,9 @@ class StaticBounces:
                 place = senders.bodies.index(number)
                 patches = senders.patches[place]
                 corners.append(patches.pieces.positions(body_positions, faces))
-                patch_of_side = np.where(patches.of_pieces < 0, -1, patches.of_pieces + senders.first[place])
+                patch_of_side = np.where(
+                    patches.patch_of_pieces < 0, -1, patches.patch_of_pieces + senders.first[place]
+                )
             else:
                 corners.append(body_positions[faces])
                 patch_of_side = np.full((2, len(faces)), -1)
@@ -288,11 +297,11 @@ class StaticBounces:
         return loose_mesh(np.concatenate(corners), device=merged_scene.device), np.concatenate(owners, axis=1)
 
 
-def _light_on_patches(at_sources: wp.array, factors: _GeometryFactors) -> wp.array:
-    """Mean light on patches, given that at their sources: vec3 of shape [batch, patch]. Differentiable: light."""
-    return multiply(factors.source_means, at_sources)
+def _light_on_patches(at_patch_samples: wp.array, factors: _GeometryFactors) -> wp.array:
+    """Mean light on patches, given that at their patch samples: vec3 of shape [batch, patch]. Differentiable: light."""
+    return multiply(factors.patch_sample_means, at_patch_samples)
 
 
 def _as_transfer(lit: wp.array) -> ColoredTransfer:
     """The matrix of receivers that are lit by each coefficient alone, vec3 of shape [coefficient, receiver]."""
-    return ColoredTransfer.of(lit.numpy(), device=lit.device)
+    return ColoredTransfer.from_lit_receivers(lit.numpy(), device=lit.device)

@@ -53,23 +53,23 @@ def mean_over_texels(
     """
     corners = patches.pieces.corners.astype(np.float64) @ uvs.astype(np.float64)[uv_faces[patches.pieces.faces]]
     edge_u, edge_v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    texels = np.abs(edge_u[:, 0] * edge_v[:, 1] - edge_u[:, 1] * edge_v[:, 0]) / 2 * size[0] * size[1]
+    texel_areas = np.abs(edge_u[:, 0] * edge_v[:, 1] - edge_u[:, 1] * edge_v[:, 0]) / 2 * size[0] * size[1]
     sizes = np.array(level_sizes(*size))
-    firsts = np.cumsum([0, *sizes.prod(axis=1)])
-    level = np.minimum(np.rint(np.log2(np.maximum(texels, 1)) / 2).astype(int), len(sizes) - 1)
-    first, (height, width) = firsts[level], sizes[level].T
+    level_starts = np.cumsum([0, *sizes.prod(axis=1)])
+    levels = np.minimum(np.rint(np.log2(np.maximum(texel_areas, 1)) / 2).astype(int), len(sizes) - 1)
+    level_start, (height, width) = level_starts[levels], sizes[levels].T
     u, v = np.moveaxis(corners.mean(axis=1) % 1, -1, 0)
     x, y = u * width - 0.5, (1 - v) * height - 0.5
-    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
+    x_floor, y_floor = np.floor(x).astype(int), np.floor(y).astype(int)
     columns, weights = [], []
-    for down, below in ((0, 1 - (y - top)), (1, y - top)):
-        for right, column_weight in ((0, 1 - (x - left)), (1, x - left)):
-            columns.append(first + (top + down) % height * width + (left + right) % width)
-            weights.append(below * column_weight)
+    for row_step, row_weight in ((0, 1 - (y - y_floor)), (1, y - y_floor)):
+        for column_step, column_weight in ((0, 1 - (x - x_floor)), (1, x - x_floor)):
+            columns.append(level_start + (y_floor + row_step) % height * width + (x_floor + column_step) % width)
+            weights.append(row_weight * column_weight)
     areas = _piece_areas(patches, positions, faces)
-    means = _mean(patches, areas, np.stack(columns, axis=1), np.stack(weights, axis=1), firsts[-1])
-    parts = (means[:, start:end] for start, end in itertools.pairwise(firsts))
-    return sum(part @ matrix for part, matrix in zip(parts, level_matrices(*size), strict=True))
+    means = _mean(patches, areas, np.stack(columns, axis=1), np.stack(weights, axis=1), level_starts[-1])
+    level_means = (means[:, start:end] for start, end in itertools.pairwise(level_starts))
+    return sum(level_mean @ matrix for level_mean, matrix in zip(level_means, level_matrices(*size), strict=True))
 
 
 def _piece_areas(patches: Patches, positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -83,12 +83,12 @@ def _mean(
     """Means by area over pieces [piece] of their weights of columns [piece, n]."""
     from scipy.sparse import csr_matrix
 
-    entries = areas[:, None] * weights
-    parts = []
-    for of_pieces in patches.of_pieces:
-        counts = of_pieces >= 0
-        rows = np.repeat(of_pieces[counts], columns.shape[1])
-        parts.append((rows, columns[counts].ravel(), entries[counts].ravel()))
-    rows, chosen, values = (np.concatenate(item) for item in zip(*parts, strict=True))
-    totals = np.bincount(rows, values, patches.count)
-    return csr_matrix((values / totals[rows], (rows, chosen)), shape=(patches.count, column_count))
+    entry_weights = areas[:, None] * weights
+    entry_lists = []
+    for patch_of_pieces in patches.patch_of_pieces:
+        has_patch = patch_of_pieces >= 0
+        rows = np.repeat(patch_of_pieces[has_patch], columns.shape[1])
+        entry_lists.append((rows, columns[has_patch].ravel(), entry_weights[has_patch].ravel()))
+    rows, entry_columns, values = (np.concatenate(item) for item in zip(*entry_lists, strict=True))
+    area_sums = np.bincount(rows, values, patches.count)
+    return csr_matrix((values / area_sums[rows], (rows, entry_columns)), shape=(patches.count, column_count))

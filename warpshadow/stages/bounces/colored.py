@@ -33,10 +33,10 @@ class ColoredTransfer:
     columns: wp.array
 
     @staticmethod
-    def of(lit: np.ndarray, *, device: wp.DeviceLike) -> ColoredTransfer:
-        """That of receivers that are lit by each coefficient alone, float32 of shape [coefficient, receiver, 3]."""
-        columns = wp.array(lit, dtype=wp.vec3, device=device)
-        return ColoredTransfer(wp.array(lit.swapaxes(0, 1), dtype=wp.vec3, device=device), columns)
+    def from_lit_receivers(lit_receivers: np.ndarray, *, device: wp.DeviceLike) -> ColoredTransfer:
+        """Transfer from the light on receivers under each coefficient alone, float32 [coefficient, receiver, 3]."""
+        columns = wp.array(lit_receivers, dtype=wp.vec3, device=device)
+        return ColoredTransfer(wp.array(lit_receivers.swapaxes(0, 1), dtype=wp.vec3, device=device), columns)
 
 
 Quad = wp.types.vector(length=12, dtype=wp.float32)
@@ -52,7 +52,7 @@ def _multiply(
     matrix_quads: wp.array2d(dtype=Quad),
     values: wp.array2d(dtype=wp.vec3),
     value_quads: wp.array2d(dtype=Quad),
-    plus: wp.array2d(dtype=wp.vec3),
+    addend: wp.array2d(dtype=wp.vec3),
     # out
     products: wp.array2d(dtype=wp.vec3),
 ):
@@ -61,16 +61,16 @@ def _multiply(
     quads = Quad(0.0)
     for quad in range(matrix_quads.shape[1]):
         quads += wp.cw_mul(matrix_quads[row, quad], value_quads[batch, quad])
-    total = wp.vec3(
+    product = wp.vec3(
         (quads[0] + quads[3]) + (quads[6] + quads[9]),
         (quads[1] + quads[4]) + (quads[7] + quads[10]),
         (quads[2] + quads[5]) + (quads[8] + quads[11]),
     )
     for column in range(4 * matrix_quads.shape[1], matrix.shape[1]):
-        total += wp.cw_mul(matrix[row, column], values[batch, column])
-    if plus:
-        total += plus[batch, row]
-    products[batch, row] = total
+        product += wp.cw_mul(matrix[row, column], values[batch, column])
+    if addend:
+        product += addend[batch, row]
+    products[batch, row] = product
 
 
 def colored_light(transfer: ColoredTransfer, light: wp.array) -> wp.array:
@@ -85,14 +85,14 @@ def colored_light(transfer: ColoredTransfer, light: wp.array) -> wp.array:
     """
     check.shape("light", light.shape, ("batch", transfer.columns.shape[0]))
 
-    def times(matrix: wp.array, values: wp.array, plus: wp.array | None, products: wp.array) -> None:
+    def multiply_rows(matrix: wp.array, values: wp.array, addend: wp.array | None, products: wp.array) -> None:
         cost = _COEFFICIENT_COST * matrix.shape[1] + _ROW_COST
-        inputs = [matrix, as_items(matrix, Quad, 4), values, as_items(values, Quad, 4), plus]
+        inputs = [matrix, as_items(matrix, Quad, 4), values, as_items(values, Quad, 4), addend]
         launch(_multiply, products.size, inputs=inputs, outputs=[products], cost=cost)
 
     return differentiable(
-        lambda lit: times(transfer.rows, light, None, lit),
-        lambda adj_lit: times(transfer.columns, adj_lit, light.grad, light.grad),
+        lambda lit_receivers: multiply_rows(transfer.rows, light, None, lit_receivers),
+        lambda adj_receivers: multiply_rows(transfer.columns, adj_receivers, light.grad, light.grad),
         result=empty((len(light), transfer.rows.shape[0]), dtype=wp.vec3, device=light.device),
         variables=[light],
     )

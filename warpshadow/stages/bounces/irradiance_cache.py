@@ -25,13 +25,15 @@ def choose_cache_points(points: np.ndarray, count: int = CACHE_POINT_COUNT) -> n
         points: Receivers, shape [receiver, 3].
         count: Most cache points; all receivers where they are fewer.
     """
-    curve_order = z_order(points.astype(np.float64))
-    return curve_order[
-        np.arange(min(count, len(curve_order))) * len(curve_order) // max(min(count, len(curve_order)), 1)
+    curve_permutation = z_order(points.astype(np.float64))
+    return curve_permutation[
+        np.arange(min(count, len(curve_permutation)))
+        * len(curve_permutation)
+        // max(min(count, len(curve_permutation)), 1)
     ]
 
 
-def interpolation(points: np.ndarray, normals: np.ndarray, cache_points: np.ndarray) -> csr_matrix:
+def interpolation_matrix(points: np.ndarray, normals: np.ndarray, cache_points: np.ndarray) -> csr_matrix:
     """The matrix that interpolates between the nearest cache points, by place and normal.
 
     With d_i the distances to the nearest cache points in order, the three nearest weigh (1/d_i − 1/d_4)² [Renka 1988].
@@ -48,12 +50,15 @@ def interpolation(points: np.ndarray, normals: np.ndarray, cache_points: np.ndar
 
     extent = float(np.ptp(points, axis=0).max(initial=0.0)) or 1.0
     features = np.concatenate([points / extent, _NORMAL_DISTANCE * normals], axis=1).astype(np.float64)
-    reached = min(_NEIGHBORS + 1, len(cache_points))
-    distances, neighbors = cKDTree(features[cache_points]).query(features, k=reached)
-    distances, neighbors = distances.reshape(len(points), reached), neighbors.reshape(len(points), reached)
+    neighbor_count = min(_NEIGHBORS + 1, len(cache_points))
+    distances, neighbors = cKDTree(features[cache_points]).query(features, k=neighbor_count)
+    distances, neighbors = (
+        distances.reshape(len(points), neighbor_count),
+        neighbors.reshape(len(points), neighbor_count),
+    )
     nearness = 1 / np.maximum(distances, 1e-9)
     weights = (nearness - nearness[:, -1:]) ** 2
     weights[weights.sum(axis=1) == 0, 0] = 1  # all are as far
     weights /= weights.sum(axis=1, keepdims=True)
-    starts = np.arange(len(points) + 1) * reached
+    starts = np.arange(len(points) + 1) * neighbor_count
     return csr_matrix((weights.astype(np.float32).ravel(), neighbors.ravel(), starts), (len(points), len(cache_points)))

@@ -32,10 +32,10 @@ from warpshadow.stages.bounces.plane_hits import (
     HIT_ROWS,
     PlaneHit,
     add_to_hit,
-    hit_sides,
-    hit_sides_adjoint,
+    find_side_hits,
+    find_side_hits_adjoint,
     load_hit,
-    mean_light,
+    mean_radiosity,
     side_transmittance_adjoint,
     store_hit,
 )
@@ -44,8 +44,8 @@ from warpshadow.stages.planes.cells import PlaneArrays, check_planes, plane_arra
 from warpshadow.stages.planes.prepared import PlaneBlockers
 from warpshadow.stages.planes.sides import (
     SIDE_ROWS,
-    place_receiver,
-    place_receiver_adjoint,
+    prepare_receiver,
+    prepare_receiver_adjoint,
     receiver_scratch,
     visible_cell,
 )
@@ -73,19 +73,21 @@ def _light_receivers(
     light: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver."""
-    batch, receiver, scratch_row, side_count = place_receiver(
+    batch, receiver, scratch_row, side_count = prepare_receiver(
         first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
     )
     store, edges = scratch[scratch_row], viewed_edges[scratch_row]
-    sent = texels[instance_in(batch, texels.shape[0])]
+    texel_radiosity = texels[instance_in(batch, texels.shape[0])]
     normal = normals[batch, receiver]
     first_hit = SIDE_ROWS * scene.grids.shape[0]
     total = wp.vec3()
     for q in range(directions.shape[0]):
         weight = wp.dot(normal, directions[q]) * transmittance[batch, receiver, q]
-        if hit_sides(scene, visible_cell(scene, normal, directions[q]), sent, weight, side_count, store, edges):
-            mean, _, covered = mean_light(first_hit, side_count, store)
-            total += (weight * wp.min(covered, 1.0)) * mean
+        if find_side_hits(
+            scene, visible_cell(scene, normal, directions[q]), texel_radiosity, weight, side_count, store, edges
+        ):
+            mean, _, total_coverage = mean_radiosity(first_hit, side_count, store)
+            total += (weight * wp.min(total_coverage, 1.0)) * mean
     light[batch, receiver] = (4.0 / float(directions.shape[0])) * total
 
 
@@ -117,50 +119,52 @@ def _light_receivers_adjoint(
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver."""
-    batch, receiver, scratch_row, side_count = place_receiver(
+    batch, receiver, scratch_row, side_count = prepare_receiver(
         first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
     )
     store, edges, adj_store = scratch[scratch_row], viewed_edges[scratch_row], adj_scratch[scratch_row]
     texel_batch = instance_in(batch, texels.shape[0])
-    sent = texels[texel_batch]
+    texel_radiosity = texels[texel_batch]
     normal = normals[batch, receiver]
     first_hit = SIDE_ROWS * scene.grids.shape[0]
     for k in range(first_hit):
         adj_store[k] = wp.vec3()
-    adj = (4.0 / float(directions.shape[0])) * adj_light[batch, receiver]
+    adj_mean = (4.0 / float(directions.shape[0])) * adj_light[batch, receiver]
     adj_normal = wp.vec3()
     for q in range(directions.shape[0]):
         direction = directions[q]
         cosine = wp.dot(normal, direction)
-        passing = transmittance[batch, receiver, q]
-        weight = cosine * passing
+        cell_transmittance = transmittance[batch, receiver, q]
+        weight = cosine * cell_transmittance
         cell = visible_cell(scene, normal, direction)
-        if hit_sides(scene, cell, sent, cosine, side_count, store, edges):
-            mean, weights, covered = mean_light(first_hit, side_count, store)
-            value = wp.dot(adj, mean)
-            total = wp.min(covered, 1.0) * value
-            factor = weight * wp.min(covered, 1.0) / weights
-            adj_covered = wp.where(covered < 1.0, weight * value, 0.0)
+        if find_side_hits(scene, cell, texel_radiosity, cosine, side_count, store, edges):
+            mean, weights, total_coverage = mean_radiosity(first_hit, side_count, store)
+            value = wp.dot(adj_mean, mean)
+            total = wp.min(total_coverage, 1.0) * value
+            factor = weight * wp.min(total_coverage, 1.0) / weights
+            adj_coverage = wp.where(total_coverage < 1.0, weight * value, 0.0)
             for i in range(side_count):
                 hit = load_hit(store, first_hit, i)
                 adj_hit = PlaneHit()
-                adj_hit.coverage = adj_covered
-                adj_hit.radiosity = (factor * hit.coverage * hit.transmittance) * adj
+                adj_hit.coverage = adj_coverage
+                adj_hit.radiosity = (factor * hit.coverage * hit.transmittance) * adj_mean
                 store_hit(adj_store, first_hit, i, adj_hit)
             for i in range(side_count):
                 hit = load_hit(store, first_hit, i)
                 if hit.coverage > 0.0:
-                    adj_weight = factor * (wp.dot(adj, hit.radiosity) - value)
+                    adj_weight = factor * (wp.dot(adj_mean, hit.radiosity) - value)
                     add_to_hit(adj_store, first_hit, i, hit.transmittance * adj_weight, 0.0, 0.0)
                     side_transmittance_adjoint(i, hit.coverage * adj_weight, first_hit, side_count, store, adj_store)
-            adj_normal += (passing * total) * direction
+            adj_normal += (cell_transmittance * total) * direction
             if adj_transmittance:
                 adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + cosine * total
-            if passing > 0.0:
-                hit_sides_adjoint(scene, cell, sent, side_count, store, edges, adj_store, texel_batch, adj_texels)
+            if cell_transmittance > 0.0:
+                find_side_hits_adjoint(
+                    scene, cell, texel_radiosity, side_count, store, edges, adj_store, texel_batch, adj_texels
+                )
     if adj_normals:
         adj_normals[batch, receiver] = adj_normals[batch, receiver] + adj_normal
-    place_receiver_adjoint(
+    prepare_receiver_adjoint(
         batch,
         receiver,
         side_count,
@@ -210,19 +214,19 @@ def plane_light(
     check.shape("normals", normals.shape, ("batch", points.shape[1]))
     check.shape("transmittance", transmittance.shape, ("batch", points.shape[1], len(directions)))
     arguments = {"points": points, "normals": normals, "transmittance": transmittance, "frames": frames}
-    instances = common_batch({**arguments, "texels": texels, "fronts": fronts})
+    batch_count = common_batch({**arguments, "texels": texels, "fronts": fronts})
     if planes.count == (skip is not None):
-        return zeros((instances, points.shape[1]), wp.vec3, points.device)
-    points, normals = (expand(array, instances) for array in (points, normals))
-    transmittance = expand_rows(transmittance, instances)
-    fronts = None if fronts is None else expand_rows(fronts, instances)
+        return zeros((batch_count, points.shape[1]), wp.vec3, points.device)
+    points, normals = (expand(array, batch_count) for array in (points, normals))
+    transmittance = expand_rows(transmittance, batch_count)
+    fronts = None if fronts is None else expand_rows(fronts, batch_count)
     scratch = receiver_scratch(planes, HIT_ROWS)
     variables = [points, normals, transmittance, frames, texels, fronts]
-    scene, first_hit = (
+    scene, cell_directions = (
         plane_arrays(planes, cell_radius(len(directions)), skip),
         constant(directions, wp.vec3, points.device),
     )
-    inputs = [*variables, scene, first_hit]
+    inputs = [*variables, scene, cell_directions]
     return differentiable(
         lambda light: launch(
             _light_receivers,

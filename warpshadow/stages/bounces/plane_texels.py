@@ -6,7 +6,7 @@ little [normalized convolution: Knutsson and Westin 1993]:
 
     B = Σ_p k_p v_p B_p / Σ_p k_p v_p
 
-with v the weight of a patch by its openness (:mod:`.open_sources`), and k its share of the mesh in the texel, or 0.002
+with v the weight of a patch by its openness (:mod:`.openness`), and k its share of the mesh in the texel, or 0.002
 of that in a texel beside it. A texel of buried patches alone has the light of those beside it, others hardly any of it.
 
 Without it the foot of a thick wall in the sun was 10% too dark with all bounces, and 35% too bright with the sun behind
@@ -26,18 +26,18 @@ from warpshadow.stages.sparse import multiply
 @wp.kernel
 def _divide(
     # in
-    sums: wp.array2d(dtype=wp.vec3),
-    weights: wp.array2d(dtype=wp.vec3),
+    radiosity_sums: wp.array2d(dtype=wp.vec3),
+    weight_sums: wp.array2d(dtype=wp.vec3),
     # out
     texels: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a texel of an instance; one far off the mesh is black."""
     batch, texel = wp.tid()
-    weight = weights[instance_in(batch, weights.shape[0]), texel][0]
-    mean = wp.vec3()
+    weight = weight_sums[instance_in(batch, weight_sums.shape[0]), texel][0]
+    mean_radiosity = wp.vec3()
     if weight > 0.0:
-        mean = sums[batch, texel] / weight
-    texels[batch, texel] = mean
+        mean_radiosity = radiosity_sums[batch, texel] / weight
+    texels[batch, texel] = mean_radiosity
 
 
 def find_texels(radiosity: wp.array, open_weights: wp.array, planes: PlaneBlockers) -> wp.array:
@@ -52,8 +52,10 @@ def find_texels(radiosity: wp.array, open_weights: wp.array, planes: PlaneBlocke
     Differentiable: radiosity, open_weights.
     """
     assert planes.texels_of_patches is not None
-    weighted = reflect(open_weights, radiosity)
-    sums, totals = (multiply(planes.texels_of_patches, values) for values in (weighted, open_weights))
-    texels = empty(sums.shape, dtype=wp.vec3, device=radiosity.device)
-    launch(_divide, sums.shape, inputs=[sums, totals], outputs=[texels])
+    weighted_radiosity = reflect(open_weights, radiosity)
+    radiosity_sums, weight_sums = (
+        multiply(planes.texels_of_patches, values) for values in (weighted_radiosity, open_weights)
+    )
+    texels = empty(radiosity_sums.shape, dtype=wp.vec3, device=radiosity.device)
+    launch(_divide, radiosity_sums.shape, inputs=[radiosity_sums, weight_sums], outputs=[texels])
     return texels

@@ -1,14 +1,14 @@
 """Projected area of patches towards each cell, without the parts hidden by their own body or by a plane.
 
-Towards a receiver that sees a patch in direction ω, its sources s with weights w show
+Towards a receiver that sees a patch in direction ω, its patch samples s with weights w show
 
     g_p(ω) = Σ_s w_ps max(−n′_s·ω, 0) (β + (1 − β) T_s(−ω)),  β = 0.1
 
 parts of its area. T_s is the body's self-transmittance in the cell that contains −ω. Other bodies do not count: the
 receiver's self-transmittance covers them, and one of them may be where the receiver is.
 
-Parts that their own body hides still count for β: a receiver in a cavity of that body is nearer than what hides them,
-and sees nothing else. By β = 0 a third of what a ball in an open box saw of the box was its outside.
+Parts that their own body hides still count for β: a receiver in a cavity of that body is nearer than the parts
+that hide them, and sees nothing else. With β = 0 a third of the box that a ball in an open box saw was its outside.
 
 Plane blockers cannot count as T, since a receiver on a ground is behind the ground in each direction from which it is
 lit. But receivers above a ground hardly see patches that face it and are near it. The bottom of a sphere of radius r,
@@ -18,7 +18,7 @@ so the part of a normal that points into a plane with normal N fades,
     n′ = n + c max(−n·N, 0) N,  c = f r² / (d² + r²) · Π_axes [S((y_most − y) / r) − S((y_least − y) / r)]
 
 which is about 1 − d / (d + r), but smooth where bodies lie: S is the smoothstep from 0 at −1 to 1 at 1, y
-where the source is along the plane, and f the part of the front that it sees; so it is for the back, with −N.
+where the patch sample is along the plane, and f the part of the front that it sees; so it is for the back, with −N.
 
 Measured with a ground and two bounces, images against all bounces by a path tracer, relative RMSE: a machine part that
 lies on the ground 7.8% by normals alone, 7.6% with T, 5.5% with T and n′; a cow 2.1%, 2.0% and 1.8%; a man of thin
@@ -41,14 +41,14 @@ _HIDDEN = wp.constant(0.1)  # β, by which parts count that their own body hides
 
 
 @wp.func
-def _part_within(place: float, minimum: float, maximum: float, reach: float):
+def _share_within(position: float, lower_bound: float, upper_bound: float, half_width: float):
     """Part of an interval around a place that lies between two others."""
-    before, behind = (minimum - place) / reach, (maximum - place) / reach
-    return wp.smoothstep(-1.0, 1.0, behind) - wp.smoothstep(-1.0, 1.0, before)
+    lower_offset, upper_offset = (lower_bound - position) / half_width, (upper_bound - position) / half_width
+    return wp.smoothstep(-1.0, 1.0, upper_offset) - wp.smoothstep(-1.0, 1.0, lower_offset)
 
 
 @wp.kernel
-def _turn_from_planes(
+def _tilt_normals(
     # in
     points: wp.array2d(dtype=wp.vec3),
     normals: wp.array2d(dtype=wp.vec3),
@@ -58,37 +58,37 @@ def _turn_from_planes(
     frames: wp.array2d(dtype=wp.vec3),
     grids: wp.array(dtype=PlaneGrid),
     # out
-    turned: wp.array2d(dtype=wp.vec3),
+    tilted_normals: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a source of an instance."""
-    batch, source = wp.tid()
-    point = points[instance_in(batch, points.shape[0]), source]
-    normal = normals[instance_in(batch, normals.shape[0]), source]
-    result = normal
-    if spheres[source] >= 0:
-        radius = radii[instance_in(batch, radii.shape[0]), spheres[source]]
+    """A thread owns a patch sample of an instance."""
+    batch, patch_sample = wp.tid()
+    point = points[instance_in(batch, points.shape[0]), patch_sample]
+    normal = normals[instance_in(batch, normals.shape[0]), patch_sample]
+    tilted_normal = normal
+    if spheres[patch_sample] >= 0:
+        radius = radii[instance_in(batch, radii.shape[0]), spheres[patch_sample]]
         frame_batch = instance_in(batch, frames.shape[0])
         for f in range(grids.shape[0]):
             grid = grids[f]
             u = frames[frame_batch, 3 * f + 1]
             v = frames[frame_batch, 3 * f + 2]
-            up = wp.normalize(wp.cross(u, v))
-            along_up = wp.dot(normal, up)
-            front = fronts[instance_in(batch, fronts.shape[0]), source, f]
-            away = front * wp.max(-along_up, 0.0) - (1.0 - front) * wp.max(along_up, 0.0)
+            plane_normal = wp.normalize(wp.cross(u, v))
+            up_component = wp.dot(normal, plane_normal)
+            front = fronts[instance_in(batch, fronts.shape[0]), patch_sample, f]
+            tilt = front * wp.max(-up_component, 0.0) - (1.0 - front) * wp.max(up_component, 0.0)
             if grid.blocks != 0 and radius > 0.0:
                 offset = point - frames[frame_batch, 3 * f]
-                height = wp.dot(offset, up) / radius
+                height = wp.dot(offset, plane_normal) / radius
                 x = wp.dot(offset, u) / wp.length(u)
                 y = wp.dot(offset, v) / wp.length(v)
                 # the plane's units are its scale in the scene's
-                within = _part_within(x, grid.minimum[0] * wp.length(u), grid.maximum[0] * wp.length(u), radius)
-                within *= _part_within(y, grid.minimum[1] * wp.length(v), grid.maximum[1] * wp.length(v), radius)
-                result += within / (1.0 + height * height) * away * up
-    turned[batch, source] = result
+                share_within = _share_within(x, grid.minimum[0] * wp.length(u), grid.maximum[0] * wp.length(u), radius)
+                share_within *= _share_within(y, grid.minimum[1] * wp.length(v), grid.maximum[1] * wp.length(v), radius)
+                tilted_normal += share_within / (1.0 + height * height) * tilt * plane_normal
+    tilted_normals[batch, patch_sample] = tilted_normal
 
 
-def turn_from_planes(
+def tilt_normals_off_planes(
     points: wp.array,
     normals: wp.array,
     radii: wp.array,
@@ -97,20 +97,20 @@ def turn_from_planes(
     frames: wp.array,
     planes: PlaneBlockers,
 ) -> wp.array:
-    """Normals of sources without the part that points into a plane on which they lie.
+    """Normals of patch samples without the part that points into a plane on which they lie.
 
     Args:
-        points: Sources [scene units], vec3 of shape [batch, source].
-        normals: Their unit normals, vec3 of shape [batch, source].
+        points: Patch samples [scene units], vec3 of shape [batch, patch sample].
+        normals: Their unit normals, vec3 of shape [batch, patch sample].
         radii: Radii of spheres [scene units], float32 of shape [batch, sphere].
-        spheres: The blocker nearest to the patch of each source, −1 for none, which keeps its normal: NumPy of shape
-            [source].
-        fronts: Part of the front of each plane that sources see, float32 of shape [batch, source, plane], from
-            :func:`.fronts.find_fronts`.
+        spheres: The blocker nearest to the patch of each patch sample, −1 for none, which keeps its normal: NumPy of
+            shape [patch sample].
+        fronts: Part of the front of each plane that patch samples see, float32 of shape [batch, patch sample, plane],
+            from :func:`.fronts.find_fronts`.
         frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`.PlaneBlockers.frames`.
         planes: The planes. Planes that cast no shadow do not count.
     Returns:
-        n′, vec3 of shape [batch, source]. Any batch may be 1.
+        n′, vec3 of shape [batch, patch sample]. Any batch may be 1.
     Differentiable: points, normals, radii, fronts, frames.
     """
     check.shape("normals", normals.shape, ("batch", points.shape[1]))
@@ -120,16 +120,16 @@ def turn_from_planes(
         raise ValueError(f"spheres: got {spheres.max()}, expected −1 to {radii.shape[1] - 1}")
     check.shape("fronts", fronts.shape, ("batch", points.shape[1], planes.count))
     arguments = {"points": points, "normals": normals, "radii": radii, "fronts": fronts, "frames": frames}
-    count = common_batch(arguments)
-    turned = empty((count, points.shape[1]), dtype=wp.vec3, device=points.device)
-    numbers = constant(np.asarray(spheres, np.int32), wp.int32, points.device)
+    batch_count = common_batch(arguments)
+    tilted_normals = empty((batch_count, points.shape[1]), dtype=wp.vec3, device=points.device)
+    blocker_indices = constant(np.asarray(spheres, np.int32), wp.int32, points.device)
     launch(
-        _turn_from_planes,
-        turned.shape,
-        inputs=[points, normals, radii, numbers, fronts, frames, planes.grids],
-        outputs=[turned],
+        _tilt_normals,
+        tilted_normals.shape,
+        inputs=[points, normals, radii, blocker_indices, fronts, frames, planes.grids],
+        outputs=[tilted_normals],
     )
-    return turned
+    return tilted_normals
 
 
 @wp.kernel
@@ -138,7 +138,7 @@ def _project(
     normals: wp.array2d(dtype=wp.vec3),
     transmittance: wp.array3d(dtype=wp.float32),
     starts: wp.array(dtype=wp.int32),
-    sources: wp.array(dtype=wp.int32),
+    patch_samples: wp.array(dtype=wp.int32),
     weights: wp.array(dtype=wp.float32),
     directions: wp.array(dtype=wp.vec3),
     opposite: wp.array(dtype=wp.int32),
@@ -147,17 +147,19 @@ def _project(
 ):
     """A thread owns a patch of an instance and a direction."""
     batch, patch, direction = wp.tid()
-    total = float(0.0)
+    projected_area = float(0.0)
     for k in range(starts[patch], starts[patch + 1]):
-        normal = normals[instance_in(batch, normals.shape[0]), sources[k]]
+        normal = normals[instance_in(batch, normals.shape[0]), patch_samples[k]]
         cosine = wp.max(-wp.dot(normal, directions[direction]), 0.0)
-        passing = transmittance[instance_in(batch, transmittance.shape[0]), sources[k], opposite[direction]]
-        total += weights[k] * cosine * (_HIDDEN + (1.0 - _HIDDEN) * passing)
-    projected_areas[batch, patch, direction] = total
+        opposite_transmittance = transmittance[
+            instance_in(batch, transmittance.shape[0]), patch_samples[k], opposite[direction]
+        ]
+        projected_area += weights[k] * cosine * (_HIDDEN + (1.0 - _HIDDEN) * opposite_transmittance)
+    projected_areas[batch, patch, direction] = projected_area
 
 
 @cached_by_values
-def _cells_and_opposites(directions: np.ndarray, device: wp.Device) -> tuple[wp.array, wp.array]:
+def _directions_and_opposites(directions: np.ndarray, device: wp.Device) -> tuple[wp.array, wp.array]:
     """Directions of cells, and the cell that is nearest to the opposite of each."""
     check_directions(directions)
     opposite = (-directions @ directions.T).argmax(axis=1).astype(np.int32)
@@ -170,21 +172,24 @@ def find_projected_areas(
     """Projected areas of patches towards cells, for :func:`.proxy_radiance.find_proxy_radiance`.
 
     Args:
-        normals: Of the sources, n′, vec3 of shape [batch, source], from :func:`turn_from_planes`.
-        transmittance: T, self-transmittance of each source, float32 of shape [batch, source, direction].
-        mean: The matrix w, [patch, source], from :func:`.radiosity.mean_over_sources`.
+        normals: Of the patch samples, n′, vec3 of shape [batch, patch sample], from :func:`tilt_normals_off_planes`.
+        transmittance: T, self-transmittance of each patch sample, float32 of shape [batch, patch sample, direction].
+        mean: The matrix w, [patch, patch sample], from :func:`.radiosity.mean_over_patch_samples`.
         directions: Unit vectors ω of the cells, from a receiver towards the patch, NumPy of shape [direction, 3].
     Returns:
         g, float32 of shape [batch, patch, direction]. Any batch may be 1.
     Differentiable: normals, transmittance.
     """
-    cells = _cells_and_opposites(directions, normals.device)
+    direction_arrays = _directions_and_opposites(directions, normals.device)
     check.shape("normals", normals.shape, ("batch", mean.shape[1]))
-    check.shape("passing", transmittance.shape, ("batch", mean.shape[1], len(directions)))
-    count = common_batch({"normals": normals, "passing": transmittance})
+    check.shape("transmittance", transmittance.shape, ("batch", mean.shape[1], len(directions)))
+    batch_count = common_batch({"normals": normals, "transmittance": transmittance})
     device = normals.device
-    projected_areas = empty((count, mean.shape[0], len(directions)), dtype=wp.float32, device=device)
+    projected_areas = empty((batch_count, mean.shape[0], len(directions)), dtype=wp.float32, device=device)
     launch(
-        _project, projected_areas.shape, inputs=[normals, transmittance, *mean.rows, *cells], outputs=[projected_areas]
+        _project,
+        projected_areas.shape,
+        inputs=[normals, transmittance, *mean.rows, *direction_arrays],
+        outputs=[projected_areas],
     )
     return projected_areas

@@ -3,7 +3,7 @@
 A patch of area A has a sphere of radius ρ = √(A/2), whose center is ρ/2 below it: as wide as the diagonal of a square
 patch, so that neighbors overlap, bulging out of the body by ρ/2. As bodies grow, so does it, by the radius of the
 sphere that blocks light beside it. Of a sheet, whose other side has patches of its own, centers are ρ/4 above: a
-receiver is nearer to the patches that it sees than to those behind them. If they were below, too, the sunlit outside of
+receiver is nearer to visible patches than to the patches behind them. If they were below, too, the sunlit outside of
 a tent shone through: its image with all bounces is 6.8% off so, 3.9% with centers in the sheet, and 3.6% with these.
 So it is with walls and boards that are thinner than their proxies: with a thickness h ≤ 2ρ centers are 3h/8 − ρ/4
 below. With ρ/2 the proxies of both sides change places, and a sunlit wall glows on its inside.
@@ -44,18 +44,18 @@ def find_depths(centers: np.ndarray, normals: np.ndarray, areas: np.ndarray) -> 
     is_opposite = normals @ normals.T < _OPPOSITE
     is_opposite &= (lateral_distances < np.maximum(radii[:, None], radii)) & (heights_below > -_ABOVE * radii[:, None])
     thickness = np.where(is_opposite, np.maximum(heights_below, 0), np.inf).min(axis=1, initial=np.inf)
-    parts = np.minimum(thickness / np.maximum(2 * radii, 1e-30), 1)
-    return (_DEPTH_OF_SHEETS + (_DEPTH - _DEPTH_OF_SHEETS) * parts).astype(np.float32)
+    thickness_shares = np.minimum(thickness / np.maximum(2 * radii, 1e-30), 1)
+    return (_DEPTH_OF_SHEETS + (_DEPTH - _DEPTH_OF_SHEETS) * thickness_shares).astype(np.float32)
 
 
 @wp.kernel
-def _place(
+def _place_proxies(
     # in
     points: wp.array2d(dtype=wp.vec3),
     normals: wp.array2d(dtype=wp.vec3),
     blocker_radii: wp.array2d(dtype=wp.float32),
-    numbers: wp.array(dtype=wp.int32),
-    ratios: wp.array(dtype=wp.float32),
+    blocker_indices: wp.array(dtype=wp.int32),
+    radius_ratios: wp.array(dtype=wp.float32),
     depths: wp.array(dtype=wp.float32),
     # out
     centers: wp.array2d(dtype=wp.vec3),
@@ -64,8 +64,10 @@ def _place(
     """A thread owns a patch of an instance."""
     batch, patch = wp.tid()
     radius = float(0.0)
-    if numbers[patch] >= 0:
-        radius = ratios[patch] * blocker_radii[instance_in(batch, blocker_radii.shape[0]), numbers[patch]]
+    if blocker_indices[patch] >= 0:
+        radius = (
+            radius_ratios[patch] * blocker_radii[instance_in(batch, blocker_radii.shape[0]), blocker_indices[patch]]
+        )
     point = points[instance_in(batch, points.shape[0]), patch]
     normal = normals[instance_in(batch, normals.shape[0]), patch]
     centers[batch, patch] = point - depths[patch] * radius * normal
@@ -73,35 +75,37 @@ def _place(
 
 
 def place_proxies(
-    sources: Receivers,
+    patch_samples: Receivers,
     mean: SparseMatrix,
     blocker_radii: wp.array,
-    numbers: np.ndarray,
-    ratios: np.ndarray,
+    blocker_indices: np.ndarray,
+    radius_ratios: np.ndarray,
     depths: np.ndarray,
 ) -> tuple[wp.array, wp.array]:
     """Place the spheres that stand in for patches.
 
     Args:
-        sources: Where patches are lit.
-        mean: The weights of these, [patch, source], from :func:`.radiosity.mean_over_sources`.
+        patch_samples: Where patches are lit.
+        mean: The weights of these, [patch, patch sample], from :func:`.radiosity.mean_over_patch_samples`.
         blocker_radii: Radii of the spheres that block light [scene units], float32 of shape [batch, sphere].
-        numbers: One of them beside each patch, −1 for patches that nothing stands in for, shape [patch].
-        ratios: Radius of each proxy in radii of that sphere, shape [patch].
+        blocker_indices: One of them beside each patch, −1 for patches that nothing stands in for, shape [patch].
+        radius_ratios: Radius of each proxy in radii of that sphere, shape [patch].
         depths: How far below its patch the center of each is, in radii of the proxy, shape [patch].
     Returns:
         Centers, vec3 of shape [batch, patch], and radii, float32 of the same shape.
-    Differentiable: points and normals of the sources, blocker_radii.
+    Differentiable: points and normals of the patch samples, blocker_radii.
     """
-    check.shape("numbers", numbers.shape, (mean.shape[0],))
-    check.shape("ratios", ratios.shape, (mean.shape[0],))
+    check.shape("blocker_indices", blocker_indices.shape, (mean.shape[0],))
+    check.shape("radius_ratios", radius_ratios.shape, (mean.shape[0],))
     check.shape("depths", depths.shape, (mean.shape[0],))
-    count = common_batch({"sources": sources.points, "normals": sources.normals, "radii": blocker_radii})
+    batch_count = common_batch(
+        {"patch_samples": patch_samples.points, "normals": patch_samples.normals, "radii": blocker_radii}
+    )
     device = blocker_radii.device
-    centers = empty((count, len(numbers)), dtype=wp.vec3, device=device)
-    radii = empty((count, len(numbers)), dtype=wp.float32, device=device)
-    means = multiply(mean, sources.points), multiply(mean, sources.normals)
-    fixed = [constant(np.asarray(numbers, np.int32), wp.int32, device)]
-    fixed += [constant(values, wp.float32, device) for values in (ratios, depths)]
-    launch(_place, centers.shape, inputs=[*means, blocker_radii, *fixed], outputs=[centers, radii])
+    centers = empty((batch_count, len(blocker_indices)), dtype=wp.vec3, device=device)
+    radii = empty((batch_count, len(blocker_indices)), dtype=wp.float32, device=device)
+    means = multiply(mean, patch_samples.points), multiply(mean, patch_samples.normals)
+    patch_arrays = [constant(np.asarray(blocker_indices, np.int32), wp.int32, device)]
+    patch_arrays += [constant(values, wp.float32, device) for values in (radius_ratios, depths)]
+    launch(_place_proxies, centers.shape, inputs=[*means, blocker_radii, *patch_arrays], outputs=[centers, radii])
     return centers, radii

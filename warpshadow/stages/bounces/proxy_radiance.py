@@ -6,7 +6,7 @@ sphere in direction ω, its patches send
     E_j(ω) = Σ_p A_p (v_p g_p + ε) B_p / Σ_p A_p (v_p g_p + ε),  ε = 0.0001
 
 the mean of their radiosities B by the area that they show: g_p is that of a unit (:mod:`.projected_areas`), and v_p
-makes patches count that other bodies do not bury (:mod:`.open_sources`). Patches
+makes patches count that other bodies do not bury (:mod:`.openness`). Patches
 that face away count for ε of their area: where none shows itself the mean is still one, so it is smooth, and nothing is
 divided by zero. The sunlit top of a slab is brighter than its bottom by more than a hundred times: by ε = 0.01 it shone
 through, and the floor of a car park below was 19% too bright.
@@ -28,7 +28,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.stages.visibility.merging import CLUSTER_SIZE, MERGING, merged_count
 
-_AVERTED = wp.constant(1.0e-4)  # ε, the part of its area that a patch counts for where it shows none
+_AVERTED_WEIGHT = wp.constant(1.0e-4)  # ε, the part of its area that a patch counts for where it shows none
 
 _BLACK_SPHERE_WEIGHT = 0.25
 """Part of its area that a convex body shows on average: the weight of spheres without patches, which are black."""
@@ -48,16 +48,16 @@ def patches_of_clusters(
         Where the patches of each node begin, and the end, int32 of shape [node + 1]; and these patches, int32.
     """
     permutation = np.argsort(spheres, kind="stable")
-    ends = np.searchsorted(spheres[permutation], np.arange(len(nearest) + 1))
-    lists = [permutation[first:end] for first, end in zip(ends[:-1], ends[1:], strict=True)]
-    lists = [
+    patch_bounds = np.searchsorted(spheres[permutation], np.arange(len(nearest) + 1))
+    patch_lists = [permutation[first:end] for first, end in zip(patch_bounds[:-1], patch_bounds[1:], strict=True)]
+    patch_lists = [
         patches_of_sphere if len(patches_of_sphere) or patch < 0 else np.array([patch])
-        for patches_of_sphere, patch in zip(lists, nearest, strict=True)
+        for patches_of_sphere, patch in zip(patch_lists, nearest, strict=True)
     ]
     for cluster in range(merged_count(len(nearest), merging)):
-        lists.append(np.concatenate(lists[CLUSTER_SIZE * cluster : CLUSTER_SIZE * (cluster + 1)]))
-    starts = np.cumsum([0, *map(len, lists)])
-    return starts.astype(np.int32), np.concatenate([*lists, []]).astype(np.int32)
+        patch_lists.append(np.concatenate(patch_lists[CLUSTER_SIZE * cluster : CLUSTER_SIZE * (cluster + 1)]))
+    starts = np.cumsum([0, *map(len, patch_lists)])
+    return starts.astype(np.int32), np.concatenate([*patch_lists, []]).astype(np.int32)
 
 
 @wp.kernel
@@ -67,25 +67,25 @@ def _tabulate(
     projected_areas: wp.array3d(dtype=wp.float32),
     open_weights: wp.array2d(dtype=wp.vec3),
     starts: wp.array(dtype=wp.int32),
-    numbers: wp.array(dtype=wp.int32),
+    patch_indices: wp.array(dtype=wp.int32),
     shares: wp.array(dtype=wp.float32),
-    weight_if_black: wp.array(dtype=wp.float32),
+    black_sphere_weights: wp.array(dtype=wp.float32),
     # out
     proxy_radiance: wp.array3d(dtype=wp.vec4),
 ):
     """A thread owns a node and a direction; shares are A / Σ A, and so sums are linear, as Warp's adjoint needs it."""
     batch, node, direction = wp.tid()
-    sent = radiosity[instance_in(batch, radiosity.shape[0])]
-    areas_of_instance = projected_areas[instance_in(batch, projected_areas.shape[0])]
-    weights = open_weights[instance_in(batch, open_weights.shape[0])]
+    patch_radiosity = radiosity[instance_in(batch, radiosity.shape[0])]
+    patch_projected_areas = projected_areas[instance_in(batch, projected_areas.shape[0])]
+    patch_weights = open_weights[instance_in(batch, open_weights.shape[0])]
     light = wp.vec3()
-    open = float(weight_if_black[node])
+    weight_sum = float(black_sphere_weights[node])
     for k in range(starts[node], starts[node + 1]):
-        patch = numbers[k]
-        part = shares[k] * (weights[patch][0] * areas_of_instance[patch, direction] + _AVERTED)
-        light += part * sent[patch]
-        open += part
-    proxy_radiance[batch, node, direction] = wp.vec4(light[0], light[1], light[2], open)
+        patch = patch_indices[k]
+        patch_weight = shares[k] * (patch_weights[patch][0] * patch_projected_areas[patch, direction] + _AVERTED_WEIGHT)
+        light += patch_weight * patch_radiosity[patch]
+        weight_sum += patch_weight
+    proxy_radiance[batch, node, direction] = wp.vec4(light[0], light[1], light[2], weight_sum)
 
 
 def find_proxy_radiance(
@@ -94,7 +94,7 @@ def find_proxy_radiance(
     open_weights: wp.array,
     areas: np.ndarray,
     starts: np.ndarray,
-    numbers: np.ndarray,
+    patch_indices: np.ndarray,
 ) -> wp.array:
     """Light that spheres send towards cells of directions, for :func:`.sphere_light.sphere_light`.
 
@@ -105,9 +105,9 @@ def find_proxy_radiance(
         projected_areas: g of each patch towards each cell, float32 of shape [batch, patch, direction], from
             :func:`.projected_areas.find_projected_areas`.
         open_weights: v of each patch, in three equal channels, vec3 of shape [batch, patch], from
-            :func:`.open_sources.open_shares`.
+            :func:`.openness.open_shares`.
         areas: Of patches [scene units²], not negative, float32 of shape [patch].
-        starts, numbers: Patches of each node, from :func:`patches_of_clusters`.
+        starts, patch_indices: Patches of each node, from :func:`patches_of_clusters`.
     Returns:
         Σ A (v g + ε) B / Σ A and Σ A (v g + ε) / Σ A, vec4 of shape [batch, node, direction].
     Differentiable: radiosity, projected_areas, open_weights.
@@ -119,17 +119,19 @@ def find_proxy_radiance(
     check.shape("projected_areas", projected_areas.shape, (projected_areas.shape[0], patch_count, "direction"))
     check.shape("open_weights", open_weights.shape, (open_weights.shape[0], patch_count))
     check.finite("areas", np.asarray(areas), minimum=0.0)
-    if starts[0] != 0 or (np.diff(starts) < 0).any() or starts[-1] != len(numbers):
-        raise ValueError(f"starts: got {np.asarray(starts)!r}, expected 0 to the {len(numbers)} numbers, rising")
-    if len(numbers) and not 0 <= min(numbers) <= max(numbers) < patch_count:
-        raise ValueError(f"numbers: got {min(numbers)} to {max(numbers)}, expected patches, 0 to {patch_count - 1}")
+    if starts[0] != 0 or (np.diff(starts) < 0).any() or starts[-1] != len(patch_indices):
+        raise ValueError(f"starts: got {np.asarray(starts)!r}, expected 0 to the {len(patch_indices)} indices, rising")
+    if len(patch_indices) and not 0 <= min(patch_indices) <= max(patch_indices) < patch_count:
+        raise ValueError(
+            f"patch_indices: got {min(patch_indices)} to {max(patch_indices)}, expected patches, 0 to {patch_count - 1}"
+        )
     device = radiosity.device
     nodes = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-    totals = np.bincount(nodes, areas[numbers], len(starts) - 1)
-    shares = areas[numbers] / np.where(totals > 0, totals, 1)[nodes]
-    integers = [constant(np.asarray(values, np.int32), wp.int32, device) for values in (starts, numbers)]
-    floats = [shares, np.where(totals > 0, 0.0, _BLACK_SPHERE_WEIGHT)]
-    tables = [*integers, *(constant(values.astype(np.float32), wp.float32, device) for values in floats)]
+    area_sums = np.bincount(nodes, areas[patch_indices], len(starts) - 1)
+    shares = areas[patch_indices] / np.where(area_sums > 0, area_sums, 1)[nodes]
+    int_tables = [constant(np.asarray(values, np.int32), wp.int32, device) for values in (starts, patch_indices)]
+    float_tables = [shares, np.where(area_sums > 0, 0.0, _BLACK_SPHERE_WEIGHT)]
+    node_arrays = [*int_tables, *(constant(values.astype(np.float32), wp.float32, device) for values in float_tables)]
     proxy_radiance = empty((batch_count, len(starts) - 1, projected_areas.shape[2]), dtype=wp.vec4, device=device)
-    launch(_tabulate, proxy_radiance.shape, inputs=[*arrays.values(), *tables], outputs=[proxy_radiance])
+    launch(_tabulate, proxy_radiance.shape, inputs=[*arrays.values(), *node_arrays], outputs=[proxy_radiance])
     return proxy_radiance

@@ -1,4 +1,4 @@
-"""Radiosity of patches: the light that they reflect of the light at their sources."""
+"""Radiosity of patches: the light that they reflect of the light at their patch samples."""
 
 import numpy as np
 import warp as wp
@@ -10,18 +10,20 @@ from warpshadow.device.memory import empty
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
 
-def mean_over_sources(patches: np.ndarray, weights: np.ndarray, count: int, *, device: wp.DeviceLike) -> SparseMatrix:
-    """The matrix of means of patches over their sources.
+def mean_over_patch_samples(
+    patches: np.ndarray, weights: np.ndarray, count: int, *, device: wp.DeviceLike
+) -> SparseMatrix:
+    """The matrix of means of patches over their patch samples.
 
     Args:
-        patches: Patch of each source, shape [source].
-        weights: Share of its patch that each source has, shape [source].
-        count: Number of patches; one without sources has a mean of 0.
+        patches: Patch of each patch sample, shape [patch sample].
+        weights: Share of its patch that each patch sample has, shape [patch sample].
+        count: Number of patches; one without patch samples has a mean of 0.
     """
     from scipy.sparse import csr_matrix
 
     entries = (weights, (patches, np.arange(len(patches))))
-    return SparseMatrix.of(csr_matrix(entries, shape=(count, len(patches))), device=device)
+    return SparseMatrix.from_matrix(csr_matrix(entries, shape=(count, len(patches))), device=device)
 
 
 @wp.kernel
@@ -34,12 +36,12 @@ def _reflect(
 ):
     """A thread owns a patch of an instance."""
     batch, patch = wp.tid()
-    reflectance = albedo[instance_in(batch, albedo.shape[0]), patch]
-    radiosity[batch, patch] = wp.cw_mul(reflectance, light[instance_in(batch, light.shape[0]), patch])
+    patch_albedo = albedo[instance_in(batch, albedo.shape[0]), patch]
+    radiosity[batch, patch] = wp.cw_mul(patch_albedo, light[instance_in(batch, light.shape[0]), patch])
 
 
 def patch_radiosity(albedo: wp.array, light: wp.array, mean: SparseMatrix, shares: wp.array | None = None) -> wp.array:
-    """Radiosity of patches: albedo times the mean light of their sources.
+    """Radiosity of patches: albedo times the mean light of their patch samples.
 
         B_p = a_p Σ_s w_ps f_s (S_s + I_s)
 
@@ -47,10 +49,11 @@ def patch_radiosity(albedo: wp.array, light: wp.array, mean: SparseMatrix, share
 
     Args:
         albedo: Mean reflectance of each patch, vec3 of shape [batch, patch].
-        light: Light that each source would reflect if it were white, direct and bounced, vec3 of shape [batch, source].
-        mean: The weights w, from :func:`mean_over_sources`.
-        shares: f, how much each source counts, vec3 of shape [batch, source], from :func:`.open_sources.open_shares`;
-            None for 1.
+        light: Light that each patch sample would reflect if it were white, direct and bounced, vec3 of shape [batch,
+            patch sample].
+        mean: The weights w, from :func:`mean_over_patch_samples`.
+        shares: f, how much each patch sample counts, vec3 of shape [batch, patch sample], from
+            :func:`.openness.open_shares`; None for 1.
     Returns:
         vec3 of shape [batch, patch]; any batch may be 1, and then serves every instance.
     Differentiable: albedo, light, shares.
@@ -65,7 +68,7 @@ def reflect(albedo: wp.array, light: wp.array) -> wp.array:
     Differentiable: albedo, light.
     """
     check.shape("albedo", albedo.shape, ("batch", light.shape[1]))
-    instances = common_batch({"albedo": albedo, "light": light})
-    radiosity = empty((instances, light.shape[1]), dtype=wp.vec3, device=light.device)
+    batch_count = common_batch({"albedo": albedo, "light": light})
+    radiosity = empty((batch_count, light.shape[1]), dtype=wp.vec3, device=light.device)
     launch(_reflect, radiosity.shape, inputs=[albedo, light], outputs=[radiosity])
     return radiosity

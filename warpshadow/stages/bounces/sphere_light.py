@@ -36,7 +36,7 @@ from warpshadow.device.lanes import (
 )
 from warpshadow.device.launch import differentiable, launch, varies
 from warpshadow.device.memory import empty, zeros
-from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_place
+from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_slot
 from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres
 from warpshadow.stages.visibility.culling import DirectionCells, make_cap_functions, make_cells, make_cull
@@ -59,7 +59,9 @@ _CORE = 0.25  # radii within which a sphere's weight hardly grows any more
 _NEAREST2 = 1.0e-12
 """The least d² + (r/4)², in squares of the radius of the largest run of spheres: so √w is at most 1e12."""
 
-_LEAST = 1.0e-30  # the least denominator of R; spheres that block so little of a cell that they have less leave T at F
+_MIN_DENOMINATOR = (
+    1.0e-30  # the least denominator of R; spheres that block so little of a cell that they have less leave T at F
+)
 _SUMS = 4  # Σ w a L, of three colors, and Σ w a S
 
 
@@ -93,22 +95,22 @@ class LightInputs:
     cells: DirectionCells
     proxy_radiance: wp.array3d(dtype=wp.vec4)
     transmittance: wp.array3d(dtype=wp.float32)
-    unblocked: wp.array3d(dtype=wp.float32)
+    transmittance_others: wp.array3d(dtype=wp.float32)
     factor: float
     span_count: int
     stores_sums: bool
 
 
 @functools.cache
-def _make_begin(lanes: int) -> wp.Function:
-    """Make the kernel function that finds out which receivers and directions a thread works on."""
+def _make_load_task(lanes: int) -> wp.Function:
+    """Make the kernel function that loads the receivers and directions of a thread."""
     Lane, LightTask = lane_type(lanes), _task_type(lanes)
     fn = make_lane_functions(lanes)
     is_any_above, dot_direction = fn.is_any_above, fn.dot_direction
     load_receivers = make_load_receivers(True, lanes)
 
     @wp.func(inline=lanes == 1)
-    def begin(
+    def load_task(
         row: int,
         span: int,
         worker: int,
@@ -120,39 +122,47 @@ def _make_begin(lanes: int) -> wp.Function:
         batch, block, receivers = load_receivers(inputs.traversed, row)
         spheres = inputs.traversed.spheres
         item = row * inputs.span_count + span
-        place = scratch_place(worker, item)
+        slot = scratch_slot(worker, item)
         task = LightTask()
         task.cells = inputs.cells
         task.first_bundle = span * (scratch.shape[2] // BUNDLE)
-        task.reached_bundles = reached_bundles[place]
-        task.ends = reached_bundles[place, 2]
-        task.blocked = scratch[place, 0]
-        task.adj_cells = scratch[place, 1]
-        task.sums = sums[wp.where(inputs.stores_sums, item, place)]
+        task.reached_bundles = reached_bundles[slot]
+        task.ends = reached_bundles[slot, 2]
+        task.blocked = scratch[slot, 0]
+        task.adj_cells = scratch[slot, 1]
+        task.sums = sums[wp.where(inputs.stores_sums, item, slot)]
         task.proxy_radiance = inputs.proxy_radiance[instance_in(batch, inputs.proxy_radiance.shape[0])]
-        size = float(TINY_RADIUS)
+        largest_radius = float(TINY_RADIUS)
         for run in range(spheres.run_bounds.shape[1]):
-            size = wp.max(size, spheres.run_bounds[batch, run][3])
-        task.inverse_size = 1.0 / size
+            largest_radius = wp.max(largest_radius, spheres.run_bounds[batch, run][3])
+        task.inverse_size = 1.0 / largest_radius
         for bundle in range(task.ends.shape[0]):
             task.ends[bundle] = 0
-            at = task.first_bundle + bundle
-            if is_any_above(dot_direction(task.cells.axes[at], receivers.normals), -task.cells.half_angles[at][1]):
+            direction_bundle = task.first_bundle + bundle
+            if is_any_above(
+                dot_direction(task.cells.axes[direction_bundle], receivers.normals),
+                -task.cells.half_angles[direction_bundle][1],
+            ):
                 for i in range(BUNDLE):
                     blocked = Lane()
                     for lane in range(wp.min(lanes, inputs.traversed.points.shape[1] - block * lanes)):
                         vertex = block * lanes + lane
-                        maximum = float(1.0)
-                        if inputs.unblocked:
-                            unblocked_batch = instance_in(batch, inputs.unblocked.shape[0])
-                            maximum = inputs.unblocked[unblocked_batch, vertex, at * BUNDLE + i]
-                        blocked[lane] = maximum - inputs.transmittance[batch, vertex, at * BUNDLE + i]
+                        cell_transmittance_others = float(1.0)
+                        if inputs.transmittance_others:
+                            others_batch = instance_in(batch, inputs.transmittance_others.shape[0])
+                            cell_transmittance_others = inputs.transmittance_others[
+                                others_batch, vertex, direction_bundle * BUNDLE + i
+                            ]
+                        blocked[lane] = (
+                            cell_transmittance_others
+                            - inputs.transmittance[batch, vertex, direction_bundle * BUNDLE + i]
+                        )
                     task.blocked[bundle * BUNDLE + i] = blocked
                     if is_any_above(wp.max(blocked, -blocked), 0.0):
                         task.ends[bundle] = spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
         return batch, block, receivers, task
 
-    return begin
+    return load_task
 
 
 @functools.cache
@@ -166,9 +176,11 @@ def _make_weight(lanes: int) -> wp.Function:
 
     @wp.func(inline=True)
     def weight(offset: Vectors, curvature: float, inverse_size: float):
-        relative = scale(Lane(inverse_size), offset)
-        core = CORE * inverse_size / curvature
-        return wp.cw_div(Lane(1.0), wp.max(dot(relative, relative) + Lane(core * core), Lane(NEAREST2)))
+        scaled_offset = scale(Lane(inverse_size), offset)
+        core_radius = CORE * inverse_size / curvature
+        return wp.cw_div(
+            Lane(1.0), wp.max(dot(scaled_offset, scaled_offset) + Lane(core_radius * core_radius), Lane(NEAREST2))
+        )
 
     return weight
 
@@ -179,33 +191,33 @@ def _make_light(lanes: int) -> wp.Kernel:
     ReceiverLanes, SphereView, LightTask = receiver_lanes_type(lanes), sphere_view_type(lanes), _task_type(lanes)
     fn = make_lane_functions(lanes)
     sqrt, is_any_above, dot_direction, add_vectors = fn.sqrt, fn.is_any_above, fn.dot_direction, fn.add_vectors
-    begin, weigh, falloff = _make_begin(lanes), _make_weight(lanes), make_falloff(lanes)
-    widen, reaches, rises, soften = make_cap_functions(True, lanes)
+    load_task, weigh, falloff = _make_load_task(lanes), _make_weight(lanes), make_falloff(lanes)
+    widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(True, lanes)
     SUMS = wp.constant(_SUMS)
-    LEAST = wp.constant(_LEAST)
+    MIN_DENOMINATOR = wp.constant(_MIN_DENOMINATOR)
 
     @wp.func(inline=True)
-    def visit(receivers: ReceiverLanes, seen: SphereView, count: int, task: LightTask):
-        cone = seen.cone
+    def visit(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: LightTask):
+        cone = sphere_view.cone
         cells = task.cells
         sine = sqrt(cone.sine2)
-        cap = widen(cone.axis, cone.cosine, sine, cells)
-        if rises(cap, receivers.normals):
+        cap = widen_cone(cone.axis, cone.cosine, sine, cells)
+        if is_above_horizon(cap, receivers.normals):
             slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
-            near = weigh(seen.offset, seen.curvature, task.inverse_size)
-            opacity = wp.cw_mul(opacity, wp.cw_mul(near, near))
+            nearness = weigh(sphere_view.offset, sphere_view.curvature, task.inverse_size)
+            opacity = wp.cw_mul(opacity, wp.cw_mul(nearness, nearness))
             for k in range(count):
                 bundle = task.reached_bundles[1, k]
-                at = task.first_bundle + bundle
-                if reaches(cap, cells.axes[at], cells.half_angles[at]):
+                direction_bundle = task.first_bundle + bundle
+                if reaches_bundle(cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle]):
                     for i in range(BUNDLE):
-                        t, step = soften(cells.directions[at * BUNDLE + i], cap, slope)
+                        t, step = soft_edge(cells.directions[direction_bundle * BUNDLE + i], cap, slope)
                         if is_any_above(t, 0.0):
                             share = wp.cw_mul(opacity, step)
-                            sent = task.proxy_radiance[seen.node, at * BUNDLE + i]
-                            place = (bundle * BUNDLE + i) * SUMS
+                            node_radiance = task.proxy_radiance[sphere_view.node, direction_bundle * BUNDLE + i]
+                            slot = (bundle * BUNDLE + i) * SUMS
                             for c in range(SUMS):
-                                task.sums[place + c] = task.sums[place + c] + sent[c] * share
+                                task.sums[slot + c] = task.sums[slot + c] + node_radiance[c] * share
 
     traverse = make_traversal(make_cull(True, LightTask, lanes), visit, LightTask, False, lanes)
 
@@ -226,25 +238,25 @@ def _make_light(lanes: int) -> wp.Kernel:
         """A thread owns a block of receivers and a span of bundles, and adds to the light."""
         i, j = wp.tid()
         span, row = find_run(worker, first_row + i, j)
-        batch, block, receivers, task = begin(row, span, worker, inputs, scratch, reached_bundles, sums)
+        batch, block, receivers, task = load_task(row, span, worker, inputs, scratch, reached_bundles, sums)
         for bundle in range(task.ends.shape[0]):
             if task.ends[bundle] > 0:
                 for k in range(BUNDLE * SUMS):
                     task.sums[bundle * BUNDLE * SUMS + k] = Lane(0.0)
         traverse(receivers, batch, inputs.traversed.spheres, Gradients(), task)
-        total = Vectors()
+        light_sum = Vectors()
         for bundle in range(task.ends.shape[0]):
             if task.ends[bundle] > 0:
                 for i in range(BUNDLE):
-                    place = bundle * BUNDLE + i
+                    slot = bundle * BUNDLE + i
                     omega = task.cells.directions[(task.first_bundle + bundle) * BUNDLE + i]
                     cosine = inputs.factor * wp.max(dot_direction(omega, receivers.normals), Lane(0.0))
-                    part = wp.cw_mul(cosine, task.blocked[place])
-                    part = wp.cw_div(part, wp.max(task.sums[place * SUMS + 3], Lane(LEAST)))
-                    total.x += wp.cw_mul(part, task.sums[place * SUMS])
-                    total.y += wp.cw_mul(part, task.sums[place * SUMS + 1])
-                    total.z += wp.cw_mul(part, task.sums[place * SUMS + 2])
-        add_vectors(total, block, light[batch])
+                    weight_factor = wp.cw_mul(cosine, task.blocked[slot])
+                    weight_factor = wp.cw_div(weight_factor, wp.max(task.sums[slot * SUMS + 3], Lane(MIN_DENOMINATOR)))
+                    light_sum.x += wp.cw_mul(weight_factor, task.sums[slot * SUMS])
+                    light_sum.y += wp.cw_mul(weight_factor, task.sums[slot * SUMS + 1])
+                    light_sum.z += wp.cw_mul(weight_factor, task.sums[slot * SUMS + 2])
+        add_vectors(light_sum, block, light[batch])
 
     return add_light
 
@@ -256,15 +268,15 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
     fn = make_lane_functions(lanes)
     sqrt, is_any_above, dot_direction, dot, scale = fn.sqrt, fn.is_any_above, fn.dot_direction, fn.dot, fn.scale
     add, load, total, add_vectors = fn.add, fn.load, fn.total, fn.add_vectors
-    begin, weigh = _make_begin(lanes), _make_weight(lanes)
+    load_task, weigh = _make_load_task(lanes), _make_weight(lanes)
     falloff, sphere_adjoint = make_falloff(lanes), make_sphere_adjoint(lanes)
-    widen, reaches, rises, soften = make_cap_functions(True, lanes)
+    widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(True, lanes)
     SUMS = wp.constant(_SUMS)
-    LEAST = wp.constant(_LEAST)
+    MIN_DENOMINATOR = wp.constant(_MIN_DENOMINATOR)
     CORE2 = wp.constant(_CORE**2)
 
     @wp.func(inline=True)
-    def visit(receivers: ReceiverLanes, seen: SphereView, count: int, task: LightTask):
+    def visit(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: LightTask):
         """The adjoint of the sphere's cone and weight.
 
         With f = 4/Q max(n·ω, 0) (F − T) / Σ w a S, and v = f (Ī·L − S Ī·R), the gradient of w a: ā = w v,  w̄ = Σ
@@ -272,16 +284,16 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         (4 size)²;  ā as for the transmittance.
         """
         adj_sphere = SphereAdjoint()
-        cone = seen.cone
+        cone = sphere_view.cone
         cells = task.cells
         sine = sqrt(cone.sine2)
-        cap = widen(cone.axis, cone.cosine, sine, cells)
-        if rises(cap, receivers.normals):
+        cap = widen_cone(cone.axis, cone.cosine, sine, cells)
+        if is_above_horizon(cap, receivers.normals):
             slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
-            near = weigh(seen.offset, seen.curvature, task.inverse_size)
-            weight = wp.cw_mul(near, near)
-            is_any_met = bool(False)
-            sum_ = Lane(0.0)
+            nearness = weigh(sphere_view.offset, sphere_view.curvature, task.inverse_size)
+            weight = wp.cw_mul(nearness, nearness)
+            is_any_blocked = bool(False)
+            sum_adj_t = Lane(0.0)
             sum_t = Lane(0.0)
             sum_x = Lane(0.0)
             sum_y = Lane(0.0)
@@ -289,46 +301,64 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
             adj_opacity = Lane(0.0)
             for k in range(count):
                 bundle = task.reached_bundles[1, k]
-                at = task.first_bundle + bundle
-                if reaches(cap, cells.axes[at], cells.half_angles[at]):
+                direction_bundle = task.first_bundle + bundle
+                if reaches_bundle(cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle]):
                     for i in range(BUNDLE):
-                        omega = cells.directions[at * BUNDLE + i]
-                        t, step = soften(omega, cap, slope)
+                        omega = cells.directions[direction_bundle * BUNDLE + i]
+                        t, step = soft_edge(omega, cap, slope)
                         if is_any_above(t, 0.0):
-                            is_any_met = True
-                            weighted = wp.cw_mul(weight, task.blocked[bundle * BUNDLE + i])
+                            is_any_blocked = True
+                            weighted_blocked = wp.cw_mul(weight, task.blocked[bundle * BUNDLE + i])
                             adj_cell = task.adj_cells[bundle * BUNDLE + i]
-                            sent = task.proxy_radiance[seen.node, at * BUNDLE + i]
-                            light = dot_direction(wp.vec3(sent[0], sent[1], sent[2]), task.adj_light)
-                            adj_blocked = wp.cw_mul(weighted, light - sent[3] * adj_cell)
+                            node_radiance = task.proxy_radiance[sphere_view.node, direction_bundle * BUNDLE + i]
+                            light = dot_direction(
+                                wp.vec3(node_radiance[0], node_radiance[1], node_radiance[2]), task.adj_light
+                            )
+                            adj_blocked = wp.cw_mul(weighted_blocked, light - node_radiance[3] * adj_cell)
                             adj_opacity += wp.cw_mul(adj_blocked, step)
-                            rise = wp.cw_mul(t, Lane(1.0) - t)
-                            adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_blocked, opacity), rise)
-                            sum_ += adj_t
+                            step_slope = wp.cw_mul(t, Lane(1.0) - t)
+                            adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_blocked, opacity), step_slope)
+                            sum_adj_t += adj_t
                             sum_t += wp.cw_mul(adj_t, t)
                             sum_x += omega[0] * adj_t
                             sum_y += omega[1] * adj_t
                             sum_z += omega[2] * adj_t
                             if task.adj_radiance:
-                                share = wp.cw_mul(weighted, wp.cw_mul(opacity, step))
-                                adj_sent = wp.vec4(
+                                share = wp.cw_mul(weighted_blocked, wp.cw_mul(opacity, step))
+                                adj_node_radiance = wp.vec4(
                                     total(wp.cw_mul(share, task.adj_light.x)),
                                     total(wp.cw_mul(share, task.adj_light.y)),
                                     total(wp.cw_mul(share, task.adj_light.z)),
                                     -total(wp.cw_mul(share, adj_cell)),
                                 )
-                                wp.atomic_add(task.adj_radiance, seen.node, at * BUNDLE + i, adj_sent)
-            if is_any_met:
+                                wp.atomic_add(
+                                    task.adj_radiance,
+                                    sphere_view.node,
+                                    direction_bundle * BUNDLE + i,
+                                    adj_node_radiance,
+                                )
+            if is_any_blocked:
                 sum_omega = Vectors(sum_x, sum_y, sum_z)
                 adj_offset, adj_radius, adj_weight = sphere_adjoint(
-                    seen, sine, cap.cosine, cells.cos_width, cells.sin_width, slope, adj_opacity, sum_, sum_t, sum_omega
+                    sphere_view,
+                    sine,
+                    cap.cosine,
+                    cells.cos_width,
+                    cells.sin_width,
+                    slope,
+                    adj_opacity,
+                    sum_adj_t,
+                    sum_t,
+                    sum_omega,
                 )
                 # w̄ w = Σ a v w = Ā A
-                nearer = (-4.0 * task.inverse_size) * wp.cw_mul(wp.cw_mul(adj_opacity, opacity), near)
+                adj_nearness = (-4.0 * task.inverse_size) * wp.cw_mul(wp.cw_mul(adj_opacity, opacity), nearness)
                 adj_sphere.is_any = True
                 adj_sphere.weight = adj_weight
-                adj_sphere.offset = add(adj_offset, scale(nearer, scale(Lane(task.inverse_size), seen.offset)))
-                adj_sphere.radius = adj_radius + (CORE2 * task.inverse_size / seen.curvature) * nearer
+                adj_sphere.offset = add(
+                    adj_offset, scale(adj_nearness, scale(Lane(task.inverse_size), sphere_view.offset))
+                )
+                adj_sphere.radius = adj_radius + (CORE2 * task.inverse_size / sphere_view.curvature) * adj_nearness
         return adj_sphere
 
     traverse = make_traversal(make_cull(True, LightTask, lanes), visit, LightTask, True, lanes)
@@ -349,7 +379,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         adj_normals: wp.array2d(dtype=wp.vec3),
         adj_transmittance: wp.array3d(dtype=wp.float32),
         # out, or a sum where one instance serves all
-        adj_unblocked: wp.array3d(dtype=wp.float32),
+        adj_transmittance_others: wp.array3d(dtype=wp.float32),
         # sums
         adj_radiance: wp.array3d(dtype=wp.vec4),
         adj_centers: wp.array2d(dtype=wp.vec3),
@@ -362,7 +392,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         """
         i, j = wp.tid()
         span, row = find_run(worker, first_row + i, j)
-        batch, block, receivers, task = begin(row, span, worker, inputs, scratch, reached_bundles, sums)
+        batch, block, receivers, task = load_task(row, span, worker, inputs, scratch, reached_bundles, sums)
         task.adj_light = load(adj_light[batch], block)
         if adj_radiance:
             task.adj_radiance = adj_radiance[instance_in(batch, inputs.proxy_radiance.shape[0])]
@@ -370,36 +400,38 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         for bundle in range(task.ends.shape[0]):
             if task.ends[bundle] > 0:
                 for i in range(BUNDLE):
-                    place = bundle * BUNDLE + i
+                    slot = bundle * BUNDLE + i
                     direction = (task.first_bundle + bundle) * BUNDLE + i
                     omega = task.cells.directions[direction]
-                    inverse = wp.cw_div(Lane(1.0), wp.max(task.sums[place * SUMS + 3], Lane(LEAST)))
-                    mean = Vectors(task.sums[place * SUMS], task.sums[place * SUMS + 1], task.sums[place * SUMS + 2])
+                    inverse = wp.cw_div(Lane(1.0), wp.max(task.sums[slot * SUMS + 3], Lane(MIN_DENOMINATOR)))
+                    mean = Vectors(task.sums[slot * SUMS], task.sums[slot * SUMS + 1], task.sums[slot * SUMS + 2])
                     adj_cell = wp.cw_mul(inverse, dot(task.adj_light, mean))
                     cosine = dot_direction(omega, receivers.normals)
-                    is_up = wp.min(wp.max(1.0e30 * cosine, Lane(0.0)), Lane(1.0))
-                    adj_cosine = inputs.factor * wp.cw_mul(is_up, wp.cw_mul(task.blocked[place], adj_cell))
+                    is_facing = wp.min(wp.max(1.0e30 * cosine, Lane(0.0)), Lane(1.0))
+                    adj_cosine = inputs.factor * wp.cw_mul(is_facing, wp.cw_mul(task.blocked[slot], adj_cell))
                     adj_normal.x += omega[0] * adj_cosine
                     adj_normal.y += omega[1] * adj_cosine
                     adj_normal.z += omega[2] * adj_cosine
-                    facing = inputs.factor * wp.max(cosine, Lane(0.0))
-                    adj_blocked = wp.cw_mul(facing, adj_cell)
+                    factored_cosine = inputs.factor * wp.max(cosine, Lane(0.0))
+                    adj_blocked = wp.cw_mul(factored_cosine, adj_cell)
                     for lane in range(wp.min(lanes, inputs.traversed.points.shape[1] - block * lanes)):
                         vertex = block * lanes + lane
                         if adj_transmittance:
                             adj_transmittance[batch, vertex, direction] = (
                                 adj_transmittance[batch, vertex, direction] - adj_blocked[lane]
                             )
-                        if adj_unblocked:
-                            unblocked_batch = instance_in(batch, adj_unblocked.shape[0])
-                            adj_unblocked[unblocked_batch, vertex, direction] = (
-                                adj_unblocked[unblocked_batch, vertex, direction] + adj_blocked[lane]
+                        if adj_transmittance_others:
+                            others_batch = instance_in(batch, adj_transmittance_others.shape[0])
+                            adj_transmittance_others[others_batch, vertex, direction] = (
+                                adj_transmittance_others[others_batch, vertex, direction] + adj_blocked[lane]
                             )
-                    task.blocked[place] = wp.cw_mul(wp.cw_mul(facing, task.blocked[place]), inverse)
-                    task.adj_cells[place] = adj_cell
-        adj = traverse(receivers, batch, inputs.traversed.spheres, Gradients(adj_centers, adj_radii, adj_extents), task)
+                    task.blocked[slot] = wp.cw_mul(wp.cw_mul(factored_cosine, task.blocked[slot]), inverse)
+                    task.adj_cells[slot] = adj_cell
+        adj_receivers = traverse(
+            receivers, batch, inputs.traversed.spheres, Gradients(adj_centers, adj_radii, adj_extents), task
+        )
         if adj_points:
-            add_vectors(adj.points, block, adj_points[batch])
+            add_vectors(adj_receivers.points, block, adj_points[batch])
         if adj_normals:
             add_vectors(adj_normal, block, adj_normals[batch])
 
@@ -413,7 +445,7 @@ def sphere_light(
     radii: wp.array,
     proxy_radiance: wp.array,
     transmittance: wp.array,
-    unblocked: wp.array | None,
+    transmittance_others: wp.array | None,
     directions: np.ndarray,
     *,
     softness: float = SOFTNESS,
@@ -430,62 +462,77 @@ def sphere_light(
             instance.
         transmittance: T past these spheres, float32 of shape [batch, receiver, direction], made with the same
             directions, softness, merging and skip.
-        unblocked: F, the factor of T without these spheres, of the same shape; a batch of 1 serves every instance. None
-            for 1.
+        transmittance_others: F, the factor of T without these spheres, of the same shape; a batch of 1 serves every
+            instance. None for 1.
         directions: Unit vectors ω, NumPy of shape [direction, 3], from :func:`warpshadow.fibonacci`.
         softness, merging, skip, clusters: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
     Returns:
         Light that a white receiver reflects of it, vec3 of shape [batch, receiver]. (All sides white and bright, 1.)
     Raises:
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii of receivers and spheres, as the transmittance.
-    Differentiable: points, normals, centers, radii, proxy_radiance, transmittance, unblocked. (The derivative in T is
-    that at a fixed blend of spheres.) Not: directions, softness, merging, skip, clusters.
+    Differentiable: points, normals, centers, radii, proxy_radiance, transmittance, transmittance_others. (The
+    derivative in T is the one at a fixed blend of spheres.) Not: directions, softness, merging, skip, clusters.
     """
     cells = make_cells(directions, softness, points.device)
     check_spheres(points, normals, centers, radii)
-    common_batch({"points": points, "proxy_radiance": proxy_radiance, "unblocked": unblocked})
+    common_batch({"points": points, "proxy_radiance": proxy_radiance, "transmittance_others": transmittance_others})
     batch_count, vertex_count = points.shape
     node_count = radii.shape[1] + merged_count(radii.shape[1], merging)
     check.shape("proxy_radiance", proxy_radiance.shape, (proxy_radiance.shape[0], node_count, len(directions)))
     check.shape("transmittance", transmittance.shape, (*points.shape, len(directions)))
-    if unblocked is not None:
-        check.shape("unblocked", unblocked.shape, (unblocked.shape[0], vertex_count, len(directions)))
+    if transmittance_others is not None:
+        check.shape(
+            "transmittance_others",
+            transmittance_others.shape,
+            (transmittance_others.shape[0], vertex_count, len(directions)),
+        )
     device = points.device
     lanes = lane_count(device)
     spans = span_count(device, len(directions))
-    own_count = len(directions) // spans
+    span_direction_count = len(directions) // spans
     cell = cell_radius(len(directions))
     nodes, traversed = make_inputs(points, normals, centers, radii, merging, cell, skip, clusters)
     row_count = batch_count * block_count(vertex_count, lanes)
-    dim = run_dimensions(device, row_count, spans)
-    variables = [points, normals, *nodes, proxy_radiance, transmittance, unblocked]
+    launch_dim = run_dimensions(device, row_count, spans)
+    variables = [points, normals, *nodes, proxy_radiance, transmittance, transmittance_others]
     stores_sums = varies(variables)
-    scratch = [Scratch((2, own_count), lane_type(lanes)), Scratch((3, own_count // BUNDLE), wp.int32)]
-    sums = (own_count * _SUMS,), lane_type(lanes)
+    scratch = [
+        Scratch((2, span_direction_count), lane_type(lanes)),
+        Scratch((3, span_direction_count // BUNDLE), wp.int32),
+    ]
+    sums = (span_direction_count * _SUMS,), lane_type(lanes)
     cached = [empty((row_count * spans, *sums[0]), dtype=sums[1], device=device)] if stores_sums else []
     inputs = LightInputs()
     inputs.traversed, inputs.cells = traversed, cells
-    inputs.proxy_radiance, inputs.transmittance, inputs.unblocked = proxy_radiance, transmittance, unblocked
+    inputs.proxy_radiance, inputs.transmittance, inputs.transmittance_others = (
+        proxy_radiance,
+        transmittance,
+        transmittance_others,
+    )
     inputs.factor, inputs.span_count, inputs.stores_sums = 4 / len(directions), spans, stores_sums
-    cost = PAIR_COST * lanes * radii.shape[1] * own_count
-    is_shared = unblocked is not None and len(unblocked) < batch_count
+    cost = PAIR_COST * lanes * radii.shape[1] * span_direction_count
+    is_shared = transmittance_others is not None and len(transmittance_others) < batch_count
 
     def adjoint(adj_light: wp.array) -> None:
-        adj_unblocked = [None if unblocked is None else unblocked.grad]
+        adj_transmittance_others = [None if transmittance_others is None else transmittance_others.grad]
         launch(
             _make_light_adjoint(lanes),
-            dim,
+            launch_dim,
             cost=2 * cost,
             inputs=[inputs, *cached, adj_light],
             scratch=scratch,
-            outputs=[points.grad, normals.grad, transmittance.grad, *([] if is_shared else adj_unblocked)],
-            sums=[*(adj_unblocked if is_shared else []), proxy_radiance.grad, *(array.grad for array in nodes)],
+            outputs=[points.grad, normals.grad, transmittance.grad, *([] if is_shared else adj_transmittance_others)],
+            sums=[
+                *(adj_transmittance_others if is_shared else []),
+                proxy_radiance.grad,
+                *(array.grad for array in nodes),
+            ],
         )
 
     return differentiable(
         lambda light: launch(
             _make_light(lanes),
-            dim,
+            launch_dim,
             cost=cost,
             inputs=[inputs],
             scratch=scratch if stores_sums else [*scratch, Scratch(*sums)],

@@ -40,84 +40,86 @@ _MIN_SQUARE = wp.constant(wp.float64(1.0e-60))  # the least <D, D>: less is dark
 
 
 @wp.func
-def _terms(
+def _bounce_terms(
     batch: int,
     patch: int,
     color: int,
-    zeroth: wp.array2d(dtype=wp.vec3),
-    first: wp.array2d(dtype=wp.vec3),
-    second: wp.array2d(dtype=wp.vec3),
-    third: wp.array2d(dtype=wp.vec3),
-    fourth: wp.array2d(dtype=wp.vec3),
+    radiosity_0: wp.array2d(dtype=wp.vec3),
+    radiosity_1: wp.array2d(dtype=wp.vec3),
+    radiosity_2: wp.array2d(dtype=wp.vec3),
+    radiosity_3: wp.array2d(dtype=wp.vec3),
+    radiosity_4: wp.array2d(dtype=wp.vec3),
 ):
     """D_1 to D_4 of a patch in a color."""
-    b0 = wp.float64(zeroth[instance_in(batch, zeroth.shape[0]), patch][color])
-    b1 = wp.float64(first[instance_in(batch, first.shape[0]), patch][color])
-    b2 = wp.float64(second[instance_in(batch, second.shape[0]), patch][color])
-    b3 = wp.float64(third[instance_in(batch, third.shape[0]), patch][color])
-    b4 = wp.float64(fourth[instance_in(batch, fourth.shape[0]), patch][color])
+    b0 = wp.float64(radiosity_0[instance_in(batch, radiosity_0.shape[0]), patch][color])
+    b1 = wp.float64(radiosity_1[instance_in(batch, radiosity_1.shape[0]), patch][color])
+    b2 = wp.float64(radiosity_2[instance_in(batch, radiosity_2.shape[0]), patch][color])
+    b3 = wp.float64(radiosity_3[instance_in(batch, radiosity_3.shape[0]), patch][color])
+    b4 = wp.float64(radiosity_4[instance_in(batch, radiosity_4.shape[0]), patch][color])
     return wp.vec4d(b1 - b0, b2 - b1, b3 - b2, b4 - b3)
 
 
 @wp.kernel
-def _sum_up(
+def _sum_products(
     # in
-    zeroth: wp.array2d(dtype=wp.vec3),
-    first: wp.array2d(dtype=wp.vec3),
-    second: wp.array2d(dtype=wp.vec3),
-    third: wp.array2d(dtype=wp.vec3),
-    fourth: wp.array2d(dtype=wp.vec3),
+    radiosity_0: wp.array2d(dtype=wp.vec3),
+    radiosity_1: wp.array2d(dtype=wp.vec3),
+    radiosity_2: wp.array2d(dtype=wp.vec3),
+    radiosity_3: wp.array2d(dtype=wp.vec3),
+    radiosity_4: wp.array2d(dtype=wp.vec3),
     areas: wp.array(dtype=wp.float32),
     # out
-    sums: wp.array3d(dtype=wp.vec4d),
+    products: wp.array3d(dtype=wp.vec4d),
 ):
     """A thread owns a patch of an instance in a color, and adds to <D_i, D_j>, i ≤ 3."""
     batch, patch, color = wp.tid()
-    terms = _terms(batch, patch, color, zeroth, first, second, third, fourth)
-    weighted = wp.float64(areas[patch]) * terms
-    wp.atomic_add(sums, batch, color, 0, weighted[0] * terms)
-    wp.atomic_add(sums, batch, color, 1, weighted[1] * terms)
-    wp.atomic_add(sums, batch, color, 2, weighted[2] * terms)
+    terms = _bounce_terms(batch, patch, color, radiosity_0, radiosity_1, radiosity_2, radiosity_3, radiosity_4)
+    weighted_terms = wp.float64(areas[patch]) * terms
+    wp.atomic_add(products, batch, color, 0, weighted_terms[0] * terms)
+    wp.atomic_add(products, batch, color, 1, weighted_terms[1] * terms)
+    wp.atomic_add(products, batch, color, 2, weighted_terms[2] * terms)
 
 
 @wp.kernel
 def _solve(
     # in
-    sums: wp.array3d(dtype=wp.vec4d),
+    products: wp.array3d(dtype=wp.vec4d),
     # out
     coefficients: wp.array2d(dtype=wp.vec3d),
 ):
     """A thread owns a color of an instance."""
     batch, color = wp.tid()
-    s0 = sums[batch, color, 0]
-    s1 = sums[batch, color, 1]
-    s2 = sums[batch, color, 2]
+    row_0 = products[batch, color, 0]
+    row_1 = products[batch, color, 1]
+    row_2 = products[batch, color, 2]
     one = wp.float64(1.0)
-    n0 = one / wp.sqrt(wp.max(s0[0], _MIN_SQUARE))
-    n1 = one / wp.sqrt(wp.max(s1[1], _MIN_SQUARE))
-    n2 = one / wp.sqrt(wp.max(s2[2], _MIN_SQUARE))
+    inverse_norm_0 = one / wp.sqrt(wp.max(row_0[0], _MIN_SQUARE))
+    inverse_norm_1 = one / wp.sqrt(wp.max(row_1[1], _MIN_SQUARE))
+    inverse_norm_2 = one / wp.sqrt(wp.max(row_2[2], _MIN_SQUARE))
     matrix = wp.mat33d(
-        n0 * n0 * (s0[0] - s0[1]) + _RIDGE,
-        n0 * n1 * (s0[1] - s0[2]),
-        n0 * n2 * (s0[2] - s0[3]),
-        n1 * n0 * (s1[0] - s1[1]),
-        n1 * n1 * (s1[1] - s1[2]) + _RIDGE,
-        n1 * n2 * (s1[2] - s1[3]),
-        n2 * n0 * (s2[0] - s2[1]),
-        n2 * n1 * (s2[1] - s2[2]),
-        n2 * n2 * (s2[2] - s2[3]) + _RIDGE,
+        inverse_norm_0 * inverse_norm_0 * (row_0[0] - row_0[1]) + _RIDGE,
+        inverse_norm_0 * inverse_norm_1 * (row_0[1] - row_0[2]),
+        inverse_norm_0 * inverse_norm_2 * (row_0[2] - row_0[3]),
+        inverse_norm_1 * inverse_norm_0 * (row_1[0] - row_1[1]),
+        inverse_norm_1 * inverse_norm_1 * (row_1[1] - row_1[2]) + _RIDGE,
+        inverse_norm_1 * inverse_norm_2 * (row_1[2] - row_1[3]),
+        inverse_norm_2 * inverse_norm_0 * (row_2[0] - row_2[1]),
+        inverse_norm_2 * inverse_norm_1 * (row_2[1] - row_2[2]),
+        inverse_norm_2 * inverse_norm_2 * (row_2[2] - row_2[3]) + _RIDGE,
     )
-    result = wp.inverse(matrix) * wp.vec3d(n0 * s0[0], n1 * s1[0], n2 * s2[0])
-    result = wp.vec3d(n0 * result[0], n1 * result[1], n2 * result[2])
-    row_dot = result[0] * s0[0] + result[1] * s0[1] + result[2] * s0[2]
-    if row_dot >= wp.float64(0.0) and row_dot <= _MAX_RESIDUAL * s0[0]:
-        coefficients[batch, color] = result
+    solution = wp.inverse(matrix) * wp.vec3d(
+        inverse_norm_0 * row_0[0], inverse_norm_1 * row_1[0], inverse_norm_2 * row_2[0]
+    )
+    solution = wp.vec3d(inverse_norm_0 * solution[0], inverse_norm_1 * solution[1], inverse_norm_2 * solution[2])
+    residual_product = solution[0] * row_0[0] + solution[1] * row_0[1] + solution[2] * row_0[2]
+    if residual_product >= wp.float64(0.0) and residual_product <= _MAX_RESIDUAL * row_0[0]:
+        coefficients[batch, color] = solution
     else:
         coefficients[batch, color] = wp.vec3d(one, one, _MAX_RESIDUAL)
 
 
 @wp.func
-def _tail(terms: wp.vec4d, coefficients: wp.vec3d):
+def _tail_of_color(terms: wp.vec4d, coefficients: wp.vec3d):
     """Σ c_j D_(j+1)."""
     return wp.float32(coefficients[0] * terms[1] + coefficients[1] * terms[2] + coefficients[2] * terms[3])
 
@@ -125,25 +127,34 @@ def _tail(terms: wp.vec4d, coefficients: wp.vec3d):
 @wp.kernel
 def _add_tail(
     # in
-    zeroth: wp.array2d(dtype=wp.vec3),
-    first: wp.array2d(dtype=wp.vec3),
-    second: wp.array2d(dtype=wp.vec3),
-    third: wp.array2d(dtype=wp.vec3),
-    fourth: wp.array2d(dtype=wp.vec3),
+    radiosity_0: wp.array2d(dtype=wp.vec3),
+    radiosity_1: wp.array2d(dtype=wp.vec3),
+    radiosity_2: wp.array2d(dtype=wp.vec3),
+    radiosity_3: wp.array2d(dtype=wp.vec3),
+    radiosity_4: wp.array2d(dtype=wp.vec3),
     coefficients: wp.array2d(dtype=wp.vec3d),
     # out
     total: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a patch of an instance."""
     batch, patch = wp.tid()
-    r = _tail(_terms(batch, patch, 0, zeroth, first, second, third, fourth), coefficients[batch, 0])
-    g = _tail(_terms(batch, patch, 1, zeroth, first, second, third, fourth), coefficients[batch, 1])
-    b = _tail(_terms(batch, patch, 2, zeroth, first, second, third, fourth), coefficients[batch, 2])
-    total[batch, patch] = first[instance_in(batch, first.shape[0]), patch] + wp.vec3(r, g, b)
+    red = _tail_of_color(
+        _bounce_terms(batch, patch, 0, radiosity_0, radiosity_1, radiosity_2, radiosity_3, radiosity_4),
+        coefficients[batch, 0],
+    )
+    green = _tail_of_color(
+        _bounce_terms(batch, patch, 1, radiosity_0, radiosity_1, radiosity_2, radiosity_3, radiosity_4),
+        coefficients[batch, 1],
+    )
+    blue = _tail_of_color(
+        _bounce_terms(batch, patch, 2, radiosity_0, radiosity_1, radiosity_2, radiosity_3, radiosity_4),
+        coefficients[batch, 2],
+    )
+    total[batch, patch] = radiosity_1[instance_in(batch, radiosity_1.shape[0]), patch] + wp.vec3(red, green, blue)
 
 
-def with_tail(radiosities: Sequence[wp.array], areas: np.ndarray) -> wp.array:
-    """Radiosity of patches after all bounces, from those after the first ones.
+def add_tail(radiosities: Sequence[wp.array], areas: np.ndarray) -> wp.array:
+    """Radiosity of patches after all bounces, extrapolated from the radiosities after the first bounces.
 
     Args:
         radiosities: By direct light, and after one to four bounces, vec3 of shape [batch, patch]; a batch of 1
@@ -160,13 +171,13 @@ def with_tail(radiosities: Sequence[wp.array], areas: np.ndarray) -> wp.array:
         check.shape("radiosities", array.shape, ("batch", patch_count))
     check.shape("areas", areas.shape, (patch_count,))
     check.finite("areas", np.asarray(areas), minimum=0.0)
-    count = common_batch({f"radiosity after {number} bounces": array for number, array in enumerate(radiosities)})
+    batch_count = common_batch({f"radiosity after {number} bounces": array for number, array in enumerate(radiosities)})
     device = radiosities[0].device
-    parts = constant(np.asarray(areas / max(areas.sum(), 1e-30), np.float32), wp.float32, device)
-    sums = zeros((count, 3, 3), dtype=wp.vec4d, device=device)
-    coefficients = empty((count, 3), dtype=wp.vec3d, device=device)
-    total = empty((count, patch_count), dtype=wp.vec3, device=device)
-    launch(_sum_up, (count, patch_count, 3), inputs=[*radiosities, parts], outputs=[sums])
-    launch(_solve, (count, 3), inputs=[sums], outputs=[coefficients])
+    area_shares = constant(np.asarray(areas / max(areas.sum(), 1e-30), np.float32), wp.float32, device)
+    products = zeros((batch_count, 3, 3), dtype=wp.vec4d, device=device)
+    coefficients = empty((batch_count, 3), dtype=wp.vec3d, device=device)
+    total = empty((batch_count, patch_count), dtype=wp.vec3, device=device)
+    launch(_sum_products, (batch_count, patch_count, 3), inputs=[*radiosities, area_shares], outputs=[products])
+    launch(_solve, (batch_count, 3), inputs=[products], outputs=[coefficients])
     launch(_add_tail, total.shape, inputs=[*radiosities, coefficients], outputs=[total])
     return total

@@ -11,27 +11,27 @@ from warpshadow.device.memory import empty
 
 
 @wp.kernel
-def _add(
+def _add_light(
     # in
-    some: wp.array2d(dtype=wp.vec3),
-    more: wp.array2d(dtype=wp.vec3),
+    first: wp.array2d(dtype=wp.vec3),
+    second: wp.array2d(dtype=wp.vec3),
     # out
     total: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver of an instance."""
     batch, receiver = wp.tid()
     total[batch, receiver] = (
-        some[instance_in(batch, some.shape[0]), receiver] + more[instance_in(batch, more.shape[0]), receiver]
+        first[instance_in(batch, first.shape[0]), receiver] + second[instance_in(batch, second.shape[0]), receiver]
     )
 
 
-def total_light(parts: Sequence[wp.array]) -> wp.array:
-    """Add light, vec3 of shape [batch, receiver]; a batch of 1 serves every instance. Differentiable: parts."""
-    return functools.reduce(_sum, parts)
+def total_light(summands: Sequence[wp.array]) -> wp.array:
+    """Add light, vec3 of shape [batch, receiver]; a batch of 1 serves every instance. Differentiable: summands."""
+    return functools.reduce(_sum_pair, summands)
 
 
-def _sum(some: wp.array, more: wp.array) -> wp.array:
-    count = common_batch({"light": some, "more light": more})
-    total = empty((count, some.shape[1]), dtype=wp.vec3, device=some.device)
-    launch(_add, total.shape, inputs=[some, more], outputs=[total])
+def _sum_pair(first: wp.array, second: wp.array) -> wp.array:
+    batch_count = common_batch({"light": first, "more light": second})
+    total = empty((batch_count, first.shape[1]), dtype=wp.vec3, device=first.device)
+    launch(_add_light, total.shape, inputs=[first, second], outputs=[total])
     return total

@@ -13,7 +13,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, instance_in
 from warpshadow.device.launch import differentiable, launch
-from warpshadow.device.parallel import Scratch, scratch_place, split_row
+from warpshadow.device.parallel import Scratch, scratch_slot, split_row
 from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.cell_coverage import ViewedEdge, convex_coverage, coverage_adjoint, viewed_edge
 from warpshadow.stages.convex.prepared import ConvexArrays, ConvexBlockers, PlacedParts
@@ -76,9 +76,9 @@ def _find_silhouette(
             b = corners[end] - point
             n = wp.cross(a, b)
             if wp.length_sq(n) > _MIN_EDGE_SINE * _MIN_EDGE_SINE * wp.length_sq(a) * wp.length_sq(b):
-                viewed = viewed_edge(a, b, n)
-                viewed.corners = wp.vec2i(begin, end)
-                silhouette[count] = viewed
+                seen_edge = viewed_edge(a, b, n)
+                seen_edge.corners = wp.vec2i(begin, end)
+                silhouette[count] = seen_edge
                 count += 1
     return wp.where(count < 3, 0, count)  # fewer enclose nothing
 
@@ -90,14 +90,14 @@ def _silhouette_adjoint(
     """Add to the gradients of corners; returns that of the receiver."""
     adj_point = wp.vec3()
     for e in range(count):
-        viewed = silhouette[e]
-        adj_n = viewed.adj_normal / viewed.length
-        adj_a = wp.cross(viewed.end, adj_n)
-        adj_b = wp.cross(adj_n, viewed.begin)
+        seen_edge = silhouette[e]
+        adj_n = seen_edge.adj_normal / seen_edge.length
+        adj_a = wp.cross(seen_edge.end, adj_n)
+        adj_b = wp.cross(adj_n, seen_edge.begin)
         adj_point -= adj_a + adj_b
         if adj_corners:
-            wp.atomic_add(adj_corners, instance, viewed.corners[0], adj_a)
-            wp.atomic_add(adj_corners, instance, viewed.corners[1], adj_b)
+            wp.atomic_add(adj_corners, instance, seen_edge.corners[0], adj_a)
+            wp.atomic_add(adj_corners, instance, seen_edge.corners[1], adj_b)
     return adj_point
 
 
@@ -114,20 +114,20 @@ class PartBound:
 @wp.func
 def _find_bound(point: wp.vec3, normal: wp.vec3, bound: wp.vec4, radius: float):
     """Find the cone around a part, widened by the radius of cells."""
-    result = PartBound()
+    part_bound = PartBound()
     away = wp.vec3(bound[0], bound[1], bound[2]) - point
-    result.is_seen = wp.dot(normal, away) > -bound[3] or wp.length_sq(normal) == 0.0
+    part_bound.is_seen = wp.dot(normal, away) > -bound[3] or wp.length_sq(normal) == 0.0
     distance2 = wp.length_sq(away)
-    result.cosine = -1.0
+    part_bound.cosine = -1.0
     if distance2 > bound[3] * bound[3]:
         distance = wp.sqrt(distance2)
-        result.axis = away / distance
+        part_bound.axis = away / distance
         sine = _BOUND_MARGIN * bound[3] / distance
         cosine = wp.sqrt(wp.max(0.0, 1.0 - sine * sine))
         scale = 1.0 / wp.sqrt(1.0 + radius * radius)
-        result.cosine = (cosine - sine * radius) * scale
-        result.sine = (sine + cosine * radius) * scale
-    return result
+        part_bound.cosine = (cosine - sine * radius) * scale
+        part_bound.sine = (sine + cosine * radius) * scale
+    return part_bound
 
 
 @wp.func
@@ -140,7 +140,7 @@ def _reaches(bound: PartBound, axis: wp.vec3, half_angle: wp.vec2):
 
 
 @wp.func
-def _cover(
+def _find_coverage(
     point: wp.vec3,
     normal: wp.vec3,
     corners: wp.array(dtype=wp.vec3),
@@ -153,7 +153,7 @@ def _cover(
     largest: wp.array(dtype=wp.float32),
     silhouette: wp.array(dtype=ViewedEdge),
     coverage: wp.array(dtype=wp.vec4),
-    covered: wp.array(dtype=wp.int32),
+    covered_cells: wp.array(dtype=wp.int32),
 ):
     """Coverage by a body of cells that no other body covers wholly; returns how many it covers, and lists them."""
     covered_count = int(0)
@@ -179,14 +179,14 @@ def _cover(
                                 by_part = convex_coverage(silhouette, 0, count, direction, radius)
                             if by_part[0] > 0.0:
                                 if coverage[q][0] == 0.0:  # not by a seam, whose prisms cover the same cells
-                                    covered[covered_count] = q
+                                    covered_cells[covered_count] = q
                                     covered_count += 1
                                 coverage[q] = coverage[q] + parts.signs[part] * by_part
     return covered_count
 
 
 @wp.func
-def _cover_all(
+def _find_blocker_sums(
     point: wp.vec3,
     normal: wp.vec3,
     corners: wp.array(dtype=wp.vec3),
@@ -199,7 +199,7 @@ def _cover_all(
     silhouette: wp.array(dtype=ViewedEdge),
     largest: wp.array(dtype=wp.float32),
     coverage: wp.array(dtype=wp.vec4),
-    covered: wp.array(dtype=wp.int32),
+    covered_cells: wp.array(dtype=wp.int32),
     sums: wp.array(dtype=BlockerSums),
 ):
     """Store sums over all bodies for each cell."""
@@ -209,7 +209,7 @@ def _cover_all(
         sums[q] = no_blockers()
     for body in range(parts.first_part.shape[0] - 1):
         if body != skip and parts.blocks[body] == 1:
-            covered_count = _cover(
+            covered_count = _find_coverage(
                 point,
                 normal,
                 corners,
@@ -222,17 +222,17 @@ def _cover_all(
                 largest,
                 silhouette,
                 coverage,
-                covered,
+                covered_cells,
             )
             for k in range(covered_count):
-                q = covered[k]
+                q = covered_cells[k]
                 sums[q] = with_blocker(sums[q], coverage[q])
                 largest[q] = sums[q].largest
                 coverage[q] = wp.vec4()
 
 
 @wp.kernel(enable_backward=False)
-def _cover_cells(
+def _find_joint_coverage(
     first_row: int,
     worker: int,
     # in
@@ -249,17 +249,17 @@ def _cover_cells(
     silhouettes: wp.array2d(dtype=ViewedEdge),
     largest: wp.array2d(dtype=wp.float32),
     coverages: wp.array2d(dtype=wp.vec4),
-    covered: wp.array2d(dtype=wp.int32),
+    covered_cells: wp.array2d(dtype=wp.int32),
     sums: wp.array2d(dtype=BlockerSums),
     # out
-    result: wp.array3d(dtype=wp.vec4),
+    joint_coverages: wp.array3d(dtype=wp.vec4),
 ):
     """A thread owns a receiver."""
     row = first_row + wp.tid()
     batch, receiver = split_row(row, points.shape[1])
-    place = scratch_place(worker, row)
+    slot = scratch_slot(worker, row)
     corner_batch = instance_in(batch, corners.shape[0])
-    _cover_all(
+    _find_blocker_sums(
         points[batch, receiver],
         horizon_normal(horizon_normals, batch, receiver),
         corners[corner_batch],
@@ -269,18 +269,18 @@ def _cover_cells(
         skip,
         cells,
         radius,
-        silhouettes[place],
-        largest[place],
-        coverages[place],
-        covered[place],
-        sums[place],
+        silhouettes[slot],
+        largest[slot],
+        coverages[slot],
+        covered_cells[slot],
+        sums[slot],
     )
     for q in range(cells.directions.shape[0]):
-        result[batch, receiver, q] = joint_coverage(sums[place, q])
+        joint_coverages[batch, receiver, q] = joint_coverage(sums[slot, q])
 
 
 @wp.kernel(enable_backward=False)
-def _cover_cells_adjoint(
+def _find_joint_coverage_adjoint(
     first_row: int,
     worker: int,
     # in
@@ -293,12 +293,12 @@ def _cover_cells_adjoint(
     cells: DirectionCells,
     radius: float,
     skip: int,
-    adj_result: wp.array3d(dtype=wp.vec4),
+    adj_joint_coverages: wp.array3d(dtype=wp.vec4),
     # scratch
     silhouettes: wp.array2d(dtype=ViewedEdge),
     largest: wp.array2d(dtype=wp.float32),
     coverages: wp.array2d(dtype=wp.vec4),
-    covered: wp.array2d(dtype=wp.int32),
+    covered_cells: wp.array2d(dtype=wp.int32),
     sums: wp.array2d(dtype=BlockerSums),
     adj_sums: wp.array2d(dtype=BlockerSums),
     # out
@@ -309,10 +309,10 @@ def _cover_cells_adjoint(
     """A thread owns a receiver; cells that are covered wholly have no gradient."""
     row = first_row + wp.tid()
     batch, receiver = split_row(row, points.shape[1])
-    place = scratch_place(worker, row)
+    slot = scratch_slot(worker, row)
     corner_batch = instance_in(batch, corners.shape[0])
     point, normal = points[batch, receiver], horizon_normal(horizon_normals, batch, receiver)
-    _cover_all(
+    _find_blocker_sums(
         point,
         normal,
         corners[corner_batch],
@@ -322,19 +322,19 @@ def _cover_cells_adjoint(
         skip,
         cells,
         radius,
-        silhouettes[place],
-        largest[place],
-        coverages[place],
-        covered[place],
-        sums[place],
+        silhouettes[slot],
+        largest[slot],
+        coverages[slot],
+        covered_cells[slot],
+        sums[slot],
     )
     for q in range(cells.directions.shape[0]):
-        if largest[place, q] < 1.0:
-            adj_sums[place, q] = joint_coverage_adjoint(sums[place, q], adj_result[batch, receiver, q])
+        if largest[slot, q] < 1.0:
+            adj_sums[slot, q] = joint_coverage_adjoint(sums[slot, q], adj_joint_coverages[batch, receiver, q])
     adj_point = wp.vec3()
     for body in range(parts.first_part.shape[0] - 1):
         if body != skip and parts.blocks[body] == 1:
-            covered_count = _cover(
+            covered_count = _find_coverage(
                 point,
                 normal,
                 corners[corner_batch],
@@ -344,23 +344,23 @@ def _cover_cells_adjoint(
                 body,
                 cells,
                 radius,
-                largest[place],
-                silhouettes[place],
-                coverages[place],
-                covered[place],
+                largest[slot],
+                silhouettes[slot],
+                coverages[slot],
+                covered_cells[slot],
             )
             for part in range(parts.first_part[body], parts.first_part[body + 1]):
                 bound = _find_bound(point, normal, bounds[corner_batch, part], radius)
                 if bound.is_seen and covered_count > 0:
                     count = int(_UNKNOWN_COUNT)
                     for k in range(covered_count):
-                        q = covered[place, k]
+                        q = covered_cells[slot, k]
                         direction = cells.directions[q]
                         if wp.dot(bound.axis, direction) > bound.cosine:
-                            adj = parts.signs[part] * blocker_adjoint(
-                                sums[place, q], adj_sums[place, q], coverages[place, q]
+                            adj_coverage = parts.signs[part] * blocker_adjoint(
+                                sums[slot, q], adj_sums[slot, q], coverages[slot, q]
                             )
-                            if wp.length_sq(adj) > 0.0:
+                            if wp.length_sq(adj_coverage) > 0.0:
                                 if count == _UNKNOWN_COUNT:
                                     count = _find_silhouette(
                                         point,
@@ -368,19 +368,19 @@ def _cover_cells_adjoint(
                                         planes[corner_batch],
                                         parts,
                                         part,
-                                        silhouettes[place],
+                                        silhouettes[slot],
                                     )
-                                coverage_adjoint(silhouettes[place], 0, count, direction, radius, adj)
-                    adj_point += _silhouette_adjoint(silhouettes[place], wp.max(count, 0), corner_batch, adj_corners)
+                                coverage_adjoint(silhouettes[slot], 0, count, direction, radius, adj_coverage)
+                    adj_point += _silhouette_adjoint(silhouettes[slot], wp.max(count, 0), corner_batch, adj_corners)
             for k in range(covered_count):
-                coverages[place, covered[place, k]] = wp.vec4()
+                coverages[slot, covered_cells[slot, k]] = wp.vec4()
     if adj_points:
         adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
 
 
 def part_coverage(
     points: wp.array,
-    placed: PlacedParts,
+    placed_parts: PlacedParts,
     blockers: ConvexBlockers,
     directions: np.ndarray,
     *,
@@ -392,7 +392,7 @@ def part_coverage(
 
     Args:
         points: Receivers [scene units], vec3 of shape [batch, receiver].
-        placed: Where the parts are, from :meth:`.ConvexBlockers.placed`; the batch may be 1.
+        placed_parts: Where the parts are, from :meth:`.ConvexBlockers.placed`; the batch may be 1.
         blockers: The bodies.
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
         radius: Of cells that do not tile the sphere [rad]; by default that of so many even ones, which do.
@@ -402,33 +402,43 @@ def part_coverage(
     Returns:
         vec4 of shape [batch, receiver, direction], for :func:`warpshadow.stages.joint_coverage.transmittance_past`.
 
-    Differentiable: points, placed. Not: horizon_normals, which decides by steps.
+    Differentiable: points, placed_parts. Not: horizon_normals, which decides by steps.
     """
     check.shape("points", points.shape, ("batch", "receiver"))
     check.shape("directions", directions.shape, ("direction", 3))
     if skip is not None:
         check.choice("skip", skip, range(blockers.body_count))
-    points = expand(points, common_batch({"points": points, "corners": placed.corners}))
-    own_radius = cell_radius(len(directions)) if radius is None else radius
+    points = expand(points, common_batch({"points": points, "corners": placed_parts.corners}))
+    radius_of_cells = cell_radius(len(directions)) if radius is None else radius
     cells = make_cells(directions, SOFTNESS, points.device)
-    inputs = [points, horizon_normals, *placed, blockers.arrays, cells, own_radius, -1 if skip is None else skip]
-    by_cell = (len(directions),)
+    inputs = [
+        points,
+        horizon_normals,
+        *placed_parts,
+        blockers.arrays,
+        cells,
+        radius_of_cells,
+        -1 if skip is None else skip,
+    ]
+    cell_shape = (len(directions),)
     scratch = [
         Scratch((blockers.edge_count,), ViewedEdge),
-        *(Scratch(by_cell, dtype) for dtype in (wp.float32, wp.vec4, wp.int32, BlockerSums)),
+        *(Scratch(cell_shape, dtype) for dtype in (wp.float32, wp.vec4, wp.int32, BlockerSums)),
     ]
-    cost = _PART_COST * placed.bounds.shape[1]
+    cost = _PART_COST * placed_parts.bounds.shape[1]
     return differentiable(
-        lambda result: launch(_cover_cells, points.size, inputs=inputs, outputs=[result], scratch=scratch, cost=cost),
-        lambda adj_result: launch(
-            _cover_cells_adjoint,
+        lambda result: launch(
+            _find_joint_coverage, points.size, inputs=inputs, outputs=[result], scratch=scratch, cost=cost
+        ),
+        lambda adj_joint_coverages: launch(
+            _find_joint_coverage_adjoint,
             points.size,
-            inputs=[*inputs, adj_result],
+            inputs=[*inputs, adj_joint_coverages],
             outputs=[points.grad],
-            sums=[placed.corners.grad],
+            sums=[placed_parts.corners.grad],
             scratch=[*scratch, scratch[-1]],
             cost=3 * cost,
         ),
         result=wp.empty((*points.shape, len(directions)), dtype=wp.vec4, device=points.device),
-        variables=[points, placed.corners],
+        variables=[points, placed_parts.corners],
     )

@@ -59,12 +59,14 @@ class ConvexBlockers:
     corners_of_vertices: SparseMatrix
 
     @staticmethod
-    def of(bodies: Sequence[ConvexBody], vertex_count: int, *, device: wp.DeviceLike) -> ConvexBlockers:
+    def from_bodies(bodies: Sequence[ConvexBody], vertex_count: int, *, device: wp.DeviceLike) -> ConvexBlockers:
         """Prepare bodies, among bodies that have so many vertices together."""
         parts = [part for body in bodies for part in body.parts]
         starts = {name: _starts([len(getattr(part, name)) for part in parts]) for name in ("corners", "faces", "edges")}
         faces = [part.faces + first for part, first in zip(parts, starts["corners"], strict=False)]
-        shifted = [part.edges + [first, first, 0, 0] for part, first in zip(parts, starts["corners"], strict=False)]
+        shifted_edges = [
+            part.edges + [first, first, 0, 0] for part, first in zip(parts, starts["corners"], strict=False)
+        ]
         arrays = ConvexArrays()
         arrays.blocks = wp.array([int(body.blocks) for body in bodies], dtype=wp.int32, device=device)
         arrays.first_part = wp.array(_starts([len(body.parts) for body in bodies]), dtype=wp.int32, device=device)
@@ -74,17 +76,17 @@ class ConvexBlockers:
         arrays.first_face = wp.array(starts["faces"], dtype=wp.int32, device=device)
         arrays.first_edge = wp.array(starts["edges"], dtype=wp.int32, device=device)
         arrays.faces = wp.array(np.concatenate(faces), dtype=wp.vec3i, device=device)
-        arrays.edges = wp.array(np.concatenate(shifted), dtype=wp.vec4i, device=device)
+        arrays.edges = wp.array(np.concatenate(shifted_edges), dtype=wp.vec4i, device=device)
         vertices = np.concatenate([body.first_vertex + part.corners for body in bodies for part in body.parts])
         return ConvexBlockers(
             len(bodies),
             max(len(part.edges) for part in parts),
             arrays,
-            SparseMatrix.of(_chosen(vertices, vertex_count), device=device),
+            SparseMatrix.from_matrix(_selection_matrix(vertices, vertex_count), device=device),
         )
 
     def placed(self, positions: wp.array) -> PlacedParts:
-        """Where parts are.
+        """Convex parts in the world.
 
         Args:
             positions: Vertices of all bodies [scene units], vec3 of shape [batch, vertex]. Parts must stay convex:
@@ -97,12 +99,12 @@ class ConvexBlockers:
         count, device, arrays = corners.shape[0], corners.device, self.arrays
         planes = wp.empty((count, arrays.faces.size), dtype=wp.vec4, device=device)
         bounds = wp.empty((count, arrays.first_face.size - 1), dtype=wp.vec4, device=device)
-        launch(_bound, bounds.shape, inputs=[without_gradient(corners), arrays], outputs=[planes, bounds])
+        launch(_bound_parts, bounds.shape, inputs=[without_gradient(corners), arrays], outputs=[planes, bounds])
         return PlacedParts(corners, planes, bounds)
 
 
 class PlacedParts(NamedTuple):
-    """Where parts are."""
+    """Convex parts in the world."""
 
     corners: wp.array  # vec3 of shape [batch, corner]
     planes: wp.array  # of faces: outward normals N, and N·x of their points, vec4 of shape [batch, face]
@@ -110,7 +112,7 @@ class PlacedParts(NamedTuple):
 
 
 @wp.kernel(enable_backward=False)
-def _bound(
+def _bound_parts(
     # in
     corners: wp.array2d(dtype=wp.vec3),
     parts: ConvexArrays,
@@ -121,10 +123,10 @@ def _bound(
     """A thread owns a part of an instance."""
     batch, part = wp.tid()
     first, end = parts.first_corner[part], parts.first_corner[part + 1]
-    total = wp.vec3()
+    corner_sum = wp.vec3()
     for corner in range(first, end):
-        total += corners[batch, corner]
-    center = total / float(end - first)
+        corner_sum += corners[batch, corner]
+    center = corner_sum / float(end - first)
     radius = float(0.0)
     for corner in range(first, end):
         radius = wp.max(radius, wp.length(corners[batch, corner] - center))
@@ -138,11 +140,11 @@ def _bound(
 
 
 def _starts(counts: Sequence[int]) -> np.ndarray:
-    """Where items of each begin, and the end of the last."""
+    """First index of each part's items, and the end of the last."""
     return np.cumsum([0, *counts]).astype(np.int32)
 
 
-def _chosen(columns: np.ndarray, count: int) -> csr_matrix:
+def _selection_matrix(columns: np.ndarray, count: int) -> csr_matrix:
     """The matrix that chooses some of so many items."""
     from scipy.sparse import csr_matrix
 

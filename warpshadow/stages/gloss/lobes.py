@@ -33,7 +33,7 @@ _COST = 60.0  # nanoseconds that a sample takes
 wp.set_module_options({"max_unroll": 1})
 
 
-def sample_places(count: int) -> np.ndarray:
+def hemisphere_points(count: int) -> np.ndarray:
     """Height in the cap and cosine and sine of the azimuth of each sample, on a spiral: shape [sample, 3]."""
     i = np.arange(count)
     azimuth = np.pi * (1 + np.sqrt(5)) * i
@@ -41,7 +41,7 @@ def sample_places(count: int) -> np.ndarray:
 
 
 @wp.func
-def eye_of(clip_matrix: wp.mat44):
+def eye_position(clip_matrix: wp.mat44):
     """The point that a camera sees the world from, where x, y and w of clip space are all 0."""
     rows = wp.mat33(
         clip_matrix[0, 0],
@@ -83,7 +83,7 @@ def _sample_lobes(
     normals: wp.array2d(dtype=wp.vec3),
     roughness: wp.array2d(dtype=wp.float32),
     clip_matrices: wp.array(dtype=wp.mat44),
-    places: wp.array(dtype=wp.vec3),
+    sample_points: wp.array(dtype=wp.vec3),
     # out
     directions: wp.array3d(dtype=wp.vec3),
     filters: wp.array3d(dtype=wp.vec3),
@@ -93,7 +93,7 @@ def _sample_lobes(
     batch, receiver = split_row(first_row + wp.tid(), cosines.shape[1])
     point_batch = instance_in(batch, points.shape[0])
     normal = normals[point_batch, receiver]
-    eye = eye_of(clip_matrices[instance_in(batch, clip_matrices.shape[0])])
+    eye = eye_position(clip_matrices[instance_in(batch, clip_matrices.shape[0])])
     view = wp.normalize(eye - points[point_batch, receiver])
     rough = wp.max(roughness[instance_in(batch, roughness.shape[0]), receiver], MIN_ROUGHNESS)
     width = rough * rough
@@ -107,30 +107,41 @@ def _sample_lobes(
     slant = _slant(cosine, width)
     cosines[batch, receiver] = cosine
     # in the frame of tangent, bitangent and normal; the cap is that of mirrors of width 1
-    stretched = wp.normalize(wp.vec3(width * sine, 0.0, cosine))
+    stretched_view = wp.normalize(wp.vec3(width * sine, 0.0, cosine))
     for i in range(directions.shape[2]):
-        place = places[i]
-        height = (1.0 - place[0]) * (1.0 + stretched[2]) - stretched[2]
-        ring = wp.sqrt(wp.max(1.0 - height * height, 1.0e-12))
+        sample_point = sample_points[i]
+        height = (1.0 - sample_point[0]) * (1.0 + stretched_view[2]) - stretched_view[2]
+        radius = wp.sqrt(wp.max(1.0 - height * height, 1.0e-12))
         mirror = wp.normalize(
             wp.vec3(
-                width * (ring * place[1] + stretched[0]),
-                width * ring * place[2],
-                (1.0 - place[0]) * (1.0 + stretched[2]),
+                width * (radius * sample_point[1] + stretched_view[0]),
+                width * radius * sample_point[2],
+                (1.0 - sample_point[0]) * (1.0 + stretched_view[2]),
             )
         )
-        facing = mirror[0] * sine + mirror[2] * cosine
-        up = 2.0 * facing * mirror[2] - cosine
-        direction = (2.0 * facing * mirror[0] - sine) * tangent + 2.0 * facing * mirror[1] * bitangent + up * normal
+        view_cosine = mirror[0] * sine + mirror[2] * cosine
+        reflected_cosine = 2.0 * view_cosine * mirror[2] - cosine
+        direction = (
+            (2.0 * view_cosine * mirror[0] - sine) * tangent
+            + 2.0 * view_cosine * mirror[1] * bitangent
+            + reflected_cosine * normal
+        )
         directions[batch, receiver, i] = wp.normalize(direction)
         weight = float(0.0)
-        if up > 0.0:
-            weight = up * (cosine + slant) / (up * slant + cosine * _slant(up, width)) / float(directions.shape[2])
-        rest = wp.max(1.0 - facing, 0.0)
-        spread = mirror[2] * mirror[2] * (width * width - 1.0) + 1.0
-        density = width * width / (wp.pi * spread * spread) / (2.0 * (cosine + slant))
+        if reflected_cosine > 0.0:
+            weight = (
+                reflected_cosine
+                * (cosine + slant)
+                / (reflected_cosine * slant + cosine * _slant(reflected_cosine, width))
+                / float(directions.shape[2])
+            )
+        grazing_base = wp.max(1.0 - view_cosine, 0.0)
+        ellipsoid = mirror[2] * mirror[2] * (width * width - 1.0) + 1.0
+        density = width * width / (wp.pi * ellipsoid * ellipsoid) / (2.0 * (cosine + slant))
         blur = wp.sqrt(1.0 / (2.0 * wp.pi * float(directions.shape[2]) * density))
-        filters[batch, receiver, i] = wp.vec3(weight, weight * rest * rest * rest * rest * rest, blur)
+        filters[batch, receiver, i] = wp.vec3(
+            weight, weight * grazing_base * grazing_base * grazing_base * grazing_base * grazing_base, blur
+        )
 
 
 def sample_lobes(
@@ -161,7 +172,7 @@ def sample_lobes(
     launch(
         _sample_lobes,
         shape[0] * shape[1],
-        inputs=[points, normals, roughness, clip_matrices, constant(sample_places(sample_count), wp.vec3, device)],
+        inputs=[points, normals, roughness, clip_matrices, constant(hemisphere_points(sample_count), wp.vec3, device)],
         outputs=[directions, filters, cosines],
         shared=[clip_matrices, points, normals, roughness],
         cost=_COST * sample_count,

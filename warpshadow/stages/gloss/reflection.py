@@ -39,10 +39,10 @@ def _sum_lobes(
     filters: wp.array3d(dtype=wp.vec3),
     light: wp.array3d(dtype=wp.vec3),
     transmittance: wp.array3d(dtype=wp.float32),
-    blocked: wp.array2d(dtype=wp.vec3),
+    blocked_light: wp.array2d(dtype=wp.vec3),
     # out
     straight: wp.array2d(dtype=wp.vec3),
-    grazing: wp.array2d(dtype=wp.vec3),
+    grazing_light: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver: G and G'."""
     batch, receiver = split_row(first_row + wp.tid(), straight.shape[1])
@@ -50,22 +50,22 @@ def _sum_lobes(
     light_batch = instance_in(batch, light.shape[0])
     transmittance_batch = instance_in(batch, transmittance.shape[0])
     instead = wp.vec3()
-    if blocked:
-        instead = blocked[instance_in(batch, blocked.shape[0]), receiver]
-    total = wp.vec3()
+    if blocked_light:
+        instead = blocked_light[instance_in(batch, blocked_light.shape[0]), receiver]
+    lobe_sum = wp.vec3()
     total_grazing = wp.vec3()
     for i in range(filters.shape[2]):
         weight = filters[filter_batch, receiver, i]
         share = transmittance[transmittance_batch, receiver, i]
         radiance = share * light[light_batch, receiver, i] + (1.0 - share) * instead
-        total += weight[0] * radiance
+        lobe_sum += weight[0] * radiance
         total_grazing += weight[1] * radiance
-    straight[batch, receiver] = total
-    grazing[batch, receiver] = total_grazing
+    straight[batch, receiver] = lobe_sum
+    grazing_light[batch, receiver] = total_grazing
 
 
 def sum_lobes(
-    filters: wp.array, light: wp.array, transmittance: wp.array, blocked: wp.array | None = None
+    filters: wp.array, light: wp.array, transmittance: wp.array, blocked_light: wp.array | None = None
 ) -> tuple[wp.array, wp.array]:
     """Sum the light of lobes.
 
@@ -73,49 +73,56 @@ def sum_lobes(
         filters: Of :func:`.lobes.sample_lobes`, vec3 of shape [batch, receiver, sample].
         light: Radiance from the samples, vec3 of shape [batch, receiver, sample].
         transmittance: Float32 of shape [batch, receiver, sample].
-        blocked: R, of :func:`blocked_radiance`, vec3 of shape [batch, receiver]; None where light does not bounce.
+        blocked_light: R, of :func:`blocked_radiance`, vec3 of shape [batch, receiver]; None where light does not
+            bounce.
 
     Returns:
         G and G', vec3 of shape [batch, receiver].
 
     Differentiable: all.
     """
-    arrays = {"filters": filters, "light": light, "transmittance": transmittance, "blocked": blocked}
+    arrays = {
+        "filters": filters,
+        "light": light,
+        "transmittance": transmittance,
+        "blocked_light": blocked_light,
+    }
     count = common_batch(arrays)
-    sums = [wp.empty((count, filters.shape[1]), dtype=wp.vec3, device=filters.device) for _ in range(2)]
+    lobe_sums = [wp.empty((count, filters.shape[1]), dtype=wp.vec3, device=filters.device) for _ in range(2)]
     launch(
         _sum_lobes,
         count * filters.shape[1],
-        inputs=[filters, light, transmittance, blocked],
-        outputs=sums,
-        shared=[filters, light, transmittance, blocked],
+        inputs=[filters, light, transmittance, blocked_light],
+        outputs=lobe_sums,
+        shared=[filters, light, transmittance, blocked_light],
         cost=_COST * filters.shape[2],
     )
-    return sums[0], sums[1]
+    return lobe_sums[0], lobe_sums[1]
 
 
 @wp.kernel
-def _find_blocked(
+def _find_blocked_radiance(
     # in
-    bounced: wp.array2d(dtype=wp.vec3),
+    bounced_light: wp.array2d(dtype=wp.vec3),
     direct: wp.array2d(dtype=wp.vec3),
     openness: wp.array2d(dtype=wp.vec3),
     # out
-    blocked: wp.array2d(dtype=wp.vec3),
+    blocked_light: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver."""
     batch, receiver = wp.tid()
-    light = bounced[instance_in(batch, bounced.shape[0]), receiver]
-    rest = light - direct[instance_in(batch, direct.shape[0]), receiver]
+    light = bounced_light[instance_in(batch, bounced_light.shape[0]), receiver]
+    indirect_light = light - direct[instance_in(batch, direct.shape[0]), receiver]
     share = 1.0 - openness[instance_in(batch, openness.shape[0]), receiver][0]
-    blocked[batch, receiver] = wp.max(rest, wp.vec3()) / wp.max(share, MIN_BLOCKED_SHARE)
+    blocked_light[batch, receiver] = wp.max(indirect_light, wp.vec3()) / wp.max(share, MIN_BLOCKED_SHARE)
 
 
-def blocked_radiance(bounced: wp.array, direct: wp.array, openness: wp.array) -> wp.array:
+def blocked_radiance(bounced_light: wp.array, direct: wp.array, openness: wp.array) -> wp.array:
     """Mean radiance of all that blocks a receiver's light, (E − S) / (1 − O).
 
     Args:
-        bounced: E, light that receivers would reflect as white diffuse surfaces, with bounces; vec3 [batch, receiver].
+        bounced_light: E, light that receivers would reflect as white diffuse surfaces, with bounces; vec3 [batch,
+            receiver].
         direct: S, the same without bounces.
         openness: O, the same under an even sky of 1 without bounces.
 
@@ -124,10 +131,15 @@ def blocked_radiance(bounced: wp.array, direct: wp.array, openness: wp.array) ->
 
     Differentiable: all.
     """
-    count = common_batch({"bounced": bounced, "direct": direct, "openness": openness})
-    blocked = wp.empty((count, bounced.shape[1]), dtype=wp.vec3, device=bounced.device)
-    launch(_find_blocked, blocked.shape, inputs=[bounced, direct, openness], outputs=[blocked])
-    return blocked
+    count = common_batch({"bounced_light": bounced_light, "direct": direct, "openness": openness})
+    blocked_light = wp.empty((count, bounced_light.shape[1]), dtype=wp.vec3, device=bounced_light.device)
+    launch(
+        _find_blocked_radiance,
+        blocked_light.shape,
+        inputs=[bounced_light, direct, openness],
+        outputs=[blocked_light],
+    )
+    return blocked_light
 
 
 @functools.cache
@@ -138,53 +150,57 @@ def even_grazing() -> wp.vec3:
     azimuth = 2 * np.pi * (np.arange(2 * count) + 0.5) / (2 * count)
     sine = np.sqrt(1 - z**2)
     cosines = np.linspace(0, 1, 33)
-    towards = cosines[:, None, None] * z[:, None] + np.sqrt(1 - cosines**2)[:, None, None] * np.outer(
+    cosine_products = cosines[:, None, None] * z[:, None] + np.sqrt(1 - cosines**2)[:, None, None] * np.outer(
         sine, np.cos(azimuth)
     )
-    values = (2 * z[:, None] * (1 - np.sqrt(np.maximum((1 + towards) / 2, 0))) ** 5).mean(axis=(1, 2))
+    values = (2 * z[:, None] * (1 - np.sqrt(np.maximum((1 + cosine_products) / 2, 0))) ** 5).mean(axis=(1, 2))
     powers = np.stack([np.ones_like(cosines), (1 - cosines) ** 2, (1 - cosines) ** 4], axis=1)
     return wp.vec3(*np.linalg.lstsq(powers, values, rcond=None)[0].tolist())
 
 
 @wp.kernel
-def _reflect(
+def _mix_reflection(
     # in
-    numbers: wp.array(dtype=wp.int32),
+    receiver_indices: wp.array(dtype=wp.int32),
     diffuse: wp.array2d(dtype=wp.vec3),
     straight: wp.array2d(dtype=wp.vec3),
-    grazing: wp.array2d(dtype=wp.vec3),
+    grazing_light: wp.array2d(dtype=wp.vec3),
     cosines: wp.array2d(dtype=wp.float32),
     metallic: wp.array2d(dtype=wp.float32),
     specular: wp.array2d(dtype=wp.float32),
-    even: wp.vec3,
+    even_coefficients: wp.vec3,
     # out
-    colored: wp.array2d(dtype=wp.vec3),
+    colored_reflection: wp.array2d(dtype=wp.vec3),
     white: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver of any body."""
     batch, receiver = wp.tid()
-    number = numbers[receiver]
+    receiver_index = receiver_indices[receiver]
     light = diffuse[instance_in(batch, diffuse.shape[0]), receiver]
-    if number < 0:
-        colored[batch, receiver] = light
+    if receiver_index < 0:
+        colored_reflection[batch, receiver] = light
         white[batch, receiver] = wp.vec3()
     else:
-        lobe = straight[instance_in(batch, straight.shape[0]), number]
-        rest = grazing[instance_in(batch, grazing.shape[0]), number]
-        m = metallic[instance_in(batch, metallic.shape[0]), number]
-        s = specular[instance_in(batch, specular.shape[0]), number]
-        slant = 1.0 - cosines[instance_in(batch, cosines.shape[0]), number]
+        lobe = straight[instance_in(batch, straight.shape[0]), receiver_index]
+        grazing_lobe = grazing_light[instance_in(batch, grazing_light.shape[0]), receiver_index]
+        m = metallic[instance_in(batch, metallic.shape[0]), receiver_index]
+        s = specular[instance_in(batch, specular.shape[0]), receiver_index]
+        slant = 1.0 - cosines[instance_in(batch, cosines.shape[0]), receiver_index]
         slant = slant * slant
-        reflected = DIELECTRIC_F0 + (1.0 - DIELECTRIC_F0) * (even[0] + slant * (even[1] + slant * even[2]))
-        colored[batch, receiver] = (1.0 - m) * (1.0 - s * reflected) * light + m * (lobe - rest)
-        white[batch, receiver] = (1.0 - m) * s * (DIELECTRIC_F0 * lobe + (1.0 - DIELECTRIC_F0) * rest) + m * rest
+        reflectance = DIELECTRIC_F0 + (1.0 - DIELECTRIC_F0) * (
+            even_coefficients[0] + slant * (even_coefficients[1] + slant * even_coefficients[2])
+        )
+        colored_reflection[batch, receiver] = (1.0 - m) * (1.0 - s * reflectance) * light + m * (lobe - grazing_lobe)
+        white[batch, receiver] = (1.0 - m) * s * (
+            DIELECTRIC_F0 * lobe + (1.0 - DIELECTRIC_F0) * grazing_lobe
+        ) + m * grazing_lobe
 
 
 def mix_reflection(
-    numbers: wp.array,
+    receiver_indices: wp.array,
     diffuse: wp.array,
     straight: wp.array,
-    grazing: wp.array,
+    grazing_light: wp.array,
     cosines: wp.array,
     metallic: wp.array,
     specular: wp.array,
@@ -192,21 +208,21 @@ def mix_reflection(
     """Mix diffuse and glossy light.
 
     Args:
-        numbers: Of each receiver among the glossy ones, −1 for diffuse ones, int32 of shape [receiver].
+        receiver_indices: Of each receiver among the glossy ones, −1 for diffuse ones, int32 of shape [receiver].
         diffuse: E, light that receivers would reflect as white diffuse surfaces, vec3 of shape [batch, receiver].
-        straight, grazing: G and G' of the glossy ones, vec3 of shape [batch, glossy].
+        straight, grazing_light: G and G' of the glossy ones, vec3 of shape [batch, glossy].
         cosines: μ of them, float32 of shape [batch, glossy].
         metallic, specular: m and s of them, float32 of shape [batch, glossy].
 
     Returns:
         A and C, vec3 of shape [batch, receiver]; E and 0 of diffuse ones.
 
-    Differentiable: all but numbers.
+    Differentiable: all but receiver_indices.
     """
-    check.shape("numbers", numbers.shape, diffuse.shape[1:])
+    check.shape("receiver_indices", receiver_indices.shape, diffuse.shape[1:])
     arrays = {"diffuse": diffuse, "gloss": straight, "cosines": cosines, "metallic": metallic, "specular": specular}
     shape = common_batch(arrays), diffuse.shape[1]
-    colored, white = (wp.empty(shape, dtype=wp.vec3, device=diffuse.device) for _ in range(2))
-    inputs = [numbers, diffuse, straight, grazing, cosines, metallic, specular, even_grazing()]
-    launch(_reflect, shape, inputs=inputs, outputs=[colored, white])
-    return colored, white
+    colored_reflection, white = (wp.empty(shape, dtype=wp.vec3, device=diffuse.device) for _ in range(2))
+    inputs = [receiver_indices, diffuse, straight, grazing_light, cosines, metallic, specular, even_grazing()]
+    launch(_mix_reflection, shape, inputs=inputs, outputs=[colored_reflection, white])
+    return colored_reflection, white

@@ -32,7 +32,7 @@ def _make_trace() -> wp.Kernel:
         receiver = first_row + wp.tid()
         point = points[receiver]
         normal = normals[receiver]
-        last = int(-1)
+        last_face = int(-1)
         for packet in range(directions.shape[1] / PACKET):
             x = Lane()
             y = Lane()
@@ -42,15 +42,23 @@ def _make_trace() -> wp.Kernel:
                 x[lane] = direction[0]
                 y[lane] = direction[1]
                 z[lane] = direction[2]
-            toward = Vectors(x, y, z)
-            facing_rays = bits_above(dot_direction(normal, toward), 0.0)
+            ray_directions = Vectors(x, y, z)
+            facing_rays = bits_above(dot_direction(normal, ray_directions), 0.0)
             is_open = int(0)
             if facing_rays != 0:
-                result = find_open(
-                    tree.corners, tree.lowers, tree.uppers, tree.leaf_count, point, normal, toward, facing_rays, last
+                open_and_face = find_open(
+                    tree.corners,
+                    tree.lowers,
+                    tree.uppers,
+                    tree.leaf_count,
+                    point,
+                    normal,
+                    ray_directions,
+                    facing_rays,
+                    last_face,
                 )
-                is_open = result[0]
-                last = result[1]
+                is_open = open_and_face[0]
+                last_face = open_and_face[1]
             for lane in range(PACKET):
                 transmittance[receiver, packet * PACKET + lane] = float((is_open >> lane) % 2)
 

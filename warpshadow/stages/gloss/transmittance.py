@@ -35,15 +35,15 @@ def _neighbors(directions: bytes) -> np.ndarray:
     from scipy.spatial import cKDTree
 
     cells = np.frombuffer(directions).reshape(-1, 3)
-    place = (np.arange(_TABLE_ROWS) + 0.5) / _TABLE_ROWS * 2 - 1
-    x, z = np.meshgrid(place, place)
+    row_centers = (np.arange(_TABLE_ROWS) + 0.5) / _TABLE_ROWS * 2 - 1
+    x, z = np.meshgrid(row_centers, row_centers)
     y = 1 - np.abs(x) - np.abs(z)
-    below = np.maximum(-y, 0)
-    texels = np.stack([x - np.sign(x) * below, y, z - np.sign(z) * below], axis=-1).reshape(-1, 3)
+    lower_part = np.maximum(-y, 0)
+    texels = np.stack([x - np.sign(x) * lower_part, y, z - np.sign(z) * lower_part], axis=-1).reshape(-1, 3)
     texels /= np.linalg.norm(texels, axis=1, keepdims=True)
-    reach = 2 * np.sin(min(KERNEL_RADIUS * cell_radius(len(cells)) + 2.2 / _TABLE_ROWS, np.pi) / 2)
+    search_radius = 2 * np.sin(min(KERNEL_RADIUS * cell_radius(len(cells)) + 2.2 / _TABLE_ROWS, np.pi) / 2)
     tree = cKDTree(cells)
-    count = max(len(near) for near in tree.query_ball_point(texels, reach))
+    count = max(len(neighbor_cells) for neighbor_cells in tree.query_ball_point(texels, search_radius))
     return tree.query(texels, min(max(count, 3), len(cells)))[1].astype(np.int32)
 
 
@@ -54,9 +54,9 @@ def _texel(direction: wp.vec3):
     x = direction[0] / size
     z = direction[2] / size
     if direction[1] < 0.0:
-        folded = wp.sign(x) * (1.0 - wp.abs(z))
+        folded_direction = wp.sign(x) * (1.0 - wp.abs(z))
         z = wp.sign(z) * (1.0 - wp.abs(x))
-        x = folded
+        x = folded_direction
     column = wp.clamp(int((x + 1.0) * 0.5 * float(_TABLE_ROWS)), 0, _TABLE_ROWS - 1)
     row = wp.clamp(int((z + 1.0) * 0.5 * float(_TABLE_ROWS)), 0, _TABLE_ROWS - 1)
     return row * _TABLE_ROWS + column
@@ -75,39 +75,39 @@ def _sum_near(
     reach_cosine: float,
     per_radius: float,
     # out
-    sums: wp.array3d(dtype=wp.vec2),
+    weighted_sums: wp.array3d(dtype=wp.vec2),
 ):
     """A thread owns a receiver: the sums of k min(T, H) and of k H."""
-    batch, receiver = split_row(first_row + wp.tid(), sums.shape[1])
+    batch, receiver = split_row(first_row + wp.tid(), weighted_sums.shape[1])
     direction_batch = instance_in(batch, directions.shape[0])
     normal = normals[instance_in(batch, normals.shape[0]), receiver]
     row = transmittance[instance_in(batch, transmittance.shape[0])]
-    for i in range(sums.shape[2]):
+    for i in range(weighted_sums.shape[2]):
         direction = directions[direction_batch, receiver, i]
         texel = _texel(direction)
-        total = wp.vec2()
+        weighted_sum = wp.vec2()
         for k in range(neighbors.shape[1]):
             cell = neighbors[texel, k]
-            near = wp.max(wp.dot(direction, cells[cell]) - reach_cosine, 0.0)
-            weight = near * near + _NEGLIGIBLE
-            above = wp.smoothstep(-1.0, 1.0, per_radius * wp.dot(normal, cells[cell])) + _NEGLIGIBLE
-            total += weight * wp.vec2(wp.min(row[receiver, cell], above), above)
-        sums[batch, receiver, i] = total
+            kernel_weight = wp.max(wp.dot(direction, cells[cell]) - reach_cosine, 0.0)
+            weight = kernel_weight * kernel_weight + _NEGLIGIBLE
+            horizon_weight = wp.smoothstep(-1.0, 1.0, per_radius * wp.dot(normal, cells[cell])) + _NEGLIGIBLE
+            weighted_sum += weight * wp.vec2(wp.min(row[receiver, cell], horizon_weight), horizon_weight)
+        weighted_sums[batch, receiver, i] = weighted_sum
 
 
 @wp.kernel
 def _divide(
     # in
-    sums: wp.array3d(dtype=wp.vec2),
+    weighted_sums: wp.array3d(dtype=wp.vec2),
     # out
     means: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a sample."""
     batch, receiver, i = wp.tid()
-    means[batch, receiver, i] = sums[batch, receiver, i][0] / sums[batch, receiver, i][1]
+    means[batch, receiver, i] = weighted_sums[batch, receiver, i][0] / weighted_sums[batch, receiver, i][1]
 
 
-def transmittance_towards(
+def transmittance_of_directions(
     transmittance: wp.array, normals: wp.array, directions: wp.array, cells: np.ndarray
 ) -> wp.array:
     """Interpolate transmittance towards the samples of lobes.
@@ -126,19 +126,19 @@ def transmittance_towards(
     check.shape("transmittance", transmittance.shape, ("batch", directions.shape[1], len(cells)))
     arrays = {"transmittance": transmittance, "directions": directions, "normals": normals}
     count, device = common_batch(arrays), directions.device
-    near = _neighbors(np.ascontiguousarray(cells, np.float64).tobytes())
+    neighbor_cells = _neighbors(np.ascontiguousarray(cells, np.float64).tobytes())
     radius = float(cell_radius(len(cells)))
-    reach = float(np.cos(KERNEL_RADIUS * radius))
-    sums = wp.empty((count, *directions.shape[1:]), dtype=wp.vec2, device=device)
-    towards, neighbors = constant(cells, wp.vec3, device), constant(near, wp.int32, device)
+    cos_radius = float(np.cos(KERNEL_RADIUS * radius))
+    weighted_sums = wp.empty((count, *directions.shape[1:]), dtype=wp.vec2, device=device)
+    cell_directions, neighbors = constant(cells, wp.vec3, device), constant(neighbor_cells, wp.int32, device)
     launch(
         _sum_near,
         count * directions.shape[1],
-        inputs=[transmittance, normals, directions, towards, neighbors, reach, 1 / radius],
-        outputs=[sums],
+        inputs=[transmittance, normals, directions, cell_directions, neighbors, cos_radius, 1 / radius],
+        outputs=[weighted_sums],
         shared=[transmittance, normals, directions],
         cost=_COST * directions.shape[2],
     )
-    means = wp.empty(sums.shape, dtype=wp.float32, device=device)
-    launch(_divide, means.shape, inputs=[sums], outputs=[means])
+    means = wp.empty(weighted_sums.shape, dtype=wp.float32, device=device)
+    launch(_divide, means.shape, inputs=[weighted_sums], outputs=[means])
     return means

@@ -82,41 +82,41 @@ def smoothstep_slope(z: float):
 
 
 @wp.struct
-class ReceiverInPlane:
-    """A receiver as a plane has it: in the plane's own axes."""
+class LocalReceiver:
+    """A receiver in the axes of a plane."""
 
-    at: wp.vec3  # along both axes, and its height [units of the body]
-    along_u: wp.vec3  # axes of unit length
-    along_v: wp.vec3
+    position: wp.vec3  # along both axes, and its height [units of the body]
+    axis_u: wp.vec3  # axes of unit length
+    axis_v: wp.vec3
     normal: wp.vec3  # 0 where the plane has no area
 
 
 @wp.func
-def find_in_plane(point: wp.vec3, frames: wp.array(dtype=wp.vec3), f: int):
-    """Find a receiver in the axes of a plane."""
-    place = ReceiverInPlane()
+def find_local_receiver(point: wp.vec3, frames: wp.array(dtype=wp.vec3), f: int):
+    """Transform a receiver to the axes of a plane."""
+    local_receiver = LocalReceiver()
     scale_u = wp.length(frames[3 * f + 1])
     scale_v = wp.length(frames[3 * f + 2])
     if scale_u > 0.0 and scale_v > 0.0:
-        place.along_u = frames[3 * f + 1] / scale_u
-        place.along_v = frames[3 * f + 2] / scale_v
-        place.normal = wp.cross(place.along_u, place.along_v)
+        local_receiver.axis_u = frames[3 * f + 1] / scale_u
+        local_receiver.axis_v = frames[3 * f + 2] / scale_v
+        local_receiver.normal = wp.cross(local_receiver.axis_u, local_receiver.axis_v)
         offset = point - frames[3 * f]
-        place.at = wp.vec3(
-            wp.dot(offset, place.along_u) / scale_u,
-            wp.dot(offset, place.along_v) / scale_v,
-            wp.dot(offset, place.normal) / scale_u,
+        local_receiver.position = wp.vec3(
+            wp.dot(offset, local_receiver.axis_u) / scale_u,
+            wp.dot(offset, local_receiver.axis_v) / scale_v,
+            wp.dot(offset, local_receiver.normal) / scale_u,
         )
-    return place
+    return local_receiver
 
 
 @wp.func
-def find_in_plane_adjoint(
+def find_local_receiver_adjoint(
     point: wp.vec3,
     frames: wp.array(dtype=wp.vec3),
     f: int,
-    place: ReceiverInPlane,
-    adj: ReceiverInPlane,
+    local_receiver: LocalReceiver,
+    adj_receiver: LocalReceiver,
     instance: int,
     adj_frames: wp.array2d(dtype=wp.vec3),
 ):
@@ -126,19 +126,21 @@ def find_in_plane_adjoint(
     if not (scale_u > 0.0 and scale_v > 0.0):
         return wp.vec3()
     offset = point - frames[3 * f]
-    adj_x = adj.at[0] / scale_u
-    adj_y = adj.at[1] / scale_v
-    adj_height = adj.at[2] / scale_u
-    adj_offset = adj_x * place.along_u + adj_y * place.along_v + adj_height * place.normal
+    adj_x = adj_receiver.position[0] / scale_u
+    adj_y = adj_receiver.position[1] / scale_v
+    adj_height = adj_receiver.position[2] / scale_u
+    adj_offset = adj_x * local_receiver.axis_u + adj_y * local_receiver.axis_v + adj_height * local_receiver.normal
     if adj_frames:
-        adj_normal = adj.normal + adj_height * offset
-        adj_u = adj.along_u + adj_x * offset + wp.cross(place.along_v, adj_normal)
-        adj_v = adj.along_v + adj_y * offset + wp.cross(adj_normal, place.along_u)
+        adj_normal = adj_receiver.normal + adj_height * offset
+        adj_u = adj_receiver.axis_u + adj_x * offset + wp.cross(local_receiver.axis_v, adj_normal)
+        adj_v = adj_receiver.axis_v + adj_y * offset + wp.cross(adj_normal, local_receiver.axis_u)
         # of an axis' direction, and of its length
-        adj_u = (adj_u - wp.dot(adj_u, place.along_u) * place.along_u) / scale_u - (
-            adj_x * place.at[0] + adj_height * place.at[2]
-        ) * place.along_u
-        adj_v = (adj_v - wp.dot(adj_v, place.along_v) * place.along_v) / scale_v - (adj_y * place.at[1]) * place.along_v
+        adj_u = (adj_u - wp.dot(adj_u, local_receiver.axis_u) * local_receiver.axis_u) / scale_u - (
+            adj_x * local_receiver.position[0] + adj_height * local_receiver.position[2]
+        ) * local_receiver.axis_u
+        adj_v = (adj_v - wp.dot(adj_v, local_receiver.axis_v) * local_receiver.axis_v) / scale_v - (
+            adj_y * local_receiver.position[1]
+        ) * local_receiver.axis_v
         wp.atomic_add(adj_frames, instance, 3 * f, -adj_offset)
         wp.atomic_add(adj_frames, instance, 3 * f + 1, adj_u)
         wp.atomic_add(adj_frames, instance, 3 * f + 2, adj_v)
@@ -158,7 +160,7 @@ def front_of_adjoint(
     fronts: wp.array3d(dtype=wp.float32),
     grid: PlaneGrid,
     height: float,
-    adj: float,
+    adj_front: float,
     batch: int,
     receiver: int,
     f: int,
@@ -167,9 +169,9 @@ def front_of_adjoint(
     """Add to the gradient of the height."""
     if fronts:
         if adj_fronts:
-            adj_fronts[batch, receiver, f] = adj_fronts[batch, receiver, f] + adj
+            adj_fronts[batch, receiver, f] = adj_fronts[batch, receiver, f] + adj_front
         return float(0.0)
-    return adj * front_weight_slope(grid, height)
+    return adj_front * front_weight_slope(grid, height)
 
 
 @wp.func
@@ -185,22 +187,24 @@ def front_weight_slope(grid: PlaneGrid, height: float):
 
 
 @wp.func
-def on_side(grid: PlaneGrid, place: ReceiverInPlane, is_back: bool):
-    """Where a receiver is above a side: a margin where it is not, and smoothly its height from two of them on."""
-    height = wp.where(is_back, -place.at[2], place.at[2])
-    rise = wp.clamp(height / grid.margin, 0.0, 2.0)
+def position_on_side(grid: PlaneGrid, local_receiver: LocalReceiver, is_back: bool):
+    """Position of a receiver above a side: at least a margin high, and its own height from two margins on."""
+    height = wp.where(is_back, -local_receiver.position[2], local_receiver.position[2])
+    front_ramp = wp.clamp(height / grid.margin, 0.0, 2.0)
     return wp.vec3(
-        place.at[0], place.at[1], grid.margin * (1.0 + 0.25 * rise * rise) + wp.max(height - 2.0 * grid.margin, 0.0)
+        local_receiver.position[0],
+        local_receiver.position[1],
+        grid.margin * (1.0 + 0.25 * front_ramp * front_ramp) + wp.max(height - 2.0 * grid.margin, 0.0),
     )
 
 
 @wp.func
-def toward_side(place: ReceiverInPlane, is_back: bool, direction: wp.vec3):
+def direction_on_side(local_receiver: LocalReceiver, is_back: bool, direction: wp.vec3):
     """Direction along the axes of a plane, and its cosine with a side."""
-    along_normal = wp.dot(direction, place.normal)
+    along_normal = wp.dot(direction, local_receiver.normal)
     return wp.vec3(
-        wp.dot(direction, place.along_u),
-        wp.dot(direction, place.along_v),
+        wp.dot(direction, local_receiver.axis_u),
+        wp.dot(direction, local_receiver.axis_v),
         wp.where(is_back, along_normal, -along_normal),
     )
 
@@ -208,22 +212,22 @@ def toward_side(place: ReceiverInPlane, is_back: bool, direction: wp.vec3):
 @wp.func
 def side_adjoint(
     grid: PlaneGrid,
-    place: ReceiverInPlane,
+    local_receiver: LocalReceiver,
     is_back: bool,
     direction: wp.vec3,
-    adj_at: wp.vec3,
-    adj_toward: wp.vec3,
-    adj_place: ReceiverInPlane,
+    adj_position: wp.vec3,
+    adj_direction: wp.vec3,
+    adj_local_receiver: LocalReceiver,
 ):
-    """Add to the gradient of a receiver over a plane, by the gradients of :func:`on_side` and :func:`toward_side`."""
+    """Add the gradients of :func:`position_on_side` and :func:`direction_on_side` to that of a receiver."""
     sign = wp.where(is_back, -1.0, 1.0)
-    adj_height = sign * wp.clamp(0.5 * sign * place.at[2] / grid.margin, 0.0, 1.0) * adj_at[2]
-    adj = ReceiverInPlane()
-    adj.at = adj_place.at + wp.vec3(adj_at[0], adj_at[1], adj_height)
-    adj.along_u = adj_place.along_u + adj_toward[0] * direction
-    adj.along_v = adj_place.along_v + adj_toward[1] * direction
-    adj.normal = adj_place.normal - (sign * adj_toward[2]) * direction
-    return adj
+    adj_height = sign * wp.clamp(0.5 * sign * local_receiver.position[2] / grid.margin, 0.0, 1.0) * adj_position[2]
+    adj_receiver = LocalReceiver()
+    adj_receiver.position = adj_local_receiver.position + wp.vec3(adj_position[0], adj_position[1], adj_height)
+    adj_receiver.axis_u = adj_local_receiver.axis_u + adj_direction[0] * direction
+    adj_receiver.axis_v = adj_local_receiver.axis_v + adj_direction[1] * direction
+    adj_receiver.normal = adj_local_receiver.normal - (sign * adj_direction[2]) * direction
+    return adj_receiver
 
 
 # ---------------------------------------------------------------------------------------------------- footprints
@@ -239,42 +243,44 @@ class PlaneFootprint:
 
 
 @wp.func
-def find_footprint(scene: PlaneArrays, at: wp.vec3, toward: wp.vec3):
+def find_footprint(scene: PlaneArrays, position: wp.vec3, direction: wp.vec3):
     """Find the footprint of a cell on a side.
 
     Args:
         scene: Has the radius of cells.
-        at: Where the receiver is: along both axes, and its height above the side.
-        toward: Direction of the cell along both axes, and its cosine, above −ρ.
+        position: Where the receiver is: along both axes, and its height above the side.
+        direction: Direction of the cell along both axes, and its cosine, above −ρ.
     """
     footprint = PlaneFootprint()
-    cosine = toward[2]
+    cosine = direction[2]
     if cosine < scene.radius:
         u = 0.5 * cosine * scene.per_radius + 0.5
         cosine = scene.radius * (1.0 / 3.0 + 2.0 / 3.0 * u * u * u)
     footprint.per_cosine = 1.0 / cosine
-    footprint.distance = at[2] * footprint.per_cosine
-    footprint.center = wp.vec2(at[0] + footprint.distance * toward[0], at[1] + footprint.distance * toward[1])
+    footprint.distance = position[2] * footprint.per_cosine
+    footprint.center = wp.vec2(
+        position[0] + footprint.distance * direction[0], position[1] + footprint.distance * direction[1]
+    )
     return footprint
 
 
 @wp.func
 def find_footprint_adjoint(
     scene: PlaneArrays,
-    toward: wp.vec3,
+    direction: wp.vec3,
     footprint: PlaneFootprint,
     adj_distance: float,
     adj_cosine: float,
     adj_center: wp.vec2,
 ):
-    """Gradients of ``at`` and ``toward``, given the footprint's and the mean cosine's, c′."""
-    adj_t = adj_distance + adj_center[0] * toward[0] + adj_center[1] * toward[1]
+    """Gradients of ``position`` and ``direction``, given the footprint's and the mean cosine's, c′."""
+    adj_t = adj_distance + adj_center[0] * direction[0] + adj_center[1] * direction[1]
     adj_c = adj_cosine - adj_t * footprint.distance * footprint.per_cosine
-    if toward[2] < scene.radius:
-        u = 0.5 * toward[2] * scene.per_radius + 0.5
+    if direction[2] < scene.radius:
+        u = 0.5 * direction[2] * scene.per_radius + 0.5
         adj_c = adj_c * u * u
-    adj_at = wp.vec3(adj_center[0], adj_center[1], adj_t * footprint.per_cosine)
-    return adj_at, wp.vec3(adj_center[0] * footprint.distance, adj_center[1] * footprint.distance, adj_c)
+    adj_position = wp.vec3(adj_center[0], adj_center[1], adj_t * footprint.per_cosine)
+    return adj_position, wp.vec3(adj_center[0] * footprint.distance, adj_center[1] * footprint.distance, adj_c)
 
 
 # ---------------------------------------------------------------------------------------------------- radiosity
@@ -282,12 +288,12 @@ def find_footprint_adjoint(
 
 @wp.struct
 class MipFootprint:
-    """Where on a grid a footprint lies, and how large it is there."""
+    """Position and size of a footprint on a grid."""
 
     texel: wp.vec2  # in texels of the finest level, from its corner
     slopes: wp.vec2  # of that by the center in the plane
     level: int  # finer of the two levels
-    part: float  # of the coarser one
+    coarse_share: float  # of the coarser one
     part_slope: float  # of that by the logarithm of the footprint's width
 
 
@@ -316,7 +322,7 @@ def find_mip_footprint(grid: PlaneGrid, scene: PlaneArrays, footprint: PlaneFoot
         mip.level = mip.level + 1
         width *= 0.5
     if width > 1.0 and mip.level < grid.level_count - 1:
-        mip.part = width - 1.0
+        mip.coarse_share = width - 1.0
         mip.part_slope = width
     return mip
 
@@ -331,19 +337,19 @@ def _log_slope(z: float):
 class _Corners:
     """Four texels of a level around a footprint, and where it lies between them."""
 
-    above: int  # the left one above
-    below: int
-    right: int  # step from the right texel to the next: 1, or 0 in a level of one column
+    upper_left: int  # the left one above
+    lower_left: int
+    column_step: int  # step from the right texel to the next: 1, or 0 in a level of one column
     s: float
     t: float
     slopes: wp.vec2  # of s and t by the texel of the finest level
 
 
 @wp.func
-def _find_corners(scene: PlaneArrays, number: int, texel: wp.vec2):
+def _find_corners(scene: PlaneArrays, level_index: int, texel: wp.vec2):
     corners = _Corners()
-    level = scene.levels[number]
-    scale = scene.level_scales[number]
+    level = scene.levels[level_index]
+    scale = scene.level_scales[level_index]
     last_x = float(level[1] - 1)
     last_y = float(level[2] - 1)
     x = texel[0] * scale[0] - 0.5
@@ -357,38 +363,42 @@ def _find_corners(scene: PlaneArrays, number: int, texel: wp.vec2):
     row = wp.min(int(y), wp.max(level[2] - 2, 0))
     corners.s = x - float(column)
     corners.t = y - float(row)
-    corners.right = wp.min(level[1] - 1, 1)
-    corners.above = level[0] + row * level[1] + column
-    corners.below = corners.above + wp.where(level[2] > 1, level[1], 0)
+    corners.column_step = wp.min(level[1] - 1, 1)
+    corners.upper_left = level[0] + row * level[1] + column
+    corners.lower_left = corners.upper_left + wp.where(level[2] > 1, level[1], 0)
     return corners
 
 
 @wp.func
-def _between(texels: wp.array(dtype=wp.vec3), corners: _Corners):
-    above = (1.0 - corners.s) * texels[corners.above] + corners.s * texels[corners.above + corners.right]
-    below = (1.0 - corners.s) * texels[corners.below] + corners.s * texels[corners.below + corners.right]
-    return (1.0 - corners.t) * above + corners.t * below
+def _interpolate_corners(texels: wp.array(dtype=wp.vec3), corners: _Corners):
+    upper_value = (1.0 - corners.s) * texels[corners.upper_left] + corners.s * texels[
+        corners.upper_left + corners.column_step
+    ]
+    lower_value = (1.0 - corners.s) * texels[corners.lower_left] + corners.s * texels[
+        corners.lower_left + corners.column_step
+    ]
+    return (1.0 - corners.t) * upper_value + corners.t * lower_value
 
 
 @wp.func
-def _slopes_between(texels: wp.array(dtype=wp.vec3), corners: _Corners, adj: wp.vec3):
+def _interpolation_slopes(texels: wp.array(dtype=wp.vec3), corners: _Corners, adj_value: wp.vec3):
     """Slopes of the dot product with a color, by the texel of the finest level."""
-    a = wp.dot(adj, texels[corners.above])
-    b = wp.dot(adj, texels[corners.above + corners.right])
-    c = wp.dot(adj, texels[corners.below])
-    d = wp.dot(adj, texels[corners.below + corners.right])
+    a = wp.dot(adj_value, texels[corners.upper_left])
+    b = wp.dot(adj_value, texels[corners.upper_left + corners.column_step])
+    c = wp.dot(adj_value, texels[corners.lower_left])
+    d = wp.dot(adj_value, texels[corners.lower_left + corners.column_step])
     slope_u = (1.0 - corners.t) * (b - a) + corners.t * (d - c)
-    down = (1.0 - corners.s) * (c - a) + corners.s * (d - b)
-    return wp.vec2(corners.slopes[0] * slope_u, corners.slopes[1] * down)
+    slope_t = (1.0 - corners.s) * (c - a) + corners.s * (d - b)
+    return wp.vec2(corners.slopes[0] * slope_u, corners.slopes[1] * slope_t)
 
 
 @wp.func
 def fetch(texels: wp.array(dtype=wp.vec3), scene: PlaneArrays, first_level: int, mip: MipFootprint):
     """Mean over a footprint, in the mip levels from ``first_level`` on."""
-    value = _between(texels, _find_corners(scene, first_level + mip.level, mip.texel))
-    if mip.part > 0.0:
-        coarse = _between(texels, _find_corners(scene, first_level + mip.level + 1, mip.texel))
-        value = (1.0 - mip.part) * value + mip.part * coarse
+    value = _interpolate_corners(texels, _find_corners(scene, first_level + mip.level, mip.texel))
+    if mip.coarse_share > 0.0:
+        coarse = _interpolate_corners(texels, _find_corners(scene, first_level + mip.level + 1, mip.texel))
+        value = (1.0 - mip.coarse_share) * value + mip.coarse_share * coarse
     return value
 
 
@@ -400,16 +410,18 @@ def fetch_adjoint(
     first_level: int,
     footprint: PlaneFootprint,
     mip: MipFootprint,
-    adj: wp.vec3,
+    adj_value: wp.vec3,
 ):
     """Gradients of the place, and of the logarithm of t / √c′, as which the footprint is wide."""
     fine = _find_corners(scene, first_level + mip.level, mip.texel)
-    slopes = _slopes_between(texels, fine, adj)
+    slopes = _interpolation_slopes(texels, fine, adj_value)
     adj_log = float(0.0)
-    if mip.part > 0.0:
+    if mip.coarse_share > 0.0:
         coarse = _find_corners(scene, first_level + mip.level + 1, mip.texel)
-        slopes = (1.0 - mip.part) * slopes + mip.part * _slopes_between(texels, coarse, adj)
-        adj_log = mip.part_slope * wp.dot(adj, _between(texels, coarse) - _between(texels, fine))
+        slopes = (1.0 - mip.coarse_share) * slopes + mip.coarse_share * _interpolation_slopes(texels, coarse, adj_value)
+        adj_log = mip.part_slope * wp.dot(
+            adj_value, _interpolate_corners(texels, coarse) - _interpolate_corners(texels, fine)
+        )
     adj_x = slopes[0] * mip.slopes[0]
     adj_y = slopes[1] * mip.slopes[1]
     if adj_log != 0.0:
@@ -419,16 +431,18 @@ def fetch_adjoint(
 
 
 @wp.func
-def scatter(adj_texels: wp.array(dtype=wp.vec3), scene: PlaneArrays, first_level: int, mip: MipFootprint, adj: wp.vec3):
+def scatter(
+    adj_texels: wp.array(dtype=wp.vec3), scene: PlaneArrays, first_level: int, mip: MipFootprint, adj_value: wp.vec3
+):
     """Add to the gradients of texels: the adjoint of :func:`fetch` by its values."""
-    part = 1.0 - mip.part
+    level_share = 1.0 - mip.coarse_share
     for coarser in range(2):
-        if part > 0.0:
+        if level_share > 0.0:
             c = _find_corners(scene, first_level + mip.level + coarser, mip.texel)
-            above = (part * (1.0 - c.t)) * adj
-            below = (part * c.t) * adj
-            wp.atomic_add(adj_texels, c.above, (1.0 - c.s) * above)
-            wp.atomic_add(adj_texels, c.above + c.right, c.s * above)
-            wp.atomic_add(adj_texels, c.below, (1.0 - c.s) * below)
-            wp.atomic_add(adj_texels, c.below + c.right, c.s * below)
-        part = mip.part
+            adj_upper = (level_share * (1.0 - c.t)) * adj_value
+            adj_lower = (level_share * c.t) * adj_value
+            wp.atomic_add(adj_texels, c.upper_left, (1.0 - c.s) * adj_upper)
+            wp.atomic_add(adj_texels, c.upper_left + c.column_step, c.s * adj_upper)
+            wp.atomic_add(adj_texels, c.lower_left, (1.0 - c.s) * adj_lower)
+            wp.atomic_add(adj_texels, c.lower_left + c.column_step, c.s * adj_lower)
+        level_share = mip.coarse_share

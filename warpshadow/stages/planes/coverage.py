@@ -18,9 +18,9 @@ from warpshadow.device.launch import differentiable, launch
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.cell_coverage import ViewedEdge, coverage_adjoint
 from warpshadow.stages.planes.cells import (
+    LocalReceiver,
     PlaneArrays,
     PlaneFootprint,
-    ReceiverInPlane,
     check_planes,
     fetch,
     fetch_adjoint,
@@ -35,11 +35,11 @@ from warpshadow.stages.planes.sides import (
     VisibleCell,
     footprint_on_side,
     footprint_on_side_adjoint,
-    load_place,
+    load_local_receiver,
     load_side,
     outline_coverage_on_side,
-    place_receiver,
-    place_receiver_adjoint,
+    prepare_receiver,
+    prepare_receiver_adjoint,
     receiver_scratch,
     visible_cell,
 )
@@ -48,11 +48,11 @@ _CELL_COST = 4.0  # mean time of a cell of a receiver [ns], over cells that hit 
 
 
 @wp.struct
-class PlaneCover:
+class PlaneCoverage:
     """Coverage of a cell by a side."""
 
     outline: wp.vec4  # (h, μ), by its outline
-    part: float  # of that, that the mesh covers, by texels
+    mesh_share: float  # of that, that the mesh covers, by texels
     footprint: PlaneFootprint  # of these texels
 
 
@@ -61,19 +61,19 @@ def side_coverage(
     scene: PlaneArrays,
     grid: PlaneGrid,
     side: PlaneSide,
-    place: ReceiverInPlane,
+    local_receiver: LocalReceiver,
     cell: VisibleCell,
     edges: wp.array(dtype=ViewedEdge),
 ):
     """Coverage of a cell by a side."""
-    covered = PlaneCover()
-    covered.part = 1.0
-    covered.outline = outline_coverage_on_side(scene, grid, side, place, cell, edges)
-    if is_covered_by_texels(grid) and covered.outline[0] > 0.0:
-        covered.footprint = footprint_on_side(scene, grid, side, place, cell.direction)
-        mip = find_mip_footprint(grid, scene, covered.footprint)
-        covered.part = fetch(scene.covered, scene, grid.first_level, mip)[0]
-    return covered
+    coverage = PlaneCoverage()
+    coverage.mesh_share = 1.0
+    coverage.outline = outline_coverage_on_side(scene, grid, side, local_receiver, cell, edges)
+    if is_covered_by_texels(grid) and coverage.outline[0] > 0.0:
+        coverage.footprint = footprint_on_side(scene, grid, side, local_receiver, cell.direction)
+        mip = find_mip_footprint(grid, scene, coverage.footprint)
+        coverage.mesh_share = fetch(scene.covered, scene, grid.first_level, mip)[0]
+    return coverage
 
 
 @wp.func
@@ -81,27 +81,29 @@ def side_coverage_adjoint(
     scene: PlaneArrays,
     grid: PlaneGrid,
     side: PlaneSide,
-    place: ReceiverInPlane,
+    local_receiver: LocalReceiver,
     cell: VisibleCell,
-    adj: wp.vec4,
+    adj_coverage: wp.vec4,
     edges: wp.array(dtype=ViewedEdge),
     adj_store: wp.array(dtype=wp.vec3),
 ):
     """Add to the gradients of the receiver relative to the plane, of the side's weight, and of viewed edges."""
-    covered = PlaneCover()
-    covered.part = 1.0
+    coverage = PlaneCoverage()
+    coverage.mesh_share = 1.0
     if side.weight < 1.0 or is_covered_by_texels(grid):
-        covered = side_coverage(scene, grid, side, place, cell, edges)
-        adj_weight = covered.part * wp.dot(adj, covered.outline) / side.weight
+        coverage = side_coverage(scene, grid, side, local_receiver, cell, edges)
+        adj_weight = coverage.mesh_share * wp.dot(adj_coverage, coverage.outline) / side.weight
         adj_store[side.row] = adj_store[side.row] + wp.vec3(0.0, 0.0, adj_weight)
-    if is_covered_by_texels(grid) and covered.outline[0] > 0.0:
-        footprint = covered.footprint
-        adj_part = wp.vec3(wp.dot(adj, covered.outline), 0.0, 0.0)
+    if is_covered_by_texels(grid) and coverage.outline[0] > 0.0:
+        footprint = coverage.footprint
+        adj_part = wp.vec3(wp.dot(adj_coverage, coverage.outline), 0.0, 0.0)
         mip = find_mip_footprint(grid, scene, footprint)
         adj_mip = fetch_adjoint(scene.covered, grid, scene, grid.first_level, footprint, mip, adj_part)
-        footprint_on_side_adjoint(scene, grid, side, place, cell.direction, footprint, adj_mip, 0.0, 0.0, adj_store)
-    weighted = (side.weight * covered.part) * adj
-    coverage_adjoint(edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, weighted)
+        footprint_on_side_adjoint(
+            scene, grid, side, local_receiver, cell.direction, footprint, adj_mip, 0.0, 0.0, adj_store
+        )
+    adj_outline = (side.weight * coverage.mesh_share) * adj_coverage
+    coverage_adjoint(edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, adj_outline)
 
 
 @wp.func
@@ -119,7 +121,7 @@ def is_above_horizon(normal: wp.vec3, direction: wp.vec3):
 
 
 @wp.kernel(enable_backward=False)
-def _cover(
+def _find_coverage(
     first_row: int,
     worker: int,
     # in
@@ -133,33 +135,33 @@ def _cover(
     scratch: wp.array2d(dtype=wp.vec3),
     viewed_edges: wp.array2d(dtype=ViewedEdge),
     # out
-    result: wp.array3d(dtype=wp.vec4),
+    coverages: wp.array3d(dtype=wp.vec4),
 ):
     """A thread owns a receiver."""
-    batch, receiver, scratch_row, side_count = place_receiver(
+    batch, receiver, scratch_row, side_count = prepare_receiver(
         first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
     )
     store, edges = scratch[scratch_row], viewed_edges[scratch_row]
     normal = horizon_normal(horizon_normals, batch, receiver)
-    covered = result[batch, receiver]
+    coverage = coverages[batch, receiver]
     for q in range(directions.shape[0]):
-        covered[q] = wp.vec4()
+        coverage[q] = wp.vec4()
     for i in range(side_count):
         side = load_side(scene, i, store)
         grid = scene.grids[side.f]
-        in_plane = load_place(store, side.f)
+        local_receiver = load_local_receiver(store, side.f)
         if grid.blocks == 1:
             for q in range(directions.shape[0]):
                 direction = directions[q]
-                if is_above_horizon(normal, direction) and covered[q][0] < 1.0:
+                if is_above_horizon(normal, direction) and coverage[q][0] < 1.0:
                     cell = visible_cell(scene, normal, direction)
-                    by_side = side_coverage(scene, grid, side, in_plane, cell, edges)
-                    if by_side.outline[0] > 0.0:
-                        covered[q] = covered[q] + by_side.part * by_side.outline
+                    coverage_of_side = side_coverage(scene, grid, side, local_receiver, cell, edges)
+                    if coverage_of_side.outline[0] > 0.0:
+                        coverage[q] = coverage[q] + coverage_of_side.mesh_share * coverage_of_side.outline
 
 
 @wp.kernel(enable_backward=False)
-def _cover_adjoint(
+def _find_coverage_adjoint(
     first_row: int,
     worker: int,
     # in
@@ -169,7 +171,7 @@ def _cover_adjoint(
     fronts: wp.array3d(dtype=wp.float32),
     scene: PlaneArrays,
     directions: wp.array(dtype=wp.vec3),
-    adj_result: wp.array3d(dtype=wp.vec4),
+    adj_coverages: wp.array3d(dtype=wp.vec4),
     # scratch
     scratch: wp.array2d(dtype=wp.vec3),
     viewed_edges: wp.array2d(dtype=ViewedEdge),
@@ -181,7 +183,7 @@ def _cover_adjoint(
     adj_frames: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver; cells that are covered wholly are taken to have no gradient."""
-    batch, receiver, scratch_row, side_count = place_receiver(
+    batch, receiver, scratch_row, side_count = prepare_receiver(
         first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
     )
     store, edges, adj_store = scratch[scratch_row], viewed_edges[scratch_row], adj_scratch[scratch_row]
@@ -191,14 +193,14 @@ def _cover_adjoint(
     for i in range(side_count):
         side = load_side(scene, i, store)
         grid = scene.grids[side.f]
-        in_plane = load_place(store, side.f)
+        local_receiver = load_local_receiver(store, side.f)
         if grid.blocks == 1:
             for q in range(directions.shape[0]):
-                adj = adj_result[batch, receiver, q]
-                if wp.length_sq(adj) > 0.0 and is_above_horizon(normal, directions[q]):
+                adj_coverage = adj_coverages[batch, receiver, q]
+                if wp.length_sq(adj_coverage) > 0.0 and is_above_horizon(normal, directions[q]):
                     cell = visible_cell(scene, normal, directions[q])
-                    side_coverage_adjoint(scene, grid, side, in_plane, cell, adj, edges, adj_store)
-    place_receiver_adjoint(
+                    side_coverage_adjoint(scene, grid, side, local_receiver, cell, adj_coverage, edges, adj_store)
+    prepare_receiver_adjoint(
         batch,
         receiver,
         side_count,
@@ -248,19 +250,21 @@ def plane_coverage(
     check_planes(planes, points, frames, directions, skip)
     count = common_batch({"points": points, "frames": frames, "fronts": fronts})
     points, fronts = expand(points, count), None if fronts is None else expand_rows(fronts, count)
-    own_radius = cell_radius(len(directions)) if radius is None else radius
-    scene = plane_arrays(planes, own_radius, skip, tiles=radius is None)
-    if not set(planes.blocking) - {skip}:
+    radius_of_cells = cell_radius(len(directions)) if radius is None else radius
+    scene = plane_arrays(planes, radius_of_cells, skip, tiles=radius is None)
+    if not set(planes.is_blocking) - {skip}:
         return None
     cells = constant(directions, wp.vec3, points.device)
     inputs, cost = [points, horizon_normals, frames, fronts, scene, cells], _CELL_COST * cells.size * planes.count
     scratch = receiver_scratch(planes)
     return differentiable(
-        lambda result: launch(_cover, points.size, inputs=inputs, scratch=scratch, outputs=[result], cost=cost),
-        lambda adj_result: launch(
-            _cover_adjoint,
+        lambda coverages: launch(
+            _find_coverage, points.size, inputs=inputs, scratch=scratch, outputs=[coverages], cost=cost
+        ),
+        lambda adj_coverages: launch(
+            _find_coverage_adjoint,
             points.size,
-            inputs=[*inputs, adj_result],
+            inputs=[*inputs, adj_coverages],
             scratch=[*scratch, scratch[0]],
             outputs=[points.grad, None if fronts is None else fronts.grad],
             sums=[frames.grad],

@@ -21,16 +21,16 @@ lifted to, off all of them, k = 5 m:
 
     x + Σ_f (2 front_f − 1) k (1 − (h_f / 2 k)²)² N_f
 
-A body that has sunk into a ground a little has sources of bounced light on its surface below. A point there gets the
-light of the ground's back: the light of the sky there. But receivers do not see the sources, they see spheres. So a
-source is on the side of a plane on which the blocker nearest to its patch is:
+A body that has sunk into a ground a little has patch samples on its surface below. A point there gets the light of the
+ground's back: the light of the sky there. But receivers do not see the patch samples, they see spheres. So a patch
+sample is on the side of a plane on which the blocker nearest to its patch is:
 
     front = S(1.25 (h + c) / r)
 
-c is the height of that sphere's center, and r its radius. A sphere that touches a plane from above has all its sources
-in front, and one that touches it from below, behind; 1.25 leaves room for spheres that bulge out of their mesh. So the
-light at a source changes over the depth of a sphere. With a margin of a tenth of a texel it jumped: the gradient of a
-ball that touches a ground held for steps of 1/5000 of its radius.
+c is the height of that sphere's center, and r its radius. A sphere that touches a plane from above has all its patch
+samples in front, and one that touches it from below, behind; 1.25 leaves room for spheres that bulge out of their mesh.
+So the light at a patch sample changes over the depth of a sphere. With a margin of a tenth of a texel it jumped: the
+gradient of a ball that touches a ground held for steps of 1/5000 of its radius.
 """
 
 from __future__ import annotations
@@ -45,30 +45,31 @@ from warpshadow.device.launch import launch
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 
 _FRONT_RADIUS_RATIO = wp.constant(1.25)
-"""A source is wholly in front of a plane where its height and its sphere's add up to 1/1.25 of the sphere's radius."""
+"""A patch sample is wholly in front of a plane where its height and its sphere's add up to 1/1.25 of the sphere's
+radius."""
 
 _LIFT_IN_MARGINS = wp.constant(5.0)  # how far receivers in a plane are lifted off it, in its margins
 _MIN_BLOCKER_RADIUS = wp.constant(1.0e-18)  # radius up to which a sphere blocks nothing
 
 
 class NearestBlockers(NamedTuple):
-    """Of each source of light the sphere that blocks light nearest to its patch."""
+    """Sphere blockers nearest to the patches of patch samples."""
 
     centers: wp.array  # [batch, sphere] vec3
     radii: wp.array  # [batch, sphere] float32
-    numbers: wp.array  # [point] int32, the sphere of each; −1 for none
+    blocker_indices: wp.array  # [point] int32, the sphere of each; −1 for none
 
     def cut(self, points: slice) -> NearestBlockers:
-        """The same of some points."""
-        return self._replace(numbers=self.numbers[points])
+        """Select some points."""
+        return self._replace(blocker_indices=self.blocker_indices[points])
 
 
 @wp.func
 def _height(point: wp.vec3, frames: wp.array2d(dtype=wp.vec3), instance: int, f: int):
     """Height of a point over a plane that has an area [units of the body]."""
     axis_u = frames[instance, 3 * f + 1]
-    up = wp.normalize(wp.cross(axis_u, frames[instance, 3 * f + 2]))
-    return wp.dot(point - frames[instance, 3 * f], up) / wp.length(axis_u)
+    plane_normal = wp.normalize(wp.cross(axis_u, frames[instance, 3 * f + 2]))
+    return wp.dot(point - frames[instance, 3 * f], plane_normal) / wp.length(axis_u)
 
 
 @wp.func
@@ -93,40 +94,40 @@ def _find_extremes(
     """A thread owns an instance and a plane."""
     batch, f = wp.tid()
     frame_batch = instance_in(batch, frames.shape[0])
-    up = wp.cross(frames[frame_batch, 3 * f + 1], frames[frame_batch, 3 * f + 2])
-    lowest, highest = int(0), int(0)
+    plane_normal = wp.cross(frames[frame_batch, 3 * f + 1], frames[frame_batch, 3 * f + 2])
+    lowest_corner, highest_corner = int(0), int(0)
     corner_batch = instance_in(batch, corners.shape[0])
-    first = corners[corner_batch, 0]
+    first_corner = corners[corner_batch, 0]
     minimum, maximum = float(0.0), float(0.0)
     for corner in range(1, corners.shape[1]):
-        height = wp.dot(corners[corner_batch, corner] - first, up)
+        height = wp.dot(corners[corner_batch, corner] - first_corner, plane_normal)
         if height < minimum:
-            lowest, minimum = corner, height
+            lowest_corner, minimum = corner, height
         if height > maximum:
-            highest, maximum = corner, height
-    extremes[batch, f] = wp.vec2i(lowest, highest)
+            highest_corner, maximum = corner, height
+    extremes[batch, f] = wp.vec2i(lowest_corner, highest_corner)
 
 
 @wp.kernel
-def _find_leanings(
+def _find_body_sides(
     # in
     corners: wp.array2d(dtype=wp.vec3),
     frames: wp.array2d(dtype=wp.vec3),
     grids: wp.array(dtype=PlaneGrid),
     extremes: wp.array2d(dtype=wp.vec2i),
     # out
-    leanings: wp.array2d(dtype=wp.float32),
+    body_sides: wp.array2d(dtype=wp.float32),
 ):
     """A thread owns an instance and a plane."""
     batch, f = wp.tid()
     frame_batch = instance_in(batch, frames.shape[0])
-    leaning = float(0.0)
+    side_of_body = float(0.0)
     if wp.length_sq(frames[frame_batch, 3 * f + 1]) > 0.0:
         corner_batch = instance_in(batch, corners.shape[0])
-        low = _height(corners[corner_batch, extremes[batch, f][0]], frames, frame_batch, f)
-        high = _height(corners[corner_batch, extremes[batch, f][1]], frames, frame_batch, f)
-        leaning = wp.clamp((high + low) / wp.max(high - low, grids[f].margin), -1.0, 1.0)
-    leanings[batch, f] = leaning
+        min_height = _height(corners[corner_batch, extremes[batch, f][0]], frames, frame_batch, f)
+        max_height = _height(corners[corner_batch, extremes[batch, f][1]], frames, frame_batch, f)
+        side_of_body = wp.clamp((max_height + min_height) / wp.max(max_height - min_height, grids[f].margin), -1.0, 1.0)
+    body_sides[batch, f] = side_of_body
 
 
 @wp.kernel
@@ -134,10 +135,10 @@ def _find_fronts(
     # in
     points: wp.array2d(dtype=wp.vec3),
     normals: wp.array2d(dtype=wp.vec3),
-    leanings: wp.array2d(dtype=wp.float32),
+    body_sides: wp.array2d(dtype=wp.float32),
     centers: wp.array2d(dtype=wp.vec3),
     radii: wp.array2d(dtype=wp.float32),
-    numbers: wp.array(dtype=wp.int32),
+    blocker_indices: wp.array(dtype=wp.int32),
     frames: wp.array2d(dtype=wp.vec3),
     grids: wp.array(dtype=PlaneGrid),
     # out
@@ -150,26 +151,32 @@ def _find_fronts(
     front = float(0.0)
     if wp.length_sq(axis_u) > 0.0:
         height = _height(points[instance_in(batch, points.shape[0]), receiver], frames, frame_batch, f)
-        number = int(-1)
-        if numbers:
-            number = numbers[receiver]
+        blocker_index = int(-1)
+        if blocker_indices:
+            blocker_index = blocker_indices[receiver]
         radius = float(0.0)
-        if number >= 0:
-            radius = radii[instance_in(batch, radii.shape[0]), number] / wp.length(axis_u)
+        if blocker_index >= 0:
+            radius = radii[instance_in(batch, radii.shape[0]), blocker_index] / wp.length(axis_u)
         if radius > _MIN_BLOCKER_RADIUS:
-            middle = _height(centers[instance_in(batch, centers.shape[0]), number], frames, frame_batch, f)
-            if _FRONT_RADIUS_RATIO * wp.abs(height + middle) < radius:
-                front = wp.smoothstep(-1.0, 1.0, _FRONT_RADIUS_RATIO * (height + middle) / radius)
+            center_height = _height(
+                centers[instance_in(batch, centers.shape[0]), blocker_index], frames, frame_batch, f
+            )
+            if _FRONT_RADIUS_RATIO * wp.abs(height + center_height) < radius:
+                front = wp.smoothstep(-1.0, 1.0, _FRONT_RADIUS_RATIO * (height + center_height) / radius)
             else:
-                front = wp.where(height + middle > 0.0, 1.0, 0.0)
+                front = wp.where(height + center_height > 0.0, 1.0, 0.0)
         elif wp.abs(height) < 2.0 * grids[f].margin:
-            leaning = float(1.0)
-            if leanings:
-                leaning = leanings[instance_in(batch, leanings.shape[0]), f]
-            up = wp.normalize(wp.cross(axis_u, frames[frame_batch, 3 * f + 2]))
-            facing = wp.dot(normals[instance_in(batch, normals.shape[0]), receiver], up)
+            side_of_body = float(1.0)
+            if body_sides:
+                side_of_body = body_sides[instance_in(batch, body_sides.shape[0]), f]
+            plane_normal = wp.normalize(wp.cross(axis_u, frames[frame_batch, 3 * f + 2]))
+            facing_cosine = wp.dot(normals[instance_in(batch, normals.shape[0]), receiver], plane_normal)
             front = wp.smoothstep(
-                -1.0, 1.0, leaning + (1.0 - leaning * leaning) * facing + _over_margin(height, grids[f].margin)
+                -1.0,
+                1.0,
+                side_of_body
+                + (1.0 - side_of_body * side_of_body) * facing_cosine
+                + _over_margin(height, grids[f].margin),
             )
         else:
             front = wp.where(height > 0.0, 1.0, 0.0)
@@ -191,40 +198,40 @@ def find_fronts(
         normals: Their unit normals, vec3 of shape [batch, receiver].
         corners: Vertices of their body that are farthest out [scene units], vec3 of shape [batch, corner]. None
             where it is not known: receivers are in front down to the plane itself.
-        spheres: The blockers nearest to sources of light; None where no receiver is one.
+        spheres: The blockers nearest to patch samples; None where no receiver is one.
         frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`.PlaneBlockers.frames`. Any batch
             may be 1.
     Returns:
         Float32 of shape [batch, receiver, plane], 0 to 1.
     Differentiable: points, normals, corners, centers and radii of spheres, frames.
     """
-    centers, radii, numbers = (None, None, None) if spheres is None else spheres
+    centers, radii, blocker_indices = (None, None, None) if spheres is None else spheres
     check.shape("normals", normals.shape, ("batch", points.shape[1]))
     check.shape("frames", frames.shape, ("batch", 3 * planes.count))
-    if numbers is not None:
-        check.shape("numbers", numbers.shape, (points.shape[1],))
+    if blocker_indices is not None:
+        check.shape("blocker_indices", blocker_indices.shape, (points.shape[1],))
     arguments = {"points": points, "normals": normals, "centers": centers, "radii": radii, "frames": frames}
     count = common_batch({**arguments, "corners": corners})
-    leanings = None if corners is None else _leanings(corners, frames, planes)
+    body_sides = None if corners is None else _body_sides(corners, frames, planes)
     fronts = wp.empty((count, points.shape[1], planes.count), dtype=wp.float32, device=points.device)
-    inputs = [points, normals, leanings, centers, radii, numbers, frames, planes.grids]
+    inputs = [points, normals, body_sides, centers, radii, blocker_indices, frames, planes.grids]
     launch(_find_fronts, fronts.shape, inputs=inputs, outputs=[fronts])
     return fronts
 
 
-def _leanings(corners: wp.array, frames: wp.array, planes: PlaneBlockers) -> wp.array:
-    """On which side of each plane a body lies, b, float32 of shape [batch, plane]. Differentiable: corners, frames."""
+def _body_sides(corners: wp.array, frames: wp.array, planes: PlaneBlockers) -> wp.array:
+    """Find the side b of each plane on which a body lies, [batch, plane]. Differentiable: corners, frames."""
     count = common_batch({"corners": corners, "frames": frames})
     extremes = wp.empty((count, planes.count), dtype=wp.vec2i, device=corners.device)
     launch(_find_extremes, extremes.shape, inputs=[corners, frames], outputs=[extremes])
-    leanings = wp.empty((count, planes.count), dtype=wp.float32, device=corners.device)
+    body_sides = wp.empty((count, planes.count), dtype=wp.float32, device=corners.device)
     inputs = [corners, frames, planes.grids, extremes]
-    launch(_find_leanings, leanings.shape, inputs=inputs, outputs=[leanings])
-    return leanings
+    launch(_find_body_sides, body_sides.shape, inputs=inputs, outputs=[body_sides])
+    return body_sides
 
 
 @wp.kernel
-def _lift(
+def _lift_points(
     # in
     points: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
@@ -238,17 +245,19 @@ def _lift(
     batch, receiver = wp.tid()
     frame_batch = instance_in(batch, frames.shape[0])
     point = points[instance_in(batch, points.shape[0]), receiver]
-    result = point
+    lifted_point = point
     for f in range(grids.shape[0]):
         axis_u = frames[frame_batch, 3 * f + 1]
         if f != skip and wp.length_sq(axis_u) > 0.0:
             height = _height(point, frames, frame_batch, f) / (2.0 * _LIFT_IN_MARGINS * grids[f].margin)
             if wp.abs(height) < 1.0:
-                near = 1.0 - height * height
-                up = wp.normalize(wp.cross(axis_u, frames[frame_batch, 3 * f + 2]))
+                nearness = 1.0 - height * height
+                plane_normal = wp.normalize(wp.cross(axis_u, frames[frame_batch, 3 * f + 2]))
                 side = 2.0 * fronts[batch, receiver, f] - 1.0
-                result += side * near * near * _LIFT_IN_MARGINS * grids[f].margin * wp.length(axis_u) * up
-    lifted[batch, receiver] = result
+                lifted_point += (
+                    side * nearness * nearness * _LIFT_IN_MARGINS * grids[f].margin * wp.length(axis_u) * plane_normal
+                )
+    lifted[batch, receiver] = lifted_point
 
 
 def lifted_points(
@@ -266,5 +275,5 @@ def lifted_points(
     """
     lifted = wp.empty(fronts.shape[:2], dtype=wp.vec3, device=points.device)
     inputs = [points, fronts, frames, planes.grids, -1 if skip is None else skip]
-    launch(_lift, lifted.shape, inputs=inputs, outputs=[lifted])
+    launch(_lift_points, lifted.shape, inputs=inputs, outputs=[lifted])
     return lifted

@@ -61,13 +61,13 @@ class PlaneTexture(NamedTuple):
         """Widths and heights of the texels at their middles, [row, column, 2]."""
         count = np.array(self.covered.shape[::-1])
         edges = [
-            self.spread * stretched(np.linspace(low, high, number + 1))
-            for low, high, number in zip(self.low, self.high, count, strict=True)
+            self.spread * stretched(np.linspace(low, high, axis_count + 1))
+            for low, high, axis_count in zip(self.low, self.high, count, strict=True)
         ]
         return np.stack(np.meshgrid(*map(np.diff, edges)), axis=-1)
 
     def in_texels(self, points: np.ndarray) -> np.ndarray:
-        """Where points (a, b) are [..., 2], in texels from the corner ``low``."""
+        """Map points (a, b) [..., 2] to texels, counted from the corner ``low``."""
         height, width = self.covered.shape
         return (squeezed(points / self.spread) - self.low) / (self.high - self.low) * (width, height)
 
@@ -77,12 +77,14 @@ class PlaneTexture(NamedTuple):
         column, row = np.clip(self.in_texels(points).astype(int), 0, (width - 1, height - 1)).T
         return row * width + column
 
-    def points(self, split: int) -> np.ndarray:
-        """Points evenly over every texel, ``split`` along each side: [row · split, column · split, 2]."""
+    def points(self, points_per_texel: int) -> np.ndarray:
+        """Points evenly over every texel, ``points_per_texel`` along each side: [row · split, column · split, 2]."""
         height, width = self.covered.shape
         axes = [
-            self.spread * stretched(low + (high - low) * (np.arange(number) + 0.5) / number)
-            for low, high, number in zip(self.low, self.high, (width * split, height * split), strict=True)
+            self.spread * stretched(low + (high - low) * (np.arange(axis_count) + 0.5) / axis_count)
+            for low, high, axis_count in zip(
+                self.low, self.high, (width * points_per_texel, height * points_per_texel), strict=True
+            )
         ]
         return np.stack(np.meshgrid(*axes), axis=-1)
 
@@ -128,32 +130,32 @@ def find_grid(
     frame = _smallest_rectangle(corners.reshape(-1, 3), normal)
     points = corners.reshape(-1, 3) @ frame.T
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
-    middle, spread = (low + high) / 2, _EVEN_SPREAD * (high - low).max()
+    center, spread = (low + high) / 2, _EVEN_SPREAD * (high - low).max()
     if others is not None and len(others):
-        near = others @ frame.T[:, :2]
-        reach = np.ptp(near, axis=0).max() / 2
-        if reach > 0:
-            middle, spread = (near.min(axis=0) + near.max(axis=0)) / 2, min(reach, spread)
-    origin = frame.T @ [*middle, points[:, 2].mean()]
-    low, high = squeezed((low - middle) / spread), squeezed((high - middle) / spread)
+        nearby_points = others @ frame.T[:, :2]
+        nearby_radius = np.ptp(nearby_points, axis=0).max() / 2
+        if nearby_radius > 0:
+            center, spread = (nearby_points.min(axis=0) + nearby_points.max(axis=0)) / 2, min(nearby_radius, spread)
+    origin = frame.T @ [*center, points[:, 2].mean()]
+    low, high = squeezed((low - center) / spread), squeezed((high - center) / spread)
     width, height = np.maximum(np.rint(_GRID * (high - low) / (high - low).max()), 1).astype(int)
     sides = 2 if is_two_sided else 1
     corners = ((corners - origin) @ frame.T)[..., :2]
-    _, first, place = np.unique(positions, axis=0, return_index=True, return_inverse=True)
-    in_plane = (positions[first].astype(np.float64) - origin) @ frame[:2].T
-    outline = in_plane[find_outline(in_plane, place.reshape(-1)[faces])]
-    whole = np.ones((height, width), np.float32)
-    grid = PlaneTexture(frame, origin, float(spread), low, high, whole, sides, outline)
-    covered, result = _find_covered(grid, corners)
-    return grid._replace(covered=covered), result
+    _, unique_vertices, vertex_index = np.unique(positions, axis=0, return_index=True, return_inverse=True)
+    vertices_in_plane = (positions[unique_vertices].astype(np.float64) - origin) @ frame[:2].T
+    outline = vertices_in_plane[find_outline(vertices_in_plane, vertex_index.reshape(-1)[faces])]
+    full_coverage = np.ones((height, width), np.float32)
+    grid = PlaneTexture(frame, origin, float(spread), low, high, full_coverage, sides, outline)
+    covered, covered_points = _find_covered(grid, corners)
+    return grid._replace(covered=covered), covered_points
 
 
 def _smallest_rectangle(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Axes of the smallest rectangle around points of a plane, and its normal, as rows."""
     from scipy.spatial import ConvexHull
 
-    aside = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    basis = np.stack([aside, np.cross(normal, aside)]) / np.linalg.norm(aside)
+    tangent = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    basis = np.stack([tangent, np.cross(normal, tangent)]) / np.linalg.norm(tangent)
     flat = points @ basis.T
     hull = flat[ConvexHull(flat).vertices]
     edges = np.roll(hull, -1, axis=0) - hull
@@ -161,8 +163,8 @@ def _smallest_rectangle(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
     edges = edges / np.linalg.norm(edges, axis=1, keepdims=True)
     normals_of_edges = np.stack([-edges[:, 1], edges[:, 0]], axis=1)
     sizes = np.ptp(hull @ edges.T, axis=0) * np.ptp(hull @ normals_of_edges.T, axis=0)
-    best = np.flatnonzero(sizes < sizes.min() * (1 + 1e-6))[0]
-    return np.stack([edges[best] @ basis, normals_of_edges[best] @ basis, normal])
+    smallest = np.flatnonzero(sizes < sizes.min() * (1 + 1e-6))[0]
+    return np.stack([edges[smallest] @ basis, normals_of_edges[smallest] @ basis, normal])
 
 
 def _find_covered(grid: PlaneTexture, corners: np.ndarray) -> tuple[np.ndarray, CoveredPoints]:
@@ -170,36 +172,40 @@ def _find_covered(grid: PlaneTexture, corners: np.ndarray) -> tuple[np.ndarray, 
     height, width = grid.covered.shape
     points = grid.points(_TESTS_PER_SIDE)
     shape = np.array([width, height]) * _TESTS_PER_SIDE
-    places = grid.in_texels(corners) * _TESTS_PER_SIDE - 0.5
-    first = np.maximum(np.ceil(places.min(axis=1) - _ROUNDING), 0).astype(int)
-    last = np.minimum(np.floor(places.max(axis=1) + _ROUNDING), shape - 1).astype(int)
-    counts = np.maximum(last - first + 1, 0)
+    grid_coordinates = grid.in_texels(corners) * _TESTS_PER_SIDE - 0.5
+    test_starts = np.maximum(np.ceil(grid_coordinates.min(axis=1) - _ROUNDING), 0).astype(int)
+    test_ends = np.minimum(np.floor(grid_coordinates.max(axis=1) + _ROUNDING), shape - 1).astype(int)
+    counts = np.maximum(test_ends - test_starts + 1, 0)
     faces = np.repeat(np.arange(len(corners)), counts.prod(axis=1))
-    number = np.arange(len(faces)) - np.repeat(
+    point_indices = np.arange(len(faces)) - np.repeat(
         np.cumsum(counts.prod(axis=1)) - counts.prod(axis=1), counts.prod(axis=1)
     )
-    column = first[faces, 0] + number % counts[faces, 0]
-    row = first[faces, 1] + number // counts[faces, 0]
+    column = test_starts[faces, 0] + point_indices % counts[faces, 0]
+    row = test_starts[faces, 1] + point_indices // counts[faces, 0]
     barycentrics = _barycentrics(corners[faces], points[row, column])
-    inside = (barycentrics > -_ROUNDING).all(axis=1)
-    owner = np.full(points.shape[:2], -1)
-    owner[row[inside], column[inside]] = np.flatnonzero(inside)
-    tested = owner.reshape(height, _TESTS_PER_SIDE, width, _TESTS_PER_SIDE).swapaxes(1, 2).reshape(height * width, -1)
-    covered = (tested >= 0).mean(axis=1)
-    from_middle = np.abs(np.arange(_TESTS_PER_SIDE**2) - _TESTS_PER_SIDE**2 // 2).argsort(kind="stable")
-    best = (tested[:, from_middle] >= 0).argmax(axis=1)
-    chosen = tested[np.arange(len(tested)), from_middle[best]]
-    texels = np.flatnonzero(chosen >= 0)
-    result = CoveredPoints(faces[chosen[texels]], np.maximum(barycentrics[chosen[texels]], 0), texels)
-    return covered.reshape(height, width).astype(np.float32), result
+    is_inside = (barycentrics > -_ROUNDING).all(axis=1)
+    owners = np.full(points.shape[:2], -1)
+    owners[row[is_inside], column[is_inside]] = np.flatnonzero(is_inside)
+    tested_points = (
+        owners.reshape(height, _TESTS_PER_SIDE, width, _TESTS_PER_SIDE).swapaxes(1, 2).reshape(height * width, -1)
+    )
+    covered = (tested_points >= 0).mean(axis=1)
+    by_centrality = np.abs(np.arange(_TESTS_PER_SIDE**2) - _TESTS_PER_SIDE**2 // 2).argsort(kind="stable")
+    nearest_test = (tested_points[:, by_centrality] >= 0).argmax(axis=1)
+    chosen_owners = tested_points[np.arange(len(tested_points)), by_centrality[nearest_test]]
+    texels = np.flatnonzero(chosen_owners >= 0)
+    covered_points = CoveredPoints(
+        faces[chosen_owners[texels]], np.maximum(barycentrics[chosen_owners[texels]], 0), texels
+    )
+    return covered.reshape(height, width).astype(np.float32), covered_points
 
 
 def _barycentrics(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Barycentric coordinates of points [item, 2] in triangles [item, 3, 2]; NaN in triangles without an area."""
     a, b, c = np.moveaxis(triangles - points[:, None], 1, 0)
-    parts = np.stack([_cross(b, c), _cross(c, a), _cross(a, b)], axis=1)
-    total = parts.sum(axis=1, keepdims=True)
-    return parts / np.where(total != 0, total, np.nan)
+    areas = np.stack([_cross(b, c), _cross(c, a), _cross(a, b)], axis=1)
+    area_sum = areas.sum(axis=1, keepdims=True)
+    return areas / np.where(area_sum != 0, area_sum, np.nan)
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -33,10 +33,10 @@ from warpshadow.stages.planes.coverage import (
 from warpshadow.stages.planes.prepared import PlaneBlockers
 from warpshadow.stages.planes.sides import (
     SIDE_ROWS,
-    load_place,
+    load_local_receiver,
     load_side,
-    place_receiver,
-    place_receiver_adjoint,
+    prepare_receiver,
+    prepare_receiver_adjoint,
     receiver_scratch,
     visible_cell,
 )
@@ -50,7 +50,7 @@ _CELL_COST = 4.0  # mean time of a cell of a receiver [ns]: few are looked at
 
 @wp.func
 def _partial_weight(coverage: float):
-    """How much a cell counts as covered in part."""
+    """Weight of a cell as partially covered."""
     return wp.clamp(_PER_RAMP * wp.min(coverage, 1.0 - coverage), 0.0, 1.0)
 
 
@@ -76,7 +76,7 @@ def _sample_weight(scene: PlaneArrays, normal: wp.vec3, direction: wp.vec3):
 
 
 @wp.func
-def _covered(
+def _find_coverage(
     scene: PlaneArrays,
     direction: wp.vec3,
     normal: wp.vec3,
@@ -85,19 +85,19 @@ def _covered(
     edges: wp.array(dtype=ViewedEdge),
 ):
     """Σ_k h_k of a direction."""
-    total = float(0.0)
+    weighted_sum = float(0.0)
     cell = visible_cell(scene, normal, direction)
     for i in range(side_count):
         side = load_side(scene, i, store)
         grid = scene.grids[side.f]
-        if grid.blocks == 1 and total < 1.0:
-            covered = side_coverage(scene, grid, side, load_place(store, side.f), cell, edges)
-            total += covered.outline[0] * covered.part
-    return total
+        if grid.blocks == 1 and weighted_sum < 1.0:
+            covered = side_coverage(scene, grid, side, load_local_receiver(store, side.f), cell, edges)
+            weighted_sum += covered.outline[0] * covered.mesh_share
+    return weighted_sum
 
 
 @wp.func
-def _mean_covered(
+def _find_mean_coverage(
     scene: PlaneArrays,
     samples: wp.array(dtype=wp.vec3),
     normal: wp.vec3,
@@ -106,16 +106,16 @@ def _mean_covered(
     edges: wp.array(dtype=ViewedEdge),
 ):
     """Mean coverage of the directions drawn from a cell, by their weights, and the sum of these."""
-    total = float(0.0)
+    weighted_sum = float(0.0)
     weights = float(0.0)
     for s in range(samples.shape[0]):
         weight = _sample_weight(scene, normal, samples[s])
         if weight > 0.0:
-            total += weight * wp.min(1.0, _covered(scene, samples[s], normal, side_count, store, edges))
+            weighted_sum += weight * wp.min(1.0, _find_coverage(scene, samples[s], normal, side_count, store, edges))
             weights += weight
     if weights > 0.0:
-        total = total / weights
-    return total, weights
+        weighted_sum = weighted_sum / weights
+    return weighted_sum, weights
 
 
 @wp.kernel(enable_backward=False)
@@ -134,10 +134,10 @@ def _sample_light(
     scratch: wp.array2d(dtype=wp.vec3),
     viewed_edges: wp.array2d(dtype=ViewedEdge),
     # out
-    result: wp.array3d(dtype=wp.vec4),
+    refined: wp.array3d(dtype=wp.vec4),
 ):
     """A thread owns a receiver."""
-    batch, receiver, scratch_row, side_count = place_receiver(
+    batch, receiver, scratch_row, side_count = prepare_receiver(
         first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
     )
     store, edges = scratch[scratch_row], viewed_edges[scratch_row]
@@ -147,10 +147,10 @@ def _sample_light(
         coverage = cell[0]
         weight = _partial_weight(coverage)
         if weight > 0.0:
-            mean, weights = _mean_covered(scene, samples[q], normal, side_count, store, edges)
+            mean_coverage, weights = _find_mean_coverage(scene, samples[q], normal, side_count, store, edges)
             if weights > 0.0:
-                coverage = coverage + weight * (mean - coverage)
-        result[batch, receiver, q] = wp.vec4(coverage, cell[1], cell[2], cell[3])
+                coverage = coverage + weight * (mean_coverage - coverage)
+        refined[batch, receiver, q] = wp.vec4(coverage, cell[1], cell[2], cell[3])
 
 
 @wp.kernel(enable_backward=False)
@@ -165,7 +165,7 @@ def _sample_light_adjoint(
     fronts: wp.array3d(dtype=wp.float32),
     scene: PlaneArrays,
     samples: wp.array2d(dtype=wp.vec3),
-    adj_result: wp.array3d(dtype=wp.vec4),
+    adj_refined: wp.array3d(dtype=wp.vec4),
     # scratch
     scratch: wp.array2d(dtype=wp.vec3),
     viewed_edges: wp.array2d(dtype=ViewedEdge),
@@ -178,7 +178,7 @@ def _sample_light_adjoint(
     adj_frames: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver; a direction that is covered wholly has no gradient."""
-    batch, receiver, scratch_row, side_count = place_receiver(
+    batch, receiver, scratch_row, side_count = prepare_receiver(
         first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
     )
     store, edges, adj_store = scratch[scratch_row], viewed_edges[scratch_row], adj_scratch[scratch_row]
@@ -187,31 +187,31 @@ def _sample_light_adjoint(
         adj_store[k] = wp.vec3()
     for q in range(samples.shape[0]):
         coverage = covered[batch, receiver, q][0]
-        adj_cell = adj_result[batch, receiver, q]
-        adj = adj_cell[0]
+        adj_cell = adj_refined[batch, receiver, q]
+        adj_share = adj_cell[0]
         weight = _partial_weight(coverage)
         slope = float(1.0)
-        if adj != 0.0 and weight > 0.0:
-            mean, weights = _mean_covered(scene, samples[q], normal, side_count, store, edges)
+        if adj_share != 0.0 and weight > 0.0:
+            mean_coverage, weights = _find_mean_coverage(scene, samples[q], normal, side_count, store, edges)
             if weights > 0.0:
-                slope = 1.0 - weight + _partial_weight_slope(coverage) * (mean - coverage)
+                slope = 1.0 - weight + _partial_weight_slope(coverage) * (mean_coverage - coverage)
             for s in range(samples.shape[1]):
                 direction = samples[q, s]
                 share = _sample_weight(scene, normal, direction)
-                if share > 0.0 and _covered(scene, direction, normal, side_count, store, edges) < 1.0:
+                if share > 0.0 and _find_coverage(scene, direction, normal, side_count, store, edges) < 1.0:
                     cell = visible_cell(scene, normal, direction)
-                    adj_part = wp.vec4(weight * adj * share / weights, 0.0, 0.0, 0.0)
+                    adj_part = wp.vec4(weight * adj_share * share / weights, 0.0, 0.0, 0.0)
                     for i in range(side_count):
                         side = load_side(scene, i, store)
                         grid = scene.grids[side.f]
                         if grid.blocks == 1:
-                            in_plane = load_place(store, side.f)
-                            side_coverage_adjoint(scene, grid, side, in_plane, cell, adj_part, edges, adj_store)
+                            local_receiver = load_local_receiver(store, side.f)
+                            side_coverage_adjoint(scene, grid, side, local_receiver, cell, adj_part, edges, adj_store)
         if adj_covered:
             adj_covered[batch, receiver, q] = adj_covered[batch, receiver, q] + wp.vec4(
-                slope * adj, adj_cell[1], adj_cell[2], adj_cell[3]
+                slope * adj_share, adj_cell[1], adj_cell[2], adj_cell[3]
             )
-    place_receiver_adjoint(
+    prepare_receiver_adjoint(
         batch,
         receiver,
         side_count,
@@ -262,11 +262,13 @@ def coverage_of_light(
     inputs = [points, horizon_normals, covered, frames, fronts, scene, samples_on_device]
     scratch, cost = receiver_scratch(planes), _CELL_COST * len(directions)
     return differentiable(
-        lambda result: launch(_sample_light, points.size, inputs=inputs, scratch=scratch, outputs=[result], cost=cost),
-        lambda adj_result: launch(
+        lambda refined: launch(
+            _sample_light, points.size, inputs=inputs, scratch=scratch, outputs=[refined], cost=cost
+        ),
+        lambda adj_refined: launch(
             _sample_light_adjoint,
             points.size,
-            inputs=[*inputs, adj_result],
+            inputs=[*inputs, adj_refined],
             scratch=[*scratch, scratch[0]],
             outputs=[points.grad, *(None if array is None else array.grad for array in (covered, fronts))],
             sums=[frames.grad],

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 MAX_EDGES = 128
 """Edges of an outline at most: beyond, it is that of the rectangle, of which the mesh takes its share by texels."""
 
-_BESIDE = 0.002  # how much texels count in their neighbors, which have their light if nothing of their own is seen
+_NEIGHBOR_WEIGHT = (
+    0.002  # how much texels count in their neighbors, which have their light if nothing of their own is seen
+)
 _MARGIN = 0.001  # margin of planes, in widths of the smallest texel
 
 
@@ -61,7 +63,7 @@ class PlaneBlockers:
 
     Args:
         count: Number of planes.
-        blocking: The plane blockers.
+        is_blocking: The plane blockers.
         grids: Their grids, of shape [plane].
         levels: First texel, width and height of each mip level, for each side of each plane, vec3i of shape [level].
         level_scales: Its texels for one of the finest level, vec2 of shape [level].
@@ -75,7 +77,7 @@ class PlaneBlockers:
     """
 
     count: int
-    blocking: tuple[int, ...]
+    is_blocking: tuple[int, ...]
     grids: wp.array
     levels: wp.array
     level_scales: wp.array
@@ -87,7 +89,9 @@ class PlaneBlockers:
     has_holes: bool
 
     @staticmethod
-    def of(bodies: Sequence[PlaneBody], patch_count: int, vertex_count: int, *, device: wp.DeviceLike) -> PlaneBlockers:
+    def from_bodies(
+        bodies: Sequence[PlaneBody], patch_count: int, vertex_count: int, *, device: wp.DeviceLike
+    ) -> PlaneBlockers:
         """Prepare flat bodies, among bodies that have so many patches and vertices together; 0 if none sends light."""
         from scipy.sparse import vstack
 
@@ -100,14 +104,16 @@ class PlaneBlockers:
             edges.append((grid.outline if is_exact else grid.rectangle()).reshape(-1, 4))
             matrices = _halvings(*grid.covered.shape)
             for side in range(grid.sides):
-                for matrix, blurred, (height, width) in matrices:
+                for matrix, level_matrix, (height, width) in matrices:
                     levels.append((texel_count, width, height))
                     scales.append((width / grid.covered.shape[1], height / grid.covered.shape[0]))
                     texel_count += width * height
                     covered.append(matrix @ grid.covered.ravel())
                     if patch_count:
                         first = body.first_patch + side * grid.covered.size
-                        pyramids.append(_shifted(blurred.multiply(grid.covered.ravel()).tocsr(), first, patch_count))
+                        pyramids.append(
+                            _shifted(level_matrix.multiply(grid.covered.ravel()).tocsr(), first, patch_count)
+                        )
             grids.append(_kernel_grid(body, first_level, len(matrices), first_edge, edges[-1]))
             grids[-1].is_covered_by_texels = int(not is_exact)
             frames.append(_frame_matrix(body, vertex_count))
@@ -115,20 +121,20 @@ class PlaneBlockers:
         vectors = outlines[:, 2:] - outlines[:, :2]
         return PlaneBlockers(
             len(bodies),
-            tuple(number for number, body in enumerate(bodies) if body.blocks),
+            tuple(body_index for body_index, body in enumerate(bodies) if body.blocks),
             wp.array(grids, dtype=PlaneGrid, device=device),
             wp.array(np.array(levels), dtype=wp.vec3i, device=device),
             wp.array(np.array(scales), dtype=wp.vec2, device=device),
             wp.array(np.repeat(np.concatenate(covered)[:, None], 3, axis=1), dtype=wp.vec3, device=device),
             wp.array(outlines, dtype=wp.vec4, device=device),
             wp.array(vectors / np.linalg.norm(vectors, axis=1, keepdims=True), dtype=wp.vec2, device=device),
-            SparseMatrix.of(vstack(pyramids), device=device) if patch_count else None,
-            SparseMatrix.of(vstack(frames), device=device),
+            SparseMatrix.from_matrix(vstack(pyramids), device=device) if patch_count else None,
+            SparseMatrix.from_matrix(vstack(frames), device=device),
             any(body.blocks and not body.grid.is_whole for body in bodies),
         )
 
     def frames(self, positions: wp.array) -> wp.array:
-        """Where planes are: origin, and both axes, each as long as the body's scale.
+        """Frames of planes: origin, and both axes, each as long as the body's scale.
 
         Args:
             positions: Vertices of all bodies [scene units], vec3 of shape [batch, vertex]. Three of each body count, so
@@ -151,17 +157,17 @@ def _halvings(height: int, width: int) -> list[tuple[csr_matrix, csr_matrix, tup
     from scipy.sparse import diags, kron
 
     def blur(count: int) -> csr_matrix:
-        return diags([_BESIDE, 1.0, _BESIDE], [-1, 0, 1], shape=(count, count)).tocsr()
+        return diags([_NEIGHBOR_WEIGHT, 1.0, _NEIGHBOR_WEIGHT], [-1, 0, 1], shape=(count, count)).tocsr()
 
     sizes = [(height, width)]
     while max(sizes[-1]) > 1:
         sizes.append((max(sizes[-1][0] // 2, 1), max(sizes[-1][1] // 2, 1)))
-    result = []
+    levels = []
     for rows, columns in sizes:
-        of_rows, of_columns = _means(height, rows), _means(width, columns)
-        matrices = kron(of_rows, of_columns), kron(blur(rows) @ of_rows, blur(columns) @ of_columns)
-        result.append((matrices[0].tocsr(), matrices[1].tocsr(), (rows, columns)))
-    return result
+        row_means, column_means = _means(height, rows), _means(width, columns)
+        matrices = kron(row_means, column_means), kron(blur(rows) @ row_means, blur(columns) @ column_means)
+        levels.append((matrices[0].tocsr(), matrices[1].tocsr(), (rows, columns)))
+    return levels
 
 
 def _means(fine: int, coarse: int) -> csr_matrix:
@@ -199,13 +205,15 @@ def _frame_matrix(body: PlaneBody, vertex_count: int) -> csr_matrix:
 
     vertices = np.unique(body.faces)
     points = (body.positions[vertices].astype(np.float64) - body.grid.origin) @ body.grid.frame[:2].T
-    first = np.linalg.norm(points - points.mean(axis=0), axis=1).argmax()
-    second = np.linalg.norm(points - points[first], axis=1).argmax()
-    axis_u = points[second] - points[first]
-    third = np.abs(axis_u[0] * (points - points[first])[:, 1] - axis_u[1] * (points - points[first])[:, 0]).argmax()
-    chosen = [first, second, third]
+    first_point = np.linalg.norm(points - points.mean(axis=0), axis=1).argmax()
+    second_point = np.linalg.norm(points - points[first_point], axis=1).argmax()
+    axis_u = points[second_point] - points[first_point]
+    third_point = np.abs(
+        axis_u[0] * (points - points[first_point])[:, 1] - axis_u[1] * (points - points[first_point])[:, 0]
+    ).argmax()
+    frame_points = [first_point, second_point, third_point]
     # the rows w with Σ w = 1 and Σ w p = 0 for the origin, and Σ w = 0 and Σ w p = e for an axis e
-    system = np.concatenate([points[chosen].T, np.ones((1, 3))])
+    system = np.concatenate([points[frame_points].T, np.ones((1, 3))])
     weights = np.linalg.solve(system, np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]).T).T
-    columns = np.tile(body.first_vertex + vertices[chosen], 3)
+    columns = np.tile(body.first_vertex + vertices[frame_points], 3)
     return csr_matrix((weights.ravel(), (np.repeat(np.arange(3), 3), columns)), shape=(3, vertex_count))

@@ -3,21 +3,21 @@
 import warp as wp
 
 from warpshadow.device.batch import instance_in
-from warpshadow.device.parallel import Scratch, scratch_place, split_row
+from warpshadow.device.parallel import Scratch, scratch_slot, split_row
 from warpshadow.stages.cell_coverage import ViewedEdge, convex_coverage, outline_coverage, viewed_edge
 from warpshadow.stages.planes.cells import (
+    LocalReceiver,
     PlaneArrays,
     PlaneFootprint,
-    ReceiverInPlane,
+    direction_on_side,
     find_footprint,
     find_footprint_adjoint,
-    find_in_plane,
-    find_in_plane_adjoint,
+    find_local_receiver,
+    find_local_receiver_adjoint,
     front_of,
     front_of_adjoint,
-    on_side,
+    position_on_side,
     side_adjoint,
-    toward_side,
 )
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 
@@ -54,57 +54,65 @@ def load_side(scene: PlaneArrays, i: int, store: wp.array(dtype=wp.vec3)):
     """Load side i of the sides that a receiver sees."""
     side = PlaneSide()
     side.row = 4 * scene.grids.shape[0] + i
-    stored = store[side.row]
-    side.f = int(stored[0])
-    side.is_back = stored[1] > 0.0
-    side.weight = stored[2]
+    stored_side = store[side.row]
+    side.f = int(stored_side[0])
+    side.is_back = stored_side[1] > 0.0
+    side.weight = stored_side[2]
     grid = scene.grids[side.f]
     side.first_edge = _VIEWS * grid.first_edge + wp.where(side.is_back, grid.edge_count, 0)
     return side
 
 
 @wp.func
-def load_place(store: wp.array(dtype=wp.vec3), f: int):
-    """Where a receiver is relative to a plane."""
-    place = ReceiverInPlane()
-    place.at = store[4 * f]
-    place.along_u = store[4 * f + 1]
-    place.along_v = store[4 * f + 2]
-    place.normal = store[4 * f + 3]
-    return place
+def load_local_receiver(store: wp.array(dtype=wp.vec3), f: int):
+    """Load a receiver in the axes of a plane."""
+    local_receiver = LocalReceiver()
+    local_receiver.position = store[4 * f]
+    local_receiver.axis_u = store[4 * f + 1]
+    local_receiver.axis_v = store[4 * f + 2]
+    local_receiver.normal = store[4 * f + 3]
+    return local_receiver
 
 
 @wp.func
-def store_place(store: wp.array(dtype=wp.vec3), f: int, place: ReceiverInPlane):
+def store_local_receiver(store: wp.array(dtype=wp.vec3), f: int, local_receiver: LocalReceiver):
     """Overwrite it."""
-    store[4 * f] = place.at
-    store[4 * f + 1] = place.along_u
-    store[4 * f + 2] = place.along_v
-    store[4 * f + 3] = place.normal
+    store[4 * f] = local_receiver.position
+    store[4 * f + 1] = local_receiver.axis_u
+    store[4 * f + 2] = local_receiver.axis_v
+    store[4 * f + 3] = local_receiver.normal
 
 
 @wp.func
-def _down(place: ReceiverInPlane, side: PlaneSide):
+def _side_normal(local_receiver: LocalReceiver, side: PlaneSide):
     """Normal of a plane away from a side."""
-    return wp.where(side.is_back, 1.0, -1.0) * place.normal
+    return wp.where(side.is_back, 1.0, -1.0) * local_receiver.normal
 
 
 @wp.func
 def _view_outline(
-    scene: PlaneArrays, grid: PlaneGrid, side: PlaneSide, place: ReceiverInPlane, edges: wp.array(dtype=ViewedEdge)
+    scene: PlaneArrays,
+    grid: PlaneGrid,
+    side: PlaneSide,
+    local_receiver: LocalReceiver,
+    edges: wp.array(dtype=ViewedEdge),
 ):
     """Store the outline of a plane as a receiver over one side sees it; n = ±(a − x) × (b − a) / |b − a|.
 
     Edges run so that the mesh is to their left as the receiver sees it: the front's from b to a.
     """
-    at = on_side(grid, place, side.is_back)
-    foot = at[2] * _down(place, side) - at[0] * place.along_u - at[1] * place.along_v
+    position = position_on_side(grid, local_receiver, side.is_back)
+    foot = (
+        position[2] * _side_normal(local_receiver, side)
+        - position[0] * local_receiver.axis_u
+        - position[1] * local_receiver.axis_v
+    )
     for e in range(grid.edge_count):
-        ends = scene.edges[grid.first_edge + e]
+        edge_ends = scene.edges[grid.first_edge + e]
         axis = scene.edge_axes[grid.first_edge + e]
-        a = foot + ends[0] * place.along_u + ends[1] * place.along_v
-        b = foot + ends[2] * place.along_u + ends[3] * place.along_v
-        n = wp.cross(a, axis[0] * place.along_u + axis[1] * place.along_v)
+        a = foot + edge_ends[0] * local_receiver.axis_u + edge_ends[1] * local_receiver.axis_v
+        b = foot + edge_ends[2] * local_receiver.axis_u + edge_ends[3] * local_receiver.axis_v
+        n = wp.cross(a, axis[0] * local_receiver.axis_u + axis[1] * local_receiver.axis_v)
         edges[side.first_edge + e] = viewed_edge(
             wp.where(side.is_back, a, b), wp.where(side.is_back, b, a), wp.where(side.is_back, 1.0, -1.0) * n
         )
@@ -115,29 +123,35 @@ def _view_outline_adjoint(
     scene: PlaneArrays,
     grid: PlaneGrid,
     side: PlaneSide,
-    place: ReceiverInPlane,
+    local_receiver: LocalReceiver,
     edges: wp.array(dtype=ViewedEdge),
-    adj_place: ReceiverInPlane,
+    adj_local_receiver: LocalReceiver,
 ):
     """Add to the gradient of the receiver relative to the plane."""
-    at = on_side(grid, place, side.is_back)
+    position = position_on_side(grid, local_receiver, side.is_back)
     sign = wp.where(side.is_back, 1.0, -1.0)
     adj_foot = wp.vec3()
     for e in range(grid.edge_count):
         edge = edges[side.first_edge + e]
-        ends = scene.edges[grid.first_edge + e]
+        edge_ends = scene.edges[grid.first_edge + e]
         axis = scene.edge_axes[grid.first_edge + e]
         adj_n = (sign / edge.length) * edge.adj_normal
-        adj_a = wp.cross(axis[0] * place.along_u + axis[1] * place.along_v, adj_n)
+        adj_a = wp.cross(axis[0] * local_receiver.axis_u + axis[1] * local_receiver.axis_v, adj_n)
         adj_axis = wp.cross(adj_n, wp.where(side.is_back, edge.begin, edge.end))
         adj_foot += adj_a
-        adj_place.along_u = adj_place.along_u + (ends[0] - at[0]) * adj_a + axis[0] * adj_axis
-        adj_place.along_v = adj_place.along_v + (ends[1] - at[1]) * adj_a + axis[1] * adj_axis
-    adj_place.normal = adj_place.normal + (sign * at[2]) * adj_foot
+        adj_local_receiver.axis_u = (
+            adj_local_receiver.axis_u + (edge_ends[0] - position[0]) * adj_a + axis[0] * adj_axis
+        )
+        adj_local_receiver.axis_v = (
+            adj_local_receiver.axis_v + (edge_ends[1] - position[1]) * adj_a + axis[1] * adj_axis
+        )
+    adj_local_receiver.normal = adj_local_receiver.normal + (sign * position[2]) * adj_foot
     adj_at = wp.vec3(
-        -wp.dot(adj_foot, place.along_u), -wp.dot(adj_foot, place.along_v), sign * wp.dot(adj_foot, place.normal)
+        -wp.dot(adj_foot, local_receiver.axis_u),
+        -wp.dot(adj_foot, local_receiver.axis_v),
+        sign * wp.dot(adj_foot, local_receiver.normal),
     )
-    return side_adjoint(grid, place, side.is_back, wp.vec3(), adj_at, wp.vec3(), adj_place)
+    return side_adjoint(grid, local_receiver, side.is_back, wp.vec3(), adj_at, wp.vec3(), adj_local_receiver)
 
 
 @wp.func
@@ -147,7 +161,7 @@ def _add_side(
     is_back: float,
     weight: float,
     side_count: int,
-    place: ReceiverInPlane,
+    local_receiver: LocalReceiver,
     store: wp.array(dtype=wp.vec3),
     edges: wp.array(dtype=ViewedEdge),
 ):
@@ -155,12 +169,12 @@ def _add_side(
     if weight <= 0.0:
         return side_count
     store[4 * scene.grids.shape[0] + side_count] = wp.vec3(float(f), is_back, weight)
-    _view_outline(scene, scene.grids[f], load_side(scene, side_count, store), place, edges)
+    _view_outline(scene, scene.grids[f], load_side(scene, side_count, store), local_receiver, edges)
     return side_count + 1
 
 
 @wp.func
-def place_receiver(
+def prepare_receiver(
     row: int,
     worker: int,
     points: wp.array2d(dtype=wp.vec3),
@@ -175,23 +189,23 @@ def place_receiver(
     Returns its instance and number, its place in scratch memory, and how many sides are stored.
     """
     batch, receiver = split_row(row, points.shape[1])
-    scratch_row = scratch_place(worker, row)
+    scratch_row = scratch_slot(worker, row)
     store, edges = scratch[scratch_row], viewed_edges[scratch_row]
     frame_batch = instance_in(batch, frames.shape[0])
     side_count = int(0)
     for f in range(scene.grids.shape[0]):
-        place = find_in_plane(points[batch, receiver], frames[frame_batch], f)
-        store_place(store, f, place)
-        if f != scene.skip and wp.length_sq(place.normal) > 0.0:
+        local_receiver = find_local_receiver(points[batch, receiver], frames[frame_batch], f)
+        store_local_receiver(store, f, local_receiver)
+        if f != scene.skip and wp.length_sq(local_receiver.normal) > 0.0:
             # below the plane the front fades, and the back takes over
-            front = front_of(fronts, scene.grids[f], place.at[2], batch, receiver, f)
-            side_count = _add_side(scene, f, 0.0, front, side_count, place, store, edges)
-            side_count = _add_side(scene, f, 1.0, 1.0 - front, side_count, place, store, edges)
+            front = front_of(fronts, scene.grids[f], local_receiver.position[2], batch, receiver, f)
+            side_count = _add_side(scene, f, 0.0, front, side_count, local_receiver, store, edges)
+            side_count = _add_side(scene, f, 1.0, 1.0 - front, side_count, local_receiver, store, edges)
     return batch, receiver, scratch_row, side_count
 
 
 @wp.func
-def place_receiver_adjoint(
+def prepare_receiver_adjoint(
     batch: int,
     receiver: int,
     side_count: int,
@@ -210,18 +224,22 @@ def place_receiver_adjoint(
     for i in range(side_count):
         side = load_side(scene, i, store)
         grid = scene.grids[side.f]
-        place = load_place(store, side.f)
-        adj = _view_outline_adjoint(scene, grid, side, place, edges, load_place(adj_store, side.f))
+        local_receiver = load_local_receiver(store, side.f)
+        adj_receiver = _view_outline_adjoint(
+            scene, grid, side, local_receiver, edges, load_local_receiver(adj_store, side.f)
+        )
         adj_front = wp.where(side.is_back, -1.0, 1.0) * adj_store[side.row][2]
-        adj_height = front_of_adjoint(fronts, grid, place.at[2], adj_front, batch, receiver, side.f, adj_fronts)
-        adj.at = adj.at + wp.vec3(0.0, 0.0, adj_height)
-        store_place(adj_store, side.f, adj)
+        adj_height = front_of_adjoint(
+            fronts, grid, local_receiver.position[2], adj_front, batch, receiver, side.f, adj_fronts
+        )
+        adj_receiver.position = adj_receiver.position + wp.vec3(0.0, 0.0, adj_height)
+        store_local_receiver(adj_store, side.f, adj_receiver)
     frame_batch = instance_in(batch, frames.shape[0])
     adj_point = wp.vec3()
     for f in range(scene.grids.shape[0]):
-        place, adj = load_place(store, f), load_place(adj_store, f)
-        adj_point += find_in_plane_adjoint(
-            points[batch, receiver], frames[frame_batch], f, place, adj, frame_batch, adj_frames
+        local_receiver, adj_receiver = load_local_receiver(store, f), load_local_receiver(adj_store, f)
+        adj_point += find_local_receiver_adjoint(
+            points[batch, receiver], frames[frame_batch], f, local_receiver, adj_receiver, frame_batch, adj_frames
         )
     if adj_points:
         adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
@@ -252,9 +270,15 @@ def visible_cell(scene: PlaneArrays, normal: wp.vec3, direction: wp.vec3):
 
 
 @wp.func
-def footprint_on_side(scene: PlaneArrays, grid: PlaneGrid, side: PlaneSide, place: ReceiverInPlane, direction: wp.vec3):
+def footprint_on_side(
+    scene: PlaneArrays, grid: PlaneGrid, side: PlaneSide, local_receiver: LocalReceiver, direction: wp.vec3
+):
     """Find the footprint of a cell on a side."""
-    return find_footprint(scene, on_side(grid, place, side.is_back), toward_side(place, side.is_back, direction))
+    return find_footprint(
+        scene,
+        position_on_side(grid, local_receiver, side.is_back),
+        direction_on_side(local_receiver, side.is_back, direction),
+    )
 
 
 @wp.func
@@ -262,7 +286,7 @@ def footprint_on_side_adjoint(
     scene: PlaneArrays,
     grid: PlaneGrid,
     side: PlaneSide,
-    place: ReceiverInPlane,
+    local_receiver: LocalReceiver,
     direction: wp.vec3,
     footprint: PlaneFootprint,
     adj_mip: wp.vec3,
@@ -280,10 +304,17 @@ def footprint_on_side_adjoint(
     adj_t = adj_distance + adj_radius * scene.radius * footprint.per_cosine
     if adj_mip[2] != 0.0:  # texels are as wide as t / √c′
         adj_t += adj_mip[2] / footprint.distance
-    toward, adj_center = toward_side(place, side.is_back, direction), wp.vec2(adj_mip[0], adj_mip[1])
-    adj_at, adj_toward = find_footprint_adjoint(scene, toward, footprint, adj_t, adj_cosine, adj_center)
-    adj_place = load_place(adj_store, side.f)
-    store_place(adj_store, side.f, side_adjoint(grid, place, side.is_back, direction, adj_at, adj_toward, adj_place))
+    local_direction, adj_center = (
+        direction_on_side(local_receiver, side.is_back, direction),
+        wp.vec2(adj_mip[0], adj_mip[1]),
+    )
+    adj_at, adj_toward = find_footprint_adjoint(scene, local_direction, footprint, adj_t, adj_cosine, adj_center)
+    adj_local_receiver = load_local_receiver(adj_store, side.f)
+    store_local_receiver(
+        adj_store,
+        side.f,
+        side_adjoint(grid, local_receiver, side.is_back, direction, adj_at, adj_toward, adj_local_receiver),
+    )
 
 
 @wp.func
@@ -291,15 +322,17 @@ def outline_coverage_on_side(
     scene: PlaneArrays,
     grid: PlaneGrid,
     side: PlaneSide,
-    place: ReceiverInPlane,
+    local_receiver: LocalReceiver,
     cell: VisibleCell,
     edges: wp.array(dtype=ViewedEdge),
 ):
     """Coverage (h, μ) of a cell by the outline of a plane, as much of it as is seen of the side."""
-    down = _down(place, side)
-    if wp.dot(down, cell.direction) <= -scene.radius:
+    side_normal = _side_normal(local_receiver, side)
+    if wp.dot(side_normal, cell.direction) <= -scene.radius:
         return wp.vec4()
-    first, count = side.first_edge, grid.edge_count
+    first_edge_index, count = side.first_edge, grid.edge_count
     if grid.is_convex == 1:
-        return side.weight * convex_coverage(edges, first, count, cell.direction, cell.radius)
-    return side.weight * outline_coverage(edges, first, count, down, place.along_u, cell.direction, cell.radius)
+        return side.weight * convex_coverage(edges, first_edge_index, count, cell.direction, cell.radius)
+    return side.weight * outline_coverage(
+        edges, first_edge_index, count, side_normal, local_receiver.axis_u, cell.direction, cell.radius
+    )

@@ -10,7 +10,7 @@ import warp as wp
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.directions import fibonacci
-from warpshadow.stages.ray_tracing import nearest
+from warpshadow.stages.ray_tracing import first_hit
 from warpshadow.stages.self_visibility.probes import VisibilityProbes
 from warpshadow.stages.self_visibility.trace import VisibilityRows
 
@@ -36,20 +36,20 @@ def _find_buried(
             if bits[row, word] != wp.uint32(0):
                 is_buried[row] = False
                 return
-    outer = int(0)
-    inner = int(0)
+    front_hits = int(0)
+    back_hits = int(0)
     for ray in range(directions.shape[0]):
         if wp.dot(normals[row], directions[ray]) > 0.0:
-            hit = nearest(mesh, points[row], normals[row], directions[ray])
+            hit = first_hit(mesh, points[row], normals[row], directions[ray])
             if hit.face >= 0:
                 if hit.is_back == (row >= probe_count):
-                    outer += 1
+                    front_hits += 1
                 else:
-                    inner += 1
+                    back_hits += 1
             elif not bits:
                 is_buried[row] = False
                 return
-    is_buried[row] = inner > outer
+    is_buried[row] = back_hits > front_hits
 
 
 def find_buried(
@@ -66,22 +66,29 @@ def find_buried(
         points: Probes, and their backs if they have any, [row, 3].
         normals: Unit normals [row, 3].
         probe_count: Number of probes; by default all are.
-        rows: What they see, where that is known.
+        rows: Their traced visibility; None traces rays instead.
     Returns:
         Bool of shape [row].
     """
     device = mesh.points.device
-    places, facing, directions = (
+    point_array, normal_array, directions = (
         wp.array(values, dtype=wp.vec3, device=device) for values in (points, normals, fibonacci(_RAYS))
     )
     is_buried = empty(len(points), dtype=wp.bool, device=device)
-    inputs = [mesh.id, places, facing, probe_count or len(points), directions, None if rows is None else rows.bits]
+    inputs = [
+        mesh.id,
+        point_array,
+        normal_array,
+        probe_count or len(points),
+        directions,
+        None if rows is None else rows.bits,
+    ]
     launch(_find_buried, len(points), inputs=inputs, outputs=[is_buried])
     return is_buried.numpy()
 
 
 def find_dilation(probes: VisibilityProbes, is_buried: np.ndarray) -> np.ndarray:
-    """For each row, the row it copies visibility from: itself, or its nearest unburied neighbor along edges.
+    """Find the row from which each row copies visibility: itself, or its nearest unburied neighbor along edges.
 
     Args:
         probes: The probes.
@@ -93,14 +100,14 @@ def find_dilation(probes: VisibilityProbes, is_buried: np.ndarray) -> np.ndarray
     from scipy.sparse.csgraph import dijkstra
 
     dilation, probe_count = np.arange(len(is_buried)), len(probes.positions)
-    ends = np.unique(np.sort(probes.edges, axis=1), axis=0)
-    lengths = np.linalg.norm(probes.positions[ends[:, 0]] - probes.positions[ends[:, 1]], axis=1)
-    graph = csr_matrix((np.maximum(lengths, 1e-12), ends.T), (probe_count, probe_count))  # 0 is no edge
-    for first in range(0, len(is_buried), probe_count):
-        buried = is_buried[first : first + probe_count]
-        if buried.any() and not buried.all():
-            open_probes = np.flatnonzero(~buried)
+    edge_ends = np.unique(np.sort(probes.edges, axis=1), axis=0)
+    lengths = np.linalg.norm(probes.positions[edge_ends[:, 0]] - probes.positions[edge_ends[:, 1]], axis=1)
+    graph = csr_matrix((np.maximum(lengths, 1e-12), edge_ends.T), (probe_count, probe_count))  # 0 is no edge
+    for first_row in range(0, len(is_buried), probe_count):
+        is_buried_probe = is_buried[first_row : first_row + probe_count]
+        if is_buried_probe.any() and not is_buried_probe.all():
+            open_probes = np.flatnonzero(~is_buried_probe)
             *_, nearest_open = dijkstra(graph, False, open_probes, return_predecessors=True, min_only=True)
-            dilates = buried & (nearest_open >= 0)
-            dilation[first : first + probe_count][dilates] = first + nearest_open[dilates]
+            is_dilated = is_buried_probe & (nearest_open >= 0)
+            dilation[first_row : first_row + probe_count][is_dilated] = first_row + nearest_open[is_dilated]
     return dilation

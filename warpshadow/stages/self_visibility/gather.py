@@ -27,7 +27,7 @@ from warpshadow.device.lanes import (
 )
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import as_items, empty, require_gradient
-from warpshadow.device.parallel import Scratch, scratch_place
+from warpshadow.device.parallel import Scratch, scratch_slot
 from warpshadow.device.warp_sums import sum_over_warp
 from warpshadow.stages.self_visibility.lookup import ResamplingKernels, ResamplingWeights
 from warpshadow.stages.self_visibility.probes import ProbeWeights
@@ -35,7 +35,7 @@ from warpshadow.stages.self_visibility.trace import VisibilityRows
 
 _LOOKUP_COST = 0.2  # nanoseconds that a lookup takes
 _MEAN_LOOKUPS = 6  # lookups of a cell, for the cost
-_WORD = 4  # coarse cells of a word of 32 bits
+_CELLS_PER_WORD = 4  # coarse cells of a word of 32 bits
 
 
 @wp.struct
@@ -44,9 +44,9 @@ class GatherInputs:
 
     normals: wp.array2d(dtype=wp.vec3)
     rows: wp.array2d(dtype=wp.vec3i)
-    place_weights: wp.array2d(dtype=wp.vec3)
+    probe_weights: wp.array2d(dtype=wp.vec3)
     directions: wp.array(dtype=wp.vec3)
-    looks_at_rays: wp.array(dtype=wp.int32)
+    uses_rays: wp.array(dtype=wp.int32)
     counts: wp.array2d(dtype=wp.int32)
     indices: wp.array3d(dtype=wp.int32)
     weights: wp.array3d(dtype=wp.float32)
@@ -56,7 +56,7 @@ class GatherInputs:
 
 @functools.cache
 def _probes_type(lanes: int) -> Any:
-    """Struct of where a block of receivers lies."""
+    """Struct of the probe weights of a block of receivers."""
     Rows = wp.types.matrix(shape=(3, lanes), dtype=wp.int32)
     Weights = wp.types.matrix(shape=(3, lanes), dtype=wp.float32)
 
@@ -72,9 +72,9 @@ def _probes_type(lanes: int) -> Any:
 class _ProbeFunctions(NamedTuple):
     """Kernel functions on the probes of a block."""
 
-    begin: wp.Function
-    spread: wp.Function
-    look: wp.Function
+    load_block: wp.Function
+    add_cell_shares: wp.Function
+    load_share: wp.Function
 
 
 @functools.cache
@@ -88,7 +88,7 @@ def _make_probe_functions(lanes: int) -> _ProbeFunctions:
     @wp.func
     def load_probes(inputs: GatherInputs, batch: int, block: int):
         rows = inputs.rows[instance_in(batch, inputs.rows.shape[0])]
-        weights = inputs.place_weights[instance_in(batch, inputs.place_weights.shape[0])]
+        weights = inputs.probe_weights[instance_in(batch, inputs.probe_weights.shape[0])]
         probes = ProbeLanes()
         probes.corner_count = 1
         for lane in range(lanes):
@@ -110,32 +110,32 @@ def _make_probe_functions(lanes: int) -> _ProbeFunctions:
         unsigned packed[{lanes}];
         for (int lane = 0; lane < {lanes}; ++lane)
             packed[lane] = wp::index(words, rows.c[lane], word);
-        for (int part = 0; part < {_WORD}; ++part) {{
-            auto& share = wp::index(shares, word * {_WORD} + part);
+        for (int part = 0; part < {_CELLS_PER_WORD}; ++part) {{
+            auto& share = wp::index(shares, word * {_CELLS_PER_WORD} + part);
             for (int lane = 0; lane < {lanes}; ++lane)
                 share.c[lane] += weights.c[lane] * ((wp::float32)((packed[lane] >> 8 * part) & 255) * unit);
         }}
     }}
     """)
-    def spread(rows: Rows, weights: Lane, words: wp.array2d(dtype=wp.uint32), shares: wp.array(dtype=Lane)):
+    def add_cell_shares(rows: Rows, weights: Lane, words: wp.array2d(dtype=wp.uint32), shares: wp.array(dtype=Lane)):
         """shares[cell] += weight · S of all coarse cells in a row of each receiver."""
         ...
 
     @wp.func
-    def look(rows: Rows, of_rays: int, index: int, inputs: GatherInputs):
+    def load_share(rows: Rows, uses_rays: int, index: int, inputs: GatherInputs):
         """S of a ray or coarse cell in a row of each receiver, from 0 to 1."""
         share = Lane()
         for lane in range(lanes):
-            if of_rays == 1:
+            if uses_rays == 1:
                 share[lane] = float(int((inputs.bits[rows[lane], index >> 5] >> wp.uint32(index & 31)) & wp.uint32(1)))
             else:
-                word = inputs.words[rows[lane], index // _WORD]
-                byte = (word >> wp.uint32(8 * (index % _WORD))) & wp.uint32(255)
+                word = inputs.words[rows[lane], index // _CELLS_PER_WORD]
+                byte = (word >> wp.uint32(8 * (index % _CELLS_PER_WORD))) & wp.uint32(255)
                 share[lane] = float(int(byte)) * (1.0 / 255.0)
         return share
 
     @wp.func
-    def begin(inputs: GatherInputs, row: int, receiver_count: int, shares: wp.array(dtype=Lane)):
+    def load_block(inputs: GatherInputs, row: int, receiver_count: int, shares: wp.array(dtype=Lane)):
         """Load a block of receivers, and S of all coarse cells where there are several."""
         batch, block = find_block(row, receiver_count)
         probes = load_probes(inputs, batch, block)
@@ -143,16 +143,16 @@ def _make_probe_functions(lanes: int) -> _ProbeFunctions:
             for cell in range(shares.shape[0]):
                 shares[cell] = Lane(0.0)
             for corner in range(probes.corner_count):
-                spread(probes.rows[corner], probes.weights[corner], inputs.words, shares)
+                add_cell_shares(probes.rows[corner], probes.weights[corner], inputs.words, shares)
         return batch, block, load(inputs.normals[instance_in(batch, inputs.normals.shape[0])], block), probes
 
-    return _ProbeFunctions(begin, spread, look)
+    return _ProbeFunctions(load_block, add_cell_shares, load_share)
 
 
 @functools.cache
 def _make_gather(lanes: int) -> wp.Kernel:
     Lane, fn = lane_type(lanes), make_lane_functions(lanes)
-    begin, _spread, look = _make_probe_functions(lanes)
+    load_block, _spread, load_share = _make_probe_functions(lanes)
     store_columns, dot_direction, is_any_above = fn.store_columns, fn.dot_direction, fn.is_any_above
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
@@ -168,31 +168,31 @@ def _make_gather(lanes: int) -> wp.Kernel:
     ):
         """A thread owns a block of receivers."""
         item = first_row + wp.tid()
-        shares = scratch[scratch_place(worker, item), 0]
-        columns = scratch[scratch_place(worker, item), 1]
-        batch, block, normal, probes = begin(inputs, item, transmittance_self.shape[1], shares)
+        shares = scratch[scratch_slot(worker, item), 0]
+        columns = scratch[scratch_slot(worker, item), 1]
+        batch, block, normal, probes = load_block(inputs, item, transmittance_self.shape[1], shares)
         weight_batch = instance_in(batch, inputs.counts.shape[0])
         for q in range(inputs.directions.shape[0]):
-            passing = Lane(0.0)
+            transmittance = Lane(0.0)
             cosine = dot_direction(inputs.directions[q], normal)
             if is_any_above(cosine, 0.0):
                 indices = inputs.indices[weight_batch, q]
                 weights = inputs.weights[weight_batch, q]
-                of_rays = inputs.looks_at_rays[q]
-                if wp.static(lanes == 1) or of_rays == 1:
+                uses_rays = inputs.uses_rays[q]
+                if wp.static(lanes == 1) or uses_rays == 1:
                     for k in range(inputs.counts[weight_batch, q]):
                         for corner in range(probes.corner_count):
-                            share = look(probes.rows[corner], of_rays, indices[k], inputs)
-                            passing += weights[k] * wp.cw_mul(probes.weights[corner], share)
+                            share = load_share(probes.rows[corner], uses_rays, indices[k], inputs)
+                            transmittance += weights[k] * wp.cw_mul(probes.weights[corner], share)
                 else:
                     for k in range(inputs.counts[weight_batch, q]):
-                        passing += weights[k] * shares[indices[k]]
+                        transmittance += weights[k] * shares[indices[k]]
             for lane in range(lanes):
-                passing[lane] = wp.where(cosine[lane] > 0.0, passing[lane], 1.0)
+                transmittance[lane] = wp.where(cosine[lane] > 0.0, transmittance[lane], 1.0)
             if wp.static(lanes == 1):
-                transmittance_self[batch, block, q] = passing[0]
+                transmittance_self[batch, block, q] = transmittance[0]
             else:
-                columns[q] = passing
+                columns[q] = transmittance
         if wp.static(lanes > 1):
             store_columns(columns, 0, inputs.directions.shape[0], block, transmittance_self[batch])
 
@@ -202,7 +202,7 @@ def _make_gather(lanes: int) -> wp.Kernel:
 @functools.cache
 def _make_gather_adjoint(lanes: int) -> wp.Kernel:
     Lane, fn = lane_type(lanes), make_lane_functions(lanes)
-    begin, spread, look = _make_probe_functions(lanes)
+    load_block, add_cell_shares, load_share = _make_probe_functions(lanes)
     dot_direction, is_any_above, total = fn.dot_direction, fn.is_any_above, fn.total
     Weights = wp.types.matrix(shape=(3, lanes), dtype=wp.float32)
 
@@ -216,23 +216,23 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
         # scratch
         scratch: wp.array3d(dtype=Lane),
         # out
-        adj_place_weights: wp.array2d(dtype=wp.vec3),
-        adj_all_weights: wp.array3d(dtype=wp.float32),
+        adj_probe_weights: wp.array2d(dtype=wp.vec3),
+        adj_resampling_weights: wp.array3d(dtype=wp.float32),
     ):
         """A thread owns a block of receivers:  w̄_qk += T̄_q Σ_j b_j S_jqk,  b̄_j += Σ_qk T̄_q w_qk S_jqk.
 
         The latter is summed up by cells first:  S̄_c = Σ_qk T̄_q w_qk where c_qk = c,  b̄_j += Σ_c S̄_c S_jc.
         """
         item = first_row + wp.tid()
-        shares = scratch[scratch_place(worker, item), 0]
-        adj_shares = scratch[scratch_place(worker, item), 1]
-        batch, block, normal, probes = begin(inputs, item, adj_transmittance.shape[1], shares)
+        shares = scratch[scratch_slot(worker, item), 0]
+        adj_shares = scratch[scratch_slot(worker, item), 1]
+        batch, block, normal, probes = load_block(inputs, item, adj_transmittance.shape[1], shares)
         weight_batch = instance_in(batch, inputs.counts.shape[0])
         if wp.static(lanes > 1):
             for cell in range(shares.shape[0]):
                 adj_shares[cell] = Lane(0.0)
         receiver_count = wp.min(lanes, adj_transmittance.shape[1] - block * lanes)
-        adj_place = Weights()
+        adj_corner_weights = Weights()
         for q in range(inputs.directions.shape[0]):
             cosine = dot_direction(inputs.directions[q], normal)
             if is_any_above(cosine, 0.0):
@@ -241,76 +241,87 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
                     adj[lane] = wp.where(cosine[lane] > 0.0, adj_transmittance[batch, block * lanes + lane, q], 0.0)
                 indices = inputs.indices[weight_batch, q]
                 weights = inputs.weights[weight_batch, q]
-                of_rays = inputs.looks_at_rays[q]
-                if wp.static(lanes == 1) or of_rays == 1:
+                uses_rays = inputs.uses_rays[q]
+                if wp.static(lanes == 1) or uses_rays == 1:
                     for k in range(inputs.counts[weight_batch, q]):
                         adj_weight = float(0.0)
                         for corner in range(3):
                             if corner < probes.corner_count:
-                                adj_look = wp.cw_mul(adj, look(probes.rows[corner], of_rays, indices[k], inputs))
-                                adj_place[corner] += weights[k] * adj_look
-                                adj_weight += total(wp.cw_mul(probes.weights[corner], adj_look))
-                        if adj_all_weights:
+                                adj_share = wp.cw_mul(
+                                    adj, load_share(probes.rows[corner], uses_rays, indices[k], inputs)
+                                )
+                                adj_corner_weights[corner] += weights[k] * adj_share
+                                adj_weight += total(wp.cw_mul(probes.weights[corner], adj_share))
+                        if adj_resampling_weights:
                             if wp.static(lanes == 1):
                                 adj_weight = sum_over_warp(
                                     adj_weight,
-                                    (weight_batch * inputs.directions.shape[0] + q) * adj_all_weights.shape[2] + k,
+                                    (weight_batch * inputs.directions.shape[0] + q) * adj_resampling_weights.shape[2]
+                                    + k,
                                 )
                             if adj_weight != 0.0:
-                                wp.atomic_add(adj_all_weights, weight_batch, q, k, adj_weight)
+                                wp.atomic_add(adj_resampling_weights, weight_batch, q, k, adj_weight)
                 else:
                     for k in range(inputs.counts[weight_batch, q]):
                         adj_shares[indices[k]] = adj_shares[indices[k]] + weights[k] * adj
-                        if adj_all_weights:
+                        if adj_resampling_weights:
                             adj_weight_sum = total(wp.cw_mul(adj, shares[indices[k]]))
-                            wp.atomic_add(adj_all_weights, weight_batch, q, k, adj_weight_sum)
-        if adj_place_weights:
+                            wp.atomic_add(adj_resampling_weights, weight_batch, q, k, adj_weight_sum)
+        if adj_probe_weights:
             for corner in range(3):
-                adj_corner = adj_place[corner]
+                adj_corner = adj_corner_weights[corner]
                 if wp.static(lanes > 1):
                     for cell in range(shares.shape[0]):
                         shares[cell] = Lane(0.0)
-                    spread(probes.rows[corner], Lane(1.0), inputs.words, shares)
+                    add_cell_shares(probes.rows[corner], Lane(1.0), inputs.words, shares)
                     for cell in range(shares.shape[0]):
                         adj_corner += wp.cw_mul(adj_shares[cell], shares[cell])
                 for lane in range(receiver_count):
                     receiver = block * lanes + lane
-                    gained = wp.vec3()
-                    gained[corner] = adj_corner[lane]
-                    adj_place_weights[batch, receiver] = adj_place_weights[batch, receiver] + gained
+                    adj_corner_vector = wp.vec3()
+                    adj_corner_vector[corner] = adj_corner[lane]
+                    adj_probe_weights[batch, receiver] = adj_probe_weights[batch, receiver] + adj_corner_vector
 
     return gather_adjoint
 
 
 def gather_self_transmittance(
-    normals: wp.array, places: ProbeWeights, lookup: ResamplingWeights, kernels: ResamplingKernels, rows: VisibilityRows
+    normals: wp.array,
+    probe_weights: ProbeWeights,
+    resampling_weights: ResamplingWeights,
+    kernels: ResamplingKernels,
+    rows: VisibilityRows,
 ) -> wp.array:
     """Gather the self-visibility of a body's receivers.
 
     Args:
         normals: Unit normals of the receivers, vec3 of shape [batch, receiver].
-        places: Where they lie on the body.
-        lookup: Lookups of the cells of directions.
+        probe_weights: Where they lie on the body.
+        resampling_weights: Lookups of the cells of directions.
         kernels: From which the lookup is.
         rows: Visibility of the probes.
     Returns:
         Transmittance T_self in [0, 1], float32 of shape [batch, receiver, direction].
-    Differentiable: weights of places and of the lookup. Not: normals (they only cut off directions below the horizon).
+    Differentiable: weights of probe_weights and of the resampling_weights. Not: normals (they only cut off directions
+    below the horizon).
     """
-    count = common_batch({"normals": normals, "places": places.rows, "rotations": lookup.counts})
+    batch_count = common_batch(
+        {"normals": normals, "probe_weights": probe_weights.rows, "rotations": resampling_weights.counts}
+    )
     direction_count = kernels.directions.size
-    shape = count, normals.shape[1], direction_count
-    if places.weights.requires_grad:
-        places = ProbeWeights(places.rows, expand(places.weights, count))  # whose gradients are apart
+    shape = batch_count, normals.shape[1], direction_count
+    if probe_weights.weights.requires_grad:
+        # each instance has a gradient of its own
+        probe_weights = ProbeWeights(probe_weights.rows, expand(probe_weights.weights, batch_count))
     lanes = lane_count(normals.device)
-    words = as_items(rows.cells, wp.uint32, _WORD)
+    words = as_items(rows.cells, wp.uint32, _CELLS_PER_WORD)
     inputs = GatherInputs()
-    inputs.normals, inputs.rows, inputs.place_weights = normals, *places
-    inputs.directions, inputs.looks_at_rays = kernels.directions, kernels.looks_at_rays
-    inputs.counts, inputs.indices, inputs.weights = lookup
+    inputs.normals, inputs.rows, inputs.probe_weights = normals, *probe_weights
+    inputs.directions, inputs.uses_rays = kernels.directions, kernels.uses_rays
+    inputs.counts, inputs.indices, inputs.weights = resampling_weights
     inputs.bits, inputs.words = rows.bits, words
-    row_count = count * block_count(shape[1], lanes)
-    cell_count = max(_WORD * words.shape[1], direction_count) if lanes > 1 else 1
+    row_count = batch_count * block_count(shape[1], lanes)
+    cell_count = max(_CELLS_PER_WORD * words.shape[1], direction_count) if lanes > 1 else 1
     scratch = [Scratch((2, cell_count), lane_type(lanes))]
     cost = _LOOKUP_COST * _MEAN_LOOKUPS * direction_count * lanes
     return differentiable(
@@ -322,17 +333,17 @@ def gather_self_transmittance(
             row_count,
             inputs=[inputs, adj_transmittance],
             scratch=scratch,
-            outputs=[places.weights.grad],
-            sums=[lookup.weights.grad],
+            outputs=[probe_weights.weights.grad],
+            sums=[resampling_weights.weights.grad],
             cost=2 * cost,
         ),
         result=empty(shape, dtype=wp.float32, device=normals.device),
-        variables=[places.weights, lookup.weights],
+        variables=[probe_weights.weights, resampling_weights.weights],
     )
 
 
 @wp.kernel
-def _multiply(
+def _multiply_chunks(
     # in
     factors: wp.array3d(dtype=Chunk),
     values: wp.array3d(dtype=Chunk),
@@ -352,5 +363,5 @@ def multiply_transmittances(transmittance_self: wp.array, transmittance_others: 
     if transmittance_self.requires_grad or transmittance_others.requires_grad:
         require_gradient(product)  # before it is seen as chunks
     inputs = [as_chunks(transmittance_self), as_chunks(transmittance_others)]
-    launch(_multiply, transmittance_self.shape[:2], inputs=inputs, outputs=[as_chunks(product)])
+    launch(_multiply_chunks, transmittance_self.shape[:2], inputs=inputs, outputs=[as_chunks(product)])
     return product

@@ -29,8 +29,8 @@ from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.self_visibility.trace import VisibilityRows
 from warpshadow.stages.sh_kernels import make_add_rotated_zonal, zonal_type
 
-_TURN_COST = 0.5  # nanoseconds that an entry of D takes for a receiver
-_PART = 1 << 9  # rows that are projected at once
+_ROTATION_COST = 0.5  # nanoseconds that an entry of D takes for a receiver
+_ROWS_PER_CHUNK = 1 << 9  # rows that are projected at once
 
 
 def project_rows(rows: VisibilityRows, normals: np.ndarray, order: int) -> wp.array:
@@ -45,27 +45,27 @@ def project_rows(rows: VisibilityRows, normals: np.ndarray, order: int) -> wp.ar
     """
     normals = np.asarray(normals, np.float64)
     rays, bits = fibonacci(rows.ray_count), rows.bits.numpy()
-    brought = (4 / len(rays) * sh.evaluate(order, rays)).astype(np.float32)
+    ray_light = (4 / len(rays) * sh.evaluate(order, rays)).astype(np.float32)
     band = sh.band_of(order)
     zonal = (sh.clamped_cosine(order) / np.pi * np.sqrt(4 * np.pi / (2 * np.arange(order) + 1)))[band]
     lobes = (zonal * sh.evaluate(order, normals)).astype(np.float32)
     lobes[~normals.any(axis=1)] = 0
-    for start in range(0, len(normals), _PART):
-        part = slice(start, start + _PART)
-        is_open = bits[part, :, None] >> np.arange(32, dtype=np.uint32) & 1
-        cosines = np.maximum(normals[part].astype(np.float32) @ rays.T.astype(np.float32), 0)
-        lobes[part] -= np.where(is_open.reshape(cosines.shape), 0, cosines) @ brought
+    for start in range(0, len(normals), _ROWS_PER_CHUNK):
+        row_slice = slice(start, start + _ROWS_PER_CHUNK)
+        is_open = bits[row_slice, :, None] >> np.arange(32, dtype=np.uint32) & 1
+        cosines = np.maximum(normals[row_slice].astype(np.float32) @ rays.T.astype(np.float32), 0)
+        lobes[row_slice] -= np.where(is_open.reshape(cosines.shape), 0, cosines) @ ray_light
     return wp.array(lobes, dtype=wp.float32, device=rows.bits.device)
 
 
 @functools.cache
-def _make_evaluate(order: int) -> wp.Kernel:
+def _make_evaluate_rotated(order: int) -> wp.Kernel:
     Lane, Vectors, Zonal = lane_type(1), vectors_type(1), zonal_type(order, 1)
     add_rotated_zonal = make_add_rotated_zonal(order, 1)
     UNIT = wp.types.vector(length=order, dtype=wp.float32)(*np.sqrt((2 * np.arange(order) + 1) / (4 * np.pi)))
 
     @wp.kernel(module="unique", enable_backward=False)
-    def evaluate_turned(
+    def evaluate_rotated(
         # in
         rotations: wp.array2d(dtype=wp.mat33),
         body: int,
@@ -75,40 +75,44 @@ def _make_evaluate(order: int) -> wp.Kernel:
     ):
         """A thread owns a direction ω:  y(Rᵀω)."""
         batch, q = wp.tid()
-        toward = wp.normalize(wp.transpose(rotations[batch, body]) * directions[q])
+        local_direction = wp.normalize(wp.transpose(rotations[batch, body]) * directions[q])
         zonal = Zonal()
         for band in range(order):
             zonal[band] = Lane(UNIT[band])
-        add_rotated_zonal(Vectors(Lane(toward[0]), Lane(toward[1]), Lane(toward[2])), zonal, basis[batch, q])
+        add_rotated_zonal(
+            Vectors(Lane(local_direction[0]), Lane(local_direction[1]), Lane(local_direction[2])),
+            zonal,
+            basis[batch, q],
+        )
 
-    return evaluate_turned
+    return evaluate_rotated
 
 
 @wp.kernel(enable_backward=False)
-def _find_turns(
+def _find_harmonic_rotations(
     # in
-    weighted: wp.array2d(dtype=wp.float32),
+    weighted_basis: wp.array2d(dtype=wp.float32),
     basis: wp.array3d(dtype=wp.float32),
     order: int,
     # out
-    turns: wp.array3d(dtype=wp.float32),
+    harmonic_rotations: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a row of D:  D_ki = ∫ y_k(ω) y_i(Rᵀω) dω, by a quadrature that is exact."""
     batch, k = wp.tid()
     band = int(wp.sqrt(float(k) + 0.5))
     for i in range(band * band, (band + 1) * (band + 1)):
-        total = float(0.0)
-        for q in range(weighted.shape[0]):
-            total += weighted[q, k] * basis[batch, q, i]
-        turns[batch, k, i] = total
+        entry = float(0.0)
+        for q in range(weighted_basis.shape[0]):
+            entry += weighted_basis[q, k] * basis[batch, q, i]
+        harmonic_rotations[batch, k, i] = entry
 
 
 class BodyRotation(NamedTuple):
-    """How a body is turned.
+    """The rotation of a body, and of spherical harmonics by it.
 
     Args:
         rotations: R of each body, mat33 of shape [batch, body].
-        body: Whose is meant.
+        body: Index of the body.
         harmonics: The rotation of harmonics by R, D: float32 of shape [batch, order², order²]; only its bands are
             filled.
     """
@@ -118,103 +122,116 @@ class BodyRotation(NamedTuple):
     harmonics: wp.array
 
 
-def find_turned(rotations: wp.array, body: int, order: int) -> BodyRotation:
-    """Find how a body turns harmonics. Differentiable: rotations, in :func:`self_visibility_lobes`."""
-    count, device = len(rotations), rotations.device
+def find_body_rotation(rotations: wp.array, body: int, order: int) -> BodyRotation:
+    """Find a body's rotation of harmonics. Differentiable: rotations, in :func:`self_visibility_lobes`."""
+    batch_count, device = len(rotations), rotations.device
     directions, weights = sh.quadrature(2 * order - 2)
-    weighted = constant((weights[:, None] * sh.evaluate(order, directions)).astype(np.float32), wp.float32, device)
-    basis = zeros((count, len(weights), order**2), dtype=wp.float32, device=device)
-    turns = empty((count, order**2, order**2), dtype=wp.float32, device=device)
+    weighted_basis = constant(
+        (weights[:, None] * sh.evaluate(order, directions)).astype(np.float32), wp.float32, device
+    )
+    basis = zeros((batch_count, len(weights), order**2), dtype=wp.float32, device=device)
+    harmonic_rotations = empty((batch_count, order**2, order**2), dtype=wp.float32, device=device)
     inputs = [rotations, body, constant(directions, wp.vec3, device)]
-    launch(_make_evaluate(order), basis.shape[:2], inputs=inputs, outputs=[basis.view(lane_type(1))])
-    launch(_find_turns, turns.shape[:2], inputs=[weighted, basis, order], outputs=[turns])
-    return BodyRotation(rotations, body, turns)
+    launch(_make_evaluate_rotated(order), basis.shape[:2], inputs=inputs, outputs=[basis.view(lane_type(1))])
+    launch(
+        _find_harmonic_rotations,
+        harmonic_rotations.shape[:2],
+        inputs=[weighted_basis, basis, order],
+        outputs=[harmonic_rotations],
+    )
+    return BodyRotation(rotations, body, harmonic_rotations)
 
 
 @wp.func
-def _self_coefficient(lobes: wp.array2d(dtype=wp.float32), row: wp.vec3i, share: wp.vec3, i: int):
+def _self_coefficient(lobes: wp.array2d(dtype=wp.float32), row: wp.vec3i, corner_weights: wp.vec3, i: int):
     """Coefficient i of a receiver, in the body's frame."""
     if row[0] == row[1] and row[0] == row[2]:
         return lobes[row[0], i]
-    return share[0] * lobes[row[0], i] + share[1] * lobes[row[1], i] + share[2] * lobes[row[2], i]
+    return (
+        corner_weights[0] * lobes[row[0], i]
+        + corner_weights[1] * lobes[row[1], i]
+        + corner_weights[2] * lobes[row[2], i]
+    )
 
 
 @wp.kernel(enable_backward=False)
-def _turn_lobes(
+def _rotate_lobes(
     first_row: int,
     worker: int,
     # in
     lobes: wp.array2d(dtype=wp.float32),
     rows: wp.array2d(dtype=wp.vec3i),
-    places: wp.array2d(dtype=wp.vec3),
-    turns: wp.array3d(dtype=wp.float32),
+    probe_weights: wp.array2d(dtype=wp.vec3),
+    harmonic_rotations: wp.array3d(dtype=wp.float32),
     bands: int,
     # out
-    turned: wp.array3d(dtype=wp.float32),
+    rotated_lobes: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a receiver."""
-    batch, receiver = split_row(first_row + wp.tid(), turned.shape[1])
-    turn_batch = instance_in(batch, turns.shape[0])
+    batch, receiver = split_row(first_row + wp.tid(), rotated_lobes.shape[1])
+    rotation_batch = instance_in(batch, harmonic_rotations.shape[0])
     row = rows[instance_in(batch, rows.shape[0]), receiver]
-    share = places[instance_in(batch, places.shape[0]), receiver]
+    corner_weights = probe_weights[instance_in(batch, probe_weights.shape[0]), receiver]
     for k in range(bands * bands):
-        turned[batch, receiver, k] = 0.0
+        rotated_lobes[batch, receiver, k] = 0.0
     for band in range(bands):
         start = band * band
         end = start + 2 * band + 1
         for i in range(start, end):
-            coefficient = _self_coefficient(lobes, row, share, i)
+            coefficient = _self_coefficient(lobes, row, corner_weights, i)
             for k in range(start, end):
-                turned[batch, receiver, k] = turned[batch, receiver, k] + turns[turn_batch, k, i] * coefficient
+                rotated_lobes[batch, receiver, k] = (
+                    rotated_lobes[batch, receiver, k] + harmonic_rotations[rotation_batch, k, i] * coefficient
+                )
 
 
 @wp.kernel(enable_backward=False)
-def _turn_lobes_adjoint(
+def _rotate_lobes_adjoint(
     first_row: int,
     worker: int,
     # in
     lobes: wp.array2d(dtype=wp.float32),
     rows: wp.array2d(dtype=wp.vec3i),
-    turns: wp.array3d(dtype=wp.float32),
+    harmonic_rotations: wp.array3d(dtype=wp.float32),
     bands: int,
-    turned: wp.array3d(dtype=wp.float32),
-    generators_first: wp.array(dtype=wp.int32),
-    generators_index: wp.array(dtype=wp.int32),
+    rotated_lobes: wp.array3d(dtype=wp.float32),
+    generator_starts: wp.array(dtype=wp.int32),
+    generator_columns: wp.array(dtype=wp.int32),
     generators: wp.array(dtype=wp.vec3),
-    adj_turned: wp.array3d(dtype=wp.float32),
+    adj_rotated_lobes: wp.array3d(dtype=wp.float32),
     # out
-    adj_places: wp.array2d(dtype=wp.vec3),
-    adj_turns: wp.array(dtype=wp.vec3),
+    adj_probe_weights: wp.array2d(dtype=wp.vec3),
+    adj_angles: wp.array(dtype=wp.vec3),
 ):
     """A thread owns a receiver:  δ̄_a += K̄ᵀ G_a K,  b̄_j += L_jᵀ Dᵀ K̄."""
-    batch, receiver = split_row(first_row + wp.tid(), adj_turned.shape[1])
-    turn_batch = instance_in(batch, turns.shape[0])
-    if adj_turns:
-        adj_turn = wp.vec3()
+    batch, receiver = split_row(first_row + wp.tid(), adj_rotated_lobes.shape[1])
+    rotation_batch = instance_in(batch, harmonic_rotations.shape[0])
+    if adj_angles:
+        adj_angle = wp.vec3()
         for k in range(bands * bands):
-            spun = wp.vec3()
-            for t in range(generators_first[k], generators_first[k + 1]):
-                spun += turned[batch, receiver, generators_index[t]] * generators[t]
-            adj_turn += adj_turned[batch, receiver, k] * spun
-        wp.atomic_add(adj_turns, turn_batch, adj_turn)
-    if adj_places:
+            generated = wp.vec3()
+            for t in range(generator_starts[k], generator_starts[k + 1]):
+                generated += rotated_lobes[batch, receiver, generator_columns[t]] * generators[t]
+            adj_angle += adj_rotated_lobes[batch, receiver, k] * generated
+        wp.atomic_add(adj_angles, rotation_batch, adj_angle)
+    if adj_probe_weights:
         row = rows[instance_in(batch, rows.shape[0]), receiver]
-        adj_share = wp.vec3()
+        adj_weights = wp.vec3()
         for band in range(bands):
             start = band * band
             end = start + 2 * band + 1
             for i in range(start, end):
                 adj_coefficient = float(0.0)
                 for k in range(start, end):
-                    adj_coefficient += turns[turn_batch, k, i] * adj_turned[batch, receiver, k]
-                adj_share += adj_coefficient * wp.vec3(lobes[row[0], i], lobes[row[1], i], lobes[row[2], i])
-        adj_places[batch, receiver] = adj_places[batch, receiver] + adj_share
+                    adj_coefficient += harmonic_rotations[rotation_batch, k, i] * adj_rotated_lobes[batch, receiver, k]
+                adj_weights += adj_coefficient * wp.vec3(lobes[row[0], i], lobes[row[1], i], lobes[row[2], i])
+        adj_probe_weights[batch, receiver] = adj_probe_weights[batch, receiver] + adj_weights
 
 
 @wp.kernel(enable_backward=False)
-def _add_turns(
+def _add_rotation_gradients(
     # in
-    adj_turns: wp.array(dtype=wp.vec3),
+    adj_angles: wp.array(dtype=wp.vec3),
     rotations: wp.array2d(dtype=wp.mat33),
     body: int,
     # out
@@ -222,8 +239,8 @@ def _add_turns(
 ):
     """A thread owns an instance. dR = [δ]× R, so R̄ = ½ [δ̄]× R."""
     batch = wp.tid()
-    adj = 0.5 * wp.skew(adj_turns[batch]) * rotations[batch, body]
-    adj_rotations[batch, body] = adj_rotations[batch, body] + adj
+    adj_rotation = 0.5 * wp.skew(adj_angles[batch]) * rotations[batch, body]
+    adj_rotations[batch, body] = adj_rotations[batch, body] + adj_rotation
 
 
 @functools.cache
@@ -239,52 +256,61 @@ def _generator_rows(order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def self_visibility_lobes(
-    lobes: wp.array, places: ProbeWeights, turned: BodyRotation, *, order: int, bands: int | None = None
+    lobes: wp.array, probe_weights: ProbeWeights, rotation: BodyRotation, *, order: int, bands: int | None = None
 ) -> wp.array:
     """Find the lobes of receivers of a body.
 
     Args:
         lobes: L of its probes, float32 of shape [row, order²].
-        places: Where receivers lie on the body.
-        turned: How it is turned.
+        probe_weights: Of the receivers, among the probes of the body.
+        rotation: Of the body.
         order: Number of SH bands n.
         bands: Number of bands to be found; all by default.
     Returns:
         K, float32 of shape [batch, receiver, bands²].
-    Differentiable: rotations, as they turn on; weights of places.
+    Differentiable: rotations, as they turn on; weights of the probes.
     """
     bands = order if bands is None else bands
-    rotations, body, turns = turned
-    count = common_batch({"places": places.rows, "rotations": turns})
-    shape, device = (count, places.rows.shape[1], bands**2), lobes.device
-    if places.weights.requires_grad:
-        places = ProbeWeights(places.rows, expand(places.weights, count))  # whose gradients are apart
-    result = empty(shape, dtype=wp.float32, device=device)
-    cost = _TURN_COST * bands**3
+    rotations, body, harmonic_rotations = rotation
+    batch_count = common_batch({"probe_weights": probe_weights.rows, "rotations": harmonic_rotations})
+    shape, device = (batch_count, probe_weights.rows.shape[1], bands**2), lobes.device
+    if probe_weights.weights.requires_grad:
+        # each instance has a gradient of its own
+        probe_weights = ProbeWeights(probe_weights.rows, expand(probe_weights.weights, batch_count))
+    rotated_lobes = empty(shape, dtype=wp.float32, device=device)
+    cost = _ROTATION_COST * bands**3
 
     def forward(open_rays: wp.array) -> None:
-        inputs = [lobes, *places, turns, bands]
-        launch(_turn_lobes, shape[0] * shape[1], inputs=inputs, outputs=[open_rays], cost=cost)
+        inputs = [lobes, *probe_weights, harmonic_rotations, bands]
+        launch(_rotate_lobes, shape[0] * shape[1], inputs=inputs, outputs=[open_rays], cost=cost)
 
-    def adjoint(adj: wp.array) -> None:
+    def adjoint(adj_rotated_lobes: wp.array) -> None:
         first, index, vectors = _generator_rows(bands)
         generators = (
             constant(values, dtype, device)
             for values, dtype in ((first, wp.int32), (index, wp.int32), (vectors, wp.vec3))
         )
-        adj_turns = None
+        adj_angles = None
         if rotations.requires_grad:
-            adj_turns = zeros(len(rotations), dtype=wp.vec3, device=device)
+            adj_angles = zeros(len(rotations), dtype=wp.vec3, device=device)
         launch(
-            _turn_lobes_adjoint,
+            _rotate_lobes_adjoint,
             shape[0] * shape[1],
-            inputs=[lobes, places.rows, turns, bands, result, *generators, adj],
-            outputs=[places.weights.grad],
-            sums=[adj_turns],
+            inputs=[
+                lobes,
+                probe_weights.rows,
+                harmonic_rotations,
+                bands,
+                rotated_lobes,
+                *generators,
+                adj_rotated_lobes,
+            ],
+            outputs=[probe_weights.weights.grad],
+            sums=[adj_angles],
             cost=2 * cost,
         )
-        if adj_turns is not None:
-            inputs = [adj_turns, rotations, body]
-            launch(_add_turns, len(rotations), inputs=inputs, outputs=[rotations.grad])
+        if adj_angles is not None:
+            inputs = [adj_angles, rotations, body]
+            launch(_add_rotation_gradients, len(rotations), inputs=inputs, outputs=[rotations.grad])
 
-    return differentiable(forward, adjoint, result=result, variables=[places.weights, rotations])
+    return differentiable(forward, adjoint, result=rotated_lobes, variables=[probe_weights.weights, rotations])

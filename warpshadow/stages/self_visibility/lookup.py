@@ -21,20 +21,20 @@ from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import cell_radius, fibonacci
-from warpshadow.stages.self_visibility.trace import RUN
+from warpshadow.stages.self_visibility.trace import RAYS_PER_CELL
 
-_MIN_REACH = 2.2  # least h, in radii of the coarse cells
+_MIN_KERNEL_RADIUS = 2.2  # least h, in radii of the coarse cells
 _MAX_RAYS = 32  # rays that a cell looks up on average at most; a wider one looks up coarse cells
 _CELL_COST = 1600.0  # nanoseconds that a cell takes
 
 
 @wp.struct
 class ResamplingKernels:
-    """Where each cell of directions looks."""
+    """Resampling kernels of the cells of directions."""
 
     directions: wp.array(dtype=wp.vec3)  # ω [direction]
-    reaches: wp.array(dtype=wp.float32)  # cos h [direction]
-    looks_at_rays: wp.array(dtype=wp.int32)  # 1, or 0 for coarse cells [direction]
+    cos_radii: wp.array(dtype=wp.float32)  # cos h [direction]
+    uses_rays: wp.array(dtype=wp.int32)  # 1, or 0 for coarse cells [direction]
     rays: wp.array(dtype=wp.vec3)  # directions of rays, and of coarse cells, in the body's frame
     cells: wp.array(dtype=wp.vec3)
     max_lookups: int  # of a cell
@@ -42,31 +42,33 @@ class ResamplingKernels:
 
 @cached_by_values
 def find_resampling_kernels(
-    directions: np.ndarray, spreads: np.ndarray | None, ray_count: int, device: wp.Device
+    directions: np.ndarray, half_angles: np.ndarray | None, ray_count: int, device: wp.Device
 ) -> ResamplingKernels:
-    """Choose where cells look.
+    """Find the resampling kernels of cells.
 
     Args:
         directions: Unit vectors ω [direction, 3].
-        spreads: Half-angles s of where their light comes from [radians], [direction]; None for even cells.
+        half_angles: Half-angles s of where their light comes from [radians], [direction]; None for even cells.
         ray_count: Rays of a probe.
     """
-    count, cell_count = len(directions), ray_count // RUN
-    spreads = np.full(count, cell_radius(count)) if spreads is None else np.minimum(spreads, cell_radius(count))
-    of_rays, of_cells = (
-        np.maximum(np.sqrt(2 * np.maximum(spreads**2 - radius**2, 0)), _MIN_REACH * radius)
+    count, cell_count = len(directions), ray_count // RAYS_PER_CELL
+    half_angles = (
+        np.full(count, cell_radius(count)) if half_angles is None else np.minimum(half_angles, cell_radius(count))
+    )
+    ray_radii, cell_radii = (
+        np.maximum(np.sqrt(2 * np.maximum(half_angles**2 - radius**2, 0)), _MIN_KERNEL_RADIUS * radius)
         for radius in map(cell_radius, (ray_count, cell_count))
     )
-    looks_at_rays = ray_count * (1 - np.cos(of_rays)) / 2 <= _MAX_RAYS
-    reaches = np.cos(np.where(looks_at_rays, of_rays, of_cells))
-    counts = np.where(looks_at_rays, ray_count, cell_count) * (1 - reaches) / 2
+    uses_rays = ray_count * (1 - np.cos(ray_radii)) / 2 <= _MAX_RAYS
+    cos_radii = np.cos(np.where(uses_rays, ray_radii, cell_radii))
+    counts = np.where(uses_rays, ray_count, cell_count) * (1 - cos_radii) / 2
     rays = fibonacci(ray_count)
-    cells = rays.reshape(cell_count, RUN, 3).sum(axis=1)
+    cells = rays.reshape(cell_count, RAYS_PER_CELL, 3).sum(axis=1)
     cells /= np.linalg.norm(cells, axis=1, keepdims=True)
     kernels = ResamplingKernels()
     kernels.directions = constant(np.asarray(directions), wp.vec3, device)
-    kernels.reaches = constant(reaches, wp.float32, device)
-    kernels.looks_at_rays = constant(looks_at_rays.astype(np.int32), wp.int32, device)
+    kernels.cos_radii = constant(cos_radii, wp.float32, device)
+    kernels.uses_rays = constant(uses_rays.astype(np.int32), wp.int32, device)
     kernels.rays, kernels.cells = constant(rays, wp.vec3, device), constant(cells, wp.vec3, device)
     kernels.max_lookups = int(1.4 * counts.max() + 8)
     return kernels
@@ -87,23 +89,23 @@ class ResamplingWeights(NamedTuple):
 
 
 @wp.func
-def _look_from(kernels: ResamplingKernels, rotation: wp.mat33, direction: int):
-    """Find d·|Rᵀω|, d, cos h, and the directions among which a cell looks."""
-    turned = wp.transpose(rotation) * kernels.directions[direction]
+def _load_kernel(kernels: ResamplingKernels, rotation: wp.mat33, direction: int):
+    """Load d·|Rᵀω|, d, cos h and the directions that the kernel of a cell samples."""
+    rotated_direction = wp.transpose(rotation) * kernels.directions[direction]
     candidates = kernels.cells
-    if kernels.looks_at_rays[direction] == 1:
+    if kernels.uses_rays[direction] == 1:
         candidates = kernels.rays
-    return turned, wp.normalize(turned), kernels.reaches[direction], candidates
+    return rotated_direction, wp.normalize(rotated_direction), kernels.cos_radii[direction], candidates
 
 
 @wp.func
-def _height(cosine: float, reach: float):
-    """Find x_k."""
-    return wp.max(0.0, (cosine - reach) / (1.0 - reach))
+def _profile(cosine: float, cos_radius: float):
+    """The kernel's profile x_k."""
+    return wp.max(0.0, (cosine - cos_radius) / (1.0 - cos_radius))
 
 
 @wp.kernel(enable_backward=False)
-def _find_lookups(
+def _find_weights(
     first_row: int,
     worker: int,
     # in
@@ -117,27 +119,27 @@ def _find_lookups(
 ):
     """A thread owns a cell of directions of an instance."""
     batch, direction = split_row(first_row + wp.tid(), kernels.directions.shape[0])
-    _turned, toward, reach, candidates = _look_from(kernels, rotations[batch, body], direction)
+    _rotated_direction, kernel_axis, cos_radius, candidates = _load_kernel(kernels, rotations[batch, body], direction)
     count = int(0)
-    total = float(0.0)
+    weight_sum = float(0.0)
     for candidate in range(candidates.shape[0]):
-        height = _height(wp.dot(candidates[candidate], toward), reach)
-        if height > 0.0 and count < weights.shape[2]:
+        profile = _profile(wp.dot(candidates[candidate], kernel_axis), cos_radius)
+        if profile > 0.0 and count < weights.shape[2]:
             indices[batch, direction, count] = candidate
-            weights[batch, direction, count] = height * height
-            total += height * height
+            weights[batch, direction, count] = profile * profile
+            weight_sum += profile * profile
             count += 1
     counts[batch, direction] = count
     for k in range(weights.shape[2]):
         if k < count:
-            weights[batch, direction, k] = weights[batch, direction, k] / total
+            weights[batch, direction, k] = weights[batch, direction, k] / weight_sum
         else:
             indices[batch, direction, k] = 0
             weights[batch, direction, k] = 0.0
 
 
 @wp.kernel(enable_backward=False)
-def _find_lookups_adjoint(
+def _find_weights_adjoint(
     # in
     rotations: wp.array2d(dtype=wp.mat33),
     body: int,
@@ -155,20 +157,27 @@ def _find_lookups_adjoint(
     v̄ = (d̄ − d d·d̄) / |v|,  R̄ += ω v̄ᵀ
     """
     batch, direction = wp.tid()
-    turned, toward, reach, candidates = _look_from(kernels, rotations[batch, body], direction)
-    total = float(0.0)
-    mean = float(0.0)
+    rotated_direction, kernel_axis, cos_radius, candidates = _load_kernel(kernels, rotations[batch, body], direction)
+    weight_sum = float(0.0)
+    adj_weight_mean = float(0.0)
     for k in range(counts[batch, direction]):
-        height = _height(wp.dot(candidates[indices[batch, direction, k]], toward), reach)
-        total += height * height
-        mean += adj_weights[batch, direction, k] * weights[batch, direction, k]
-    adj_toward = wp.vec3()
+        profile = _profile(wp.dot(candidates[indices[batch, direction, k]], kernel_axis), cos_radius)
+        weight_sum += profile * profile
+        adj_weight_mean += adj_weights[batch, direction, k] * weights[batch, direction, k]
+    adj_axis = wp.vec3()
     for k in range(counts[batch, direction]):
         candidate = candidates[indices[batch, direction, k]]
-        height = _height(wp.dot(candidate, toward), reach)
-        adj_toward += 2.0 * height * (adj_weights[batch, direction, k] - mean) / total / (1.0 - reach) * candidate
-    adj_turned = (adj_toward - wp.dot(adj_toward, toward) * toward) / wp.length(turned)
-    wp.atomic_add(adj_rotations, batch, body, wp.outer(kernels.directions[direction], adj_turned))
+        profile = _profile(wp.dot(candidate, kernel_axis), cos_radius)
+        adj_axis += (
+            2.0
+            * profile
+            * (adj_weights[batch, direction, k] - adj_weight_mean)
+            / weight_sum
+            / (1.0 - cos_radius)
+            * candidate
+        )
+    adj_rotated = (adj_axis - wp.dot(adj_axis, kernel_axis) * kernel_axis) / wp.length(rotated_direction)
+    wp.atomic_add(adj_rotations, batch, body, wp.outer(kernels.directions[direction], adj_rotated))
 
 
 def find_resampling_weights(rotations: wp.array, body: int, kernels: ResamplingKernels) -> ResamplingWeights:
@@ -176,8 +185,8 @@ def find_resampling_weights(rotations: wp.array, body: int, kernels: ResamplingK
 
     Args:
         rotations: R of each body, mat33 of shape [batch, body].
-        body: Whose is meant.
-        kernels: Where cells look.
+        body: Index of the body.
+        kernels: Of the cells.
     Differentiable: rotations.
     """
     shape = len(rotations), kernels.directions.size
@@ -187,10 +196,10 @@ def find_resampling_weights(rotations: wp.array, body: int, kernels: ResamplingK
     inputs = [rotations, body, kernels]
     weights = differentiable(
         lambda weights: launch(
-            _find_lookups, shape[0] * shape[1], inputs=inputs, outputs=[counts, indices, weights], cost=_CELL_COST
+            _find_weights, shape[0] * shape[1], inputs=inputs, outputs=[counts, indices, weights], cost=_CELL_COST
         ),
         lambda adj_weights: launch(
-            _find_lookups_adjoint,
+            _find_weights_adjoint,
             shape,
             inputs=[*inputs, counts, indices, weights, adj_weights],
             outputs=[rotations.grad],

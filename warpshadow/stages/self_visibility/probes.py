@@ -1,4 +1,4 @@
-"""Probes: the points of a body where its visibility of itself is known, and where receivers lie among them.
+"""Probes: the points of a body at which self-visibility is tabulated, and the interpolation between them.
 
 Probes are the body's vertices and, where edges are long, points between them: light changes along a rail that has no
 vertex between its ends. Faces are cut at the middle of their longest edge, and so are their pieces, until no edge is
@@ -18,34 +18,34 @@ from warpshadow.device.memory import empty
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.sides import split_side
 
-_SMALL_FACES = 10_000
+_EVEN_FACES = 10_000
 """Faces of the even cut by which edges are judged, so that it resolves visibility between probes: 507 vertices alone
 lose 3.5%.
 """
 
-_LONG = 1.2  # longest edge where samples receive, in edges of that even cut
+_MAX_SAMPLE_EDGE = 1.2  # longest edge where samples receive, in edges of that even cut
 
-_LONG_BETWEEN_VERTICES = 4.0
-"""The same where only vertices receive: probes between them are there for vertices that are buried …"""
+_MAX_VERTEX_EDGE = 4.0
+"""Longest edge where only vertices receive: probes between them are there for vertices that are buried …"""
 
-_ENTRY = 1 / 3
+_ENTRY_RATIO = 1 / 3
 """Longest edge that enters another part of the body, as a spoke a hub, over that of others. Images of the cage and of
 the chair, wheel and fence of demos/kinds.py are 7.1 and 5.1% off with 1/3, 7.5 and 5.5% with 1; with 1/8 there are so
 many that probes elsewhere are missing."""
 
-_SLENDER = 3.0  # … and only on edges that are longer than a third of all edges by such a factor: on edges of slivers
+_SLIVER_RATIO = 3.0  # … and only on edges longer than a third of all edges by this factor: on edges of slivers
 _MAX_PROBES = 2**14  # probes of a body at most, as long as it has fewer than half as many vertices
-_FEWER = 1.3  # how much longer edges may be at each try to have fewer probes
+_LENGTH_STEP = 1.3  # how much longer edges may be at each try to have fewer probes
 
 
 class ProbeWeights(NamedTuple):
-    """Where receivers lie on their body: three rows of numbers, and the weight of each."""
+    """Barycentric interpolation between probes: three rows of each receiver, and their weights."""
 
     rows: wp.array  # [batch, receiver] vec3i, probes and then their backs; a vertex has one thrice
     weights: wp.array  # [batch, receiver] vec3 with sum 1
 
     def cut(self, receivers: slice) -> "ProbeWeights":
-        """Places of some receivers, without a gradient."""
+        """Select the weights of some receivers, without a gradient."""
         return ProbeWeights(self.rows[:, receivers].contiguous(), self.weights[:, receivers].contiguous())
 
 
@@ -67,26 +67,26 @@ class VisibilityProbes(NamedTuple):
     @property
     def edges(self) -> np.ndarray:
         """Pairs of probes that are next to each other on a face, int of shape [pair, 2]; some stand there twice."""
-        whole = self.pieces[self.pieces[:, 3] < 0]
-        return np.concatenate([whole[:, [k, (k + 1) % 3]] for k in range(3)])
+        uncut_pieces = self.pieces[self.pieces[:, 3] < 0]
+        return np.concatenate([uncut_pieces[:, [k, (k + 1) % 3]] for k in range(3)])
 
 
-def longest_edge(positions: np.ndarray, faces: np.ndarray, *, samples_receive: bool) -> float:
+def longest_edge(positions: np.ndarray, faces: np.ndarray, *, has_sample_receivers: bool) -> float:
     """Longest edge that a body's pieces should have, where samples or only vertices of it are receivers."""
     corners = np.asarray(positions, np.float64)[faces]
     sides = corners - np.roll(corners, 1, axis=1)
     area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum() / 2
-    even = np.sqrt(4 / np.sqrt(3) * area / _SMALL_FACES)
-    if samples_receive:
-        return float(_LONG * even)
-    return float(max(_LONG_BETWEEN_VERTICES * even, _SLENDER * np.quantile(np.linalg.norm(sides, axis=2), 1 / 3)))
+    even_edge = np.sqrt(4 / np.sqrt(3) * area / _EVEN_FACES)
+    if has_sample_receivers:
+        return float(_MAX_SAMPLE_EDGE * even_edge)
+    return float(max(_MAX_VERTEX_EDGE * even_edge, _SLIVER_RATIO * np.quantile(np.linalg.norm(sides, axis=2), 1 / 3)))
 
 
 def find_probes(
     positions: np.ndarray,
     normals: np.ndarray,
     faces: np.ndarray,
-    longest: float = np.inf,
+    max_edge: float = np.inf,
     find_buried: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
 ) -> VisibilityProbes:
     """Find the probes of a mesh.
@@ -95,74 +95,77 @@ def find_probes(
         positions: Vertices [vertex, 3].
         normals: Their unit normals [vertex, 3]; between them normals are interpolated.
         faces: Indices of vertices [face, 3].
-        longest: Length beyond which edges are cut; it is raised where probes would be too many.
+        max_edge: Length beyond which edges are cut; it is raised where probes would be too many.
         find_buried: Whether points [point, 3] with unit normals lie inside another part of the body, bool of
             shape [point]. Edges from one to another kind are cut to a third of that length. None where there are none.
     """
-    maximum = max(_MAX_PROBES, 2 * len(positions))
-    while (result := _cut(positions, normals, faces, longest, maximum, find_buried)) is None:
-        longest *= _FEWER
-    points, directions, pieces = result
-    directions = _unit(directions)
+    max_points = max(_MAX_PROBES, 2 * len(positions))
+    while (probe_data := _cut_faces(positions, normals, faces, max_edge, max_points, find_buried)) is None:
+        max_edge *= _LENGTH_STEP
+    points, directions, pieces = probe_data
+    directions = _normalized(directions)
     directions[: len(normals)] = normals
     return VisibilityProbes(points.astype(np.float32), directions.astype(np.float32), pieces.astype(np.int32))
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
+def _normalized(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
 
 
-def _cut(
+def _cut_faces(
     positions: np.ndarray,
     normals: np.ndarray,
     faces: np.ndarray,
-    longest: float,
-    maximum: int,
+    max_edge: float,
+    max_points: int,
     find_buried: Callable[[np.ndarray, np.ndarray], np.ndarray] | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Points, their normals of any length, and pieces; None for more than ``maximum`` points."""
+    """Points, their normals of any length, and pieces; None for more than ``max_points`` points."""
     points, directions = (np.asarray(values, np.float64) for values in (positions, normals))
     is_buried = np.zeros(len(points), bool) if find_buried is None else find_buried(points, directions)
     pieces = np.concatenate([faces, np.full((len(faces), 1), -1)], axis=1).astype(np.int64)
-    known, middles = np.empty(0, np.int64), np.empty(0, np.int64)
+    cut_edges, edge_middles = np.empty(0, np.int64), np.empty(0, np.int64)
     while True:
-        whole = np.flatnonzero(pieces[:, 3] < 0)
-        corners = pieces[whole, :3]
-        ends = np.sort(np.stack([np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)], axis=2), axis=2)
-        lengths = np.linalg.norm(points[ends[..., 0]] - points[ends[..., 1]], axis=2)  # of the edges across
-        enters = is_buried[ends[..., 0]] != is_buried[ends[..., 1]]
-        is_cut = np.isin(ends[..., 0] << 32 | ends[..., 1], known)  # by the piece beside it
-        is_long = ((lengths > np.where(enters, _ENTRY * longest, longest)) | is_cut).any(axis=1)
-        whole, cut_corner = whole[is_long], np.argmax(lengths[is_long], axis=1)
-        if not len(whole):
+        uncut_pieces = np.flatnonzero(pieces[:, 3] < 0)
+        corners = pieces[uncut_pieces, :3]
+        edge_ends = np.sort(np.stack([np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)], axis=2), axis=2)
+        lengths = np.linalg.norm(points[edge_ends[..., 0]] - points[edge_ends[..., 1]], axis=2)  # of the edges across
+        enters_part = is_buried[edge_ends[..., 0]] != is_buried[edge_ends[..., 1]]
+        is_cut = np.isin(edge_ends[..., 0] << 32 | edge_ends[..., 1], cut_edges)  # by the piece beside it
+        is_long = ((lengths > np.where(enters_part, _ENTRY_RATIO * max_edge, max_edge)) | is_cut).any(axis=1)
+        uncut_pieces, cut_corner = uncut_pieces[is_long], np.argmax(lengths[is_long], axis=1)
+        if not len(uncut_pieces):
             return points, directions, pieces
-        number = np.arange(len(whole))
-        ends = ends[is_long][number, cut_corner]
-        keys, edge = np.unique(ends[:, 0] << 32 | ends[:, 1], return_inverse=True)
-        new = np.setdiff1d(keys, known, assume_unique=True)
-        first, second = new >> 32, new & 0xFFFFFFFF
-        middles = np.concatenate([middles, len(points) + np.arange(len(new))])
+        piece_numbers = np.arange(len(uncut_pieces))
+        edge_ends = edge_ends[is_long][piece_numbers, cut_corner]
+        edge_keys, edge_indices = np.unique(edge_ends[:, 0] << 32 | edge_ends[:, 1], return_inverse=True)
+        new_edges = np.setdiff1d(edge_keys, cut_edges, assume_unique=True)
+        first_probes, second_probes = new_edges >> 32, new_edges & 0xFFFFFFFF
+        edge_middles = np.concatenate([edge_middles, len(points) + np.arange(len(new_edges))])
         points, directions = (
-            np.concatenate([values, (values[first] + values[second]) / 2]) for values in (points, directions)
+            np.concatenate([values, (values[first_probes] + values[second_probes]) / 2])
+            for values in (points, directions)
         )
-        if len(points) > maximum:
+        if len(points) > max_points:
             return None
-        middle_is_buried = np.zeros(len(new), bool)
-        if find_buried is not None and len(new):
-            middle_is_buried = find_buried(points[-len(new) :], _unit(directions[-len(new) :]))
+        middle_is_buried = np.zeros(len(new_edges), bool)
+        if find_buried is not None and len(new_edges):
+            middle_is_buried = find_buried(points[-len(new_edges) :], _normalized(directions[-len(new_edges) :]))
         is_buried = np.concatenate([is_buried, middle_is_buried])
-        known = np.concatenate([known, new])
-        permutation = np.argsort(known)
-        known, middles = known[permutation], middles[permutation]
-        middle = middles[np.searchsorted(known, keys)][edge.ravel()]
-        parts = np.repeat(pieces[whole], 2, axis=0)
-        parts[2 * number, (cut_corner + 2) % 3] = parts[2 * number + 1, (cut_corner + 1) % 3] = middle
-        pieces[whole, 3] = 3 * (len(pieces) + 2 * number) + cut_corner
-        pieces = np.concatenate([pieces, parts])
+        cut_edges = np.concatenate([cut_edges, new_edges])
+        permutation = np.argsort(cut_edges)
+        cut_edges, edge_middles = cut_edges[permutation], edge_middles[permutation]
+        cut_middles = edge_middles[np.searchsorted(cut_edges, edge_keys)][edge_indices.ravel()]
+        new_pieces = np.repeat(pieces[uncut_pieces], 2, axis=0)
+        new_pieces[2 * piece_numbers, (cut_corner + 2) % 3] = new_pieces[
+            2 * piece_numbers + 1, (cut_corner + 1) % 3
+        ] = cut_middles
+        pieces[uncut_pieces, 3] = 3 * (len(pieces) + 2 * piece_numbers) + cut_corner
+        pieces = np.concatenate([pieces, new_pieces])
 
 
 @wp.kernel(enable_backward=False)
-def _place_vertices(
+def _find_vertex_weights(
     # in
     vertices: wp.array(dtype=wp.int32),
     vertex_count: int,
@@ -181,34 +184,34 @@ def _place_vertices(
 
 
 @wp.func
-def _descend(pieces: wp.array(dtype=wp.vec4i), face: int, barycentrics: wp.vec3):
+def _find_piece_and_matrix(pieces: wp.array(dtype=wp.vec4i), face: int, barycentrics: wp.vec3):
     """Corners of the piece of a face around a point, its barycentrics there, and M, from the face's to these."""
     piece = pieces[face]
     weights = barycentrics
     matrix = wp.identity(n=3, dtype=wp.float32)
     while piece[3] >= 0:
         cut_corner = piece[3] % 3
-        nearer = (cut_corner + 1) % 3
-        farther = (cut_corner + 2) % 3
-        number = piece[3] // 3
-        if weights[nearer] < weights[farther]:
-            swapped = nearer
-            nearer = farther
-            farther = swapped
-            number += 1
-        weights[nearer] = weights[nearer] - weights[farther]
-        weights[farther] = 2.0 * weights[farther]
+        nearer_corner = (cut_corner + 1) % 3
+        farther_corner = (cut_corner + 2) % 3
+        piece_number = piece[3] // 3
+        if weights[nearer_corner] < weights[farther_corner]:
+            previous = nearer_corner
+            nearer_corner = farther_corner
+            farther_corner = previous
+            piece_number += 1
+        weights[nearer_corner] = weights[nearer_corner] - weights[farther_corner]
+        weights[farther_corner] = 2.0 * weights[farther_corner]
         for k in range(3):
-            matrix[nearer, k] = matrix[nearer, k] - matrix[farther, k]
-            matrix[farther, k] = 2.0 * matrix[farther, k]
-        piece = pieces[number]
+            matrix[nearer_corner, k] = matrix[nearer_corner, k] - matrix[farther_corner, k]
+            matrix[farther_corner, k] = 2.0 * matrix[farther_corner, k]
+        piece = pieces[piece_number]
     return wp.vec3i(piece[0], piece[1], piece[2]), weights, matrix
 
 
 @wp.func
 def _find_piece(pieces: wp.array(dtype=wp.vec4i), face: int, barycentrics: wp.vec3):
     """Corners of the piece of a face around a point, and its barycentrics there."""
-    corners, weights, _matrix = _descend(pieces, face, barycentrics)
+    corners, weights, _matrix = _find_piece_and_matrix(pieces, face, barycentrics)
     return corners, weights
 
 
@@ -217,12 +220,12 @@ def _find_piece_adjoint(
     pieces: wp.array(dtype=wp.vec4i), face: int, barycentrics: wp.vec3, adj_corners: wp.vec3i, adj_weights: wp.vec3
 ):
     """On a piece M does not change:  b̄ = Mᵀ w̄."""
-    _corners, _weights, matrix = _descend(pieces, face, barycentrics)
+    _corners, _weights, matrix = _find_piece_and_matrix(pieces, face, barycentrics)
     wp.adjoint[barycentrics] += wp.transpose(matrix) * adj_weights
 
 
 @wp.kernel
-def _place_samples(
+def _find_sample_weights(
     # in
     sides: wp.array2d(dtype=wp.int32),
     barycentrics: wp.array2d(dtype=wp.vec3),
@@ -234,17 +237,17 @@ def _place_samples(
     rows: wp.array2d(dtype=wp.vec3i),
     weights: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a receiver at a sample's point, −1 for none."""
+    """A thread owns a receiver at a fragment, −1 for none."""
     batch, receiver = wp.tid()
     face, is_back = split_side(wp.max(sides[batch, receiver], first_face), face_count)
-    corners, result = _find_piece(pieces, face - first_face, barycentrics[batch, receiver])
-    shift = wp.where(is_back, probe_count, 0)
-    rows[batch, receiver] = corners + wp.vec3i(shift, shift, shift)
-    weights[batch, receiver] = result
+    corners, piece_weights = _find_piece(pieces, face - first_face, barycentrics[batch, receiver])
+    back_offset = wp.where(is_back, probe_count, 0)
+    rows[batch, receiver] = corners + wp.vec3i(back_offset, back_offset, back_offset)
+    weights[batch, receiver] = piece_weights
 
 
 class ProbeTable(NamedTuple):
-    """Arrays that place receivers of a body on its probes.
+    """Arrays by which receivers of a body find their probes.
 
     Args:
         first_vertex, vertex_count: Of the body's vertices among all, and how many all are.
@@ -261,19 +264,26 @@ class ProbeTable(NamedTuple):
     pieces: wp.array
 
     def of_vertices(self, vertices: wp.array) -> ProbeWeights:
-        """Places of vertices and their backs, int32 of shape [receiver], numbered among all: batch 1."""
-        places = _empty_weights(1, vertices.size, vertices.device)
+        """Weights of vertices and their backs, int32 of shape [receiver], indices among all vertices: batch 1."""
+        probe_weights = _empty_weights(1, vertices.size, vertices.device)
         inputs = [vertices, self.vertex_count, self.first_vertex, self.probe_count]
-        launch(_place_vertices, vertices.size, inputs=inputs, outputs=list(places))
-        return places
+        launch(_find_vertex_weights, vertices.size, inputs=inputs, outputs=list(probe_weights))
+        return probe_weights
 
-    def of_samples(self, seen: Fragments) -> ProbeWeights:
-        """Places of the samples' fragments: sides and barycentrics, [batch, receiver]. Differentiable: barycentrics."""
-        batch_count, count = seen.face_ids.shape
-        places = _empty_weights(batch_count, count, seen.face_ids.device)
-        inputs = [seen.face_ids, seen.barycentrics, self.face_count, self.first_face, self.probe_count, self.pieces]
-        launch(_place_samples, seen.face_ids.shape, inputs=inputs, outputs=list(places))
-        return places
+    def of_samples(self, fragments: Fragments) -> ProbeWeights:
+        """Weights of fragments: sides and barycentrics, [batch, receiver]. Differentiable: barycentrics."""
+        batch_count, count = fragments.face_ids.shape
+        probe_weights = _empty_weights(batch_count, count, fragments.face_ids.device)
+        inputs = [
+            fragments.face_ids,
+            fragments.barycentrics,
+            self.face_count,
+            self.first_face,
+            self.probe_count,
+            self.pieces,
+        ]
+        launch(_find_sample_weights, fragments.face_ids.shape, inputs=inputs, outputs=list(probe_weights))
+        return probe_weights
 
 
 def _empty_weights(batch_count: int, count: int, device: wp.Device) -> ProbeWeights:

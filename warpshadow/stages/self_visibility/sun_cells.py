@@ -27,7 +27,7 @@ from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 
 _PACKET_COST = 2000.0  # nanoseconds that a packet takes
-_BRIGHT = 0.05  # share of all light that a sun cell has at least
+_MIN_SUN_SHARE = 0.05  # share of all light that a sun cell has at least
 
 
 class SunCells(NamedTuple):
@@ -35,11 +35,11 @@ class SunCells(NamedTuple):
 
     Args:
         directions: Rays to their light, unit vectors of shape [16, 16, 3], with the rays of some cells repeated.
-        places: Index of each cell among them, −1 for cells that are not bright: [direction].
+        slots: Index of each cell among them, −1 for cells that are not bright: [direction].
     """
 
     directions: np.ndarray
-    places: np.ndarray
+    slots: np.ndarray
 
 
 def find_sun_cells(power: np.ndarray, draw: Callable[[np.ndarray, int], np.ndarray]) -> SunCells | None:
@@ -50,12 +50,12 @@ def find_sun_cells(power: np.ndarray, draw: Callable[[np.ndarray, int], np.ndarr
         draw: Draws directions from the light of some cells, of their numbers and how many of each: unit vectors [cell,
             count, 3].
     """
-    cells, repeated, places = brightest_chunk(power, power > _BRIGHT * power.sum())
-    return SunCells(draw(cells, PACKET)[repeated], places) if len(cells) else None
+    cells, repeated_cells, slots = brightest_chunk(power, power > _MIN_SUN_SHARE * power.sum())
+    return SunCells(draw(cells, PACKET)[repeated_cells], slots) if len(cells) else None
 
 
 class RayProbes(NamedTuple):
-    """Where the rays of a body start.
+    """Points at which rays of a body start.
 
     Args:
         tree: Its faces, in its own frame.
@@ -80,19 +80,19 @@ def _make_trace() -> wp.Kernel:
         tree: FaceTree,
         points: wp.array(dtype=wp.vec3),
         normals: wp.array(dtype=wp.vec3),
-        all_rows: wp.array2d(dtype=wp.vec3i),
-        all_weights: wp.array2d(dtype=wp.vec3),
+        probe_rows: wp.array2d(dtype=wp.vec3i),
+        probe_weights: wp.array2d(dtype=wp.vec3),
         rotations: wp.array2d(dtype=wp.mat33),
         body: int,
         directions: wp.array2d(dtype=Lane),
-        firsts: wp.array(dtype=wp.int32),
+        first_slots: wp.array(dtype=wp.int32),
         # out
-        passing: wp.array3d(dtype=wp.float32),
+        transmittance: wp.array3d(dtype=wp.float32),
     ):
         """A thread owns a receiver. A cell's first place has its rays, and the others copy it."""
-        batch, receiver = split_row(first_row + wp.tid(), passing.shape[1])
-        rows = all_rows[instance_in(batch, all_rows.shape[0]), receiver]
-        weights = all_weights[instance_in(batch, all_weights.shape[0]), receiver]
+        batch, receiver = split_row(first_row + wp.tid(), transmittance.shape[1])
+        rows = probe_rows[instance_in(batch, probe_rows.shape[0]), receiver]
+        weights = probe_weights[instance_in(batch, probe_weights.shape[0]), receiver]
         point = wp.vec3()
         normal = wp.vec3()
         for corner in range(3):
@@ -103,58 +103,70 @@ def _make_trace() -> wp.Kernel:
         axes = wp.matrix_from_rows(
             wp.normalize(rotation[:, 0]), wp.normalize(rotation[:, 1]), wp.normalize(rotation[:, 2])
         )
-        last = int(-1)
-        for place in range(firsts.shape[0]):
-            if firsts[place] < place:
-                passing[batch, receiver, place] = passing[batch, receiver, firsts[place]]
+        last_face = int(-1)
+        for slot in range(first_slots.shape[0]):
+            if first_slots[slot] < slot:
+                transmittance[batch, receiver, slot] = transmittance[batch, receiver, first_slots[slot]]
             else:
-                world = Vectors(directions[place, 0], directions[place, 1], directions[place, 2])
-                toward = Vectors(
-                    dot_direction(axes[0], world), dot_direction(axes[1], world), dot_direction(axes[2], world)
+                world_directions = Vectors(directions[slot, 0], directions[slot, 1], directions[slot, 2])
+                ray_directions = Vectors(
+                    dot_direction(axes[0], world_directions),
+                    dot_direction(axes[1], world_directions),
+                    dot_direction(axes[2], world_directions),
                 )
-                cosine = dot_direction(normal, toward)
+                cosine = dot_direction(normal, ray_directions)
                 facing_rays = bits_above(cosine, 0.0)
-                result = find_open(
-                    tree.corners, tree.lowers, tree.uppers, tree.leaf_count, point, normal, toward, facing_rays, last
+                open_and_face = find_open(
+                    tree.corners,
+                    tree.lowers,
+                    tree.uppers,
+                    tree.leaf_count,
+                    point,
+                    normal,
+                    ray_directions,
+                    facing_rays,
+                    last_face,
                 )
-                last = result[1]
-                total = float(0.0)
-                left = float(0.0)
+                last_face = open_and_face[1]
+                cosine_sum = float(0.0)
+                open_cosine_sum = float(0.0)
                 for lane in range(PACKET):
-                    total += wp.max(cosine[lane], 0.0)
-                    if (result[0] >> lane) % 2 == 1:
-                        left += cosine[lane]
-                passing[batch, receiver, place] = wp.where(total > 0.0, left / total, 1.0)
+                    cosine_sum += wp.max(cosine[lane], 0.0)
+                    if (open_and_face[0] >> lane) % 2 == 1:
+                        open_cosine_sum += cosine[lane]
+                transmittance[batch, receiver, slot] = wp.where(cosine_sum > 0.0, open_cosine_sum / cosine_sum, 1.0)
 
     return trace_sun
 
 
 def trace_sun_cells(
-    probes: RayProbes, places: ProbeWeights, rotations: wp.array, body: int, cells: SunCells
+    probes: RayProbes, probe_weights: ProbeWeights, rotations: wp.array, body: int, cells: SunCells
 ) -> wp.array:
     """Trace the self-visibility of a body's receivers in sun cells.
 
     Args:
         probes: Of the body.
-        places: Where the receivers lie among them.
+        probe_weights: Where the receivers lie among them.
         rotations: R of each body, mat33 of shape [batch, body].
-        body: Whose is meant.
+        body: Index of the body.
         cells: The sun cells.
     Returns:
         Transmittance in [0, 1], float32 of shape [batch, receiver, 16].
     Differentiable: no.
     """
-    device, cell_count = rotations.device, int((cells.places >= 0).sum())
-    count = common_batch({"places": places.rows, "rotations": rotations})
-    passing = empty((count, places.rows.shape[1], len(cells.directions)), dtype=wp.float32, device=device)
-    lanes = constant(cells.directions.swapaxes(1, 2), lane_type(PACKET), device)
-    starts = np.sort(cells.places[cells.places >= 0])
-    firsts = constant(starts[np.searchsorted(starts, np.arange(CHUNK), side="right") - 1], wp.int32, device)
+    device, cell_count = rotations.device, int((cells.slots >= 0).sum())
+    batch_count = common_batch({"probe_weights": probe_weights.rows, "rotations": rotations})
+    transmittance = empty(
+        (batch_count, probe_weights.rows.shape[1], len(cells.directions)), dtype=wp.float32, device=device
+    )
+    direction_lanes = constant(cells.directions.swapaxes(1, 2), lane_type(PACKET), device)
+    starts = np.sort(cells.slots[cells.slots >= 0])
+    first_slots = constant(starts[np.searchsorted(starts, np.arange(CHUNK), side="right") - 1], wp.int32, device)
     launch(
         _make_trace(),
-        count * passing.shape[1],
-        inputs=[*probes, *places, rotations, body, lanes, firsts],
-        outputs=[passing],
+        batch_count * transmittance.shape[1],
+        inputs=[*probes, *probe_weights, rotations, body, direction_lanes, first_slots],
+        outputs=[transmittance],
         cost=_PACKET_COST * cell_count,
     )
-    return passing
+    return transmittance

@@ -20,26 +20,26 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open, packets_of
-from warpshadow.stages.ray_tracing import parts
+from warpshadow.stages.ray_tracing import progress_slices
 
 RAYS = 4096  # rays of a probe, if memory allows
 MIN_RAYS = 256  # rays of a probe, for any amount of memory
-RUN = 8  # rays of a coarse cell
+RAYS_PER_CELL = 8  # rays of a coarse cell
 MAX_MEMORY = 2**28  # bytes that the rows of a body take at most, as long as probes have :data:`MIN_RAYS`
 
-_MIRRORED = 3.5
+_MIRROR_DEPTH = 3.5
 """Angle below the horizon to which rays are mirrored, in radii of a coarse cell: no lookup reaches farther."""
 
-_LEVEL = 2.0
+_TRACE_DEPTH = 2.0
 """Angle below the horizon, in radii of a ray's cell, to which mirrored rays are traced: none above may be near."""
 
-_GRID = 128  # rows of the map of directions, each 1.4° high, that has the nearest ray
-_BLOCK = 2**22  # rays that are traced between two states of a progress bar
+_MAP_ROWS = 128  # rows of the map of directions, each 1.4° high, that has the nearest ray
+_BLOCK_RAYS = 2**22  # rays that are traced between two states of a progress bar
 _RAY_COST = 30.0  # nanoseconds that a ray takes
 
 
 def trace_seconds(row_count: int, face_count: int) -> float:
-    """How long :func:`trace_rows` takes, about, on one thread [s].
+    """Estimate the time of :func:`trace_rows` on one thread [s].
 
     Measured on a Zen 4, of a bunny of 12 200 faces 89 ns a ray; of wavy balls of 20 000, 82 000 and 330 000 faces 130,
     200 and 280.
@@ -78,7 +78,7 @@ def ray_count(row_count: int) -> int:
 
 
 @wp.func
-def _bit(bits: wp.array2d(dtype=wp.uint32), row: int, ray: int):
+def _ray_bit(bits: wp.array2d(dtype=wp.uint32), row: int, ray: int):
     """Whether a ray escapes, 1 or 0."""
     return int((bits[row, ray // 32] >> wp.uint32(ray % 32)) & wp.uint32(1))
 
@@ -88,11 +88,11 @@ def _nearest_rays(count: int) -> np.ndarray:
     """The ray that is nearest to each direction of a map, int32 of shape [row, column]: by polar angle and azimuth."""
     from scipy.spatial import KDTree
 
-    angles = np.pi / _GRID * (np.arange(2 * _GRID) + 0.5)
-    polar, azimuth = np.broadcast_arrays(angles[:_GRID, None], angles - np.pi)
+    angles = np.pi / _MAP_ROWS * (np.arange(2 * _MAP_ROWS) + 0.5)
+    polar, azimuth = np.broadcast_arrays(angles[:_MAP_ROWS, None], angles - np.pi)
     radius = np.sin(polar)
-    towards = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.cos(polar)], axis=2)
-    return KDTree(fibonacci(count)).query(towards)[1].astype(np.int32)
+    map_directions = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.cos(polar)], axis=2)
+    return KDTree(fibonacci(count)).query(map_directions)[1].astype(np.int32)
 
 
 @functools.cache
@@ -110,72 +110,89 @@ def _make_trace() -> wp.Kernel:
         points: wp.array(dtype=wp.vec3),
         normals: wp.array(dtype=wp.vec3),
         directions: wp.array2d(dtype=Lane),
-        lowest: float,
-        level: float,
-        nearest: wp.array2d(dtype=wp.int32),
+        mirror_sine: float,
+        trace_sine: float,
+        nearest_rays: wp.array2d(dtype=wp.int32),
         # out
         bits: wp.array2d(dtype=wp.uint32),
     ):
         """A thread owns a row, whose bits are zero before."""
         row = first_row + wp.tid()
         normal = normals[row]
-        last = int(-1)
+        last_face = int(-1)
         for packet in range(directions.shape[0]):
-            toward = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
-            cosine = dot_direction(normal, toward)
-            if is_any_above(cosine, -level):
-                facing_rays = bits_above(cosine, -level)
+            ray_directions = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
+            cosine = dot_direction(normal, ray_directions)
+            if is_any_above(cosine, -trace_sine):
+                facing_rays = bits_above(cosine, -trace_sine)
                 for lane in range(PACKET):
                     cosine[lane] = 2.0 * wp.min(cosine[lane], 0.0)
-                toward.x -= normal[0] * cosine
-                toward.y -= normal[1] * cosine
-                toward.z -= normal[2] * cosine
-                at = points[row]
-                result = find_open(
-                    tree.corners, tree.lowers, tree.uppers, tree.leaf_count, at, normal, toward, facing_rays, last
+                ray_directions.x -= normal[0] * cosine
+                ray_directions.y -= normal[1] * cosine
+                ray_directions.z -= normal[2] * cosine
+                point = points[row]
+                open_and_face = find_open(
+                    tree.corners,
+                    tree.lowers,
+                    tree.uppers,
+                    tree.leaf_count,
+                    point,
+                    normal,
+                    ray_directions,
+                    facing_rays,
+                    last_face,
                 )
-                last = result[1]
+                last_face = open_and_face[1]
                 word = PACKET * packet // 32
-                bits[row, word] = bits[row, word] | (wp.uint32(result[0]) << wp.uint32(PACKET * packet % 32))
+                bits[row, word] = bits[row, word] | (wp.uint32(open_and_face[0]) << wp.uint32(PACKET * packet % 32))
         for packet in range(directions.shape[0]):
-            toward = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
-            cosine = dot_direction(normal, toward)
-            if is_any_above(cosine, -lowest):
+            ray_directions = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
+            cosine = dot_direction(normal, ray_directions)
+            if is_any_above(cosine, -mirror_sine):
                 for lane in range(PACKET):
-                    if cosine[lane] > -lowest and cosine[lane] <= -level:
-                        up = wp.vec3(toward.x[lane], toward.y[lane], toward.z[lane]) - 2.0 * cosine[lane] * normal
-                        size = float(nearest.shape[0]) / wp.pi
-                        i = wp.min(int(size * wp.acos(wp.clamp(up[2], -1.0, 1.0))), nearest.shape[0] - 1)
-                        j = wp.clamp(int(size * (wp.atan2(up[1], up[0]) + wp.pi)), 0, nearest.shape[1] - 1)
+                    if cosine[lane] > -mirror_sine and cosine[lane] <= -trace_sine:
+                        mirrored = (
+                            wp.vec3(ray_directions.x[lane], ray_directions.y[lane], ray_directions.z[lane])
+                            - 2.0 * cosine[lane] * normal
+                        )
+                        rows_per_radian = float(nearest_rays.shape[0]) / wp.pi
+                        row_in_map = wp.min(
+                            int(rows_per_radian * wp.acos(wp.clamp(mirrored[2], -1.0, 1.0))), nearest_rays.shape[0] - 1
+                        )
+                        column_in_map = wp.clamp(
+                            int(rows_per_radian * (wp.atan2(mirrored[1], mirrored[0]) + wp.pi)),
+                            0,
+                            nearest_rays.shape[1] - 1,
+                        )
                         ray = PACKET * packet + lane
-                        is_open = wp.uint32(_bit(bits, row, nearest[i, j]))
+                        is_open = wp.uint32(_ray_bit(bits, row, nearest_rays[row_in_map, column_in_map]))
                         bits[row, ray // 32] = bits[row, ray // 32] | (is_open << wp.uint32(ray % 32))
 
     return trace_row
 
 
 @wp.kernel(enable_backward=False)
-def _average(
+def _average_cells(
     # in
     normals: wp.array(dtype=wp.vec3),
     directions: wp.array(dtype=wp.vec3),
-    lowest: float,
+    mirror_sine: float,
     bits: wp.array2d(dtype=wp.uint32),
     # out
     cells: wp.array2d(dtype=wp.uint8),
 ):
     """A thread owns a coarse cell of a row."""
     row, cell = wp.tid()
-    passing = float(0.0)
-    total = float(0.0)
-    for ray in range(RUN * cell, RUN * cell + RUN):
+    open_weight = float(0.0)
+    weight_sum = float(0.0)
+    for ray in range(RAYS_PER_CELL * cell, RAYS_PER_CELL * cell + RAYS_PER_CELL):
         cosine = wp.dot(normals[row], directions[ray])
-        if cosine > -lowest:
-            total += wp.abs(cosine)
-            passing += wp.abs(cosine) * float(_bit(bits, row, ray))
+        if cosine > -mirror_sine:
+            weight_sum += wp.abs(cosine)
+            open_weight += wp.abs(cosine) * float(_ray_bit(bits, row, ray))
     share = float(1.0)
-    if total > 0.0:
-        share = passing / total
+    if weight_sum > 0.0:
+        share = open_weight / weight_sum
     cells[row, cell] = wp.uint8(int(255.0 * share + 0.5))
 
 
@@ -185,8 +202,8 @@ def trace_rows(
     normals: np.ndarray,
     count: int = RAYS,
     *,
-    before: np.ndarray | None = None,
-    keep: Callable[[wp.array], None] | None = None,
+    cached_bits: np.ndarray | None = None,
+    store_bits: Callable[[wp.array], None] | None = None,
     progress: bool = False,
 ) -> VisibilityRows:
     """Trace the self-visibility of points on a mesh.
@@ -196,30 +213,37 @@ def trace_rows(
         points: Probes, [row, 3].
         normals: Unit normals [row, 3].
         count: Rays of a probe, from :func:`ray_count`.
-        before: Bits of the first rows that an interrupted call traced, uint32 of shape [traced row, ray / 32].
-        keep: Gets the rows traced so far, after every block of them.
+        cached_bits: Bits of the first rows that an interrupted call traced, uint32 of shape [traced row, ray / 32].
+        store_bits: Gets the rows traced so far, after every block of them.
     Differentiable: no.
     """
     device, row_count = tree.corners.device, len(points)
-    places, facing = (wp.array(values, dtype=wp.vec3, device=device) for values in (points, normals))
+    point_array, normal_array = (wp.array(values, dtype=wp.vec3, device=device) for values in (points, normals))
     directions = wp.array(fibonacci(count), dtype=wp.vec3, device=device)
     packets = wp.array(packets_of(fibonacci(count)), dtype=lane_type(PACKET), device=device)
     rows = VisibilityRows(
         zeros((row_count, count // 32), dtype=wp.uint32, device=device),
-        empty((row_count, count // RUN), dtype=wp.uint8, device=device),
+        empty((row_count, count // RAYS_PER_CELL), dtype=wp.uint8, device=device),
     )
-    lowest = float(np.sin(min(_MIRRORED * cell_radius(count // RUN), np.pi / 2)))
-    level = float(np.sin(min(_LEVEL * cell_radius(count), np.pi / 2)))
-    nearest = wp.array(_nearest_rays(count), dtype=wp.int32, device=device)
-    first = 0
-    if before is not None:
-        first = len(before)
-        wp.copy(rows.bits[:first], wp.array(before, dtype=wp.uint32, device=device))
-    for part in parts(row_count, _BLOCK // count, progress, "tracing self-shadows", first=first):
-        inputs = [tree, places[part], facing[part], packets, lowest, level, nearest]
-        size = part.stop - part.start
-        launch(_make_trace(), size, inputs=inputs, outputs=[rows.bits[part]], cost=_RAY_COST * count)
-        if keep is not None:
-            keep(rows.bits[: part.stop])
-    launch(_average, rows.cells.shape, inputs=[facing, directions, lowest, rows.bits], outputs=[rows.cells])
+    mirror_sine = float(np.sin(min(_MIRROR_DEPTH * cell_radius(count // RAYS_PER_CELL), np.pi / 2)))
+    trace_sine = float(np.sin(min(_TRACE_DEPTH * cell_radius(count), np.pi / 2)))
+    nearest_rays = wp.array(_nearest_rays(count), dtype=wp.int32, device=device)
+    first_row = 0
+    if cached_bits is not None:
+        first_row = len(cached_bits)
+        wp.copy(rows.bits[:first_row], wp.array(cached_bits, dtype=wp.uint32, device=device))
+    for row_slice in progress_slices(
+        row_count, _BLOCK_RAYS // count, progress, "tracing self-shadows", first=first_row
+    ):
+        inputs = [tree, point_array[row_slice], normal_array[row_slice], packets, mirror_sine, trace_sine, nearest_rays]
+        rows_per_radian = row_slice.stop - row_slice.start
+        launch(_make_trace(), rows_per_radian, inputs=inputs, outputs=[rows.bits[row_slice]], cost=_RAY_COST * count)
+        if store_bits is not None:
+            store_bits(rows.bits[: row_slice.stop])
+    launch(
+        _average_cells,
+        rows.cells.shape,
+        inputs=[normal_array, directions, mirror_sine, rows.bits],
+        outputs=[rows.cells],
+    )
     return rows

@@ -22,24 +22,24 @@ import warp as wp
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.stages.screen import (
-    distance,
+    direction_sign,
+    face_plane,
     half_size,
-    lean,
+    line_distance,
+    line_slope,
     neighbor,
     opposite,
-    plane,
-    relative,
-    relative_adjoint,
+    relative_to_ray,
+    relative_to_ray_adjoint,
     sample_center,
-    sense,
 )
-from warpshadow.stages.silhouettes.lines import NOTHING, FragmentArrays, image_of, line_between
+from warpshadow.stages.silhouettes.lines import NOTHING, FragmentArrays, image_index, line_between
 
 wp.set_module_options({"max_unroll": 1})  # loops that are not unrolled compile faster, and run as fast
 
 
 @wp.kernel(enable_backward=False)
-def _measure(
+def _measure_areas(
     # in
     samples: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
@@ -51,29 +51,29 @@ def _measure(
     """A thread owns a direction of an entry: area e beyond the line there, its weight ω, and the kind of its end."""
     entry, direction = wp.tid()
     edge = edges[entry, direction]
-    share = wp.vec3()
+    area_and_weight = wp.vec3()
     if edge[0] != NOTHING:
-        half = half_size(fragments.width, fragments.height)
+        samples_per_unit = half_size(fragments.width, fragments.height)
         line = line_between(fragments, samples[entry], direction, edge)
-        t = wp.clamp(distance(line, direction, half), 0.0, 1.0)
-        steepness = lean(line, direction, half)
-        m = wp.min(steepness, 1.0)
+        distance = wp.clamp(line_distance(line, direction, samples_per_unit), 0.0, 1.0)
+        slope = line_slope(line, direction, samples_per_unit)
+        clamped_slope = wp.min(slope, 1.0)
         area = float(0.0)
-        if t <= 0.5 * (1.0 - m):
-            area = 0.5 - t
-        elif t < 0.5 * (1.0 + m):
-            rest = 0.5 * (1.0 + m) - t
-            area = 0.5 * rest * rest / m
+        if distance <= 0.5 * (1.0 - clamped_slope):
+            area = 0.5 - distance
+        elif distance < 0.5 * (1.0 + clamped_slope):
+            overlap = 0.5 * (1.0 + clamped_slope) - distance
+            area = 0.5 * overlap * overlap / clamped_slope
         if wp.isfinite(line / line[direction / 2]):  # else vertices are so far away that products overflow
-            its_edge = edges[entries[neighbor(samples[entry], direction, fragments.width)], opposite(direction)]
-            is_end = edge[0] == its_edge[0] and edge[1] == its_edge[1]
-            line_weight = 1.0 / (1.0 + steepness * steepness * steepness * steepness)
-            share = wp.vec3(area, line_weight, wp.where(is_end, 1.0, 0.0))
-    shares[entry, direction] = share
+            neighbor_edge = edges[entries[neighbor(samples[entry], direction, fragments.width)], opposite(direction)]
+            is_surface_end = edge[0] == neighbor_edge[0] and edge[1] == neighbor_edge[1]
+            line_weight = 1.0 / (1.0 + slope * slope * slope * slope)
+            area_and_weight = wp.vec3(area, line_weight, wp.where(is_surface_end, 1.0, 0.0))
+    shares[entry, direction] = area_and_weight
 
 
 @wp.kernel(enable_backward=False)
-def _measure_adjoint(
+def _measure_areas_adjoint(
     # in
     samples: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
@@ -89,39 +89,40 @@ def _measure_adjoint(
     if edge[0] != NOTHING and adj_area != 0.0:
         axis = direction / 2
         sample = samples[entry]
-        batch = image_of(fragments, sample)
+        batch = image_index(fragments, sample)
         clip = fragments.clip_positions[batch]
-        half = half_size(fragments.width, fragments.height)
+        samples_per_unit = half_size(fragments.width, fragments.height)
         center = sample_center(sample, fragments.width, fragments.height)
         line = line_between(fragments, sample, direction, edge)
-        t = wp.clamp(distance(line, direction, half), 0.0, 1.0)
-        m = wp.min(lean(line, direction, half), 1.0)
-        decline = float(0.0)  # of e with t
-        if t <= 0.5 * (1.0 - m):
-            decline = 1.0
-        elif t < 0.5 * (1.0 + m):
-            decline = (0.5 * (1.0 + m) - t) / m
-        adj_place = -sense(direction) * adj_area * decline * half[axis]  # by the line's x in a row, or y in a column
+        distance = wp.clamp(line_distance(line, direction, samples_per_unit), 0.0, 1.0)
+        clamped_slope = wp.min(line_slope(line, direction, samples_per_unit), 1.0)
+        area_slope = float(0.0)  # of e with t
+        if distance <= 0.5 * (1.0 - clamped_slope):
+            area_slope = 1.0
+        elif distance < 0.5 * (1.0 + clamped_slope):
+            area_slope = (0.5 * (1.0 + clamped_slope) - distance) / clamped_slope
+        # of the line's x in a row, or its y in a column
+        adj_position = -direction_sign(direction) * adj_area * area_slope * samples_per_unit[axis]
         if edge[0] >= 0:
-            across_a = relative(clip[edge[0]], center)[1 - axis]
-            across_b = relative(clip[edge[1]], center)[1 - axis]
-            spread = wp.where(axis == 0, -line[0], line[1])
-            adj_clip = adj_place * relative_adjoint(center, line / line[axis])
-            wp.atomic_add(adj_clip_positions, batch, edge[0], (across_b / spread) * adj_clip)
-            wp.atomic_add(adj_clip_positions, batch, edge[1], (-across_a / spread) * adj_clip)
+            offset_a = relative_to_ray(clip[edge[0]], center)[1 - axis]
+            offset_b = relative_to_ray(clip[edge[1]], center)[1 - axis]
+            cross_component = wp.where(axis == 0, -line[0], line[1])
+            adj_clip = adj_position * relative_to_ray_adjoint(center, line / line[axis])
+            wp.atomic_add(adj_clip_positions, batch, edge[0], (offset_b / cross_component) * adj_clip)
+            wp.atomic_add(adj_clip_positions, batch, edge[1], (-offset_a / cross_component) * adj_clip)
         else:
             for end in range(2):
-                at = sample
+                fragment = sample
                 sign = float(1.0)
                 if end == 1:
-                    at = neighbor(sample, direction, fragments.width)
+                    fragment = neighbor(sample, direction, fragments.width)
                     sign = -1.0
-                corners = fragments.faces[fragments.face_ids[at]]
-                ray = sample_center(at, fragments.width, fragments.height)
-                normal = plane(corners, ray, clip)
-                adj_clip = sign * adj_place * (normal[2] / line[axis]) * relative_adjoint(ray, normal)
+                corners = fragments.faces[fragments.face_ids[fragment]]
+                ray = sample_center(fragment, fragments.width, fragments.height)
+                normal = face_plane(corners, ray, clip)
+                adj_clip = sign * adj_position * (normal[2] / line[axis]) * relative_to_ray_adjoint(ray, normal)
                 for k in range(3):
-                    wp.atomic_add(adj_clip_positions, batch, corners[k], fragments.barycentrics[at][k] * adj_clip)
+                    wp.atomic_add(adj_clip_positions, batch, corners[k], fragments.barycentrics[fragment][k] * adj_clip)
 
 
 def measure_areas(samples: wp.array, edges: wp.array, entries: wp.array, arrays: FragmentArrays) -> wp.array:
@@ -137,11 +138,13 @@ def measure_areas(samples: wp.array, edges: wp.array, entries: wp.array, arrays:
         vec3 of shape [entry, 4], zero where there is no line.
     """
     shares = empty(edges.shape, dtype=wp.vec3, device=edges.device)
-    launch(_measure, edges.shape, inputs=[samples, edges, entries, arrays], outputs=[shares])
+    launch(_measure_areas, edges.shape, inputs=[samples, edges, entries, arrays], outputs=[shares])
     return shares
 
 
-def add_to_vertices(samples: wp.array, edges: wp.array, arrays: FragmentArrays, adj_areas: wp.array) -> None:
+def measure_areas_adjoint(samples: wp.array, edges: wp.array, arrays: FragmentArrays, adj_areas: wp.array) -> None:
     """The adjoint of the areas e, float32 of shape [entry, 4]: add to the gradient of the clip positions."""
     adj_clip_positions = arrays.clip_positions.grad
-    launch(_measure_adjoint, edges.shape, inputs=[samples, edges, arrays, adj_areas], outputs=[adj_clip_positions])
+    launch(
+        _measure_areas_adjoint, edges.shape, inputs=[samples, edges, arrays, adj_areas], outputs=[adj_clip_positions]
+    )

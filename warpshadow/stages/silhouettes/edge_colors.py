@@ -6,18 +6,18 @@ from warpshadow.device.batch import instance_in, rows
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import zeros
 from warpshadow.stages.screen import (
-    distance,
     ends_before,
     half_size,
     has_neighbor,
+    line_distance,
     neighbor,
     opposite,
-    relative,
+    relative_to_ray,
     sample_center,
 )
 from warpshadow.stages.sides import join_side, split_side
 from warpshadow.stages.silhouettes.find import Silhouettes
-from warpshadow.stages.silhouettes.lines import NOTHING, FragmentArrays, image_of, line_between, make_fragment_arrays
+from warpshadow.stages.silhouettes.lines import NOTHING, FragmentArrays, image_index, line_between, make_fragment_arrays
 
 wp.set_module_options({"max_unroll": 1})  # loops that are not unrolled compile faster, and run as fast
 
@@ -40,37 +40,43 @@ def _find_edge_colors(
     instance, entry = wp.tid()
     sample = samples[entry]
     if sample >= 0:
-        batch = image_of(fragments, sample)
-        of_receivers = shading[instance_in(instance + batch, shading.shape[0])]
-        of_samples = albedo[instance_in(instance + batch, albedo.shape[0])]
+        batch = image_index(fragments, sample)
+        receiver_shading = shading[instance_in(instance + batch, shading.shape[0])]
+        sample_albedo = albedo[instance_in(instance + batch, albedo.shape[0])]
         center = sample_center(sample, fragments.width, fragments.height)
-        half = half_size(fragments.width, fragments.height)
+        samples_per_unit = half_size(fragments.width, fragments.height)
         clip = fragments.clip_positions[batch]
-        here = image[instance, sample]
+        sample_color = image[instance, sample]
         for direction in range(4):
             edge = edges[entry, direction]
             if edge[0] != NOTHING:
                 line = line_between(fragments, sample, direction, edge)
-                color = here
-                back = opposite(direction)
-                if edges[entry, back][0] == NOTHING and has_neighbor(sample, back, fragments.width, fragments.height):
-                    rise = here - image[instance, neighbor(sample, back, fragments.width)]
-                    if rise[3] == 0.0:
-                        color += wp.clamp(distance(line, direction, half), 0.0, 1.0) * rise
+                color = sample_color
+                opposite_direction = opposite(direction)
+                if edges[entry, opposite_direction][0] == NOTHING and has_neighbor(
+                    sample, opposite_direction, fragments.width, fragments.height
+                ):
+                    color_step = sample_color - image[instance, neighbor(sample, opposite_direction, fragments.width)]
+                    if color_step[3] == 0.0:
+                        color += wp.clamp(line_distance(line, direction, samples_per_unit), 0.0, 1.0) * color_step
                 if edge[0] >= 0 and ends_before(line, direction):
                     is_back = bool(False)
                     if sides:
                         _, is_back = split_side(sides[sample], fragments.faces.shape[0])
-                    first = receivers[join_side(edge[0], is_back, clip.shape[0])]
-                    second = receivers[join_side(edge[1], is_back, clip.shape[0])]
-                    if wp.min(first, second) >= 0:
-                        across_a = relative(clip[edge[0]], center)[1 - direction / 2]
-                        across_b = relative(clip[edge[1]], center)[1 - direction / 2]
-                        place = wp.clamp(across_a / (across_a - across_b), 0.0, 1.0)
-                        received = wp.lerp(of_receivers[first], of_receivers[second], place)
-                        received = wp.cw_mul(received, of_samples[sample % (fragments.width * fragments.height)])
-                        color = wp.vec4(received[0], received[1], received[2], 1.0)
-                edge_colors[instance, entry, direction] = wp.where(wp.isfinite(color), color, here)
+                    receiver_a = receivers[join_side(edge[0], is_back, clip.shape[0])]
+                    receiver_b = receivers[join_side(edge[1], is_back, clip.shape[0])]
+                    if wp.min(receiver_a, receiver_b) >= 0:
+                        offset_a = relative_to_ray(clip[edge[0]], center)[1 - direction / 2]
+                        offset_b = relative_to_ray(clip[edge[1]], center)[1 - direction / 2]
+                        edge_position = wp.clamp(offset_a / (offset_a - offset_b), 0.0, 1.0)
+                        edge_radiance = wp.lerp(
+                            receiver_shading[receiver_a], receiver_shading[receiver_b], edge_position
+                        )
+                        edge_radiance = wp.cw_mul(
+                            edge_radiance, sample_albedo[sample % (fragments.width * fragments.height)]
+                        )
+                        color = wp.vec4(edge_radiance[0], edge_radiance[1], edge_radiance[2], 1.0)
+                edge_colors[instance, entry, direction] = wp.where(wp.isfinite(color), color, sample_color)
 
 
 def find_edge_colors(

@@ -16,14 +16,22 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import run_length, split_row, strip_count
 from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.screen import half_size, has_neighbor, neighbor, orientation, plane, sample_center, sense
+from warpshadow.stages.screen import (
+    direction_sign,
+    face_plane,
+    half_size,
+    has_neighbor,
+    neighbor,
+    orientation,
+    sample_center,
+)
 from warpshadow.stages.silhouettes.areas import measure_areas
-from warpshadow.stages.silhouettes.edges import SNAP, edge_at, edge_between, is_crease, is_silhouette
+from warpshadow.stages.silhouettes.edges import SNAP, edge_of_crossing, find_half_edge, is_crease, is_silhouette
 from warpshadow.stages.silhouettes.lines import (
     INTERSECTION,
     NOTHING,
     FragmentArrays,
-    image_of,
+    image_index,
     line_between,
     make_fragment_arrays,
 )
@@ -46,7 +54,7 @@ _UNKNOWN_EDGE, _NO_EDGE = NOTHING, -2
 
 @dataclass(frozen=True, eq=False)
 class Silhouettes:
-    """Where an image has silhouettes: an entry for every sample beside one.
+    """Silhouettes of an image: an entry for every sample beside one.
 
     Args:
         samples: Number of the sample in the flat images [batch, height, width], −1 in an entry that is not used, int32
@@ -77,18 +85,20 @@ class Silhouettes:
 
 
 @wp.func
-def _end_on_screen(p: wp.vec4, q: wp.vec4, half: wp.vec2):
-    """The end p of an edge pq, or where the edge meets the near plane if p lies behind it [samples]."""
-    behind = p[2] - p[3]
-    end = p
-    if behind > 0.0:
-        end = p + (behind / (behind - (q[2] - q[3]))) * (q - p)
-    return wp.vec2((end[0] / end[3] + 1.0) * half[0], (end[1] / end[3] + 1.0) * half[1])
+def _endpoint_on_screen(p: wp.vec4, q: wp.vec4, samples_per_unit: wp.vec2):
+    """Screen position [samples] of the end p of an edge pq, clipped at the near plane."""
+    near_distance = p[2] - p[3]
+    endpoint = p
+    if near_distance > 0.0:
+        endpoint = p + (near_distance / (near_distance - (q[2] - q[3]))) * (q - p)
+    return wp.vec2(
+        (endpoint[0] / endpoint[3] + 1.0) * samples_per_unit[0], (endpoint[1] / endpoint[3] + 1.0) * samples_per_unit[1]
+    )
 
 
 @wp.func
-def _centers_before(coordinate: float, count: int):
-    """How many of ``count`` samples have their centers before a coordinate [samples]."""
+def _center_count_before(coordinate: float, count: int):
+    """Number of the ``count`` samples whose centers are before a coordinate [samples]."""
     return int(wp.clamp(wp.ceil(coordinate - 0.5), 0.0, float(count)))
 
 
@@ -102,45 +112,44 @@ def _find_edges(
     creases: wp.array(dtype=wp.int32),
     strips: int,
     # out
-    between: wp.array2d(dtype=wp.int32),
+    half_edges: wp.array2d(dtype=wp.int32),
     crossings: wp.array2d(dtype=wp.int32),
 ):
     """A thread owns every ``strips``-th row and column that silhouette edges and creases of a face of an instance cut.
 
-    Both faces of an edge follow it; the one over which the surface comes to the edge has its crossings. Several edges
-    pass between two samples, so which of them the samples see is kept, in ``between``: whoever writes there writes the
-    same.
+    Both faces of an edge follow it; the face over which the surface comes to the edge has its crossings. Several edges
+    may pass between two samples: ``half_edges`` caches the visible one, for which all threads write the same value.
     """
     row_of_faces, strip = wp.tid()
     batch, face = split_row(first_row + row_of_faces, fragments.faces.shape[0])
     clip = fragments.clip_positions[batch]
     corners = fragments.faces[face]
-    surrounding = neighbors[face]
-    half = half_size(fragments.width, fragments.height)
+    adjacent_faces = neighbors[face]
+    samples_per_unit = half_size(fragments.width, fragments.height)
     volume = orientation(clip[corners[0]], clip[corners[1]], clip[corners[2]])
     for k in range(3):
         a = clip[corners[(k + 1) % 3]]
         b = clip[corners[(k + 2) % 3]]
-        is_line = a[3] > a[2] or b[3] > b[2]  # else it lies behind the near plane
-        if is_line and not is_silhouette(face, surrounding[k], a, b, volume, fragments.faces, neighbors, clip):
-            is_line = is_crease(face, k, creases)
-        if is_line:
-            p = _end_on_screen(a, b, half)
-            q = _end_on_screen(b, a, half)
+        is_drawn_edge = a[3] > a[2] or b[3] > b[2]  # else it lies behind the near plane
+        if is_drawn_edge and not is_silhouette(face, adjacent_faces[k], a, b, volume, fragments.faces, neighbors, clip):
+            is_drawn_edge = is_crease(face, k, creases)
+        if is_drawn_edge:
+            screen_a = _endpoint_on_screen(a, b, samples_per_unit)
+            screen_b = _endpoint_on_screen(b, a, samples_per_unit)
             for axis in range(2):
                 # Said for axis 0: along rows, from the lower to the higher row. Axis 1 goes along columns.
-                low = wp.where(p[1 - axis] < q[1 - axis], p, q)
-                high = wp.where(p[1 - axis] < q[1 - axis], q, p)
-                extent = high[1 - axis] - low[1 - axis]
-                slope = (high[axis] - low[axis]) / wp.max(extent, 1.0e-30)
+                lower_end = wp.where(screen_a[1 - axis] < screen_b[1 - axis], screen_a, screen_b)
+                upper_end = wp.where(screen_a[1 - axis] < screen_b[1 - axis], screen_b, screen_a)
+                extent = upper_end[1 - axis] - lower_end[1 - axis]
+                slope = (upper_end[axis] - lower_end[axis]) / wp.max(extent, 1.0e-30)
                 row_count = wp.where(axis == 0, fragments.height, fragments.width)
                 column_count = wp.where(axis == 0, fragments.width, fragments.height)
-                row = _centers_before(low[1 - axis] - SNAP, row_count) + strip
-                row_end = _centers_before(high[1 - axis] + SNAP, row_count)
+                row = _center_count_before(lower_end[1 - axis] - SNAP, row_count) + strip
+                row_end = _center_count_before(upper_end[1 - axis] + SNAP, row_count)
                 while row < row_end:
-                    x = low[axis] + slope * wp.clamp(float(row) + 0.5 - low[1 - axis], 0.0, extent)
-                    column = wp.max(_centers_before(x - SNAP, column_count) - 1, 0)
-                    column_end = wp.min(_centers_before(x + SNAP, column_count), column_count - 1)
+                    x = lower_end[axis] + slope * wp.clamp(float(row) + 0.5 - lower_end[1 - axis], 0.0, extent)
+                    column = wp.max(_center_count_before(x - SNAP, column_count) - 1, 0)
+                    column_end = wp.min(_center_count_before(x + SNAP, column_count), column_count - 1)
                     while column < column_end:
                         sample = batch * fragments.width * fragments.height
                         sample += wp.where(axis == 0, row * fragments.width + column, column * fragments.width + row)
@@ -148,12 +157,12 @@ def _find_edges(
                             fragments.face_ids[sample]
                             != fragments.face_ids[neighbor(sample, 2 * axis, fragments.width)]
                         ):
-                            edge_found = between[axis, sample]
-                            if edge_found == _UNKNOWN_EDGE:
-                                edge_found = edge_between(fragments, neighbors, creases, sample, 2 * axis)
-                                between[axis, sample] = wp.where(edge_found < 0, _NO_EDGE, edge_found)
-                            if edge_found == 3 * face + k:
-                                crossings[axis, sample] = edge_found
+                            half_edge = half_edges[axis, sample]
+                            if half_edge == _UNKNOWN_EDGE:
+                                half_edge = find_half_edge(fragments, neighbors, creases, sample, 2 * axis)
+                                half_edges[axis, sample] = wp.where(half_edge < 0, _NO_EDGE, half_edge)
+                            if half_edge == 3 * face + k:
+                                crossings[axis, sample] = half_edge
                         column += 1
                     row += strips
 
@@ -162,15 +171,15 @@ def _find_edges(
 
 
 @wp.func
-def _approach(fragments: FragmentArrays, sample: int, direction: int):
-    """Whether the face of a sample's neighbor gets clearly nearer than the sample's from one to the other."""
+def _intersects_between(fragments: FragmentArrays, sample: int, direction: int):
+    """Whether the faces of a sample and its neighbor intersect between them, by more than rounding."""
     axis = direction / 2
-    clip = fragments.clip_positions[image_of(fragments, sample)]
+    clip = fragments.clip_positions[image_index(fragments, sample)]
     line = line_between(fragments, sample, direction, wp.vec2i(INTERSECTION, INTERSECTION))
     center = sample_center(sample, fragments.width, fragments.height)
-    inverse_depth = plane(fragments.faces[fragments.face_ids[sample]], center, clip)[2]
-    opening = -sense(direction) * line[axis] / half_size(fragments.width, fragments.height)[axis]
-    return opening > MIN_OPENING * inverse_depth
+    inverse_depth = face_plane(fragments.faces[fragments.face_ids[sample]], center, clip)[2]
+    opening_rate = -direction_sign(direction) * line[axis] / half_size(fragments.width, fragments.height)[axis]
+    return opening_rate > MIN_OPENING * inverse_depth
 
 
 @wp.kernel(enable_backward=False)
@@ -187,24 +196,24 @@ def _find_intersections(
     crossings: wp.array2d(dtype=wp.int32),
 ):
     """A thread owns ``run`` samples after one another: the crossings to their right and their lower neighbors."""
-    first = (first_row + wp.tid()) * run
+    first_sample = (first_row + wp.tid()) * run
     count = fragments.face_ids.shape[0]
-    for sample in range(first, wp.min(first + run, count)):
-        here = fragments.face_ids[sample]
-        if here >= 0:
+    for sample in range(first_sample, wp.min(first_sample + run, count)):
+        face = fragments.face_ids[sample]
+        if face >= 0:
             # Nearly all samples end here, so this comes first, and without branches.
-            body = bodies[here]
-            right = bodies[wp.max(fragments.face_ids[wp.min(sample + 1, count - 1)], 0)]
-            below = bodies[wp.max(fragments.face_ids[wp.min(sample + fragments.width, count - 1)], 0)]
-            if right != body or below != body:
+            body = bodies[face]
+            right_body = bodies[wp.max(fragments.face_ids[wp.min(sample + 1, count - 1)], 0)]
+            lower_body = bodies[wp.max(fragments.face_ids[wp.min(sample + fragments.width, count - 1)], 0)]
+            if right_body != body or lower_body != body:
                 for axis in range(2):
                     direction = 2 * axis
-                    differs = wp.where(axis == 0, right, below) != body
+                    differs = wp.where(axis == 0, right_body, lower_body) != body
                     if differs and has_neighbor(sample, direction, fragments.width, fragments.height):
                         is_face = fragments.face_ids[neighbor(sample, direction, fragments.width)] >= 0
-                        if is_face and _approach(fragments, sample, direction):
-                            edge_found = edge_between(fragments, neighbors, creases, sample, direction)
-                            if edge_found < 0:
+                        if is_face and _intersects_between(fragments, sample, direction):
+                            half_edge = find_half_edge(fragments, neighbors, creases, sample, direction)
+                            if half_edge < 0:
                                 crossings[axis, sample] = INTERSECTION
 
 
@@ -214,10 +223,10 @@ def _find_intersections(
 @wp.func
 def _has_crossing(crossings: wp.array2d(dtype=wp.int32), sample: int, width: int):
     """Whether a line crosses between a sample and any of its neighbors; NOTHING has all bits."""
-    before = crossings[0, wp.max(sample - 1, 0)] & crossings[1, wp.max(sample - width, 0)]
+    preceding_crossings = crossings[0, wp.max(sample - 1, 0)] & crossings[1, wp.max(sample - width, 0)]
     if sample < width:
-        before = crossings[0, wp.max(sample - 1, 0)]
-    return (before & crossings[0, sample] & crossings[1, sample]) != NOTHING
+        preceding_crossings = crossings[0, wp.max(sample - 1, 0)]
+    return (preceding_crossings & crossings[0, sample] & crossings[1, sample]) != NOTHING
 
 
 @wp.kernel(enable_backward=False)
@@ -268,21 +277,27 @@ def _make_entries(
     if ends and thread > 0:
         first_entry = ends[thread - 1]
     for sample in range(thread * run, wp.min((thread + 1) * run, entries.shape[0])):
-        number = entries[sample]
-        if number >= 0 or not ends:
-            entry = wp.where(number >= 0, first_entry + number, -1)
+        entry_number = entries[sample]
+        if entry_number >= 0 or not ends:
+            entry = wp.where(entry_number >= 0, first_entry + entry_number, -1)
             if not ends:
                 entry = sample
-            samples[entry] = wp.where(number >= 0, sample, -1)
+            samples[entry] = wp.where(entry_number >= 0, sample, -1)
             for direction in range(4):
                 edge = wp.vec2i(NOTHING, NOTHING)
-                first = wp.where(direction % 2 == 0, sample, neighbor(sample, direction, fragments.width))
-                if number >= 0 and first >= 0:
-                    edge = edge_at(
-                        fragments, neighbors, creases, crossings, first, direction - direction % 2, direction % 2 == 1
+                crossing_sample = wp.where(direction % 2 == 0, sample, neighbor(sample, direction, fragments.width))
+                if entry_number >= 0 and crossing_sample >= 0:
+                    edge = edge_of_crossing(
+                        fragments,
+                        neighbors,
+                        creases,
+                        crossings,
+                        crossing_sample,
+                        direction - direction % 2,
+                        direction % 2 == 1,
                     )
                 edges[entry, direction] = edge
-            entries[sample] = wp.where(number >= 0, entry, -1)
+            entries[sample] = wp.where(entry_number >= 0, entry, -1)
 
 
 def find_silhouettes(
@@ -315,8 +330,8 @@ def find_silhouettes(
     if sample_count > MAX_SAMPLES:
         raise ValueError(f"fragments: got {sample_count} samples in all, expected at most {MAX_SAMPLES}")
     arrays, strips = make_fragment_arrays(fragments, faces, clip_positions), strip_count(device)
-    numbers = wp.full((4, sample_count), NOTHING, dtype=wp.int32, device=device)
-    between, crossings = numbers[:2], numbers[2:]  # in the latter 3 face + corner of an edge, or INTERSECTION
+    crossing_arrays = wp.full((4, sample_count), NOTHING, dtype=wp.int32, device=device)
+    half_edges, crossings = crossing_arrays[:2], crossing_arrays[2:]  # 3 face + corner, or INTERSECTION
     if creases is not None:
         check.shape("creases", creases.shape, faces.shape)
     launch(
@@ -324,22 +339,25 @@ def find_silhouettes(
         (len(clip_positions) * faces.shape[0], strips),
         cost=_FACE_COST,
         inputs=[arrays, neighbors, creases, strips],
-        outputs=[between, crossings],
+        outputs=[half_edges, crossings],
     )
     run = run_length(device, arrays.width)
-    dim = -(-sample_count // run)
+    thread_count = -(-sample_count // run)
     if bodies is not None:
         check.shape("bodies", bodies.shape, faces.shape)
         inputs = [arrays, neighbors, bodies, creases, run]
-        launch(_find_intersections, dim, cost=_SAMPLE_COST * run, inputs=inputs, outputs=[crossings])
-    entries, ends = empty(sample_count, wp.int32, device), None if device.is_capturing else empty(dim, wp.int32, device)
+        launch(_find_intersections, thread_count, cost=_SAMPLE_COST * run, inputs=inputs, outputs=[crossings])
+    entries, ends = (
+        empty(sample_count, wp.int32, device),
+        None if device.is_capturing else empty(thread_count, wp.int32, device),
+    )
     inputs = [crossings, arrays.width, run]
-    launch(_count_entries, dim, cost=_ENTRY_COST * run, inputs=inputs, outputs=[entries, ends])
+    launch(_count_entries, thread_count, cost=_ENTRY_COST * run, inputs=inputs, outputs=[entries, ends])
     entry_count = sample_count
     if ends is not None:
         wp.utils.array_scan(ends, ends)
-        entry_count = int(ends[-1:].numpy()[0]) if dim else 0
+        entry_count = int(ends[-1:].numpy()[0]) if thread_count else 0
     samples, edges = empty(entry_count, wp.int32, device), empty((entry_count, 4), wp.vec2i, device)
     inputs = [crossings, arrays, neighbors, creases, ends, run]
-    launch(_make_entries, dim, cost=_ENTRY_COST * run, inputs=inputs, outputs=[samples, edges, entries])
+    launch(_make_entries, thread_count, cost=_ENTRY_COST * run, inputs=inputs, outputs=[samples, edges, entries])
     return Silhouettes(samples, edges, measure_areas(samples, edges, entries, arrays), entries, fragments, faces)

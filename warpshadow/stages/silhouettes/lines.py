@@ -3,7 +3,7 @@
 import warp as wp
 
 from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.screen import neighbor, plane, relative, sample_center
+from warpshadow.stages.screen import face_plane, neighbor, relative_to_ray, sample_center
 
 NOTHING = -1
 INTERSECTION = -2  # in place of an edge's vertices, where there is no line, and where there is that of two faces
@@ -31,24 +31,26 @@ def make_fragment_arrays(fragments: Fragments, faces: wp.array, clip_positions: 
 
 
 @wp.func
-def image_of(fragments: FragmentArrays, sample: int):
-    """Number of the image that has a sample of flat images."""
+def image_index(fragments: FragmentArrays, sample: int):
+    """Index of the image that a sample of flat images belongs to."""
     return sample / (fragments.width * fragments.height)
 
 
 @wp.func
 def edge_line(edge: wp.vec2i, position: wp.vec2, clip_positions: wp.array(dtype=wp.vec4)):
     """The line of an edge, relative to a position."""
-    return wp.cross(relative(clip_positions[edge[0]], position), relative(clip_positions[edge[1]], position))
+    return wp.cross(
+        relative_to_ray(clip_positions[edge[0]], position), relative_to_ray(clip_positions[edge[1]], position)
+    )
 
 
 @wp.func
 def line_between(fragments: FragmentArrays, sample: int, direction: int, edge: wp.vec2i):
     """The line ℓ between a sample and its neighbor in a direction, relative to the sample's center."""
     position = sample_center(sample, fragments.width, fragments.height)
-    clip = fragments.clip_positions[image_of(fragments, sample)]
+    clip = fragments.clip_positions[image_index(fragments, sample)]
     if edge[0] >= 0:
         return edge_line(edge, position, clip)
-    here = fragments.faces[fragments.face_ids[sample]]
-    there = fragments.faces[fragments.face_ids[neighbor(sample, direction, fragments.width)]]
-    return plane(here, position, clip) - plane(there, position, clip)
+    face = fragments.faces[fragments.face_ids[sample]]
+    neighbor_face = fragments.faces[fragments.face_ids[neighbor(sample, direction, fragments.width)]]
+    return face_plane(face, position, clip) - face_plane(neighbor_face, position, clip)

@@ -21,26 +21,26 @@ from warpshadow.device.batch import accumulate
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import zeros
 from warpshadow.device.warp_internals import scalar_type
-from warpshadow.stages.interpolation import inner
+from warpshadow.stages.interpolation import inner_product
 from warpshadow.stages.screen import neighbor, opposite
-from warpshadow.stages.silhouettes.areas import add_to_vertices
+from warpshadow.stages.silhouettes.areas import measure_areas_adjoint
 from warpshadow.stages.silhouettes.find import Silhouettes
 from warpshadow.stages.silhouettes.lines import make_fragment_arrays
 
 
 @wp.func
-def _loss(share: wp.vec3, neighbor_share: wp.vec3):
+def _overlap_loss(share: wp.vec3, neighbor_share: wp.vec3):
     """Loss of an area to one beyond a neighboring line, as a fraction of their product."""
-    part = 0.5 * (1.0 + neighbor_share[2] - share[2])
-    return part * wp.max(share[1] + neighbor_share[1] - 1.0, 0.0)
+    loss_share = 0.5 * (1.0 + neighbor_share[2] - share[2])
+    return loss_share * wp.max(share[1] + neighbor_share[1] - 1.0, 0.0)
 
 
 @wp.func
 def _area_weight(shares: wp.array(dtype=wp.vec3), direction: int):
     """Weight of the area in a direction: ω, less its loss to the areas in both directions across."""
     perpendicular = wp.where(direction < 2, 2, 0)
-    weight = shares[direction][1] - _loss(shares[direction], shares[perpendicular]) * shares[perpendicular][0]
-    return weight - _loss(shares[direction], shares[perpendicular + 1]) * shares[perpendicular + 1][0]
+    weight = shares[direction][1] - _overlap_loss(shares[direction], shares[perpendicular]) * shares[perpendicular][0]
+    return weight - _overlap_loss(shares[direction], shares[perpendicular + 1]) * shares[perpendicular + 1][0]
 
 
 @functools.cache
@@ -61,15 +61,15 @@ def _make_blend(dtype: type) -> wp.Kernel:
         instance, entry = wp.tid()
         sample = samples[entry]
         if sample >= 0:
-            own_shares = shares[entry]
-            here = image[instance, sample]
-            total = here
+            sample_shares = shares[entry]
+            color = image[instance, sample]
+            blended = color
             for direction in range(4):
-                area = own_shares[direction][0]
+                area = sample_shares[direction][0]
                 if area > 0.0:
-                    contrast = image[instance, neighbor(sample, direction, width)] - here
-                    total += area * _area_weight(own_shares, direction) * contrast
-            smoothed[instance, sample] = total
+                    contrast = image[instance, neighbor(sample, direction, width)] - color
+                    blended += area * _area_weight(sample_shares, direction) * contrast
+            smoothed[instance, sample] = blended
 
     return blend
 
@@ -99,27 +99,27 @@ def _make_blend_adjoint(dtype: type) -> wp.Kernel:
         instance, entry = wp.tid()
         sample = samples[entry]
         if sample >= 0:
-            own_shares = shares[entry]
+            sample_shares = shares[entry]
             adj = adj_smoothed[instance, sample]
             for direction in range(4):
-                share = own_shares[direction]
+                share = sample_shares[direction]
                 if share[0] > 0.0:
                     other = neighbor(sample, direction, width)
-                    weight = _area_weight(own_shares, direction)
+                    weight = _area_weight(sample_shares, direction)
                     if adj_image:
                         wp.atomic_add(adj_image, instance, other, share[0] * weight * adj)
                         wp.atomic_sub(adj_image, instance, sample, share[0] * weight * adj)
                     if adj_areas:
                         contrast = image[instance, other] - image[instance, sample]
                         if edge_colors:
-                            color_across = edge_colors[instance, entries[other], opposite(direction)]
-                            contrast = color_across - edge_colors[instance, entry, direction]
-                        change = inner(adj, contrast)
-                        wp.atomic_add(adj_areas, entry, direction, weight * change)
+                            neighbor_color = edge_colors[instance, entries[other], opposite(direction)]
+                            contrast = neighbor_color - edge_colors[instance, entry, direction]
+                        adj_area = inner_product(adj, contrast)
+                        wp.atomic_add(adj_areas, entry, direction, weight * adj_area)
                         perpendicular = wp.where(direction < 2, 2, 0)
                         for k in range(2):
-                            loss = _loss(share, own_shares[perpendicular + k]) * share[0]
-                            wp.atomic_sub(adj_areas, entry, perpendicular + k, loss * change)
+                            loss = _overlap_loss(share, sample_shares[perpendicular + k]) * share[0]
+                            wp.atomic_sub(adj_areas, entry, perpendicular + k, loss * adj_area)
 
     return blend_adjoint
 
@@ -172,6 +172,6 @@ def smooth_silhouettes(
         )
         if adj_areas is not None:
             arrays = make_fragment_arrays(fragments, silhouettes.faces, clip_positions)
-            add_to_vertices(samples, silhouettes.edges, arrays, adj_areas)
+            measure_areas_adjoint(samples, silhouettes.edges, arrays, adj_areas)
 
     return differentiable(blend, adjoint, wp.clone(image, requires_grad=False), [image, clip_positions])

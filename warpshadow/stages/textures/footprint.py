@@ -16,7 +16,7 @@ from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
 from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.screen import center, relative, volumes
+from warpshadow.stages.screen import center, ray_volumes, relative_to_ray
 from warpshadow.stages.textures.pyramid import Textures
 
 PROBE_LINE_EXCESS = 0.25
@@ -60,29 +60,49 @@ class Footprints:
 
 @wp.func
 def _uv_derivatives(
-    a: wp.vec4, b: wp.vec4, c: wp.vec4, to_a: wp.vec2, to_b: wp.vec2, to_c: wp.vec2, ray: wp.vec2, step: wp.vec2
+    a: wp.vec4,
+    b: wp.vec4,
+    c: wp.vec4,
+    uv_offset_a: wp.vec2,
+    uv_offset_b: wp.vec2,
+    uv_offset_c: wp.vec2,
+    ray: wp.vec2,
+    step: wp.vec2,
 ):
     """Derivative of uv by the position of a sample [1/sample], its columns by column and row.
 
-    ``a``, ``b`` and ``c`` are the vertices in clip space, ``to_a``, ``to_b`` and ``to_c`` their uvs relative to that of
-    the sample, and ``step`` is that of the ray from one sample to the next. With volumes v, linear in the ray,
-    uv = Σ v_i uv_i / Σ v_i has the derivative Σ v_i' (uv_i - uv) / Σ v_i, on the whole plane of the face.
+    ``a``, ``b`` and ``c`` are the vertices in clip space, ``uv_offset_a``, ``uv_offset_b`` and ``uv_offset_c`` their
+    uvs relative to that of the sample, and ``step`` is that of the ray from one sample to the next. With volumes v,
+    linear in the ray, uv = Σ v_i uv_i / Σ v_i has the derivative Σ v_i' (uv_i - uv) / Σ v_i, on the whole plane of the
+    face.
     """
-    at_a = relative(a, ray)
-    at_b = relative(b, ray)
-    at_c = relative(c, ray)
-    spanned = volumes(at_a, at_b, at_c)
-    total = spanned[0] + spanned[1] + spanned[2]
-    by_x = wp.vec3(at_b[1] * c[3] - b[3] * at_c[1], at_c[1] * a[3] - c[3] * at_a[1], at_a[1] * b[3] - a[3] * at_b[1])
-    by_y = wp.vec3(b[3] * at_c[0] - at_b[0] * c[3], c[3] * at_a[0] - at_c[0] * a[3], a[3] * at_b[0] - at_a[0] * b[3])
+    relative_a = relative_to_ray(a, ray)
+    relative_b = relative_to_ray(b, ray)
+    relative_c = relative_to_ray(c, ray)
+    vertex_volumes = ray_volumes(relative_a, relative_b, relative_c)
+    volume_sum = vertex_volumes[0] + vertex_volumes[1] + vertex_volumes[2]
+    volumes_by_x = wp.vec3(
+        relative_b[1] * c[3] - b[3] * relative_c[1],
+        relative_c[1] * a[3] - c[3] * relative_a[1],
+        relative_a[1] * b[3] - a[3] * relative_b[1],
+    )
+    volumes_by_y = wp.vec3(
+        b[3] * relative_c[0] - relative_b[0] * c[3],
+        c[3] * relative_a[0] - relative_c[0] * a[3],
+        a[3] * relative_b[0] - relative_a[0] * b[3],
+    )
     # seen edge-on the total vanishes: no less, then, than a millionth of the change of the volumes within a sample
     minimum = 1.0e-6 * (
-        step[0] * (wp.abs(by_x[0]) + wp.abs(by_x[1]) + wp.abs(by_x[2]))
-        + step[1] * (wp.abs(by_y[0]) + wp.abs(by_y[1]) + wp.abs(by_y[2]))
+        step[0] * (wp.abs(volumes_by_x[0]) + wp.abs(volumes_by_x[1]) + wp.abs(volumes_by_x[2]))
+        + step[1] * (wp.abs(volumes_by_y[0]) + wp.abs(volumes_by_y[1]) + wp.abs(volumes_by_y[2]))
     )
-    scale = wp.where(wp.abs(total) > minimum, total, minimum + 1.0e-30)
-    x = (step[0] / scale) * (by_x[0] * to_a + by_x[1] * to_b + by_x[2] * to_c)
-    y = (step[1] / scale) * (by_y[0] * to_a + by_y[1] * to_b + by_y[2] * to_c)
+    scale = wp.where(wp.abs(volume_sum) > minimum, volume_sum, minimum + 1.0e-30)
+    x = (step[0] / scale) * (
+        volumes_by_x[0] * uv_offset_a + volumes_by_x[1] * uv_offset_b + volumes_by_x[2] * uv_offset_c
+    )
+    y = (step[1] / scale) * (
+        volumes_by_y[0] * uv_offset_a + volumes_by_y[1] * uv_offset_b + volumes_by_y[2] * uv_offset_c
+    )
     return wp.mat22(x[0], y[0], x[1], y[1])
 
 
@@ -153,10 +173,10 @@ def _find_footprints(
         a = clip[faces[face][0]]
         b = clip[faces[face][1]]
         c = clip[faces[face][2]]
-        of_instance = uvs[instance_in(instance, uvs.shape[0])]
-        uv_a = of_instance[uv_faces[face][0]]
-        uv_b = of_instance[uv_faces[face][1]]
-        uv_c = of_instance[uv_faces[face][2]]
+        instance_uvs = uvs[instance_in(instance, uvs.shape[0])]
+        uv_a = instance_uvs[uv_faces[face][0]]
+        uv_b = instance_uvs[uv_faces[face][1]]
+        uv_c = instance_uvs[uv_faces[face][2]]
         weights = barycentrics[fragment_batch, sample]
         uv = weights[0] * uv_a + weights[1] * uv_b + weights[2] * uv_c
         row = sample // image_width

@@ -8,28 +8,28 @@ from warpshadow.device.memory import empty, zeros
 
 
 @wp.kernel
-def _to_grays(
+def _scalars_to_colors(
     # in
-    numbers: wp.array2d(dtype=wp.float32),
+    scalars: wp.array2d(dtype=wp.float32),
     # out
     grays: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a number."""
-    batch, item = wp.tid()
-    number = numbers[batch, item]
-    grays[batch, item] = wp.vec3(number, number, number)
+    batch, index = wp.tid()
+    scalar = scalars[batch, index]
+    grays[batch, index] = wp.vec3(scalar, scalar, scalar)
 
 
 @wp.kernel
-def _from_grays(
+def _colors_to_scalars(
     # in
     grays: wp.array2d(dtype=wp.vec3),
     # out
-    numbers: wp.array2d(dtype=wp.float32),
+    scalars: wp.array2d(dtype=wp.float32),
 ):
     """A thread owns a number."""
-    batch, item = wp.tid()
-    numbers[batch, item] = grays[batch, item][0]
+    batch, index = wp.tid()
+    scalars[batch, index] = grays[batch, index][0]
 
 
 def as_colors(values: wp.array) -> wp.array:
@@ -42,22 +42,22 @@ def as_colors(values: wp.array) -> wp.array:
     if values.dtype == wp.vec3:
         return values
     grays = empty((len(values), values[0].size), dtype=wp.vec3, device=values.device)
-    launch(_to_grays, grays.shape, inputs=[values if values.ndim == 2 else rows(values)], outputs=[grays])
+    launch(_scalars_to_colors, grays.shape, inputs=[values if values.ndim == 2 else rows(values)], outputs=[grays])
     return grays.reshape(values.shape)
 
 
-def as_numbers(grays: wp.array) -> wp.array:
+def as_scalars(grays: wp.array) -> wp.array:
     """The numbers of grays, float32 of shape [batch, item]. Differentiable: grays, [batch, height, width]."""
     colors = rows(grays)
-    numbers = empty(colors.shape, dtype=wp.float32, device=grays.device)
-    launch(_from_grays, numbers.shape, inputs=[colors], outputs=[numbers])
-    return numbers
+    scalars = empty(colors.shape, dtype=wp.float32, device=grays.device)
+    launch(_colors_to_scalars, scalars.shape, inputs=[colors], outputs=[scalars])
+    return scalars
 
 
 @wp.kernel
 def _add_to_receivers(
     # in
-    numbers: wp.array2d(dtype=wp.float32),
+    scalars: wp.array2d(dtype=wp.float32),
     face_ids: wp.array2d(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
     # out
@@ -69,11 +69,11 @@ def _add_to_receivers(
     if face >= 0:
         corners = faces[face]
         if corners[0] == corners[1]:
-            wp.atomic_add(sums, batch, corners[0], wp.vec2(numbers[batch, sample], 1.0))
+            wp.atomic_add(sums, batch, corners[0], wp.vec2(scalars[batch, sample], 1.0))
 
 
 @wp.kernel
-def _divide(
+def _divide_sums(
     # in
     sums: wp.array2d(dtype=wp.vec2),
     # out
@@ -84,20 +84,20 @@ def _divide(
     means[batch, receiver] = sums[batch, receiver][0] / wp.max(sums[batch, receiver][1], 1.0)
 
 
-def means_of_receivers(numbers: wp.array, face_ids: wp.array, faces: wp.array, receiver_count: int) -> wp.array:
-    """Means of the numbers of the samples that share a receiver; those of different faces are in different texels.
+def means_of_receivers(scalars: wp.array, face_ids: wp.array, faces: wp.array, receiver_count: int) -> wp.array:
+    """Means of the scalars of samples that share a receiver; samples of different faces are in different texels.
 
     Args:
-        numbers: Float32 of shape [batch, sample].
+        scalars: Float32 of shape [batch, sample].
         face_ids: Of :attr:`.receivers.Receivers.fragments`, int32 of shape [view, sample].
         faces: Of receivers, vec3i of shape [face].
         receiver_count: Number of receivers.
     Returns:
         Float32 of shape [batch, receiver], 0 for receivers that are vertices.
-    Differentiable: numbers.
+    Differentiable: scalars.
     """
-    sums = zeros((len(numbers), receiver_count), dtype=wp.vec2, device=numbers.device)
-    launch(_add_to_receivers, numbers.shape, inputs=[numbers, face_ids, faces], outputs=[sums])
-    means = empty(sums.shape, dtype=wp.float32, device=numbers.device)
-    launch(_divide, means.shape, inputs=[sums], outputs=[means])
+    sums = zeros((len(scalars), receiver_count), dtype=wp.vec2, device=scalars.device)
+    launch(_add_to_receivers, scalars.shape, inputs=[scalars, face_ids, faces], outputs=[sums])
+    means = empty(sums.shape, dtype=wp.float32, device=scalars.device)
+    launch(_divide_sums, means.shape, inputs=[sums], outputs=[means])
     return means

@@ -58,12 +58,12 @@ def level_matrices(height: int, width: int) -> Iterator[csr_matrix]:
     """The matrices from the texels of an image to the texels of each level, [texel of the level, texel], one by one."""
     from scipy.sparse import identity, kron
 
-    down, columns = identity(height, format="csr"), identity(width, format="csr")
-    yield kron(down, columns, format="csr")
+    row_matrix, column_matrix = identity(height, format="csr"), identity(width, format="csr")
+    yield kron(row_matrix, column_matrix, format="csr")
     for rows_left, columns_left in level_sizes(height, width)[1:]:
-        down = _halving(down.shape[0], rows_left) @ down
-        columns = _halving(columns.shape[0], columns_left) @ columns
-        yield kron(down, columns, format="csr")
+        row_matrix = _halving(row_matrix.shape[0], rows_left) @ row_matrix
+        column_matrix = _halving(column_matrix.shape[0], columns_left) @ column_matrix
+        yield kron(row_matrix, column_matrix, format="csr")
 
 
 def _halving(fine_count: int, coarse_count: int) -> csr_matrix:
@@ -77,21 +77,21 @@ def _halving(fine_count: int, coarse_count: int) -> csr_matrix:
         shares = np.full((coarse_count, 2), 0.5)
     else:
         shares = np.stack([coarse_count - coarse, np.full(coarse_count, coarse_count), coarse + 1], axis=1) / fine_count
-    columns = 2 * coarse[:, None] + np.arange(shares.shape[1])
+    fine_indices = 2 * coarse[:, None] + np.arange(shares.shape[1])
     starts = np.arange(coarse_count + 1) * shares.shape[1]
-    return csr_matrix((shares.ravel(), columns.ravel(), starts), (coarse_count, fine_count))
+    return csr_matrix((shares.ravel(), fine_indices.ravel(), starts), (coarse_count, fine_count))
 
 
 class _Layout:
-    """Where the levels of textures lie in an array of texels."""
+    """Layout of the levels of textures in an array of texels."""
 
     def __init__(self, sizes: Sizes, device: str):
-        of_textures = [level_sizes(*size) for size in sizes]
-        self.level_counts = [len(part) for part in of_textures]
+        level_sizes_of_textures = [level_sizes(*size) for size in sizes]
+        self.level_counts = [len(texture_levels) for texture_levels in level_sizes_of_textures]
         self.levels = np.zeros((len(sizes), max(self.level_counts), 3), np.int32)
         self.texel_count = 0
-        for texture, part in enumerate(of_textures):
-            for level, (height, width) in enumerate(part):
+        for texture, texture_levels in enumerate(level_sizes_of_textures):
+            for level, (height, width) in enumerate(texture_levels):
                 self.levels[texture, level] = self.texel_count, width, height
                 self.texel_count += width * height
         self.device_levels = wp.array(self.levels, dtype=wp.vec3i, device=device)
@@ -126,7 +126,7 @@ def _shares(coarse: int, fine_count: int, coarse_count: int):
 
 
 @wp.func
-def _covered(texel: int, fine: wp.vec3i, coarse: wp.vec3i):
+def _fine_texels(texel: int, fine: wp.vec3i, coarse: wp.vec3i):
     """First of the 3 × 3 fine texels around a coarse one, and the shares of their columns and rows."""
     row = texel // coarse[1]
     column = texel - row * coarse[1]
@@ -145,16 +145,16 @@ def _halve(
 ):
     """A thread owns a run of texels of the coarse level: means over the fine texels that they cover."""
     batch, thread = wp.tid()
-    of_instance = texels[batch]
+    instance_texels = texels[batch]
     for texel in range(thread * run, (thread + 1) * run):
-        start, columns, down = _covered(texel, fine, coarse)
+        start, column_shares, row_shares = _fine_texels(texel, fine, coarse)
         mean = wp.vec3()
         for i in range(3):
-            if down[i] > 0.0:
+            if row_shares[i] > 0.0:
                 for j in range(3):
-                    if columns[j] > 0.0:
-                        mean += (down[i] * columns[j]) * of_instance[start + i * fine[1] + j]
-        of_instance[coarse[0] + texel] = mean
+                    if column_shares[j] > 0.0:
+                        mean += (row_shares[i] * column_shares[j]) * instance_texels[start + i * fine[1] + j]
+        instance_texels[coarse[0] + texel] = mean
 
 
 @wp.kernel(enable_backward=False)
@@ -168,15 +168,17 @@ def _halve_adjoint(
 ):
     """A thread owns a run of texels of the coarse level."""
     batch, thread = wp.tid()
-    of_instance = adj_texels[batch]
+    instance_texels = adj_texels[batch]
     for texel in range(thread * run, (thread + 1) * run):
-        start, columns, down = _covered(texel, fine, coarse)
-        adj_mean = of_instance[coarse[0] + texel]
+        start, column_shares, row_shares = _fine_texels(texel, fine, coarse)
+        adj_mean = instance_texels[coarse[0] + texel]
         for i in range(3):
-            if down[i] > 0.0:
+            if row_shares[i] > 0.0:
                 for j in range(3):
-                    if columns[j] > 0.0:
-                        wp.atomic_add(of_instance, start + i * fine[1] + j, (down[i] * columns[j]) * adj_mean)
+                    if column_shares[j] > 0.0:
+                        wp.atomic_add(
+                            instance_texels, start + i * fine[1] + j, (row_shares[i] * column_shares[j]) * adj_mean
+                        )
 
 
 def mip_pyramids(images: Sequence[wp.array], *, coarsest: int | None = None) -> Textures:
@@ -212,8 +214,8 @@ def mip_pyramids(images: Sequence[wp.array], *, coarsest: int | None = None) -> 
     def fill(texels: wp.array) -> None:
         with unrecorded():  # Warp's tape would record copies
             for number, image in enumerate(images):
-                for from_image, to_texels in _finest_levels(image, texels, layout, number):
-                    wp.copy(to_texels, from_image)
+                for image_region, texel_region in _finest_levels(image, texels, layout, number):
+                    wp.copy(texel_region, image_region)
                 for fine, coarse in layout.steps(number, coarsest):
                     _launch_on_level(_halve, fine, coarse, texels)
 
@@ -242,8 +244,8 @@ def gather_levels(
         if image is not None:
             for fine, coarse in reversed(layout.steps(number, coarsest)):
                 _launch_on_level(_halve_adjoint, fine, coarse, adj_texels)
-            for to_image, from_texels in _finest_levels(image, adj_texels, layout, number):
-                accumulate(from_texels, to_image)
+            for image_region, texel_region in _finest_levels(image, adj_texels, layout, number):
+                accumulate(texel_region, image_region)
 
 
 def _finest_levels(image: wp.array, texels: wp.array, layout: _Layout, number: int) -> list[tuple[wp.array, wp.array]]:

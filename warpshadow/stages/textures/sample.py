@@ -15,7 +15,7 @@ from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import differentiable, launch, varies
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import run_length, split_row
-from warpshadow.stages.interpolation import add_to_corners, adj_weights, at_point
+from warpshadow.stages.interpolation import interpolate_at, interpolate_values_adjoint, interpolate_weights_adjoint
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.textures.footprint import Footprints
 from warpshadow.stages.textures.pyramid import Textures
@@ -24,7 +24,7 @@ _COST = 10.0  # nanoseconds that a sample takes
 
 
 @wp.struct
-class _Sampled:
+class _SampleInputs:
     """The faces and the parts of textures that samples see, all but their colors."""
 
     face_ids: wp.array2d(dtype=wp.int32)
@@ -42,7 +42,7 @@ class _Sampled:
 
 
 @wp.func
-def _level_of(width: float, level_count: int):
+def _split_level(width: float, level_count: int):
     """Finer of the two levels that a probe blends, and the part of the coarser one.
 
     With the part width/2^level - 1 the mean width of their texels is that of the probe.
@@ -56,13 +56,13 @@ def _level_of(width: float, level_count: int):
 
 
 @wp.func
-def _reach(count: float):
+def _line_reach(count: float):
     """Number of the outermost probe on either side."""
     return int(wp.ceil(0.5 * (count - 1.0)))
 
 
 @wp.func
-def _share(probe: int, count: float):
+def _probe_share(probe: int, count: float):
     """Weight of a probe among ``count``: the part of the line in its stretch, so outer ones fade in as it grows."""
     return wp.min(0.5 * (count + 1.0) - float(wp.abs(probe)), 1.0)
 
@@ -80,8 +80,8 @@ class _Cell:
 
 
 @wp.func
-def _place(level: wp.vec3i, uv: wp.vec2):
-    """Where a uv lies in a level [texels], relative to the center of its first texel; it repeats outside of [0, 1]."""
+def _texel_position(level: wp.vec3i, uv: wp.vec2):
+    """Position of a uv in a level [texels], relative to the center of its first texel; it repeats outside of [0, 1]."""
     x = (uv[0] - wp.floor(uv[0])) * float(level[1]) - 0.5
     y = (1.0 - (uv[1] - wp.floor(uv[1]))) * float(level[2]) - 0.5
     return wp.vec2(x, y)
@@ -95,100 +95,106 @@ def _repeated(texel: int, count: int):
 
 @wp.func
 def _cell(level: wp.vec3i, x: float, y: float):
-    """Find the texels around a place in a level, as `_place` has it or beside that."""
+    """Find the texels around a place in a level, as `_texel_position` has it or beside that."""
     cell = _Cell()
     cell.s = x - wp.floor(x)
     cell.t = y - wp.floor(y)
-    left = int(wp.floor(x))
+    left_column = int(wp.floor(x))
     top = int(wp.floor(y))
-    right = left + 1
+    right_column = left_column + 1
     bottom = top + 1
-    if wp.min(left, top) < 0 or right >= level[1] or bottom >= level[2]:  # few do, and remainders take long
-        left = _repeated(left, level[1])
-        right = _repeated(right, level[1])
+    if (
+        wp.min(left_column, top) < 0 or right_column >= level[1] or bottom >= level[2]
+    ):  # few do, and remainders take long
+        left_column = _repeated(left_column, level[1])
+        right_column = _repeated(right_column, level[1])
         top = _repeated(top, level[2])
         bottom = _repeated(bottom, level[2])
-    above = level[0] + top * level[1]
-    below = level[0] + bottom * level[1]
-    cell.above_left = above + left
-    cell.above_right = above + right
-    cell.below_left = below + left
-    cell.below_right = below + right
+    upper_row = level[0] + top * level[1]
+    lower_row = level[0] + bottom * level[1]
+    cell.above_left = upper_row + left_column
+    cell.above_right = upper_row + right_column
+    cell.below_left = lower_row + left_column
+    cell.below_right = lower_row + right_column
     return cell
 
 
 @wp.func
-def _filtered(texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2, line: wp.vec4):
+def _filter_line(texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2, probe_line: wp.vec4):
     """Mean of a level over the probes of a footprint, each bilinear between four texels."""
-    place = _place(level, uv)
-    reach = _reach(line[3])
-    scale = 1.0 / line[3]
+    texel_position = _texel_position(level, uv)
+    line_reach = _line_reach(probe_line[3])
+    scale = 1.0 / probe_line[3]
     color = wp.vec3()
-    for probe in range(-reach, reach + 1):
-        x = place[0] + float(probe) * line[0] * float(level[1])
-        y = place[1] - float(probe) * line[1] * float(level[2])
+    for probe in range(-line_reach, line_reach + 1):
+        x = texel_position[0] + float(probe) * probe_line[0] * float(level[1])
+        y = texel_position[1] - float(probe) * probe_line[1] * float(level[2])
         cell = _cell(level, x, y)
-        share = scale * _share(probe, line[3])
-        below = share * cell.t
-        above = share - below
+        share = scale * _probe_share(probe, probe_line[3])
+        lower_weight = share * cell.t
+        upper_weight = share - lower_weight
         color += (
-            (above * (1.0 - cell.s)) * texels[cell.above_left]
-            + (above * cell.s) * texels[cell.above_right]
-            + (below * (1.0 - cell.s)) * texels[cell.below_left]
-            + (below * cell.s) * texels[cell.below_right]
+            (upper_weight * (1.0 - cell.s)) * texels[cell.above_left]
+            + (upper_weight * cell.s) * texels[cell.above_right]
+            + (lower_weight * (1.0 - cell.s)) * texels[cell.below_left]
+            + (lower_weight * cell.s) * texels[cell.below_right]
         )
     return color
 
 
 @wp.func
-def at_uv(texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2):
+def interpolate_uv(texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2):
     """A level at a point, bilinear between four texels."""
-    return _filtered(texels, level, uv, wp.vec4(0.0, 0.0, 0.0, 1.0))
+    return _filter_line(texels, level, uv, wp.vec4(0.0, 0.0, 0.0, 1.0))
 
 
 @wp.func
-def _scatter(adj_texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2, line: wp.vec4, adj_color: wp.vec3):
-    """Add to the gradients of a level's texels: the adjoint of `_filtered`, by its value."""
-    place = _place(level, uv)
-    reach = _reach(line[3])
-    adj_sum = (1.0 / line[3]) * adj_color
-    for probe in range(-reach, reach + 1):
-        x = place[0] + float(probe) * line[0] * float(level[1])
-        y = place[1] - float(probe) * line[1] * float(level[2])
+def _scatter(
+    adj_texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2, probe_line: wp.vec4, adj_color: wp.vec3
+):
+    """Add to the gradients of a level's texels: the adjoint of `_filter_line`, by its value."""
+    texel_position = _texel_position(level, uv)
+    line_reach = _line_reach(probe_line[3])
+    adj_sum = (1.0 / probe_line[3]) * adj_color
+    for probe in range(-line_reach, line_reach + 1):
+        x = texel_position[0] + float(probe) * probe_line[0] * float(level[1])
+        y = texel_position[1] - float(probe) * probe_line[1] * float(level[2])
         cell = _cell(level, x, y)
-        below = _share(probe, line[3]) * cell.t
-        above = _share(probe, line[3]) - below
-        wp.atomic_add(adj_texels, cell.above_left, (above * (1.0 - cell.s)) * adj_sum)
-        wp.atomic_add(adj_texels, cell.above_right, (above * cell.s) * adj_sum)
-        wp.atomic_add(adj_texels, cell.below_left, (below * (1.0 - cell.s)) * adj_sum)
-        wp.atomic_add(adj_texels, cell.below_right, (below * cell.s) * adj_sum)
+        lower_weight = _probe_share(probe, probe_line[3]) * cell.t
+        upper_weight = _probe_share(probe, probe_line[3]) - lower_weight
+        wp.atomic_add(adj_texels, cell.above_left, (upper_weight * (1.0 - cell.s)) * adj_sum)
+        wp.atomic_add(adj_texels, cell.above_right, (upper_weight * cell.s) * adj_sum)
+        wp.atomic_add(adj_texels, cell.below_left, (lower_weight * (1.0 - cell.s)) * adj_sum)
+        wp.atomic_add(adj_texels, cell.below_right, (lower_weight * cell.s) * adj_sum)
 
 
 @wp.func
 def _color(
-    sampled: _Sampled,
+    sample_inputs: _SampleInputs,
     instance: int,
     sample: int,
     vertex_albedo: wp.array(dtype=wp.vec3),
     texels: wp.array(dtype=wp.vec3),
 ):
     """Reflectance of a sample of an instance."""
-    footprint_batch = instance_in(instance, sampled.texture_ids.shape[0])
-    texture = sampled.texture_ids[footprint_batch, sample]
+    footprint_batch = instance_in(instance, sample_inputs.texture_ids.shape[0])
+    texture = sample_inputs.texture_ids[footprint_batch, sample]
     color = wp.vec3()
     if texture >= 0:
-        line = sampled.probes[footprint_batch, sample]
-        uv = sampled.uvs[footprint_batch, sample]
-        level, coarse_part = _level_of(line[2], sampled.level_counts[texture])
-        color = _filtered(texels, sampled.levels[texture, level], uv, line)
-        if coarse_part > 0.0:
-            coarse = _filtered(texels, sampled.levels[texture, level + 1], uv, line)
-            color = (1.0 - coarse_part) * color + coarse_part * coarse
+        probe_line = sample_inputs.probes[footprint_batch, sample]
+        uv = sample_inputs.uvs[footprint_batch, sample]
+        level, coarse_share = _split_level(probe_line[2], sample_inputs.level_counts[texture])
+        color = _filter_line(texels, sample_inputs.levels[texture, level], uv, probe_line)
+        if coarse_share > 0.0:
+            coarse = _filter_line(texels, sample_inputs.levels[texture, level + 1], uv, probe_line)
+            color = (1.0 - coarse_share) * color + coarse_share * coarse
     else:
-        fragment_batch = instance_in(instance, sampled.face_ids.shape[0])
-        face = sampled.face_ids[fragment_batch, sample]
+        fragment_batch = instance_in(instance, sample_inputs.face_ids.shape[0])
+        face = sample_inputs.face_ids[fragment_batch, sample]
         if face >= 0:
-            color = at_point(vertex_albedo, sampled.faces[face], sampled.barycentrics[fragment_batch, sample])
+            color = interpolate_at(
+                vertex_albedo, sample_inputs.faces[face], sample_inputs.barycentrics[fragment_batch, sample]
+            )
     return color
 
 
@@ -197,7 +203,7 @@ def _sample(
     first_row: int,
     worker: int,
     # in
-    sampled: _Sampled,
+    sample_inputs: _SampleInputs,
     vertex_albedo: wp.array2d(dtype=wp.vec3),
     texels: wp.array2d(dtype=wp.vec3),
     white: wp.array2d(dtype=wp.vec4),
@@ -206,11 +212,11 @@ def _sample(
     radiance: wp.array2d(dtype=wp.vec4),
 ):
     """A thread owns a run of samples: their reflectance or, if samples of white surfaces are given, their exposure."""
-    instance, thread = split_row(first_row + wp.tid(), sampled.texture_ids.shape[1] // sampled.run)
-    of_vertices = vertex_albedo[instance_in(instance, vertex_albedo.shape[0])]
-    of_textures = texels[instance_in(instance, texels.shape[0])]
-    for sample in range(thread * sampled.run, (thread + 1) * sampled.run):
-        color = _color(sampled, instance, sample, of_vertices, of_textures)
+    instance, thread = split_row(first_row + wp.tid(), sample_inputs.texture_ids.shape[1] // sample_inputs.run)
+    instance_albedo = vertex_albedo[instance_in(instance, vertex_albedo.shape[0])]
+    instance_texels = texels[instance_in(instance, texels.shape[0])]
+    for sample in range(thread * sample_inputs.run, (thread + 1) * sample_inputs.run):
+        color = _color(sample_inputs, instance, sample, instance_albedo, instance_texels)
         if radiance:
             light = white[instance_in(instance, white.shape[0]), sample]
             radiance[instance, sample] = wp.cw_mul(light, wp.vec4(color[0], color[1], color[2], 1.0))
@@ -221,7 +227,7 @@ def _sample(
 @wp.kernel(enable_backward=False)
 def _sample_adjoint_by_colors(
     # in
-    sampled: _Sampled,
+    sample_inputs: _SampleInputs,
     white: wp.array2d(dtype=wp.vec4),
     adj_albedo: wp.array2d(dtype=wp.vec3),
     adj_radiance: wp.array2d(dtype=wp.vec4),
@@ -231,53 +237,63 @@ def _sample_adjoint_by_colors(
 ):
     """A thread owns a run of samples: the adjoint of `_sample` by the reflectance."""
     instance, thread = wp.tid()
-    footprint_batch = instance_in(instance, sampled.texture_ids.shape[0])
-    fragment_batch = instance_in(instance, sampled.face_ids.shape[0])
-    for sample in range(thread * sampled.run, (thread + 1) * sampled.run):
+    footprint_batch = instance_in(instance, sample_inputs.texture_ids.shape[0])
+    fragment_batch = instance_in(instance, sample_inputs.face_ids.shape[0])
+    for sample in range(thread * sample_inputs.run, (thread + 1) * sample_inputs.run):
         adj_color = wp.vec3()
         if adj_radiance:
-            adj = wp.cw_mul(white[instance_in(instance, white.shape[0]), sample], adj_radiance[instance, sample])
-            adj_color = wp.vec3(adj[0], adj[1], adj[2])
+            adj_color_ = wp.cw_mul(white[instance_in(instance, white.shape[0]), sample], adj_radiance[instance, sample])
+            adj_color = wp.vec3(adj_color_[0], adj_color_[1], adj_color_[2])
         else:
             adj_color = adj_albedo[instance, sample]
-        texture = sampled.texture_ids[footprint_batch, sample]
+        texture = sample_inputs.texture_ids[footprint_batch, sample]
         if texture >= 0:
             if adj_texels:
                 adj_of_textures = adj_texels[instance_in(instance, adj_texels.shape[0])]
-                line = sampled.probes[footprint_batch, sample]
-                uv = sampled.uvs[footprint_batch, sample]
-                level, coarse_part = _level_of(line[2], sampled.level_counts[texture])
-                fine_color = (1.0 - coarse_part) * adj_color
-                _scatter(adj_of_textures, sampled.levels[texture, level], uv, line, fine_color)
-                if coarse_part > 0.0:
-                    _scatter(adj_of_textures, sampled.levels[texture, level + 1], uv, line, coarse_part * adj_color)
+                probe_line = sample_inputs.probes[footprint_batch, sample]
+                uv = sample_inputs.uvs[footprint_batch, sample]
+                level, coarse_share = _split_level(probe_line[2], sample_inputs.level_counts[texture])
+                fine_color = (1.0 - coarse_share) * adj_color
+                _scatter(adj_of_textures, sample_inputs.levels[texture, level], uv, probe_line, fine_color)
+                if coarse_share > 0.0:
+                    _scatter(
+                        adj_of_textures,
+                        sample_inputs.levels[texture, level + 1],
+                        uv,
+                        probe_line,
+                        coarse_share * adj_color,
+                    )
         elif adj_vertex_albedo:
-            face = sampled.face_ids[fragment_batch, sample]
+            face = sample_inputs.face_ids[fragment_batch, sample]
             if face >= 0:
-                adj_of_vertices = adj_vertex_albedo[instance_in(instance, adj_vertex_albedo.shape[0])]
-                weights = sampled.barycentrics[fragment_batch, sample]
-                add_to_corners(adj_of_vertices, sampled.faces[face], weights, adj_color)
+                adj_instance_albedo = adj_vertex_albedo[instance_in(instance, adj_vertex_albedo.shape[0])]
+                weights = sample_inputs.barycentrics[fragment_batch, sample]
+                interpolate_values_adjoint(adj_instance_albedo, sample_inputs.faces[face], weights, adj_color)
 
 
 @wp.func
 def _slopes(texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2, step: wp.vec2, adj_color: wp.vec3):
     """Derivatives of a level's color by u and v, a step from a uv, and the color itself, each times ``adj_color``."""
-    place = _place(level, uv)
-    cell = _cell(level, place[0] + step[0] * float(level[1]), place[1] - step[1] * float(level[2]))
+    texel_position = _texel_position(level, uv)
+    cell = _cell(level, texel_position[0] + step[0] * float(level[1]), texel_position[1] - step[1] * float(level[2]))
     above_left = wp.dot(texels[cell.above_left], adj_color)
     above_right = wp.dot(texels[cell.above_right], adj_color)
     below_left = wp.dot(texels[cell.below_left], adj_color)
     below_right = wp.dot(texels[cell.below_right], adj_color)
-    above = (1.0 - cell.s) * above_left + cell.s * above_right
-    below = (1.0 - cell.s) * below_left + cell.s * below_right
-    by_s = (1.0 - cell.t) * (above_right - above_left) + cell.t * (below_right - below_left)
-    return wp.vec3(by_s * float(level[1]), (above - below) * float(level[2]), (1.0 - cell.t) * above + cell.t * below)
+    upper_color = (1.0 - cell.s) * above_left + cell.s * above_right
+    lower_color = (1.0 - cell.s) * below_left + cell.s * below_right
+    slope_s = (1.0 - cell.t) * (above_right - above_left) + cell.t * (below_right - below_left)
+    return wp.vec3(
+        slope_s * float(level[1]),
+        (upper_color - lower_color) * float(level[2]),
+        (1.0 - cell.t) * upper_color + cell.t * lower_color,
+    )
 
 
 @wp.kernel(enable_backward=False)
-def _sample_adjoint_by_places(
+def _sample_adjoint_by_coordinates(
     # in
-    sampled: _Sampled,
+    sample_inputs: _SampleInputs,
     vertex_albedo: wp.array2d(dtype=wp.vec3),
     texels: wp.array2d(dtype=wp.vec3),
     adj_albedo: wp.array2d(dtype=wp.vec3),
@@ -288,32 +304,32 @@ def _sample_adjoint_by_places(
 ):
     """A thread owns a run of samples: the adjoint of `_sample` by where on their faces, and how wide, they are."""
     instance, thread = wp.tid()
-    footprint_batch = instance_in(instance, sampled.texture_ids.shape[0])
-    of_textures = texels[instance_in(instance, texels.shape[0])]
-    for sample in range(thread * sampled.run, (thread + 1) * sampled.run):
-        texture = sampled.texture_ids[footprint_batch, sample]
+    footprint_batch = instance_in(instance, sample_inputs.texture_ids.shape[0])
+    instance_texels = texels[instance_in(instance, texels.shape[0])]
+    for sample in range(thread * sample_inputs.run, (thread + 1) * sample_inputs.run):
+        texture = sample_inputs.texture_ids[footprint_batch, sample]
         adj_color = adj_albedo[instance, sample]
         if texture >= 0:
-            line = sampled.probes[footprint_batch, sample]
-            count = line[3]
-            level, coarse_part = _level_of(line[2], sampled.level_counts[texture])
-            reach = _reach(count)
+            probe_line = sample_inputs.probes[footprint_batch, sample]
+            count = probe_line[3]
+            level, coarse_share = _split_level(probe_line[2], sample_inputs.level_counts[texture])
+            line_reach = _line_reach(count)
             adj_u = float(0.0)
             adj_v = float(0.0)
             adj_line = wp.vec4()
-            for probe in range(-reach, reach + 1):
-                uv = sampled.uvs[footprint_batch, sample]
-                step = float(probe) * wp.vec2(line[0], line[1])
-                weight = _share(probe, count) / count
-                slopes = _slopes(of_textures, sampled.levels[texture, level], uv, step, adj_color)
+            for probe in range(-line_reach, line_reach + 1):
+                uv = sample_inputs.uvs[footprint_batch, sample]
+                step = float(probe) * wp.vec2(probe_line[0], probe_line[1])
+                weight = _probe_share(probe, count) / count
+                slopes = _slopes(instance_texels, sample_inputs.levels[texture, level], uv, step, adj_color)
                 adj_width = float(0.0)
-                if coarse_part > 0.0:
-                    coarse = _slopes(of_textures, sampled.levels[texture, level + 1], uv, step, adj_color)
+                if coarse_share > 0.0:
+                    coarse = _slopes(instance_texels, sample_inputs.levels[texture, level + 1], uv, step, adj_color)
                     adj_width = weight * (coarse[2] - slopes[2]) / float(1 << level)
-                    slopes += coarse_part * (coarse - slopes)
+                    slopes += coarse_share * (coarse - slopes)
                 # as the line grows, the outermost probes gain half a width each, and all share a longer line
                 adj_count = -weight * slopes[2] / count
-                if wp.abs(probe) == reach:
+                if wp.abs(probe) == line_reach:
                     adj_count += 0.5 * slopes[2] / count
                 adj_u += weight * slopes[0]
                 adj_v += weight * slopes[1]
@@ -322,16 +338,16 @@ def _sample_adjoint_by_places(
             if adj_uvs:
                 wp.atomic_add(adj_uvs, footprint_batch, sample, wp.vec2(adj_u, adj_v))
             if adj_probes:
-                if reach == 0:
+                if line_reach == 0:
                     adj_line[3] = 0.0
                 wp.atomic_add(adj_probes, footprint_batch, sample, adj_line)
         elif adj_barycentrics:
-            fragment_batch = instance_in(instance, sampled.face_ids.shape[0])
-            face = sampled.face_ids[fragment_batch, sample]
+            fragment_batch = instance_in(instance, sample_inputs.face_ids.shape[0])
+            face = sample_inputs.face_ids[fragment_batch, sample]
             if face >= 0:
-                of_vertices = vertex_albedo[instance_in(instance, vertex_albedo.shape[0])]
-                adj = adj_weights(of_vertices, sampled.faces[face], adj_color)
-                wp.atomic_add(adj_barycentrics, fragment_batch, sample, adj)
+                instance_albedo = vertex_albedo[instance_in(instance, vertex_albedo.shape[0])]
+                adj_color_ = interpolate_weights_adjoint(instance_albedo, sample_inputs.faces[face], adj_color)
+                wp.atomic_add(adj_barycentrics, fragment_batch, sample, adj_color_)
 
 
 def sample_albedo(
@@ -352,24 +368,24 @@ def sample_albedo(
     """
     arrays = {"fragments": fragments.barycentrics, "vertex_albedo": vertex_albedo, "textures": textures.texels}
     shape = _checked_shape(arrays, fragments, footprints)
-    colors, places = [vertex_albedo, textures.texels], [fragments.barycentrics, footprints.uvs, footprints.probes]
-    sampled = _make_sampled(textures, footprints, fragments, faces)
+    colors, coordinates = [vertex_albedo, textures.texels], [fragments.barycentrics, footprints.uvs, footprints.probes]
+    sample_inputs = _make_sample_inputs(textures, footprints, fragments, faces)
 
     def adjoint(adj_albedo: wp.array) -> None:
         if varies(colors):
-            inputs = [sampled, None, rows(adj_albedo), None]
+            inputs = [sample_inputs, None, rows(adj_albedo), None]
             outputs = [array.grad for array in colors]
             launch(_sample_adjoint_by_colors, _runs(adj_albedo), inputs=inputs, outputs=outputs)
-        if varies(places):
-            inputs = [sampled, *colors, rows(adj_albedo)]
-            outputs = [rows(array.grad) for array in places]
-            launch(_sample_adjoint_by_places, _runs(adj_albedo), inputs=inputs, outputs=outputs)
+        if varies(coordinates):
+            inputs = [sample_inputs, *colors, rows(adj_albedo)]
+            outputs = [rows(array.grad) for array in coordinates]
+            launch(_sample_adjoint_by_coordinates, _runs(adj_albedo), inputs=inputs, outputs=outputs)
 
     return differentiable(
-        lambda albedo: _launch_sample([sampled, *colors, None], albedo, [rows(albedo), None]),
+        lambda albedo: _launch_sample([sample_inputs, *colors, None], albedo, [rows(albedo), None]),
         adjoint,
         result=empty(shape, dtype=wp.vec3, device=faces.device),
-        variables=[*colors, *places],
+        variables=[*colors, *coordinates],
     )
 
 
@@ -398,13 +414,13 @@ def textured_radiance(
     arrays = {"fragments": fragments.face_ids, "vertex_albedo": vertex_albedo, "textures": textures.texels}
     shape = _checked_shape(arrays | {"white": white}, fragments, footprints)
     colors = [vertex_albedo, textures.texels]
-    sampled = _make_sampled(textures, footprints, fragments, faces)
+    sample_inputs = _make_sample_inputs(textures, footprints, fragments, faces)
     return differentiable(
-        lambda radiance: _launch_sample([sampled, *colors, rows(white)], radiance, [None, rows(radiance)]),
+        lambda radiance: _launch_sample([sample_inputs, *colors, rows(white)], radiance, [None, rows(radiance)]),
         lambda adj_radiance: launch(
             _sample_adjoint_by_colors,
             _runs(adj_radiance),
-            inputs=[sampled, rows(white), None, rows(adj_radiance)],
+            inputs=[sample_inputs, rows(white), None, rows(adj_radiance)],
             outputs=[array.grad for array in colors],
         ),
         result=empty(shape, dtype=wp.vec4, device=faces.device),
@@ -420,7 +436,7 @@ def add_to_texels(adj_texels: wp.array, textures: Textures, footprints: Footprin
         footprints: Of the samples.
         adj_albedo: Gradients of the samples' reflectance, vec3 of shape [batch, height, width].
     """
-    inputs = [_make_sampled(textures, footprints), None, rows(adj_albedo), None]
+    inputs = [_make_sample_inputs(textures, footprints), None, rows(adj_albedo), None]
     launch(_sample_adjoint_by_colors, _runs(adj_albedo), inputs=inputs, outputs=[None, adj_texels])
 
 
@@ -432,16 +448,16 @@ def _checked_shape(arrays: dict[str, wp.array], fragments: Fragments, footprints
     return common_batch(arrays | {"footprints": footprints.uvs}), *size
 
 
-def _make_sampled(
+def _make_sample_inputs(
     textures: Textures, footprints: Footprints, fragments: Fragments | None = None, faces: wp.array | None = None
-) -> _Sampled:
-    sampled = _Sampled()
+) -> _SampleInputs:
+    sample_inputs = _SampleInputs()
     if fragments is not None:
-        (sampled.face_ids, sampled.barycentrics), sampled.faces = fragments.rows, faces
-    sampled.levels, sampled.level_counts = textures.levels, textures.level_counts
-    sampled.texture_ids, sampled.uvs, sampled.probes = footprints.rows
-    sampled.run = run_length(footprints.uvs.device, footprints.uvs.shape[2])
-    return sampled
+        (sample_inputs.face_ids, sample_inputs.barycentrics), sample_inputs.faces = fragments.rows, faces
+    sample_inputs.levels, sample_inputs.level_counts = textures.levels, textures.level_counts
+    sample_inputs.texture_ids, sample_inputs.uvs, sample_inputs.probes = footprints.rows
+    sample_inputs.run = run_length(footprints.uvs.device, footprints.uvs.shape[2])
+    return sample_inputs
 
 
 def _runs(images: wp.array) -> tuple[int, int]:

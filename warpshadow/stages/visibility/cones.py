@@ -19,15 +19,15 @@ from warpshadow import check
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 
 BLEND = 0.01  # the exact formula ends at D = (1 + BLEND) r
-FADE = 0.25  # the sphere fades out from D = FADE·r to its center
+FADE_RADIUS = 0.25  # the sphere fades out from D = FADE·r to its center
 TINY_RADIUS = 1.0e-19  # spheres no larger block nothing: the largest distance, over one that is, is still a float32
 
-_NEAREST2 = 1.0e-37  # (D/r)² is kept where its root and the inverse of that are float32
-_FARTHEST2 = 1.0e38
+_MIN_DISTANCE2 = 1.0e-37  # (D/r)² is kept where its root and the inverse of that are float32
+_MAX_DISTANCE2 = 1.0e38
 
-_SINE2 = (1 + BLEND) ** -2  # where the blend begins: sin²θ, cos θ, and d(cos θ)/d(D/r) times the blend's width
-_COSINE = np.sqrt(1 - _SINE2)
-_RISE = BLEND * (1 + BLEND) ** -3 / _COSINE
+_BLEND_SINE2 = (1 + BLEND) ** -2  # where the blend begins: sin²θ, cos θ, and d(cos θ)/d(D/r) times the blend's width
+_BLEND_COSINE = np.sqrt(1 - _BLEND_SINE2)
+_BLEND_SLOPE = BLEND * (1 + BLEND) ** -3 / _BLEND_COSINE
 
 
 def check_spheres(points: wp.array, normals: wp.array | None, centers: wp.array, radii: wp.array) -> None:
@@ -62,28 +62,31 @@ def make_cone(lanes: int) -> wp.Function:
     Lane, Vectors, Cone = lane_type(lanes), vectors_type(lanes), cone_type(lanes)
     fn = make_lane_functions(lanes)
     sqrt, scale, dot, smoothstep = fn.sqrt, fn.scale, fn.dot, fn.smoothstep
-    SINE2 = wp.constant(float(_SINE2))
-    COSINE = wp.constant(float(_COSINE))
-    RISE = wp.constant(float(_RISE))
-    NEAREST2 = wp.constant(_NEAREST2)
+    BLEND_SINE2 = wp.constant(float(_BLEND_SINE2))
+    BLEND_COSINE = wp.constant(float(_BLEND_COSINE))
+    BLEND_SLOPE = wp.constant(float(_BLEND_SLOPE))
+    MIN_DISTANCE2 = wp.constant(_MIN_DISTANCE2)
 
     @wp.func(inline=True)
     def cone(offset: Vectors, curvature: float):
-        relative = Vectors(curvature * offset.x, curvature * offset.y, curvature * offset.z)
+        scaled_offset = Vectors(curvature * offset.x, curvature * offset.y, curvature * offset.z)
         # A receiver at the center has direction 0 and weight 0. One so far that the square is Inf has inverse 0.
-        distance = sqrt(wp.max(dot(relative, relative), Lane(NEAREST2)))
+        distance = sqrt(wp.max(dot(scaled_offset, scaled_offset), Lane(MIN_DISTANCE2)))
         inverse = wp.cw_div(Lane(1.0), distance)
-        sine2 = wp.min(wp.cw_mul(inverse, inverse), Lane(SINE2))
-        # The blend's cubic misses _COSINE by exactly 0 from 1.01 r on, where u is: sums need no cases, and sine2 keeps
-        # its digits even where a compiler fuses multiplication and addition.
+        sine2 = wp.min(wp.cw_mul(inverse, inverse), Lane(BLEND_SINE2))
+        # The blend's cubic misses its cosine by exactly 0 from 1.01 r on, as blend_position is 0 there: sums need no
+        # cases, and sine2 keeps its digits even where a compiler fuses multiplication and addition.
         t = wp.min(wp.max((1.0 / BLEND) * (distance - Lane(1.0)), Lane(0.0)), Lane(1.0))
-        u = Lane(1.0) - t
-        lack = wp.cw_mul(u, Lane(3.0 * COSINE - 2.0 * RISE) + (RISE - 2.0 * COSINE) * u)
-        lack = wp.cw_mul(u, Lane(RISE) + lack)
-        cosine = sqrt(Lane(1.0) - sine2) - lack
-        sine2 = sine2 + wp.cw_mul(lack, Lane(2.0 * COSINE) - lack)
-        near = wp.min((1.0 / FADE) * distance, Lane(1.0))
-        return Cone(scale(inverse, relative), cosine, sine2, smoothstep(near))
+        blend_position = Lane(1.0) - t
+        cosine_deficit = wp.cw_mul(
+            blend_position,
+            Lane(3.0 * BLEND_COSINE - 2.0 * BLEND_SLOPE) + (BLEND_SLOPE - 2.0 * BLEND_COSINE) * blend_position,
+        )
+        cosine_deficit = wp.cw_mul(blend_position, Lane(BLEND_SLOPE) + cosine_deficit)
+        cosine = sqrt(Lane(1.0) - sine2) - cosine_deficit
+        sine2 = sine2 + wp.cw_mul(cosine_deficit, Lane(2.0 * BLEND_COSINE) - cosine_deficit)
+        fade_position = wp.min((1.0 / FADE_RADIUS) * distance, Lane(1.0))
+        return Cone(scale(inverse, scaled_offset), cosine, sine2, smoothstep(fade_position))
 
     return cone
 
@@ -100,35 +103,38 @@ def make_cone_adjoint(lanes: int) -> wp.Function:
     Lane, Vectors, Cone = lane_type(lanes), vectors_type(lanes), cone_type(lanes)
     fn = make_lane_functions(lanes)
     sqrt, dot = fn.sqrt, fn.dot
-    SINE2 = wp.constant(float(_SINE2))
-    COSINE = wp.constant(float(_COSINE))
-    RISE = wp.constant(float(_RISE))
-    NEAREST2 = wp.constant(_NEAREST2)
-    FARTHEST2 = wp.constant(_FARTHEST2)
+    BLEND_SINE2 = wp.constant(float(_BLEND_SINE2))
+    BLEND_COSINE = wp.constant(float(_BLEND_COSINE))
+    BLEND_SLOPE = wp.constant(float(_BLEND_SLOPE))
+    MIN_DISTANCE2 = wp.constant(_MIN_DISTANCE2)
+    MAX_DISTANCE2 = wp.constant(_MAX_DISTANCE2)
 
     @wp.func(inline=True)
     def adjoint(offset: Vectors, curvature: float, cone: Cone, adj_cone: Cone):
-        relative = Vectors(curvature * offset.x, curvature * offset.y, curvature * offset.z)
-        distance = sqrt(wp.min(wp.max(dot(relative, relative), Lane(NEAREST2)), Lane(FARTHEST2)))
+        scaled_offset = Vectors(curvature * offset.x, curvature * offset.y, curvature * offset.z)
+        distance = sqrt(wp.min(wp.max(dot(scaled_offset, scaled_offset), Lane(MIN_DISTANCE2)), Lane(MAX_DISTANCE2)))
         inverse = wp.cw_div(Lane(1.0), distance)
-        ratio2 = wp.min(wp.cw_mul(inverse, inverse), Lane(SINE2))
+        ratio2 = wp.min(wp.cw_mul(inverse, inverse), Lane(BLEND_SINE2))
         exact_slope = wp.cw_div(wp.cw_mul(ratio2, sqrt(ratio2)), sqrt(Lane(1.0) - ratio2))
-        u = Lane(1.0) - wp.min(wp.max((1.0 / BLEND) * (distance - Lane(1.0)), Lane(0.0)), Lane(1.0))
-        blend_slope = Lane(RISE) + wp.cw_mul(u, Lane(6.0 * COSINE - 4.0 * RISE) + (3.0 * RISE - 6.0 * COSINE) * u)
+        blend_position = Lane(1.0) - wp.min(wp.max((1.0 / BLEND) * (distance - Lane(1.0)), Lane(0.0)), Lane(1.0))
+        blend_slope = Lane(BLEND_SLOPE) + wp.cw_mul(
+            blend_position,
+            Lane(6.0 * BLEND_COSINE - 4.0 * BLEND_SLOPE) + (3.0 * BLEND_SLOPE - 6.0 * BLEND_COSINE) * blend_position,
+        )
         is_blended = wp.min(wp.max((Lane(1.0 + BLEND) - distance) * 1.0e20, Lane(0.0)), Lane(1.0))
         cosine_slope = exact_slope + wp.cw_mul(is_blended, (1.0 / BLEND) * blend_slope - exact_slope)
-        near = wp.min((1.0 / FADE) * distance, Lane(1.0))
-        weight_slope = (6.0 / FADE) * wp.cw_mul(near, Lane(1.0) - near)
+        fade_position = wp.min((1.0 / FADE_RADIUS) * distance, Lane(1.0))
+        weight_slope = (6.0 / FADE_RADIUS) * wp.cw_mul(fade_position, Lane(1.0) - fade_position)
 
         adj_distance = Lane(0.0)  # summed up from 0, all of the kernel runs a seventh faster on a CPU
         adj_distance += wp.cw_mul(adj_cone.cosine - 2.0 * wp.cw_mul(cone.cosine, adj_cone.sine2), cosine_slope)
         adj_distance += wp.cw_mul(adj_cone.weight, weight_slope)
         axis, adj_axis = cone.axis, adj_cone.axis
-        radial = adj_distance - wp.cw_mul(dot(axis, adj_axis), inverse)
+        adj_radial = adj_distance - wp.cw_mul(dot(axis, adj_axis), inverse)
         adj_offset = Vectors(
-            curvature * (wp.cw_mul(adj_axis.x, inverse) + wp.cw_mul(axis.x, radial)),
-            curvature * (wp.cw_mul(adj_axis.y, inverse) + wp.cw_mul(axis.y, radial)),
-            curvature * (wp.cw_mul(adj_axis.z, inverse) + wp.cw_mul(axis.z, radial)),
+            curvature * (wp.cw_mul(adj_axis.x, inverse) + wp.cw_mul(axis.x, adj_radial)),
+            curvature * (wp.cw_mul(adj_axis.y, inverse) + wp.cw_mul(axis.y, adj_radial)),
+            curvature * (wp.cw_mul(adj_axis.z, inverse) + wp.cw_mul(axis.z, adj_radial)),
         )
         return adj_offset, -curvature * wp.cw_mul(adj_distance, distance)
 

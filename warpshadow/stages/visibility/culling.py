@@ -15,7 +15,7 @@ from warpshadow.device.constants import cached_by_values, constant
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 from warpshadow.maths.directions import bundle_cones, check_directions, falloff_width
 from warpshadow.stages.visibility.cones import BLEND
-from warpshadow.stages.visibility.traversal import ALL, receiver_lanes_type
+from warpshadow.stages.visibility.traversal import ALL_BUNDLES, receiver_lanes_type
 
 BOUND_MARGIN = 1.001 + BLEND
 """Bounds are so much larger: cones of receivers as near as BLEND are wider than the sphere, and there is rounding."""
@@ -34,7 +34,7 @@ class DirectionCells:
 
 @cached_by_values
 def make_cells(directions: np.ndarray, softness: float, device: wp.Device) -> DirectionCells:
-    """Put cells together with the cones around their bundles, and the width of a falloff of some softness.
+    """Make cells with the cones around their bundles, and the width of the falloff.
 
     Raises:
         ValueError: for directions for which there are no cells, and for too soft a falloff.
@@ -67,10 +67,10 @@ def cap_type(lanes: int) -> Any:
 class CapFunctions(NamedTuple):
     """Kernel functions on caps."""
 
-    widen: wp.Function  # cones by w: axis, cosine and sine of θ, cells → caps
-    reaches: wp.Function  # whether a cap reaches a bundle for any receiver
-    rises: wp.Function  # whether a cap rises above the horizon of any receiver
-    soften: wp.Function  # direction, cap, 1/(hi−lo) → t in the falloff, and its smoothstep
+    widen_cone: wp.Function  # cones by w: axis, cosine and sine of θ, cells → caps
+    reaches_bundle: wp.Function  # whether a cap reaches a bundle for any receiver
+    is_above_horizon: wp.Function  # whether a cap rises above the horizon of any receiver
+    soft_edge: wp.Function  # direction, cap, 1/(hi−lo) → t in the falloff, and its smoothstep
 
 
 @functools.cache
@@ -81,32 +81,32 @@ def make_cap_functions(has_horizon: bool, lanes: int) -> CapFunctions:
     is_any_above, dot, dot_direction, smoothstep = fn.is_any_above, fn.dot, fn.dot_direction, fn.smoothstep
 
     @wp.func(inline=True)
-    def widen(axis: Vectors, cosine: Lane, sine: Lane, cells: DirectionCells):
-        low = cells.cos_width * cosine - cells.sin_width * sine
-        return Cap(axis, low, cells.sin_width * cosine + cells.cos_width * sine)
+    def widen_cone(axis: Vectors, cosine: Lane, sine: Lane, cells: DirectionCells):
+        cap_cosine = cells.cos_width * cosine - cells.sin_width * sine
+        return Cap(axis, cap_cosine, cells.sin_width * cosine + cells.cos_width * sine)
 
     @wp.func(inline=True)
-    def reaches(cap: Cap, axis: wp.vec3, half_angle: wp.vec2):
+    def reaches_bundle(cap: Cap, axis: wp.vec3, half_angle: wp.vec2):
         # u·axis > cos(θ + w + the bundle's half-angle)
-        limit = half_angle[0] * cap.cosine - half_angle[1] * cap.sine
-        return is_any_above(dot_direction(axis, cap.axis) - limit, 0.0)
+        min_cosine = half_angle[0] * cap.cosine - half_angle[1] * cap.sine
+        return is_any_above(dot_direction(axis, cap.axis) - min_cosine, 0.0)
 
     @wp.func(inline=True)
-    def rises(cap: Cap, normals: Vectors):
-        is_up = bool(True)
+    def is_above_horizon(cap: Cap, normals: Vectors):
+        is_above = bool(True)
         if wp.static(has_horizon):
             # u·n > cos(90° + θ + w), which a cap wider than 90° does anyway
-            wide = 1.0e9 * wp.max(Lane(0.0) - cap.cosine, Lane(0.0))
-            is_up = is_any_above(dot(cap.axis, normals) + cap.sine + wide, 0.0)
-        return is_up
+            wide_cap_offset = 1.0e9 * wp.max(Lane(0.0) - cap.cosine, Lane(0.0))
+            is_above = is_any_above(dot(cap.axis, normals) + cap.sine + wide_cap_offset, 0.0)
+        return is_above
 
     @wp.func(inline=True)
-    def soften(direction: wp.vec3, cap: Cap, slope: Lane):
+    def soft_edge(direction: wp.vec3, cap: Cap, slope: Lane):
         t = wp.cw_mul(dot_direction(direction, cap.axis) - cap.cosine, slope)
         t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
         return t, smoothstep(t)
 
-    return CapFunctions(widen, reaches, rises, soften)
+    return CapFunctions(widen_cone, reaches_bundle, is_above_horizon, soft_edge)
 
 
 @functools.cache
@@ -127,34 +127,37 @@ def make_cull(has_horizon: bool, Task: type, lanes: int) -> wp.Function:
     Lane, ReceiverLanes = lane_type(lanes), receiver_lanes_type(lanes)
     fn = make_lane_functions(lanes)
     sqrt, is_any_above, dot, offset, scale = fn.sqrt, fn.is_any_above, fn.dot, fn.offset, fn.scale
-    widen, reaches, rises, _soften = make_cap_functions(has_horizon, lanes)
+    widen_cone, reaches_bundle, is_above_horizon, _soft_edge = make_cap_functions(has_horizon, lanes)
 
     @wp.func
-    def cull(receivers: ReceiverLanes, bound: wp.vec4, place: int, candidates: int, task: Task):
-        """Returns how many of the candidates, none for spheres that are wholly below the horizon."""
+    def cull(receivers: ReceiverLanes, bound: wp.vec4, traversal_index: int, candidates: int, task: Task):
+        """Returns the number of candidates that the bound may reach; 0 where it is wholly below the horizon."""
         count = int(0)
         cells = task.cells
         if bound[3] > 0.0:
-            reach = BOUND_MARGIN * bound[3]
-            away = offset(wp.vec3(bound[0], bound[1], bound[2]), receivers.points)
-            distance = sqrt(dot(away, away))
-            is_within = is_any_above(-distance, -reach)
-            inverse = wp.cw_div(Lane(1.0), wp.max(distance, Lane(reach)))
-            sine = reach * inverse
+            bound_radius = BOUND_MARGIN * bound[3]
+            bound_offset = offset(wp.vec3(bound[0], bound[1], bound[2]), receivers.points)
+            distance = sqrt(dot(bound_offset, bound_offset))
+            is_within = is_any_above(-distance, -bound_radius)
+            inverse = wp.cw_div(Lane(1.0), wp.max(distance, Lane(bound_radius)))
+            sine = bound_radius * inverse
             cosine = sqrt(Lane(1.0) - wp.cw_mul(sine, sine))
-            cap = widen(scale(inverse, away), cosine, sine, cells)
-            if is_within or rises(cap, receivers.normals):
+            cap = widen_cone(scale(inverse, bound_offset), cosine, sine, cells)
+            if is_within or is_above_horizon(cap, receivers.normals):
                 candidate_count = candidates
-                if candidates == ALL:
+                if candidates == ALL_BUNDLES:
                     candidate_count = task.ends.shape[0]
                 for k in range(candidate_count):
                     bundle = k
-                    if candidates != ALL:
+                    if candidates != ALL_BUNDLES:
                         bundle = task.reached_bundles[0, k]
-                    at = task.first_bundle + bundle
-                    is_met = task.ends[bundle] > place
-                    if is_met and (is_within or reaches(cap, cells.axes[at], cells.half_angles[at])):
-                        task.reached_bundles[wp.where(candidates == ALL, 0, 1), count] = bundle
+                    direction_bundle = task.first_bundle + bundle
+                    is_candidate = task.ends[bundle] > traversal_index
+                    if is_candidate and (
+                        is_within
+                        or reaches_bundle(cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle])
+                    ):
+                        task.reached_bundles[wp.where(candidates == ALL_BUNDLES, 0, 1), count] = bundle
                         count += 1
         return count
 

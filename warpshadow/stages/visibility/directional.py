@@ -27,7 +27,7 @@ from warpshadow.device.lanes import (
 )
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
-from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_place
+from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_slot
 from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.visibility.cones import check_spheres
 from warpshadow.stages.visibility.culling import DirectionCells, cap_type, make_cap_functions, make_cells, make_cull
@@ -46,7 +46,7 @@ from warpshadow.stages.visibility.traversal import (
 
 SOFTNESS = 0.35  # κ: half-width of the falloff in cell radii. More gives wider gradients and more bias
 
-_OPAQUE = 1.0e-4  # below this transmittance a bundle is not looked at any more
+_OPAQUE_BELOW = 1.0e-4  # below this transmittance a bundle is not looked at any more
 
 PAIR_COST = 0.15  # nanoseconds that a sphere costs for a receiver and a direction, culling included
 
@@ -62,19 +62,19 @@ def _task_type(lanes: int) -> Any:
         first_bundle: int
         ends: wp.array(dtype=wp.int32)  # [bundle] the place in the traversal where nothing is left to block
         reached_bundles: wp.array2d(dtype=wp.int32)  # bundles that a run, and then a cluster, may reach
-        passing: wp.array(dtype=Lane)  # [direction] transmittance; for the adjoint its product with its adjoint
+        transmittances: wp.array(dtype=Lane)  # [direction] transmittance; for the adjoint its product with its adjoint
 
     return TransmittanceTask
 
 
 @functools.cache
-def _make_begin(has_horizon: bool, lanes: int) -> wp.Function:
-    """Make the kernel function that finds out which receivers and directions a thread works on."""
+def _make_load_task(has_horizon: bool, lanes: int) -> wp.Function:
+    """Make the kernel function that loads the receivers and directions of a thread."""
     Lane, TransmittanceTask = lane_type(lanes), _task_type(lanes)
     load_receivers = make_load_receivers(has_horizon, lanes)
 
     @wp.func(inline=lanes == 1)
-    def begin(
+    def load_task(
         row: int,
         span: int,
         worker: int,
@@ -85,32 +85,32 @@ def _make_begin(has_horizon: bool, lanes: int) -> wp.Function:
         reached_bundles: wp.array3d(dtype=wp.int32),
     ):
         batch, block, receivers = load_receivers(inputs, row)
-        place = scratch_place(worker, row * all_ends.shape[1] + span)
+        slot = scratch_slot(worker, row * all_ends.shape[1] + span)
         ends = all_ends[row, span]
-        task = TransmittanceTask(cells, span * ends.shape[0], ends, reached_bundles[place], scratch[place])
+        task = TransmittanceTask(cells, span * ends.shape[0], ends, reached_bundles[slot], scratch[slot])
         return batch, block, receivers, task
 
-    return begin
+    return load_task
 
 
 @functools.cache
 def _make_attenuate(lanes: int) -> wp.Function:
     """Make the kernel function that lets a sphere block its share of a bundle's transmittance."""
     Lane, TransmittanceTask, Cap = lane_type(lanes), _task_type(lanes), cap_type(lanes)
-    is_any_above, soften = make_lane_functions(lanes).is_any_above, make_cap_functions(False, lanes).soften
+    is_any_above, soft_edge = make_lane_functions(lanes).is_any_above, make_cap_functions(False, lanes).soft_edge
 
     @wp.func(inline=True)
     def attenuate(cap: Cap, slope: Lane, opacity: Lane, bundle: int, task: TransmittanceTask):
-        """Returns whether anything is left."""
-        maximum = Lane(0.0)
+        """Returns whether any light is left."""
+        max_transmittance = Lane(0.0)
         direction = (task.first_bundle + bundle) * BUNDLE
-        place = bundle * BUNDLE
+        slot = bundle * BUNDLE
         for i in range(BUNDLE):
-            _t, step = soften(task.cells.directions[direction + i], cap, slope)
-            left = wp.cw_mul(task.passing[place + i], Lane(1.0) - wp.cw_mul(opacity, step))
-            maximum = wp.max(maximum, left)
-            task.passing[place + i] = left
-        return is_any_above(maximum, _OPAQUE)
+            _t, step = soft_edge(task.cells.directions[direction + i], cap, slope)
+            transmitted = wp.cw_mul(task.transmittances[slot + i], Lane(1.0) - wp.cw_mul(opacity, step))
+            max_transmittance = wp.max(max_transmittance, transmitted)
+            task.transmittances[slot + i] = transmitted
+        return is_any_above(max_transmittance, _OPAQUE_BELOW)
 
     return attenuate
 
@@ -121,23 +121,25 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
     ReceiverLanes, SphereView = receiver_lanes_type(lanes), sphere_view_type(lanes)
     fn = make_lane_functions(lanes)
     store_columns, sqrt, is_any_above, dot_direction = fn.store_columns, fn.sqrt, fn.is_any_above, fn.dot_direction
-    begin, falloff, attenuate = _make_begin(has_horizon, lanes), make_falloff(lanes), _make_attenuate(lanes)
-    widen, reaches, rises, _soften = make_cap_functions(has_horizon, lanes)
+    load_task, falloff, attenuate = _make_load_task(has_horizon, lanes), make_falloff(lanes), _make_attenuate(lanes)
+    widen_cone, reaches_bundle, is_above_horizon, _soft_edge = make_cap_functions(has_horizon, lanes)
 
     @wp.func(inline=True)
-    def visit(receivers: ReceiverLanes, seen: SphereView, count: int, task: TransmittanceTask):
-        cone = seen.cone
+    def visit(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: TransmittanceTask):
+        cone = sphere_view.cone
         cells = task.cells
         sine = sqrt(cone.sine2)
-        cap = widen(cone.axis, cone.cosine, sine, cells)
-        if rises(cap, receivers.normals):
+        cap = widen_cone(cone.axis, cone.cosine, sine, cells)
+        if is_above_horizon(cap, receivers.normals):
             slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
             for k in range(count):
                 bundle = task.reached_bundles[1, k]
-                at = task.first_bundle + bundle
-                is_met = task.ends[bundle] > seen.place and reaches(cap, cells.axes[at], cells.half_angles[at])
-                if is_met and not attenuate(cap, slope, opacity, bundle, task):
-                    task.ends[bundle] = seen.place + 1
+                direction_bundle = task.first_bundle + bundle
+                is_candidate = task.ends[bundle] > sphere_view.traversal_index and reaches_bundle(
+                    cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle]
+                )
+                if is_candidate and not attenuate(cap, slope, opacity, bundle, task):
+                    task.ends[bundle] = sphere_view.traversal_index + 1
 
     traverse = make_traversal(make_cull(has_horizon, TransmittanceTask, lanes), visit, TransmittanceTask, False, lanes)
 
@@ -158,18 +160,21 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
         """A thread owns a block of receivers and a span of bundles; ends are the spheres where it stopped looking."""
         i, j = wp.tid()
         span, row = find_run(worker, first_row + i, j)
-        batch, block, receivers, task = begin(row, span, worker, inputs, cells, all_ends, scratch, reached_bundles)
+        batch, block, receivers, task = load_task(row, span, worker, inputs, cells, all_ends, scratch, reached_bundles)
         for bundle in range(task.ends.shape[0]):
             for i in range(BUNDLE):
-                task.passing[bundle * BUNDLE + i] = Lane(1.0)
+                task.transmittances[bundle * BUNDLE + i] = Lane(1.0)
             task.ends[bundle] = inputs.spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
             if wp.static(has_horizon):
-                at = task.first_bundle + bundle
-                if not is_any_above(dot_direction(cells.axes[at], receivers.normals), -cells.half_angles[at][1]):
+                direction_bundle = task.first_bundle + bundle
+                if not is_any_above(
+                    dot_direction(cells.axes[direction_bundle], receivers.normals),
+                    -cells.half_angles[direction_bundle][1],
+                ):
                     task.ends[bundle] = 0  # wholly below the horizon: the cosine is zero there
         traverse(receivers, batch, inputs.spheres, Gradients(), task)
         direction_count = task.ends.shape[0] * BUNDLE
-        store_columns(task.passing, task.first_bundle * BUNDLE, direction_count, block, transmittance[batch])
+        store_columns(task.transmittances, task.first_bundle * BUNDLE, direction_count, block, transmittance[batch])
 
     return transmit
 
@@ -180,24 +185,28 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
     ReceiverLanes, SphereView, SphereAdjoint = lane_structs(lanes)
     fn = make_lane_functions(lanes)
     load_products, sqrt, add_vectors = fn.load_products, fn.sqrt, fn.add_vectors
-    begin, falloff, sphere_adjoint = _make_begin(has_horizon, lanes), make_falloff(lanes), make_sphere_adjoint(lanes)
-    widen, reaches, rises, soften = make_cap_functions(has_horizon, lanes)
+    load_task, falloff, sphere_adjoint = (
+        _make_load_task(has_horizon, lanes),
+        make_falloff(lanes),
+        make_sphere_adjoint(lanes),
+    )
+    widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(has_horizon, lanes)
 
     @wp.func(inline=True)
-    def visit(receivers: ReceiverLanes, seen: SphereView, count: int, task: TransmittanceTask):
+    def visit(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: TransmittanceTask):
         """The adjoint of the sphere's cone.
 
         With a the share of a cell that it blocks, ā_i = −T̄ T / (1 − a_i).
         """
         adj_sphere = SphereAdjoint()
-        cone = seen.cone
+        cone = sphere_view.cone
         cells = task.cells
         sine = sqrt(cone.sine2)
-        cap = widen(cone.axis, cone.cosine, sine, cells)
-        if rises(cap, receivers.normals):
+        cap = widen_cone(cone.axis, cone.cosine, sine, cells)
+        if is_above_horizon(cap, receivers.normals):
             slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
-            is_any_met = bool(False)
-            sum_ = Lane(0.0)
+            is_any_blocked = bool(False)
+            sum_adj_t = Lane(0.0)
             sum_t = Lane(0.0)
             sum_x = Lane(0.0)
             sum_y = Lane(0.0)
@@ -205,26 +214,37 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
             adj_opacity = Lane(0.0)
             for k in range(count):
                 bundle = task.reached_bundles[1, k]
-                at = task.first_bundle + bundle
-                if task.ends[bundle] > seen.place and reaches(cap, cells.axes[at], cells.half_angles[at]):
-                    is_any_met = True
+                direction_bundle = task.first_bundle + bundle
+                if task.ends[bundle] > sphere_view.traversal_index and reaches_bundle(
+                    cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle]
+                ):
+                    is_any_blocked = True
                     for i in range(BUNDLE):
-                        omega = cells.directions[at * BUNDLE + i]
-                        t, step = soften(omega, cap, slope)
-                        left = wp.max(Lane(1.0) - wp.cw_mul(opacity, step), Lane(1.0e-7))
-                        adj_blocked = -wp.cw_div(task.passing[bundle * BUNDLE + i], left)
+                        omega = cells.directions[direction_bundle * BUNDLE + i]
+                        t, step = soft_edge(omega, cap, slope)
+                        transmitted = wp.max(Lane(1.0) - wp.cw_mul(opacity, step), Lane(1.0e-7))
+                        adj_blocked = -wp.cw_div(task.transmittances[bundle * BUNDLE + i], transmitted)
                         adj_opacity += wp.cw_mul(adj_blocked, step)
-                        rise = wp.cw_mul(t, Lane(1.0) - t)
-                        adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_blocked, opacity), rise)
-                        sum_ += adj_t
+                        step_slope = wp.cw_mul(t, Lane(1.0) - t)
+                        adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_blocked, opacity), step_slope)
+                        sum_adj_t += adj_t
                         sum_t += wp.cw_mul(adj_t, t)
                         sum_x += omega[0] * adj_t
                         sum_y += omega[1] * adj_t
                         sum_z += omega[2] * adj_t
-            if is_any_met:
+            if is_any_blocked:
                 sum_omega = Vectors(sum_x, sum_y, sum_z)
                 adj_offset, adj_radius, adj_weight = sphere_adjoint(
-                    seen, sine, cap.cosine, cells.cos_width, cells.sin_width, slope, adj_opacity, sum_, sum_t, sum_omega
+                    sphere_view,
+                    sine,
+                    cap.cosine,
+                    cells.cos_width,
+                    cells.sin_width,
+                    slope,
+                    adj_opacity,
+                    sum_adj_t,
+                    sum_t,
+                    sum_omega,
                 )
                 adj_sphere.is_any = True
                 adj_sphere.offset = adj_offset
@@ -256,12 +276,14 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
         """A thread owns a block of receivers and a span of bundles."""
         i, j = wp.tid()
         span, row = find_run(worker, first_row + i, j)
-        batch, block, receivers, task = begin(row, span, worker, inputs, cells, all_ends, scratch, reached_bundles)
-        begin_column, count = task.first_bundle * BUNDLE, task.ends.shape[0] * BUNDLE
-        load_products(transmittance[batch], adj_transmittance[batch], begin_column, count, block, task.passing)
-        adj = traverse(receivers, batch, inputs.spheres, Gradients(adj_centers, adj_radii, adj_extents), task)
+        batch, block, receivers, task = load_task(row, span, worker, inputs, cells, all_ends, scratch, reached_bundles)
+        first_direction, count = task.first_bundle * BUNDLE, task.ends.shape[0] * BUNDLE
+        load_products(
+            transmittance[batch], adj_transmittance[batch], first_direction, count, block, task.transmittances
+        )
+        adj_receivers = traverse(receivers, batch, inputs.spheres, Gradients(adj_centers, adj_radii, adj_extents), task)
         if adj_points:
-            add_vectors(adj.points, block, adj_points[batch])
+            add_vectors(adj_receivers.points, block, adj_points[batch])
 
     return transmit_adjoint
 
@@ -309,7 +331,7 @@ def transmittance(
     bundle_count = len(directions) // (BUNDLE * spans)
     nodes, inputs = make_inputs(points, normals, centers, radii, merging, cell_radius(len(directions)), skip, clusters)
     row_count = batch_count * block_count(vertex_count, lanes)
-    dim = run_dimensions(device, row_count, spans)
+    launch_dim = run_dimensions(device, row_count, spans)
     scratch = [Scratch((bundle_count * BUNDLE,), lane_type(lanes)), Scratch((2, bundle_count), wp.int32)]
     ends = empty((row_count, spans, bundle_count), dtype=wp.int32, device=device)
     result = empty((batch_count, vertex_count, len(directions)), dtype=wp.float32, device=device)
@@ -317,7 +339,7 @@ def transmittance(
     return differentiable(
         lambda result: launch(
             _make_transmit(normals is not None, lanes),
-            dim,
+            launch_dim,
             cost=cost,
             inputs=[inputs, cells],
             scratch=scratch,
@@ -325,7 +347,7 @@ def transmittance(
         ),
         lambda adj_result: launch(
             _make_transmit_adjoint(normals is not None, lanes),
-            dim,
+            launch_dim,
             cost=2 * cost,
             inputs=[inputs, cells, ends, result, adj_result],
             scratch=scratch,

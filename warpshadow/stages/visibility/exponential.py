@@ -24,7 +24,7 @@ from warpshadow import check
 from warpshadow.device.lanes import block_count, lane_count, lane_type, make_lane_functions, module_options
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty, zeros
-from warpshadow.device.parallel import Scratch, scratch_place
+from warpshadow.device.parallel import Scratch, scratch_slot
 from warpshadow.maths import sh
 from warpshadow.stages.sh_kernels import ProductTable, make_multiply, product_table
 from warpshadow.stages.visibility.held_squares import UNIT, make_square, make_square_adjoint
@@ -65,15 +65,15 @@ def _optimal_table(order: int, device: str) -> wp.array:
     exponential = 2 * np.pi * np.exp(log @ basis.T) * weight @ basis
     a = exponential[:, 0] / UNIT
     b = np.sum(exponential * log, axis=1) / norm**2
-    rising = np.argmax(norm)
+    peak = np.argmax(norm)
     knots = np.linspace(0, THRESHOLDS["optimal_linear"].limit, _TABLE_KNOTS + 1)
-    table = np.stack([np.interp(knots, np.r_[0, norm[:rising]], np.r_[1, v[:rising]]) for v in (a, b)], axis=-1)
+    table = np.stack([np.interp(knots, np.r_[0, norm[:peak]], np.r_[1, v[:peak]]) for v in (a, b)], axis=-1)
     return wp.array(table.astype(np.float32), dtype=wp.vec2, device=device)
 
 
 @functools.cache
-def _make_measure(order: int, lanes: int) -> wp.Function:
-    """Make the kernel function that finds out how often f is halved and squared.
+def _make_find_squarings(order: int, lanes: int) -> wp.Function:
+    """Make the kernel function of the number of squarings.
 
     It returns, for each lane but the fifth:
         the number of squarings p, and 2^−p;
@@ -87,38 +87,38 @@ def _make_measure(order: int, lanes: int) -> wp.Function:
     PER_BLEND = wp.constant(1 / (BLEND_START - 0.5))
 
     @wp.func
-    def measure(log: wp.array(dtype=Lane), threshold: float):
+    def find_squarings(log: wp.array(dtype=Lane), threshold: float):
         norm2 = Lane(0.0)
         for i in range(1, wp.static(order**2)):
             norm2 += wp.cw_mul(log[i], log[i])
-        above = wp.max(log[0], Lane(0.0))
-        depth = sqrt(norm2 + wp.cw_mul(above, above))
+        positive_dc = wp.max(log[0], Lane(0.0))
+        depth = sqrt(norm2 + wp.cw_mul(positive_dc, positive_dc))
         count = Lane(0.0)
         scale = Lane(1.0)
         maximum = int(0)
-        root = Lane(0.0)
+        sqrt_factor = Lane(0.0)
         blend = Lane(0.0)
         blend_slope = Lane(0.0)
         for lane in range(lanes):
             # the least p with |f̂| / 2^p ≤ threshold, of each receiver by itself
-            p = int(0)
-            s = float(1.0)
-            while s * depth[lane] > threshold:
-                s = 0.5 * s
-                p = p + 1
-            p = wp.min(p, MAX_SQUARINGS)
-            count[lane] = float(p)
-            scale[lane] = s
-            maximum = wp.max(maximum, p)
+            squaring_count = int(0)
+            halving = float(1.0)
+            while halving * depth[lane] > threshold:
+                halving = 0.5 * halving
+                squaring_count = squaring_count + 1
+            squaring_count = wp.min(squaring_count, MAX_SQUARINGS)
+            count[lane] = float(squaring_count)
+            scale[lane] = halving
+            maximum = wp.max(maximum, squaring_count)
             # DC isolation: exp*(f) = e^{f0/√4π} exp*(f̂), the factor taken below the squarings so that nothing
             # overflows
-            root[lane] = wp.exp(0.5 * s * log[0][lane] / UNIT)
-            t = wp.clamp((s * depth[lane] / threshold - 0.5) * PER_BLEND, 0.0, 1.0)
+            sqrt_factor[lane] = wp.exp(0.5 * halving * log[0][lane] / UNIT)
+            t = wp.clamp((halving * depth[lane] / threshold - 0.5) * PER_BLEND, 0.0, 1.0)
             blend[lane] = wp.smoothstep(0.0, 1.0, t)
-            blend_slope[lane] = 6.0 * PER_BLEND * t * (1.0 - t) * s / threshold
-        return count, scale, sqrt(norm2), depth, maximum, root, blend, blend_slope
+            blend_slope[lane] = 6.0 * PER_BLEND * t * (1.0 - t) * halving / threshold
+        return count, scale, sqrt(norm2), depth, maximum, sqrt_factor, blend, blend_slope
 
-    return measure
+    return find_squarings
 
 
 @functools.cache
@@ -138,10 +138,10 @@ def _make_factor(base: str, lanes: int) -> wp.Function:
             for lane in range(lanes):
                 position = length[lane] / STEP
                 interval = wp.min(int(position), _TABLE_KNOTS - 1)
-                ab = wp.lerp(optimal[interval], optimal[interval + 1], position - float(interval))
+                factors_at_length = wp.lerp(optimal[interval], optimal[interval + 1], position - float(interval))
                 change = (optimal[interval + 1] - optimal[interval]) / STEP
-                constant[lane] = ab[0]
-                slope[lane] = ab[1]
+                constant[lane] = factors_at_length[0]
+                slope[lane] = factors_at_length[1]
                 constant_change[lane] = change[0]
                 slope_change[lane] = change[1]
         return constant, slope, constant_change, slope_change
@@ -186,7 +186,7 @@ def _make_exponentiate(order: int, base: str, keeps_powers: bool, lanes: int) ->
     fn = make_lane_functions(lanes)
     load_rows, store_rows, multiply = fn.load_rows, fn.store_rows, make_multiply(order, lanes)
     find_block = fn.find_block
-    measure, approximate = _make_measure(order, lanes), _make_base(order, base, lanes)
+    find_squarings, approximate = _make_find_squarings(order, lanes), _make_base(order, base, lanes)
     square_held = make_square(order, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
@@ -212,23 +212,23 @@ def _make_exponentiate(order: int, base: str, keeps_powers: bool, lanes: int) ->
         """
         thread = first_row + wp.tid()
         batch, block = find_block(thread, log_sh.shape[1])
-        thread_scratch = scratch[scratch_place(worker, thread)]
+        thread_scratch = scratch[scratch_slot(worker, thread)]
         row = thread_scratch[0]
         square = thread_scratch[1]
-        half = thread_scratch[2]
+        half_base = thread_scratch[2]
         if wp.static(keeps_powers):
-            half = powers[batch, block, 0]
+            half_base = powers[batch, block, 0]
         load_rows(log_sh[batch], block, row)
-        count, scale, norm, depth, maximum, root, blend, _slope = measure(row, threshold)
+        count, scale, norm, depth, maximum, sqrt_factor, blend, _slope = find_squarings(row, threshold)
         mean = row[0]
         row[0] = Lane(0.0)
         if wp.static(base == "quadratic"):
             multiply(row, row, table, square)
-        approximate(row, square, norm, 0.5 * scale, root, optimal, half)
-        approximate(row, square, norm, scale, wp.cw_mul(root, root), optimal, row)
-        held = Lane(0.0)
+        approximate(row, square, norm, 0.5 * scale, sqrt_factor, optimal, half_base)
+        approximate(row, square, norm, scale, wp.cw_mul(sqrt_factor, sqrt_factor), optimal, row)
+        held_share = Lane(0.0)
         if wp.max(blend) > 0.0:
-            held = wp.cw_mul(blend, square_held(half, depth, table, square))
+            held_share = wp.cw_mul(blend, square_held(half_base, depth, table, square))
             for i in range(wp.static(order**2)):
                 row[i] = wp.cw_mul(Lane(1.0) - blend, row[i]) + wp.cw_mul(blend, square[i])
         for step in range(maximum):
@@ -236,13 +236,13 @@ def _make_exponentiate(order: int, base: str, keeps_powers: bool, lanes: int) ->
                 for i in range(wp.static(order**2)):
                     powers[batch, block, step + 1, i] = row[i]
             is_due = wp.min(wp.max(count - Lane(float(step)), Lane(0.0)), Lane(1.0))  # 1 while step < p
-            held += wp.cw_mul(is_due, square_held(row, depth, table, square))
+            held_share += wp.cw_mul(is_due, square_held(row, depth, table, square))
             for i in range(wp.static(order**2)):
                 row[i] = wp.cw_mul(Lane(1.0) - is_due, row[i]) + wp.cw_mul(is_due, square[i])
         for lane in range(wp.min(lanes, log_sh.shape[1] - block * lanes)):
             if not wp.isfinite(depth[lane] + mean[lane]):
                 wp.atomic_add(faults, 1, 1)
-            elif held[lane] > 0.0:
+            elif held_share[lane] > 0.0:
                 wp.atomic_add(faults, 0, 1)
         store_rows(row, block, visibility[batch])
 
@@ -255,7 +255,7 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
     fn = make_lane_functions(lanes)
     load_rows, add_rows, multiply = fn.load_rows, fn.add_rows, make_multiply(order, lanes)
     find_block = fn.find_block
-    measure, factors = _make_measure(order, lanes), _make_factor(base, lanes)
+    find_squarings, factors = _make_find_squarings(order, lanes), _make_factor(base, lanes)
     square_held_adjoint = make_square_adjoint(order, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
@@ -283,77 +283,79 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
         """
         thread = first_row + wp.tid()
         batch, block = find_block(thread, log_sh.shape[1])
-        thread_scratch = scratch[scratch_place(worker, thread)]
+        thread_scratch = scratch[scratch_slot(worker, thread)]
         log = thread_scratch[0]
         adj_row = thread_scratch[1]
         product = thread_scratch[2]
-        bent = thread_scratch[3]
+        square_term = thread_scratch[3]
         load_rows(log_sh[batch], block, log)
         load_rows(adj_visibility[batch], block, adj_row)
-        count, scale, norm, depth, maximum, root, blend, blend_slope = measure(log, threshold)
+        count, scale, norm, depth, maximum, sqrt_factor, blend, blend_slope = find_squarings(log, threshold)
         adj_depth = Lane(0.0)
-        for back in range(maximum):
-            step = maximum - 1 - back
+        for reverse_step in range(maximum):
+            step = maximum - 1 - reverse_step
             is_due = wp.min(wp.max(count - Lane(float(step)), Lane(0.0)), Lane(1.0))
             _, change = square_held_adjoint(powers[batch, block, step + 1], depth, table, adj_row, product)
             adj_depth += wp.cw_mul(is_due, change)
             for i in range(wp.static(order**2)):
                 adj_row[i] = adj_row[i] + wp.cw_mul(is_due, product[i] - adj_row[i])
 
-        half = powers[batch, block, 0]
-        above = wp.cw_mul(scale, wp.max(log[0], Lane(0.0)))
+        half_base = powers[batch, block, 0]
+        positive_dc = wp.cw_mul(scale, wp.max(log[0], Lane(0.0)))
         log[0] = Lane(0.0)
-        factor = wp.cw_mul(root, root)
+        factor = wp.cw_mul(sqrt_factor, sqrt_factor)
         length = wp.cw_mul(scale, norm)
         constant, slope, constant_change, slope_change = factors(length, optimal)
         _constant, half_slope, half_constant_change, half_slope_change = factors(0.5 * length, optimal)
 
         row_dot = Lane(0.0)  # Σ v̄ h
-        half_along = Lane(0.0)  # Σ v̄ u
+        half_dot = Lane(0.0)  # Σ v̄ u
         for i in range(wp.static(order**2)):
             log[i] = wp.cw_mul(scale, log[i])
             row_dot += wp.cw_mul(adj_row[i], log[i])
-            half_along += wp.cw_mul(adj_row[i], half[i])
-        whole = wp.cw_mul(factor, UNIT * wp.cw_mul(constant, adj_row[0]) + wp.cw_mul(slope, row_dot))  # Σ v̄ q
+            half_dot += wp.cw_mul(adj_row[i], half_base[i])
+        base_dot = wp.cw_mul(factor, UNIT * wp.cw_mul(constant, adj_row[0]) + wp.cw_mul(slope, row_dot))  # Σ v̄ q
         if wp.static(base == "quadratic"):
-            whole = 4.0 * wp.cw_mul(root, half_along) - wp.cw_mul(factor, 3.0 * UNIT * adj_row[0] + row_dot)
-        rest = Lane(1.0) - blend
-        dc = wp.cw_mul(rest, whole)
+            base_dot = 4.0 * wp.cw_mul(sqrt_factor, half_dot) - wp.cw_mul(factor, 3.0 * UNIT * adj_row[0] + row_dot)
+        base_share = Lane(1.0) - blend
+        adj_dc = wp.cw_mul(base_share, base_dot)
         if wp.max(blend) > 0.0:
-            squared, change = square_held_adjoint(half, depth, table, adj_row, product)
-            adj_depth += wp.cw_mul(blend, change) + wp.cw_mul(blend_slope, squared - whole)
+            squared_dot, change = square_held_adjoint(half_base, depth, table, adj_row, product)
+            adj_depth += wp.cw_mul(blend, change) + wp.cw_mul(blend_slope, squared_dot - base_dot)
             for i in range(wp.static(order**2)):
                 adj_half = 0.5 * wp.cw_mul(blend, product[i])
-                dc += wp.cw_mul(adj_half, half[i])
-                product[i] = wp.cw_mul(root, adj_half)
+                adj_dc += wp.cw_mul(adj_half, half_base[i])
+                product[i] = wp.cw_mul(sqrt_factor, adj_half)
         else:
             for i in range(wp.static(order**2)):
                 product[i] = Lane(0.0)
 
         # from here on adj_row is F q̄ and product ½ √F ū
-        half_along = Lane(0.0)
+        half_dot = Lane(0.0)
         for i in range(wp.static(order**2)):
-            adj_row[i] = wp.cw_mul(wp.cw_mul(factor, rest), adj_row[i])
-            half_along += wp.cw_mul(product[i], log[i])
-        row_dot = wp.cw_mul(wp.cw_mul(factor, rest), row_dot)
-        radial = Lane(0.0)
+            adj_row[i] = wp.cw_mul(wp.cw_mul(factor, base_share), adj_row[i])
+            half_dot += wp.cw_mul(product[i], log[i])
+        row_dot = wp.cw_mul(wp.cw_mul(factor, base_share), row_dot)
+        radial_adjoint = Lane(0.0)
         if wp.static(base == "optimal_linear"):
-            radial = UNIT * wp.cw_mul(adj_row[0], constant_change) + wp.cw_mul(row_dot, slope_change)
-            radial += UNIT * wp.cw_mul(product[0], half_constant_change)
-            radial += 0.5 * wp.cw_mul(half_along, half_slope_change)
-            radial = wp.cw_div(radial, wp.max(length, Lane(1.0e-20)))
+            radial_adjoint = UNIT * wp.cw_mul(adj_row[0], constant_change) + wp.cw_mul(row_dot, slope_change)
+            radial_adjoint += UNIT * wp.cw_mul(product[0], half_constant_change)
+            radial_adjoint += 0.5 * wp.cw_mul(half_dot, half_slope_change)
+            radial_adjoint = wp.cw_div(radial_adjoint, wp.max(length, Lane(1.0e-20)))
         for i in range(wp.static(order**2)):
-            whole_and_half = adj_row[i] + 0.5 * product[i]
-            adj_row[i] = wp.cw_mul(slope, adj_row[i]) + wp.cw_mul(half_slope, product[i]) + wp.cw_mul(radial, log[i])
-            product[i] = whole_and_half
+            summed_adjoint = adj_row[i] + 0.5 * product[i]
+            adj_row[i] = (
+                wp.cw_mul(slope, adj_row[i]) + wp.cw_mul(half_slope, product[i]) + wp.cw_mul(radial_adjoint, log[i])
+            )
+            product[i] = summed_adjoint
         if wp.static(base == "quadratic"):
-            multiply(log, product, table, bent)
+            multiply(log, product, table, square_term)
             for i in range(wp.static(order**2)):
-                adj_row[i] = adj_row[i] + bent[i]
+                adj_row[i] = adj_row[i] + square_term[i]
         adj_depth = wp.cw_div(adj_depth, wp.max(wp.cw_mul(scale, depth), Lane(1.0e-20)))
         for i in range(1, wp.static(order**2)):
             adj_row[i] = wp.cw_mul(scale, adj_row[i]) + wp.cw_mul(adj_depth, log[i])
-        adj_row[0] = wp.cw_mul(scale, dc) / UNIT + wp.cw_mul(adj_depth, above)
+        adj_row[0] = wp.cw_mul(scale, adj_dc) / UNIT + wp.cw_mul(adj_depth, positive_dc)
         add_rows(adj_row, block, adj_log_sh[batch])
 
     return exponentiate_log_sh_adjoint
@@ -427,12 +429,12 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
         variables=[log_sh],
     )
     if not device.is_capturing:
-        held, broken = faults.numpy().tolist()
-        if broken:
+        held_count, broken_count = faults.numpy().tolist()
+        if broken_count:
             check.finite_arrays({"log_sh": log_sh})
-        if held:
+        if held_count:
             check.warn(
-                f"log-SH visibility of {held} of {batch_count * vertex_count} receivers is held back from rising above "
-                "1, since many spheres overlap; fewer spheres, or directional transmittance, are accurate"
+                f"log-SH visibility of {held_count} of {batch_count * vertex_count} receivers is held back from rising "
+                "above 1, since many spheres overlap; fewer spheres, or directional transmittance, are accurate"
             )
     return visibility

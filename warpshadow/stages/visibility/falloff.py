@@ -18,8 +18,8 @@ def make_falloff(lanes: int) -> wp.Function:
     @wp.func(inline=True)
     def falloff(cone: Cone, sine: Lane, low: Lane, cos_width: float, sin_width: float):
         # cos(max(θ − w, 0)): where θ < w the sine of the difference is cut off at 0
-        inner = wp.max(cos_width * sine - sin_width * cone.cosine, Lane(0.0))
-        high = sqrt(Lane(1.0) - wp.cw_mul(inner, inner))
+        inner_sine = wp.max(cos_width * sine - sin_width * cone.cosine, Lane(0.0))
+        high = sqrt(Lane(1.0) - wp.cw_mul(inner_sine, inner_sine))
         slope = wp.cw_div(Lane(1.0), high - low)
         solid_angle = wp.cw_div(cone.sine2, Lane(1.0) + cone.cosine)
         opacity = wp.cw_div(solid_angle, Lane(1.0) - 0.5 * (high + low))
@@ -51,19 +51,19 @@ def make_falloff_adjoint(lanes: int) -> wp.Function:
         adj_high: Lane,
         adj_opacity: Lane,
     ):
-        inner = wp.max(cos_width * sine - sin_width * cone.cosine, Lane(0.0))
-        high = sqrt(Lane(1.0) - wp.cw_mul(inner, inner))
+        inner_sine = wp.max(cos_width * sine - sin_width * cone.cosine, Lane(0.0))
+        high = sqrt(Lane(1.0) - wp.cw_mul(inner_sine, inner_sine))
         inverse = wp.cw_div(Lane(1.0), Lane(1.0) - 0.5 * (high + low))
         share = wp.cw_mul(wp.cw_div(cone.sine2, Lane(1.0) + cone.cosine), inverse)
-        is_partial = wp.min(wp.max((Lane(1.0) - share) * 1.0e20, Lane(0.0)), Lane(1.0))
+        is_below_one = wp.min(wp.max((Lane(1.0) - share) * 1.0e20, Lane(0.0)), Lane(1.0))
         adj_weight = wp.cw_mul(adj_opacity, wp.min(share, Lane(1.0)))
-        adj_solid_angle = wp.cw_mul(wp.cw_mul(is_partial, wp.cw_mul(adj_opacity, cone.weight)), inverse)
-        gain = 0.5 * wp.cw_mul(adj_solid_angle, share)
-        low_ = adj_low + gain
-        high_ = adj_high + gain
-        adj_inner = -wp.cw_div(wp.cw_mul(high_, inner), high)
-        adj_cosine = cos_width * low_ - sin_width * adj_inner - adj_solid_angle
-        adj_sine = cos_width * adj_inner - sin_width * low_
+        adj_solid_angle = wp.cw_mul(wp.cw_mul(is_below_one, wp.cw_mul(adj_opacity, cone.weight)), inverse)
+        adj_bound = 0.5 * wp.cw_mul(adj_solid_angle, share)
+        total_adj_low = adj_low + adj_bound
+        total_adj_high = adj_high + adj_bound
+        adj_inner_sine = -wp.cw_div(wp.cw_mul(total_adj_high, inner_sine), high)
+        adj_cosine = cos_width * total_adj_low - sin_width * adj_inner_sine - adj_solid_angle
+        adj_sine = cos_width * adj_inner_sine - sin_width * total_adj_low
         adj_sine2 = wp.cw_div(0.5 * adj_sine, wp.max(sine, Lane(1.0e-18)))
         return adj_cosine, adj_sine2, adj_weight
 
@@ -89,29 +89,29 @@ def make_sphere_adjoint(lanes: int) -> wp.Function:
 
     @wp.func(inline=True)
     def sphere_adjoint(
-        seen: SphereView,
+        sphere_view: SphereView,
         sine: Lane,
         low: Lane,
         cos_width: float,
         sin_width: float,
         slope: Lane,
         adj_opacity: Lane,
-        sum_: Lane,
+        sum_adj_t: Lane,
         sum_t: Lane,
         sum_omega: Vectors,
     ):
         adj_cosine, adj_sine2, adj_weight = falloff_adjoint(
-            seen.cone,
+            sphere_view.cone,
             sine,
             low,
             cos_width,
             sin_width,
-            wp.cw_mul(slope, sum_t - sum_),  # type: ignore[operator]
+            wp.cw_mul(slope, sum_t - sum_adj_t),  # type: ignore[operator]
             -wp.cw_mul(slope, sum_t),
             adj_opacity,
         )
-        adj_cone = Cone(scale(slope, sum_omega), adj_cosine, adj_sine2, wp.cw_mul(adj_weight, seen.share))
-        adj_offset, adj_radius = cone_adjoint(seen.offset, seen.curvature, seen.cone, adj_cone)
+        adj_cone = Cone(scale(slope, sum_omega), adj_cosine, adj_sine2, wp.cw_mul(adj_weight, sphere_view.share))
+        adj_offset, adj_radius = cone_adjoint(sphere_view.offset, sphere_view.curvature, sphere_view.cone, adj_cone)
         return adj_offset, adj_radius, adj_weight
 
     return sphere_adjoint

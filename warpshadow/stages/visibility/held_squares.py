@@ -32,41 +32,41 @@ UNIT = float(np.sqrt(4 * np.pi))  # the coefficient of the constant function 1
 
 
 @functools.cache
-def _make_hold(lanes: int) -> wp.Function:
+def _make_square_share(lanes: int) -> wp.Function:
     """Make the kernel function of holding squarings: |f̂| d → the share w of the square, and its derivative."""
     Lane = lane_type(lanes)
-    PER_OCTAVES = wp.constant(float(1 / np.log(HELD_ABOVE / SQUARED_BELOW)))
+    PER_LOG_RANGE = wp.constant(float(1 / np.log(HELD_ABOVE / SQUARED_BELOW)))
 
     @wp.func
-    def hold(loudness: Lane):
+    def find_square_share(overshoot: Lane):
         share = Lane(1.0)
         slope = Lane(0.0)
-        if wp.max(loudness) > SQUARED_BELOW:
+        if wp.max(overshoot) > SQUARED_BELOW:
             for lane in range(lanes):
-                if loudness[lane] > SQUARED_BELOW:
-                    t = wp.min(wp.log(loudness[lane] / SQUARED_BELOW) * PER_OCTAVES, 1.0)
+                if overshoot[lane] > SQUARED_BELOW:
+                    t = wp.min(wp.log(overshoot[lane] / SQUARED_BELOW) * PER_LOG_RANGE, 1.0)
                     share[lane] = 1.0 - wp.smoothstep(0.0, 1.0, t)
-                    slope[lane] = -6.0 * PER_OCTAVES * t * (1.0 - t) / loudness[lane]
+                    slope[lane] = -6.0 * PER_LOG_RANGE * t * (1.0 - t) / overshoot[lane]
         return share, slope
 
-    return hold
+    return find_square_share
 
 
 @functools.cache
 def make_square(order: int, lanes: int) -> wp.Function:
     """Make the kernel function of held squaring: H(v) = v + w (v * v − v); returns 1 − w."""
     Lane = lane_type(lanes)
-    hold, multiply = _make_hold(lanes), make_multiply(order, lanes)
+    find_square_share, multiply = _make_square_share(lanes), make_multiply(order, lanes)
 
     @wp.func
     def square_held(row: wp.array(dtype=Lane), depth: Lane, table: ProductTable, square: wp.array(dtype=Lane)):
         multiply(row, row, table, square)
-        share, _slope = hold(wp.cw_mul(depth, square[0] - row[0]) / UNIT)
-        rest = Lane(1.0) - share
-        if wp.max(rest) > 0.0:
+        share, _slope = find_square_share(wp.cw_mul(depth, square[0] - row[0]) / UNIT)
+        held_share = Lane(1.0) - share
+        if wp.max(held_share) > 0.0:
             for i in range(wp.static(order**2)):
-                square[i] = wp.cw_mul(rest, row[i]) + wp.cw_mul(share, square[i])
-        return rest
+                square[i] = wp.cw_mul(held_share, row[i]) + wp.cw_mul(share, square[i])
+        return held_share
 
     return square_held
 
@@ -76,11 +76,11 @@ def make_square_adjoint(order: int, lanes: int) -> wp.Function:
     """Make the adjoint of :func:`make_square`: H̄ → v̄; returns Σ H̄ H(v) and |f̂|¯.
 
     Γ is symmetric, so v̄ = H̄ + w (2 v * H̄ − H̄), w̄ = Σ v (v * H̄ − H̄) and, as (v * v)_0 = |v|²/√4π, with the
-    loudness λ = |f̂| (|v|²/4π − v0/√4π) and λ̄ = w̄ w' where it is held also v̄ += λ̄ |f̂| (2v/4π − e0/√4π), |f̂|¯ = λ̄
-    λ/|f̂|.
+    overshoot λ = |f̂| (|v|²/4π − v0/√4π) and λ̄ = w̄ w' where it is held also v̄ += λ̄ |f̂| (2v/4π − e0/√4π), |f̂|¯ =
+    λ̄ λ/|f̂|.
     """
     Lane = lane_type(lanes)
-    hold, multiply = _make_hold(lanes), make_multiply(order, lanes)
+    find_square_share, multiply = _make_square_share(lanes), make_multiply(order, lanes)
 
     @wp.func
     def square_held_adjoint(
@@ -98,16 +98,16 @@ def make_square_adjoint(order: int, lanes: int) -> wp.Function:
             mean_square += wp.cw_mul(row[i], row[i])
             row_dot += wp.cw_mul(row[i], adj_square[i])
             adj_share += wp.cw_mul(row[i], adj_row[i] - adj_square[i])
-        growth = (mean_square / UNIT - row[0]) / UNIT
-        share, share_slope = hold(wp.cw_mul(depth, growth))
+        mean_excess = (mean_square / UNIT - row[0]) / UNIT
+        share, share_slope = find_square_share(wp.cw_mul(depth, mean_excess))
         for i in range(wp.static(order**2)):
             adj_row[i] = adj_square[i] + wp.cw_mul(share, 2.0 * adj_row[i] - adj_square[i])
-        adj_loudness = wp.cw_mul(adj_share, share_slope)
+        adj_overshoot = wp.cw_mul(adj_share, share_slope)
         if wp.min(share_slope) < 0.0:
-            adj_growth = wp.cw_mul(adj_loudness, depth)
+            adj_mean_excess = wp.cw_mul(adj_overshoot, depth)
             for i in range(wp.static(order**2)):
-                adj_row[i] = adj_row[i] + (2.0 / UNIT / UNIT) * wp.cw_mul(adj_growth, row[i])
-            adj_row[0] = adj_row[0] - adj_growth / UNIT
-        return row_dot + wp.cw_mul(share, adj_share), wp.cw_mul(adj_loudness, growth)
+                adj_row[i] = adj_row[i] + (2.0 / UNIT / UNIT) * wp.cw_mul(adj_mean_excess, row[i])
+            adj_row[0] = adj_row[0] - adj_mean_excess / UNIT
+        return row_dot + wp.cw_mul(share, adj_share), wp.cw_mul(adj_overshoot, mean_excess)
 
     return square_held_adjoint

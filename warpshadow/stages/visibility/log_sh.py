@@ -12,7 +12,7 @@ from warpshadow import check
 from warpshadow.device.lanes import block_count, lane_count, lane_type, make_lane_functions, module_options
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
-from warpshadow.device.parallel import Scratch, scratch_place
+from warpshadow.device.parallel import Scratch, scratch_slot
 from warpshadow.maths import sh
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.sh_kernels import make_add_rotated_zonal, make_rotated_zonal_adjoint, zonal_type
@@ -28,7 +28,7 @@ from warpshadow.stages.visibility.traversal import (
     receiver_lanes_type,
     sphere_view_type,
 )
-from warpshadow.stages.visibility.zonal_logs import LOGS, band_type, make_look_up, zonal_table
+from warpshadow.stages.visibility.zonal_logs import LOGS, band_type, make_interpolate_zonal, zonal_table
 
 HORIZON_FADE = 0.5  # a sphere fades out from (1 − HORIZON_FADE) radii to one radius below the tangent plane
 
@@ -57,8 +57,8 @@ def _make_horizon(lanes: int) -> wp.Function:
     @wp.func(inline=True)
     def horizon(height: Lane):
         t = wp.min(wp.max((height + Lane(1.0)) / HORIZON_FADE, Lane(0.0)), Lane(1.0))
-        slope = 6.0 / HORIZON_FADE * wp.cw_mul(t, Lane(1.0) - t)
-        return smoothstep(t), slope
+        zonal_slopes = 6.0 / HORIZON_FADE * wp.cw_mul(t, Lane(1.0) - t)
+        return smoothstep(t), zonal_slopes
 
     return horizon
 
@@ -71,7 +71,7 @@ def _make_cull(order: int, has_horizon: bool, lanes: int) -> wp.Function:
     is_any_above, dot, offset = fn.is_any_above, fn.dot, fn.offset
 
     @wp.func
-    def cull(receivers: ReceiverLanes, bound: wp.vec4, place: int, candidates: int, task: LogTask):
+    def cull(receivers: ReceiverLanes, bound: wp.vec4, traversal_index: int, candidates: int, task: LogTask):
         """Returns 1 or 0."""
         count = int(1)
         if wp.static(has_horizon):
@@ -90,20 +90,23 @@ def _make_accumulate(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
     fn = make_lane_functions(lanes)
     store_rows, is_any_above, dot = fn.store_rows, fn.is_any_above, fn.dot
     load_receivers, horizon = make_load_receivers(has_horizon, lanes), _make_horizon(lanes)
-    look_up, add_rotated_zonal = make_look_up(order, False, lanes), make_add_rotated_zonal(order, lanes)
+    interpolate_zonal, add_rotated_zonal = (
+        make_interpolate_zonal(order, False, lanes),
+        make_add_rotated_zonal(order, lanes),
+    )
 
     @wp.func(inline=True)
-    def visit(receivers: ReceiverLanes, seen: SphereView, count: int, task: LogTask):
-        weight = seen.cone.weight
+    def visit(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: LogTask):
+        weight = sphere_view.cone.weight
         if wp.static(has_horizon):
-            fade, _slope = horizon(seen.curvature * dot(receivers.normals, seen.offset))
+            fade, _slope = horizon(sphere_view.curvature * dot(receivers.normals, sphere_view.offset))
             weight = wp.cw_mul(weight, fade)
         if is_any_above(weight, 0.0):
-            amount = wp.cw_mul(seen.cone.sine2, weight)
-            zonal = look_up(seen.cone.cosine, task.table)
+            zonal_scale = wp.cw_mul(sphere_view.cone.sine2, weight)
+            zonal = interpolate_zonal(sphere_view.cone.cosine, task.table)
             for band in range(order):
-                zonal[band] = wp.cw_mul(zonal[band], amount)
-            add_rotated_zonal(seen.cone.axis, zonal, task.row)
+                zonal[band] = wp.cw_mul(zonal[band], zonal_scale)
+            add_rotated_zonal(sphere_view.cone.axis, zonal, task.row)
 
     traverse = make_traversal(_make_cull(order, has_horizon, lanes), visit, LogTask, False, lanes)
 
@@ -115,14 +118,14 @@ def _make_accumulate(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
         inputs: TraversalInputs,
         table: wp.array2d(dtype=Band),
         # scratch
-        total: wp.array2d(dtype=Lane),
+        scratch: wp.array2d(dtype=Lane),
         # out
         log_sh: wp.array3d(dtype=wp.float32),
     ):
         """A thread owns a block of receivers and sums the log-visibility of all spheres."""
         thread = first_row + wp.tid()
         batch, block, receivers = load_receivers(inputs, thread)
-        row = total[scratch_place(worker, thread)]
+        row = scratch[scratch_slot(worker, thread)]
         for i in range(wp.static(order**2)):
             row[i] = Lane(0.0)
         traverse(receivers, batch, inputs.spheres, Gradients(), LogTask(table, row))
@@ -141,51 +144,57 @@ def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Ke
     is_any_above, dot, add, scale = fn.is_any_above, fn.dot, fn.add, fn.scale
     cone_adjoint = make_cone_adjoint(lanes)
     load_receivers, horizon = make_load_receivers(has_horizon, lanes), _make_horizon(lanes)
-    look_up, look_up_slope = make_look_up(order, False, lanes), make_look_up(order, True, lanes)
+    interpolate_zonal, interpolate_zonal_slope = (
+        make_interpolate_zonal(order, False, lanes),
+        make_interpolate_zonal(order, True, lanes),
+    )
     rotated_zonal_adjoint = make_rotated_zonal_adjoint(order, lanes)
 
     @wp.func(inline=True)
-    def visit(receivers: ReceiverLanes, seen: SphereView, count: int, task: LogTask):
+    def visit(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: LogTask):
         """The adjoint of the sphere's cone and of its height over the horizon.
 
         With z_l = a h_l(c), a = s² w and h from the table:  ā = Σ z̄_l h_l,  c̄ = a Σ z̄_l h_l',  s̄² = ā w,  w̄ = ā
         s², and with w = w_cone w_horizon(n·d/r):  n̄ = d w̄_h w_h'/r,  d̄ += n w̄_h w_h'/r,  r̄ −= n·d/r w̄_h w_h'/r
         """
         adj_sphere = SphereAdjoint()
-        cone = seen.cone
+        cone = sphere_view.cone
         height = Lane(0.0)
         fade = Lane(1.0)
         fade_slope = Lane(0.0)
         if wp.static(has_horizon):
-            height = seen.curvature * dot(receivers.normals, seen.offset)
+            height = sphere_view.curvature * dot(receivers.normals, sphere_view.offset)
             height = wp.min(wp.max(height, Lane(-1.0)), Lane(1.0))  # beyond, nothing depends on it
             fade, fade_slope = horizon(height)
-        faded = wp.cw_mul(cone.weight, fade)
-        if is_any_above(faded, 0.0):
-            amount = wp.cw_mul(cone.sine2, faded)
-            shape = look_up(cone.cosine, task.table)
-            slope = look_up_slope(cone.cosine, task.table)
+        faded_weight = wp.cw_mul(cone.weight, fade)
+        if is_any_above(faded_weight, 0.0):
+            zonal_scale = wp.cw_mul(cone.sine2, faded_weight)
+            zonal_values = interpolate_zonal(cone.cosine, task.table)
+            zonal_slopes = interpolate_zonal_slope(cone.cosine, task.table)
             zonal = Zonal()
             for band in range(order):
-                zonal[band] = wp.cw_mul(shape[band], amount)
+                zonal[band] = wp.cw_mul(zonal_values[band], zonal_scale)
             adj_axis, adj_zonal = rotated_zonal_adjoint(cone.axis, zonal, task.row)
-            adj_amount = Lane(0.0)
+            adj_zonal_scale = Lane(0.0)
             adj_cosine = Lane(0.0)
             for band in range(order):
-                adj_amount += wp.cw_mul(adj_zonal[band], shape[band])
-                adj_cosine += wp.cw_mul(adj_zonal[band], slope[band])
-            adj_faded = wp.cw_mul(adj_amount, cone.sine2)
-            adj_weight = wp.cw_mul(adj_faded, fade)
+                adj_zonal_scale += wp.cw_mul(adj_zonal[band], zonal_values[band])
+                adj_cosine += wp.cw_mul(adj_zonal[band], zonal_slopes[band])
+            adj_faded_weight = wp.cw_mul(adj_zonal_scale, cone.sine2)
+            adj_weight = wp.cw_mul(adj_faded_weight, fade)
             adj_cone = Cone(
-                adj_axis, wp.cw_mul(adj_cosine, amount), wp.cw_mul(adj_amount, faded), wp.cw_mul(adj_weight, seen.share)
+                adj_axis,
+                wp.cw_mul(adj_cosine, zonal_scale),
+                wp.cw_mul(adj_zonal_scale, faded_weight),
+                wp.cw_mul(adj_weight, sphere_view.share),
             )
-            adj_offset, adj_radius = cone_adjoint(seen.offset, seen.curvature, cone, adj_cone)
-            adj_height = seen.curvature * wp.cw_mul(wp.cw_mul(adj_faded, cone.weight), fade_slope)
+            adj_offset, adj_radius = cone_adjoint(sphere_view.offset, sphere_view.curvature, cone, adj_cone)
+            adj_height = sphere_view.curvature * wp.cw_mul(wp.cw_mul(adj_faded_weight, cone.weight), fade_slope)
             adj_sphere.is_any = True
             adj_sphere.offset = add(adj_offset, scale(adj_height, receivers.normals))
             adj_sphere.radius = adj_radius - wp.cw_mul(adj_height, height)
             adj_sphere.weight = adj_weight
-            adj_sphere.normals = scale(adj_height, seen.offset)
+            adj_sphere.normals = scale(adj_height, sphere_view.offset)
         return adj_sphere
 
     traverse = make_traversal(_make_cull(order, has_horizon, lanes), visit, LogTask, True, lanes)
@@ -210,14 +219,14 @@ def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Ke
         """A thread owns a block of receivers."""
         thread = first_row + wp.tid()
         batch, block, receivers = load_receivers(inputs, thread)
-        row = scratch[scratch_place(worker, thread)]
+        row = scratch[scratch_slot(worker, thread)]
         load_rows(adj_log_sh[batch], block, row)
         gradients = Gradients(adj_centers, adj_radii, adj_extents)
-        adj = traverse(receivers, batch, inputs.spheres, gradients, LogTask(table, row))
+        adj_receivers = traverse(receivers, batch, inputs.spheres, gradients, LogTask(table, row))
         if adj_points:
-            add_vectors(adj.points, block, adj_points[batch])
+            add_vectors(adj_receivers.points, block, adj_points[batch])
         if adj_normals:
-            add_vectors(adj.normals, block, adj_normals[batch])
+            add_vectors(adj_receivers.normals, block, adj_normals[batch])
 
     return accumulate_log_sh_adjoint
 

@@ -37,9 +37,9 @@ MERGED_FROM = 512  # fewer spheres do not merge: they are so large that hardly a
 
 _BLEND_ANGLE_RATIO = 0.7  # τ0 / τ
 
-_SHADOW = 5.4  # of an ellipsoid, from the moments of spheres
+_ELLIPSOID_AREA_FACTOR = 5.4  # squared radius of an ellipsoid's mean shadow over √(e2/3)
 
-_FARTHEST2 = 1.0e30  # (D/E)² is kept where its products are float32
+_MAX_DISTANCE2 = 1.0e30  # (D/E)² is kept where its products are float32
 
 
 class ClusterNodes(NamedTuple):
@@ -51,7 +51,7 @@ class ClusterNodes(NamedTuple):
 
 
 @wp.kernel
-def _merge(
+def _merge_clusters(
     # in
     centers: wp.array2d(dtype=wp.vec3),
     radii: wp.array2d(dtype=wp.float32),
@@ -72,39 +72,39 @@ def _merge(
         radii[batch, 4 * cluster + 2],
         radii[batch, 4 * cluster + 3],
     )
-    largest = wp.max(radius)
-    if largest > TINY_RADIUS:
-        share = radius / largest
+    max_radius = wp.max(radius)
+    if max_radius > TINY_RADIUS:
+        share = radius / max_radius
         share = wp.cw_mul(share, wp.cw_mul(share, share))
         share = share / (share[0] + share[1] + share[2] + share[3])
-        middle = share[0] * a + share[1] * b + share[2] * c + share[3] * d
-        size = largest + wp.max(
-            wp.max(wp.max(wp.abs(a - middle)), wp.max(wp.abs(b - middle))),
-            wp.max(wp.max(wp.abs(c - middle)), wp.max(wp.abs(d - middle))),
+        center = share[0] * a + share[1] * b + share[2] * c + share[3] * d
+        size = max_radius + wp.max(
+            wp.max(wp.max(wp.abs(a - center)), wp.max(wp.abs(b - center))),
+            wp.max(wp.max(wp.abs(c - center)), wp.max(wp.abs(d - center))),
         )
-        a = (a - middle) / size
-        b = (b - middle) / size
-        c = (c - middle) / size
-        d = (d - middle) / size
-        square = wp.cw_mul(radius, radius) / (size * size)
+        a = (a - center) / size
+        b = (b - center) / size
+        c = (c - center) / size
+        d = (d - center) / size
+        squared_radii = wp.cw_mul(radius, radius) / (size * size)
         moments = share[0] * wp.outer(a, a) + share[1] * wp.outer(b, b)
         moments += share[2] * wp.outer(c, c) + share[3] * wp.outer(d, d)
-        moments += 0.2 * wp.dot(share, square) * wp.identity(n=3, dtype=wp.float32)
+        moments += 0.2 * wp.dot(share, squared_radii) * wp.identity(n=3, dtype=wp.float32)
         trace = wp.trace(moments)
-        shadow = _SHADOW * wp.sqrt(wp.max((trace * trace - wp.ddot(moments, moments)) / 6.0, 1.0e-30))
-        total = wp.max(square[0] + square[1] + square[2] + square[3], 1.0e-15)
-        less = wp.min(shadow, total)
-        ratio = less / wp.max(shadow, total)
+        shadow = _ELLIPSOID_AREA_FACTOR * wp.sqrt(wp.max((trace * trace - wp.ddot(moments, moments)) / 6.0, 1.0e-30))
+        squared_sum = wp.max(squared_radii[0] + squared_radii[1] + squared_radii[2] + squared_radii[3], 1.0e-15)
+        min_square = wp.min(shadow, squared_sum)
+        ratio = min_square / wp.max(shadow, squared_sum)
         ratio = ratio * ratio * ratio * ratio
-        reach = square + wp.vec4(wp.dot(a, a), wp.dot(b, b), wp.dot(c, c), wp.dot(d, d))
-        reach = wp.cw_mul(reach, reach)
-        merged_centers[batch, cluster] = middle
-        merged_radii[batch, cluster] = size * wp.sqrt(less / wp.sqrt(wp.sqrt(1.0 + ratio)))
-        extents[batch, cluster] = size * wp.sqrt(wp.sqrt(wp.sqrt(wp.dot(reach, reach))))
+        squared_reaches = squared_radii + wp.vec4(wp.dot(a, a), wp.dot(b, b), wp.dot(c, c), wp.dot(d, d))
+        squared_reaches = wp.cw_mul(squared_reaches, squared_reaches)
+        merged_centers[batch, cluster] = center
+        merged_radii[batch, cluster] = size * wp.sqrt(min_square / wp.sqrt(wp.sqrt(1.0 + ratio)))
+        extents[batch, cluster] = size * wp.sqrt(wp.sqrt(wp.sqrt(wp.dot(squared_reaches, squared_reaches))))
     else:
         merged_centers[batch, cluster] = a
-        merged_radii[batch, cluster] = largest
-        extents[batch, cluster] = largest
+        merged_radii[batch, cluster] = max_radius
+        extents[batch, cluster] = max_radius
 
 
 def check_merging(merging: float) -> None:
@@ -114,7 +114,7 @@ def check_merging(merging: float) -> None:
 
 
 def merged_count(sphere_count: int, merging: float) -> int:
-    """Quads that so many spheres merge into, 0 where they do not.
+    """Number of clusters that spheres merge into, 0 where they do not.
 
     Raises:
         ValueError: for ``merging`` out of range.
@@ -135,14 +135,14 @@ def merge(centers: wp.array, radii: wp.array) -> ClusterNodes:
     shape = batch_count, sphere_count // CLUSTER_SIZE
     merged_centers = empty(shape, dtype=wp.vec3, device=radii.device)
     merged_radii, extents = (empty(shape, dtype=wp.float32, device=radii.device) for _ in range(2))
-    launch(_merge, shape, inputs=[centers, radii], outputs=[merged_centers, merged_radii, extents])
+    launch(_merge_clusters, shape, inputs=[centers, radii], outputs=[merged_centers, merged_radii, extents])
     counts = [sphere_count, shape[1]]
     return ClusterNodes(
         concatenate([centers, merged_centers], counts), concatenate([radii, merged_radii], counts), extents
     )
 
 
-def merge_where_far(centers: wp.array, radii: wp.array, merging: float) -> ClusterNodes:
+def merge_if_many(centers: wp.array, radii: wp.array, merging: float) -> ClusterNodes:
     """Merge spheres where there are enough of them and ``merging``, in cell radii, is not 0.
 
     Raises:
@@ -170,20 +170,20 @@ class SphereClusters:
 
 
 @wp.func
-def meets(begin: int, end: int, spheres: SphereClusters):
-    """Whether one of some spheres that follow each other is left out."""
+def is_skipped_partly(begin: int, end: int, spheres: SphereClusters):
+    """Whether any sphere from ``begin`` to ``end`` is skipped."""
     return wp.max(begin, spheres.skip_begin) < wp.min(end, spheres.skip_end)
 
 
 @wp.func
-def within(begin: int, end: int, spheres: SphereClusters):
-    """Whether all of some spheres that follow each other are left out."""
+def is_skipped(begin: int, end: int, spheres: SphereClusters):
+    """Whether all spheres from ``begin`` to ``end`` are skipped."""
     return begin >= spheres.skip_begin and end <= spheres.skip_end
 
 
 @wp.struct
 class Gradients:
-    """Where to add the gradients of spheres; unwanted ones are empty."""
+    """Gradients of spheres, to which adjoints add; arrays of no gradient are empty."""
 
     centers: wp.array2d(dtype=wp.vec3)
     radii: wp.array2d(dtype=wp.float32)
@@ -194,11 +194,13 @@ class Gradients:
 def make_add_to_node(lanes: int) -> wp.Function:
     """Make the kernel function that adds a block's share to the gradients of a node."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
-    total = make_lane_functions(lanes).total
+    squared_sum = make_lane_functions(lanes).total
 
     @wp.func(inline=True)
     def add_to_node(adj_offset: Vectors, adj_radius: Lane, batch: int, node: int, gradients: Gradients):
-        adj = wp.vec4(total(adj_offset.x), total(adj_offset.y), total(adj_offset.z), total(adj_radius))
+        adj = wp.vec4(
+            squared_sum(adj_offset.x), squared_sum(adj_offset.y), squared_sum(adj_offset.z), squared_sum(adj_radius)
+        )
         if wp.static(lanes == 1):
             node_count = wp.max(gradients.centers.shape[1], gradients.radii.shape[1])
             adj = sums_over_warp(adj, batch * node_count + node)
@@ -212,91 +214,101 @@ def make_add_to_node(lanes: int) -> wp.Function:
 
 
 @functools.cache
-def _make_blend(lanes: int) -> wp.Function:
+def _make_blend_share(lanes: int) -> wp.Function:
     """Make the kernel function of the share m of a cluster's sphere: d/E, τ → m, and its derivative by (D/E)²."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
     fn = make_lane_functions(lanes)
     dot, smoothstep = fn.dot, fn.smoothstep
     BLEND2 = wp.constant(_BLEND_ANGLE_RATIO**2)
-    FARTHEST2 = wp.constant(_FARTHEST2)
+    MAX_DISTANCE2 = wp.constant(_MAX_DISTANCE2)
 
     @wp.func
-    def blend(relative: Vectors, angle: float):
-        distance2 = dot(relative, relative)
-        inverse2 = wp.cw_div(Lane(1.0), wp.min(wp.max(distance2, Lane(1.0)), Lane(FARTHEST2)))
+    def blend_share(relative_offset: Vectors, angle: float):
+        distance2 = dot(relative_offset, relative_offset)
+        inverse2 = wp.cw_div(Lane(1.0), wp.min(wp.max(distance2, Lane(1.0)), Lane(MAX_DISTANCE2)))
         slope = 1.0 / (angle * angle * (1.0 - BLEND2))
         t = wp.min(wp.max(slope * (Lane(angle * angle) - inverse2), Lane(0.0)), Lane(1.0))
-        rise = (6.0 * slope) * wp.cw_mul(wp.cw_mul(t, Lane(1.0) - t), wp.cw_mul(inverse2, inverse2))
-        return smoothstep(t), rise
+        blend_slope = (6.0 * slope) * wp.cw_mul(wp.cw_mul(t, Lane(1.0) - t), wp.cw_mul(inverse2, inverse2))
+        return smoothstep(t), blend_slope
 
-    return blend
+    return blend_share
 
 
 @functools.cache
-def _make_relative(lanes: int) -> wp.Function:
+def _make_offset_over_extent(lanes: int) -> wp.Function:
     """Make the kernel function of the offset from a block of receivers to a cluster, over its extent: d/E and 1/E."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
 
     @wp.func
-    def relative(points: Vectors, batch: int, cluster: int, spheres: SphereClusters):
+    def offset_over_extent(points: Vectors, batch: int, cluster: int, spheres: SphereClusters):
         center = spheres.centers[batch, spheres.count + cluster]
-        inverse = 1.0 / wp.max(spheres.extents[batch, cluster], TINY_RADIUS)
-        offset = Vectors(
-            inverse * (Lane(center[0]) - points.x),
-            inverse * (Lane(center[1]) - points.y),
-            inverse * (Lane(center[2]) - points.z),
+        inverse_extent = 1.0 / wp.max(spheres.extents[batch, cluster], TINY_RADIUS)
+        relative_offset = Vectors(
+            inverse_extent * (Lane(center[0]) - points.x),
+            inverse_extent * (Lane(center[1]) - points.y),
+            inverse_extent * (Lane(center[2]) - points.z),
         )
-        return offset, inverse
+        return relative_offset, inverse_extent
 
-    return relative
+    return offset_over_extent
 
 
 @functools.cache
-def make_merged(lanes: int) -> wp.Function:
+def make_cluster_share(lanes: int) -> wp.Function:
     """Make the kernel function of the share that a cluster's sphere has for a block of receivers."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
-    blend, relative = _make_blend(lanes), _make_relative(lanes)
+    blend_share, offset_over_extent = _make_blend_share(lanes), _make_offset_over_extent(lanes)
 
     @wp.func
-    def merged(points: Vectors, batch: int, cluster: int, spheres: SphereClusters):
+    def cluster_share(points: Vectors, batch: int, cluster: int, spheres: SphereClusters):
         share = Lane(0.0)
-        if cluster < spheres.extents.shape[1] and not meets(
+        if cluster < spheres.extents.shape[1] and not is_skipped_partly(
             CLUSTER_SIZE * cluster, CLUSTER_SIZE * (cluster + 1), spheres
         ):
-            offset, _inverse = relative(points, batch, cluster, spheres)
-            share_, _slope = blend(offset, spheres.merging_angle)
-            share = share_
+            relative_offset, _inverse_extent = offset_over_extent(points, batch, cluster, spheres)
+            blended_share, _slope = blend_share(relative_offset, spheres.merging_angle)
+            share = blended_share
         return share
 
-    return merged
+    return cluster_share
 
 
 @functools.cache
-def make_merged_adjoint(lanes: int) -> wp.Function:
-    """Make the adjoint of :func:`make_merged`'s function: m̄ → that of the offset to a cluster, added to its own.
+def make_cluster_share_adjoint(lanes: int) -> wp.Function:
+    """Make the adjoint of :func:`make_cluster_share`'s function: m̄ → that of the offset to a cluster, added to its
+    own.
 
     With x = d/E and X² = |x|²:  X̄² = m' m̄,  d̄ = 2 x X̄² / E,  Ē = −2 X² X̄² / E.
     """
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
-    blend, relative, add_to_node = _make_blend(lanes), _make_relative(lanes), make_add_to_node(lanes)
+    blend_share, offset_over_extent, add_to_node = (
+        _make_blend_share(lanes),
+        _make_offset_over_extent(lanes),
+        make_add_to_node(lanes),
+    )
     fn = make_lane_functions(lanes)
-    is_any_above, scale, dot, total = fn.is_any_above, fn.scale, fn.dot, fn.total
+    is_any_above, scale, dot, squared_sum = fn.is_any_above, fn.scale, fn.dot, fn.total
 
     @wp.func
     def adjoint(
-        points: Vectors, batch: int, cluster: int, adj_merged: Lane, spheres: SphereClusters, gradients: Gradients
+        points: Vectors,
+        batch: int,
+        cluster: int,
+        adj_cluster_share: Lane,
+        spheres: SphereClusters,
+        gradients: Gradients,
     ):
         adj_offset = Vectors()
-        if cluster < spheres.extents.shape[1] and not meets(
+        if cluster < spheres.extents.shape[1] and not is_skipped_partly(
             CLUSTER_SIZE * cluster, CLUSTER_SIZE * (cluster + 1), spheres
         ):
-            offset, inverse = relative(points, batch, cluster, spheres)
-            _merged, slope = blend(offset, spheres.merging_angle)
+            relative_offset, inverse_extent = offset_over_extent(points, batch, cluster, spheres)
+            _cluster_share, slope = blend_share(relative_offset, spheres.merging_angle)
             if is_any_above(slope, 0.0):
-                adj_offset = scale((2.0 * inverse) * wp.cw_mul(adj_merged, slope), offset)
+                adj_offset = scale((2.0 * inverse_extent) * wp.cw_mul(adj_cluster_share, slope), relative_offset)
                 add_to_node(adj_offset, Lane(0.0), batch, spheres.count + cluster, gradients)
                 if gradients.extents:
-                    adj_extent = -total(dot(adj_offset, offset))
+                    adj_extent = -squared_sum(dot(adj_offset, relative_offset))
                     if wp.static(lanes == 1):
                         adj_extent = sum_over_warp(adj_extent, batch * gradients.extents.shape[1] + cluster)
                     if adj_extent != 0.0:

@@ -20,32 +20,32 @@ from warpshadow.stages.visibility.merging import (
     ClusterNodes,
     Gradients,
     SphereClusters,
+    is_skipped,
     make_add_to_node,
-    make_merged,
-    make_merged_adjoint,
-    merge_where_far,
-    within,
+    make_cluster_share,
+    make_cluster_share_adjoint,
+    merge_if_many,
 )
 
 CLUSTERS_PER_RUN = 4  # spheres of a run, and then of a cluster, are culled together: they had best be neighbors
-ALL = -1  # the number of candidates for a run: all that there are
+ALL_BUNDLES = -1  # the number of candidates for a run: all that there are
 
 
 @wp.func
 def find_node(cluster: int, item: int, sphere_count: int, node_count: int):
     """Node of an item of a cluster: its four spheres and then its own; −1 where there is none."""
     node = cluster * CLUSTER_SIZE + item
-    last = sphere_count
+    end_node = sphere_count
     if item == CLUSTER_SIZE:
         node = sphere_count + cluster
-        last = node_count
-    if node >= last:
+        end_node = node_count
+    if node >= end_node:
         node = -1
     return node
 
 
 @wp.kernel(enable_backward=False)
-def _bound(
+def _bound_runs(
     # in
     centers: wp.array2d(dtype=wp.vec3),
     radii: wp.array2d(dtype=wp.float32),
@@ -56,27 +56,27 @@ def _bound(
 ):
     """A thread owns a run of clusters: center and radius of a sphere around all of theirs, negative for none."""
     batch, run = wp.tid()
-    low = wp.vec3(wp.inf)
-    high = wp.vec3(-wp.inf)
+    lower = wp.vec3(wp.inf)
+    upper = wp.vec3(-wp.inf)
     for k in range(cluster_count * NODES_PER_CLUSTER):
         node = find_node(
             run * cluster_count + k // NODES_PER_CLUSTER, k % NODES_PER_CLUSTER, sphere_count, radii.shape[1]
         )
         if node >= 0 and radii[batch, wp.max(node, 0)] > TINY_RADIUS:
             extent = wp.vec3(radii[batch, node])
-            low = wp.min(low, centers[batch, node] - extent)
-            high = wp.max(high, centers[batch, node] + extent)
-    middle = 0.5 * (low + high)
-    reach = float(-1.0)
+            lower = wp.min(lower, centers[batch, node] - extent)
+            upper = wp.max(upper, centers[batch, node] + extent)
+    center = 0.5 * (lower + upper)
+    radius_of_bound = float(-1.0)
     for k in range(cluster_count * NODES_PER_CLUSTER):
         node = find_node(
             run * cluster_count + k // NODES_PER_CLUSTER, k % NODES_PER_CLUSTER, sphere_count, radii.shape[1]
         )
         if node >= 0 and radii[batch, wp.max(node, 0)] > TINY_RADIUS:
-            reach = wp.max(reach, wp.length(centers[batch, node] - middle) + radii[batch, node])
-    if reach < 0.0:
-        middle = wp.vec3(0.0)
-    bounds[batch, run] = wp.vec4(middle[0], middle[1], middle[2], reach)
+            radius_of_bound = wp.max(radius_of_bound, wp.length(centers[batch, node] - center) + radii[batch, node])
+    if radius_of_bound < 0.0:
+        center = wp.vec3(0.0)
+    bounds[batch, run] = wp.vec4(center[0], center[1], center[2], radius_of_bound)
 
 
 class ClusterTree(NamedTuple):
@@ -95,7 +95,7 @@ def find_clusters(centers: wp.array, radii: wp.array, merging: float) -> Cluster
         merging: τ, 0 for never.
     Differentiable: centers, radii to the nodes.
     """
-    nodes, count = merge_where_far(centers, radii, merging), radii.shape[1]
+    nodes, count = merge_if_many(centers, radii, merging), radii.shape[1]
     return ClusterTree(nodes, _find_bounds(nodes, count, 1), _find_bounds(nodes, count, CLUSTERS_PER_RUN))
 
 
@@ -114,7 +114,7 @@ def make_inputs(
     centers: wp.array,
     radii: wp.array,
     merging: float,
-    cell: float,
+    cell_radius: float,
     skip: tuple[int, int] = (0, 0),
     clusters: ClusterTree | None = None,
 ) -> tuple[ClusterNodes, TraversalInputs]:
@@ -124,7 +124,7 @@ def make_inputs(
         points, normals: Receivers, [batch, receiver].
         centers, radii: Spheres, [batch, sphere].
         merging: τ in cell radii, 0 for never.
-        cell: Radius of a cell [rad].
+        cell_radius: Radius of a cell [rad].
         skip: Spheres that are left out: the first, and the one after the last.
         clusters: Of these spheres, where they are found already.
     Returns:
@@ -137,7 +137,7 @@ def make_inputs(
     nodes, *bounds = find_clusters(centers, radii, merging) if clusters is None else clusters
     spheres = SphereClusters()
     spheres.centers, spheres.radii, spheres.extents = nodes
-    spheres.count, spheres.merging_angle = count, merging * cell
+    spheres.count, spheres.merging_angle = count, merging * cell_radius
     spheres.skip_begin, spheres.skip_end = skip
     spheres.cluster_bounds, spheres.run_bounds = bounds
     inputs = TraversalInputs()
@@ -149,7 +149,7 @@ def _find_bounds(nodes: ClusterNodes, sphere_count: int, cluster_count: int) -> 
     """Spheres around runs of clusters, vec4 of shape [batch, run]."""
     shape = nodes.radii.shape[0], -(-sphere_count // (CLUSTER_SIZE * cluster_count))
     bounds = empty(shape, dtype=wp.vec4, device=nodes.radii.device)
-    launch(_bound, shape, inputs=[nodes.centers, nodes.radii, sphere_count, cluster_count], outputs=[bounds])
+    launch(_bound_runs, shape, inputs=[nodes.centers, nodes.radii, sphere_count, cluster_count], outputs=[bounds])
     return bounds
 
 
@@ -191,7 +191,7 @@ def sphere_view_type(lanes: int) -> Any:
 
     @wp.struct
     class SphereView:
-        place: int  # in the traversal
+        traversal_index: int  # in the traversal
         node: int
         offset: Vectors  # from the receivers to its center
         curvature: float  # 1/radius
@@ -228,8 +228,8 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
 
     Args:
         cull: (receivers, bound, place, candidates, task) → to how many candidates the spheres in a bound may matter.
-            ``place`` is the first sphere's in the traversal. ``candidates`` is how many there are: :data:`ALL` for a
-            run, and for a cluster those that its run left.
+            ``traversal_index`` is the first sphere's in the traversal. ``candidates`` is how many there are:
+            :data:`ALL_BUNDLES` for a run, and for a cluster the bundles that its run may reach.
         visit: (receivers, seen, count, task), called for each sphere with the count of its cluster; for an adjoint →
             SphereAdjoint.
         Task: Struct of all else that these two read and write.
@@ -240,19 +240,21 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
     ReceiverLanes, SphereView = receiver_lanes_type(lanes), sphere_view_type(lanes)
     fn = make_lane_functions(lanes)
     is_any_above, offset, add, subtract = fn.is_any_above, fn.offset, fn.add, fn.subtract
-    cone, merged = make_cone(lanes), make_merged(lanes)
-    merged_adjoint, add_to_node = make_merged_adjoint(lanes), make_add_to_node(lanes)
+    cone, find_cluster_share = make_cone(lanes), make_cluster_share(lanes)
+    cluster_share_adjoint, add_to_node = make_cluster_share_adjoint(lanes), make_add_to_node(lanes)
 
     @wp.func(inline=lanes == 1)
     def traverse(receivers: ReceiverLanes, batch: int, spheres: SphereClusters, gradients: Gradients, task: Task):
         """Returns the adjoint of the receivers."""
-        adj = ReceiverLanes()
+        adj_receivers = ReceiverLanes()
         for run in range(spheres.run_bounds.shape[1]):
             begin = run * CLUSTERS_PER_RUN
             end = wp.min(begin + CLUSTERS_PER_RUN, spheres.cluster_bounds.shape[1])
             run_count = int(0)
-            if not within(begin * CLUSTER_SIZE, wp.min(end * CLUSTER_SIZE, spheres.count), spheres):
-                run_count = cull(receivers, spheres.run_bounds[batch, run], begin * NODES_PER_CLUSTER, ALL, task)
+            if not is_skipped(begin * CLUSTER_SIZE, wp.min(end * CLUSTER_SIZE, spheres.count), spheres):
+                run_count = cull(
+                    receivers, spheres.run_bounds[batch, run], begin * NODES_PER_CLUSTER, ALL_BUNDLES, task
+                )
             if run_count == 0:
                 end = begin
             for cluster in range(begin, end):
@@ -260,7 +262,7 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
                     receivers, spheres.cluster_bounds[batch, cluster], cluster * NODES_PER_CLUSTER, run_count, task
                 )
                 if count > 0:
-                    cluster_share = merged(receivers.points, batch, cluster, spheres)
+                    cluster_share = find_cluster_share(receivers.points, batch, cluster, spheres)
                     adj_share = Lane(0.0)
                     for item in range(NODES_PER_CLUSTER):
                         node = find_node(cluster, item, spheres.count, spheres.centers.shape[1])
@@ -270,31 +272,33 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
                             share = cluster_share
                             sign = 1.0
                         radius = float(0.0)
-                        is_left_out = item < CLUSTER_SIZE and within(node, node + 1, spheres)
+                        is_left_out = item < CLUSTER_SIZE and is_skipped(node, node + 1, spheres)
                         if node >= 0 and not is_left_out and is_any_above(share, 0.0):
                             radius = spheres.radii[batch, node]
                         if radius > TINY_RADIUS:
-                            seen = SphereView()
-                            seen.place = cluster * NODES_PER_CLUSTER + item
-                            seen.node = node
-                            seen.offset = offset(spheres.centers[batch, node], receivers.points)
-                            seen.curvature = 1.0 / radius
-                            seen.cone = cone(seen.offset, seen.curvature)
-                            near = seen.cone.weight
-                            seen.cone.weight = wp.cw_mul(near, share)
-                            seen.share = share
+                            sphere_view = SphereView()
+                            sphere_view.traversal_index = cluster * NODES_PER_CLUSTER + item
+                            sphere_view.node = node
+                            sphere_view.offset = offset(spheres.centers[batch, node], receivers.points)
+                            sphere_view.curvature = 1.0 / radius
+                            sphere_view.cone = cone(sphere_view.offset, sphere_view.curvature)
+                            cone_weight = sphere_view.cone.weight
+                            sphere_view.cone.weight = wp.cw_mul(cone_weight, share)
+                            sphere_view.share = share
                             if wp.static(is_adjoint):
-                                adj_sphere = visit(receivers, seen, count, task)
+                                adj_sphere = visit(receivers, sphere_view, count, task)
                                 if adj_sphere.is_any:
-                                    adj_share += sign * wp.cw_mul(adj_sphere.weight, near)
-                                    adj.points = subtract(adj.points, adj_sphere.offset)
-                                    adj.normals = add(adj.normals, adj_sphere.normals)
+                                    adj_share += sign * wp.cw_mul(adj_sphere.weight, cone_weight)
+                                    adj_receivers.points = subtract(adj_receivers.points, adj_sphere.offset)
+                                    adj_receivers.normals = add(adj_receivers.normals, adj_sphere.normals)
                                     add_to_node(adj_sphere.offset, adj_sphere.radius, batch, node, gradients)
                             else:
-                                visit(receivers, seen, count, task)
+                                visit(receivers, sphere_view, count, task)
                     if wp.static(is_adjoint):
-                        adj_offset = merged_adjoint(receivers.points, batch, cluster, adj_share, spheres, gradients)
-                        adj.points = subtract(adj.points, adj_offset)
-        return adj
+                        adj_offset = cluster_share_adjoint(
+                            receivers.points, batch, cluster, adj_share, spheres, gradients
+                        )
+                        adj_receivers.points = subtract(adj_receivers.points, adj_offset)
+        return adj_receivers
 
     return traverse

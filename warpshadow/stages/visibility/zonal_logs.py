@@ -44,10 +44,10 @@ def zonal_eigen_log(order: int, cosine: np.ndarray) -> np.ndarray:
     """
     visibility = -zonal_cap(order, cosine)
     visibility[..., 0] += np.sqrt(4 * np.pi)
-    z, weight = np.polynomial.legendre.leggauss(2 * order)
-    basis = sh.zonal_basis(order, z)
-    triple = 2 * np.pi * np.einsum("q,ql,qj,qk->ljk", weight, basis, basis, basis)
-    eigenvalues, vectors = np.linalg.eigh(np.einsum("...j,ljk->...lk", visibility, triple))
+    node_cosines, weight = np.polynomial.legendre.leggauss(2 * order)
+    basis = sh.zonal_basis(order, node_cosines)
+    triple_products = 2 * np.pi * np.einsum("q,ql,qj,qk->ljk", weight, basis, basis, basis)
+    eigenvalues, vectors = np.linalg.eigh(np.einsum("...j,ljk->...lk", visibility, triple_products))
     logs = np.log(np.maximum(eigenvalues, EIGENVALUE_FLOOR))
     return np.sqrt(4 * np.pi) * np.einsum("...lj,...j,...j->...l", vectors, logs, vectors[..., 0, :])
 
@@ -82,26 +82,26 @@ def zonal_table(order: int, function: str, device: str) -> wp.array:
 
 
 @functools.cache
-def make_look_up(order: int, is_slope: bool, lanes: int) -> wp.Function:
+def make_interpolate_zonal(order: int, is_slope: bool, lanes: int) -> wp.Function:
     """Make the kernel function of a table: cos θ → z_l / sin²θ of each lane, or its derivative by cos θ."""
     Lane, Zonal, Band = lane_type(lanes), zonal_type(order, lanes), band_type(order)
 
     @wp.func
-    def look_up(cosine: Lane, table: wp.array2d(dtype=Band)):
+    def interpolate_zonal(cosine: Lane, table: wp.array2d(dtype=Band)):
         zonal = Zonal()
         for lane in range(lanes):
             position = cosine[lane] * float(_INTERVALS)
             interval = wp.min(int(position), _INTERVALS - 1)
             t = position - float(interval)
             if wp.static(is_slope):
-                z = 2.0 * table[interval, 2] + (3.0 * t) * table[interval, 3]
-                z = float(_INTERVALS) * (table[interval, 1] + t * z)
+                values = 2.0 * table[interval, 2] + (3.0 * t) * table[interval, 3]
+                values = float(_INTERVALS) * (table[interval, 1] + t * values)
             else:
-                z = table[interval, 2] + t * table[interval, 3]
-                z = table[interval, 1] + t * z
-                z = table[interval, 0] + t * z
+                values = table[interval, 2] + t * table[interval, 3]
+                values = table[interval, 1] + t * values
+                values = table[interval, 0] + t * values
             for band in range(order):
-                zonal[band, lane] = z[band]
+                zonal[band, lane] = values[band]
         return zonal
 
-    return look_up
+    return interpolate_zonal

@@ -11,14 +11,14 @@ from warpshadow import check
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import zeros
 from warpshadow.stages.bounces.patches import Patches
-from warpshadow.stages.ray_tracing import RAY_COST, nearest, parts
+from warpshadow.stages.ray_tracing import RAY_COST, first_hit, progress_slices
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 _MAX_COUNTS = 1 << 22  # counts that are held at once [receivers × patches]
 
-GOLDEN = (5**0.5 - 1) / 2  # turn from ray to ray, as a part of a full turn
+GOLDEN_TURN = (5**0.5 - 1) / 2  # turn from ray to ray, as a part of a full turn
 
 
 BLACK_ENTRIES = ("black surfaces", "insides of closed bodies")
@@ -34,7 +34,7 @@ def _count_hits(
     worker: int,
     # in
     mesh: wp.uint64,
-    of_faces: wp.array2d(dtype=wp.int32),
+    patch_of_sides: wp.array2d(dtype=wp.int32),
     points: wp.array(dtype=wp.vec3),
     normals: wp.array(dtype=wp.vec3),
     first_receiver: int,
@@ -49,20 +49,22 @@ def _count_hits(
     if wp.length_sq(normal) == 0.0:
         return
     sign = wp.where(normal[2] < 0.0, -1.0, 1.0)  # [Duff et al. 2017]
-    p = -1.0 / (sign + normal[2])
-    q = normal[0] * normal[1] * p
-    tangent = wp.vec3(1.0 + sign * normal[0] * normal[0] * p, sign * q, -sign * normal[0])
-    bitangent = wp.vec3(q, sign + normal[1] * normal[1] * p, -normal[1])
-    turn = wp.randf(wp.rand_init(29, first_receiver + receiver))
+    duff_a = -1.0 / (sign + normal[2])
+    duff_b = normal[0] * normal[1] * duff_a
+    tangent = wp.vec3(1.0 + sign * normal[0] * normal[0] * duff_a, sign * duff_b, -sign * normal[0])
+    bitangent = wp.vec3(duff_b, sign + normal[1] * normal[1] * duff_a, -normal[1])
+    first_turn = wp.randf(wp.rand_init(29, first_receiver + receiver))
     for ray in range(ray_count):
         # a Fibonacci lattice on the disc below the hemisphere: so directions are as dense as their cosine is large
-        square = (float(ray) + 0.5) / float(ray_count)
-        angle = 2.0 * wp.pi * (turn + wp.frac(float(ray) * GOLDEN))
-        radius = wp.sqrt(square)
-        toward = radius * wp.cos(angle) * tangent + radius * wp.sin(angle) * bitangent + wp.sqrt(1.0 - square) * normal
-        hit = nearest(mesh, point, normal, toward)
+        radius2 = (float(ray) + 0.5) / float(ray_count)
+        angle = 2.0 * wp.pi * (first_turn + wp.frac(float(ray) * GOLDEN_TURN))
+        radius = wp.sqrt(radius2)
+        ray_direction = (
+            radius * wp.cos(angle) * tangent + radius * wp.sin(angle) * bitangent + wp.sqrt(1.0 - radius2) * normal
+        )
+        hit = first_hit(mesh, point, normal, ray_direction)
         if hit.face >= 0:
-            patch = of_faces[wp.where(hit.is_back, 1, 0), hit.face]
+            patch = patch_of_sides[wp.where(hit.is_back, 1, 0), hit.face]
             if patch >= 0:
                 counts[receiver, patch] = counts[receiver, patch] + 1
 
@@ -83,9 +85,9 @@ def loose_mesh(corners: np.ndarray, *, device: wp.DeviceLike) -> wp.Mesh:
     return wp.Mesh(points, wp.array(np.arange(points.size), dtype=wp.int32, device=device))
 
 
-def trace_factors(
+def trace_form_factors(
     mesh: wp.Mesh,
-    of_faces: np.ndarray,
+    patch_of_sides: np.ndarray,
     count: int,
     points: np.ndarray,
     normals: np.ndarray,
@@ -103,7 +105,7 @@ def trace_factors(
 
     Args:
         mesh: The mesh for rays; :func:`patch_mesh` makes it of a body.
-        of_faces: Patch of the front and the back of each of its faces, −1 for black, shape [2, face].
+        patch_of_sides: Patch of the front and the back of each of its faces, −1 for black, shape [2, face].
         count: Number of patches.
         points: Receivers, which may lie on the mesh, shape [receiver, 3].
         normals: Unit normals, shape [receiver, 3]. Where one is zero nothing is seen.
@@ -114,17 +116,17 @@ def trace_factors(
     """
     from scipy.sparse import csr_matrix, vstack
 
-    check.shape("of_faces", of_faces.shape, (2, "face"))
+    check.shape("patch_of_sides", patch_of_sides.shape, (2, "face"))
     check.shape("points", points.shape, ("receiver", 3))
     check.shape("normals", normals.shape, points.shape)
     device = mesh.device
-    owners = wp.array(of_faces, dtype=wp.int32, device=device)
+    patch_array = wp.array(patch_of_sides, dtype=wp.int32, device=device)
     factors = []
-    for part in parts(len(points), _MAX_COUNTS // max(count, 1), progress):
-        counts = zeros((part.stop - part.start, count), dtype=wp.int32, device=device)
-        at = [wp.array(values[part], dtype=wp.vec3, device=device) for values in (points, normals)]
-        inputs = [mesh.id, owners, *at, part.start, rays]
-        launch(_count_hits, len(at[0]), inputs=inputs, outputs=[counts], cost=RAY_COST * rays)
+    for receivers in progress_slices(len(points), _MAX_COUNTS // max(count, 1), progress):
+        counts = zeros((receivers.stop - receivers.start, count), dtype=wp.int32, device=device)
+        receiver_arrays = [wp.array(values[receivers], dtype=wp.vec3, device=device) for values in (points, normals)]
+        inputs = [mesh.id, patch_array, *receiver_arrays, receivers.start, rays]
+        launch(_count_hits, len(receiver_arrays[0]), inputs=inputs, outputs=[counts], cost=RAY_COST * rays)
         factors.append(csr_matrix(counts.numpy()))
     if not factors:
         return csr_matrix((0, count), dtype=np.float32)
@@ -141,29 +143,32 @@ class PatchFormFactors(NamedTuple):
     is_buried: np.ndarray  # whether they lie inside another body, bool of shape [point]
 
 
-def scaled_to_sky(factors: csr_matrix, casts: np.ndarray, sky: np.ndarray | None) -> PatchFormFactors:
+def scale_to_sky(factors: csr_matrix, is_blocker: np.ndarray, sky: np.ndarray | None) -> PatchFormFactors:
     """Scale form factors so that they and the sky of direct light fill the hemisphere: by (1 − s) / f.
 
     Args:
         factors: f by rays, of patches and of BLACK_ENTRIES, shape [point, patch + 2].
-        casts: Which of these cast shadows, bool of shape [patch + 2]; the others take nothing of the sky.
+        is_blocker: Which of these cast shadows, bool of shape [patch + 2]; the others take nothing of the sky.
         sky: s, part of the hemisphere that is open where direct light is found, shape [point]; None for rays, too.
     """
     from scipy.sparse import diags
 
     is_buried = factors[:, [-1]].toarray().ravel() > _BURIED_SHARE
     if sky is not None:
-        blocking = factors @ diags(casts.astype(np.float32))
-        factors = (factors + scaled(blocking, ratios(1 - sky, np.asarray(blocking.sum(axis=1)).ravel()) - 1)).tocsr()
+        blocker_factors = factors @ diags(is_blocker.astype(np.float32))
+        factors = (
+            factors
+            + scale_rows(blocker_factors, scaling_factors(1 - sky, np.asarray(blocker_factors.sum(axis=1)).ravel()) - 1)
+        ).tocsr()
     return PatchFormFactors(factors[:, : -len(BLACK_ENTRIES)], is_buried)
 
 
-def ratios(target: np.ndarray, current: np.ndarray) -> np.ndarray:
+def scaling_factors(target: np.ndarray, current_values: np.ndarray) -> np.ndarray:
     """Factors that scale current values to targets: 0 for negative targets, 1 where the value is 0."""
-    return np.where(current > 0, np.maximum(target, 0) / np.where(current > 0, current, 1), 1)
+    return np.where(current_values > 0, np.maximum(target, 0) / np.where(current_values > 0, current_values, 1), 1)
 
 
-def scaled(matrix: csr_matrix, factors: np.ndarray) -> csr_matrix:
+def scale_rows(matrix: csr_matrix, factors: np.ndarray) -> csr_matrix:
     """Scale the rows of a matrix."""
     from scipy.sparse import diags
 
@@ -172,6 +177,8 @@ def scaled(matrix: csr_matrix, factors: np.ndarray) -> csr_matrix:
 
 def mean_outside(means: csr_matrix, is_buried: np.ndarray) -> csr_matrix:
     """Means over items that are not buried, [row, item]; as they were where all are."""
-    left = scaled(means.T, (~is_buried).astype(np.float32)).T.tocsr()
-    target, sums = (np.asarray(item.sum(axis=1)).ravel() for item in (means, left))
-    return scaled(left, ratios(target, sums)) + scaled(means, (sums == 0).astype(np.float32))
+    open_means = scale_rows(means.T, (~is_buried).astype(np.float32)).T.tocsr()
+    target, open_sums = (np.asarray(item.sum(axis=1)).ravel() for item in (means, open_means))
+    return scale_rows(open_means, scaling_factors(target, open_sums)) + scale_rows(
+        means, (open_sums == 0).astype(np.float32)
+    )

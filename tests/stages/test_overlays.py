@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpshadow.stages.bounces.covers import cover
+from warpshadow.stages.bounces.overlays import overlaid_radiosity
 from warpshadow.stages.sparse import SparseMatrix
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
@@ -27,9 +27,9 @@ def test_what_covered_patches_send_and_its_gradient_are_those_of_the_twin(device
     values = [rng.random((4, 3)), CENTERS]
     put = {"dtype": wp.vec3, "device": device, "requires_grad": True}
     arrays = [wp.array(each[None], **put) for each in values]
-    before = SparseMatrix.of(BEFORE, device=device)
+    before = SparseMatrix.from_matrix(BEFORE, device=device)
     with wp.Tape() as tape:
-        sent = cover(*arrays, before, DISTANCES)
+        sent = overlaid_radiosity(*arrays, before, DISTANCES)
     expected = twin(*values)
     np.testing.assert_allclose(sent.numpy()[0], expected, atol=1e-6)
     assert np.abs(expected - values[0])[:2].max(axis=1).min() > 0.1  # both are covered, at least in part

@@ -1,12 +1,13 @@
-"""How much sources count in their patches: against float64 NumPy, differences of it, and cases with known answers."""
+"""How much patch samples count in their patches: against float64 NumPy, differences of it, and cases with known
+answers."""
 
 import numpy as np
 import pytest
 import warp as wp
 from test_projected_areas import DIRECTIONS, compare
 
-from warpshadow.stages.bounces.open_sources import find_openness, open_shares
-from warpshadow.stages.bounces.radiosity import mean_over_sources, patch_radiosity
+from warpshadow.stages.bounces.openness import find_openness, open_shares
+from warpshadow.stages.bounces.radiosity import mean_over_patch_samples, patch_radiosity
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -32,7 +33,7 @@ def twin_weights(normals, past_self, past_all):
 
 
 def find(normals, past_self, past_all, device):
-    mean = mean_over_sources(PATCHES, WEIGHTS, 3, device=device)
+    mean = mean_over_patch_samples(PATCHES, WEIGHTS, 3, device=device)
     return open_shares(find_openness(normals, past_self, past_all, DIRECTIONS), mean, PATCHES)
 
 
@@ -41,7 +42,7 @@ def shares(normals, past_self, past_all, device):
 
 
 @pytest.mark.parametrize(("name", "twin"), [("shares", twin_shares), ("weights", twin_weights)])
-def test_shares_of_sources_and_weights_of_patches_are_those_of_the_twin(name, twin, device):
+def test_shares_of_patch_samples_and_weights_of_patches_are_those_of_the_twin(name, twin, device):
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(5, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -53,21 +54,21 @@ def test_shares_of_sources_and_weights_of_patches_are_those_of_the_twin(name, tw
 
 
 @pytest.mark.parametrize("has_self", [True, False])
-def test_a_buried_source_hardly_darkens_its_patch(has_self, device):
-    """Sources 1 and 4 are black inside another body, the others stand free."""
+def test_a_buried_patch_sample_hardly_darkens_its_patch(has_self, device):
+    """Patch samples 1 and 4 are black inside another body, the others stand free."""
     normals = wp.array(np.tile(UP, (1, 5, 1)), dtype=wp.vec3, device=device)
     is_free = np.float32([1, 0, 1, 1, 0])
     past_all = wp.array(np.tile(is_free[None, :, None], (1, 1, 32)), dtype=wp.float32, device=device)
     past_self = wp.full((1, 5, 32), 1.0, dtype=wp.float32, device=device) if has_self else None
     light = wp.array(is_free[None, :, None] * np.ones(3), dtype=wp.vec3, device=device)
     white = wp.full((1, 3), wp.vec3(1.0), dtype=wp.vec3, device=device)
-    mean = mean_over_sources(PATCHES, WEIGHTS, 3, device=device)
+    mean = mean_over_patch_samples(PATCHES, WEIGHTS, 3, device=device)
     weighted = patch_radiosity(white, light, mean, shares(normals, past_self, past_all, device)).numpy()[0, :, 0]
     np.testing.assert_allclose(weighted, [1, 0, 1], atol=0.02)
     np.testing.assert_allclose(patch_radiosity(white, light, mean).numpy()[0, :, 0], [0.4, 0, 0.7], atol=1e-6)
 
 
-def test_of_a_patch_that_is_buried_wholly_all_sources_count(device):
+def test_of_a_patch_that_is_buried_wholly_all_patch_samples_count(device):
     normals = wp.array(np.tile(UP, (1, 5, 1)), dtype=wp.vec3, device=device)
     nothing = wp.zeros((1, 5, 32), dtype=wp.float32, device=device)
     np.testing.assert_allclose(shares(normals, None, nothing, device).numpy(), 1, rtol=1e-5)
