@@ -8,7 +8,7 @@ import warp as wp
 
 from warpshadow.device.tape import recorded
 from warpshadow.pipeline.explain import Explanation, decide
-from warpshadow.pipeline.node import Call, Clock, Input, Node, detached
+from warpshadow.pipeline.node import Call, Clock, Input, Node, NodeStage, detached
 
 
 @pytest.fixture
@@ -220,17 +220,20 @@ def test_parts_of_a_stage_and_of_its_adjoint_are_timed_together(clock, monkeypat
     """By a clock that ticks when it is looked at."""
     ticks = itertools.count()
     monkeypatch.setattr(clock, "now", lambda: next(ticks))
-    node = Node("transfer", lambda given: given, Input("vertices", array(requires_grad=True)))
+    stage = NodeStage("transfer")
+    node = Node("", None, Input("vertices", array(requires_grad=True)), stages=(stage,))
     with recorded() as tape:
         call = Call(clock)
-        for part in range(3):
-            node.run(call, part)
+        for _ in range(3):
+            with node.timed(call, stage):
+                pass
     timing = clock.timings["transfer"]
     assert timing.forward == 3 and timing.backward is None
     for _ in range(2):
         tape.backward()
         assert timing.backward == 3
-    node.run(Call(clock), 0)
+    with node.timed(Call(clock), stage):
+        pass
     assert clock.timings["transfer"].forward == 1 and clock.timings["transfer"].backward is None
 
 

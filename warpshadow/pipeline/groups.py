@@ -171,7 +171,7 @@ def find_groups(
     points: LitPoints,
     receivers: Receivers,
     blockers: Blockers,
-    self_lookups: dict[int, Any],
+    self_lookups: dict[int, Any] | None,
     cached_rows: CachedRows | None,
     static_normals: wp.array | None,
 ) -> list[Group]:
@@ -181,11 +181,11 @@ def find_groups(
         points: Of which they are the receivers.
         receivers: All of them.
         blockers: Their surroundings.
-        self_lookups: Self-visibility of receivers, by body.
+        self_lookups: Self-visibility of receivers, by body; None without any.
         cached_rows: Cached transmittance past static bodies, for receivers on them.
         static_normals: Normals of all vertices of static bodies; None where any may move.
     """
-    groups = list(_groups_that_move(receivers, blockers, self_lookups, points.blocker_of_point))
+    groups = list(_groups_that_move(receivers, blockers, self_lookups or {}, points.blocker_of_point))
     if points.static_bodies is None or not len(receivers.on_static):
         return groups
     assert static_normals is not None

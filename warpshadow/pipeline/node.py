@@ -8,7 +8,7 @@ comes before it. Only values with a gradient are not cached: a tape is good for 
 
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -96,20 +96,38 @@ def _is_same_array(array: wp.array, before: wp.array, copy: wp.array) -> bool:
     return origin is not None and origin is getattr(before, "origin", None) and marks[0] == marks[1]
 
 
+class NodeStage(NamedTuple):
+    """A stage as it is timed and explained. A node with a name is one; the function of a node may have more.
+
+    Args:
+        name: Its name.
+        items: On how many items it is computed, in words.
+        idle: Why there is nothing to do, in words.
+        has_adjoint: Whether gradients take it more than to hand them on.
+        inputs: What it depends on, where that is less than its node does.
+
+    Items and idle may be functions that make the words.
+    """
+
+    name: str
+    items: str | Callable[[], str] = ""
+    idle: str | Callable[[], str] = ""
+    has_adjoint: bool = True
+    inputs: "tuple[AnyInput, ...]" = ()
+
+
 class Node:
     """A value of the pipeline that a function computes from inputs.
 
     Args:
         name: Name of the stage; empty for a node that is neither timed nor explained.
-        function: Computes the value from the inputs' values; None if nothing asks for it.
+        function: Computes the value from the inputs' values; None where there is nothing to compute: the value is None.
         inputs: Nodes and inputs of the pipeline; anything else is passed on as it is.
-        items: On how many items it is computed, in words.
-        idle: Why there is nothing to do, in words; the function then passes something on.
-        has_adjoint: Whether gradients take it more than to hand them on.
+        items, idle, has_adjoint: As for :class:`NodeStage`; a function of an idle node passes something on.
         caches: Whether the value may outlive a call.
-        extra_inputs: Other nodes that run for this one, or are explained beside it.
+        extra_inputs: Other nodes that run for this one.
+        stages: Stages that are explained before it: those that its function times, and stages that it makes needless.
 
-    Items and idle may be functions that make the words.
     Attributes:
         before: The nodes and inputs that it depends on at once.
         root_inputs: All inputs that it depends on.
@@ -127,8 +145,9 @@ class Node:
         has_adjoint: bool = True,
         caches: bool = True,
         extra_inputs: tuple["Node", ...] = (),
+        stages: tuple[NodeStage, ...] = (),
     ):
-        self.name, self.function, self.inputs = name, function, inputs
+        self.name, self.function, self.inputs, self.stages = name, function, inputs, stages
         self.items, self.idle, self.has_adjoint = items, idle, has_adjoint
         self.before: list[AnyInput] = []
         self.root_inputs: dict[Input, None] = {}  # in order
@@ -159,21 +178,23 @@ class Node:
 
     def compute(self, call: "Call") -> Any:
         """Compute the value."""
-        return self.run(call, *self.values(call))
+        if self.function is None:
+            return None
+        values = self.values(call)
+        if not self.name or isinstance(self.idle, str) and self.idle:
+            return self.function(*values)
+        with call.timed(self.name, is_marked=self.has_adjoint and bool(self.differentiated_inputs)):
+            return self.function(*values)
+
+    def timed(self, call: "Call", stage: NodeStage) -> "StageTimer":
+        """Time one of its stages while it computes its value."""
+        inputs = stage.inputs or (self,)
+        is_marked = stage.has_adjoint and any(item.differentiated_inputs for item in inputs)
+        return call.timed(stage.name, is_marked=is_marked)
 
     def values(self, call: "Call") -> list[Any]:
         """The values of the inputs."""
         return [item.value(call) if isinstance(item, (Node, Input)) else item for item in self.inputs]
-
-    def run(self, call: "Call", *values: Any) -> Any:
-        """Call the function, and time it."""
-        assert self.function is not None
-        if not self.name or isinstance(self.idle, str) and self.idle:
-            return self.function(*values)
-        end = call.start(self.name, is_marked=self.has_adjoint and bool(self.differentiated_inputs))
-        value = self.function(*values)
-        end()
-        return value
 
     def value_if_known(self, call: "Call") -> Any:
         """The value if it needs no computation, else None."""
@@ -250,28 +271,35 @@ class Call(dict[Node, Any]):
         self._clock = clock
         self._timings: dict[str, Timing] = {}
 
-    def start(self, name: str, *, is_marked: bool) -> Callable[[], None]:
-        """Start a stage, or resume one that has run in this call, and return the function that ends it.
+    def timed(self, name: str, *, is_marked: bool) -> "StageTimer":
+        """Time a stage, or one more part of a stage that has run in this call.
 
         Its adjoint is timed by marks on the tape.
         """
         timing = self._timings.get(name)
         if timing is None:
             timing = self._timings[name] = self._clock.timings[name] = Timing()
-        part, now = object(), self._clock.now
+        return StageTimer(timing, self._clock, is_marked)
 
-        def end_adjoint() -> None:
-            timing.adjoints[part] += now()
 
-        def start_adjoint() -> None:
-            timing.adjoints[part] = -now()
+class StageTimer:
+    """Adds the time that passes within a ``with`` statement, and in the adjoints that it records, to a stage's."""
 
-        def end() -> None:
-            if is_marked:
-                record(start_adjoint)
-            timing.forward += now() - start
+    def __init__(self, timing: Timing, clock: Clock, is_marked: bool):
+        self._timing, self._clock, self._is_marked = timing, clock, is_marked
 
-        if is_marked:
-            record(end_adjoint)  # the tape plays back from the end
-        start = now()
-        return end
+    def __enter__(self) -> None:
+        if self._is_marked:
+            record(self._end_adjoint)  # the tape plays back from the end
+        self._start = self._clock.now()
+
+    def __exit__(self, *_: object) -> None:
+        if self._is_marked:
+            record(self._start_adjoint)
+        self._timing.forward += self._clock.now() - self._start
+
+    def _end_adjoint(self) -> None:
+        self._timing.adjoints[self] += self._clock.now()
+
+    def _start_adjoint(self) -> None:
+        self._timing.adjoints[self] = -self._clock.now()

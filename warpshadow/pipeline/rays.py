@@ -10,7 +10,7 @@ import warp as wp
 from warpshadow.assets.basis import Basis, HarmonicBasis
 from warpshadow.pipeline.lighting import KnownLight, LitPoints, Method, map_of, receiver_text
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.node import Input, Node, detached
+from warpshadow.pipeline.node import Input, Node, NodeStage, detached
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.gloss.reflection import blocked_radiance
 from warpshadow.stages.gloss.traced import trace_lobes
@@ -55,7 +55,7 @@ class Rays(Method):
                 points.receivers_node,
                 light,
                 items=lambda: receiver_text(points),
-                extra_inputs=(Node("transfer", None, idle="rays shade known light at once"),),
+                stages=(NodeStage("transfer", idle="rays shade known light at once"),),
             )
 
         if not self.merged_scene.scene.bounces:
@@ -155,7 +155,6 @@ class Rays(Method):
 
     def _meshes(self, points: LitPoints) -> Node:
         """Node of the meshes that rays meet."""
-        alike = "rays treat all receivers alike"
         return Node(
             "visibility",
             self._casting_meshes,
@@ -164,7 +163,7 @@ class Rays(Method):
             items=lambda: f"{receiver_text(points)} by rays",
             idle="" if self.merged_scene.casting else "no body has blockers",
             caches=False,
-            extra_inputs=(Node("static shadows", None, idle=alike),),
+            stages=(NodeStage("static shadows", idle="rays treat all receivers alike"),),
         )
 
     def _meshes_for(self, points: LitPoints, receivers: Node) -> Node:

@@ -10,7 +10,7 @@ import warp as wp
 from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.lighting import BlockerKinds, Light, LitPoints, Method, receiver_text
-from warpshadow.pipeline.node import Call, Input, Node, detached, identity
+from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached, identity
 from warpshadow.pipeline.reflectance import Materials, SampleReflectance
 from warpshadow.stages.film import average, sample_radiance, sum_radiance
 from warpshadow.stages.normals import vertex_normals
@@ -192,11 +192,11 @@ class View(LitPoints):
         if materials.roughness:
             samples = self._glossy(shading, light, materials, reflectance.samples)
         elif reflectance.pyramids.requires_grad and not (shading.requires_grad or clip.requires_grad):
-            replaced_stages = (Node("reflectance", None, idle="found with the radiance"),)
+            replaced_stages = (NodeStage("reflectance", idle="found with the radiance"),)
             reflectance_inputs = reflectance.vertex_albedo, reflectance.pyramids, reflectance.footprints
             arguments = fragments, self.merged_scene.faces, *reflectance_inputs, self._white_radiance_of(shading)
             samples = Node(
-                "radiance", textured_radiance, *arguments, items=item_text, caches=False, extra_inputs=replaced_stages
+                "radiance", textured_radiance, *arguments, items=item_text, caches=False, stages=replaced_stages
             )
         else:
             samples = self._radiance(shading, reflectance.samples)
