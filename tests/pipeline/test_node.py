@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from warpshadow.assets.harmonic_light import HarmonicLight
 from warpshadow.device.tape import recorded
 from warpshadow.pipeline.explain import Explanation, decide
 from warpshadow.pipeline.node import Call, Clock, Input, Node, NodeStage, detached
@@ -138,9 +139,9 @@ def test_what_has_a_gradient_is_never_the_same():
 
 
 def test_coefficients_are_compared_and_other_things_are_what_they_are():
-    first = Input.renewed("light", np.ones((4, 3)), None)
-    assert Input.renewed("light", np.ones((4, 3)), first) is first
-    assert Input.renewed("light", np.zeros((4, 3)), first) is not first
+    first = Input.renewed("light", HarmonicLight(np.ones((4, 3))), None)
+    assert Input.renewed("light", HarmonicLight(np.ones((4, 3))), first) is first
+    assert Input.renewed("light", HarmonicLight(np.zeros((4, 3))), first) is not first
     sky = object()
     last = Input.renewed("light", sky, first)
     assert Input.renewed("light", sky, last) is last and Input.renewed("light", object(), last) is not last

@@ -12,8 +12,8 @@ import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.geometry import Geometry
-from warpshadow.pipeline.lighting import Light
 from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.transfers import Light
 from warpshadow.pipeline.view import View
 from warpshadow.scene.scene import PerBody
 

@@ -22,7 +22,6 @@ import warp as wp
 from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.color import LUMINANCE
-from warpshadow.assets.harmonic_light import as_light
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.merged_scene import MergedScene
@@ -135,7 +134,7 @@ def choose_receivers(
     if is_open.any() and merged_scene.scene.visibility.method != "none":
         faces = [np.unique(face_ids[face_ids >= 0], return_counts=True) for face_ids, _ in images]
         seen = [(camera, *counted) for camera, counted in zip(cameras, faces, strict=True)]
-        light = EnvironmentMap.constant() if is_light_free else as_light(merged_scene.scene.light)
+        light = EnvironmentMap.constant() if is_light_free else merged_scene.scene.known_light
         bodies = np.flatnonzero(is_open).tolist()
         unevenness[is_open] = light_unevenness(merged_scene, positions, seen, bodies, light)
     chosen[unevenness > UNEVEN] = "pixel"
@@ -191,7 +190,7 @@ def _has_sun(scene: Scene) -> bool:
     """Whether the directional method is to find shadows of a sun."""
     if scene.visibility.method != "directional":
         return False
-    cells = as_light(scene.light).cells(fibonacci(scene.visibility.directions))
+    cells = scene.known_light.cells(fibonacci(scene.visibility.directions))
     if cells.spots is None or cells.spreads is None:
         return False
     return find_sharp_cells(cells.radiance @ LUMINANCE, cells.spots, cells.spreads) is not None

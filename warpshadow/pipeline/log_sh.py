@@ -7,12 +7,12 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import Basis, HarmonicBasis
-from warpshadow.assets.harmonic_light import as_light
+from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.device.batch import expand_rows
 from warpshadow.device.memory import zeros
 from warpshadow.pipeline.by_spheres import SphereMethod
 from warpshadow.pipeline.groups import Group, GroupVisibility
-from warpshadow.pipeline.lighting import BlockerKinds, KnownLight
+from warpshadow.pipeline.lit_points import BlockerKinds
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input
 from warpshadow.pipeline.self_visibility import SelfVisibilityLobes
@@ -47,8 +47,8 @@ class LogSH(SphereMethod):
 
     def project_light(self, light: KnownLight) -> ProjectedBands:
         """The bands that the light has."""
-        count = as_light(light).bands(self._order)
-        coefficients = self.native_basis.coefficients(light)[None, : count**2]
+        count = light.bands(self._order)
+        coefficients = light.sh(self._order)[None, : count**2]
         return ProjectedBands(count, wp.array(coefficients, dtype=wp.vec3, device=self.merged_scene.device))
 
     def coefficient_count(self, light: Input | None) -> int:
@@ -56,7 +56,7 @@ class LogSH(SphereMethod):
         known = None if light is None else light.value()
         if known is None or isinstance(known, wp.array):
             return self.free_projection.bands**2
-        return as_light(known).bands(self._order) ** 2
+        return known.bands(self._order) ** 2
 
     def self_lookups(
         self, bodies: tuple[int, ...], rotations: wp.array, projected_light: ProjectedBands

@@ -4,8 +4,8 @@ import importlib
 
 from warpshadow.assets.basis import Basis
 from warpshadow.device.threads import one_at_a_time
-from warpshadow.pipeline.lighting import Method
 from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.method import Method
 from warpshadow.scene.visibility import DEFAULT_METHOD, SPHERE_METHODS
 
 _CLASSES = {

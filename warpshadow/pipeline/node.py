@@ -72,18 +72,14 @@ def _arrays(value: Any) -> list[wp.array]:
 def _copied(value: Any) -> Any:
     if isinstance(value, tuple):
         return tuple(map(_copied, value))
-    if isinstance(value, wp.array):
-        return wp.clone(value)
-    return value.copy() if isinstance(value, np.ndarray) else value
+    return wp.clone(value) if isinstance(value, wp.array) else value
 
 
 def _is_same(new_value: Any, last: Input) -> bool:
     """Whether a value equals an input's, as far as the host knows without waiting."""
     arrays, value = _arrays(new_value), last.value()
-    if isinstance(new_value, np.ndarray):
-        return isinstance(value, np.ndarray) and np.array_equal(new_value, value)
     if not arrays:
-        return new_value is value
+        return bool(new_value == value)
     return all(map(_is_same_array, arrays, _arrays(last.original) or arrays, _arrays(value)))
 
 

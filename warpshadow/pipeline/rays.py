@@ -8,8 +8,10 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import Basis, HarmonicBasis
-from warpshadow.pipeline.lighting import KnownLight, LitPoints, Method, map_of, receiver_text
+from warpshadow.assets.harmonic_light import KnownLight
+from warpshadow.pipeline.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.method import Method
 from warpshadow.pipeline.node import Input, Node, NodeStage, detached
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.gloss.reflection import blocked_radiance
@@ -93,7 +95,7 @@ class Rays(Method):
         from warpshadow.pipeline.bounces.patches import ScenePatches
         from warpshadow.pipeline.bounces.static_bounces import RAYS, STILL_RAYS, StaticBounces
 
-        arguments = ScenePatches(self.merged_scene), self.merged_scene.scene.bounces
+        arguments = ScenePatches(self.merged_scene), self.merged_scene.scene.bounces, self.openness
         rays = STILL_RAYS if self.shares_directions else RAYS
         return StaticBounces(*arguments, rays=rays, progress=self.progress)
 
@@ -183,7 +185,7 @@ class Rays(Method):
 
     def _shade(self, meshes: Meshes, receivers: Receivers, light: KnownLight) -> wp.array:
         points, normals = _checked_points(receivers.points), receivers.normals
-        samples = sample_map(map_of(light), self._sample_count)
+        samples = sample_map(light.radiance, self._sample_count)
         traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
         for instance, mesh in enumerate(meshes):
             lit = trace_shading(mesh, points[instance], normals[instance], samples, progress=self.progress)
@@ -200,7 +202,7 @@ class Rays(Method):
             lit_points = tree, points[instance], normals[instance]
             # a ratio image has the same directions with the bodies and without
             pilots = None if self.merged_scene.scene.catchers else functools.partial(find_shares, *lit_points)
-            samples = cut_map(map_of(light), count, pilots)
+            samples = cut_map(light.radiance, count, pilots)
             corners = None
             if receivers.fragments.face_ids.ndim == 3:  # of an image
                 corners = find_corners(receivers, instance, self.merged_scene.scene.supersampling)

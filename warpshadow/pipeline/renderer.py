@@ -25,13 +25,14 @@ from warpshadow.pipeline.delegation import delegated
 from warpshadow.pipeline.explain import Explanation, bounce_notes, decide
 from warpshadow.pipeline.geometry import Geometry, as_geometry
 from warpshadow.pipeline.layers import LayerArrays, Layers, find_layer_arrays, find_layers
-from warpshadow.pipeline.lighting import Light, LitPoints, one_transfer
+from warpshadow.pipeline.lit_points import LitPoints
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.methods import make_method
 from warpshadow.pipeline.node import Clock, Input, Node
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.scene_views import SceneViews, camera_batch
 from warpshadow.pipeline.shading_ratio import shading_ratio
+from warpshadow.pipeline.transfers import Light, one_transfer
 from warpshadow.pipeline.view import View
 from warpshadow.pipeline.view_warnings import warn_of_vertex_receivers, warn_of_view
 from warpshadow.scene.body import GLOSS_ARGUMENTS
@@ -246,7 +247,7 @@ class SceneRenderer:
         Differentiable: light, view.
         """
         view = self._checked(view)
-        return view.shading(light).value(self._views.call(view))
+        return self._method.shading(view, light).value(self._views.call(view))
 
     @announced
     def reflect(

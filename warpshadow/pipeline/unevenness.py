@@ -12,8 +12,7 @@ import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.color import LUMINANCE
-from warpshadow.assets.harmonic_light import HarmonicLight
-from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.stages.normals import vertex_normals
@@ -29,7 +28,7 @@ def light_unevenness(
     positions: np.ndarray,
     images: Sequence[tuple[Camera, np.ndarray, np.ndarray]],
     bodies: Sequence[int],
-    light: EnvironmentMap | HarmonicLight,
+    light: KnownLight,
 ) -> np.ndarray:
     """Error of direct light on bodies that is interpolated between their vertices, over their pixels, relative L2.
 
@@ -79,7 +78,7 @@ def _irradiance(
     mesh: wp.Mesh | None,
     points: np.ndarray,
     normals: np.ndarray,
-    light: EnvironmentMap | HarmonicLight,
+    light: KnownLight,
     device: wp.Device,
 ) -> np.ndarray:
     """Luminance of the light that reaches points, [face, point], of rays that are shared out by the light of cells."""

@@ -9,9 +9,11 @@ import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.pipeline.lighting import BlockerKinds, Light, LitPoints, Method, receiver_text
+from warpshadow.pipeline.lit_points import BlockerKinds, LitPoints, receiver_text
+from warpshadow.pipeline.method import Method
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached, identity
 from warpshadow.pipeline.reflectance import Materials, SampleReflectance
+from warpshadow.pipeline.transfers import Light
 from warpshadow.stages.film import average, sample_radiance, sum_radiance
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.project import to_clip
@@ -70,6 +72,7 @@ class View(LitPoints):
         is_scene_view: bool = False,
     ):
         self.dependencies = vertices, spheres, cameras, static_bodies, blocker_kinds
+        self.method = method
         self._separate_bodies = method.separate_bodies(blocker_kinds)
         self._samples_receive = method.samples_receive(blocker_kinds)
         self.cameras = cameras
@@ -78,7 +81,16 @@ class View(LitPoints):
         self._sample_count = counts[1] * self._size[0] * self._size[1]
         normals, receivers = self._wire(method, vertices, spheres, cameras, static_bodies)
         super().__init__(
-            method, materials, vertices, spheres, receivers, call, static_bodies, normals, blocker_kinds, is_scene_view
+            method.merged_scene,
+            materials,
+            vertices,
+            spheres,
+            receivers,
+            call,
+            static_bodies,
+            normals,
+            blocker_kinds,
+            is_scene_view,
         )
 
     def _wire(
@@ -143,10 +155,8 @@ class View(LitPoints):
                 merged_scene.faces, keeps_vertex, on_static_body, merged_scene.vertex_order, bodies
             )
             if spheres is not None and (is_adaptive := method.is_adaptive & wants_samples).any():
-                from warpshadow.pipeline.adaptive import find_squares
-
                 seen = positions, normals, fragments, spheres
-                quadtree = find_squares(self, *seen, is_adaptive, self._supersampling)
+                quadtree = method.find_squares(self.blocker_kinds, *seen, is_adaptive, self._supersampling)
         elif on_static_body is None:
             numbering = method.numbering(self.blocker_kinds, has_backs)
         else:
@@ -184,6 +194,15 @@ class View(LitPoints):
             casting = [body for body in static_bodies.bodies if self.merged_scene.scene.bodies[body].casts_shadow]
             result[[body for body in static_bodies.bodies if set(casting) - {body}]] = True
         return result
+
+    def shading(self, light: Light | None, materials: Materials | None = None) -> Node:
+        """Light on the receivers: :meth:`.Method.shading`."""
+        return self.method.shading(self, light, materials)
+
+    @property
+    def transfers(self) -> Node:
+        """Transfer vectors of the receivers: :meth:`.Method.cached_transfers`."""
+        return self.method.cached_transfers(self)
 
     def image(self, light: Light | None, materials: Materials) -> Node:
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""
@@ -240,7 +259,7 @@ class View(LitPoints):
         from warpshadow.pipeline.gloss import GlossyPoints
 
         arguments = self.cameras, self.fragments_node, self.clip_positions
-        points = self.cached("gloss", None, lambda: GlossyPoints(self, *arguments))
+        points = self.cached("gloss", None, lambda: GlossyPoints(self.method, self, *arguments))
         colored, white = points.mixed(self, shading, light, materials)
         parts = self._radiance(colored, reflectance), self._radiance(white, self._white_reflectance)
         return Node("radiance", _sum_moving if self._is_moving else sum_radiance, *parts, caches=False)

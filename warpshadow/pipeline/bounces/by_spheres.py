@@ -36,9 +36,10 @@ from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.bounces.static_bounces import StaticBounces
 from warpshadow.pipeline.by_spheres import PortionedShading, SphereMethod
 from warpshadow.pipeline.groups import Group
-from warpshadow.pipeline.lighting import LitPoints, joined, receiver_text
+from warpshadow.pipeline.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage
 from warpshadow.pipeline.reflectance import Materials
+from warpshadow.pipeline.transfers import joined
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.open_sources import Openness, find_openness, open_shares
 from warpshadow.stages.bounces.radiosity import patch_radiosity
@@ -361,13 +362,13 @@ class SphereBounces:
 
     @functools.cached_property
     def _static_bounces(self) -> StaticBounces:
-        return StaticBounces(self._patches, self._count, progress=self._method.progress)
+        return StaticBounces(self._patches, self._count, self._method.openness, progress=self._method.progress)
 
     def _at(
         self, sources: Node, points: LitPoints, materials: Materials, blocker_of_point: np.ndarray | None = None
     ) -> LitPoints:
         """Make lit points of sources, among the same bodies as other points."""
-        arguments = self._method, materials, points.vertices, points.spheres, sources, points.call
+        arguments = self._method.merged_scene, materials, points.vertices, points.spheres, sources, points.call
         return LitPoints(
             *arguments, normals=points.normals, blocker_kinds=points.blocker_kinds, blocker_of_point=blocker_of_point
         )

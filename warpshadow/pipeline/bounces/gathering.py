@@ -22,8 +22,8 @@ from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.by_spheres import SphereMethod
 from warpshadow.pipeline.directional import ProjectedCells
 from warpshadow.pipeline.groups import Group, GroupVisibility, nonplanar_bodies
-from warpshadow.pipeline.lighting import joined
 from warpshadow.pipeline.node import Call, Node, NodeStage
+from warpshadow.pipeline.transfers import joined
 from warpshadow.scene.visibility import Visibility
 from warpshadow.stages.bounces.covers import cover
 from warpshadow.stages.bounces.plane_light import plane_light
