@@ -26,8 +26,8 @@ from warpshadow.inverse.result import Result
 from warpshadow.inverse.schedule import Stage
 from warpshadow.inverse.uncertainty import MAX_POSE_UNCERTAINTY
 from warpshadow.scene import toml_tables
-from warpshadow.scene.body import GLOSS_ARGUMENTS
 from warpshadow.scene.files import camera_table, write_scene
+from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.scene.scene import Scene
 
 SUMMARY = "summary.toml"  # the file of a folder of results that is written last: where it is, the others are

@@ -19,7 +19,7 @@ from warpshadow.pipeline.method import Method
 from warpshadow.pipeline.node import Input, Node, detached
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.transfers import Light, change_basis
-from warpshadow.scene.body import GLOSS_ARGUMENTS
+from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.stages.gloss.lobes import sample_lobes
 from warpshadow.stages.gloss.prefilter import look_up_light, prefilter
 from warpshadow.stages.gloss.reflection import mix_reflection, sum_lobes

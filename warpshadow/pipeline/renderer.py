@@ -35,7 +35,7 @@ from warpshadow.pipeline.shading_ratio import shading_ratio
 from warpshadow.pipeline.transfers import Light, one_transfer
 from warpshadow.pipeline.view import View
 from warpshadow.pipeline.view_warnings import warn_of_vertex_receivers, warn_of_view
-from warpshadow.scene.body import GLOSS_ARGUMENTS
+from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.scene.scene import SCENE_TYPES, BodyLike, PerBody, Scene
 from warpshadow.scene.visibility import METHODS
 

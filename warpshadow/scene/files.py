@@ -24,7 +24,8 @@ from warpshadow.assets.sky import synthetic_sky
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
-from warpshadow.scene.body import COLORS_SUFFIX, GLOSS_ARGUMENTS, LIKELY_MISTAKES, VALUES_SUFFIX, Body
+from warpshadow.scene.body import COLORS_SUFFIX, LIKELY_MISTAKES, VALUES_SUFFIX, Body
+from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.scene.scene import SCENE_TYPES, Bounces, Scene, check_bounces, check_supersampling
 from warpshadow.scene.toml_tables import Table
 from warpshadow.scene.visibility import METHODS_OF_SETTING, Visibility
