@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.cuda_graph import is_readable
+from warpshadow.device.memory import copied
 from warpshadow.device.tape import record
 
 
@@ -72,7 +73,7 @@ def _arrays(value: Any) -> list[wp.array]:
 def _copied(value: Any) -> Any:
     if isinstance(value, tuple):
         return tuple(map(_copied, value))
-    return wp.clone(value) if isinstance(value, wp.array) else value
+    return copied(value) if isinstance(value, wp.array) else value
 
 
 def _is_same(new_value: Any, last: Input) -> bool:
@@ -86,7 +87,7 @@ def _is_same(new_value: Any, last: Input) -> bool:
 def _is_same_array(array: wp.array, before: wp.array, copy: wp.array) -> bool:
     """Whether an array equals a stored copy; on a GPU, whether it is the array before, not written to since."""
     if is_readable(array.device):  # it sees writes by NumPy, which torch does not count
-        return np.array_equal(array.numpy(), copy.numpy())
+        return np.array_equal(np.asarray(array), np.asarray(copy))
     origin = getattr(array, "origin", None)
     marks = [(item.ptr, item.shape, item.strides, getattr(item, "version", None)) for item in (array, before)]
     return origin is not None and origin is getattr(before, "origin", None) and marks[0] == marks[1]
