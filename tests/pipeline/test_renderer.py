@@ -13,8 +13,8 @@ from warpshadow.assets.basis import CellBasis, HarmonicBasis
 from warpshadow.maths import sh
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline import directional, groups
-from warpshadow.pipeline.choice_of_receivers import for_picture
 from warpshadow.pipeline.geometry import Geometry
+from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.tuning.point_sample import PointSample
 

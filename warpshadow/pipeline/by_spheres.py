@@ -16,14 +16,14 @@ from warpshadow.device.progress import progress_bar
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.convex import SceneConvexParts
 from warpshadow.pipeline.geometry import Geometry
-from warpshadow.pipeline.groups import Blockers, Group, GroupVisibility, find_groups
-from warpshadow.pipeline.lit_points import ONLY_SPHERES, BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.method import Method
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached
 from warpshadow.pipeline.planes import ScenePlanes
+from warpshadow.pipeline.receivers.groups import Blockers, Group, GroupVisibility, find_groups
+from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds, LitPoints, receiver_text
+from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.self_visibility import SelfVisibility
-from warpshadow.pipeline.static import StaticBodies, VertexRows
 from warpshadow.pipeline.transfers import LARGEST_COEFFICIENT, change_basis, joined
 from warpshadow.stages.quadtree import Quadtree
 from warpshadow.stages.rasterization import Fragments
@@ -38,6 +38,7 @@ class SphereMethod(Method):
         why_no_shadows: Why the method has no shadows, in words; empty if it has.
         joins_cached: Whether visibility combines cached rows with moving blockers.
         traces_self_visibility: Whether bodies' shadows on themselves may come from rays, not spheres.
+        sees_cells: Whether visibility is transmittance in cells: those towards ``directions`` of projected light.
         shades_transmittance: Whether known light is shaded without transfer vectors, by :meth:`shade_transmittance`.
         bounces: The ``SphereBounces`` by which light bounces; None where it does not.
     """
@@ -46,6 +47,7 @@ class SphereMethod(Method):
     why_no_shadows = ""
     joins_cached = False
     traces_self_visibility = False
+    sees_cells = False
     shades_transmittance = False
     bounces: Any = None
 
@@ -125,7 +127,7 @@ class SphereMethod(Method):
         supersampling: int,
     ) -> Quadtree:
         """Find the squares of images by the sharpest shadows."""
-        from warpshadow.pipeline.adaptive import find_squares
+        from warpshadow.pipeline.receivers.adaptive import find_squares
 
         positions, normals, *spheres_alone = map(without_gradient, (positions, normals, *spheres))
         with unrecorded():

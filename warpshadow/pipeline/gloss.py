@@ -14,9 +14,9 @@ import warp as wp
 
 from warpshadow.device.batch import concatenate, cut, rows
 from warpshadow.device.constants import constant
-from warpshadow.pipeline.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.method import Method
 from warpshadow.pipeline.node import Input, Node, detached
+from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.transfers import Light, change_basis
 from warpshadow.scene.material import GLOSS_ARGUMENTS

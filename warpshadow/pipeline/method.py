@@ -11,9 +11,9 @@ import warp as wp
 from warpshadow.assets.basis import Basis, HarmonicBasis, conversion
 from warpshadow.assets.harmonic_light import KnownLight, as_light
 from warpshadow.pipeline.geometry import Geometry
-from warpshadow.pipeline.lit_points import ONLY_SPHERES, BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node
+from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.transfers import Light, check_light, shade_free
 from warpshadow.stages.gloss.prefilter import prefilter
@@ -78,7 +78,7 @@ class Method:
         is_adaptive: np.ndarray,
         supersampling: int,
     ) -> Quadtree:
-        """Find the squares of images in which the samples of some bodies interpolate: :mod:`.pipeline.adaptive`."""
+        """Find the squares of images in which the samples of some bodies interpolate: :mod:`.receivers.adaptive`."""
         raise NotImplementedError
 
     def can_receive(self, blocker_kinds: BlockerKinds) -> np.ndarray:

@@ -20,15 +20,15 @@ from warpshadow.device.progress import waiting
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import announced, one_at_a_time
 from warpshadow.pipeline.catchers import CatchersAlone
-from warpshadow.pipeline.choice_of_receivers import choose_receivers, receiver_notes, with_receivers
 from warpshadow.pipeline.delegation import delegated
 from warpshadow.pipeline.explain import Explanation, bounce_notes, decide
 from warpshadow.pipeline.geometry import Geometry, as_geometry
 from warpshadow.pipeline.layers import LayerArrays, Layers, find_layer_arrays, find_layers
-from warpshadow.pipeline.lit_points import LitPoints
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.methods import make_method
+from warpshadow.pipeline.methods.by_name import make_method
 from warpshadow.pipeline.node import Clock, Input, Node
+from warpshadow.pipeline.receivers.choice_of_receivers import choose_receivers, receiver_notes, with_receivers
+from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.scene_views import SceneViews, camera_batch
 from warpshadow.pipeline.shading_ratio import shading_ratio

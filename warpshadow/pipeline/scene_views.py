@@ -11,11 +11,11 @@ from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.device.batch import common_batch
 from warpshadow.pipeline.geometry import PLACED, Geometry
-from warpshadow.pipeline.lit_points import BlockerKinds, LitPoints
 from warpshadow.pipeline.method import Method
 from warpshadow.pipeline.node import Call, Clock, Input, Node, identity
+from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints
+from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.reflectance import Materials
-from warpshadow.pipeline.static import StaticBodies
 from warpshadow.pipeline.view import View
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.project import check_clip_space

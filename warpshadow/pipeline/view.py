@@ -9,9 +9,9 @@ import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.pipeline.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.method import Method
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached, identity
+from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials, SampleReflectance
 from warpshadow.pipeline.transfers import Light
 from warpshadow.stages.film import average, sample_radiance, sum_radiance
@@ -28,7 +28,7 @@ from warpshadow.stages.textures.sample import textured_radiance
 from warpshadow.stages.textures.seen import seen_texels
 
 if TYPE_CHECKING:
-    from warpshadow.pipeline.static import StaticBodies
+    from warpshadow.pipeline.receivers.static import StaticBodies
     from warpshadow.stages.photograph import RatioImage
 
 MAX_SHARED = 2

@@ -35,9 +35,9 @@ from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.bounces.static_bounces import StaticBounces
 from warpshadow.pipeline.by_spheres import PortionedShading, SphereMethod
-from warpshadow.pipeline.groups import Group
-from warpshadow.pipeline.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage
+from warpshadow.pipeline.receivers.groups import Group
+from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.transfers import joined
 from warpshadow.scene.scene import Bounces

@@ -20,9 +20,8 @@ from warpshadow.pipeline.bounces.covered import find_covers
 from warpshadow.pipeline.bounces.patches import Senders
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.by_spheres import SphereMethod
-from warpshadow.pipeline.directional import ProjectedCells
-from warpshadow.pipeline.groups import Group, GroupVisibility, nonplanar_bodies
 from warpshadow.pipeline.node import Call, Node, NodeStage
+from warpshadow.pipeline.receivers.groups import Group, GroupVisibility, nonplanar_bodies
 from warpshadow.pipeline.transfers import joined
 from warpshadow.scene.visibility import Visibility
 from warpshadow.stages.bounces.covers import cover
@@ -75,7 +74,7 @@ def find_cell_transmittance(
         spheres: Centers and radii of all spheres.
     """
     merged_scene = method.merged_scene
-    if isinstance(projected_light, ProjectedCells):
+    if method.sees_cells:
         directions, transmittance_self = projected_light.directions, visibility.transmittance_self
         transmittance_spheres = (
             visibility.transmittance_total

@@ -27,8 +27,8 @@ import warp as wp
 
 from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
-from warpshadow.pipeline.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.node import Input, Node
+from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.colored import ColoredTransfer, colored_light

@@ -12,9 +12,9 @@ from warpshadow.device.batch import common_batch, cut, expand
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import varies
 from warpshadow.pipeline.convex import GroupConvexParts, SceneConvexParts
-from warpshadow.pipeline.lit_points import BlockerKinds, LitPoints
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.planes import GroupPlanes, ScenePlanes
+from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints
 from warpshadow.pipeline.self_visibility import SelfVisibility, SelfVisibilityLobes, SelfVisibilityLookup
 from warpshadow.stages.cached_cells import CachedRows
 from warpshadow.stages.convex.prepared import PlacedParts

@@ -15,12 +15,12 @@ from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.pipeline.by_spheres import PortionedShading, SphereMethod
 from warpshadow.pipeline.convex import GroupConvexParts
-from warpshadow.pipeline.groups import Group, GroupVisibility
-from warpshadow.pipeline.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Call, Input, Node
+from warpshadow.pipeline.receivers.groups import Group, GroupVisibility
+from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
+from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.self_visibility import SelfVisibilityLookup
-from warpshadow.pipeline.static import StaticBodies, VertexRows
 from warpshadow.pipeline.transfers import LARGEST_COEFFICIENT, change_basis, joined
 from warpshadow.scene.blockers import blocking_planes
 from warpshadow.stages.cached_cells import CachedRows, cell_transfer, light_cells
@@ -81,6 +81,7 @@ class Directional(SphereMethod):
     """Visibility for each cell of directions by itself."""
 
     traces_self_visibility = True
+    sees_cells = True
     shades_transmittance = True
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):

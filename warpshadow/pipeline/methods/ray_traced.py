@@ -9,10 +9,10 @@ import warp as wp
 
 from warpshadow.assets.basis import Basis, HarmonicBasis
 from warpshadow.assets.harmonic_light import KnownLight
-from warpshadow.pipeline.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.method import Method
 from warpshadow.pipeline.node import Input, Node, NodeStage, detached
+from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.gloss.reflection import blocked_radiance
 from warpshadow.stages.gloss.traced import trace_lobes

@@ -15,7 +15,7 @@ from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.receivers import Receivers
 
 if TYPE_CHECKING:
-    from warpshadow.pipeline.static import StaticBodies
+    from warpshadow.pipeline.receivers.static import StaticBodies
 
 Cached = TypeVar("Cached")
 Points = TypeVar("Points", bound="LitPoints")

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.tape import unrecorded
-from warpshadow.pipeline.groups import Blockers, Group
+from warpshadow.pipeline.receivers.groups import Blockers, Group
 from warpshadow.stages.quadtree import Quadtree, find_quadtree, keys_of, probe_grid
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import points_seen

@@ -12,7 +12,7 @@ _CLASSES = {
     "directional": ("directional", "Directional"),
     "log-sh": ("log_sh", "LogSH"),
     "none": ("log_sh", "LogSH"),  # without blockers
-    "ray-traced": ("rays", "Rays"),
+    "ray-traced": ("ray_traced", "Rays"),
 }
 
 

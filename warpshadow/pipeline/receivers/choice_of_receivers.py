@@ -2,7 +2,7 @@
 
 So are bodies on whose faces the light varies, from creases to the open or across shadows' edges (:data:`UNEVEN`).
 
-Flat bodies whose faces have more than 2 pixels are adaptive (:mod:`warpshadow.pipeline.adaptive`) where shadows may
+Flat bodies whose faces have more than 2 pixels are adaptive (:mod:`.receivers.adaptive`) where shadows may
 have edges, with directional visibility, where the light is known, and where arrays are readable, on a CPU: an image
 takes about 1.5 times as long as at the vertices of 64² quads, an iteration of a pose 1.2 times, and the ground has
 about the error that it has by pixel. Where a renderer has a basis, light is free, and nobody knows where edges will be.
@@ -25,7 +25,7 @@ from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.unevenness import light_unevenness
+from warpshadow.pipeline.receivers.unevenness import light_unevenness
 from warpshadow.scene.body import Body
 from warpshadow.scene.scene import Scene, change_bodies
 from warpshadow.scene.visibility import AUTO, Visibility
