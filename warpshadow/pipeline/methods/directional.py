@@ -439,3 +439,6 @@ def _joined_cells(cells: list[wp.array], count: int) -> wp.array:
 def _has_light(cached: CachedRows) -> bool:
     """Whether cached cells have known light, in three channels."""
     return cached.rows.shape[1] == 3
+
+
+METHOD = Directional

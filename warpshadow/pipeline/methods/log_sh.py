@@ -31,9 +31,10 @@ class ProjectedBands(NamedTuple):
 
 
 class LogSH(SphereMethod):
-    """Visibility of low frequencies. Where no body has spheres there are no shadows: so is the method "none"."""
+    """Visibility of low frequencies. Where no body has spheres there are no shadows."""
 
     joins_cached = True
+    traces_self_visibility = True
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
         self._order = order = merged_scene.scene.visibility.order
@@ -41,9 +42,6 @@ class LogSH(SphereMethod):
         self.free_projection = ProjectedBands(
             min(order, self.basis.order) if isinstance(self.basis, HarmonicBasis) else order
         )
-        self.traces_self_visibility = self.visibility.method == "log-sh"
-        if not self.traces_self_visibility:
-            self.why_no_shadows = "the method is to have no shadows"
 
     def project_light(self, light: KnownLight) -> ProjectedBands:
         """The bands that the light has."""
@@ -155,3 +153,6 @@ class LogSH(SphereMethod):
         log, merging = self.visibility.log, self.visibility.merging
         arguments = points, normals, centers, radii
         return log_sh.accumulate(*arguments, order=self._order, log=log, merging=merging, **options)
+
+
+METHOD = LogSH

@@ -257,3 +257,6 @@ def _checked_points(points: wp.array) -> wp.array:
 
 def _refuse(*_: object) -> None:
     raise ValueError("light: got free light for moving geometry, which rays cannot shade; expected known light")
+
+
+METHOD = Rays
