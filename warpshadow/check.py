@@ -79,12 +79,15 @@ def keywords(**instead: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
                     hint = f" (write {instead[key]})" if key in instead else _suggestion(key, known)
                     raise TypeError(f"{name}: unknown argument {key!r}{hint}")
             try:
-                signature.bind(*args, **arguments)
-            except TypeError as error:
-                key = _unmatched_argument(signature, args, error)
-                hint = f" (write {instead[key]})" if key in instead else ""
-                raise TypeError(f"{name}: {error}{hint}; its arguments are {_listed(signature)}") from None
-            return function(*args, **arguments)
+                return function(*args, **arguments)
+            except TypeError:
+                try:
+                    signature.bind(*args, **arguments)
+                except TypeError as error:
+                    key = _unmatched_argument(signature, args, error)
+                    hint = f" (write {instead[key]})" if key in instead else ""
+                    raise TypeError(f"{name}: {error}{hint}; its arguments are {_listed(signature)}") from None
+                raise
 
         return checked
 
