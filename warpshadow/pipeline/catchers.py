@@ -28,9 +28,6 @@ class CatchersAlone:
 
     def __init__(self, renderer: Any, merged_scene: MergedScene):
         self._renderer, self._merged_scene, self._numbers = renderer, merged_scene, merged_scene.scene.catchers
-        renderer.merged_scene.take_spheres(merged_scene, self._numbers)
-        renderer.merged_scene.has_chosen_receivers = merged_scene.has_chosen_receivers[list(self._numbers)]
-        renderer._has_warned = True
 
     def with_cameras(self, cameras: Sequence[Camera]) -> CatchersAlone:
         """The same for other cameras."""

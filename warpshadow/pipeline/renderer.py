@@ -400,9 +400,17 @@ class SceneRenderer:
 
     @functools.cached_property
     def _catchers_alone(self) -> CatchersAlone:
-        scene = replace(self.scene, bodies=tuple(self.scene.bodies[number] for number in self.scene.catchers))
+        return CatchersAlone(self._of_bodies_alone(self.scene.catchers), self.merged_scene)
+
+    def _of_bodies_alone(self, numbers: tuple[int, ...]) -> "SceneRenderer":
+        """Make a renderer of some bodies alone, with the receivers and spheres that they have here; it never warns."""
+        scene = replace(self.scene, bodies=tuple(self.scene.bodies[number] for number in numbers))
         arguments: dict[str, Any] = self._arguments | {"scene": scene, "cameras": self.cameras}
-        return CatchersAlone(SceneRenderer(**arguments), self.merged_scene)
+        alone = SceneRenderer(**arguments)
+        alone.merged_scene.take_spheres(self.merged_scene, numbers)
+        alone.merged_scene.has_chosen_receivers = self.merged_scene.has_chosen_receivers[list(numbers)]
+        alone._has_warned = True
+        return alone
 
     @one_at_a_time
     def layers(self, view: View | None = None) -> Layers:
