@@ -11,9 +11,7 @@ import warp as wp
 
 from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.assets.light import EnvironmentMap
-from warpshadow.device.launch import without_gradient
 from warpshadow.device.progress import progress_bar
-from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.convex import SceneConvexParts
 from warpshadow.pipeline.geometry import Geometry
 from warpshadow.pipeline.method import Method
@@ -25,8 +23,6 @@ from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.self_visibility import SelfVisibility
 from warpshadow.pipeline.transfers import LARGEST_COEFFICIENT, change_basis, joined
-from warpshadow.stages.quadtree import Quadtree
-from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.shading import shade
 
 
@@ -115,25 +111,6 @@ class SphereMethod(Method):
         frames = self.planes.frames(blocker_kinds.planes, positions) if blocker_kinds.planes else None
         placed = self.parts.placed(blocker_kinds.convex, positions) if blocker_kinds.convex else None
         return Blockers(self.merged_scene, blocker_kinds, *owners, positions, spheres, frames, placed)
-
-    def find_squares(
-        self,
-        blocker_kinds: BlockerKinds,
-        positions: wp.array,
-        normals: wp.array,
-        fragments: Fragments,
-        spheres: tuple[wp.array, wp.array],
-        is_adaptive: np.ndarray,
-        supersampling: int,
-    ) -> Quadtree:
-        """Find the squares of images by the sharpest shadows."""
-        from warpshadow.pipeline.receivers.adaptive import find_squares
-
-        positions, normals, *spheres_alone = map(without_gradient, (positions, normals, *spheres))
-        with unrecorded():
-            blockers = self.blockers(blocker_kinds, positions, (spheres_alone[0], spheres_alone[1]))
-        seen = positions, normals, fragments, is_adaptive, supersampling
-        return find_squares(blockers, self.sharp_share, *seen)
 
     def find_visibility_past_planes(
         self, group: Group, visibility: GroupVisibility, projected_light: Any

@@ -17,8 +17,6 @@ from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds,
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.transfers import Light, check_light, shade_free
 from warpshadow.stages.gloss.prefilter import prefilter
-from warpshadow.stages.quadtree import Quadtree
-from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import Numbering, number_receivers
 
 
@@ -67,19 +65,6 @@ class Method:
         """Flat bodies on which samples interpolate between receivers, bool of shape [body]."""
         adaptive = np.array([body.receivers == "adaptive" for body in self.merged_scene.scene.bodies])
         return adaptive & self.merged_scene.is_flat & (not self.lights_samples)
-
-    def find_squares(
-        self,
-        blocker_kinds: BlockerKinds,
-        positions: wp.array,
-        normals: wp.array,
-        fragments: Fragments,
-        spheres: tuple[wp.array, wp.array],
-        is_adaptive: np.ndarray,
-        supersampling: int,
-    ) -> Quadtree:
-        """Find the squares of images in which the samples of some bodies interpolate: :mod:`.receivers.adaptive`."""
-        raise NotImplementedError
 
     def can_receive(self, blocker_kinds: BlockerKinds) -> np.ndarray:
         """Vertices that may be receivers, and vertices whose backs may be, bool of shape [2, vertex]."""

@@ -6,8 +6,10 @@ node's value stays right for as long as the node exists. It is cached, and a nod
 comes before it. Only values with a gradient are not cached: a tape is good for one playback.
 """
 
+import contextlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -183,7 +185,7 @@ class Node:
         with call.timed(self.name, is_marked=self.has_adjoint and bool(self.differentiated_inputs)):
             return self.function(*values)
 
-    def timed(self, call: "Call", stage: NodeStage) -> "StageTimer":
+    def timed(self, call: "Call", stage: NodeStage) -> AbstractContextManager[None]:
         """Time one of its stages while it computes its value."""
         inputs = stage.inputs or (self,)
         is_marked = stage.has_adjoint and any(item.differentiated_inputs for item in inputs)
@@ -268,7 +270,8 @@ class Call(dict[Node, Any]):
         self._clock = clock
         self._timings: dict[str, Timing] = {}
 
-    def timed(self, name: str, *, is_marked: bool) -> "StageTimer":
+    @contextlib.contextmanager
+    def timed(self, name: str, *, is_marked: bool) -> Iterator[None]:
         """Time a stage, or one more part of a stage that has run in this call.
 
         Its adjoint is timed by marks on the tape.
@@ -276,27 +279,18 @@ class Call(dict[Node, Any]):
         timing = self._timings.get(name)
         if timing is None:
             timing = self._timings[name] = self._clock.timings[name] = Timing()
-        return StageTimer(timing, self._clock, is_marked)
+        part, now = object(), self._clock.now
 
+        def end_adjoint() -> None:
+            timing.adjoints[part] += now()
 
-class StageTimer:
-    """Adds the time that passes within a ``with`` statement, and in the adjoints that it records, to a stage's."""
+        def start_adjoint() -> None:
+            timing.adjoints[part] = -now()
 
-    def __init__(self, timing: Timing, clock: Clock, is_marked: bool):
-        self._timing, self._clock, self._is_marked = timing, clock, is_marked
-
-    def __enter__(self) -> None:
-        if self._is_marked:
-            record(self._end_adjoint)  # the tape plays back from the end
-        self._start = self._clock.now()
-
-    def __exit__(self, *_: object) -> None:
-        if self._is_marked:
-            record(self._start_adjoint)
-        self._timing.forward += self._clock.now() - self._start
-
-    def _end_adjoint(self) -> None:
-        self._timing.adjoints[self] += self._clock.now()
-
-    def _start_adjoint(self) -> None:
-        self._timing.adjoints[self] = -self._clock.now()
+        if is_marked:
+            record(end_adjoint)  # the tape plays back from the end
+        start = now()
+        yield
+        if is_marked:
+            record(start_adjoint)
+        timing.forward += now() - start

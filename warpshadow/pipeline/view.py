@@ -155,8 +155,13 @@ class View(LitPoints):
                 merged_scene.faces, keeps_vertex, on_static_body, merged_scene.vertex_order, bodies
             )
             if spheres is not None and (is_adaptive := method.is_adaptive & wants_samples).any():
+                from warpshadow.pipeline.by_spheres import SphereMethod
+                from warpshadow.pipeline.receivers.adaptive import find_squares
+
+                assert isinstance(method, SphereMethod)
+                place = functools.partial(method.blockers, self.blocker_kinds)
                 seen = positions, normals, fragments, spheres
-                quadtree = method.find_squares(self.blocker_kinds, *seen, is_adaptive, self._supersampling)
+                quadtree = find_squares(place, method.sharp_share, *seen, is_adaptive, self._supersampling)
         elif on_static_body is None:
             numbering = method.numbering(self.blocker_kinds, has_backs)
         else:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
+from warpshadow.device.launch import without_gradient
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.receivers.groups import Blockers, Group
 from warpshadow.stages.quadtree import Quadtree, find_quadtree, keys_of, probe_grid
@@ -19,24 +20,29 @@ from warpshadow.stages.sample_receivers import see_samples
 
 
 def find_squares(
-    blockers: Blockers,
+    place_blockers: Callable[[wp.array, tuple[wp.array, wp.array]], Blockers],
     sharp_share: Callable[[Group], np.ndarray | None],
     positions: wp.array,
     normals: wp.array,
     fragments: Fragments,
+    spheres: tuple[wp.array, wp.array],
     is_adaptive: np.ndarray,
     supersampling: int,
 ) -> Quadtree:
     """Find the squares of images in which the samples of some bodies interpolate.
 
     Args:
-        blockers: What blocks light around the bodies.
+        place_blockers: Places what blocks light, given the vertices, and the spheres.
         sharp_share: Finds the share of the unblocked light of a group that comes from the cells with the sharpest
             shadows, shape [batch, receiver]; None where no shadow is sharp.
         positions, normals: Of the vertices, vec3 of shape [batch, vertex]; no gradient passes.
+        spheres: Centers and radii of all spheres.
         is_adaptive: The bodies, which are flat, bool of shape [body].
         supersampling: Samples of a pixel across and down.
     """
+    positions, normals, centers, radii = map(without_gradient, (positions, normals, *spheres))
+    with unrecorded():
+        blockers = place_blockers(positions, (centers, radii))
     merged_scene = blockers.merged_scene
     sides = fragments.face_ids if fragments.sides is None else fragments.sides
     keys = _keys(is_adaptive.tobytes(), merged_scene.first_face.tobytes())
