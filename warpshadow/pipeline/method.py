@@ -56,9 +56,9 @@ class Method:
 
     def samples_receive(self, blocker_kinds: BlockerKinds = ONLY_SPHERES) -> np.ndarray:
         """Bodies on which samples are receivers while bodies block in some ways, bool of shape [body]."""
-        by_vertex = [body.receivers == "vertex" for body in self.merged_scene.scene.bodies]
-        is_bulging = np.isin(np.arange(len(by_vertex)), blocker_kinds.bulging)
-        return ~(np.array(by_vertex) | is_bulging) | self.lights_samples
+        bodies = enumerate(self.merged_scene.scene.bodies)
+        by_vertex = [body.receivers == "vertex" or number in blocker_kinds.bulging for number, body in bodies]
+        return ~np.array(by_vertex) | self.lights_samples
 
     @functools.cached_property
     def is_adaptive(self) -> np.ndarray:
@@ -77,11 +77,11 @@ class Method:
 
     def separate_bodies(self, blocker_kinds: BlockerKinds) -> np.ndarray | None:
         """Number of each body whose receivers form a group, −1 for others, shape [body]; None where all share one."""
-        bodies = np.arange(len(self.merged_scene.scene.bodies))
+        bodies = range(len(self.merged_scene.scene.bodies))
         if self.merged_scene.scene.bounces:
-            return bodies
-        separate = (*blocker_kinds.traced, *blocker_kinds.planes, *np.flatnonzero(self.merged_scene.is_glossy))
-        return np.where(np.isin(bodies, separate), bodies, -1) if separate else None
+            return np.array(bodies)
+        separate = {*blocker_kinds.traced, *blocker_kinds.planes, *np.flatnonzero(self.merged_scene.is_glossy).tolist()}
+        return np.array([body if body in separate else -1 for body in bodies]) if separate else None
 
     def numbering(self, blocker_kinds: BlockerKinds, has_backs: bool) -> Numbering:
         """Number all vertices, or all with their backs; the first call makes both, so that a capture finds them."""

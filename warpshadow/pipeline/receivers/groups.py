@@ -201,7 +201,8 @@ def _groups_that_move(
     """Groups of receivers that may move."""
     sphere_bodies = blockers.sphere_blockers(blockers.bodies)
     spheres, none = blockers.spheres_of(sphere_bodies), blockers.spheres_of([])
-    corners = blockers.planes.corners(blockers.positions) if blockers.planes.numbers and receivers.spans else None
+    has_planes = blockers.blocker_kinds.planes or (blockers.planes.numbers and blockers.merged_scene.scene.bounces)
+    corners = blockers.planes.corners(blockers.positions) if has_planes and receivers.spans else None
     clusters, nearest_blockers = None, _nearest_blockers(blocker_of_point, blockers)
     if not receivers.spans:
         facing = receivers.points, receivers.normals
