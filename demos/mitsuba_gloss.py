@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 import warpshadow as ws
-from warpshadow.scene.body import GLOSS_ARGUMENTS
+from warpshadow.scene.material import GLOSS_ARGUMENTS
 
 NAMES = ("color", *GLOSS_ARGUMENTS)
 

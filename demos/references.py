@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 import warpshadow as ws
-from warpshadow.scene.body import GLOSS_ARGUMENTS
+from warpshadow.scene.material import GLOSS_ARGUMENTS
 
 MIN_PIXELS = 16  # of a body, to be measured
 BLOCK = 8  # pixels across

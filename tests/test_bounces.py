@@ -29,9 +29,9 @@ from test_end_to_end import (
 )
 
 import warpshadow as ws
-from warpshadow.pipeline import groups
 from warpshadow.pipeline.bounces import by_spheres as pipeline_bounces
 from warpshadow.pipeline.bounces import patches, static_bounces
+from warpshadow.pipeline.receivers import groups
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -26,7 +26,7 @@ def test_importing_the_package_imports_nothing_heavy():
     assert not names.intersection(HEAVY)
 
 
-METHODS = {f"warpshadow.pipeline.{name}" for name in ("directional", "log_sh", "rays")}
+METHODS = {f"warpshadow.pipeline.methods.{name}" for name in ("directional", "log_sh", "ray_traced")}
 
 STILL = """
 import warpshadow as ws
@@ -39,7 +39,7 @@ ws.render(ws.Scene([ws.Body(ws.icosphere(1.0, 1))], ws.EnvironmentMap.constant()
 def test_a_method_of_visibility_is_imported_when_a_scene_asks_for_it():
     renderer_and_stages = {"warpshadow.pipeline.renderer", "warpshadow.stages.facade"}
     assert not modules_after("import warpshadow").intersection(METHODS | renderer_and_stages)
-    assert modules_after(STILL).intersection(METHODS) == {"warpshadow.pipeline.rays"}
+    assert modules_after(STILL).intersection(METHODS) == {"warpshadow.pipeline.methods.ray_traced"}
 
 
 @pytest.mark.slow

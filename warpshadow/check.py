@@ -79,12 +79,15 @@ def keywords(**instead: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
                     hint = f" (write {instead[key]})" if key in instead else _suggestion(key, known)
                     raise TypeError(f"{name}: unknown argument {key!r}{hint}")
             try:
-                signature.bind(*args, **arguments)
-            except TypeError as error:
-                key = _unmatched_argument(signature, args, error)
-                hint = f" (write {instead[key]})" if key in instead else ""
-                raise TypeError(f"{name}: {error}{hint}; its arguments are {_listed(signature)}") from None
-            return function(*args, **arguments)
+                return function(*args, **arguments)
+            except TypeError:
+                try:
+                    signature.bind(*args, **arguments)
+                except TypeError as error:
+                    key = _unmatched_argument(signature, args, error)
+                    hint = f" (write {instead[key]})" if key in instead else ""
+                    raise TypeError(f"{name}: {error}{hint}; its arguments are {_listed(signature)}") from None
+                raise
 
         return checked
 
@@ -401,18 +404,18 @@ def finite_arrays(
         nonnegative: Names of the arrays that must hold nothing below 0.
     """
     present = {name: array for name, array in arrays.items() if array is not None and array.size}
-    if not present or any(array.device.is_capturing for array in present.values()):
+    devices = [array.device for array in present.values()]
+    if not devices or any(device.is_capturing for device in devices):
         return
     ranges = {name: (0.0 if name in nonnegative else -maximum, maximum) for name in present}
-    is_on_host = all(array.device.is_cpu for array in present.values())
-    find = _outside_on_host if is_on_host else _outside_on_device
+    find = _outside_on_host if all(device.is_cpu for device in devices) else _outside_on_device
     for name in find(present, ranges):
         finite(name, present[name].numpy(), minimum=ranges[name][0], maximum=maximum)
 
 
 def _outside_on_host(arrays: Mapping[str, wp.array], ranges: Mapping[str, tuple[float, float]]) -> list[str]:
     """Names of the arrays that hold a number out of their range, by NumPy."""
-    return [name for name, array in arrays.items() if not _is_within(array.numpy(), *ranges[name])]
+    return [name for name, array in arrays.items() if not _is_within(np.asarray(array), *ranges[name])]
 
 
 _SMALL = 10_000  # numbers up to which BLAS sums on one thread

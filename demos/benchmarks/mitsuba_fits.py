@@ -33,7 +33,7 @@ from demos.problems import Case
 from demos.scenes import image_error, shipped_mesh
 from warpshadow import inverse
 from warpshadow.inverse.target import stacked
-from warpshadow.scene.body import GLOSS_ARGUMENTS
+from warpshadow.scene.material import GLOSS_ARGUMENTS
 
 SAMPLES = 64  # a pixel, for the image and again for its gradient
 MIN_LLVM = (17,)  # before, x86 has no minimum and maximum that pass NaN on

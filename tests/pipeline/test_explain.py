@@ -14,9 +14,9 @@ from warpshadow.assets.basis import HarmonicBasis
 from warpshadow.device import warp_internals
 from warpshadow.device.batch import expand
 from warpshadow.maths.directions import CHUNK, fibonacci
-from warpshadow.pipeline import directional as directional_method
 from warpshadow.pipeline import merged_scene, node
 from warpshadow.pipeline.geometry import Geometry
+from warpshadow.pipeline.methods import directional as directional_method
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.pipeline.view import View
 from warpshadow.stages.light_samples import sample_map

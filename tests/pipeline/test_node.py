@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import warp as wp
 
+from warpshadow.assets.harmonic_light import HarmonicLight
 from warpshadow.device.tape import recorded
 from warpshadow.pipeline.explain import Explanation, decide
-from warpshadow.pipeline.node import Call, Clock, Input, Node, detached
+from warpshadow.pipeline.node import Call, Clock, Input, Node, NodeStage, detached
 
 
 @pytest.fixture
@@ -138,9 +139,9 @@ def test_what_has_a_gradient_is_never_the_same():
 
 
 def test_coefficients_are_compared_and_other_things_are_what_they_are():
-    first = Input.renewed("light", np.ones((4, 3)), None)
-    assert Input.renewed("light", np.ones((4, 3)), first) is first
-    assert Input.renewed("light", np.zeros((4, 3)), first) is not first
+    first = Input.renewed("light", HarmonicLight(np.ones((4, 3))), None)
+    assert Input.renewed("light", HarmonicLight(np.ones((4, 3))), first) is first
+    assert Input.renewed("light", HarmonicLight(np.zeros((4, 3))), first) is not first
     sky = object()
     last = Input.renewed("light", sky, first)
     assert Input.renewed("light", sky, last) is last and Input.renewed("light", object(), last) is not last
@@ -220,17 +221,20 @@ def test_parts_of_a_stage_and_of_its_adjoint_are_timed_together(clock, monkeypat
     """By a clock that ticks when it is looked at."""
     ticks = itertools.count()
     monkeypatch.setattr(clock, "now", lambda: next(ticks))
-    node = Node("transfer", lambda given: given, Input("vertices", array(requires_grad=True)))
+    stage = NodeStage("transfer")
+    node = Node("", None, Input("vertices", array(requires_grad=True)), stages=(stage,))
     with recorded() as tape:
         call = Call(clock)
-        for part in range(3):
-            node.run(call, part)
+        for _ in range(3):
+            with node.timed(call, stage):
+                pass
     timing = clock.timings["transfer"]
     assert timing.forward == 3 and timing.backward is None
     for _ in range(2):
         tape.backward()
         assert timing.backward == 3
-    node.run(Call(clock), 0)
+    with node.timed(Call(clock), stage):
+        pass
     assert clock.timings["transfer"].forward == 1 and clock.timings["transfer"].backward is None
 
 

@@ -12,9 +12,10 @@ import warpshadow as ws
 from warpshadow.assets.basis import CellBasis, HarmonicBasis
 from warpshadow.maths import sh
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline import directional, groups
-from warpshadow.pipeline.choice_of_receivers import for_picture
 from warpshadow.pipeline.geometry import Geometry
+from warpshadow.pipeline.methods import directional
+from warpshadow.pipeline.receivers import groups
+from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.tuning.point_sample import PointSample
 

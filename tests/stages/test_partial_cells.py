@@ -6,7 +6,7 @@ from test_plane_light import DIRECTIONS, Setting
 
 import warpshadow as ws
 from warpshadow.maths.directions import cell_radius
-from warpshadow.pipeline import directional
+from warpshadow.pipeline.methods import directional
 from warpshadow.stages.planes.coverage import plane_coverage
 from warpshadow.stages.planes.partial_cells import coverage_of_light
 

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 import warpshadow as ws
-from warpshadow.pipeline.choice_of_receivers import for_picture
+from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
 from warpshadow.scene.visibility import SHARED_DIRECTIONS
 from warpshadow.spheres import Spheres
 from warpshadow.stages.light_samples import cut_map
@@ -99,7 +99,7 @@ def test_receivers_between_corners_get_the_light_that_they_get_alone(device):
 def test_a_still_is_that_of_all_rays_at_all_receivers(monkeypatch):
     monkeypatch.setattr("warpshadow.stages.shared_rays.SQUARES", 32)  # of 2 × 2 pixels
     image = ws.render(scene(64))
-    monkeypatch.setattr("warpshadow.pipeline.rays.find_corners", lambda *_: None)
+    monkeypatch.setattr("warpshadow.pipeline.methods.ray_traced.find_corners", lambda *_: None)
     assert 0 < error(image, ws.render(scene(64))) < 0.005
 
 

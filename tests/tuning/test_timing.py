@@ -8,7 +8,7 @@ import pytest
 from test_point_sample import make_scene
 
 import warpshadow as ws
-from warpshadow.pipeline import directional
+from warpshadow.pipeline.methods import directional
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.tuning import timing
 from warpshadow.tuning.timing import image_times, median_times, whole_image

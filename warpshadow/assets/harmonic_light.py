@@ -18,19 +18,50 @@ _ROWS = 64  # of maps of harmonics: the last of eight bands loses 0.5% to the si
 class HarmonicLight:
     """Light as coefficients in spherical harmonics, which answers as an :class:`EnvironmentMap` does.
 
+    Two of the same coefficients are equal.
+
     Args:
-        coefficients: Linear RGB of any order, [order², 3].
+        coefficients: Linear RGB of any order, [order², 3]; it holds a copy.
     """
 
     coefficients: np.ndarray
 
     def __post_init__(self) -> None:
         sh.order_of("light", self.coefficients)
+        copied = np.array(self.coefficients)
+        copied.setflags(write=False)
+        object.__setattr__(self, "coefficients", copied)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, HarmonicLight) and np.array_equal(self.coefficients, other.coefficients)
+
+    def __hash__(self) -> int:
+        return hash(self.coefficients.tobytes())
+
+    def __repr__(self) -> str:
+        return f"{len(self.coefficients)} SH coefficients"
 
     @functools.cached_property
     def radiance(self) -> np.ndarray:
         """The light as a map [height, 2·height, 3], negative where it rings."""
         return sh.reconstruct_map(self.coefficients, _ROWS)
+
+    def towards(self, directions: np.ndarray) -> np.ndarray:
+        """Radiance from directions [..., 3], 0 where it rings below that, float64 of shape [..., 3]."""
+        harmonics = sh.evaluate(sh.order_of("light", self.coefficients), directions.reshape(-1, 3))
+        radiance: np.ndarray = np.maximum(harmonics @ self.coefficients, 0).reshape(directions.shape)
+        return radiance
+
+    def rotated(self, degrees: float) -> HarmonicLight:
+        """Turn the light about +y, as :meth:`EnvironmentMap.rotated` does."""
+        from scipy.spatial.transform import Rotation
+
+        about_y = Rotation.from_rotvec([0, degrees, 0], degrees=True).as_matrix()
+        return HarmonicLight(sh.rotation_matrix(sh.order_of("light", self.coefficients), about_y) @ self.coefficients)
+
+    def scaled(self, factor: float) -> HarmonicLight:
+        """Multiply the radiance by a factor."""
+        return HarmonicLight(factor * self.coefficients)
 
     def bands(self, order: int) -> int:
         """Number of bands, of some, in which there may be light."""
@@ -49,9 +80,11 @@ class HarmonicLight:
         return CellLight((functions @ self.coefficients).astype(np.float32), directions, None, None)
 
 
-def as_light(light: EnvironmentMap | np.ndarray) -> EnvironmentMap | HarmonicLight:
-    """Known light with its methods: a map as it is, and SH coefficients [order², 3] as :class:`HarmonicLight`.
+KnownLight = EnvironmentMap | HarmonicLight
+"""Known light of any kind. It has ``radiance``, ``towards``, ``rotated``, ``scaled``, ``bands``, ``sh`` and ``cells``;
+methods of visibility ask for no more."""
 
-    A kind of known light has ``radiance``, ``bands``, ``sh`` and ``cells``; methods of visibility ask for no more.
-    """
+
+def as_light(light: EnvironmentMap | np.ndarray) -> KnownLight:
+    """The light of a user with its methods: a map as it is, SH coefficients [order², 3] as :class:`HarmonicLight`."""
     return HarmonicLight(light) if isinstance(light, np.ndarray) else light

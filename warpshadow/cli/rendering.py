@@ -137,7 +137,7 @@ def render(
 ) -> None:
     """Render a scene file, or a mesh on a ground under a sky, to an image with soft shadows."""
     from warpshadow.assets.image import write_image
-    from warpshadow.pipeline.choice_of_receivers import for_picture
+    from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
     from warpshadow.pipeline.renderer import SceneRenderer
     from warpshadow.scene.camera_path import CameraPath
     from warpshadow.tuning.tune import describe, resolved

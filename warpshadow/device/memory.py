@@ -67,6 +67,15 @@ def from_numpy(values: np.ndarray, dtype: type, device: wp.DeviceLike) -> wp.arr
     return array
 
 
+def copied(array: wp.array) -> wp.array:
+    """Copy an array without its gradient: ``wp.clone``, but quicker."""
+    if not array.device.is_cpu or not array.is_contiguous or not array.size:
+        return wp.clone(array, requires_grad=False)
+    copy = empty(array.shape, array.dtype, array.device)
+    ctypes.memmove(copy.ptr, array.ptr, array.size * wp.types.type_size_in_bytes(array.dtype))
+    return copy
+
+
 def reshaped(array: wp.array, shape: Sequence[int]) -> wp.array:
     """View an array in another shape: ``array.reshape``, but quicker. One length may be −1."""
     if -1 in shape:

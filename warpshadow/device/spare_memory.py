@@ -33,11 +33,12 @@ class SpareMemory:
 
     def take(self, size: int) -> int:
         """Take a block of at least ``size`` bytes; returns its address, 0 where there is no memory."""
-        size = _rounded(size)
-        with self._lock:
-            if self._blocks.get(size):
-                self.cached_bytes -= size
-                return self._blocks[size].pop()
+        if size > _MIN_BYTES:
+            size = _rounded(size)
+            with self._lock:
+                if self._blocks.get(size):
+                    self.cached_bytes -= size
+                    return self._blocks[size].pop()
         block = self._take(size)
         if not block and self.cached_bytes:
             self.clear()
@@ -46,8 +47,7 @@ class SpareMemory:
 
     def give_back(self, block: int, size: int) -> None:
         """Give back a block that was taken for ``size`` bytes."""
-        size = _rounded(size)
-        if size not in self._blocks:
+        if size <= _MIN_BYTES or (size := _rounded(size)) not in self._blocks:
             self._give_back(block)
             return
         with self._lock:

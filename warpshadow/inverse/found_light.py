@@ -19,6 +19,7 @@ import torch
 
 from warpshadow.assets.basis import CellBasis
 from warpshadow.assets.color import auto_exposure
+from warpshadow.assets.harmonic_light import as_light
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.picture import Picture
 from warpshadow.inverse.diagnostics import small_stage
@@ -29,7 +30,6 @@ from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.world import Setting
 from warpshadow.maths.directions import fibonacci
 from warpshadow.maths.sh import equirectangular_directions, pixel_solid_angles
-from warpshadow.pipeline.lighting import map_of
 
 MIN_INFLUENCE = 0.05
 """Influence below which a direction is not determined, as a fraction of the mean over all directions: noise in the
@@ -94,7 +94,7 @@ def found_light(
         setting: Of the problem.
         values: Free parameters by name.
     """
-    radiance = map_of(light)
+    radiance = as_light(light).radiance
     pixel_directions = equirectangular_directions(len(radiance))
     cells = CellBasis(fibonacci(_CELLS)).functions(pixel_directions.reshape(-1, 3))
     influence = cells @ influence_of_cells(problem, setting, values)

@@ -25,10 +25,9 @@ from warpshadow.inverse.one_thread import torch_on_one_thread
 from warpshadow.inverse.result import Result
 from warpshadow.inverse.schedule import Stage
 from warpshadow.inverse.uncertainty import MAX_POSE_UNCERTAINTY
-from warpshadow.pipeline.lighting import map_of
 from warpshadow.scene import toml_tables
-from warpshadow.scene.body import GLOSS_ARGUMENTS
 from warpshadow.scene.files import camera_table, write_scene
+from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.scene.scene import Scene
 
 SUMMARY = "summary.toml"  # the file of a folder of results that is written last: where it is, the others are
@@ -71,7 +70,7 @@ class Report:
         scene = result.scene
         written = write_scene(scene, folder, stems=_stems(scene))
         if not isinstance(scene.light, EnvironmentMap):
-            write_image(folder / "light.exr", map_of(scene.light).astype(np.float32))
+            write_image(folder / "light.exr", scene.known_light.radiance.astype(np.float32))
             written.append(folder / "light.exr")
         values: dict[str, Any] = {
             f"{name}.{key}": item.cpu().numpy() for name, parts in result.values.items() for key, item in parts.items()
@@ -174,7 +173,7 @@ def found_values(result: Result) -> list[str]:
                 rounded_text = ", ".join(f"{value:.4g}" for value in values.ravel())
                 lines.append(f"{after.called}: {name} ({rounded_text}){unit}")
     if scene.light is not start.light:
-        radiance = map_of(scene.light)
+        radiance = scene.known_light.radiance
         x, y, z = EnvironmentMap(np.maximum(radiance, 0)).directions().reshape(-1, 3)[radiance.sum(axis=2).argmax()]
         lines.append(f"light: strongest from ({x:.3f}, {y:.3f}, {z:.3f})")
     if any(factor != 1 for factor in result.found.exposures):

@@ -13,7 +13,7 @@ import torch
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.geometry import Geometry
 from warpshadow.scene.blockers import scene_blockers
-from warpshadow.scene.body import GLOSS_ARGUMENTS
+from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.scene.scene import Scene
 from warpshadow.scene.visibility import SPHERE_METHODS, Visibility
 from warpshadow.spheres import Spheres

@@ -1,4 +1,4 @@
-"""Shading with sphere blockers: the base of such methods, and nodes for the receivers' visibility."""
+"""Shading with sphere blockers: the base of such methods, and the node of the receivers' visibility."""
 
 from __future__ import annotations
 
@@ -9,27 +9,20 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.progress import progress_bar
 from warpshadow.pipeline.convex import SceneConvexParts
 from warpshadow.pipeline.geometry import Geometry
-from warpshadow.pipeline.groups import Blockers, Group, GroupVisibility, find_groups
-from warpshadow.pipeline.lighting import (
-    LARGEST_COEFFICIENT,
-    ONLY_SPHERES,
-    BlockerKinds,
-    KnownLight,
-    LitPoints,
-    Method,
-    change_basis,
-    joined,
-    receiver_text,
-)
-from warpshadow.pipeline.node import Call, Input, Node, detached
+from warpshadow.pipeline.method import Method
+from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached
 from warpshadow.pipeline.planes import ScenePlanes
+from warpshadow.pipeline.receivers.groups import Blockers, Group, GroupVisibility, find_groups
+from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds, LitPoints, receiver_text
+from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.self_visibility import SelfVisibility
-from warpshadow.pipeline.static import StaticBodies, VertexRows
+from warpshadow.pipeline.transfers import LARGEST_COEFFICIENT, change_basis, joined
 from warpshadow.stages.shading import shade
 
 
@@ -41,6 +34,7 @@ class SphereMethod(Method):
         why_no_shadows: Why the method has no shadows, in words; empty if it has.
         joins_cached: Whether visibility combines cached rows with moving blockers.
         traces_self_visibility: Whether bodies' shadows on themselves may come from rays, not spheres.
+        sees_cells: Whether visibility is transmittance in cells: those towards ``directions`` of projected light.
         shades_transmittance: Whether known light is shaded without transfer vectors, by :meth:`shade_transmittance`.
         bounces: The ``SphereBounces`` by which light bounces; None where it does not.
     """
@@ -49,6 +43,7 @@ class SphereMethod(Method):
     why_no_shadows = ""
     joins_cached = False
     traces_self_visibility = False
+    sees_cells = False
     shades_transmittance = False
     bounces: Any = None
 
@@ -226,7 +221,7 @@ class PortionedShading(Node):
         caches: As for :class:`Node`.
         where: Suffix of the names of its stages, to tell them from others.
         is_shaded: Whether portions are shaded in known light; else they end with transfer vectors, too.
-        extra_inputs: As for :class:`Node`.
+        stages: Further ones, as for :class:`Node`.
     """
 
     def __init__(
@@ -240,60 +235,45 @@ class PortionedShading(Node):
         caches: bool = True,
         where: str = "",
         is_shaded: bool = True,
-        extra_inputs: tuple[Node, ...] = (),
+        stages: tuple[NodeStage, ...] = (),
     ):
         self.method, self._points = method, points
         self._finish, self._progress = finish, method.progress and light is not None
         receivers, spheres, item_text = points.receivers_node, points.spheres, functools.partial(receiver_text, points)
         self_visibility = _self_visibility(method, points, projected_light)
-        self._visibility = Node(
-            f"visibility{where}",
-            method.find_visibility,
-            receivers,
-            spheres,
-            projected_light,
-            self_visibility,
-            items=lambda: _pairs(method, points),
-            idle=lambda: _why_unblocked(method, points),
-            caches=False,
-        )
+        shadows = _static_shadows(method, points, light)
         planes = points.blocker_kinds.planes
         place = functools.partial(method.blockers, points.blocker_kinds)
         blockers = points.cached("blockers", None, lambda: Node("", place, points.vertices, spheres))
-        self._visibility_past_planes = Node(
+        self._is_shaded = light is not None and is_shaded
+        self._is_transferred = not (self._is_shaded and method.shades_transmittance)
+        self._visibility = NodeStage(
+            f"visibility{where}", lambda: _pairs(method, points), lambda: _why_unblocked(method, points)
+        )
+        self._planes = NodeStage(
             f"planes{where}",
-            method.find_visibility_past_planes,
-            receivers,
-            self._visibility,
-            projected_light,
-            blockers,
-            items=lambda: f"{item_text()} × {len(planes)} flat {'body' if len(planes) == 1 else 'bodies'}",
-            idle="" if planes else "spheres stand in for what casts shadows",
-            caches=False,
+            lambda: f"{item_text()} × {len(planes)} flat {'body' if len(planes) == 1 else 'bodies'}",
+            "" if planes else "spheres stand in for what casts shadows",
         )
-        is_lit = light is not None and is_shaded
-        self._is_transferred = not (is_lit and method.shades_transmittance)
-        self._transfer = result = Node(
+        self._transfer = NodeStage(
             f"transfer{where}",
-            method.transfer if self._is_transferred else None,
-            self._visibility_past_planes,
-            projected_light,
-            items=lambda: f"{item_text()} × {method.coefficient_count(light)} coefficients",
-            idle="" if self._is_transferred else "known light is shaded without transfer vectors",
-            caches=False,
+            lambda: f"{item_text()} × {method.coefficient_count(light)} coefficients",
+            "" if self._is_transferred else "known light is shaded without transfer vectors",
         )
-        self._shading = None
-        if is_lit:
-            shade_portion = method.shade_transfer if self._is_transferred else method.shade_transmittance
-            arguments = self._transfer, projected_light
-            self._shading = result = Node(f"shading{where}", shade_portion, *arguments, items=item_text, caches=False)
-        shadows = _static_shadows(method, points, light)
-        cached_rows = shadows if shadows.function else None
-        looked_up: Node | dict = self_visibility if self_visibility.function else {}
+        self._shading = NodeStage(f"shading{where}", item_text)
+        own_stages = self._visibility, self._planes, self._transfer, self._shading
         static_normals = None if points.static_bodies is None else points.static_bodies.normals
-        before = receivers, blockers, projected_light, looked_up, cached_rows, static_normals
         super().__init__(
-            "", None, *before, extra_inputs=(self_visibility, shadows, result, *extra_inputs), caches=caches
+            "",
+            None,
+            receivers,
+            blockers,
+            projected_light,
+            self_visibility,
+            shadows,
+            static_normals,
+            stages=(*(own_stages if self._is_shaded else own_stages[:3]), *stages),
+            caches=caches,
         )
 
     def compute(self, call: Call) -> Any:
@@ -317,18 +297,24 @@ class PortionedShading(Node):
 
     def find_visibility(self, call: Call, portion: Group, projected_light: Any) -> GroupVisibility:
         """Find the visibility of a portion."""
-        visibility = self._visibility.run(call, portion, projected_light)
+        with self.timed(call, self._visibility):
+            visibility = self.method.find_visibility(portion, projected_light)
         if portion.planes is None:
             return visibility
-        return self._visibility_past_planes.run(call, portion, visibility, projected_light)
+        with self.timed(call, self._planes):
+            return self.method.find_visibility_past_planes(portion, visibility, projected_light)
 
     def light(self, call: Call, portion: Group, visibility: GroupVisibility, projected_light: Any) -> wp.array:
         """Transfer vectors of a portion, or its shading."""
         if not self._is_transferred:
-            assert self._shading is not None
-            return self._shading.run(call, visibility, portion, projected_light)
-        transfer = self._transfer.run(call, visibility, portion, projected_light)
-        return transfer if self._shading is None else self._shading.run(call, transfer, portion, projected_light)
+            with self.timed(call, self._shading):
+                return self.method.shade_transmittance(visibility, portion, projected_light)
+        with self.timed(call, self._transfer):
+            transfer = self.method.transfer(visibility, portion, projected_light)
+        if not self._is_shaded:
+            return transfer
+        with self.timed(call, self._shading):
+            return self.method.shade_transfer(transfer, portion, projected_light)
 
 
 def _sphere_counts(method: SphereMethod, points: LitPoints) -> np.ndarray:

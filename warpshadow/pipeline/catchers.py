@@ -12,8 +12,8 @@ import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.geometry import Geometry
-from warpshadow.pipeline.lighting import Light
 from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.transfers import Light
 from warpshadow.pipeline.view import View
 from warpshadow.scene.scene import PerBody
 
@@ -28,9 +28,6 @@ class CatchersAlone:
 
     def __init__(self, renderer: Any, merged_scene: MergedScene):
         self._renderer, self._merged_scene, self._numbers = renderer, merged_scene, merged_scene.scene.catchers
-        renderer.merged_scene.take_spheres(merged_scene, self._numbers)
-        renderer.merged_scene.has_chosen_receivers = merged_scene.has_chosen_receivers[list(self._numbers)]
-        renderer._has_warned = True
 
     def with_cameras(self, cameras: Sequence[Camera]) -> CatchersAlone:
         """The same for other cameras."""

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 
-from warpshadow.pipeline.node import AnyInput, Call, Input, Node, Timing
+from warpshadow.pipeline.node import AnyInput, Call, Input, Node, NodeStage, Timing
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,12 @@ class Explanation:
         notes: Iterable[str] = (),
     ):
         decisions = decide(image, call)
-        nodes = [node for node in decisions if node.name and node not in hidden]
-        self.stages = {node.name: _stage(node, decisions[node]) for node in nodes}
+        self.stages: dict[str, StageReport] = {}
+        for node in decisions:
+            if node not in hidden:
+                reports = [_report(stage, node, _stage_decision(stage, decisions[node])) for stage in node.stages]
+                reports += [_report(node, node, decisions[node])] if node.name else []
+                self.stages |= {report.name: report for report in reports}
         self.timings = dict(timings)
         self.notes = list(notes)
         if not is_host:
@@ -133,25 +137,39 @@ def _decision(node: Node, call: Call, reason: Decision) -> Decision:
         return Decision(False, f"cached: {_names(node.root_inputs)} are the same")
     if idle := _text(node.idle):
         return Decision(False, idle)
+    return _reason_to_run([node], reason, "nothing is cached yet" if node.caches else "")
+
+
+def _reason_to_run(inputs: Iterable[AnyInput], reason: Decision, otherwise: str = "") -> Decision:
+    """Whether a stage of some inputs runs, given why it is asked for: what changed before it, if anything did."""
     if not reason:
         return reason
-    if node.requires_grad:
-        varying = (item for item in node.root_inputs if item.requires_grad)
+    root_inputs = dict.fromkeys(root for item in inputs for root in item.root_inputs)
+    if varying := [root for root in root_inputs if root.requires_grad]:
         return Decision(True, f"a gradient to {_names(varying)} is asked for")
-    if news := [item.news for item in node.root_inputs if item.news]:
+    if news := [root.news for root in root_inputs if root.news]:
         return Decision(True, _listed(dict.fromkeys(news)))
-    return Decision(True, "nothing is cached yet") if node.caches else reason
+    return Decision(True, otherwise) if otherwise else reason
 
 
-def _stage(node: Node, forward: Decision) -> StageReport:
-    """A stage whose adjoint runs if it runs itself and something before it requires a gradient."""
+def _stage_decision(stage: NodeStage, decision: Decision) -> Decision:
+    """Whether a stage of a node runs, given the decision about the node."""
+    if idle := _text(stage.idle):
+        return Decision(False, idle)
+    return _reason_to_run(stage.inputs, decision)
+
+
+def _report(stage: Node | NodeStage, node: Node, forward: Decision) -> StageReport:
+    """A stage of a node; its adjoint runs if it runs itself and something before it requires a gradient."""
+    inputs = stage.inputs if isinstance(stage, NodeStage) else ()
+    differentiated = dict.fromkeys(root for item in inputs or (node,) for root in item.differentiated_inputs)
     if not forward:
         backward = Decision(False, "nothing is computed")
-    elif node.differentiated_inputs and node.has_adjoint:
-        backward = Decision(True, f"a gradient to {_names(node.differentiated_inputs)} is asked for")
+    elif differentiated and stage.has_adjoint:
+        backward = Decision(True, f"a gradient to {_names(differentiated)} is asked for")
     else:
         backward = Decision(False, "nothing before it requires a gradient")
-    return StageReport(node.name, forward, backward, _text(node.items) if forward else "")
+    return StageReport(stage.name, forward, backward, _text(stage.items) if forward else "")
 
 
 def _names(inputs: Iterable[Input]) -> str:

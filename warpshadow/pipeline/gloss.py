@@ -14,10 +14,12 @@ import warp as wp
 
 from warpshadow.device.batch import concatenate, cut, rows
 from warpshadow.device.constants import constant
-from warpshadow.pipeline.lighting import Light, LitPoints, change_basis, receiver_text
+from warpshadow.pipeline.method import Method
 from warpshadow.pipeline.node import Input, Node, detached
+from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
-from warpshadow.scene.body import GLOSS_ARGUMENTS
+from warpshadow.pipeline.transfers import Light, change_basis
+from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.stages.gloss.lobes import sample_lobes
 from warpshadow.stages.gloss.prefilter import look_up_light, prefilter
 from warpshadow.stages.gloss.reflection import mix_reflection, sum_lobes
@@ -37,16 +39,18 @@ class GlossyPoints(LitPoints):
     """The receivers of a view on bodies that shine.
 
     Args:
+        method: How their light is blocked.
         cameras: Clip matrices of its cameras, or one for all.
         fragments, clip_positions: Nodes of its samples, and of the vertices in clip space.
     """
 
-    def __init__(self, view: LitPoints, cameras: Input, fragments: Node, clip_positions: Node):
+    def __init__(self, method: Method, view: LitPoints, cameras: Input, fragments: Node, clip_positions: Node):
         glossy = view.merged_scene.is_glossy
         receivers = Node("", functools.partial(_glossy_receivers, glossy), view.receivers_node)
         self._all_receivers, self._cameras = view.receivers_node, cameras
         self._fragments, self._clip_positions = fragments, clip_positions
-        arguments = view.method, view.materials, view.vertices, view.spheres, receivers, view.call
+        self.method = method
+        arguments = view.merged_scene, view.materials, view.vertices, view.spheres, receivers, view.call
         super().__init__(
             *arguments, normals=view.normals, blocker_kinds=view.blocker_kinds, is_scene_view=view.is_scene_view
         )
@@ -58,7 +62,7 @@ class GlossyPoints(LitPoints):
         Args:
             view: The view, or its preview.
             diffuse: Node of the view's shading.
-            light: As for :meth:`LitPoints.shading`.
+            light: As for :meth:`.Method.shading`.
             materials: Of the bodies.
         """
         item_text = functools.partial(receiver_text, self)
@@ -71,7 +75,7 @@ class GlossyPoints(LitPoints):
 
         sampled = self.cached("lobes", key, lobes)
         directions, filters, cosines = (Node("", operator.itemgetter(part), sampled) for part in range(3))
-        source = self.light_input(light)
+        source = self.method.light_input(self, light)
         texels = self.cached("prefiltered", source, lambda: self._prefiltered(source))
         radiance = Node("prefiltered light", look_up_light, texels, directions, filters, items=item_text)
         through = self.method.lobe_transmittance(self, directions, source)

@@ -6,14 +6,17 @@ node's value stays right for as long as the node exists. It is cached, and a nod
 comes before it. Only values with a gradient are not cached: a tape is good for one playback.
 """
 
+import contextlib
 import time
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from warpshadow.device.cuda_graph import is_readable
+from warpshadow.device.memory import copied
 from warpshadow.device.tape import record
 
 
@@ -72,28 +75,44 @@ def _arrays(value: Any) -> list[wp.array]:
 def _copied(value: Any) -> Any:
     if isinstance(value, tuple):
         return tuple(map(_copied, value))
-    if isinstance(value, wp.array):
-        return wp.clone(value)
-    return value.copy() if isinstance(value, np.ndarray) else value
+    return copied(value) if isinstance(value, wp.array) else value
 
 
 def _is_same(new_value: Any, last: Input) -> bool:
     """Whether a value equals an input's, as far as the host knows without waiting."""
     arrays, value = _arrays(new_value), last.value()
-    if isinstance(new_value, np.ndarray):
-        return isinstance(value, np.ndarray) and np.array_equal(new_value, value)
     if not arrays:
-        return new_value is value
+        return bool(new_value == value)
     return all(map(_is_same_array, arrays, _arrays(last.original) or arrays, _arrays(value)))
 
 
 def _is_same_array(array: wp.array, before: wp.array, copy: wp.array) -> bool:
     """Whether an array equals a stored copy; on a GPU, whether it is the array before, not written to since."""
     if is_readable(array.device):  # it sees writes by NumPy, which torch does not count
-        return np.array_equal(array.numpy(), copy.numpy())
+        return np.array_equal(np.asarray(array), np.asarray(copy))
     origin = getattr(array, "origin", None)
     marks = [(item.ptr, item.shape, item.strides, getattr(item, "version", None)) for item in (array, before)]
     return origin is not None and origin is getattr(before, "origin", None) and marks[0] == marks[1]
+
+
+class NodeStage(NamedTuple):
+    """A stage as it is timed and explained. A node with a name is one; the function of a node may have more.
+
+    Args:
+        name: Its name.
+        items: On how many items it is computed, in words.
+        idle: Why there is nothing to do, in words.
+        has_adjoint: Whether gradients take it more than to hand them on.
+        inputs: What it depends on, where that is less than its node does.
+
+    Items and idle may be functions that make the words.
+    """
+
+    name: str
+    items: str | Callable[[], str] = ""
+    idle: str | Callable[[], str] = ""
+    has_adjoint: bool = True
+    inputs: "tuple[AnyInput, ...]" = ()
 
 
 class Node:
@@ -101,15 +120,13 @@ class Node:
 
     Args:
         name: Name of the stage; empty for a node that is neither timed nor explained.
-        function: Computes the value from the inputs' values; None if nothing asks for it.
+        function: Computes the value from the inputs' values; None where there is nothing to compute: the value is None.
         inputs: Nodes and inputs of the pipeline; anything else is passed on as it is.
-        items: On how many items it is computed, in words.
-        idle: Why there is nothing to do, in words; the function then passes something on.
-        has_adjoint: Whether gradients take it more than to hand them on.
+        items, idle, has_adjoint: As for :class:`NodeStage`; a function of an idle node passes something on.
         caches: Whether the value may outlive a call.
-        extra_inputs: Other nodes that run for this one, or are explained beside it.
+        extra_inputs: Other nodes that run for this one.
+        stages: Stages that are explained before it: those that its function times, and stages that it makes needless.
 
-    Items and idle may be functions that make the words.
     Attributes:
         before: The nodes and inputs that it depends on at once.
         root_inputs: All inputs that it depends on.
@@ -127,8 +144,9 @@ class Node:
         has_adjoint: bool = True,
         caches: bool = True,
         extra_inputs: tuple["Node", ...] = (),
+        stages: tuple[NodeStage, ...] = (),
     ):
-        self.name, self.function, self.inputs = name, function, inputs
+        self.name, self.function, self.inputs, self.stages = name, function, inputs, stages
         self.items, self.idle, self.has_adjoint = items, idle, has_adjoint
         self.before: list[AnyInput] = []
         self.root_inputs: dict[Input, None] = {}  # in order
@@ -159,21 +177,23 @@ class Node:
 
     def compute(self, call: "Call") -> Any:
         """Compute the value."""
-        return self.run(call, *self.values(call))
+        if self.function is None:
+            return None
+        values = self.values(call)
+        if not self.name or isinstance(self.idle, str) and self.idle:
+            return self.function(*values)
+        with call.timed(self.name, is_marked=self.has_adjoint and bool(self.differentiated_inputs)):
+            return self.function(*values)
+
+    def timed(self, call: "Call", stage: NodeStage) -> AbstractContextManager[None]:
+        """Time one of its stages while it computes its value."""
+        inputs = stage.inputs or (self,)
+        is_marked = stage.has_adjoint and any(item.differentiated_inputs for item in inputs)
+        return call.timed(stage.name, is_marked=is_marked)
 
     def values(self, call: "Call") -> list[Any]:
         """The values of the inputs."""
         return [item.value(call) if isinstance(item, (Node, Input)) else item for item in self.inputs]
-
-    def run(self, call: "Call", *values: Any) -> Any:
-        """Call the function, and time it."""
-        assert self.function is not None
-        if not self.name or isinstance(self.idle, str) and self.idle:
-            return self.function(*values)
-        end = call.start(self.name, is_marked=self.has_adjoint and bool(self.differentiated_inputs))
-        value = self.function(*values)
-        end()
-        return value
 
     def value_if_known(self, call: "Call") -> Any:
         """The value if it needs no computation, else None."""
@@ -250,8 +270,9 @@ class Call(dict[Node, Any]):
         self._clock = clock
         self._timings: dict[str, Timing] = {}
 
-    def start(self, name: str, *, is_marked: bool) -> Callable[[], None]:
-        """Start a stage, or resume one that has run in this call, and return the function that ends it.
+    @contextlib.contextmanager
+    def timed(self, name: str, *, is_marked: bool) -> Iterator[None]:
+        """Time a stage, or one more part of a stage that has run in this call.
 
         Its adjoint is timed by marks on the tape.
         """
@@ -266,12 +287,10 @@ class Call(dict[Node, Any]):
         def start_adjoint() -> None:
             timing.adjoints[part] = -now()
 
-        def end() -> None:
-            if is_marked:
-                record(start_adjoint)
-            timing.forward += now() - start
-
         if is_marked:
             record(end_adjoint)  # the tape plays back from the end
         start = now()
-        return end
+        yield
+        if is_marked:
+            record(start_adjoint)
+        timing.forward += now() - start

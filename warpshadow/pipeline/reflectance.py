@@ -14,7 +14,7 @@ from warpshadow.device.constants import constant
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node, detached
-from warpshadow.scene.body import GLOSS_ARGUMENTS
+from warpshadow.scene.material import GLOSS_ARGUMENTS, GLOSS_DEFAULTS
 from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.textures.footprint import find_footprints
 from warpshadow.stages.textures.numbers import as_colors
@@ -23,10 +23,6 @@ from warpshadow.stages.textures.sample import sample_albedo
 
 BodyArrays = Sequence[wp.array | None] | None
 """For each body an array, or None for the scene's own; None for all bodies' own."""
-
-
-GLOSS_DEFAULTS = {"roughness": 1.0, "metallic": 0.0, "specular": 1.0}
-"""Of bodies that do not say; their roughness does not count where they do not shine."""
 
 
 class SampleReflectance(NamedTuple):

@@ -20,21 +20,22 @@ from warpshadow.device.progress import waiting
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import announced, one_at_a_time
 from warpshadow.pipeline.catchers import CatchersAlone
-from warpshadow.pipeline.choice_of_receivers import choose_receivers, receiver_notes, with_receivers
 from warpshadow.pipeline.delegation import delegated
 from warpshadow.pipeline.explain import Explanation, bounce_notes, decide
 from warpshadow.pipeline.geometry import Geometry, as_geometry
 from warpshadow.pipeline.layers import LayerArrays, Layers, find_layer_arrays, find_layers
-from warpshadow.pipeline.lighting import Light, LitPoints, one_transfer
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.methods import make_method
+from warpshadow.pipeline.methods.by_name import make_method
 from warpshadow.pipeline.node import Clock, Input, Node
+from warpshadow.pipeline.receivers.choice_of_receivers import choose_receivers, receiver_notes, with_receivers
+from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.scene_views import SceneViews, camera_batch
 from warpshadow.pipeline.shading_ratio import shading_ratio
+from warpshadow.pipeline.transfers import Light, one_transfer
 from warpshadow.pipeline.view import View
 from warpshadow.pipeline.view_warnings import warn_of_vertex_receivers, warn_of_view
-from warpshadow.scene.body import GLOSS_ARGUMENTS
+from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.scene.scene import SCENE_TYPES, BodyLike, PerBody, Scene
 from warpshadow.scene.visibility import METHODS
 
@@ -246,7 +247,7 @@ class SceneRenderer:
         Differentiable: light, view.
         """
         view = self._checked(view)
-        return view.shading(light).value(self._views.call(view))
+        return self._method.shading(view, light).value(self._views.call(view))
 
     @announced
     def reflect(
@@ -399,9 +400,17 @@ class SceneRenderer:
 
     @functools.cached_property
     def _catchers_alone(self) -> CatchersAlone:
-        scene = replace(self.scene, bodies=tuple(self.scene.bodies[number] for number in self.scene.catchers))
+        return CatchersAlone(self._of_bodies_alone(self.scene.catchers), self.merged_scene)
+
+    def _of_bodies_alone(self, numbers: tuple[int, ...]) -> "SceneRenderer":
+        """Make a renderer of some bodies alone, with the receivers and spheres that they have here; it never warns."""
+        scene = replace(self.scene, bodies=tuple(self.scene.bodies[number] for number in numbers))
         arguments: dict[str, Any] = self._arguments | {"scene": scene, "cameras": self.cameras}
-        return CatchersAlone(SceneRenderer(**arguments), self.merged_scene)
+        alone = SceneRenderer(**arguments)
+        alone.merged_scene.take_spheres(self.merged_scene, numbers)
+        alone.merged_scene.has_chosen_receivers = self.merged_scene.has_chosen_receivers[list(numbers)]
+        alone._has_warned = True
+        return alone
 
     @one_at_a_time
     def layers(self, view: View | None = None) -> Layers:

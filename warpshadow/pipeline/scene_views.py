@@ -11,10 +11,11 @@ from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.device.batch import common_batch
 from warpshadow.pipeline.geometry import PLACED, Geometry
-from warpshadow.pipeline.lighting import BlockerKinds, LitPoints, Method
+from warpshadow.pipeline.method import Method
 from warpshadow.pipeline.node import Call, Clock, Input, Node, identity
+from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints
+from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.reflectance import Materials
-from warpshadow.pipeline.static import StaticBodies
 from warpshadow.pipeline.view import View
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.project import check_clip_space
@@ -139,7 +140,7 @@ class SceneViews:
         receivers = Input("receivers", Receivers(points, normals, None, None, None))  # type: ignore[arg-type]
         node = Node("", identity, receivers)
         bodies, blocker_kinds = self._bodies(geometry), self._method.blocker_kinds(geometry, None)
-        return LitPoints(self._method, self._materials, *bodies, node, self.call(), blocker_kinds=blocker_kinds)
+        return LitPoints(self._merged_scene, self._materials, *bodies, node, self.call(), blocker_kinds=blocker_kinds)
 
     def on_faces(self, sides: np.ndarray, barycentrics: np.ndarray, geometry: Geometry | None = None) -> LitPoints:
         """Points on faces of bodies to be lit by :meth:`shade`, by whose own bodies it knows them.
@@ -157,7 +158,7 @@ class SceneViews:
             owners = owners[scene.body_of_face[sides % len(scene.body_of_face)]]
         normals = Node("", vertex_normals, bodies[0], scene.faces)
         node = Node("", receivers_on_faces, bodies[0], normals, scene.faces, sides, barycentrics, owners)
-        points = self._method, self._materials, *bodies, node, self.call()
+        points = scene, self._materials, *bodies, node, self.call()
         return LitPoints(*points, normals=normals, blocker_kinds=blocker_kinds)
 
 

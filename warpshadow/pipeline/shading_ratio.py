@@ -6,10 +6,10 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.memory import empty
-from warpshadow.pipeline.lighting import LitPoints
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.methods import make_method
+from warpshadow.pipeline.methods.by_name import make_method
 from warpshadow.pipeline.node import Call, Input, Node
+from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.view import View
 from warpshadow.stages.receivers import Receivers
 
@@ -25,7 +25,9 @@ def shading_ratio(view: View, call: Call) -> np.ndarray:
     without_blockers = make_method(MergedScene(replace(scene, bodies=bodies), device=device), None)
     receivers = Node("", Receivers.without_bodies, view.receivers_node)
     spheres = Input("spheres", tuple(empty((1, 0), dtype=dtype, device=device) for dtype in (wp.vec3, wp.float32)))
-    free = LitPoints(without_blockers, view.materials, view.vertices, spheres, receivers, call)
-    images = (view.white_image(item.shading(None)).value(call) for item in (view, free))
+    free = LitPoints(without_blockers.merged_scene, view.materials, view.vertices, spheres, receivers, call)
+    images = (
+        view.white_image(shading).value(call) for shading in (view.shading(None), without_blockers.shading(free, None))
+    )
     received, unblocked = (image.numpy()[..., :3].copy() for image in images)
     return np.divide(received, unblocked, out=np.ones_like(received), where=unblocked > 0)

@@ -9,9 +9,11 @@ import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.pipeline.lighting import BlockerKinds, Light, LitPoints, Method, receiver_text
-from warpshadow.pipeline.node import Call, Input, Node, detached, identity
+from warpshadow.pipeline.method import Method
+from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached, identity
+from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials, SampleReflectance
+from warpshadow.pipeline.transfers import Light
 from warpshadow.stages.film import average, sample_radiance, sum_radiance
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.project import to_clip
@@ -26,7 +28,7 @@ from warpshadow.stages.textures.sample import textured_radiance
 from warpshadow.stages.textures.seen import seen_texels
 
 if TYPE_CHECKING:
-    from warpshadow.pipeline.static import StaticBodies
+    from warpshadow.pipeline.receivers.static import StaticBodies
     from warpshadow.stages.photograph import RatioImage
 
 MAX_SHARED = 2
@@ -70,6 +72,7 @@ class View(LitPoints):
         is_scene_view: bool = False,
     ):
         self.dependencies = vertices, spheres, cameras, static_bodies, blocker_kinds
+        self.method = method
         self._separate_bodies = method.separate_bodies(blocker_kinds)
         self._samples_receive = method.samples_receive(blocker_kinds)
         self.cameras = cameras
@@ -78,7 +81,16 @@ class View(LitPoints):
         self._sample_count = counts[1] * self._size[0] * self._size[1]
         normals, receivers = self._wire(method, vertices, spheres, cameras, static_bodies)
         super().__init__(
-            method, materials, vertices, spheres, receivers, call, static_bodies, normals, blocker_kinds, is_scene_view
+            method.merged_scene,
+            materials,
+            vertices,
+            spheres,
+            receivers,
+            call,
+            static_bodies,
+            normals,
+            blocker_kinds,
+            is_scene_view,
         )
 
     def _wire(
@@ -143,10 +155,13 @@ class View(LitPoints):
                 merged_scene.faces, keeps_vertex, on_static_body, merged_scene.vertex_order, bodies
             )
             if spheres is not None and (is_adaptive := method.is_adaptive & wants_samples).any():
-                from warpshadow.pipeline.adaptive import find_squares
+                from warpshadow.pipeline.by_spheres import SphereMethod
+                from warpshadow.pipeline.receivers.adaptive import find_squares
 
+                assert isinstance(method, SphereMethod)
+                place = functools.partial(method.blockers, self.blocker_kinds)
                 seen = positions, normals, fragments, spheres
-                quadtree = find_squares(self, *seen, is_adaptive, self._supersampling)
+                quadtree = find_squares(place, method.sharp_share, *seen, is_adaptive, self._supersampling)
         elif on_static_body is None:
             numbering = method.numbering(self.blocker_kinds, has_backs)
         else:
@@ -185,6 +200,15 @@ class View(LitPoints):
             result[[body for body in static_bodies.bodies if set(casting) - {body}]] = True
         return result
 
+    def shading(self, light: Light | None, materials: Materials | None = None) -> Node:
+        """Light on the receivers: :meth:`.Method.shading`."""
+        return self.method.shading(self, light, materials)
+
+    @property
+    def transfers(self) -> Node:
+        """Transfer vectors of the receivers: :meth:`.Method.cached_transfers`."""
+        return self.method.cached_transfers(self)
+
     def image(self, light: Light | None, materials: Materials) -> Node:
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""
         item_text, clip, fragments = self._samples, self.clip_positions, self.fragments_node
@@ -192,11 +216,11 @@ class View(LitPoints):
         if materials.roughness:
             samples = self._glossy(shading, light, materials, reflectance.samples)
         elif reflectance.pyramids.requires_grad and not (shading.requires_grad or clip.requires_grad):
-            replaced_stages = (Node("reflectance", None, idle="found with the radiance"),)
+            replaced_stages = (NodeStage("reflectance", idle="found with the radiance"),)
             reflectance_inputs = reflectance.vertex_albedo, reflectance.pyramids, reflectance.footprints
             arguments = fragments, self.merged_scene.faces, *reflectance_inputs, self._white_radiance_of(shading)
             samples = Node(
-                "radiance", textured_radiance, *arguments, items=item_text, caches=False, extra_inputs=replaced_stages
+                "radiance", textured_radiance, *arguments, items=item_text, caches=False, stages=replaced_stages
             )
         else:
             samples = self._radiance(shading, reflectance.samples)
@@ -240,7 +264,7 @@ class View(LitPoints):
         from warpshadow.pipeline.gloss import GlossyPoints
 
         arguments = self.cameras, self.fragments_node, self.clip_positions
-        points = self.cached("gloss", None, lambda: GlossyPoints(self, *arguments))
+        points = self.cached("gloss", None, lambda: GlossyPoints(self.method, self, *arguments))
         colored, white = points.mixed(self, shading, light, materials)
         parts = self._radiance(colored, reflectance), self._radiance(white, self._white_reflectance)
         return Node("radiance", _sum_moving if self._is_moving else sum_radiance, *parts, caches=False)

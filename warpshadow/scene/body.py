@@ -17,6 +17,7 @@ from warpshadow.assets.mesh import Mesh, MeshError
 from warpshadow.assets.mesh_files import Material, MeshSource, is_of_trimesh, load_material, load_shape
 from warpshadow.assets.topology import CREASE
 from warpshadow.check import AnyPath
+from warpshadow.scene.material import GLOSS_ARGUMENTS, MATERIAL_FIELDS
 from warpshadow.scene.rotation import rotation_matrix, rotation_vector
 from warpshadow.scene.visibility import AUTO, SELF_SHADOWS, Visibility
 from warpshadow.spheres import Spheres
@@ -28,8 +29,6 @@ COLORS_SUFFIX = ".npy"  # suffixes of files with a color for each vertex; other 
 VALUES_SUFFIX = ".npy"  # suffix of files with a number for each vertex
 
 _SPHERES_SUFFIX = ".npz"
-
-GLOSS_ARGUMENTS = ("roughness", "metallic", "specular")  # arguments of a body that say how it shines
 
 LIKELY_MISTAKES = {"color": "albedo", "colour": "albedo", "position": "translation"}
 """Replacements for likely mistakes in a body's arguments, and keys."""
@@ -206,7 +205,7 @@ class Body:
         )
         is_diffuse = self.shadow_catcher or self.receivers in ("vertex", "adaptive")
         if all(getattr(self, name) is None for name in GLOSS_ARGUMENTS) and not is_diffuse:
-            vars(self).update(roughness=material.roughness, metallic=material.metallic)
+            vars(self).update({item.name: getattr(material, item.name) for item in MATERIAL_FIELDS if item.is_in_files})
 
     def _read_files(self) -> None:
         """Replace paths by the content of their files."""
@@ -254,13 +253,14 @@ class Body:
     def _check_gloss(self) -> None:
         """Convert roughness and the like to float32: [1], [vertex] or [height, width]."""
         count = self.mesh.vertex_count
-        expected = f"a number from 0 to 1, one for each of the {count} vertices, or a texture [height, width]"
-        for name in GLOSS_ARGUMENTS:
+        for name, _, minimum, maximum, _ in MATERIAL_FIELDS:
             value = getattr(self, name)
             if value is None:
                 continue
             if self.roughness is None:
                 raise ValueError(f"{name}: got {check.described(value)} without roughness, expected roughness, too")
+            number = f"a number from {minimum:g} to {maximum:g}"
+            expected = f"{number}, one for each of the {count} vertices, or a texture [height, width]"
             numbers = np.atleast_1d(check.numbers(name, value, expected=expected))
             if numbers.ndim == 2 and numbers.size and self.mesh.uvs is None:
                 raise ValueError(
@@ -269,7 +269,7 @@ class Body:
                 )
             if not numbers.size or (numbers.ndim != 2 and numbers.shape not in ((1,), (count,))):
                 raise ValueError(f"{name}: got shape {numbers.shape}, expected {expected}")
-            check.finite(name, numbers, minimum=0.0, maximum=1.0)
+            check.finite(name, numbers, minimum=minimum, maximum=maximum)
             numbers.setflags(write=False)
             object.__setattr__(self, name, numbers)
         if self.roughness is not None and self.shadow_catcher:

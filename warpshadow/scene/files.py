@@ -14,6 +14,7 @@ from warpshadow import check
 from warpshadow.assets import files
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.camera_conventions import HALF_PIXEL
+from warpshadow.assets.harmonic_light import as_light
 from warpshadow.assets.image import write_image
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.mesh import Mesh
@@ -23,7 +24,8 @@ from warpshadow.assets.sky import synthetic_sky
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
-from warpshadow.scene.body import COLORS_SUFFIX, GLOSS_ARGUMENTS, LIKELY_MISTAKES, VALUES_SUFFIX, Body
+from warpshadow.scene.body import COLORS_SUFFIX, LIKELY_MISTAKES, VALUES_SUFFIX, Body
+from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.scene.scene import SCENE_TYPES, Bounces, Scene, check_bounces, check_supersampling
 from warpshadow.scene.toml_tables import Table
 from warpshadow.scene.visibility import METHODS_OF_SETTING, Visibility
@@ -175,16 +177,10 @@ def _light(table: Table, folder: Path) -> EnvironmentMap | np.ndarray:
 
 def turned_light(light: EnvironmentMap | np.ndarray, rotation: float, scale: float) -> EnvironmentMap | np.ndarray:
     """Light as the keys ``rotation`` [degrees about +y] and ``scale`` make it of a map or of SH coefficients."""
-    if isinstance(light, EnvironmentMap):
-        light = light.rotated(rotation) if rotation else light
-        return light.scaled(scale) if scale != 1 else light
-    if not rotation:
-        return scale * light
-    from scipy.spatial.transform import Rotation
-
-    about_y = Rotation.from_rotvec([0, rotation, 0], degrees=True).as_matrix()
-    turned: np.ndarray = sh.rotation_matrix(sh.order_of("sh", light), about_y) @ light
-    return scale * turned
+    changed = as_light(light)
+    changed = changed.rotated(rotation) if rotation else changed
+    changed = changed.scaled(scale) if scale != 1 else changed
+    return changed if isinstance(changed, EnvironmentMap) else changed.coefficients
 
 
 def _body(table: Table, folder: Path) -> Body:

@@ -14,8 +14,9 @@ import warp as wp
 
 from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.topology import welded
+from warpshadow.maths.adjacency import edges_of
 from warpshadow.scene.body import Body, into_own_space
-from warpshadow.stages.ray_tracing import trace_visibility
+from warpshadow.stages.ray_tracing import trace_visibility_on_host
 
 DEPTH = 1 / 16
 """How far the solid reaches beyond the mesh, over the longest side of its bounds.
@@ -81,12 +82,11 @@ def _meet(mesh: Mesh, other: Mesh, axis: np.ndarray) -> int:
     corners = mesh.positions[mesh.surface.faces]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).cumsum()
     chosen = np.searchsorted(areas, areas[-1] * (np.arange(_POINTS) + 0.5) / _POINTS)
-    points = wp.array(corners[chosen].mean(axis=1)[None], dtype=wp.vec3, device="cpu")
-    horizons = wp.array(np.broadcast_to(axis, (1, _POINTS, 3)), dtype=wp.vec3, device="cpu")
+    horizons = np.broadcast_to(axis, (_POINTS, 3))
     vertices = wp.array(other.positions, dtype=wp.vec3, device="cpu")
     blocker = wp.Mesh(vertices, wp.array(other.faces.ravel(), dtype=wp.int32, device="cpu"))
-    ray = wp.array(axis[None], dtype=wp.vec3, device="cpu")
-    return int((trace_visibility(blocker, points, horizons, ray).numpy() == 0).sum())
+    visibility = trace_visibility_on_host(blocker, corners[chosen].mean(axis=1), horizons, axis[None], "cpu")
+    return int((~visibility).sum())
 
 
 def _closed(mesh: Mesh, axis: np.ndarray) -> Mesh:
@@ -98,7 +98,7 @@ def _closed(mesh: Mesh, axis: np.ndarray) -> Mesh:
     heights = points.astype(np.float64) @ axis
     level = heights.min() - DEPTH * np.ptp(points, axis=0).max()
     bottom = points - np.outer(heights - level, axis)
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = edges_of(faces)
     places, codes = len(points), edges @ [len(points), 1]
     rim = edges[~np.isin(codes, edges @ [1, len(points)])]
     a, b = rim.T

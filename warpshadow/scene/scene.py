@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar
@@ -11,6 +12,7 @@ import numpy.typing as npt
 
 from warpshadow import check
 from warpshadow.assets.camera import Camera
+from warpshadow.assets.harmonic_light import KnownLight, as_light
 from warpshadow.assets.image import ImageError
 from warpshadow.assets.light import LIGHT, EnvironmentMap, check_coefficients
 from warpshadow.check import AnyPath
@@ -153,11 +155,15 @@ class Scene:
             )
 
     def __repr__(self) -> str:
-        light = self.light if isinstance(self.light, EnvironmentMap) else f"{len(self.light)} SH coefficients"
         bounces = f", {self.bounces} bounces" if self.bounces else ""
         bodies = ", ".join(map(repr, self.bodies))
         method = "" if self.visibility.method is None else f", {self.visibility.method!r}"
-        return f"Scene([{bodies}], {light}, {self.camera!r}{method}{bounces})"
+        return f"Scene([{bodies}], {self.known_light}, {self.camera!r}{method}{bounces})"
+
+    @functools.cached_property
+    def known_light(self) -> KnownLight:
+        """The light with its methods, of whichever kind it is."""
+        return as_light(self.light)
 
     def with_method(self) -> Scene:
         """The scene as renderers that are kept have it: "directional" where no method is named."""
@@ -167,11 +173,7 @@ class Scene:
         """The light as the camera sees it where no body is, linear RGB, float32 of shape [height, width, 3]."""
         supersampling = self.supersampling
         _, directions = self.camera.resized(supersampling).rays()
-        if isinstance(self.light, EnvironmentMap):
-            radiance = self.light.towards(directions)
-        else:
-            harmonics = sh.evaluate(sh.order_of("light", self.light), directions.reshape(-1, 3))
-            radiance = np.maximum(harmonics @ self.light, 0).reshape(directions.shape)
+        radiance = self.known_light.towards(directions)
         height, width, _ = directions.shape
         samples = radiance.reshape(height // supersampling, supersampling, width // supersampling, supersampling, 3)
         return samples.mean(axis=(1, 3)).astype(np.float32)

@@ -13,7 +13,7 @@ from warpshadow.spheres.cover import ball_samples
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
 from warpshadow.spheres.occlusion import exact_occlusion
 from warpshadow.spheres.receivers import around
-from warpshadow.stages.ray_tracing import trace_visibility
+from warpshadow.stages.ray_tracing import trace_visibility_on_host
 
 GROUND, SURFACE, NEARBY = 20, 400, 400  # receivers on a side of the ground's grid, on the surface and in the air
 DIRECTIONS = 512  # rays from each of them
@@ -65,7 +65,7 @@ def _errors(mesh: NormalizedMesh, spheres: np.ndarray, points: np.ndarray, norma
     directions = fibonacci(DIRECTIONS)
     array = partial(wp.array, dtype=wp.vec3, device=mesh.device)
     receivers, rays = array(points[None].astype(np.float32)), array(directions.astype(np.float32))
-    visible = trace_visibility(mesh.mesh, receivers, array(normals[None].astype(np.float32)), rays).numpy()[0]
+    visible = trace_visibility_on_host(mesh.mesh, points, normals, directions, mesh.device)
     centers = array(spheres[None, :, :3].astype(np.float32))
     radii = wp.array(spheres[None, :, 3].astype(np.float32), dtype=wp.float32, device=mesh.device)
     transmittance = 1 - exact_occlusion(receivers, rays, centers, radii).numpy()[0]

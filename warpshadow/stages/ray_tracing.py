@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
 import warp as wp
 
 from warpshadow import check
@@ -190,6 +191,15 @@ def trace_visibility(mesh: wp.Mesh | None, points: wp.array, normals: wp.array, 
     inputs = [mesh_id(mesh), points, normals, directions]
     launch(_trace_visibility, (points.size, *directions.shape), inputs=inputs, outputs=[visibility], cost=RAY_COST)
     return visibility
+
+
+def trace_visibility_on_host(
+    mesh: wp.Mesh | None, points: np.ndarray, normals: np.ndarray, directions: np.ndarray, device: wp.DeviceLike
+) -> np.ndarray:
+    """The same for NumPy's arrays of one batch, of shape [vertex, 3] and [direction, 3]: bool [vertex, direction]."""
+    at, facing, towards = (wp.array(values, dtype=wp.vec3, device=device) for values in (points, normals, directions))
+    visibility: np.ndarray = trace_visibility(mesh, at.reshape((1, -1)), facing.reshape((1, -1)), towards).numpy()[0]
+    return visibility.astype(bool)
 
 
 def mesh_id(mesh: wp.Mesh | None) -> wp.uint64:

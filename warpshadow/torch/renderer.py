@@ -1,8 +1,10 @@
 """A renderer of one scene, whose arguments are tensors."""
 
+import inspect
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from types import MappingProxyType
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 import torch
@@ -16,7 +18,7 @@ from warpshadow.device.threads import one_at_a_time
 from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.explain import Explanation
 from warpshadow.pipeline.geometry import GEOMETRY_DTYPES, Geometry
-from warpshadow.scene.body import GLOSS_ARGUMENTS
+from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.scene.scene import BodyLike, PerBody, Scene
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.poses import Poses
@@ -24,6 +26,9 @@ from warpshadow.stages.project import compose_clip_matrices
 from warpshadow.torch.arguments import Arguments, Slot
 from warpshadow.torch.autograd import uncompiled
 from warpshadow.tuning.renderer import Renderer
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 _ELSEWHERE = {
     **dict.fromkeys(
@@ -39,7 +44,16 @@ _ELSEWHERE = {
 }
 """Remedies for keywords that a call does not have."""
 
-REFLECTANCE = ("albedo", "textures", *GLOSS_ARGUMENTS)  # arguments that bodies have, each its own
+
+def _with_gloss(function: Callable[P, T]) -> Callable[P, T]:
+    """Let a method's signature name the arguments that its last, ``gloss``, takes."""
+    signature = inspect.signature(function)
+    *first, gloss = signature.parameters.values()
+    arguments = [gloss.replace(name=name, kind=gloss.KEYWORD_ONLY, default=None) for name in GLOSS_ARGUMENTS]
+    function.__signature__ = signature.replace(parameters=[*first, *arguments])  # type: ignore[attr-defined]
+    types = {name: kind for name, kind in function.__annotations__.items() if name != "gloss"}
+    function.__annotations__ = types | dict.fromkeys(GLOSS_ARGUMENTS, gloss.annotation)
+    return function
 
 
 class LayerTensors(NamedTuple):
@@ -155,6 +169,7 @@ class TorchRenderer(torch.nn.Module):
 
     @uncompiled
     @check.keywords(**_ELSEWHERE)
+    @_with_gloss
     @one_at_a_time
     def forward(
         self,
@@ -164,9 +179,7 @@ class TorchRenderer(torch.nn.Module):
         textures: PerBody[torch.Tensor] | None = None,
         geometry: Geometry[torch.Tensor] | None = None,
         clip_matrices: torch.Tensor | None = None,
-        roughness: PerBody[torch.Tensor] | None = None,
-        metallic: PerBody[torch.Tensor] | None = None,
-        specular: PerBody[torch.Tensor] | None = None,
+        **gloss: PerBody[torch.Tensor] | None,
     ) -> torch.Tensor:
         """Render images.
 
@@ -183,10 +196,10 @@ class TorchRenderer(torch.nn.Module):
                 still.
             clip_matrices: Cameras, [4, 4] or [batch, 4, 4], from :meth:`clip_matrices` or
                 :func:`~warpshadow.torch.clip_matrices_from_opengl`; by default the renderer's own.
-            roughness, metallic, specular: Of bodies that have roughness in the scene, in [0, 1], one number, [] or [1],
-                one for each vertex, [vertex], or either in a batch, [batch, 1 or vertex]; or as images, [height, width]
-                or [batch, height, width], of bodies with uvs: one that is as wide as there are vertices, or 1 wide,
-                needs the batch. A list or a mapping, as albedo.
+            gloss: ``roughness``, ``metallic`` and ``specular`` of bodies that have roughness in the scene, in [0, 1],
+                one number, [] or [1], one for each vertex, [vertex], or either in a batch, [batch, 1 or vertex]; or as
+                images, [height, width] or [batch, height, width], of bodies with uvs: one that is as wide as there are
+                vertices, or 1 wide, needs the batch. A list or a mapping, as albedo.
         Returns:
             Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4], or [batch, height, width, 4]
             where an argument has a batch dimension or the renderer's own cameras have; the background is 0.
@@ -195,7 +208,7 @@ class TorchRenderer(torch.nn.Module):
             others raise NotImplementedError then.
         """
         arguments, inputs = self._checked_inputs(
-            light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular)
+            light, geometry, clip_matrices, {"albedo": albedo, "textures": textures, **gloss}
         )
 
         def draw(inputs: dict[str, Any]) -> wp.array:
@@ -231,6 +244,8 @@ class TorchRenderer(torch.nn.Module):
         return LayerTensors(depth, normals, bodies, masks.movedim(-1, -3))
 
     @uncompiled
+    @check.keywords(**_ELSEWHERE)
+    @_with_gloss
     @one_at_a_time
     def insert(
         self,
@@ -241,16 +256,14 @@ class TorchRenderer(torch.nn.Module):
         textures: PerBody[torch.Tensor] | None = None,
         geometry: Geometry[torch.Tensor] | None = None,
         clip_matrices: torch.Tensor | None = None,
-        roughness: PerBody[torch.Tensor] | None = None,
-        metallic: PerBody[torch.Tensor] | None = None,
-        specular: PerBody[torch.Tensor] | None = None,
+        **gloss: PerBody[torch.Tensor] | None,
     ) -> torch.Tensor:
         """Render the bodies in a photograph whose surfaces the scene's shadow catchers model.
 
         Args:
             photograph: Linear RGB, of radiance in the units of the light, of the size of the cameras' images,
                 [height, width, 3] or [batch, height, width, 3].
-            light, albedo, textures, geometry, clip_matrices, roughness, metallic, specular: As for :meth:`forward`.
+            light, albedo, textures, geometry, clip_matrices, gloss: As for :meth:`forward`.
         Returns:
             Linear RGB, [height, width, 3] or [batch, height, width, 3]; see :mod:`warpshadow.stages.photograph`.
         Raises:
@@ -258,7 +271,7 @@ class TorchRenderer(torch.nn.Module):
         Differentiable: all, as :meth:`forward` is; both the light with and that without the other bodies are.
         """
         arguments, inputs = self._checked_inputs(
-            light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular)
+            light, geometry, clip_matrices, {"albedo": albedo, "textures": textures, **gloss}
         )
         camera = self.cameras[0]
         size = camera.height, camera.width
@@ -266,6 +279,8 @@ class TorchRenderer(torch.nn.Module):
         return arguments.apply(lambda inputs: self.warp.insert(**inputs), inputs)
 
     @uncompiled
+    @check.keywords(**_ELSEWHERE)
+    @_with_gloss
     @one_at_a_time
     def explain(
         self,
@@ -275,13 +290,11 @@ class TorchRenderer(torch.nn.Module):
         textures: PerBody[torch.Tensor] | None = None,
         geometry: Geometry[torch.Tensor] | None = None,
         clip_matrices: torch.Tensor | None = None,
-        roughness: PerBody[torch.Tensor] | None = None,
-        metallic: PerBody[torch.Tensor] | None = None,
-        specular: PerBody[torch.Tensor] | None = None,
+        **gloss: PerBody[torch.Tensor] | None,
     ) -> Explanation:
         """List the stages that a call with the same arguments computes and skips, as :meth:`Renderer.explain` does."""
         arguments, inputs = self._checked_inputs(
-            light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular)
+            light, geometry, clip_matrices, {"albedo": albedo, "textures": textures, **gloss}
         )
         return self.warp.explain(**arguments.filled(inputs))
 
@@ -290,13 +303,13 @@ class TorchRenderer(torch.nn.Module):
         light: torch.Tensor | EnvironmentMap | None = None,
         geometry: Geometry[torch.Tensor] | None = None,
         clip_matrices: torch.Tensor | None = None,
-        of_bodies: Sequence[PerBody[torch.Tensor] | None] = (),
+        of_bodies: Mapping[str, PerBody[torch.Tensor] | None] = MappingProxyType({}),
     ) -> tuple[Arguments, dict[str, Any]]:
         """The tensors among the arguments of a call, checked, and the inputs of the renderer of arrays.
 
         Args:
             light, geometry, clip_matrices: Of the call.
-            of_bodies: Of the call, in the order of REFLECTANCE.
+            of_bodies: Reflectance of the call, by name.
         """
         has_cameras = self.warp.has_camera_batch and clip_matrices is None
         arguments = Arguments(self.device, cameras=self.cameras if has_cameras else None)
@@ -315,7 +328,7 @@ class TorchRenderer(torch.nn.Module):
             inputs["geometry"] = arguments.add_geometry("geometry", geometry, self.warp.rest())
         if clip_matrices is not None:
             inputs["clip_matrices"] = arguments.add("clip_matrices", clip_matrices, wp.mat44, ())
-        for name, values in zip(REFLECTANCE, of_bodies, strict=False):
+        for name, values in of_bodies.items():
             slots: list[Slot | None] = [None] * len(self.scene.bodies)
             for number, tensor in enumerate(self.scene.per_body(values, name)):
                 if tensor is not None:

@@ -12,7 +12,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.image import ImageError, read_rgb
 from warpshadow.check import AnyPath
 from warpshadow.device.tape import unrecorded
-from warpshadow.pipeline.choice_of_receivers import for_picture
+from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
 from warpshadow.scene.scene import SCENE_TYPES, Scene
 from warpshadow.tuning.renderer import Renderer
 

@@ -9,7 +9,7 @@ from warpshadow import check
 from warpshadow.assets.basis import Basis, check_basis
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline import renderer
-from warpshadow.pipeline.choice_of_receivers import for_picture
+from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
 from warpshadow.scene.scene import SCENE_TYPES, Scene
 from warpshadow.tuning import tune
 
@@ -50,7 +50,7 @@ def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = True
     """Render a scene once; for several images of it, keep a :class:`Renderer`.
 
     Where the scene names no method, and no settings or spheres that "directional" alone reads, this is by rays that all
-    pixels share (:func:`warpshadow.pipeline.choice_of_receivers.for_picture`): nothing is fitted or tabulated first,
+    pixels share (:func:`.receivers.choice_of_receivers.for_picture`): nothing is fitted or tabulated first,
     and the image does not depend on the content of the cache. Light that bounces goes between patches, by rays, too. A
     :class:`Renderer` is by "directional" then, and its images differ from this by that method's error, of which
     pipeline/README.md has figures. A method that is named gives the same method in both: ``Visibility("directional")``,

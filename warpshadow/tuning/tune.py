@@ -13,7 +13,7 @@ import warnings
 import weakref
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -385,7 +385,7 @@ def _by_work(scene: Scene, sample: PointSample) -> Iterator[Scene]:
 
 
 def _all_directions(scene: Scene) -> Iterator[Scene]:
-    return (replace(scene, visibility=visibility) for visibility in _directional(scene.visibility))
+    return (replace(scene, visibility=visibility) for visibility in _variants(scene.visibility, "directional"))
 
 
 # ---------------------------------------------------------------------------------------------- settings
@@ -398,8 +398,9 @@ def _settings(scene: Scene, fine: Sequence[str], fits: bool, device: wp.DeviceLi
         if not scene.bounces:
             yield replace(scene_with_receivers, visibility=scene.visibility.by("none"))
         for variant in _sphere_variants(scene_with_receivers, fits, device):
-            for visibility in (*_directional(scene.visibility), *_harmonic(scene.visibility)):
-                yield replace(variant, visibility=visibility)
+            for method in SPHERE_METHODS:
+                for visibility in _variants(scene.visibility, method):
+                    yield replace(variant, visibility=visibility)
 
 
 def _sphere_variants(scene: Scene, fits: bool, device: wp.DeviceLike) -> Iterator[Scene]:
@@ -413,13 +414,10 @@ def _sphere_variants(scene: Scene, fits: bool, device: wp.DeviceLike) -> Iterato
             yield change_bodies(scene, "blockers", dict.fromkeys(fitted, count))
 
 
-def _directional(visibility: Visibility) -> Iterator[Visibility]:
-    """Numbers of directions that the softness allows."""
-    for count in DIRECTION_COUNTS:
+def _variants(visibility: Visibility, method: str) -> Iterator[Visibility]:
+    """A method with all values that are tried of the settings that tuning varies, as far as its others allow them."""
+    candidates: dict[str, Sequence[Any]] = {"directions": DIRECTION_COUNTS, "log": LOGS, "order": ORDERS}
+    names = METHOD_TRAITS[method].tuned
+    for values in itertools.product(*(candidates[name] for name in names)):
         with contextlib.suppress(ValueError):
-            yield replace(visibility.by("directional"), directions=count)
-
-
-def _harmonic(visibility: Visibility) -> Iterator[Visibility]:
-    for log, permutation in itertools.product(LOGS, ORDERS):
-        yield replace(visibility.by("log-sh"), log=log, order=permutation)
+            yield replace(visibility.by(method), **dict(zip(names, values, strict=True)))

@@ -6,7 +6,7 @@ import warp as wp
 
 from warpshadow.device.parallel import thread_count
 from warpshadow.device.progress import show_time
-from warpshadow.pipeline.choice_of_receivers import for_picture
+from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
 from warpshadow.scene.blockers import fitted_meshes
 from warpshadow.scene.scene import Scene
 from warpshadow.scene.visibility import SHARED_DIRECTIONS

@@ -17,8 +17,8 @@ from warpshadow.assets.camera import Camera, framed_points
 from warpshadow.assets.color import auto_exposure, linear_to_srgb
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.threads import one_at_a_time
-from warpshadow.pipeline.choice_of_receivers import for_picture
 from warpshadow.pipeline.geometry import Geometry
+from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
 from warpshadow.pipeline.self_visibility import SelfVisibility
 from warpshadow.pipeline.view import View
 from warpshadow.scene.scene import Scene

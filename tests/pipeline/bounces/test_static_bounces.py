@@ -10,9 +10,9 @@ import trimesh
 import warp as wp
 
 import warpshadow as ws
-from warpshadow.pipeline import rays
 from warpshadow.pipeline.bounces import static_bounces
 from warpshadow.pipeline.bounces.patches import ScenePatches
+from warpshadow.pipeline.methods import ray_traced as rays
 from warpshadow.stages.bounces.irradiance_cache import choose_cache_points, interpolation_matrix
 from warpshadow.torch import TorchRenderer
 

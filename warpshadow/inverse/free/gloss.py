@@ -13,7 +13,7 @@ from warpshadow import check
 from warpshadow.inverse.free.base import FreeOfBody, Values
 from warpshadow.inverse.free.reflectance import check_uvs, checked_size, resized, variation
 from warpshadow.inverse.world import FittedScene, Setting, World
-from warpshadow.pipeline.reflectance import GLOSS_DEFAULTS
+from warpshadow.scene.material import GLOSS_DEFAULTS
 from warpshadow.scene.scene import Scene
 from warpshadow.stages.gloss.lobes import MIN_ROUGHNESS
 

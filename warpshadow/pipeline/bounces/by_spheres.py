@@ -35,10 +35,11 @@ from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.bounces.static_bounces import StaticBounces
 from warpshadow.pipeline.by_spheres import PortionedShading, SphereMethod
-from warpshadow.pipeline.groups import Group
-from warpshadow.pipeline.lighting import LitPoints, joined, receiver_text
-from warpshadow.pipeline.node import Call, Input, Node
+from warpshadow.pipeline.node import Call, Input, Node, NodeStage
+from warpshadow.pipeline.receivers.groups import Group
+from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
+from warpshadow.pipeline.transfers import joined
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.openness import Openness, find_openness, open_shares
 from warpshadow.stages.bounces.radiosity import patch_radiosity
@@ -93,7 +94,7 @@ class PortionedDirectLight(Node):
         item_text: Number of receivers, in words.
         where: Put after the name of its stage.
         others: More that it depends on.
-        extra_inputs: As for :class:`Node`.
+        stages: Further ones, as for :class:`Node`.
     """
 
     def __init__(
@@ -103,18 +104,12 @@ class PortionedDirectLight(Node):
         item_text: str | Callable[[], str],
         where: str = "",
         others: tuple[Node, ...] = (),
-        extra_inputs: tuple[Node, ...] = (),
+        stages: tuple[NodeStage, ...] = (),
     ):
         self._visibilities = visibility
-        self._shade = Node(
-            f"shading{where}",
-            visibility.method.shade_transfer,
-            visibility,
-            projected_light,
-            items=item_text,
-            caches=False,
-        )
-        super().__init__("", None, projected_light, *others, extra_inputs=(visibility, self._shade, *extra_inputs))
+        self._shading = NodeStage(f"shading{where}", item_text, inputs=(visibility, projected_light))
+        stages = self._shading, *stages
+        super().__init__("", None, projected_light, *others, extra_inputs=(visibility,), stages=stages)
 
     def compute(self, call: Call) -> Any:
         """Light all portions."""
@@ -122,9 +117,9 @@ class PortionedDirectLight(Node):
         return [self._light(call, portion, projected_light) for portion in self._visibilities.value(call)]
 
     def _light(self, call: Call, portion: PortionVisibility, projected_light: Any) -> PortionDirectLight:
-        return PortionDirectLight(
-            self._shade.run(call, portion.transfer, portion.group, projected_light), portion.group, portion.cells
-        )
+        with self.timed(call, self._shading):
+            direct = self._visibilities.method.shade_transfer(portion.transfer, portion.group, projected_light)
+        return PortionDirectLight(direct, portion.group, portion.cells)
 
 
 def _openness(senders: Senders, visibility: list[PortionVisibility]) -> Openness:
@@ -165,12 +160,10 @@ class Radiosity(Node):
         senders = proxies.senders
         item_text = f"{len(senders.areas):,} patches"
         idle = ALL_FLAT if all(senders.merged_scene.is_flat[body] for body in senders.bodies) else ""
-        self._reflect = Node("radiosity", patch_radiosity, albedo, lit, items=item_text, caches=False)
-        self._reflect_self = Node(
-            "self light of patches", patch_radiosity, albedo, lit, items=item_text, idle=idle, caches=False
-        )
-        extra_inputs = self._reflect, self._reflect_self, *gathering.stages
-        super().__init__("", None, lit, albedo, projected_patches, frames, openness, extra_inputs=extra_inputs)
+        self._reflection = NodeStage("radiosity", item_text)
+        self._self_reflection = NodeStage("self light of patches", item_text, idle)
+        stages = self._reflection, self._self_reflection, *gathering.stages
+        super().__init__("", None, lit, albedo, projected_patches, frames, openness, stages=stages)
 
     def compute(self, call: Call) -> OutgoingRadiance:
         """Reflect direct light, then light that has bounced once, and so on; more often between patches of one body."""
@@ -178,7 +171,7 @@ class Radiosity(Node):
         senders, count = self._proxies.senders, self._count
         between = (
             None
-            if self._reflect_self.idle
+            if self._self_reflection.idle
             else self._self_form_factors.between_patches(senders, [portion.group for portion in lit])
         )
 
@@ -192,12 +185,15 @@ class Radiosity(Node):
             else:
                 outgoing = sent(radiosity)
                 portions = [self._light(call, portion, outgoing) for portion in lit]
-            return self._reflect.run(call, albedo, joined(portions), senders.mean, openness.shares)
+            with self.timed(call, self._reflection):
+                return patch_radiosity(albedo, joined(portions), senders.mean, openness.shares)
 
         def add_radiosity_by_self(by_others: wp.array, radiosity: wp.array | None) -> wp.array:
             if between is None or radiosity is None:
                 return by_others
-            return total_light([by_others, self._reflect_self.run(call, albedo, radiosity, between)])
+            with self.timed(call, self._self_reflection):
+                by_self = patch_radiosity(albedo, radiosity, between)
+            return total_light([by_others, by_self])
 
         self_bounces = 0 if between is None else SELF_BOUNCES
         return sent(
@@ -206,7 +202,8 @@ class Radiosity(Node):
 
     def _light(self, call: Call, portion: PortionDirectLight, outgoing: OutgoingRadiance) -> wp.array:
         """Light of a portion of the patch samples past its own body, from the sky and from others."""
-        return total_light([portion.direct, *self._gathering.run(call, portion.group, portion.cells, outgoing)])
+        bounced = self._gathering.lights(self, call, portion.group, portion.cells, outgoing)
+        return total_light([portion.direct, *bounced])
 
 
 class BouncedShading(PortionedDirectLight):
@@ -229,7 +226,7 @@ class BouncedShading(PortionedDirectLight):
         gathering: Gathering,
     ):
         self._gathering = gathering
-        super().__init__(visibility, projected_light, item_text, others=(radiosity,), extra_inputs=gathering.stages)
+        super().__init__(visibility, projected_light, item_text, others=(radiosity,), stages=gathering.stages)
 
     def compute(self, call: Call) -> wp.array:
         """Light all portions, directly and by the patches' radiosity."""
@@ -240,7 +237,8 @@ class BouncedShading(PortionedDirectLight):
         )
 
     def _bounced(self, call: Call, portion: PortionDirectLight, outgoing: OutgoingRadiance) -> wp.array:
-        return total_light([portion.direct, *self._gathering.run(call, portion.group, portion.cells, outgoing)])
+        bounced = self._gathering.lights(self, call, portion.group, portion.cells, outgoing)
+        return total_light([portion.direct, *bounced])
 
 
 class SphereBounces:
@@ -288,8 +286,8 @@ class SphereBounces:
         """Shading of points, given the projected light and the inputs of their visibility."""
         method, senders = self._method, self._patches.senders(materials)
         if not senders.bodies:
-            idle = Node("bounces", None, idle="every body is black")
-            return PortionedShading(method, points, projected_light, light, joined, extra_inputs=(idle,))
+            idle = NodeStage("bounces", idle="every body is black")
+            return PortionedShading(method, points, projected_light, light, joined, stages=(idle,))
         proxies = self._proxies.setdefault(senders, Proxies(senders, method.visibility.merging))
         make_visibility = functools.partial(
             PortionedVisibility, method, projected_light=visibility_light, light=light, finish=list, is_shaded=False
@@ -301,7 +299,7 @@ class SphereBounces:
         )
         radiosity = self._radiosity(of_patch_samples, projected_light, proxies, materials)
         item_text = functools.partial(receiver_text, points)
-        at_points = self._gathering(senders, (points.receivers_node, radiosity), item_text)
+        at_points = self._gathering(senders, item_text)
         return BouncedShading(visibility, projected_light, item_text, radiosity, at_points)
 
     def _patch_samples(
@@ -333,9 +331,8 @@ class SphereBounces:
             patch_samples.visibility, projected_light, _patch_sample_text(senders), _OF_PATCH_SAMPLES
         )
         albedo = self._patches.albedo(materials, senders.bodies)
-        arguments = lit, albedo, patch_samples.frames
         among_senders = self._gathering(
-            senders, arguments, _patch_sample_text(senders), _OF_PATCH_SAMPLES, why_not, only_others=True
+            senders, _patch_sample_text(senders), _OF_PATCH_SAMPLES, why_not, only_others=True
         )
         return Radiosity(self._count, proxies, self._self_form_factors, among_senders, lit, albedo, patch_samples)
 
@@ -373,13 +370,13 @@ class SphereBounces:
 
     @functools.cached_property
     def _static_bounces(self) -> StaticBounces:
-        return StaticBounces(self._patches, self._count, progress=self._method.progress)
+        return StaticBounces(self._patches, self._count, self._method.openness, progress=self._method.progress)
 
     def _at(
         self, patch_samples: Node, points: LitPoints, materials: Materials, blocker_of_point: np.ndarray | None = None
     ) -> LitPoints:
         """Make lit points of patch samples, among the same bodies as other points."""
-        arguments = self._method, materials, points.vertices, points.spheres, patch_samples, points.call
+        arguments = self._method.merged_scene, materials, points.vertices, points.spheres, patch_samples, points.call
         return LitPoints(
             *arguments, normals=points.normals, blocker_kinds=points.blocker_kinds, blocker_of_point=blocker_of_point
         )

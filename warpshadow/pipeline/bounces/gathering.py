@@ -20,10 +20,9 @@ from warpshadow.pipeline.bounces.covered import find_overlays
 from warpshadow.pipeline.bounces.patches import Senders
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.by_spheres import SphereMethod
-from warpshadow.pipeline.directional import ProjectedCells
-from warpshadow.pipeline.groups import Group, GroupVisibility, nonplanar_bodies
-from warpshadow.pipeline.lighting import joined
-from warpshadow.pipeline.node import Call, Input, Node
+from warpshadow.pipeline.node import Call, Node, NodeStage
+from warpshadow.pipeline.receivers.groups import Group, GroupVisibility, nonplanar_bodies
+from warpshadow.pipeline.transfers import joined
 from warpshadow.scene.visibility import Visibility
 from warpshadow.stages.bounces.overlays import overlaid_radiosity
 from warpshadow.stages.bounces.plane_light import plane_light
@@ -75,7 +74,7 @@ def find_cell_transmittance(
         spheres: Centers and radii of all spheres.
     """
     merged_scene = method.merged_scene
-    if isinstance(projected_light, ProjectedCells):
+    if method.sees_cells:
         directions, transmittance_self = projected_light.directions, visibility.transmittance_self
         transmittance_spheres = (
             visibility.transmittance_total
@@ -307,13 +306,12 @@ class Gathering:
         visibility: How spheres block light.
         senders: The bodies whose patches send light.
         self_form_factors: Form factors of bodies for themselves.
-        arguments: Nodes that radiosity, receivers and spheres depend on.
         item_text: Number of receivers, in words.
         where: Put after the names of its stages.
         why_not: Why nobody asks for it, in words; empty if somebody does.
         only_others: Leave out light from a body to itself.
     Attributes:
-        stages: Nodes of its parts.
+        stages: Its parts.
     """
 
     def __init__(
@@ -321,7 +319,6 @@ class Gathering:
         visibility: Visibility,
         senders: Senders,
         self_form_factors: SelfFormFactors,
-        arguments: tuple[Node | Input, ...],
         item_text: str | Callable[[], str],
         where: str = "",
         why_not: str = "",
@@ -335,18 +332,27 @@ class Gathering:
             "" if len(nonplanar_bodies) < len(senders.bodies) else "nothing flat reflects",
             "" if any(sphere_counts[body] for body in nonplanar_bodies) else "nothing that reflects has spheres",
         )
-        functions = self._from_itself, self._from_planes, self._from_spheres
         names = "self light", "plane light", "sphere light"
         stages = tuple(
-            Node(f"{name}{where}", function, *arguments, items=item_text, idle=why_not or why, caches=False)
-            for name, function, why in zip(names, functions, idle, strict=True)
+            NodeStage(f"{name}{where}", item_text, why_not or why) for name, why in zip(names, idle, strict=True)
         )
-        self.stages = stages[1:] if only_others else stages
+        functions = self._from_itself, self._from_planes, self._from_spheres
+        first = 1 if only_others else 0
+        self.stages, self._functions = stages[first:], functions[first:]
 
-    def run(self, call: Call, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> list[wp.array]:
-        """Bounced light of a group by each path: planes, spheres, its own body; vec3 of shape [batch, receiver]."""
-        lights = [node.run(call, group, cells, outgoing) for node in self.stages if not node.idle]
-        return [light for light in lights if light is not None]
+    def lights(
+        self, node: Node, call: Call, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance
+    ) -> list[wp.array]:
+        """Bounced light of a group by each path: planes, spheres, its own body; vec3 of shape [batch, receiver].
+
+        ``node`` has the stages.
+        """
+        result = []
+        for stage, function in zip(self.stages, self._functions, strict=True):
+            if not stage.idle:
+                with node.timed(call, stage):
+                    result.append(function(group, cells, outgoing))
+        return [light for light in result if light is not None]
 
     def _from_itself(self, group: Group, _: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
         if group.body not in outgoing.senders.bodies or self._is_flat[group.body]:

@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import warp as wp
 
+from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.device.batch import common_batch
 from warpshadow.device.memory import empty
-from warpshadow.pipeline.lighting import KnownLight, LitPoints, map_of, receiver_text
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node
+from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.light_samples import sample_map
@@ -48,13 +49,13 @@ def path_traced(
         casting: list[wp.Mesh | None],
         positions: wp.array,
         normals: wp.array,
-        radiance: KnownLight,
+        known_light: KnownLight,
         vertex_albedo: wp.array,
         textures: Textures | None,
     ) -> wp.array:
         texels = None if textures is None else textures.texels
         count = common_batch({"geometry": shading, "albedo": vertex_albedo, "textures": texels})
-        drawn = sample_map(map_of(radiance), _LIGHT_SAMPLES, seed=1)
+        drawn = sample_map(known_light.radiance, _LIGHT_SAMPLES, seed=1)
         bounced = empty((count, *shading.shape[1:]), dtype=wp.vec3, device=shading.device)
 
         def of_instance(array: wp.array) -> wp.array:

@@ -28,8 +28,8 @@ import warp as wp
 
 from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
-from warpshadow.pipeline.lighting import LitPoints, receiver_text
 from warpshadow.pipeline.node import Input, Node
+from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.colored import ColoredTransfer, colored_light
@@ -88,11 +88,21 @@ class StaticBounces:
     Args:
         patches: Of the scene.
         bounces: How often, 1 or more; "all" until nothing is left.
+        openness: Node of the light of points under an even sky, :meth:`.Method.openness`.
         rays: Of a cache point or patch sample.
     """
 
-    def __init__(self, patches: ScenePatches, bounces: Bounces, *, rays: int = RAYS, progress: bool = False):
+    def __init__(
+        self,
+        patches: ScenePatches,
+        bounces: Bounces,
+        openness: Callable[[LitPoints], Node | None],
+        *,
+        rays: int = RAYS,
+        progress: bool = False,
+    ):
         self._patches, self._progress, self._bounces, self._rays = patches, progress, bounces, rays
+        self._openness = openness
 
     def patch_samples(self, points: LitPoints, materials: Materials) -> Node:
         """Node of the points of patches that are lit, of one instance."""
@@ -256,9 +266,9 @@ class StaticBounces:
 
         def make() -> Node:
             patch_samples = self.patch_samples(points, materials)
-            arguments = points.method, materials, points.vertices, points.spheres, patch_samples, points.call
+            arguments = points.merged_scene, materials, points.vertices, points.spheres, patch_samples, points.call
             at_patch_samples = LitPoints(*arguments, normals=points.normals, blocker_kinds=points.blocker_kinds)
-            skies = [points.method.openness(item) for item in (at_patch_samples, points)]
+            skies = [self._openness(item) for item in (at_patch_samples, points)]
             return Node(
                 "form factors",
                 find,

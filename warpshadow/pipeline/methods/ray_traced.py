@@ -8,9 +8,11 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import Basis, HarmonicBasis
-from warpshadow.pipeline.lighting import KnownLight, LitPoints, Method, map_of, receiver_text
+from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.node import Input, Node, detached
+from warpshadow.pipeline.method import Method
+from warpshadow.pipeline.node import Input, Node, NodeStage, detached
+from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.gloss.reflection import blocked_radiance
 from warpshadow.stages.gloss.traced import trace_lobes
@@ -55,7 +57,7 @@ class Rays(Method):
                 points.receivers_node,
                 light,
                 items=lambda: receiver_text(points),
-                extra_inputs=(Node("transfer", None, idle="rays shade known light at once"),),
+                stages=(NodeStage("transfer", idle="rays shade known light at once"),),
             )
 
         if not self.merged_scene.scene.bounces:
@@ -93,7 +95,7 @@ class Rays(Method):
         from warpshadow.pipeline.bounces.patches import ScenePatches
         from warpshadow.pipeline.bounces.static_bounces import RAYS, STILL_RAYS, StaticBounces
 
-        arguments = ScenePatches(self.merged_scene), self.merged_scene.scene.bounces
+        arguments = ScenePatches(self.merged_scene), self.merged_scene.scene.bounces, self.openness
         rays = STILL_RAYS if self.shares_directions else RAYS
         return StaticBounces(*arguments, rays=rays, progress=self.progress)
 
@@ -155,7 +157,6 @@ class Rays(Method):
 
     def _meshes(self, points: LitPoints) -> Node:
         """Node of the meshes that rays meet."""
-        alike = "rays treat all receivers alike"
         return Node(
             "visibility",
             self._casting_meshes,
@@ -164,7 +165,7 @@ class Rays(Method):
             items=lambda: f"{receiver_text(points)} by rays",
             idle="" if self.merged_scene.casting else "no body has blockers",
             caches=False,
-            extra_inputs=(Node("static shadows", None, idle=alike),),
+            stages=(NodeStage("static shadows", idle="rays treat all receivers alike"),),
         )
 
     def _meshes_for(self, points: LitPoints, receivers: Node) -> Node:
@@ -184,7 +185,7 @@ class Rays(Method):
 
     def _shade(self, meshes: Meshes, receivers: Receivers, light: KnownLight) -> wp.array:
         points, normals = _checked_points(receivers.points), receivers.normals
-        samples = sample_map(map_of(light), self._sample_count)
+        samples = sample_map(light.radiance, self._sample_count)
         traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
         for instance, mesh in enumerate(meshes):
             lit = trace_shading(mesh, points[instance], normals[instance], samples, progress=self.progress)
@@ -201,7 +202,7 @@ class Rays(Method):
             lit_points = tree, points[instance], normals[instance]
             # a ratio image has the same directions with the bodies and without
             pilots = None if self.merged_scene.scene.catchers else functools.partial(find_shares, *lit_points)
-            samples = cut_map(map_of(light), count, pilots)
+            samples = cut_map(light.radiance, count, pilots)
             corners = None
             if receivers.fragments.face_ids.ndim == 3:  # of an image
                 corners = find_corners(receivers, instance, self.merged_scene.scene.supersampling)
@@ -256,3 +257,6 @@ def _checked_points(points: wp.array) -> wp.array:
 
 def _refuse(*_: object) -> None:
     raise ValueError("light: got free light for moving geometry, which rays cannot shade; expected known light")
+
+
+METHOD = Rays

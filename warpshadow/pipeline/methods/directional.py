@@ -10,25 +10,17 @@ import warp as wp
 from warpshadow.assets.basis import Basis, CellBasis
 from warpshadow.assets.cells import draw_in_cells, gather_cells, without_spots
 from warpshadow.assets.color import LUMINANCE
-from warpshadow.assets.harmonic_light import as_light
+from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.pipeline.by_spheres import PortionedShading, SphereMethod
-from warpshadow.pipeline.groups import CellCoverages, Group, GroupVisibility
-from warpshadow.pipeline.lighting import (
-    LARGEST_COEFFICIENT,
-    BlockerKinds,
-    KnownLight,
-    LitPoints,
-    change_basis,
-    joined,
-    map_of,
-    receiver_text,
-)
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Call, Input, Node
+from warpshadow.pipeline.receivers.groups import CellCoverages, Group, GroupVisibility
+from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
+from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.self_visibility import SelfVisibilityLookup
-from warpshadow.pipeline.static import StaticBodies, VertexRows
+from warpshadow.pipeline.transfers import LARGEST_COEFFICIENT, change_basis, joined
 from warpshadow.scene.blockers import blocking_planes
 from warpshadow.stages.cached_cells import CachedRows, cell_transfer, shade_cached_cells
 from warpshadow.stages.gloss.reflection import blocked_radiance
@@ -91,6 +83,7 @@ class Directional(SphereMethod):
     """Visibility for each cell of directions by itself."""
 
     traces_self_visibility = True
+    sees_cells = True
     shades_transmittance = True
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
@@ -100,19 +93,18 @@ class Directional(SphereMethod):
 
     def project_light(self, light: KnownLight) -> ProjectedCells:
         """Cells that look to where their light comes from: a sun is rarely in the middle of one."""
-        known = as_light(light)
-        cells = known.cells(self._directions)
+        cells = light.cells(self._directions)
         if cells.spots is None or cells.half_angles is None:
             return ProjectedCells(cells.directions, self._on_device(cells.radiance), cells.directions)
         power, softness = cells.radiance @ LUMINANCE, self.visibility.softness
         find = functools.partial(find_sharp_cells, power, cells.spots, cells.half_angles, softness)
-        draw = functools.partial(draw_in_cells, known.radiance, self._directions)
+        draw = functools.partial(draw_in_cells, light.radiance, self._directions)
         sun = find_sun_cells(power, draw) if self.self_visibility.wants_rays else None
         sharp_cells = find(), find(MAX_RADIUS_PAST_PLANES)
-        rest, rest_light, directions, spot_shares = known.radiance, cells, cells.directions, np.ones(len(power))
+        rest, rest_light, directions, spot_shares = light.radiance, cells, cells.directions, np.ones(len(power))
         if sharp_cells[0] is not None and sharp_cells[1] is not None:
             is_sharp = (sharp_cells[0].slots >= 0) & (sharp_cells[1].slots >= 0)
-            rest = without_spots(known.radiance, cells.spots[is_sharp], _NEAR_SPOT * cells.half_angles[is_sharp])
+            rest = without_spots(light.radiance, cells.spots[is_sharp], _NEAR_SPOT * cells.half_angles[is_sharp])
             rest_light = gather_cells(rest, self._directions)
             directions = np.where(is_sharp[:, None], rest_light.directions, directions)
             spot_shares[is_sharp] = 1 - (rest_light.radiance @ LUMINANCE)[is_sharp] / power[is_sharp]
@@ -417,7 +409,7 @@ class Directional(SphereMethod):
 
     @functools.cached_property
     def _lit_samples(self) -> CellSamples:
-        samples = sample_map(map_of(self.light.value()), self.visibility.ray_count)
+        samples = sample_map(self.light.value().radiance, self.visibility.ray_count)
         return cell_samples(samples, self._directions, device=self.merged_scene.device)
 
     @functools.cached_property
@@ -455,3 +447,6 @@ def _joined_cells(cells: list[wp.array], count: int) -> wp.array:
 def _has_light(cached: CachedRows) -> bool:
     """Whether cached cells have known light, in three channels."""
     return cached.rows.shape[1] == 3
+
+
+METHOD = Directional

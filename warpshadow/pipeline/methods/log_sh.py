@@ -7,16 +7,16 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import Basis, HarmonicBasis
-from warpshadow.assets.harmonic_light import as_light
+from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.device.batch import expand_rows
 from warpshadow.device.memory import zeros
 from warpshadow.pipeline.by_spheres import SphereMethod
-from warpshadow.pipeline.groups import Group, GroupVisibility
-from warpshadow.pipeline.lighting import BlockerKinds, KnownLight
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input
+from warpshadow.pipeline.receivers.groups import Group, GroupVisibility
+from warpshadow.pipeline.receivers.lit_points import BlockerKinds
+from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.self_visibility import SelfVisibilityLobes
-from warpshadow.pipeline.static import StaticBodies, VertexRows
 from warpshadow.stages.cached_cells import add_rows
 from warpshadow.stages.self_visibility.lobes import self_visibility_lobes
 from warpshadow.stages.transfer import sh_product, sh_transfer
@@ -31,9 +31,10 @@ class ProjectedBands(NamedTuple):
 
 
 class LogSH(SphereMethod):
-    """Visibility of low frequencies. Where no body has spheres there are no shadows: so is the method "none"."""
+    """Visibility of low frequencies. Where no body has spheres there are no shadows."""
 
     joins_cached = True
+    traces_self_visibility = True
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
         self._order = order = merged_scene.scene.visibility.order
@@ -41,14 +42,11 @@ class LogSH(SphereMethod):
         self.free_projection = ProjectedBands(
             min(order, self.basis.order) if isinstance(self.basis, HarmonicBasis) else order
         )
-        self.traces_self_visibility = self.visibility.method == "log-sh"
-        if not self.traces_self_visibility:
-            self.why_no_shadows = "the method is to have no shadows"
 
     def project_light(self, light: KnownLight) -> ProjectedBands:
         """The bands that the light has."""
-        count = as_light(light).bands(self._order)
-        coefficients = self.native_basis.coefficients(light)[None, : count**2]
+        count = light.bands(self._order)
+        coefficients = light.sh(self._order)[None, : count**2]
         return ProjectedBands(count, wp.array(coefficients, dtype=wp.vec3, device=self.merged_scene.device))
 
     def coefficient_count(self, light: Input | None) -> int:
@@ -56,7 +54,7 @@ class LogSH(SphereMethod):
         known = None if light is None else light.value()
         if known is None or isinstance(known, wp.array):
             return self.free_projection.bands**2
-        return as_light(known).bands(self._order) ** 2
+        return known.bands(self._order) ** 2
 
     def self_lookups(
         self, bodies: tuple[int, ...], rotations: wp.array, projected_light: ProjectedBands
@@ -155,3 +153,6 @@ class LogSH(SphereMethod):
         log, merging = self.visibility.log, self.visibility.merging
         arguments = points, normals, centers, radii
         return log_sh.accumulate(*arguments, order=self._order, log=log, merging=merging, **options)
+
+
+METHOD = LogSH

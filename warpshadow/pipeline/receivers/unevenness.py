@@ -12,12 +12,11 @@ import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.color import LUMINANCE
-from warpshadow.assets.harmonic_light import HarmonicLight
-from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.ray_tracing import trace_visibility
+from warpshadow.stages.ray_tracing import trace_visibility_on_host
 
 _CELLS = 128  # of directions; the default of "directional", which has them already
 _RAYS = 64  # from a point, to cells by their light
@@ -29,7 +28,7 @@ def light_unevenness(
     positions: np.ndarray,
     images: Sequence[tuple[Camera, np.ndarray, np.ndarray]],
     bodies: Sequence[int],
-    light: EnvironmentMap | HarmonicLight,
+    light: KnownLight,
 ) -> np.ndarray:
     """Error of direct light on bodies that is interpolated between their vertices, over their pixels, relative L2.
 
@@ -79,7 +78,7 @@ def _irradiance(
     mesh: wp.Mesh | None,
     points: np.ndarray,
     normals: np.ndarray,
-    light: EnvironmentMap | HarmonicLight,
+    light: KnownLight,
     device: wp.Device,
 ) -> np.ndarray:
     """Luminance of the light that reaches points, [face, point], of rays that are shared out by the light of cells."""
@@ -87,8 +86,8 @@ def _irradiance(
     power = np.cumsum(np.maximum(cells.radiance @ LUMINANCE, 0))
     chosen, counts = np.unique(np.searchsorted(power, power[-1] * (np.arange(_RAYS) + 0.5) / _RAYS), return_counts=True)
     directions = (cells.directions if cells.spots is None else cells.spots)[chosen]
-    at, facing = (wp.array(values.reshape(1, -1, 3), dtype=wp.vec3, device=device) for values in (points, normals))
-    visibility = trace_visibility(mesh, at, facing, wp.array(directions, dtype=wp.vec3, device=device)).numpy()
+    at, facing = points.reshape(-1, 3), normals.reshape(-1, 3)
+    visibility = trace_visibility_on_host(mesh, at, facing, directions, device)
     shaded = visibility.reshape(*points.shape[:2], -1) * np.maximum(normals @ directions.T, 0)
     result: np.ndarray = shaded @ (power[-1] / _RAYS * counts)
     return result

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import warpshadow as ws
-from warpshadow.pipeline.groups import find_groups
+from warpshadow.pipeline.receivers.groups import find_groups
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.torch import TorchRenderer
 

@@ -7,8 +7,8 @@ import pytest
 import trimesh
 
 import warpshadow as ws
-from warpshadow.pipeline.choice_of_receivers import UNEVEN, choose_receivers
 from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.receivers.choice_of_receivers import UNEVEN, choose_receivers
 
 
 def scene_of(*, sunk=0.1, **options):

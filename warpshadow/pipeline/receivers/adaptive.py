@@ -5,14 +5,14 @@ at the probes of a quadtree (:mod:`warpshadow.stages.quadtree`), an eighth of al
 """
 
 import functools
+from collections.abc import Callable
 
 import numpy as np
 import warp as wp
 
 from warpshadow.device.launch import without_gradient
 from warpshadow.device.tape import unrecorded
-from warpshadow.pipeline.by_spheres import SphereMethod
-from warpshadow.pipeline.lighting import LitPoints
+from warpshadow.pipeline.receivers.groups import Blockers, Group
 from warpshadow.stages.quadtree import Quadtree, find_quadtree, keys_of, probe_grid
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import points_of_fragments
@@ -20,7 +20,8 @@ from warpshadow.stages.sample_receivers import fragments_of_samples
 
 
 def find_squares(
-    points: LitPoints,
+    place_blockers: Callable[[wp.array, tuple[wp.array, wp.array]], Blockers],
+    sharp_share: Callable[[Group], np.ndarray | None],
     positions: wp.array,
     normals: wp.array,
     fragments: Fragments,
@@ -31,14 +32,18 @@ def find_squares(
     """Find the squares of images in which the samples of some bodies interpolate.
 
     Args:
-        points: Receivers with their blockers.
-        positions, normals: Of the vertices, vec3 of shape [batch, vertex].
+        place_blockers: Places what blocks light, given the vertices, and the spheres.
+        sharp_share: Finds the share of the unblocked light of a group that comes from the cells with the sharpest
+            shadows, shape [batch, receiver]; None where no shadow is sharp.
+        positions, normals: Of the vertices, vec3 of shape [batch, vertex]; no gradient passes.
         spheres: Centers and radii of all spheres.
         is_adaptive: The bodies, which are flat, bool of shape [body].
         supersampling: Samples of a pixel across and down.
     """
-    merged_scene, method = points.merged_scene, points.method
-    assert isinstance(method, SphereMethod)
+    positions, normals, centers, radii = map(without_gradient, (positions, normals, *spheres))
+    with unrecorded():
+        blockers = place_blockers(positions, (centers, radii))
+    merged_scene = blockers.merged_scene
     sides = fragments.face_ids if fragments.sides is None else fragments.sides
     keys = _keys(is_adaptive.tobytes(), merged_scene.first_face.tobytes())
     row, column = probe_grid(sides.shape[1:], supersampling)
@@ -48,19 +53,15 @@ def find_squares(
     body_of_probe = np.where(probe_keys < 0, -1, probe_keys % len(is_adaptive))
     shares = np.zeros(probe_keys.shape, np.float32)
     with unrecorded():
-        bare = without_gradient(spheres[0]), without_gradient(spheres[1])
-        blockers = method.blockers(points.blocker_kinds, without_gradient(positions), bare)
         for body in np.flatnonzero(is_adaptive).tolist():
             columns = _ragged(body_of_probe == body)
             if not columns.shape[1]:
                 continue
             samples = np.where(columns < 0, -1, probes[columns])
             seen = fragments_of_samples(fragments, samples)
-            facing = points_of_fragments(
-                without_gradient(positions), without_gradient(normals), merged_scene.faces, seen
-            )
+            facing = points_of_fragments(positions, normals, merged_scene.faces, seen)
             group = blockers.around_plane(*facing, body)
-            portions = [method.sharp_share(portion) for portion in group.portions()]
+            portions = [sharp_share(portion) for portion in group.portions()]
             known = [portion for portion in portions if portion is not None]
             if known:
                 view, place = np.nonzero(columns >= 0)

@@ -12,9 +12,9 @@ from warpshadow.device.batch import common_batch, cut, expand
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import varies
 from warpshadow.pipeline.convex import GroupConvexParts, SceneConvexParts
-from warpshadow.pipeline.lighting import BlockerKinds, LitPoints
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.planes import GroupPlanes, ScenePlanes
+from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints
 from warpshadow.pipeline.self_visibility import SelfVisibility, SelfVisibilityLobes, SelfVisibilityLookup
 from warpshadow.stages.cached_cells import CachedRows
 from warpshadow.stages.convex.prepared import PlacedParts
@@ -180,7 +180,7 @@ def find_groups(
     points: LitPoints,
     receivers: Receivers,
     blockers: Blockers,
-    self_lookups: dict[int, Any],
+    self_lookups: dict[int, Any] | None,
     cached_rows: CachedRows | None,
     static_normals: wp.array | None,
 ) -> list[Group]:
@@ -190,11 +190,11 @@ def find_groups(
         points: Of which they are the receivers.
         receivers: All of them.
         blockers: Their surroundings.
-        self_lookups: Self-visibility of receivers, by body.
+        self_lookups: Self-visibility of receivers, by body; None without any.
         cached_rows: Cached transmittance past static bodies, for receivers on them.
         static_normals: Normals of all vertices of static bodies; None where any may move.
     """
-    groups = list(_groups_that_move(receivers, blockers, self_lookups, points.blocker_of_point))
+    groups = list(_groups_that_move(receivers, blockers, self_lookups or {}, points.blocker_of_point))
     if points.static_bodies is None or not len(receivers.on_static):
         return groups
     assert static_normals is not None
@@ -210,7 +210,8 @@ def _groups_that_move(
     """Groups of receivers that may move."""
     sphere_bodies = blockers.sphere_blockers(blockers.bodies)
     spheres, none = blockers.spheres_of(sphere_bodies), blockers.spheres_of([])
-    corners = blockers.planes.corners(blockers.positions) if blockers.planes.numbers and receivers.spans else None
+    has_planes = blockers.blocker_kinds.planes or (blockers.planes.numbers and blockers.merged_scene.scene.bounces)
+    corners = blockers.planes.corners(blockers.positions) if has_planes and receivers.spans else None
     clusters, nearest_blockers = None, _nearest_blockers(blocker_of_point, blockers)
     if not receivers.spans:
         facing = receivers.points, receivers.normals

@@ -2,7 +2,7 @@
 
 So are bodies on whose faces the light varies, from creases to the open or across shadows' edges (:data:`UNEVEN`).
 
-Flat bodies whose faces have more than 2 pixels are adaptive (:mod:`warpshadow.pipeline.adaptive`) where shadows may
+Flat bodies whose faces have more than 2 pixels are adaptive (:mod:`.receivers.adaptive`) where shadows may
 have edges, with directional visibility, where the light is known, and where arrays are readable, on a CPU: an image
 takes about 1.5 times as long as at the vertices of 64² quads, an iteration of a pose 1.2 times, and the ground has
 about the error that it has by pixel. Where a renderer has a basis, light is free, and nobody knows where edges will be.
@@ -22,11 +22,10 @@ import warp as wp
 from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.color import LUMINANCE
-from warpshadow.assets.harmonic_light import as_light
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.unevenness import light_unevenness
+from warpshadow.pipeline.receivers.unevenness import light_unevenness
 from warpshadow.scene.body import Body
 from warpshadow.scene.scene import Scene, change_bodies
 from warpshadow.scene.visibility import AUTO, Visibility
@@ -135,7 +134,7 @@ def choose_receivers(
     if is_open.any() and merged_scene.scene.visibility.method != "none":
         faces = [np.unique(face_ids[face_ids >= 0], return_counts=True) for face_ids, _ in images]
         seen = [(camera, *counted) for camera, counted in zip(cameras, faces, strict=True)]
-        light = EnvironmentMap.constant() if is_light_free else as_light(merged_scene.scene.light)
+        light = EnvironmentMap.constant() if is_light_free else merged_scene.scene.known_light
         bodies = np.flatnonzero(is_open).tolist()
         unevenness[is_open] = light_unevenness(merged_scene, positions, seen, bodies, light)
     chosen[unevenness > UNEVEN] = "pixel"
@@ -191,7 +190,7 @@ def _has_sun(scene: Scene) -> bool:
     """Whether the directional method is to find shadows of a sun."""
     if scene.visibility.method != "directional":
         return False
-    cells = as_light(scene.light).cells(fibonacci(scene.visibility.directions))
+    cells = scene.known_light.cells(fibonacci(scene.visibility.directions))
     if cells.spots is None or cells.half_angles is None:
         return False
     return find_sharp_cells(cells.radiance @ LUMINANCE, cells.spots, cells.half_angles) is not None

@@ -1,0 +1,1 @@
+"""Methods of visibility, a file each, and the one that finds them by their names."""

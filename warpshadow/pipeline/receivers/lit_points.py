@@ -1,0 +1,114 @@
+"""Points that are lit: their surroundings, and the values that are cached for them."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Hashable
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.node import Call, Input, Node
+from warpshadow.pipeline.reflectance import Materials
+from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.receivers import Receivers
+
+if TYPE_CHECKING:
+    from warpshadow.pipeline.receivers.static import StaticBodies
+
+Cached = TypeVar("Cached")
+Points = TypeVar("Points", bound="LitPoints")
+
+
+class BlockerKinds(NamedTuple):
+    """Which bodies block light as planes, convex parts or by traced self-visibility; spheres block the rest."""
+
+    traced: tuple[int, ...] = ()  # bodies that block their own light as rays found, not by their spheres
+    rotations: Input | None = None  # of all bodies, mat33 of shape [batch, body]; None where none is traced
+    why_spheres: tuple[str, ...] = ()  # of each body, why it blocks its own light by spheres; empty for the traced
+    planes: tuple[int, ...] = ()  # bodies that block all light as the planes in which they lie
+    convex: tuple[int, ...] = ()  # traced ones that block the light of others by the convex parts that they consist of
+    bulging: tuple[int, ...] = ()  # bodies out of which spheres bulge: they receive at vertices, for any choice
+
+
+ONLY_SPHERES = BlockerKinds()  # all bodies block by their spheres
+
+
+class LitPoints:
+    """Points that are lit, such as the receivers of a view: all that their light depends on but light and method.
+
+    Args:
+        merged_scene: The bodies among which they are.
+        materials: Reflectance of the scene's bodies.
+        vertices: Positions of all vertices.
+        spheres: Centers and radii of the spheres.
+        receivers: The points.
+        call: Holds values of the points that may not be cached.
+        static_bodies: Those among moving ones; None where any may move.
+        normals: Node of the normals of all vertices, vec3 of shape [batch, vertex]; by default its own.
+        blocker_kinds: Which bodies block light by something else than their spheres.
+        is_scene_view: Whether bodies and points are where the scene and its camera have them, for good.
+        blocker_of_point: Of points that send light, the number of the blocker nearest to the patch of each, among the
+            spheres of bodies that are not flat, −1 for none: NumPy of shape [receiver].
+    """
+
+    def __init__(
+        self,
+        merged_scene: MergedScene,
+        materials: Materials,
+        vertices: Input,
+        spheres: Input,
+        receivers: Node,
+        call: Call,
+        static_bodies: StaticBodies | None = None,
+        normals: Node | None = None,
+        blocker_kinds: BlockerKinds = ONLY_SPHERES,
+        is_scene_view: bool = False,
+        blocker_of_point: np.ndarray | None = None,
+    ):
+        self.blocker_kinds, self.is_scene_view, self.blocker_of_point = blocker_kinds, is_scene_view, blocker_of_point
+        self.materials, self.merged_scene = materials, merged_scene
+        self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
+        self.call, self.static_bodies = call, static_bodies
+        self.normals = Node("", vertex_normals, vertices, merged_scene.faces) if normals is None else normals
+        self.last_light: Input | None = None  # that was known, but for the scene's
+        self._cached: dict[str, tuple[Hashable, Any]] = {}
+
+    def cached(self, name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:
+        """A value for the points, such as a node, cached under a name while its inputs stay the same."""
+        if name not in self._cached or self._cached[name][0] != key:
+            self._cached[name] = key, make()
+        return self._cached[name][1]
+
+    def with_receivers(self: Points, receivers: Node) -> Points:
+        """Other receivers, of which nothing is cached, among the same blockers, any of which may move."""
+        points = copy.copy(self)
+        points.receivers_node, points.static_bodies, points.is_scene_view = receivers, None, False
+        points._cached, points.last_light = {}, None
+        return points
+
+    def preview(self: Points) -> Points:
+        """The points with the values cached so far, which does not add its own to them."""
+        points = copy.copy(self)
+        points._cached = {
+            name: (key, value.preview() if isinstance(value, LitPoints) else value)
+            for name, (key, value) in self._cached.items()
+        }
+        return points
+
+    @property
+    def receivers(self) -> Receivers:
+        """Where light is evaluated."""
+        return self.receivers_node.value(self.call)
+
+    def counts(self) -> tuple[str, int, int]:
+        """How many receivers may move and how many are static; "up to " where they are not found yet."""
+        receivers = self.receivers
+        return "", receivers.points.size, len(receivers.on_static)
+
+
+def receiver_text(points: LitPoints, *, moving: bool = True, static: bool = True) -> str:
+    """Number of receivers, in words."""
+    up_to, moving_count, static_count = points.counts()
+    return f"{up_to}{moving * moving_count + static * static_count:,} receivers"
