@@ -52,16 +52,16 @@ def test_another_process_fills_the_caches_and_says_how_far_it_is():
 
 
 def test_a_process_that_is_closed_ends_and_keeps_what_it_has():
-    for count in (1024, 1000, 976):  # one may be closed before there is anything to keep
+    for count in (1024, 1000, 976, 952, 928):  # one may be closed before there is a part to keep, or after
         notes = []
         preparation = Preparation(scene(count, subdivisions=5), notes.append)
         eventually(lambda notes=notes: any("fitting" in note and " 0 of" not in note for note in notes))
         preparation.close()
         assert preparation._process.wait(LONG) is not None
         assert "" not in notes
-        if cached_files("spheres"):
-            break
-    assert [path.name.endswith(".part.npz") for path in cached_files("spheres")] == [True]
+        if any(path.name.endswith(".part.npz") for path in cached_files("spheres")):
+            return
+    pytest.fail("no process kept a part of its fit")
 
 
 def test_pages_see_rays_until_spheres_are_there():
