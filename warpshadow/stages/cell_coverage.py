@@ -25,7 +25,7 @@ share the disc. Shapes that meet at an edge share the cells there without a rema
 
 import warp as wp
 
-_LEAST = wp.constant(1.0e-12)
+LEAST_DISTANCE = 1.0e-12
 """The least distance of an edge from ω."""
 
 
@@ -37,7 +37,6 @@ class ViewedEdge:
     begin: wp.vec3  # a − x
     end: wp.vec3  # b − x
     length: float  # |n|, by which the gradient of n is divided
-    corners: wp.vec2i  # numbers of a and b
     adj_normal: wp.vec3  # gradient of n, times its length
 
 
@@ -104,7 +103,7 @@ def _share_past_edges(edges: wp.array(dtype=ViewedEdge), first: int, count: int,
             chord = _find_chord(edges, e, cosine, direction, radius)
             if chord.end > chord.begin:
                 length = chord.end - chord.begin
-                d = wp.where(cosine > 0.0, chord.distance, wp.min(chord.distance, -_LEAST))  # of 0, turns by +π
+                d = wp.where(cosine > 0.0, chord.distance, wp.min(chord.distance, -LEAST_DISTANCE))  # of 0, turns by +π
                 area += 0.5 * d * length
                 x, y = d * d + chord.begin * chord.end, d * length
                 scale = 1.0 / wp.max(wp.abs(x), wp.abs(y))
