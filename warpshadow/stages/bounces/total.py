@@ -1,6 +1,5 @@
 """Sums of light that comes to receivers on several ways."""
 
-import functools
 from collections.abc import Sequence
 
 import warp as wp
@@ -13,25 +12,31 @@ from warpshadow.device.memory import empty
 @wp.kernel
 def _add(
     # in
-    some: wp.array2d(dtype=wp.vec3),
-    more: wp.array2d(dtype=wp.vec3),
+    first: wp.array2d(dtype=wp.vec3),
+    second: wp.array2d(dtype=wp.vec3),
+    third: wp.array2d(dtype=wp.vec3),
+    fourth: wp.array2d(dtype=wp.vec3),
     # out
     total: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a receiver of an instance."""
+    """A thread owns a receiver of an instance; the last two of four parts may be missing."""
     batch, receiver = wp.tid()
-    total[batch, receiver] = (
-        some[instance_in(batch, some.shape[0]), receiver] + more[instance_in(batch, more.shape[0]), receiver]
-    )
+    light = first[instance_in(batch, first.shape[0]), receiver] + second[instance_in(batch, second.shape[0]), receiver]
+    if third:
+        light += third[instance_in(batch, third.shape[0]), receiver]
+    if fourth:
+        light += fourth[instance_in(batch, fourth.shape[0]), receiver]
+    total[batch, receiver] = light
 
 
 def total_light(parts: Sequence[wp.array]) -> wp.array:
-    """Add light, vec3 of shape [batch, receiver]; a batch of 1 serves every instance. Differentiable: parts."""
-    return functools.reduce(_sum, parts)
+    """Add up to four parts of light, vec3 of shape [batch, receiver]; a batch of 1 serves every instance.
 
-
-def _sum(some: wp.array, more: wp.array) -> wp.array:
-    count = common_batch({"light": some, "more light": more})
-    total = empty((count, some.shape[1]), dtype=wp.vec3, device=some.device)
-    launch(_add, total.shape, inputs=[some, more], outputs=[total])
+    Differentiable: parts.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    count = common_batch({f"part {number}": part for number, part in enumerate(parts)})
+    total = empty((count, parts[0].shape[1]), dtype=wp.vec3, device=parts[0].device)
+    launch(_add, total.shape, inputs=[*parts, *[None] * (4 - len(parts))], outputs=[total])
     return total
