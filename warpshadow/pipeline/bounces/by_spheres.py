@@ -34,7 +34,7 @@ from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.bounces.static_bounces import StaticBounces
-from warpshadow.pipeline.by_spheres import PortionedShading, SphereMethod
+from warpshadow.pipeline.by_spheres import PortionedShading, SphereMethod, self_visibility_node
 from warpshadow.pipeline.groups import Group
 from warpshadow.pipeline.lighting import LitPoints, joined, receiver_text
 from warpshadow.pipeline.node import Call, Input, Node
@@ -297,7 +297,7 @@ class SphereBounces:
         key, is_cached = None if is_free else light, is_free or materials is not points.materials
         visibility = points.cached("visibility", (key, is_cached), lambda: make_visibility(points, caches=is_cached))
         of_sources = points.cached(
-            "of sources", (key, senders), lambda: self._sources(make_visibility, proxies, points)
+            "of sources", (key, senders), lambda: self._sources(make_visibility, visibility_light, proxies, points)
         )
         radiosity = self._radiosity(of_sources, projected_light, proxies, materials)
         item_text = functools.partial(receiver_text, points)
@@ -305,7 +305,11 @@ class SphereBounces:
         return BouncedShading(visibility, projected_light, item_text, radiosity, at_points)
 
     def _sources(
-        self, make_visibility: Callable[..., PortionedVisibility], proxies: Proxies, points: LitPoints
+        self,
+        make_visibility: Callable[..., PortionedVisibility],
+        visibility_light: Any,
+        proxies: Proxies,
+        points: LitPoints,
     ) -> PatchSampleNodes:
         """Sources among the bodies among which points are."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
@@ -315,9 +319,10 @@ class SphereBounces:
 
         make = functools.partial(Node, "sources", senders.sources, points.vertices, points.normals)
         sources = points.cached("sources", senders, lambda: make(items=_source_text(senders)))
-        visibility = make_visibility(
-            self._at(sources, points, points.materials, proxies.blocker_of_source), where=_OF_SOURCES
-        )
+        lit_sources = self._at(sources, points, points.materials, proxies.blocker_of_source)
+        lookups = self_visibility_node(self._method, points, visibility_light)
+        lit_sources.cached("self-visibility", id(visibility_light), lambda: lookups)
+        visibility = make_visibility(lit_sources, where=_OF_SOURCES)
         frames = Node("", planes.all.frames if planes else lambda _: None, points.vertices)
         projected_patches = Node("", project, sources, visibility, spheres, frames)
         return PatchSampleNodes(
