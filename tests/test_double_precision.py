@@ -282,9 +282,9 @@ def test_light_of_planes(double, planes, check):
 
 def test_transmittance_past_planes(double, planes, check):
     directions = double("maths.directions").fibonacci(16)
-    past = double("stages.planes.transmittance")
+    find, past = double("stages.planes.coverage").plane_coverage, double("stages.joint_coverage").transmittance_past
     given = (wp.vec3d, plane_receivers()[0]), (wp.float64, 0.1 + random(1, 1, 3, 16) ** 2), (wp.vec3d, FRAMES)
-    check(lambda p, t, f: past.transmittance_past_planes(t, past.plane_coverage(p, f, planes, directions)), *given)
+    check(lambda p, t, f: past(t, find(p, f, planes, directions)), *given)
 
 
 @pytest.fixture
@@ -305,15 +305,15 @@ def test_coverage_of_light_in_cells(name, double, request, check):
     planes, directions = request.getfixturevalue(name), double("maths.directions").fibonacci(16)
     find = double("stages.planes.partial_cells").coverage_of_light
     samples = unit(directions[:, None] + 0.2 * random(4, 16, 8, 3))
-    covered = np.random.default_rng(1).uniform(-0.1, 1.1, size=(1, 3, 16))
-    given = (wp.vec3d, plane_receivers()[0]), (wp.float64, covered), (wp.vec3d, FRAMES)
+    covered = np.random.default_rng(1).uniform(-0.1, 1.1, size=(1, 3, 16, 4))
+    given = (wp.vec3d, plane_receivers()[0]), (wp.vec4d, covered), (wp.vec3d, FRAMES)
     check(lambda p, c, f: find(p, c, f, planes, directions, samples), *given)
 
 
-def test_transmittance_past_convex_parts(double, check, device):
+def test_coverage_by_convex_parts(double, check, device):
     """A wedge and a tetrahedron, which share a body, and a second tetrahedron."""
     module, find = double("stages.convex.prepared"), double("maths.convex").find_convex_parts
-    past = double("stages.convex.transmittance").transmittance_past_parts
+    cover = double("stages.convex.coverage").part_coverage
     directions = double("maths.directions").fibonacci(32)
     wedge = np.array([[0, 0, 0], [2, 0, 0.1], [0.1, 1, 0], [0, 0, 1], [2, 0, 1.1], [0.1, 1, 1]])
     sides = np.int32([[0, 2, 1], [3, 4, 5], [0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5]])
@@ -330,11 +330,22 @@ def test_transmittance_past_convex_parts(double, check, device):
     positions = np.concatenate([points + shift for points, shift in zip(corners, shifts, strict=True)])[None]
     points = np.array([[[0.1, 2.2, 0.3], [-0.4, 0.7, -1.9], [2.5, 0.2, 1.5]]])
     given = (wp.vec3d, points), (wp.vec3d, positions)
-    passing = past(
+    covered = cover(
         put(points, wp.vec3d, device), blockers.placed(put(positions, wp.vec3d, device)), blockers, directions
-    )
-    assert ((passing.numpy() > 0) & (passing.numpy() < 1)).mean() > 0.2
-    check(lambda p, v: past(p, blockers.placed(v), blockers, directions), *given)
+    ).numpy()[..., 0]
+    assert ((covered > 0) & (covered < 1)).mean() > 0.2
+    check(lambda p, v: cover(p, blockers.placed(v), blockers, directions), *given)
+
+
+def test_transmittance_past_two_blockers(double, check):
+    """Coverages whose moments are as long as such may be, and as short, at any angle."""
+    rng, past = np.random.default_rng(2), double("stages.joint_coverage").transmittance_past
+    coverages = []
+    for _ in range(2):
+        share, moment = rng.uniform(0.02, 0.98, (1, 2, 16, 1)), unit(rng.normal(size=(1, 2, 16, 3)))
+        length = rng.uniform(0, 0.9, share.shape) * share * (1 - share)
+        coverages.append((wp.vec4d, np.concatenate([share, length * moment], axis=-1)))
+    check(past, (wp.float64, rng.uniform(size=(1, 2, 16))), *coverages)
 
 
 def test_what_patches_show(double, planes, check, device):

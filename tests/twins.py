@@ -236,6 +236,28 @@ def blocked_shares(points, centers, radii, directions, softness=0.35):
     return 1 - np.stack(alone, axis=1)
 
 
+def moment_bound(share):
+    """Moment of a half-plane that covers a share of a disc of radius 1, over the disc's area; nearly."""
+    u = share * (1 - share)
+    return 0.96935 * u - 0.81588 * u**2 + 1.36307 * u**3
+
+
+def open_share(shares, moments):
+    """Share of a disc that blockers leave open, which cover shares of it, by pairs of their moments [blocker, 3]."""
+    shares, moments = np.clip(shares, 0, 1), np.asarray(moments, float).reshape(-1, 3)
+    bounds, is_pair = moment_bound(shares), ~np.eye(len(shares), dtype=bool)
+    relation = (moments @ moments.T)[is_pair].sum() / (np.outer(bounds, bounds)[is_pair].sum() + 1e-6)
+    relation = np.clip(relation, -1, 1)
+    related = max(0, 1 - shares.sum()) if relation < 0 else 1 - shares.max(initial=0)
+    return (1 - abs(relation)) * np.prod(1 - shares) + abs(relation) * related
+
+
+def joint_coverage(shares, moments):
+    """Coverage (h, μ) of a disc by blockers together."""
+    share, total = 1 - open_share(shares, moments), np.clip(shares, 0, 1).sum()
+    return np.append(share, np.sum(moments, axis=0) * share / total if share > 0 else np.zeros(3))
+
+
 def find_proxy_radiance(radiosity, shown, weights, areas, patches):
     """Light and area that the patches of spheres show, [sphere, direction, 4]; ``patches`` lists those of a sphere."""
     table, sent = np.zeros((len(patches), shown.shape[1], 4)), weights[:, :1] * shown + 1e-4

@@ -80,7 +80,7 @@ BUDGETS = {
     "_make_gather": {"": Budget(72)},
     "_make_gather_adjoint": {"": Budget(80)},
     "warpshadow.stages.self_visibility.lookup": {"find_lookups": Budget(56), "find_lookups_adjoint": Budget(64)},
-    "warpshadow.stages.planes.transmittance": {"cover": Budget(112), "cover_adjoint": Budget(200)},
+    "warpshadow.stages.planes.coverage": {"cover": Budget(112), "cover_adjoint": Budget(200)},
     "warpshadow.stages.bounces.plane_light": {"light_receivers": Budget(128), "light_receivers_adjoint": Budget(176)},
 }
 """By the name of a factory's kernel, or of a file and its kernels: compiling a file takes long, so it is for sm_90."""

@@ -112,10 +112,10 @@ def test_a_ridge_within_a_face_is_no_higher_than_the_tolerance(height, count):
 
 
 WINDOWS = {  # squares of a wall, and parts at most
-    "window": (["####", "#  #", "#  #", "####"], 4),
-    "two windows": (["#######", "#  #  #", "#######"], 6),
-    "ell": (["#   ", "#   ", "####"], 2),
-    "fork": (["# # #", "#####"], 4),
+    "window": (["####", "#  #", "#  #", "####"], 4, 1),
+    "two windows": (["#######", "#  #  #", "#######"], 6, 2),
+    "ell": (["#   ", "#   ", "####"], 2, 0),
+    "fork": (["# # #", "#####"], 4, 0),
 }
 
 
@@ -145,11 +145,19 @@ def is_inside(points, mesh, part):
 @pytest.mark.parametrize("name", WINDOWS)
 def test_a_prism_with_holes_is_cut_into_few_convex_ones(name, thickness):
     """Each point inside is in one of them, and no point outside in any, however the mesh is triangulated."""
-    rows, most = WINDOWS[name]
+    rows, most, holes = WINDOWS[name]
     counts = set()
     for seed in range(3):
         wall = wall_of(rows, thickness, seed)
-        parts = parts_of(wall)
+        parts = [part for part in parts_of(wall) if not part.is_seam]
+        seams = parts_of(wall)[len(parts) :]
+        assert len(seams) == len(parts) + holes - 1 and all(seam.is_seam for seam in seams)
+        for seam in seams:  # points beside its middle are in a prism each
+            corners = wall.vertices[seam.corners]
+            aside = 1e-3 * np.cross(corners[1] - corners[0], corners[2] - corners[0])
+            both = [is_inside(corners.mean(axis=0) + np.stack([aside, -aside]), wall, part) for part in parts]
+            np.testing.assert_array_equal(np.sum(both, axis=0), 1)
+            assert np.argmax(both, axis=0)[0] != np.argmax(both, axis=0)[1]
         counts.add(len(parts))
         points = np.random.default_rng(1).uniform(*wall.bounds, size=(4000, 3))
         owners = sum(is_inside(points, wall, part).astype(int) for part in parts)
@@ -180,7 +188,8 @@ def test_prisms_that_are_none_have_no_parts():
     twisted.vertices[:4] += 0.01
     assert parts_of(twisted) is None
     assert parts_of(wall_of([*sieve, "#" * 21], 1.0)) is None  # 50 windows
-    assert len(parts_of(together(wall_of(rows, 1.0), box(middle=(9, 0, 0))))) == 5
+    parts = parts_of(together(wall_of(rows, 1.0), box(middle=(9, 0, 0))))
+    assert [part.is_seam for part in parts] == [False] * 5 + [True] * 4
 
 
 def roof(ridge, top, slope):

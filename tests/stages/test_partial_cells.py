@@ -7,8 +7,8 @@ from test_plane_light import DIRECTIONS, Setting
 import warpshadow as ws
 from warpshadow.maths.directions import cell_radius
 from warpshadow.pipeline import directional
+from warpshadow.stages.planes.coverage import plane_coverage
 from warpshadow.stages.planes.partial_cells import coverage_of_light
-from warpshadow.stages.planes.transmittance import plane_coverage
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -35,8 +35,10 @@ def test_cells_that_are_covered_in_part_are_so_as_where_their_light_is(names, sk
     options = {"horizon_normals": normals if is_facing else None, "skip": skip}
     covered = plane_coverage(points, frames, setting.planes, DIRECTIONS, **options)
     found = coverage_of_light(points, covered, frames, setting.planes, DIRECTIONS, samples, **options).numpy()
-    coverage, small = covered.numpy(), cell_radius(8 * len(DIRECTIONS))
-    each = plane_coverage(points, frames, setting.planes, samples.reshape(-1, 3), radius=small, **options).numpy()
+    np.testing.assert_array_equal(found[..., 1:], covered.numpy()[..., 1:])
+    found, coverage, small = found[..., 0], covered.numpy()[..., 0], cell_radius(8 * len(DIRECTIONS))
+    each = plane_coverage(points, frames, setting.planes, samples.reshape(-1, 3), radius=small, **options)
+    each = each.numpy()[..., 0]
     weights = np.ones((*found.shape, 8))
     if is_facing:
         cosines = np.einsum("brc,qsc->brqs", setting.normals, samples)

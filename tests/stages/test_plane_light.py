@@ -12,9 +12,10 @@ from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.stages.bounces.patches import find_plane_patches
 from warpshadow.stages.bounces.plane_light import plane_light as light_of_texels
 from warpshadow.stages.bounces.plane_texels import find_texels
+from warpshadow.stages.joint_coverage import transmittance_past
 from warpshadow.stages.planes import prepared
+from warpshadow.stages.planes.coverage import plane_coverage
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneBody
-from warpshadow.stages.planes.transmittance import plane_coverage, transmittance_past_planes
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -29,7 +30,7 @@ def plane_light(points, normals, transmittance, frames, radiosity, planes, direc
 
 
 def passing_flats(points, transmittance, frames, planes, directions, **options):
-    return transmittance_past_planes(transmittance, plane_coverage(points, frames, planes, directions, **options))
+    return transmittance_past(transmittance, plane_coverage(points, frames, planes, directions, **options))
 
 
 # ---------------------------------------------------------------------------------------------------- the twin

@@ -1,5 +1,7 @@
 """Quadtrees: squares of the image whose corners are receivers, and what samples get in them."""
 
+import functools
+
 import numpy as np
 import pytest
 import warp as wp
@@ -79,10 +81,23 @@ def test_squares_are_small_where_light_has_an_edge_and_large_where_it_rises_even
     assert all((size[far_left] == 4).all() for size in sizes.values())
     below = np.s_[24:, 16:28]
     assert (sizes["even"][below] == 4).all() and (sizes["weak"][below] == 4).all()
-    np.testing.assert_array_equal(sizes["edge"][below], np.tile([4] * 4 + [1] * 2 + [2] * 2 + [4] * 4, (8, 1)))
+    np.testing.assert_array_equal(sizes["edge"][below], np.tile([4] * 4 + [0] * 2 + [2] * 2 + [4] * 4, (8, 1)))
     behind = fragments.face_ids.numpy()[0] == 2
     assert behind.any() and (sizes["even"][behind] < 4).any()
-    assert all(((size == 0) | (size == 1) | (size == 2) | (size == 4)).all() for size in sizes.values())
+    assert all(((size == 0) | (size == 2) | (size == 4)).all() for size in sizes.values())
+
+
+@pytest.mark.parametrize(("size", "spacing"), [(128, 1), (132, 2)])
+def test_each_pixel_of_a_small_image_is_a_probe(size, spacing, device):
+    """A stripe of one pixel is seen there, wherever it is."""
+    positions, faces, fragments = sheet_and_triangle(device, size=size)
+    missed = 0
+    for stripe in range(20, 24):
+        shares = shares_of(fragments, 1, functools.partial(np.equal, stripe))
+        assert shares.shape[2] == size // spacing + 1
+        sizes = find_quadtree(fragments.face_ids, np.append(KEYS, KEYS), shares, 1).sizes.numpy()[0]
+        missed += (sizes[-8:, stripe] > 0).all()
+    assert missed == (0 if spacing == 1 else 2)
 
 
 def test_bodies_and_sides_do_not_share_squares(device):
@@ -101,8 +116,9 @@ def test_gradients_to_corners_are_central_differences(device, verified_tape):
     matrix = wp.array(
         [ws.Camera.look_at((0, 0, 3.0), (0, 0, 0), size=(22, 22)).clip_matrix()], dtype=wp.mat44, device=device
     )
-    shares = shares_of(fragments, 2, lambda x: 1.0 * (x > 5))
+    shares = shares_of(fragments, 2, lambda x: 0.05 * np.abs(x - 6))
     quadtree = find_quadtree(fragments.face_ids, np.append(KEYS, KEYS), shares, 2)
+    assert {2, 4} <= set(quadtree.sizes.numpy()[0, -3].tolist())
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(1, 7, 3)) * [[[1, 1, 1]] * 4 + [[0, 0, 0]] * 3]  # else other samples see the triangle
     start = wp.array(positions.numpy(), dtype=wp.vec3, device=device, requires_grad=True)

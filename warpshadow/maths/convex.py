@@ -39,6 +39,8 @@ class ConvexPart(NamedTuple):
     """Three corners of each face, counterclockwise from outside, numbers among the corners, shape [face, 3]."""
     edges: np.ndarray
     """Where each edge begins and ends, numbers among the corners, and the faces to its left and right, [edge, 4]."""
+    is_seam: bool = False
+    """Whether it is the face that two prisms share: seen at a slant both cover it, so it is to be taken off."""
 
 
 def find_convex_parts(
@@ -54,9 +56,9 @@ def find_convex_parts(
 
     Returns:
         The parts, which may touch and overlap: for each closed piece of the mesh a solid, or the prisms into which it
-        is cut if it is one, with holes or without; panels for each open one. None where a closed piece is hollow or
-        curved otherwise, where a part has more than 64 faces, or where there are more than 32 prisms of a piece, or 64
-        panels.
+        is cut if it is one, with holes or without; panels for each open one. The seams of prisms come last. None where
+        a closed piece is hollow or curved otherwise, where a part has more than 64 faces, or where there are more than
+        32 prisms of a piece, or 64 panels.
     """
     _, first, vertex = np.unique(positions, axis=0, return_index=True, return_inverse=True)
     triangles = vertex.reshape(-1)[faces]
@@ -78,7 +80,7 @@ def find_convex_parts(
     panels = _find_panels(points, sheets, tolerances)
     if panels is None:
         return None
-    parts = [*solids, *map(_panel, panels)]
+    parts = sorted([*solids, *map(_panel, panels)], key=lambda part: part.is_seam)
     return [part._replace(corners=first[part.corners]) for part in parts]
 
 
@@ -211,8 +213,30 @@ def _prisms_along(
     gaps, below = cKDTree(plane[bottom]).query(plane[np.concatenate(polygons)])
     if gaps.max() > _FLATNESS * size:
         return None
-    below = np.split(bottom[below], np.cumsum([len(polygon) for polygon in polygons])[:-1])
-    return [_prism(polygon, base) for polygon, base in zip(polygons, below, strict=True)]
+    below_top = dict(zip(np.concatenate(polygons).tolist(), bottom[below].tolist(), strict=True))
+    prisms = [_prism(polygon, np.array([below_top[corner] for corner in polygon.tolist()])) for polygon in polygons]
+    seams = [[a, b, below_top[b], below_top[a]] for a, b in _shared_sides(plane, polygons)]
+    return prisms + [_panel(np.array(corners))._replace(is_seam=True) for corners in seams]
+
+
+def _shared_sides(plane: np.ndarray, polygons: Sequence[np.ndarray]) -> list[tuple[int, int]]:
+    """Where pairs of polygons in a plane touch along their sides: the points at both ends, numbers."""
+    ends = np.concatenate([np.stack([polygon, np.roll(polygon, -1)], axis=1) for polygon in polygons])
+    starts, sides = plane[ends[:, 0]], plane[ends[:, 1]] - plane[ends[:, 0]]
+    lengths = np.linalg.norm(sides, axis=1)
+    offsets = plane[ends] - starts[:, None, None]  # [side, other side, end, 2]
+    units = sides / lengths[:, None]
+    places = np.einsum("sotx,sx->sot", offsets, units)
+    heights = np.abs(offsets[..., 0] * units[:, None, None, 1] - offsets[..., 1] * units[:, None, None, 0]).max(axis=2)
+    size = lengths.max()
+    first, last = np.maximum(places[..., 1], 0), np.minimum(places[..., 0], lengths[:, None])
+    is_shared = (heights < _FLATNESS * size) & (places[..., 0] > places[..., 1]) & (last - first > _FLATNESS * size)
+    seams = set()
+    for side, other in np.argwhere(is_shared).tolist():
+        begin = ends[side, 0] if places[side, other, 1] <= _FLATNESS * size else ends[other, 1]
+        end = ends[side, 1] if places[side, other, 0] >= lengths[side] - _FLATNESS * size else ends[other, 0]
+        seams.add((int(min(begin, end)), int(max(begin, end))))
+    return sorted(seams)
 
 
 def _prism(top: np.ndarray, bottom: np.ndarray) -> ConvexPart:

@@ -15,8 +15,8 @@ import warp as wp
 from warpshadow.maths.convex import ConvexPart
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.scene.blockers import blocking_parts
+from warpshadow.stages.convex.coverage import part_coverage
 from warpshadow.stages.convex.prepared import ConvexBlockers, ConvexBody, PlacedParts
-from warpshadow.stages.convex.transmittance import transmittance_past_parts
 
 
 class GroupConvexParts(NamedTuple):
@@ -26,11 +26,11 @@ class GroupConvexParts(NamedTuple):
     placed: PlacedParts
     skip: int | None = None  # index, among the bodies of blockers, of the body that the receivers are part of
 
-    def transmittance(
+    def coverage(
         self, points: wp.array, horizon_normals: wp.array | None, directions: np.ndarray, radius: float | None = None
     ) -> wp.array:
-        """Transmittance past them, see :func:`.transmittance_past_parts`. Differentiable: points."""
-        return transmittance_past_parts(
+        """Coverage of cells by them, see :func:`.part_coverage`. Differentiable: points."""
+        return part_coverage(
             points,
             self.placed,
             self.blockers,

@@ -14,8 +14,7 @@ from warpshadow.assets.harmonic_light import as_light
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.pipeline.by_spheres import PortionedShading, SphereMethod
-from warpshadow.pipeline.convex import GroupConvexParts
-from warpshadow.pipeline.groups import Group, GroupVisibility
+from warpshadow.pipeline.groups import CellCoverages, Group, GroupVisibility
 from warpshadow.pipeline.lighting import (
     LARGEST_COEFFICIENT,
     BlockerKinds,
@@ -34,9 +33,10 @@ from warpshadow.scene.blockers import blocking_planes
 from warpshadow.stages.cached_cells import CachedRows, cell_transfer, light_cells
 from warpshadow.stages.gloss.reflection import blocked_radiance
 from warpshadow.stages.gloss.transmittance import transmittance_towards
+from warpshadow.stages.joint_coverage import transmittance_past
 from warpshadow.stages.light_samples import CellSamples, cell_samples, even_samples, sample_map
+from warpshadow.stages.planes.coverage import plane_coverage
 from warpshadow.stages.planes.partial_cells import SAMPLES, coverage_of_light
-from warpshadow.stages.planes.transmittance import plane_coverage, transmittance_past_planes
 from warpshadow.stages.ray_tracing import trace_cells
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.self_visibility.gather import gather_self_transmittance, multiply_transmittances
@@ -45,7 +45,9 @@ from warpshadow.stages.shading import shade, shade_cells
 from warpshadow.stages.sides import split_sides
 from warpshadow.stages.transfer import directional_transfer
 from warpshadow.stages.visibility import directional
+from warpshadow.stages.visibility.directional import SOFTNESS
 from warpshadow.stages.visibility.sharp_cells import (
+    SHARP_CELL_RADII,
     WIDEST_PAST_PLANES,
     SharpCells,
     blend_sharp_cells,
@@ -157,40 +159,51 @@ class Directional(SphereMethod):
         transmittance_self = self._transmittance_self(group, projected_light)
         # cached cells have light although their middles are below the horizon
         horizon_normals = normals if cached_rows is None else None
-        factors = [transmittance_self]
-        if points.size and group.convex_parts_around is not None:
-            factors.append(self._past_parts(group.convex_parts_around, points, horizon_normals, projected_light))
+        curved, parts = transmittance_self, None
         if points.size and radii.shape[1]:
-            factors.append(self._past_spheres(group, horizon_normals, projected_light))
-        known = [factor for factor in factors if factor is not None]
-        if not known:
+            spheres = self._past_spheres(group, horizon_normals, projected_light)
+            curved = spheres if curved is None else multiply_transmittances(curved, spheres)
+        if points.size and group.convex_parts_around is not None:
+            cover = functools.partial(group.convex_parts_around.coverage, points, horizon_normals)
+            parts = self._coverages(cover, projected_light)
+        total = curved if parts is None else self._past_coverages(curved, parts, None, projected_light)
+        if total is None:
             shape = *points.shape, len(projected_light.directions)
-            return GroupVisibility(wp.full(shape, 1.0, dtype=wp.float32, device=points.device))
-        return GroupVisibility(functools.reduce(multiply_transmittances, known), transmittance_self)
+            total = wp.full(shape, 1.0, dtype=wp.float32, device=points.device)
+        return GroupVisibility(total, transmittance_self, transmittance_curved=curved, part_coverages=parts)
 
-    def _past_parts(
+    def _coverages(self, cover: Callable[..., wp.array], projected_light: ProjectedCells) -> CellCoverages:
+        """Coverage of all cells and of sharp ones."""
+        coverage = cover(projected_light.directions)
+        sharp_cells = projected_light.sharp_cells_past_planes
+        if sharp_cells is None:
+            return CellCoverages(coverage)
+        return CellCoverages(coverage, cover(sharp_cells.directions, radius=self._edge_radius(sharp_cells)))
+
+    def _past_coverages(
         self,
-        parts: GroupConvexParts,
-        points: wp.array,
-        horizon_normals: wp.array | None,
+        transmittance: wp.array | None,
+        coverages: CellCoverages,
+        others: CellCoverages | None,
         projected_light: ProjectedCells,
     ) -> wp.array:
-        """Transmittance past convex parts."""
-        transmittance = parts.transmittance(points, horizon_normals, projected_light.directions)
-        if projected_light.sharp_cells_past_planes is None:
-            return transmittance
-        directions, places, _ = projected_light.sharp_cells_past_planes
-        radius = self._edge_radius(projected_light.sharp_cells_past_planes)
-        return blend_sharp_cells(
-            transmittance,
-            parts.transmittance(points, horizon_normals, directions, radius),
-            places,
+        """Transmittance past blockers that cover cells, and others that may cover the same parts of them."""
+        of_others = (None, None) if others is None else others
+        sharp_cells = projected_light.sharp_cells_past_planes
+        if sharp_cells is None or coverages.sharp_cells is None:
+            return transmittance_past(transmittance, coverages.cells, of_others[0])
+        passing = blend_sharp_cells(
+            transmittance_past(None, coverages.cells, of_others[0]),
+            transmittance_past(None, coverages.sharp_cells, of_others[1]),
+            sharp_cells.places,
             projected_light.spot_shares,
         )
+        return passing if transmittance is None else multiply_transmittances(transmittance, passing)
 
     def _edge_radius(self, sharp_cells: SharpCells) -> float:
-        """How soft edges of planes and convex parts are in sharp cells [rad]; they need no room for a cell's rest."""
-        return self.visibility.softness * sharp_cells.scale * cell_radius(len(sharp_cells.directions))
+        """Radius of the disc by which planes and convex parts cover sharp cells [rad]: the sun's, for κ = 0.35."""
+        softness = self.visibility.softness / SOFTNESS
+        return softness * sharp_cells.scale * cell_radius(len(sharp_cells.directions)) / SHARP_CELL_RADII
 
     def _past_spheres(
         self, group: Group, horizon_normals: wp.array | None, projected_light: ProjectedCells
@@ -222,30 +235,24 @@ class Directional(SphereMethod):
         self, group: Group, visibility: GroupVisibility, projected_light: ProjectedCells
     ) -> GroupVisibility:
         """Transmittance past the flat bodies around a group, too."""
-        planes, transmittance_spheres = group.planes, visibility.transmittance_total
-        if planes is None or transmittance_spheres is None or not group.points.size:
+        planes = group.planes
+        if planes is None or not group.points.size or not set(planes.planes.blocking) - {planes.skip}:
             return visibility
         horizon_normals = group.normals if group.cached_rows is None else None
         points, fronts = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
         options: dict[str, Any] = {"horizon_normals": horizon_normals, "fronts": fronts, "skip": planes.skip}
-        cover: Callable[..., wp.array | None] = functools.partial(
-            plane_coverage, points, planes.frames, planes.planes, **options
+        covered = self._coverages(
+            functools.partial(plane_coverage, points, planes.frames, planes.planes, **options), projected_light
         )
-        covered = cover(projected_light.directions)
-        if covered is None:
-            return visibility
         if projected_light.samples is not None and planes.planes.has_holes:
             cells = projected_light.directions, projected_light.samples
-            covered = coverage_of_light(points, covered, planes.frames, planes.planes, *cells, **options)
-        if projected_light.sharp_cells_past_planes is not None:
-            directions, places, _ = projected_light.sharp_cells_past_planes
-            sharp_coverage = cover(directions, radius=self._edge_radius(projected_light.sharp_cells_past_planes))
-            assert sharp_coverage is not None
-            covered = blend_sharp_cells(covered, sharp_coverage, places, projected_light.spot_shares)
-        return visibility._replace(
-            transmittance_total=transmittance_past_planes(transmittance_spheres, covered),
-            transmittance_spheres=transmittance_spheres,
+            covered = covered._replace(
+                cells=coverage_of_light(points, covered.cells, planes.frames, planes.planes, *cells, **options)
+            )
+        total = self._past_coverages(
+            visibility.transmittance_curved, covered, visibility.part_coverages, projected_light
         )
+        return visibility._replace(transmittance_total=total, transmittance_spheres=visibility.transmittance_total)
 
     def _transmittance_self(self, group: Group, projected_light: ProjectedCells) -> wp.array | None:
         """Transmittance past the body of the receivers: looked up, and of a sun by rays where these are asked for."""
@@ -322,17 +329,18 @@ class Directional(SphereMethod):
             )
         else:
             transmittance = wp.full((*points.shape, CHUNK), 1.0, dtype=wp.float32, device=points.device)
+        coverages = []
         if group.convex_parts_around is not None:
-            past_parts = group.convex_parts_around.transmittance(points, normals, directions, radius)
-            transmittance = multiply_transmittances(transmittance, past_parts)
-        if group.planes is not None:
-            planes = group.planes
+            coverages.append(group.convex_parts_around.coverage(points, normals, directions, radius))
+        planes = group.planes
+        if planes is not None and set(planes.planes.blocking) - {planes.skip}:
             lifted, fronts = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
-            arguments = lifted, planes.frames, planes.planes, directions
-            covered = plane_coverage(
-                *arguments, radius=radius, horizon_normals=normals, fronts=fronts, skip=planes.skip
+            options: dict[str, Any] = {"radius": radius, "horizon_normals": normals, "fronts": fronts}
+            coverages.append(
+                plane_coverage(lifted, planes.frames, planes.planes, directions, skip=planes.skip, **options)
             )
-            transmittance = transmittance if covered is None else transmittance_past_planes(transmittance, covered)
+        if coverages:
+            transmittance = transmittance_past(transmittance, *coverages)
         lit = shade_cells(transmittance, normals, directions, light, maximum=LARGEST_COEFFICIENT).numpy()[..., 0]
         receiver_normals, towards = normals.numpy(), self.free_projection.directions
         plane_normals = receiver_normals[:, :1]  # points of a plane have this normal or its opposite

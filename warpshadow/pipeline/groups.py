@@ -100,12 +100,21 @@ class Group(NamedTuple):
             )
 
 
+class CellCoverages(NamedTuple):
+    """Coverage (h, μ) of cells by blockers, vec4 of shape [batch, receiver, direction]."""
+
+    cells: wp.array
+    sharp_cells: wp.array | None = None  # [batch, receiver, 16]; None where no cell is sharp
+
+
 class GroupVisibility(NamedTuple):
     """Visibility of a group."""
 
     transmittance_total: wp.array | None  # visibility or transmittance past all bodies; None where nothing blocks
     transmittance_self: wp.array | None = None  # a factor of it: transmittance past its own body; None where that is 1
     transmittance_spheres: wp.array | None = None  # transmittance past all but planes; None where no planes block
+    transmittance_curved: wp.array | None = None  # transmittance past its own body and spheres; None where that is 1
+    part_coverages: CellCoverages | None = None  # coverage by convex parts; None where there are none around
 
 
 class Blockers(NamedTuple):

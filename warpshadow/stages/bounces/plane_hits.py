@@ -23,7 +23,7 @@ from warpshadow.stages.planes.sides import (
     footprint_on_side_adjoint,
     load_place,
     load_side,
-    plane_share,
+    outline_coverage_on_side,
 )
 
 _MIN_WEIGHT_SUM = wp.constant(1.0e-30)  # the least Σ s
@@ -115,7 +115,7 @@ def hit_sides(
         side = load_side(scene, i, store)
         grid = scene.grids[side.f]
         place = load_place(store, side.f)
-        share = plane_share(scene, grid, side, place, cell, edges)
+        share = outline_coverage_on_side(scene, grid, side, place, cell, edges)[0]
         clear_hit(store, first_hit, i)
         if share > 0.0:
             hit = PlaneHit()
@@ -182,7 +182,7 @@ def hit_sides_adjoint(
                 scene, grid, side, place, cell.direction, footprint, adj_mip, adj.distance, adj_range, adj_store
             )
             adj_share = adj.coverage * hit.mesh_share
-            weighted = adj_share * side.weight
+            weighted = wp.vec4(adj_share * side.weight, 0.0, 0.0, 0.0)
             coverage_adjoint(edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, weighted)
             adj_store[side.row] = adj_store[side.row] + wp.vec3(
                 0.0, 0.0, adj_share * hit.outline_coverage / side.weight

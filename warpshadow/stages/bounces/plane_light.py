@@ -4,7 +4,7 @@ Their patches are the texels of a grid; :mod:`warpshadow.stages.planes.cells` ha
 coverage h, distance t, mean cosine c′ and radiosity B.
 
 A plane blocker is seen from both sides; its back is black unless it has patches there. Plane blockers send all that
-they block of a cell (:mod:`warpshadow.stages.planes.transmittance`). The nearest sends most of it; where they are at
+they block of a cell (:mod:`warpshadow.stages.planes.coverage`). The nearest sends most of it; where they are at
 about the same distance, they share it:
 
     I = 4/Q Σ_q max(n·ω_q, 0) T_q min(1, Σ_k h_k) Σ_k s_k B_k / Σ_k s_k

@@ -34,6 +34,7 @@ class ConvexArrays:
 
     blocks: wp.array(dtype=wp.int32)  # whether a body casts shadows
     first_part: wp.array(dtype=wp.int32)  # of each body, and the end of the last
+    signs: wp.array(dtype=wp.float32)  # of the coverage of each part: −1 for seams, which are a body's last
     first_corner: wp.array(dtype=wp.int32)  # of each part, and the end of the last
     first_face: wp.array(dtype=wp.int32)
     first_edge: wp.array(dtype=wp.int32)
@@ -61,12 +62,14 @@ class ConvexBlockers:
     def of(bodies: Sequence[ConvexBody], vertex_count: int, *, device: wp.DeviceLike) -> ConvexBlockers:
         """Prepare bodies, among bodies that have so many vertices together."""
         parts = [part for body in bodies for part in body.parts]
-        starts = {name: _starts([len(getattr(part, name)) for part in parts]) for name in ConvexPart._fields}
+        starts = {name: _starts([len(getattr(part, name)) for part in parts]) for name in ("corners", "faces", "edges")}
         faces = [part.faces + first for part, first in zip(parts, starts["corners"], strict=False)]
         shifted = [part.edges + [first, first, 0, 0] for part, first in zip(parts, starts["corners"], strict=False)]
         arrays = ConvexArrays()
         arrays.blocks = wp.array([int(body.blocks) for body in bodies], dtype=wp.int32, device=device)
         arrays.first_part = wp.array(_starts([len(body.parts) for body in bodies]), dtype=wp.int32, device=device)
+        signs = [-1.0 if part.is_seam else 1.0 for part in parts]
+        arrays.signs = wp.array(signs, dtype=wp.float32, device=device)
         arrays.first_corner = wp.array(starts["corners"], dtype=wp.int32, device=device)
         arrays.first_face = wp.array(starts["faces"], dtype=wp.int32, device=device)
         arrays.first_edge = wp.array(starts["edges"], dtype=wp.int32, device=device)

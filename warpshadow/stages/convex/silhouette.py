@@ -1,4 +1,4 @@
-"""Silhouettes of convex parts, as a block of receivers sees them, and the share of a cell within one.
+"""Silhouettes of convex parts, as a block of receivers sees them, and the coverage of a cell by one.
 
 The formulas are those of :mod:`warpshadow.stages.cell_coverage`. Receivers that are near each other see nearly the same
 edges of a part, so a block of them goes over its edges together (:mod:`warpshadow.device.lanes`): an edge that only
@@ -12,6 +12,7 @@ import warp as wp
 
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 from warpshadow.stages.cell_coverage import LEAST_DISTANCE
+from warpshadow.stages.convex.joint_lanes import coverage_type
 from warpshadow.stages.convex.prepared import ConvexArrays
 
 EDGE_LANES = 5
@@ -20,6 +21,9 @@ sees the one to its left, 0 where it sees both or none; and 0, or there 2: a cos
 
 ADJOINT_LANES = 6
 """Lanes of an edge's gradients: of its normal; or of its two ends."""
+
+SUM_LANES = 7
+"""Lanes of sums over chords: area, product of complex numbers, its turns, and moment."""
 
 _MIN_EDGE_SINE = 1.0e-6
 """Sine of the least angle under which a receiver sees an edge."""
@@ -48,6 +52,8 @@ _CHORD = """
     const float half2 = radius * radius - distance * distance;
     const float half = wp::sqrt(half2 > (float)0 ? half2 : (float)0);
     const float tx = scale * (dy * mz - dz * my), ty = scale * (dz * mx - dx * mz), tz = scale * (dx * my - dy * mx);
+    const float toward_x = scale * (mx - cosine_ * dx), toward_y = scale * (my - cosine_ * dy);
+    const float toward_z = scale * (mz - cosine_ * dz);
     const float ahead_a = ax * dx + ay * dy + az * dz, ahead_b = bx * dx + by * dy + bz * dz;
     const float aside_a = ax * tx + ay * ty + az * tz, aside_b = bx * tx + by * ty + bz * tz;
     const float border_a = aside_a > (float)0 ? half : -half, border_b = aside_b > (float)0 ? half : -half;
@@ -75,7 +81,7 @@ def silhouette_type(lanes: int) -> Any:
         numbers: wp.array(dtype=wp.int32)  # [edge]
         edges: wp.array(dtype=Lane)  # [EDGE_LANES · edge]
         adj_edges: wp.array(dtype=Lane)  # [ADJOINT_LANES · edge]
-        sums: wp.array(dtype=Lane)  # of chords: area, product of complex numbers, and its turns
+        sums: wp.array(dtype=Lane)  # [SUM_LANES]
         count: int  # edges that it has for some of the receivers
         is_solid: Lane  # 1; 0 where it encloses nothing: tiny, or a polygon from the side
 
@@ -86,8 +92,8 @@ class SilhouetteFunctions(NamedTuple):
     """Kernel functions on silhouettes."""
 
     find: wp.Function
-    find_share: wp.Function
-    share_adjoint: wp.Function
+    find_coverage: wp.Function
+    coverage_adjoint: wp.Function
     silhouette_adjoint: wp.Function
 
 
@@ -95,8 +101,9 @@ class SilhouetteFunctions(NamedTuple):
 def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
     """Make the kernel functions for a number of lanes."""
     Lane, Vectors, Silhouette = lane_type(lanes), vectors_type(lanes), silhouette_type(lanes)
-    fn = make_lane_functions(lanes)
-    bits_above, is_any_above, dot_direction, total = fn.bits_above, fn.is_any_above, fn.dot_direction, fn.total
+    Coverages, fn = coverage_type(lanes), make_lane_functions(lanes)
+    bits_above, is_any_above, dot_direction = fn.bits_above, fn.is_any_above, fn.dot_direction
+    scale, total = fn.scale, fn.total
     STRIDE, ADJOINT_STRIDE = wp.constant(EDGE_LANES), wp.constant(ADJOINT_LANES)
 
     @wp.func_native(f"""
@@ -129,6 +136,8 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
     {_DIRECTION}
     wp::vec_t<{lanes}, float> area = wp::index(sums, 0), real = wp::index(sums, 1);
     wp::vec_t<{lanes}, float> imaginary = wp::index(sums, 2), turns = wp::index(sums, 3);
+    wp::vec_t<{lanes}, float> moment_x = wp::index(sums, 4), moment_y = wp::index(sums, 5);
+    wp::vec_t<{lanes}, float> moment_z = wp::index(sums, 6);
     for (int lane = 0; lane < {lanes}; ++lane) {{
         {_ENDS} {_CHORD}
         const float least = distance < (float)-{LEAST_DISTANCE} ? distance : (float)-{LEAST_DISTANCE};
@@ -141,7 +150,11 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
         const float after = inverse * (before * x - real.c[lane] * y);
         const float back = y > (float)0 && before < (float)0 && after >= (float)0 ? (float)1 : (float)0;
         const float on = y < (float)0 && before >= (float)0 && after < (float)0 ? (float)1 : (float)0;
+        const float from_line = length * (radius * radius - d * d), on_line = (float)0.5 * d * length * (begin + end);
         area.c[lane] += (float)0.5 * d * length;
+        moment_x.c[lane] += from_line * toward_x + on_line * tx;
+        moment_y.c[lane] += from_line * toward_y + on_line * ty;
+        moment_z.c[lane] += from_line * toward_z + on_line * tz;
         real.c[lane] = crosses ? after_real : real.c[lane];
         imaginary.c[lane] = crosses ? after : before;
         turns.c[lane] += crosses ? on - back : (float)0;
@@ -150,6 +163,9 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
     wp::index(sums, 1) = real;
     wp::index(sums, 2) = imaginary;
     wp::index(sums, 3) = turns;
+    wp::index(sums, 4) = moment_x;
+    wp::index(sums, 5) = moment_y;
+    wp::index(sums, 6) = moment_z;
     """)
     def add_chord(
         points: Vectors,
@@ -167,35 +183,53 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
 
     @wp.func_native(f"""
     const float pi = (float){wp.pi!r};
+    const float per_moment = (float)1 / ((float)3 * pi * radius * radius * radius);
     wp::vec_t<{lanes}, float> share;
     for (int lane = 0; lane < {lanes}; ++lane) {{
         const float cosine = nearest.c[lane];
-        share.c[lane] = cosine >= radius ? (float)1 : (float)0;
+        share.c[lane] = cosine >= radius ? is_solid.c[lane] : (float)0;
         if (cosine < radius && cosine > -radius) {{
             const float angle = wp::atan2(wp::index(sums, 2).c[lane], wp::index(sums, 1).c[lane]);
             const float sector = (float)0.5 * radius * radius * (angle + (float)2 * pi * wp::index(sums, 3).c[lane]);
             const float part = (wp::index(sums, 0).c[lane] + sector) / (pi * radius * radius);
             const float within = (cosine > (float)0 ? (float)1 : (float)0) + part;
-            share.c[lane] = within < (float)0 ? (float)0 : within > (float)1 ? (float)1 : within;
+            share.c[lane] = is_solid.c[lane] * (within < (float)0 ? (float)0 : within > (float)1 ? (float)1 : within);
         }}
+    }}
+    for (int lane = 0; lane < {lanes}; ++lane) {{
+        const bool crosses = nearest.c[lane] < radius && share.c[lane] > (float)0;
+        const float factor = crosses ? per_moment : (float)0;
+        wp::index(sums, 4).c[lane] *= factor;
+        wp::index(sums, 5).c[lane] *= factor;
+        wp::index(sums, 6).c[lane] *= factor;
     }}
     return share;
     """)
-    def share_of_sums(nearest: Lane, sums: wp.array(dtype=Lane), radius: float) -> Lane: ...  # type: ignore[empty-body, valid-type]
+    def finish_sums(nearest: Lane, is_solid: Lane, sums: wp.array(dtype=Lane), radius: float) -> Lane:  # type: ignore[empty-body, valid-type]
+        """Share of a cell; its moment replaces the sum."""
+        ...
 
     @wp.func_native(f"""
     {_DIRECTION}
-    const float inverse_area = (float)1 / ((float){wp.pi!r} * radius * radius);
+    const float per_area = (float)1 / ((float){wp.pi!r} * radius * radius), per_moment = per_area / radius;
     wp::vec_t<{lanes}, float> sum_x = wp::index(gradients, first), sum_y = wp::index(gradients, first + 1);
     wp::vec_t<{lanes}, float> sum_z = wp::index(gradients, first + 2);
     for (int lane = 0; lane < {lanes}; ++lane) {{
         {_ENDS} {_CHORD}
-        const float middle = crosses ? (float)0.5 * (begin + end) : (float)0;
-        const float weight = change.c[lane] * scale * length * inverse_area;
-        const float off = distance * scale;
-        sum_x.c[lane] += weight * (dx - off * (mx - cosine_ * dx) + middle * tx);
-        sum_y.c[lane] += weight * (dy - off * (my - cosine_ * dy) + middle * ty);
-        sum_z.c[lane] += weight * (dz - off * (mz - cosine_ * dz) + middle * tz);
+        const float adj_x = per_moment * adj.moment.x.c[lane], adj_y = per_moment * adj.moment.y.c[lane];
+        const float adj_z = per_moment * adj.moment.z.c[lane];
+        const float foot_x = -distance * toward_x, foot_y = -distance * toward_y, foot_z = -distance * toward_z;
+        // the integral of (at_foot + s slope) (direction + foot + s t) ds
+        const float at_foot = per_area * adj.share.c[lane] + adj_x * foot_x + adj_y * foot_y + adj_z * foot_z;
+        const float slope = adj_x * tx + adj_y * ty + adj_z * tz;
+        const float by_first = crosses ? (float)0.5 * (begin + end) * length : (float)0;
+        const float cubes = (begin * begin + begin * end + end * end) / (float)3;
+        const float by_second = crosses ? cubes * length : (float)0;
+        const float along_foot = scale * (at_foot * length + slope * by_first);
+        const float along_line = scale * (at_foot * by_first + slope * by_second);
+        sum_x.c[lane] += along_foot * (dx + foot_x) + along_line * tx;
+        sum_y.c[lane] += along_foot * (dy + foot_y) + along_line * ty;
+        sum_z.c[lane] += along_foot * (dz + foot_z) + along_line * tz;
     }}
     wp::index(gradients, first) = sum_x;
     wp::index(gradients, first + 1) = sum_y;
@@ -208,7 +242,7 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
         cosine: Lane,
         direction: wp.vec3,
         radius: float,
-        change: Lane,
+        adj: Coverages,
         row: int,
         edges: wp.array(dtype=Lane),
         first: int,
@@ -291,7 +325,7 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
         return count, is_solid
 
     @wp.func
-    def find_share(
+    def find_coverage(
         points: Vectors,
         corners: wp.array(dtype=wp.vec3),
         parts: ConvexArrays,
@@ -299,16 +333,15 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
         direction: wp.vec3,
         radius: float,
     ):
-        """Share of a cell, 0 to 1, within a silhouette."""
+        """Coverage of a cell by a silhouette."""
         nearest = Lane(radius)
         for k in range(silhouette.count):
             nearest = wp.min(nearest, edge_cosine(silhouette, k, direction))
             if not is_any_above(nearest, -radius):
-                return Lane(0.0)
-        silhouette.sums[0] = Lane(0.0)
+                return Coverages()
+        for i in range(wp.static(SUM_LANES)):
+            silhouette.sums[i] = Lane(0.0)
         silhouette.sums[1] = Lane(1.0)
-        silhouette.sums[2] = Lane(0.0)
-        silhouette.sums[3] = Lane(0.0)
         if is_any_above(-nearest, -radius):
             for k in range(silhouette.count):
                 cosine = edge_cosine(silhouette, k, direction)
@@ -316,19 +349,21 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
                     edge = parts.edges[silhouette.numbers[k]]
                     a, b = corners[edge[0]], corners[edge[1]]
                     add_chord(points, a, b, cosine, direction, radius, STRIDE * k, silhouette.edges, silhouette.sums)
-        return wp.cw_mul(silhouette.is_solid, share_of_sums(nearest, silhouette.sums, radius))
+        share = finish_sums(nearest, silhouette.is_solid, silhouette.sums, radius)
+        return Coverages(share, Vectors(silhouette.sums[4], silhouette.sums[5], silhouette.sums[6]))
 
     @wp.func
-    def share_adjoint(
+    def coverage_adjoint(
         points: Vectors,
         corners: wp.array(dtype=wp.vec3),
         parts: ConvexArrays,
         silhouette: Silhouette,
         direction: wp.vec3,
         radius: float,
-        adj: Lane,
+        adj: Coverages,
     ):
         """Add to the gradients of the edges' normals."""
+        solid = Coverages(wp.cw_mul(silhouette.is_solid, adj.share), scale(silhouette.is_solid, adj.moment))
         for k in range(silhouette.count):
             cosine = edge_cosine(silhouette, k, direction)
             if is_any_above(-wp.max(cosine, -cosine), -radius):
@@ -336,7 +371,6 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
                 a, b = corners[edge[0]], corners[edge[1]]
                 row, adj_row = STRIDE * k, ADJOINT_STRIDE * k
                 edges, adj_edges = silhouette.edges, silhouette.adj_edges
-                solid = wp.cw_mul(silhouette.is_solid, adj)
                 add_chord_adjoint(points, a, b, cosine, direction, radius, solid, row, edges, adj_row, adj_edges)
 
     @wp.func
@@ -365,4 +399,4 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
                     wp.atomic_add(adj_corners, instance, edge[end], wp.vec3(total(x), total(y), total(z)))
         return adj_points
 
-    return SilhouetteFunctions(find, find_share, share_adjoint, silhouette_adjoint)
+    return SilhouetteFunctions(find, find_coverage, coverage_adjoint, silhouette_adjoint)

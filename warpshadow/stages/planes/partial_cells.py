@@ -25,6 +25,11 @@ from warpshadow.device.memory import empty
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.cell_coverage import ViewedEdge
 from warpshadow.stages.planes.cells import PlaneArrays, check_planes, plane_arrays
+from warpshadow.stages.planes.coverage import (
+    horizon_normal,
+    side_coverage,
+    side_coverage_adjoint,
+)
 from warpshadow.stages.planes.prepared import PlaneBlockers
 from warpshadow.stages.planes.sides import (
     SIDE_ROWS,
@@ -34,11 +39,6 @@ from warpshadow.stages.planes.sides import (
     place_receiver_adjoint,
     receiver_scratch,
     visible_cell,
-)
-from warpshadow.stages.planes.transmittance import (
-    horizon_normal,
-    side_coverage,
-    side_coverage_adjoint,
 )
 
 SAMPLES = 8
@@ -92,7 +92,7 @@ def _covered(
         grid = scene.grids[side.f]
         if grid.blocks == 1 and total < 1.0:
             covered = side_coverage(scene, grid, side, load_place(store, side.f), cell, edges)
-            total += covered.outline * covered.part
+            total += covered.outline[0] * covered.part
     return total
 
 
@@ -125,7 +125,7 @@ def _sample_light(
     # in
     points: wp.array2d(dtype=wp.vec3),
     horizon_normals: wp.array2d(dtype=wp.vec3),
-    covered: wp.array3d(dtype=wp.float32),
+    covered: wp.array3d(dtype=wp.vec4),
     frames: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
     scene: PlaneArrays,
@@ -134,7 +134,7 @@ def _sample_light(
     scratch: wp.array2d(dtype=wp.vec3),
     viewed_edges: wp.array2d(dtype=ViewedEdge),
     # out
-    result: wp.array3d(dtype=wp.float32),
+    result: wp.array3d(dtype=wp.vec4),
 ):
     """A thread owns a receiver."""
     batch, receiver, scratch_row, side_count = place_receiver(
@@ -143,13 +143,14 @@ def _sample_light(
     store, edges = scratch[scratch_row], viewed_edges[scratch_row]
     normal = horizon_normal(horizon_normals, batch, receiver)
     for q in range(samples.shape[0]):
-        coverage = covered[batch, receiver, q]
+        cell = covered[batch, receiver, q]
+        coverage = cell[0]
         weight = _partial_weight(coverage)
         if weight > 0.0:
             mean, weights = _mean_covered(scene, samples[q], normal, side_count, store, edges)
             if weights > 0.0:
                 coverage = coverage + weight * (mean - coverage)
-        result[batch, receiver, q] = coverage
+        result[batch, receiver, q] = wp.vec4(coverage, cell[1], cell[2], cell[3])
 
 
 @wp.kernel(enable_backward=False)
@@ -159,19 +160,19 @@ def _sample_light_adjoint(
     # in
     points: wp.array2d(dtype=wp.vec3),
     horizon_normals: wp.array2d(dtype=wp.vec3),
-    covered: wp.array3d(dtype=wp.float32),
+    covered: wp.array3d(dtype=wp.vec4),
     frames: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
     scene: PlaneArrays,
     samples: wp.array2d(dtype=wp.vec3),
-    adj_result: wp.array3d(dtype=wp.float32),
+    adj_result: wp.array3d(dtype=wp.vec4),
     # scratch
     scratch: wp.array2d(dtype=wp.vec3),
     viewed_edges: wp.array2d(dtype=ViewedEdge),
     adj_scratch: wp.array2d(dtype=wp.vec3),
     # out
     adj_points: wp.array2d(dtype=wp.vec3),
-    adj_covered: wp.array3d(dtype=wp.float32),
+    adj_covered: wp.array3d(dtype=wp.vec4),
     adj_fronts: wp.array3d(dtype=wp.float32),
     # sums
     adj_frames: wp.array2d(dtype=wp.vec3),
@@ -185,8 +186,9 @@ def _sample_light_adjoint(
     for k in range(SIDE_ROWS * scene.grids.shape[0]):
         adj_store[k] = wp.vec3()
     for q in range(samples.shape[0]):
-        coverage = covered[batch, receiver, q]
-        adj = adj_result[batch, receiver, q]
+        coverage = covered[batch, receiver, q][0]
+        adj_cell = adj_result[batch, receiver, q]
+        adj = adj_cell[0]
         weight = _partial_weight(coverage)
         slope = float(1.0)
         if adj != 0.0 and weight > 0.0:
@@ -197,7 +199,8 @@ def _sample_light_adjoint(
                 direction = samples[q, s]
                 share = _sample_weight(scene, normal, direction)
                 if share > 0.0 and _covered(scene, direction, normal, side_count, store, edges) < 1.0:
-                    cell, adj_part = visible_cell(scene, normal, direction), weight * adj * share / weights
+                    cell = visible_cell(scene, normal, direction)
+                    adj_part = wp.vec4(weight * adj * share / weights, 0.0, 0.0, 0.0)
                     for i in range(side_count):
                         side = load_side(scene, i, store)
                         grid = scene.grids[side.f]
@@ -205,7 +208,9 @@ def _sample_light_adjoint(
                             in_plane = load_place(store, side.f)
                             side_coverage_adjoint(scene, grid, side, in_plane, cell, adj_part, edges, adj_store)
         if adj_covered:
-            adj_covered[batch, receiver, q] = adj_covered[batch, receiver, q] + slope * adj
+            adj_covered[batch, receiver, q] = adj_covered[batch, receiver, q] + wp.vec4(
+                slope * adj, adj_cell[1], adj_cell[2], adj_cell[3]
+            )
     place_receiver_adjoint(
         batch,
         receiver,
@@ -238,11 +243,11 @@ def coverage_of_light(
     """Coverage of the light of cells, C′: more exact than that of cells where planes cover them in part.
 
     Args:
-        points, frames, planes, directions, horizon_normals, fronts, skip: As for :func:`.transmittance.plane_coverage`.
-        covered: C, its result, float32 of shape [batch, receiver, direction].
+        points, frames, planes, directions, horizon_normals, fronts, skip: As for :func:`.plane_coverage`.
+        covered: Its result, (C, μ), vec4 of shape [batch, receiver, direction].
         samples: Eight directions drawn from the light of each cell, NumPy of shape [direction, 8, 3].
     Returns:
-        Float32 of shape [batch, receiver, direction].
+        (C′, μ), of the same shape.
     Differentiable: points, covered, frames, fronts. Not: horizon_normals, which decide by steps,
     and how much directions count for receivers in a plane.
     """
@@ -267,6 +272,6 @@ def coverage_of_light(
             sums=[frames.grad],
             cost=2 * cost,
         ),
-        result=empty(covered.shape, dtype=wp.float32, device=points.device),
+        result=empty(covered.shape, dtype=wp.vec4, device=points.device),
         variables=[points, covered, frames, fronts],
     )

@@ -287,7 +287,7 @@ def footprint_on_side_adjoint(
 
 
 @wp.func
-def plane_share(
+def outline_coverage_on_side(
     scene: PlaneArrays,
     grid: PlaneGrid,
     side: PlaneSide,
@@ -295,10 +295,10 @@ def plane_share(
     cell: VisibleCell,
     edges: wp.array(dtype=ViewedEdge),
 ):
-    """Share of a cell within the outline of a plane, as much of it as is seen of the side."""
+    """Coverage (h, μ) of a cell by the outline of a plane, as much of it as is seen of the side."""
     down = _down(place, side)
     if wp.dot(down, cell.direction) <= -scene.radius:
-        return 0.0
+        return wp.vec4()
     first, count = side.first_edge, grid.edge_count
     if grid.is_convex == 1:
         return side.weight * convex_coverage(edges, first, count, cell.direction, cell.radius)

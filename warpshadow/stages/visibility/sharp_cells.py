@@ -22,7 +22,9 @@ from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK, MIN_WIDTH, brightest_chunk, cell_radius
 from warpshadow.stages.visibility.directional import SOFTNESS
 
-_RADII = 2.4  # radius of the cell whose soft edge is like a spot's penumbra, in half-angles of the spot
+SHARP_CELL_RADII = 2.4
+"""Radius of the cell whose soft edge is like a spot's penumbra, in half-angles of the spot."""
+
 _MIN_SHARE = 0.1  # share of all light that sharp cells have at least: less is not worth their time
 
 WIDEST_PAST_PLANES = 1.7
@@ -61,7 +63,7 @@ def find_sharp_cells(
         softness: κ, by which edges become no narrower than a falloff may be.
         widest: Radius up to which cells are sharp, in radii of all cells.
     """
-    radii = np.maximum(_RADII * spreads, max(_MIN_RADIUS, 1.001 * MIN_WIDTH / softness))
+    radii = np.maximum(SHARP_CELL_RADII * spreads, max(_MIN_RADIUS, 1.001 * MIN_WIDTH / softness))
     is_small = radii < widest * cell_radius(len(power))
     cells, repeated, places = brightest_chunk(power, is_small & (power > 0))
     if power[cells].sum() <= _MIN_SHARE * power.sum():

@@ -1,9 +1,9 @@
-"""Transmittance past plane blockers, such as a ground or walls.
+"""Coverage of cells by plane blockers, such as a ground or walls.
 
-    P_q = T_q max(0, 1 − Σ_k h_k),
+    h_q = Σ_k h_qk,  μ_q = Σ_k μ_qk
 
-h_k the coverage of cell q by plane k, and T_q the transmittance past all else. Plane blockers that share a cell mostly
-meet in it, as walls do, and cover different parts of it.
+h_qk and μ_qk are the coverage of cell q by plane k (:mod:`warpshadow.stages.cell_coverage`). Plane blockers that share
+a cell mostly meet in it, as walls do, and cover different parts of it.
 
 A large sphere in place of a ground is worse: on a cow over a ground the error of direct light is 0.7% of the image's
 mean by the plane, and 2.3% by the sphere.
@@ -12,11 +12,9 @@ mean by the plane, and 2.3% by the sphere.
 import numpy as np
 import warp as wp
 
-from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, expand_rows, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import differentiable, launch
-from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.cell_coverage import ViewedEdge, coverage_adjoint
 from warpshadow.stages.planes.cells import (
@@ -39,22 +37,21 @@ from warpshadow.stages.planes.sides import (
     footprint_on_side_adjoint,
     load_place,
     load_side,
+    outline_coverage_on_side,
     place_receiver,
     place_receiver_adjoint,
-    plane_share,
     receiver_scratch,
     visible_cell,
 )
 
 _CELL_COST = 4.0  # mean time of a cell of a receiver [ns], over cells that hit a plane and cells that do not
-_PASS_COST = 0.4  # time of a cell that is only multiplied [ns]
 
 
 @wp.struct
 class PlaneCover:
     """Coverage of a cell by a side."""
 
-    outline: float  # by its outline
+    outline: wp.vec4  # (h, μ), by its outline
     part: float  # of that, that the mesh covers, by texels
     footprint: PlaneFootprint  # of these texels
 
@@ -71,8 +68,8 @@ def side_coverage(
     """Coverage of a cell by a side."""
     covered = PlaneCover()
     covered.part = 1.0
-    covered.outline = plane_share(scene, grid, side, place, cell, edges)
-    if is_covered_by_texels(grid) and covered.outline > 0.0:
+    covered.outline = outline_coverage_on_side(scene, grid, side, place, cell, edges)
+    if is_covered_by_texels(grid) and covered.outline[0] > 0.0:
         covered.footprint = footprint_on_side(scene, grid, side, place, cell.direction)
         mip = find_mip_footprint(grid, scene, covered.footprint)
         covered.part = fetch(scene.covered, scene, grid.first_level, mip)[0]
@@ -86,7 +83,7 @@ def side_coverage_adjoint(
     side: PlaneSide,
     place: ReceiverInPlane,
     cell: VisibleCell,
-    adj: float,
+    adj: wp.vec4,
     edges: wp.array(dtype=ViewedEdge),
     adj_store: wp.array(dtype=wp.vec3),
 ):
@@ -95,15 +92,15 @@ def side_coverage_adjoint(
     covered.part = 1.0
     if side.weight < 1.0 or is_covered_by_texels(grid):
         covered = side_coverage(scene, grid, side, place, cell, edges)
-        adj_weight = adj * covered.part * covered.outline / side.weight
+        adj_weight = covered.part * wp.dot(adj, covered.outline) / side.weight
         adj_store[side.row] = adj_store[side.row] + wp.vec3(0.0, 0.0, adj_weight)
-    if is_covered_by_texels(grid) and covered.outline > 0.0:
+    if is_covered_by_texels(grid) and covered.outline[0] > 0.0:
         footprint = covered.footprint
-        adj_part = wp.vec3(adj * covered.outline, 0.0, 0.0)
+        adj_part = wp.vec3(wp.dot(adj, covered.outline), 0.0, 0.0)
         mip = find_mip_footprint(grid, scene, footprint)
         adj_mip = fetch_adjoint(scene.covered, grid, scene, grid.first_level, footprint, mip, adj_part)
         footprint_on_side_adjoint(scene, grid, side, place, cell.direction, footprint, adj_mip, 0.0, 0.0, adj_store)
-    weighted = adj * side.weight * covered.part
+    weighted = (side.weight * covered.part) * adj
     coverage_adjoint(edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, weighted)
 
 
@@ -136,9 +133,9 @@ def _cover(
     scratch: wp.array2d(dtype=wp.vec3),
     viewed_edges: wp.array2d(dtype=ViewedEdge),
     # out
-    result: wp.array3d(dtype=wp.float32),
+    result: wp.array3d(dtype=wp.vec4),
 ):
-    """A thread owns a receiver:  C_q = Σ_k h_k."""
+    """A thread owns a receiver."""
     batch, receiver, scratch_row, side_count = place_receiver(
         first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
     )
@@ -146,7 +143,7 @@ def _cover(
     normal = horizon_normal(horizon_normals, batch, receiver)
     covered = result[batch, receiver]
     for q in range(directions.shape[0]):
-        covered[q] = 0.0
+        covered[q] = wp.vec4()
     for i in range(side_count):
         side = load_side(scene, i, store)
         grid = scene.grids[side.f]
@@ -154,11 +151,11 @@ def _cover(
         if grid.blocks == 1:
             for q in range(directions.shape[0]):
                 direction = directions[q]
-                if is_above_horizon(normal, direction) and covered[q] < 1.0:
+                if is_above_horizon(normal, direction) and covered[q][0] < 1.0:
                     cell = visible_cell(scene, normal, direction)
                     by_side = side_coverage(scene, grid, side, in_plane, cell, edges)
-                    if by_side.outline > 0.0:
-                        covered[q] = covered[q] + by_side.outline * by_side.part
+                    if by_side.outline[0] > 0.0:
+                        covered[q] = covered[q] + by_side.part * by_side.outline
 
 
 @wp.kernel(enable_backward=False)
@@ -172,7 +169,7 @@ def _cover_adjoint(
     fronts: wp.array3d(dtype=wp.float32),
     scene: PlaneArrays,
     directions: wp.array(dtype=wp.vec3),
-    adj_result: wp.array3d(dtype=wp.float32),
+    adj_result: wp.array3d(dtype=wp.vec4),
     # scratch
     scratch: wp.array2d(dtype=wp.vec3),
     viewed_edges: wp.array2d(dtype=ViewedEdge),
@@ -198,7 +195,7 @@ def _cover_adjoint(
         if grid.blocks == 1:
             for q in range(directions.shape[0]):
                 adj = adj_result[batch, receiver, q]
-                if adj != 0.0 and is_above_horizon(normal, directions[q]):
+                if wp.length_sq(adj) > 0.0 and is_above_horizon(normal, directions[q]):
                     cell = visible_cell(scene, normal, directions[q])
                     side_coverage_adjoint(scene, grid, side, in_plane, cell, adj, edges, adj_store)
     place_receiver_adjoint(
@@ -218,46 +215,6 @@ def _cover_adjoint(
     )
 
 
-@wp.kernel(enable_backward=False)
-def _pass(
-    first_row: int,
-    worker: int,
-    # in
-    transmittance: wp.array3d(dtype=wp.float32),
-    covered: wp.array3d(dtype=wp.float32),
-    # out
-    passing: wp.array3d(dtype=wp.float32),
-):
-    """A thread owns a receiver:  P_q = T_q max(0, 1 − C_q)."""
-    batch, receiver = split_row(first_row + wp.tid(), passing.shape[1])
-    for q in range(passing.shape[2]):
-        passing[batch, receiver, q] = transmittance[batch, receiver, q] * wp.max(0.0, 1.0 - covered[batch, receiver, q])
-
-
-@wp.kernel(enable_backward=False)
-def _pass_adjoint(
-    first_row: int,
-    worker: int,
-    # in
-    transmittance: wp.array3d(dtype=wp.float32),
-    covered: wp.array3d(dtype=wp.float32),
-    adj_passing: wp.array3d(dtype=wp.float32),
-    # out
-    adj_transmittance: wp.array3d(dtype=wp.float32),
-    adj_covered: wp.array3d(dtype=wp.float32),
-):
-    """A thread owns a receiver."""
-    batch, receiver = split_row(first_row + wp.tid(), adj_passing.shape[1])
-    for q in range(adj_passing.shape[2]):
-        adj, left = adj_passing[batch, receiver, q], 1.0 - covered[batch, receiver, q]
-        if left > 0.0:
-            if adj_transmittance:
-                adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + adj * left
-            if adj_covered:
-                blocked = adj * transmittance[batch, receiver, q]
-                adj_covered[batch, receiver, q] = adj_covered[batch, receiver, q] - blocked
-
-
 def plane_coverage(
     points: wp.array,
     frames: wp.array,
@@ -269,7 +226,7 @@ def plane_coverage(
     fronts: wp.array | None = None,
     skip: int | None = None,
 ) -> wp.array | None:
-    """Coverage of cells by the planes that cast shadows, Σ_k h_k: values of 1 and more need not be complete.
+    """Coverage (h, μ) of cells by the planes that cast shadows: an h of 1 and more need not be complete.
 
     Args:
         points: Receivers [scene units], vec3 of shape [batch, receiver].
@@ -283,8 +240,8 @@ def plane_coverage(
             [batch, receiver, plane]; by default their heights decide.
         skip: Number of the plane that the receivers are part of, which blocks none of their light; None for none.
     Returns:
-        Float32 of shape [batch, receiver, direction], 1 or more where nothing passes; None where no plane casts a
-        shadow on them.
+        vec4 of shape [batch, receiver, direction], for :func:`warpshadow.stages.joint_coverage.transmittance_past`; h
+        is 1 or more where nothing passes. None where no plane casts a shadow on them.
     Differentiable: points, frames, fronts. Not: horizon_normals, which decide by steps,
     and how much receivers in a plane see of a cell.
     """
@@ -309,35 +266,6 @@ def plane_coverage(
             sums=[frames.grad],
             cost=2 * cost,
         ),
-        result=wp.empty((*points.shape, cells.size), dtype=wp.float32, device=points.device),
+        result=wp.empty((*points.shape, cells.size), dtype=wp.vec4, device=points.device),
         variables=[points, frames, fronts],
-    )
-
-
-def transmittance_past_planes(transmittance: wp.array, covered: wp.array) -> wp.array:
-    """Transmittance past planes, given the transmittance past all else, T_q max(0, 1 − C_q).
-
-    Args:
-        transmittance: Past all else, float32 of shape [batch, receiver, direction]; its batch may be 1.
-        covered: Coverage by planes, :func:`plane_coverage`, of the same shape; its batch may be 1.
-    Returns:
-        Float32 of the same shape.
-    Differentiable: transmittance, covered.
-    """
-    check.shape("transmittance", transmittance.shape, ("batch", *covered.shape[1:]))
-    count = common_batch({"transmittance": transmittance, "covered": covered})
-    transmittance, covered = expand_rows(transmittance, count), expand_rows(covered, count)
-    rows, cost = transmittance.shape[0] * transmittance.shape[1], _PASS_COST * transmittance.shape[2]
-    inputs = [transmittance, covered]
-    return differentiable(
-        lambda passing: launch(_pass, rows, inputs=inputs, outputs=[passing], cost=cost),
-        lambda adj_passing: launch(
-            _pass_adjoint,
-            rows,
-            inputs=[*inputs, adj_passing],
-            outputs=[transmittance.grad, covered.grad],
-            cost=2 * cost,
-        ),
-        result=wp.empty(transmittance.shape, dtype=wp.float32, device=transmittance.device),
-        variables=inputs,
     )

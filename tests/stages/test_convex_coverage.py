@@ -1,20 +1,22 @@
-"""Transmittance past convex parts, against rays through NumPy's planes, and against differences."""
+"""Coverage of cells by convex parts, against rays through NumPy's planes."""
 
 import numpy as np
 import pytest
 import trimesh
+import twins
 import warp as wp
 from scipy.spatial import ConvexHull
 
 from warpshadow.maths.convex import find_convex_parts
 from warpshadow.maths.directions import cell_radius, fibonacci
+from warpshadow.stages.convex.coverage import part_coverage
 from warpshadow.stages.convex.prepared import ConvexBlockers, ConvexBody
-from warpshadow.stages.convex.transmittance import transmittance_past_parts
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
-# Rays of the twin: 200 across a cell. Measured: 3e-3.
-RAYS = 4e-3
+# Rays of the twin: 200 across a cell. Measured: 4e-3.
+RAYS = 5e-3
+# Without the seam the error is 0.16.
 DIRECTIONS = fibonacci(32)
 BOX = trimesh.creation.box((1, 0.5, 0.3))
 PRISM = trimesh.creation.cylinder(0.3, 1.0, sections=7)
@@ -48,7 +50,7 @@ def hits(vertices, point, rays):
 
 
 def twin(point, directions, radius, bodies, across=200, vertices=VERTICES):
-    """Transmittance of a receiver, by rays through the disc of each cell."""
+    """Coverage (h, μ) of a receiver's cells, by rays through the disc of each."""
     axis = (np.arange(across) + 0.5) / across * 2 - 1
     u, v = np.meshgrid(axis, axis)
     disc = radius * np.stack([u, v], axis=-1)[u**2 + v**2 < 1]
@@ -57,8 +59,12 @@ def twin(point, directions, radius, bodies, across=200, vertices=VERTICES):
         side = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
         frame = np.stack([side, np.cross(direction, side)]) / np.linalg.norm(side)
         rays = direction + disc @ frame
-        shares = [sum(hits(vertices[part], point, rays).mean() for part in parts) for parts in bodies]
-        result.append(np.prod(np.maximum(0, 1 - np.array(shares))))
+        covers = [sum(hits(vertices[part], point, rays).astype(float) for part in parts) for parts in bodies]
+        result.append(
+            twins.joint_coverage(
+                [cover.mean() for cover in covers], [cover @ (disc @ frame) / radius / len(rays) for cover in covers]
+            )
+        )
     return np.array(result)
 
 
@@ -71,13 +77,16 @@ POINTS = np.array(
 def of_kernel(points, device, directions=DIRECTIONS, **options):
     placed = blockers(device).placed(wp.array(np.concatenate(VERTICES)[None], dtype=wp.vec3, device=device))
     arguments = wp.array(points[None], dtype=wp.vec3, device=device), placed, blockers(device), directions
-    return transmittance_past_parts(*arguments, **options).numpy()[0]
+    return part_coverage(*arguments, **options).numpy()[0]
 
 
 @pytest.mark.parametrize("number", range(len(POINTS)))
-def test_shares_of_cells_are_those_of_rays(number, device):
+def test_coverages_of_cells_are_those_of_rays(number, device):
     expected = twin(POINTS[number], DIRECTIONS, cell_radius(32), BODIES)
-    np.testing.assert_allclose(of_kernel(POINTS[[number]], device)[0], expected, rtol=0, atol=RAYS)
+    found = of_kernel(POINTS[[number]], device)[0]
+    np.testing.assert_allclose(found[:, 0], expected[:, 0], rtol=0, atol=RAYS)
+    is_open = expected[:, 0] < 1  # else the moment is that of the first body that covers all
+    np.testing.assert_allclose(found[is_open], expected[is_open], rtol=0, atol=RAYS)
 
 
 def test_a_panel_is_two_sided_and_blocks_nothing_of_receivers_in_its_plane(device):
@@ -87,12 +96,12 @@ def test_a_panel_is_two_sided_and_blocks_nothing_of_receivers_in_its_plane(devic
     placed = some.placed(wp.array(corners[None], dtype=wp.vec3, device=device))
     points = np.array([[0.1, 1.0, 0.0], [0.1, -0.1, 0.1], [0.1, 0.2, 0.1], [3.0, 0.2, 0.1]])
     arguments = wp.array(points[None], dtype=wp.vec3, device=device), placed, some, DIRECTIONS
-    got = transmittance_past_parts(*arguments).numpy()[0]
+    got = part_coverage(*arguments).numpy()[0]
     thick = np.concatenate([corners - [0, 1e-4, 0], corners + [0, 1e-4, 0]])
     expected = [twin(point, DIRECTIONS, cell_radius(32), [[0]], vertices=[thick]) for point in points[:2]]
     np.testing.assert_allclose(got[:2], expected, rtol=0, atol=RAYS)
-    assert got[:2].min(axis=1).max() < 0.1
-    np.testing.assert_array_equal(got[2:], 1)
+    assert got[:2, :, 0].max(axis=1).min() > 0.9
+    np.testing.assert_array_equal(got[2:], 0)
 
 
 @pytest.mark.parametrize("turn", range(4))
@@ -105,8 +114,34 @@ def test_a_cell_whose_middle_is_on_an_edge_is_half_covered(turn, device):
     points = np.array([[0, 1, 0], [1, 0, 0], [0, 2, 2], [1, 1, 0.0]])
     directions = np.tile([0, 0, 1.0], (16, 1)) * np.where(np.arange(16) < 8, 1, -1)[:, None]
     arguments = wp.array(points[None], dtype=wp.vec3, device=device), placed, some, directions
-    got = transmittance_past_parts(*arguments, radius=0.1).numpy()[0][:, [0, 15]]
-    np.testing.assert_allclose(got, [[0.5, 1], [0.5, 1], [1, 0.5], [0, 1]], atol=1e-5)
+    got = part_coverage(*arguments, radius=0.1).numpy()[0][:, [0, 15], 0]
+    np.testing.assert_allclose(got, [[0.5, 0], [0.5, 0], [0, 0.5], [1, 0]], atol=1e-5)
+
+
+def test_prisms_of_a_body_cover_their_seam_once(device):
+    """A bracket of six corners, cut into two prisms, which both cover their seam where it is seen at a slant."""
+    outline = np.array([[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2.0]])
+    triangles = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 5], [3, 4, 5]])
+    bracket = trimesh.creation.extrude_triangulation(outline, triangles, 1.0)
+    parts = find_convex_parts(bracket.vertices, bracket.faces)
+    assert [part.is_seam for part in parts] == [False, False, True]
+    some = ConvexBlockers.of([ConvexBody(parts, 0)], len(bracket.vertices), device=device)
+    placed = some.placed(wp.array(bracket.vertices[None], dtype=wp.vec3, device=device))
+    points = np.array([[-1.5, -0.7, 1.8], [-0.6, -0.9, -1.2]])  # from outside the notch
+    solids = [bracket.vertices[part.corners] for part in parts[:2]]
+    for point in points:
+        toward = bracket.triangles_center[::2] - point
+        toward = np.resize(toward / np.linalg.norm(toward, axis=1, keepdims=True), (16, 3))
+        arguments = wp.array(point[None, None], dtype=wp.vec3, device=device), placed, some, toward
+        got = part_coverage(*arguments, radius=0.3).numpy()[0, 0, :, 0]
+        axis = (np.arange(200) + 0.5) / 100 - 1
+        u, v = np.meshgrid(axis, axis)
+        for direction, share in zip(toward, got, strict=True):
+            side = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
+            frame = np.stack([side, np.cross(direction, side)]) / np.linalg.norm(side)
+            rays = direction + 0.3 * np.stack([u, v], axis=-1)[u**2 + v**2 < 1] @ frame
+            met = np.any([hits(solid, point, rays) for solid in solids], axis=0).mean()
+            assert share == pytest.approx(met, abs=RAYS)
 
 
 def test_narrow_cells_and_a_receivers_own_body_are_left_to_it(device):
@@ -116,7 +151,7 @@ def test_narrow_cells_and_a_receivers_own_body_are_left_to_it(device):
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     got = of_kernel(POINTS[[0]], device, toward, radius=0.02, skip=1)[0]
     expected = twin(POINTS[0], toward, 0.02, BODIES[:1])
-    assert ((expected > 0.1) & (expected < 0.9)).sum() > 4
+    assert ((expected[:, 0] > 0.1) & (expected[:, 0] < 0.9)).sum() > 4
     np.testing.assert_allclose(got, expected, rtol=0, atol=RAYS)
 
 
@@ -124,14 +159,14 @@ def test_parts_so_far_away_that_they_have_no_size_block_nothing(device):
     """Some or all edges are under 1e-6 rad, the least that counts."""
     distances = np.repeat(10.0 ** np.arange(4, 9, 0.25), len(DIRECTIONS))
     points = distances[:, None] * np.tile(DIRECTIONS, (20, 1))
-    assert of_kernel(points, device).min() > 1 - 1e-4
+    assert of_kernel(points, device)[..., 0].max() < 1e-4
 
 
 def test_bodies_that_cast_no_shadow_block_nothing(device):
     vertices = wp.array(np.concatenate(VERTICES)[None], dtype=wp.vec3, device=device)
     some = blockers(device, blocks=(True, False))
     points = wp.array(POINTS[None], dtype=wp.vec3, device=device)
-    got = transmittance_past_parts(points, some.placed(vertices), some, DIRECTIONS).numpy()[0]
+    got = part_coverage(points, some.placed(vertices), some, DIRECTIONS).numpy()[0]
     np.testing.assert_array_equal(got, of_kernel(POINTS, device, skip=1))
 
 
@@ -139,7 +174,7 @@ def test_nothing_below_the_horizon_is_blocked(device):
     normals = np.random.default_rng(0).normal(size=POINTS.shape)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     horizon_normals = wp.array(normals[None], dtype=wp.vec3, device=device)
-    expected = np.where(normals @ DIRECTIONS.T > 0, of_kernel(POINTS, device), 1)
+    expected = np.where((normals @ DIRECTIONS.T > 0)[..., None], of_kernel(POINTS, device), 0)
     np.testing.assert_array_equal(of_kernel(POINTS, device, horizon_normals=horizon_normals), expected)
 
 
@@ -149,7 +184,7 @@ def test_instances_have_parts_of_their_own(device):
     points = np.stack([POINTS, POINTS + shift])
     some = blockers(device)
     placed = some.placed(wp.array(positions, dtype=wp.vec3, device=device))
-    got = transmittance_past_parts(wp.array(points[:, :4], dtype=wp.vec3, device=device), placed, some, DIRECTIONS)
+    got = part_coverage(wp.array(points[:, :4], dtype=wp.vec3, device=device), placed, some, DIRECTIONS)
     np.testing.assert_allclose(got.numpy()[1], got.numpy()[0], rtol=0, atol=1e-4)  # rounding of 1e-7 beside edges
     np.testing.assert_array_equal(got.numpy()[0], of_kernel(POINTS[:4], device))
 

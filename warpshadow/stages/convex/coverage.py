@@ -1,12 +1,10 @@
-"""Transmittance past convex blockers, such as boxes and rods.
+"""Coverage of cells by convex blockers, such as boxes and rods.
 
-    P_q = Π_bodies max(0, 1 − Σ_parts h_q)
-
-h is the share of cell q within the silhouette of a convex part (:mod:`warpshadow.stages.cell_coverage`), the edges
-between a face that a receiver sees and one that it does not.
-
-Parts of one body are beside each other, so they cover different parts of a cell; bodies are independent. Edges are
-exact, and so are thin parts: spheres bulge out of them.
+Each body covers h_q = Σ_parts h, with the moment Σ_parts μ, of cell q: h and μ are the coverage by the silhouette of a
+convex part (:mod:`warpshadow.stages.cell_coverage`), the edges between a face that a receiver sees and one that it does
+not. Parts of one body are beside each other, so they cover different parts of a cell. Prisms into which a body is cut
+both cover their seam, the face between them, where they are seen at a slant: it is taken off. How bodies are to each
+other, :mod:`.joint_coverage` tells. Edges are exact, and so are thin parts: spheres bulge out of them.
 """
 
 import functools
@@ -28,10 +26,12 @@ from warpshadow.device.lanes import (
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths.directions import BUNDLE, cell_radius
+from warpshadow.stages.convex.joint_lanes import coverage_type, make_joint_functions, sums_type
 from warpshadow.stages.convex.prepared import ConvexArrays, ConvexBlockers, PlacedParts
 from warpshadow.stages.convex.silhouette import (
     ADJOINT_LANES,
     EDGE_LANES,
+    SUM_LANES,
     make_silhouette_functions,
     silhouette_type,
 )
@@ -49,15 +49,16 @@ _BOUND_MARGIN = 1.001
 def _task_type(lanes: int) -> Any:
     """Struct of a block of receivers, and memory for its cells."""
     Lane, Vectors, Silhouette = lane_type(lanes), vectors_type(lanes), silhouette_type(lanes)
+    Coverages, SumsOfBlockers = coverage_type(lanes), sums_type(lanes)
 
     @wp.struct
     class PartsTask:
         points: Vectors
         normals: Vectors
         lift: Lane  # 1 where there is no horizon, else 0
-        left: wp.array(dtype=Lane)  # [direction] transmittance; for the adjoint its product with its adjoint
-        coverage: wp.array(dtype=Lane)  # [direction] of the parts of a body, 0 between bodies
+        coverage: wp.array(dtype=Coverages)  # [direction] by the parts of a body, 0 between bodies
         covered: wp.array(dtype=wp.int32)  # numbers of the cells in which that is not 0
+        sums: wp.array(dtype=SumsOfBlockers)  # [direction] over bodies
         silhouette: Silhouette
 
     return PartsTask
@@ -83,8 +84,9 @@ class _PartFunctions(NamedTuple):
 
     begin: wp.Function
     find_bound: wp.Function
-    find_effect: wp.Function
+    find_reach: wp.Function
     cover: wp.Function
+    cover_all: wp.Function
 
 
 @functools.cache
@@ -92,9 +94,12 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
     """Make the kernel functions for a number of lanes."""
     Lane = lane_type(lanes)
     PartsTask, PartBound = _task_type(lanes), _bound_type(lanes)
-    fn, silhouettes = make_lane_functions(lanes), make_silhouette_functions(lanes)
+    Coverages, SumsOfBlockers = coverage_type(lanes), sums_type(lanes)
+    fn, silhouettes, joint = make_lane_functions(lanes), make_silhouette_functions(lanes), make_joint_functions(lanes)
     is_any_above, dot, dot_direction, offset, scale = fn.is_any_above, fn.dot, fn.dot_direction, fn.offset, fn.scale
-    load, sqrt, find, find_share = fn.load, fn.sqrt, silhouettes.find, silhouettes.find_share
+    load, sqrt, add, is_positive = fn.load, fn.sqrt, fn.add, fn.is_positive
+    find, find_coverage = silhouettes.find, silhouettes.find_coverage
+    no_blockers, with_blocker = joint.no_blockers, joint.with_blocker
     MARGIN = wp.constant(_BOUND_MARGIN)
 
     @wp.func
@@ -103,8 +108,10 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         horizon_normals: wp.array2d(dtype=wp.vec3),
         batch: int,
         block: int,
-        lane_scratch: wp.array2d(dtype=Lane),
+        coverage: wp.array(dtype=Coverages),
         covered: wp.array(dtype=wp.int32),
+        sums: wp.array(dtype=SumsOfBlockers),
+        chord_sums: wp.array(dtype=Lane),
         edge_scratch: wp.array(dtype=Lane),
         adj_edge_scratch: wp.array(dtype=Lane),
         numbers: wp.array2d(dtype=wp.int32),
@@ -114,17 +121,18 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         task.points = load(points[batch], block)
         if horizon_normals:
             task.normals = load(horizon_normals[batch], block)
-        task.lift = Lane(1.0) - wp.min(1.0e30 * dot(task.normals, task.normals), Lane(1.0))
-        task.left = lane_scratch[0]
-        task.coverage = lane_scratch[1]
+        task.lift = Lane(1.0) - is_positive(dot(task.normals, task.normals))
+        task.coverage = coverage
         task.covered = covered
+        task.sums = sums
         task.silhouette.facing = numbers[0]
         task.silhouette.numbers = numbers[1]
         task.silhouette.edges = edge_scratch
         task.silhouette.adj_edges = adj_edge_scratch
-        task.silhouette.sums = lane_scratch[2]
+        task.silhouette.sums = chord_sums
         for q in range(task.coverage.shape[0]):
-            task.coverage[q] = Lane(0.0)
+            task.coverage[q] = Coverages()
+            task.sums[q] = no_blockers()
         return task
 
     @wp.func(inline=True)
@@ -137,7 +145,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         inverse = wp.cw_div(Lane(1.0), sqrt(wp.max(distance2, Lane(wp.max(reach * reach, 1.0e-37)))))
         sine = reach * inverse
         cosine = sqrt(wp.max(Lane(1.0) - wp.cw_mul(sine, sine), Lane(0.0)))
-        is_within = wp.min(wp.max(1.0e30 * (Lane(bound[3] * bound[3]) - distance2), Lane(0.0)), Lane(1.0))
+        is_within = is_positive(Lane(bound[3] * bound[3]) - distance2)
         shrink = 1.0 / wp.sqrt(1.0 + radius * radius)
         result.rise = dot(task.normals, away) + Lane(bound[3]) + 1.0e30 * task.lift
         result.axis = scale(inverse, away)
@@ -154,12 +162,10 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         return is_any_above(wp.max(dot_direction(axis, bound.axis) - cosine, Lane(0.0) - sine), 0.0)
 
     @wp.func(inline=True)
-    def find_effect(task: PartsTask, bound: PartBound, direction: wp.vec3, q: int):
-        """Above 0 where a part may block something of a cell; and where both are above the horizon."""
+    def find_reach(task: PartsTask, bound: PartBound, direction: wp.vec3):
+        """Above 0 where the cone around a part reaches a cell, and both are above the horizon."""
         is_above = wp.min(dot_direction(direction, task.normals) + task.lift, bound.rise)
-        reached = dot_direction(direction, bound.axis) - bound.cosine
-        left = wp.max(task.left[q], -task.left[q])
-        return wp.min(wp.min(reached, is_above), wp.min(left, Lane(1.0) - task.coverage[q])), is_above
+        return wp.min(dot_direction(direction, bound.axis) - bound.cosine, is_above)
 
     @wp.func
     def cover(
@@ -172,45 +178,75 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         radius: float,
         task: PartsTask,
     ):
-        """Σ_parts h_q of a body, in cells of which something is left; returns how many it covers, and lists them."""
+        """Coverage by a body of cells that no other body covers wholly; returns how many it covers, and lists them."""
         covered_count = int(0)
         silhouette = task.silhouette
+        enough = wp.where(parts.signs[parts.first_part[body + 1] - 1] < 0.0, 1.0e30, 1.0)  # seams take off
         for part in range(parts.first_part[body], parts.first_part[body + 1]):
             bound = find_bound(task, bounds[part], radius)
+            sign = parts.signs[part]
             if is_any_above(bound.rise, 0.0):
                 is_found = bool(False)
                 for bundle in range(cells.axes.shape[0]):
                     if reaches(bound, cells.axes[bundle], cells.half_angles[bundle]):
                         for q in range(bundle * BUNDLE, (bundle + 1) * BUNDLE):
                             direction = cells.directions[q]
-                            effect, is_above = find_effect(task, bound, direction, q)
+                            before = task.coverage[q].share
+                            room = wp.min(Lane(enough) - before, Lane(1.0) - task.sums[q].largest)
+                            if sign < 0.0:
+                                room = wp.min(room, before)  # prisms cover the same cells
+                            effect = wp.min(find_reach(task, bound, direction), room)
                             if is_any_above(effect, 0.0):
                                 if not is_found:
                                     count, is_solid = find(task.points, corners, planes, parts, part, silhouette)
                                     silhouette.count = count
                                     silhouette.is_solid = is_solid
                                     is_found = True
-                                share = find_share(task.points, corners, parts, silhouette, direction, radius)
-                                share = wp.cw_mul(share, wp.min(wp.max(1.0e30 * is_above, Lane(0.0)), Lane(1.0)))
-                                if is_any_above(share, 0.0):
-                                    before = task.coverage[q]
+                                by_part = find_coverage(task.points, corners, parts, silhouette, direction, radius)
+                                is_affected = is_positive(effect)
+                                if is_any_above(wp.cw_mul(is_affected, by_part.share), 0.0):
                                     if not is_any_above(before, 0.0):
                                         task.covered[covered_count] = q
                                         covered_count += 1
-                                    task.coverage[q] = before + share
+                                    factor = sign * is_affected
+                                    task.coverage[q] = Coverages(
+                                        before + wp.cw_mul(factor, by_part.share),
+                                        add(task.coverage[q].moment, scale(factor, by_part.moment)),
+                                    )
         return covered_count
 
-    return _PartFunctions(begin, find_bound, find_effect, cover)
+    @wp.func
+    def cover_all(
+        corners: wp.array(dtype=wp.vec3),
+        planes: wp.array(dtype=wp.vec4),
+        bounds: wp.array(dtype=wp.vec4),
+        parts: ConvexArrays,
+        skip: int,
+        cells: DirectionCells,
+        radius: float,
+        task: PartsTask,
+    ):
+        """Store sums over all bodies for each cell."""
+        for body in range(parts.first_part.shape[0] - 1):
+            if body != skip and parts.blocks[body] == 1:
+                covered_count = cover(corners, planes, bounds, parts, body, cells, radius, task)
+                for k in range(covered_count):
+                    q = task.covered[k]
+                    task.sums[q] = with_blocker(task.sums[q], task.coverage[q])
+                    task.coverage[q] = Coverages()
+
+    return _PartFunctions(begin, find_bound, find_reach, cover, cover_all)
 
 
 @functools.cache
-def _make_pass(lanes: int) -> wp.Kernel:
-    Lane = lane_type(lanes)
-    fn, functions = make_lane_functions(lanes), _make_part_functions(lanes)
-    find_block, store_rows, begin, cover = fn.find_block, fn.store_rows, functions.begin, functions.cover
+def _make_cover(lanes: int) -> wp.Kernel:
+    Lane, Coverages, SumsOfBlockers = lane_type(lanes), coverage_type(lanes), sums_type(lanes)
+    fn, functions, joint = make_lane_functions(lanes), _make_part_functions(lanes), make_joint_functions(lanes)
+    find_block, is_any_above, begin, cover_all = fn.find_block, fn.is_any_above, functions.begin, functions.cover_all
+    joint_coverage, store_columns = joint.joint_coverage, joint.store_columns
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
-    def pass_parts(
+    def cover_cells(
         first_row: int,
         worker: int,
         # in
@@ -224,12 +260,14 @@ def _make_pass(lanes: int) -> wp.Kernel:
         radius: float,
         skip: int,
         # scratch
-        lane_scratch: wp.array3d(dtype=Lane),
+        coverage: wp.array2d(dtype=Coverages),
         covered: wp.array2d(dtype=wp.int32),
+        sums: wp.array2d(dtype=SumsOfBlockers),
+        chord_sums: wp.array2d(dtype=Lane),
         edge_scratch: wp.array2d(dtype=Lane),
         numbers: wp.array3d(dtype=wp.int32),
         # out
-        passing: wp.array3d(dtype=wp.float32),
+        result: wp.array3d(dtype=wp.vec4),
     ):
         """A thread owns a block of receivers."""
         row = first_row + wp.tid()
@@ -240,44 +278,46 @@ def _make_pass(lanes: int) -> wp.Kernel:
             horizon_normals,
             batch,
             block,
-            lane_scratch[place],
+            coverage[place],
             covered[place],
+            sums[place],
+            chord_sums[place],
             edge_scratch[place],
             edge_scratch[place],
             numbers[place],
         )
-        for q in range(task.left.shape[0]):
-            task.left[q] = Lane(1.0)
-        for body in range(parts.first_part.shape[0] - 1):
-            if body != skip and parts.blocks[body] == 1:
-                covered_count = cover(
-                    corners[instance], planes[instance], bounds[instance], parts, body, cells, radius, task
-                )
-                for k in range(covered_count):
-                    q = task.covered[k]
-                    task.left[q] = wp.cw_mul(task.left[q], wp.max(Lane(0.0), Lane(1.0) - task.coverage[q]))
-                    task.coverage[q] = Lane(0.0)
-        store_rows(task.left, block, passing[batch])
+        cover_all(corners[instance], planes[instance], bounds[instance], parts, skip, cells, radius, task)
+        for q in range(task.coverage.shape[0]):
+            if is_any_above(task.sums[q].total, 0.0):
+                task.coverage[q] = joint_coverage(task.sums[q])
+        store_columns(task.coverage, block, result[batch])
 
-    return pass_parts
+    return cover_cells
 
 
 @functools.cache
-def _make_pass_adjoint(lanes: int) -> wp.Kernel:
+def _make_cover_adjoint(lanes: int) -> wp.Kernel:
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
-    fn, functions, silhouettes = (
-        make_lane_functions(lanes),
-        _make_part_functions(lanes),
-        make_silhouette_functions(lanes),
-    )
-    find_block, load_products, add, add_vectors = fn.find_block, fn.load_products, fn.add, fn.add_vectors
-    begin, find_bound, find_effect, cover = functions
-    find, _find_share, share_adjoint, silhouette_adjoint = silhouettes
-    is_any_above = fn.is_any_above
+    Coverages, SumsOfBlockers = coverage_type(lanes), sums_type(lanes)
+    fn, functions, joint = make_lane_functions(lanes), _make_part_functions(lanes), make_joint_functions(lanes)
+    find_block, is_any_above, is_positive, scale = fn.find_block, fn.is_any_above, fn.is_positive, fn.scale
+    add, add_vectors = fn.add, fn.add_vectors
+    joint_coverage_adjoint, blocker_adjoint = joint.joint_coverage_adjoint, joint.blocker_adjoint
+    load_columns = joint.load_columns
+    begin, find_bound, find_reach, cover, cover_all = functions
+    find, _find_coverage, coverage_adjoint, silhouette_adjoint = make_silhouette_functions(lanes)
     ADJOINT_STRIDE = wp.constant(ADJOINT_LANES)
 
+    @wp.func(inline=True)
+    def is_any(coverage: Coverages):
+        """Whether anything is not 0."""
+        moment = coverage.moment
+        highest = wp.max(wp.max(coverage.share, moment.x), wp.max(moment.y, moment.z))
+        lowest = wp.min(wp.min(coverage.share, moment.x), wp.min(moment.y, moment.z))
+        return is_any_above(wp.max(highest, -lowest), 0.0)
+
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
-    def pass_parts_adjoint(
+    def cover_cells_adjoint(
         first_row: int,
         worker: int,
         # in
@@ -290,20 +330,22 @@ def _make_pass_adjoint(lanes: int) -> wp.Kernel:
         cells: DirectionCells,
         radius: float,
         skip: int,
-        passing: wp.array3d(dtype=wp.float32),
-        adj_passing: wp.array3d(dtype=wp.float32),
+        adj_result: wp.array3d(dtype=wp.vec4),
         # scratch
-        lane_scratch: wp.array3d(dtype=Lane),
+        coverage: wp.array2d(dtype=Coverages),
         covered: wp.array2d(dtype=wp.int32),
+        sums: wp.array2d(dtype=SumsOfBlockers),
+        chord_sums: wp.array2d(dtype=Lane),
         edge_scratch: wp.array2d(dtype=Lane),
         numbers: wp.array3d(dtype=wp.int32),
+        adj_sums: wp.array2d(dtype=SumsOfBlockers),
         adj_edge_scratch: wp.array2d(dtype=Lane),
         # out
         adj_points: wp.array2d(dtype=wp.vec3),
         # sums
         adj_corners: wp.array2d(dtype=wp.vec3),
     ):
-        """A thread owns a block of receivers:  ∂P/∂h = −P / (1 − Σ_parts h) where that is positive."""
+        """A thread owns a block of receivers; cells that are covered wholly have no gradient."""
         row = first_row + wp.tid()
         batch, block = find_block(row, points.shape[1])
         place, instance = scratch_place(worker, row), instance_in(batch, corners.shape[0])
@@ -312,30 +354,46 @@ def _make_pass_adjoint(lanes: int) -> wp.Kernel:
             horizon_normals,
             batch,
             block,
-            lane_scratch[place],
+            coverage[place],
             covered[place],
+            sums[place],
+            chord_sums[place],
             edge_scratch[place],
             adj_edge_scratch[place],
             numbers[place],
         )
+        cover_all(corners[instance], planes[instance], bounds[instance], parts, skip, cells, radius, task)
+        load_columns(adj_result[batch], block, task.coverage)
+        for q in range(task.coverage.shape[0]):
+            adj_sums[place, q] = SumsOfBlockers()
+            if is_any_above(task.sums[q].total, 0.0):
+                adj_sums[place, q] = joint_coverage_adjoint(task.sums[q], task.coverage[q])
+            task.coverage[q] = Coverages()
         silhouette = task.silhouette
         adj_point = Vectors()
-        load_products(passing[batch], adj_passing[batch], 0, passing.shape[2], block, task.left)
         for body in range(parts.first_part.shape[0] - 1):
             covered_count = int(0)
             if body != skip and parts.blocks[body] == 1:
                 covered_count = cover(
                     corners[instance], planes[instance], bounds[instance], parts, body, cells, radius, task
                 )
-            if covered_count > 0:
+            affected_count = int(0)
+            for k in range(covered_count):
+                q = task.covered[k]
+                adj_coverage = blocker_adjoint(task.sums[q], adj_sums[place, q], task.coverage[q])
+                task.coverage[q] = adj_coverage
+                if is_any(adj_coverage):
+                    task.covered[affected_count] = q
+                    affected_count += 1
+            if affected_count > 0:
                 for part in range(parts.first_part[body], parts.first_part[body + 1]):
                     bound = find_bound(task, bounds[instance, part], radius)
                     is_found = bool(False)
-                    for k in range(covered_count):
+                    for k in range(affected_count):
                         q = task.covered[k]
                         direction = cells.directions[q]
-                        effect, _is_above = find_effect(task, bound, direction, q)
-                        if is_any_above(effect, 0.0):
+                        reach = find_reach(task, bound, direction)
+                        if is_any_above(reach, 0.0):
                             if not is_found:
                                 count, is_solid = find(
                                     task.points, corners[instance], planes[instance], parts, part, silhouette
@@ -345,10 +403,11 @@ def _make_pass_adjoint(lanes: int) -> wp.Kernel:
                                 is_found = True
                                 for i in range(ADJOINT_STRIDE * count):
                                     silhouette.adj_edges[i] = Lane(0.0)
-                            is_affected = wp.min(wp.max(1.0e30 * effect, Lane(0.0)), Lane(1.0))
-                            left = wp.max(Lane(1.0) - task.coverage[q], Lane(1.0e-30))
-                            adj = -wp.cw_div(wp.cw_mul(is_affected, task.left[q]), left)
-                            share_adjoint(task.points, corners[instance], parts, silhouette, direction, radius, adj)
+                            factor = parts.signs[part] * is_positive(reach)
+                            adj = Coverages(
+                                wp.cw_mul(factor, task.coverage[q].share), scale(factor, task.coverage[q].moment)
+                            )
+                            coverage_adjoint(task.points, corners[instance], parts, silhouette, direction, radius, adj)
                     if is_found:
                         adj_point = add(
                             adj_point,
@@ -356,15 +415,15 @@ def _make_pass_adjoint(lanes: int) -> wp.Kernel:
                                 task.points, corners[instance], parts, silhouette, instance, adj_corners
                             ),
                         )
-                for k in range(covered_count):
-                    task.coverage[task.covered[k]] = Lane(0.0)
+                for k in range(affected_count):
+                    task.coverage[task.covered[k]] = Coverages()
         if adj_points:
             add_vectors(adj_point, block, adj_points[batch])
 
-    return pass_parts_adjoint
+    return cover_cells_adjoint
 
 
-def transmittance_past_parts(
+def part_coverage(
     points: wp.array,
     placed: PlacedParts,
     blockers: ConvexBlockers,
@@ -374,7 +433,7 @@ def transmittance_past_parts(
     horizon_normals: wp.array | None = None,
     skip: int | None = None,
 ) -> wp.array:
-    """Transmittance of cells past the convex parts of bodies.
+    """Coverage (h, μ) of cells by the convex parts of bodies.
 
     Args:
         points: Receivers [scene units], vec3 of shape [batch, receiver].
@@ -386,7 +445,7 @@ def transmittance_past_parts(
         skip: Number of the body that the receivers are part of, which blocks none of their light; None for none.
 
     Returns:
-        Float32 of shape [batch, receiver, direction].
+        vec4 of shape [batch, receiver, direction], for :func:`warpshadow.stages.joint_coverage.transmittance_past`.
 
     Differentiable: points, placed. Not: horizon_normals, which decides by steps.
     """
@@ -399,28 +458,28 @@ def transmittance_past_parts(
     cells = make_cells(directions, SOFTNESS, points.device)
     inputs = [points, horizon_normals, *placed, blockers.arrays, cells, own_radius, -1 if skip is None else skip]
     lanes = lane_count(points.device)
-    Lane, edge_count = lane_type(lanes), blockers.edge_count
+    Lane, sums, edge_count = lane_type(lanes), sums_type(lanes), blockers.edge_count
+    by_cell = (len(directions),)
     scratch = [
-        Scratch((3, len(directions)), Lane),
-        Scratch((len(directions),), wp.int32),
+        *(Scratch(by_cell, dtype) for dtype in (coverage_type(lanes), wp.int32, sums)),
+        Scratch((SUM_LANES,), Lane),
         Scratch((EDGE_LANES * edge_count,), Lane),
         Scratch((2, edge_count), wp.int32),
     ]
-    adj_scratch = Scratch((ADJOINT_LANES * edge_count,), Lane)
+    adj_scratch = [Scratch(by_cell, sums), Scratch((ADJOINT_LANES * edge_count,), Lane)]
     rows = points.shape[0] * block_count(points.shape[1], lanes)
     cost = _PART_COST * lanes * placed.bounds.shape[1]
-    passing = wp.empty((*points.shape, len(directions)), dtype=wp.float32, device=points.device)
     return differentiable(
-        lambda result: launch(_make_pass(lanes), rows, inputs=inputs, outputs=[result], scratch=scratch, cost=cost),
-        lambda adj_passing: launch(
-            _make_pass_adjoint(lanes),
+        lambda result: launch(_make_cover(lanes), rows, inputs=inputs, outputs=[result], scratch=scratch, cost=cost),
+        lambda adj_result: launch(
+            _make_cover_adjoint(lanes),
             rows,
-            inputs=[*inputs, passing, adj_passing],
+            inputs=[*inputs, adj_result],
             outputs=[points.grad],
             sums=[placed.corners.grad],
-            scratch=[*scratch, adj_scratch],
-            cost=2 * cost,
+            scratch=[*scratch, *adj_scratch],
+            cost=3 * cost,
         ),
-        result=passing,
+        result=wp.empty((*points.shape, len(directions)), dtype=wp.vec4, device=points.device),
         variables=[points, placed.corners],
     )
