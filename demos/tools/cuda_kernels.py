@@ -14,6 +14,7 @@ from warpshadow.device.warp_internals import kernel_modules
 from warpshadow.spheres import refine
 from warpshadow.stages import shared_rays, traced_transfer, transfer
 from warpshadow.stages.bounces import sphere_light
+from warpshadow.stages.convex import coverage as convex
 from warpshadow.stages.gloss import traced
 from warpshadow.stages.interpolation import _make_interpolate
 from warpshadow.stages.self_visibility import gather, lobes, sun_cells, trace
@@ -65,6 +66,7 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
     },
     **{f"_make_copy {dtype.__name__}": partial(batch._make_copy, dtype) for dtype in (wp.float32, wp.vec3)},
     **{make.__name__: partial(make, LANES) for make in (sphere_light._make_light, sphere_light._make_light_adjoint)},
+    **{make.__name__: partial(make, LANES) for make in (convex._make_cover, convex._make_cover_adjoint)},
     **{make.__name__: partial(make, LANES) for make in (refine._make_project, refine._make_project_adjoint)},
     **{make.__name__: partial(make, LANES) for make in (gather._make_gather, gather._make_gather_adjoint)},
     "trace._make_trace": trace._make_trace,

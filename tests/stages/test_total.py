@@ -1,14 +1,17 @@
 """Sums of light on several ways, and their gradients."""
 
 import numpy as np
+import pytest
 import warp as wp
 
 from warpshadow.stages.bounces.total import total_light
 
 
-def test_light_adds_up_and_its_gradient_goes_to_every_part(device):
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_light_adds_up_and_its_gradient_goes_to_every_part(count, device):
     random = np.random.default_rng(0)
-    values = [random.normal(size=shape).astype(np.float32) for shape in ((2, 5, 3), (1, 5, 3), (2, 5, 3))]
+    shapes = [(2, 5, 3), (1, 5, 3), (2, 5, 3), (1, 5, 3)][:count]
+    values = [random.normal(size=shape).astype(np.float32) for shape in shapes]
     parts = [wp.array(each, dtype=wp.vec3, device=device, requires_grad=True) for each in values]
     with wp.Tape() as tape:
         total = total_light(parts)

@@ -202,6 +202,7 @@ class LaneFunctions(NamedTuple):
 
     is_any_above: wp.Function
     bits_above: wp.Function
+    is_positive: wp.Function
     dot: wp.Function
     dot_direction: wp.Function
     offset: wp.Function
@@ -253,6 +254,11 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
     return part[0];
     """)
     def total(value: Lane) -> float: ...  # type: ignore[empty-body]
+
+    @wp.func(inline=True)
+    def is_positive(value: Lane):
+        """1 where a lane is above 0, else 0."""
+        return wp.min(wp.max(1.0e30 * value, Lane(0.0)), Lane(1.0))
 
     @wp.func(inline=True)
     def smoothstep(t: Lane):

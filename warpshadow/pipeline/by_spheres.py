@@ -240,7 +240,7 @@ class PortionedShading(Node):
         self.method, self._points = method, points
         self._finish, self._progress = finish, method.progress and light is not None
         receivers, spheres, item_text = points.receivers_node, points.spheres, functools.partial(receiver_text, points)
-        self_visibility = _self_visibility(method, points, projected_light)
+        self_visibility = self_visibility_node(method, points, projected_light)
         shadows = _static_shadows(method, points, light)
         planes = points.blocker_kinds.planes
         place = functools.partial(method.blockers, points.blocker_kinds)
@@ -361,8 +361,13 @@ def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
     return "no moving body has blockers" if static else "nothing is seen"
 
 
+def self_visibility_node(method: SphereMethod, points: LitPoints, projected_light: Any) -> Node:
+    """Node of the receivers' self-visibility lookups, by body; the same for any receivers among the same bodies."""
+    make = functools.partial(_self_visibility, method, points, projected_light)
+    return points.cached("self-visibility", id(projected_light), make)
+
+
 def _self_visibility(method: SphereMethod, points: LitPoints, projected_light: Any) -> Node:
-    """Node of the receivers' self-visibility lookups, by body."""
     bodies, rotations = points.blocker_kinds.traced, points.blocker_kinds.rotations
     curved_bodies = [body for body in bodies if not method.merged_scene.is_flat[body]]
     if not curved_bodies or rotations is None:

@@ -29,7 +29,7 @@ share the disc. Shapes that meet at an edge share the cells there without a rema
 
 import warp as wp
 
-_MIN_DISTANCE = wp.constant(1.0e-12)
+MIN_DISTANCE = 1.0e-12
 """The least distance of an edge from ω."""
 
 
@@ -41,7 +41,6 @@ class ViewedEdge:
     begin: wp.vec3  # a − x
     end: wp.vec3  # b − x
     length: float  # |n|, by which the gradient of n is divided
-    corners: wp.vec2i  # numbers of a and b
     adj_normal: wp.vec3  # gradient of n, times its length
 
 
@@ -117,7 +116,7 @@ def _coverage_within_edges(
             chord = _find_chord(edges, edge, cosine, direction, radius)
             if chord.end > chord.begin:
                 length = chord.end - chord.begin
-                d = wp.where(cosine > 0.0, chord.distance, wp.min(chord.distance, -_MIN_DISTANCE))  # of 0, turns by +π
+                d = wp.where(cosine > 0.0, chord.distance, wp.min(chord.distance, -MIN_DISTANCE))  # of 0, turns by +π
                 area += 0.5 * d * length
                 normal_part = (radius * radius - d * d) * _line_normal(edges[edge], cosine, direction, chord)
                 moment += length * (normal_part + (0.5 * d * (chord.begin + chord.end)) * chord.tangent)

@@ -27,8 +27,11 @@ from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 
-_MIN_BOUNDS = wp.constant(1.0e-6)
+MIN_BOUNDS = wp.constant(1.0e-6)
 """Σ ν ν below which blockers count as independent: such a product is of the size of its rounding."""
+
+MOMENT_BOUND = wp.constant(wp.vec3(0.96935, -0.81588, 1.36307))
+"""ν(h) by powers of h (1 − h), from the first on."""
 
 _PASS_COST = 1.0  # time of a cell [ns]
 
@@ -37,14 +40,14 @@ _PASS_COST = 1.0  # time of a cell [ns]
 def _moment_bound(share: float):
     """ν(h), the moment of a half-plane that covers a share of a cell; within 3% from 0.02 to 0.98."""
     u = share * (1.0 - share)
-    return u * (0.96935 + u * (1.36307 * u - 0.81588))
+    return u * (MOMENT_BOUND[0] + u * (MOMENT_BOUND[1] + u * MOMENT_BOUND[2]))
 
 
 @wp.func
 def _moment_bound_slope(share: float):
     """Its derivative."""
     u = share * (1.0 - share)
-    return (1.0 - 2.0 * share) * (0.96935 + u * (4.08921 * u - 1.63176))
+    return (1.0 - 2.0 * share) * (MOMENT_BOUND[0] + u * (2.0 * MOMENT_BOUND[1] + u * (3.0 * MOMENT_BOUND[2])))
 
 
 @wp.struct
@@ -94,7 +97,7 @@ def with_blocker(sums: BlockerSums, coverage: wp.vec4):
 def _relation(sums: BlockerSums):
     """k, before it is clamped."""
     pairs = wp.dot(sums.moment, sums.moment) - sums.squares
-    return pairs / (sums.bounds * sums.bounds - sums.bound_squares + _MIN_BOUNDS)
+    return pairs / (sums.bounds * sums.bounds - sums.bound_squares + MIN_BOUNDS)
 
 
 @wp.func
@@ -124,38 +127,12 @@ def open_share_adjoint(sums: BlockerSums, adj_open: float):
         adj_sums.largest = -weight * adj_open
     if weight < 1.0:
         adj_relation = wp.sign(relation) * adj_open * (_open_if_related(sums, relation) - sums.product)
-        per_bounds = 1.0 / (sums.bounds * sums.bounds - sums.bound_squares + _MIN_BOUNDS)
+        per_bounds = 1.0 / (sums.bounds * sums.bounds - sums.bound_squares + MIN_BOUNDS)
         adj_pairs = adj_relation * per_bounds
         adj_sums.moment = (2.0 * adj_pairs) * sums.moment
         adj_sums.squares = -adj_pairs
         adj_sums.bounds = -2.0 * adj_pairs * relation * sums.bounds
         adj_sums.bound_squares = adj_pairs * relation
-    return adj_sums
-
-
-@wp.func
-def joint_coverage(sums: BlockerSums):
-    """Coverage (h, μ) by all blockers together."""
-    share = 1.0 - open_share(sums)
-    if share <= 0.0:
-        return wp.vec4()
-    moment = (share / sums.total) * sums.moment
-    return wp.vec4(share, moment[0], moment[1], moment[2])
-
-
-@wp.func
-def joint_coverage_adjoint(sums: BlockerSums, adj_coverage: wp.vec4):
-    """Gradients of the sums, given that of the joint coverage."""
-    adj_moment = _moment_of(adj_coverage)
-    share = 1.0 - open_share(sums)
-    adj_scale = float(0.0)
-    scale = float(0.0)
-    if share > 0.0:
-        scale = share / sums.total
-        adj_scale = wp.dot(adj_moment, sums.moment) / sums.total
-    adj_sums = open_share_adjoint(sums, -(adj_coverage[0] + adj_scale))
-    adj_sums.total = adj_sums.total - adj_scale * scale
-    adj_sums.moment = adj_sums.moment + scale * adj_moment
     return adj_sums
 
 

@@ -4,7 +4,9 @@ import pytest
 import torch
 
 import warpshadow as ws
+from warpshadow.pipeline.self_visibility import SelfVisibility
 from warpshadow.torch import TorchRenderer
+from warpshadow.tuning.timing import whole_image
 
 
 @pytest.mark.parametrize(
@@ -30,3 +32,18 @@ def test_cameras_that_see_one_geometry_by_pixel_have_their_own_images(method, se
 
     alone = torch.cat([images([camera]) for camera in cameras])
     torch.testing.assert_close(images(cameras), alone, rtol=1e-4, atol=1e-4)
+
+
+def test_samples_of_patches_and_receivers_share_the_lookups_of_self_visibility(monkeypatch):
+    ball = ws.Body(ws.icosphere(0.8, 1), translation=(0, 0.8, 0))
+    camera = ws.Camera.look_at((2, 3, 4.5), (0, 0.6, 0), size=(12, 12))
+    scene = ws.Scene([ball, ws.Body(ws.plane(6.0, 4))], ws.synthetic_sky(), camera, bounces=2)
+    draw, lookups, calls = whole_image(ws.Renderer(scene)), SelfVisibility.lookups, []
+
+    def counted(self, *arguments, **options):
+        calls.append(arguments)
+        return lookups(self, *arguments, **options)
+
+    monkeypatch.setattr(SelfVisibility, "lookups", counted)
+    draw()
+    assert len(calls) == 1

@@ -34,7 +34,7 @@ from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.bounces.static_bounces import StaticBounces
-from warpshadow.pipeline.by_spheres import PortionedShading, SphereMethod
+from warpshadow.pipeline.by_spheres import PortionedShading, SphereMethod, self_visibility_node
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage
 from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
@@ -295,7 +295,9 @@ class SphereBounces:
         key, is_cached = None if is_free else light, is_free or materials is not points.materials
         visibility = points.cached("visibility", (key, is_cached), lambda: make_visibility(points, caches=is_cached))
         of_patch_samples = points.cached(
-            "of patch samples", (key, senders), lambda: self._patch_samples(make_visibility, proxies, points)
+            "of patch samples",
+            (key, senders),
+            lambda: self._patch_samples(make_visibility, visibility_light, proxies, points),
         )
         radiosity = self._radiosity(of_patch_samples, projected_light, proxies, materials)
         item_text = functools.partial(receiver_text, points)
@@ -303,7 +305,11 @@ class SphereBounces:
         return BouncedShading(visibility, projected_light, item_text, radiosity, at_points)
 
     def _patch_samples(
-        self, make_visibility: Callable[..., PortionedVisibility], proxies: Proxies, points: LitPoints
+        self,
+        make_visibility: Callable[..., PortionedVisibility],
+        visibility_light: Any,
+        proxies: Proxies,
+        points: LitPoints,
     ) -> PatchSampleNodes:
         """Patch samples among the bodies among which points are."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
@@ -313,9 +319,10 @@ class SphereBounces:
 
         make = functools.partial(Node, "patch samples", senders.patch_samples, points.vertices, points.normals)
         patch_samples = points.cached("patch samples", senders, lambda: make(items=_patch_sample_text(senders)))
-        visibility = make_visibility(
-            self._at(patch_samples, points, points.materials, proxies.blocker_of_sample), where=_OF_PATCH_SAMPLES
-        )
+        lit_samples = self._at(patch_samples, points, points.materials, proxies.blocker_of_sample)
+        lookups = self_visibility_node(self._method, points, visibility_light)
+        lit_samples.cached("self-visibility", id(visibility_light), lambda: lookups)
+        visibility = make_visibility(lit_samples, where=_OF_PATCH_SAMPLES)
         frames = Node("", planes.all.frames if planes else lambda _: None, points.vertices)
         projected_patches = Node("", project, patch_samples, visibility, spheres, frames)
         return PatchSampleNodes(

@@ -1,6 +1,5 @@
 """Sums of light that comes to receivers on several ways."""
 
-import functools
 from collections.abc import Sequence
 
 import warp as wp
@@ -15,23 +14,29 @@ def _add_light(
     # in
     first: wp.array2d(dtype=wp.vec3),
     second: wp.array2d(dtype=wp.vec3),
+    third: wp.array2d(dtype=wp.vec3),
+    fourth: wp.array2d(dtype=wp.vec3),
     # out
     total: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a receiver of an instance."""
+    """A thread owns a receiver of an instance; the last two of four parts may be missing."""
     batch, receiver = wp.tid()
-    total[batch, receiver] = (
-        first[instance_in(batch, first.shape[0]), receiver] + second[instance_in(batch, second.shape[0]), receiver]
-    )
+    light = first[instance_in(batch, first.shape[0]), receiver] + second[instance_in(batch, second.shape[0]), receiver]
+    if third:
+        light += third[instance_in(batch, third.shape[0]), receiver]
+    if fourth:
+        light += fourth[instance_in(batch, fourth.shape[0]), receiver]
+    total[batch, receiver] = light
 
 
 def total_light(summands: Sequence[wp.array]) -> wp.array:
-    """Add light, vec3 of shape [batch, receiver]; a batch of 1 serves every instance. Differentiable: summands."""
-    return functools.reduce(_sum_pair, summands)
+    """Add up to four summands of light, vec3 of shape [batch, receiver]; a batch of 1 serves every instance.
 
-
-def _sum_pair(first: wp.array, second: wp.array) -> wp.array:
-    batch_count = common_batch({"light": first, "more light": second})
-    total = empty((batch_count, first.shape[1]), dtype=wp.vec3, device=first.device)
-    launch(_add_light, total.shape, inputs=[first, second], outputs=[total])
+    Differentiable: summands.
+    """
+    if len(summands) == 1:
+        return summands[0]
+    count = common_batch({f"summand {number}": summand for number, summand in enumerate(summands)})
+    total = empty((count, summands[0].shape[1]), dtype=wp.vec3, device=summands[0].device)
+    launch(_add_light, total.shape, inputs=[*summands, *[None] * (4 - len(summands))], outputs=[total])
     return total

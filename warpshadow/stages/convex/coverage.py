@@ -7,380 +7,425 @@ both cover their seam, the face between them, where they are seen at a slant: it
 other, :mod:`.joint_coverage` tells. Edges are exact, and so are thin parts: spheres bulge out of them.
 """
 
+import functools
+from typing import Any, NamedTuple
+
 import numpy as np
 import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, instance_in
-from warpshadow.device.launch import differentiable, launch
-from warpshadow.device.parallel import Scratch, scratch_slot, split_row
-from warpshadow.maths.directions import BUNDLE, cell_radius
-from warpshadow.stages.cell_coverage import ViewedEdge, convex_coverage, coverage_adjoint, viewed_edge
-from warpshadow.stages.convex.prepared import ConvexArrays, ConvexBlockers, PlacedParts
-from warpshadow.stages.joint_coverage import (
-    BlockerSums,
-    blocker_adjoint,
-    joint_coverage,
-    joint_coverage_adjoint,
-    no_blockers,
-    with_blocker,
+from warpshadow.device.lanes import (
+    block_count,
+    lane_count,
+    lane_type,
+    make_lane_functions,
+    module_options,
+    vectors_type,
 )
-from warpshadow.stages.planes.coverage import horizon_normal, is_above_horizon
+from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.parallel import Scratch, scratch_slot
+from warpshadow.maths.directions import BUNDLE, cell_radius
+from warpshadow.stages.convex.joint_lanes import coverage_type, make_joint_functions, sums_type
+from warpshadow.stages.convex.prepared import ConvexArrays, ConvexBlockers, PlacedParts
+from warpshadow.stages.convex.silhouette import (
+    ADJOINT_LANES,
+    EDGE_LANES,
+    SUM_LANES,
+    make_silhouette_functions,
+    silhouette_type,
+)
 from warpshadow.stages.visibility.culling import DirectionCells, make_cells
 from warpshadow.stages.visibility.directional import SOFTNESS
 
-_PART_COST = 300.0
+_PART_COST = 200.0
 """Mean time of a part of a receiver [ns]."""
 
-_UNKNOWN_COUNT = wp.constant(-2)
-"""Number of edges of a silhouette that is not found yet."""
-
-_BOUND_MARGIN = wp.constant(1.001)
+_BOUND_MARGIN = 1.001
 """Bounds are so much larger, for rounding."""
 
-_MIN_EDGE_SINE = wp.constant(1.0e-6)
-"""Sine of the least angle under which a receiver sees an edge."""
+
+@functools.cache
+def _task_type(lanes: int) -> Any:
+    """Struct of a block of receivers, and memory for its cells."""
+    Lane, Vectors, Silhouette = lane_type(lanes), vectors_type(lanes), silhouette_type(lanes)
+    Coverages, SumsOfBlockers = coverage_type(lanes), sums_type(lanes)
+
+    @wp.struct
+    class PartsTask:
+        points: Vectors
+        normals: Vectors
+        lift: Lane  # 1 where there is no horizon, else 0
+        coverage: wp.array(dtype=Coverages)  # [direction] by the parts of a body, 0 between bodies
+        covered: wp.array(dtype=wp.int32)  # numbers of the cells in which that is not 0
+        sums: wp.array(dtype=SumsOfBlockers)  # [direction] over bodies
+        silhouette: Silhouette
+
+    return PartsTask
 
 
-@wp.func
-def _find_silhouette(
-    point: wp.vec3,
-    corners: wp.array(dtype=wp.vec3),
-    planes: wp.array(dtype=wp.vec4),
-    parts: ConvexArrays,
-    part: int,
-    silhouette: wp.array(dtype=ViewedEdge),
-):
-    """Store a part's silhouette.
+@functools.cache
+def _bound_type(lanes: int) -> Any:
+    """Struct of the cones around a part, as a block of receivers sees it."""
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
 
-    Returns how many edges it has, 0 for a tiny one or a polygon from the side, −1 for a receiver inside the part.
-    """
-    first_face = parts.first_face[part]
-    facing_bits = wp.uint64(0)
-    for face in range(first_face, parts.first_face[part + 1]):
-        plane = planes[face]
-        if plane[0] * point[0] + plane[1] * point[1] + plane[2] * point[2] > plane[3]:
-            facing_bits = facing_bits | (wp.uint64(1) << wp.uint64(face - first_face))
-    if facing_bits == wp.uint64(0):
-        return wp.where(parts.first_face[part + 1] - first_face > 2, -1, 0)
-    count = int(0)
-    for e in range(parts.first_edge[part], parts.first_edge[part + 1]):
-        edge = parts.edges[e]
-        is_left = ((facing_bits >> wp.uint64(edge[2])) & wp.uint64(1)) == wp.uint64(1)
-        is_right = ((facing_bits >> wp.uint64(edge[3])) & wp.uint64(1)) == wp.uint64(1)
-        if is_left != is_right:
-            # the part is to the left of its faces' edges as they are seen
-            begin = wp.where(is_left, edge[1], edge[0])
-            end = wp.where(is_left, edge[0], edge[1])
-            a = corners[begin] - point
-            b = corners[end] - point
-            n = wp.cross(a, b)
-            if wp.length_sq(n) > _MIN_EDGE_SINE * _MIN_EDGE_SINE * wp.length_sq(a) * wp.length_sq(b):
-                seen_edge = viewed_edge(a, b, n)
-                seen_edge.corners = wp.vec2i(begin, end)
-                silhouette[count] = seen_edge
-                count += 1
-    return wp.where(count < 3, 0, count)  # fewer enclose nothing
+    @wp.struct
+    class PartBound:
+        rise: Lane  # above 0 where some of it is above the horizon of a receiver
+        axis: Vectors
+        cosine: Lane  # of its half-angle and that of a cell together, and sine; below −1 within the bound
+        sine: Lane
+
+    return PartBound
 
 
-@wp.func
-def _silhouette_adjoint(
-    silhouette: wp.array(dtype=ViewedEdge), count: int, instance: int, adj_corners: wp.array2d(dtype=wp.vec3)
-):
-    """Add to the gradients of corners; returns that of the receiver."""
-    adj_point = wp.vec3()
-    for e in range(count):
-        seen_edge = silhouette[e]
-        adj_n = seen_edge.adj_normal / seen_edge.length
-        adj_a = wp.cross(seen_edge.end, adj_n)
-        adj_b = wp.cross(adj_n, seen_edge.begin)
-        adj_point -= adj_a + adj_b
-        if adj_corners:
-            wp.atomic_add(adj_corners, instance, seen_edge.corners[0], adj_a)
-            wp.atomic_add(adj_corners, instance, seen_edge.corners[1], adj_b)
-    return adj_point
+class _PartFunctions(NamedTuple):
+    """Kernel functions on the parts of a body."""
+
+    begin: wp.Function
+    find_bound: wp.Function
+    find_reach: wp.Function
+    cover: wp.Function
+    cover_all: wp.Function
 
 
-@wp.struct
-class PartBound:
-    """The cone around a part, as a receiver sees it."""
+@functools.cache
+def _make_part_functions(lanes: int) -> _PartFunctions:
+    """Make the kernel functions for a number of lanes."""
+    Lane = lane_type(lanes)
+    PartsTask, PartBound = _task_type(lanes), _bound_type(lanes)
+    Coverages, SumsOfBlockers = coverage_type(lanes), sums_type(lanes)
+    fn, silhouettes, joint = make_lane_functions(lanes), make_silhouette_functions(lanes), make_joint_functions(lanes)
+    is_any_above, dot, dot_direction, offset, scale = fn.is_any_above, fn.dot, fn.dot_direction, fn.offset, fn.scale
+    load, sqrt, add, is_positive = fn.load, fn.sqrt, fn.add, fn.is_positive
+    find, find_coverage = silhouettes.find, silhouettes.find_coverage
+    no_blockers, with_blocker = joint.no_blockers, joint.with_blocker
+    MARGIN = wp.constant(_BOUND_MARGIN)
 
-    is_seen: wp.bool  # whether some of it is above the horizon
-    axis: wp.vec3
-    cosine: float  # of its half-angle and that of a cell together, and sine
-    sine: float
+    @wp.func
+    def begin(
+        points: wp.array2d(dtype=wp.vec3),
+        horizon_normals: wp.array2d(dtype=wp.vec3),
+        batch: int,
+        block: int,
+        coverage: wp.array(dtype=Coverages),
+        covered: wp.array(dtype=wp.int32),
+        sums: wp.array(dtype=SumsOfBlockers),
+        chord_sums: wp.array(dtype=Lane),
+        edge_scratch: wp.array(dtype=Lane),
+        adj_edge_scratch: wp.array(dtype=Lane),
+        numbers: wp.array2d(dtype=wp.int32),
+    ):
+        """Load a block of receivers; nothing is covered yet."""
+        task = PartsTask()
+        task.points = load(points[batch], block)
+        if horizon_normals:
+            task.normals = load(horizon_normals[batch], block)
+        task.lift = Lane(1.0) - is_positive(dot(task.normals, task.normals))
+        task.coverage = coverage
+        task.covered = covered
+        task.sums = sums
+        task.silhouette.facing = numbers[0]
+        task.silhouette.numbers = numbers[1]
+        task.silhouette.edges = edge_scratch
+        task.silhouette.adj_edges = adj_edge_scratch
+        task.silhouette.sums = chord_sums
+        for q in range(task.coverage.shape[0]):
+            task.coverage[q] = Coverages()
+            task.sums[q] = no_blockers()
+        return task
 
+    @wp.func(inline=True)
+    def find_bound(task: PartsTask, bound: wp.vec4, radius: float):
+        """Find the cones around a part, widened by the radius of cells."""
+        result = PartBound()
+        away = offset(wp.vec3(bound[0], bound[1], bound[2]), task.points)
+        distance2 = dot(away, away)
+        reach = MARGIN * bound[3]
+        inverse = wp.cw_div(Lane(1.0), sqrt(wp.max(distance2, Lane(wp.max(reach * reach, 1.0e-37)))))
+        sine = reach * inverse
+        cosine = sqrt(wp.max(Lane(1.0) - wp.cw_mul(sine, sine), Lane(0.0)))
+        is_within = is_positive(Lane(bound[3] * bound[3]) - distance2)
+        shrink = 1.0 / wp.sqrt(1.0 + radius * radius)
+        result.rise = dot(task.normals, away) + Lane(bound[3]) + 1.0e30 * task.lift
+        result.axis = scale(inverse, away)
+        result.cosine = shrink * (cosine - radius * sine) - 4.0 * is_within
+        result.sine = shrink * (sine + radius * cosine)
+        return result
 
-@wp.func
-def _find_bound(point: wp.vec3, normal: wp.vec3, bound: wp.vec4, radius: float):
-    """Find the cone around a part, widened by the radius of cells."""
-    part_bound = PartBound()
-    away = wp.vec3(bound[0], bound[1], bound[2]) - point
-    part_bound.is_seen = wp.dot(normal, away) > -bound[3] or wp.length_sq(normal) == 0.0
-    distance2 = wp.length_sq(away)
-    part_bound.cosine = -1.0
-    if distance2 > bound[3] * bound[3]:
-        distance = wp.sqrt(distance2)
-        part_bound.axis = away / distance
-        sine = _BOUND_MARGIN * bound[3] / distance
-        cosine = wp.sqrt(wp.max(0.0, 1.0 - sine * sine))
-        scale = 1.0 / wp.sqrt(1.0 + radius * radius)
-        part_bound.cosine = (cosine - sine * radius) * scale
-        part_bound.sine = (sine + cosine * radius) * scale
-    return part_bound
+    @wp.func(inline=True)
+    def reaches(bound: PartBound, axis: wp.vec3, half_angle: wp.vec2):
+        """Whether the cone around a part reaches that of a bundle."""
+        # as far as π together, else all does
+        cosine = half_angle[0] * bound.cosine - half_angle[1] * bound.sine
+        sine = half_angle[0] * bound.sine + half_angle[1] * bound.cosine
+        return is_any_above(wp.max(dot_direction(axis, bound.axis) - cosine, Lane(0.0) - sine), 0.0)
 
+    @wp.func(inline=True)
+    def find_reach(task: PartsTask, bound: PartBound, direction: wp.vec3):
+        """Above 0 where the cone around a part reaches a cell, and both are above the horizon."""
+        is_above = wp.min(dot_direction(direction, task.normals) + task.lift, bound.rise)
+        return wp.min(dot_direction(direction, bound.axis) - bound.cosine, is_above)
 
-@wp.func
-def _reaches(bound: PartBound, axis: wp.vec3, half_angle: wp.vec2):
-    """Whether the cone around a part reaches that of a bundle."""
-    # as far as π together, else all does
-    cosine = bound.cosine * half_angle[0] - bound.sine * half_angle[1]
-    is_wide = bound.sine * half_angle[0] + bound.cosine * half_angle[1] <= 0.0
-    return is_wide or wp.dot(axis, bound.axis) > cosine
-
-
-@wp.func
-def _find_coverage(
-    point: wp.vec3,
-    normal: wp.vec3,
-    corners: wp.array(dtype=wp.vec3),
-    planes: wp.array(dtype=wp.vec4),
-    bounds: wp.array(dtype=wp.vec4),
-    parts: ConvexArrays,
-    body: int,
-    cells: DirectionCells,
-    radius: float,
-    largest: wp.array(dtype=wp.float32),
-    silhouette: wp.array(dtype=ViewedEdge),
-    coverage: wp.array(dtype=wp.vec4),
-    covered_cells: wp.array(dtype=wp.int32),
-):
-    """Coverage by a body of cells that no other body covers wholly; returns how many it covers, and lists them."""
-    covered_count = int(0)
-    enough = wp.where(parts.signs[parts.first_part[body + 1] - 1] < 0.0, 1.0e30, 1.0)  # seams take off
-    for part in range(parts.first_part[body], parts.first_part[body + 1]):
-        bound = _find_bound(point, normal, bounds[part], radius)
-        if bound.is_seen:
-            count = int(_UNKNOWN_COUNT)
-            for bundle in range(cells.axes.shape[0]):
-                if _reaches(bound, cells.axes[bundle], cells.half_angles[bundle]):
-                    for q in range(bundle * BUNDLE, (bundle + 1) * BUNDLE):
-                        direction = cells.directions[q]
-                        if (
-                            wp.dot(bound.axis, direction) > bound.cosine
-                            and largest[q] < 1.0
-                            and coverage[q][0] < enough
-                            and is_above_horizon(normal, direction)
-                        ):
-                            if count == _UNKNOWN_COUNT:
-                                count = _find_silhouette(point, corners, planes, parts, part, silhouette)
-                            by_part = wp.vec4(1.0, 0.0, 0.0, 0.0)
-                            if count >= 0:
-                                by_part = convex_coverage(silhouette, 0, count, direction, radius)
-                            if by_part[0] > 0.0:
-                                if coverage[q][0] == 0.0:  # not by a seam, whose prisms cover the same cells
-                                    covered_cells[covered_count] = q
-                                    covered_count += 1
-                                coverage[q] = coverage[q] + parts.signs[part] * by_part
-    return covered_count
-
-
-@wp.func
-def _find_blocker_sums(
-    point: wp.vec3,
-    normal: wp.vec3,
-    corners: wp.array(dtype=wp.vec3),
-    planes: wp.array(dtype=wp.vec4),
-    bounds: wp.array(dtype=wp.vec4),
-    parts: ConvexArrays,
-    skip: int,
-    cells: DirectionCells,
-    radius: float,
-    silhouette: wp.array(dtype=ViewedEdge),
-    largest: wp.array(dtype=wp.float32),
-    coverage: wp.array(dtype=wp.vec4),
-    covered_cells: wp.array(dtype=wp.int32),
-    sums: wp.array(dtype=BlockerSums),
-):
-    """Store sums over all bodies for each cell."""
-    for q in range(cells.directions.shape[0]):
-        largest[q] = 0.0
-        coverage[q] = wp.vec4()
-        sums[q] = no_blockers()
-    for body in range(parts.first_part.shape[0] - 1):
-        if body != skip and parts.blocks[body] == 1:
-            covered_count = _find_coverage(
-                point,
-                normal,
-                corners,
-                planes,
-                bounds,
-                parts,
-                body,
-                cells,
-                radius,
-                largest,
-                silhouette,
-                coverage,
-                covered_cells,
-            )
-            for k in range(covered_count):
-                q = covered_cells[k]
-                sums[q] = with_blocker(sums[q], coverage[q])
-                largest[q] = sums[q].largest
-                coverage[q] = wp.vec4()
-
-
-@wp.kernel(enable_backward=False)
-def _find_joint_coverage(
-    first_row: int,
-    worker: int,
-    # in
-    points: wp.array2d(dtype=wp.vec3),
-    horizon_normals: wp.array2d(dtype=wp.vec3),
-    corners: wp.array2d(dtype=wp.vec3),
-    planes: wp.array2d(dtype=wp.vec4),
-    bounds: wp.array2d(dtype=wp.vec4),
-    parts: ConvexArrays,
-    cells: DirectionCells,
-    radius: float,
-    skip: int,
-    # scratch
-    silhouettes: wp.array2d(dtype=ViewedEdge),
-    largest: wp.array2d(dtype=wp.float32),
-    coverages: wp.array2d(dtype=wp.vec4),
-    covered_cells: wp.array2d(dtype=wp.int32),
-    sums: wp.array2d(dtype=BlockerSums),
-    # out
-    joint_coverages: wp.array3d(dtype=wp.vec4),
-):
-    """A thread owns a receiver."""
-    row = first_row + wp.tid()
-    batch, receiver = split_row(row, points.shape[1])
-    slot = scratch_slot(worker, row)
-    corner_batch = instance_in(batch, corners.shape[0])
-    _find_blocker_sums(
-        points[batch, receiver],
-        horizon_normal(horizon_normals, batch, receiver),
-        corners[corner_batch],
-        planes[corner_batch],
-        bounds[corner_batch],
-        parts,
-        skip,
-        cells,
-        radius,
-        silhouettes[slot],
-        largest[slot],
-        coverages[slot],
-        covered_cells[slot],
-        sums[slot],
-    )
-    for q in range(cells.directions.shape[0]):
-        joint_coverages[batch, receiver, q] = joint_coverage(sums[slot, q])
-
-
-@wp.kernel(enable_backward=False)
-def _find_joint_coverage_adjoint(
-    first_row: int,
-    worker: int,
-    # in
-    points: wp.array2d(dtype=wp.vec3),
-    horizon_normals: wp.array2d(dtype=wp.vec3),
-    corners: wp.array2d(dtype=wp.vec3),
-    planes: wp.array2d(dtype=wp.vec4),
-    bounds: wp.array2d(dtype=wp.vec4),
-    parts: ConvexArrays,
-    cells: DirectionCells,
-    radius: float,
-    skip: int,
-    adj_joint_coverages: wp.array3d(dtype=wp.vec4),
-    # scratch
-    silhouettes: wp.array2d(dtype=ViewedEdge),
-    largest: wp.array2d(dtype=wp.float32),
-    coverages: wp.array2d(dtype=wp.vec4),
-    covered_cells: wp.array2d(dtype=wp.int32),
-    sums: wp.array2d(dtype=BlockerSums),
-    adj_sums: wp.array2d(dtype=BlockerSums),
-    # out
-    adj_points: wp.array2d(dtype=wp.vec3),
-    # sums
-    adj_corners: wp.array2d(dtype=wp.vec3),
-):
-    """A thread owns a receiver; cells that are covered wholly have no gradient."""
-    row = first_row + wp.tid()
-    batch, receiver = split_row(row, points.shape[1])
-    slot = scratch_slot(worker, row)
-    corner_batch = instance_in(batch, corners.shape[0])
-    point, normal = points[batch, receiver], horizon_normal(horizon_normals, batch, receiver)
-    _find_blocker_sums(
-        point,
-        normal,
-        corners[corner_batch],
-        planes[corner_batch],
-        bounds[corner_batch],
-        parts,
-        skip,
-        cells,
-        radius,
-        silhouettes[slot],
-        largest[slot],
-        coverages[slot],
-        covered_cells[slot],
-        sums[slot],
-    )
-    for q in range(cells.directions.shape[0]):
-        if largest[slot, q] < 1.0:
-            adj_sums[slot, q] = joint_coverage_adjoint(sums[slot, q], adj_joint_coverages[batch, receiver, q])
-    adj_point = wp.vec3()
-    for body in range(parts.first_part.shape[0] - 1):
-        if body != skip and parts.blocks[body] == 1:
-            covered_count = _find_coverage(
-                point,
-                normal,
-                corners[corner_batch],
-                planes[corner_batch],
-                bounds[corner_batch],
-                parts,
-                body,
-                cells,
-                radius,
-                largest[slot],
-                silhouettes[slot],
-                coverages[slot],
-                covered_cells[slot],
-            )
-            for part in range(parts.first_part[body], parts.first_part[body + 1]):
-                bound = _find_bound(point, normal, bounds[corner_batch, part], radius)
-                if bound.is_seen and covered_count > 0:
-                    count = int(_UNKNOWN_COUNT)
-                    for k in range(covered_count):
-                        q = covered_cells[slot, k]
-                        direction = cells.directions[q]
-                        if wp.dot(bound.axis, direction) > bound.cosine:
-                            adj_coverage = parts.signs[part] * blocker_adjoint(
-                                sums[slot, q], adj_sums[slot, q], coverages[slot, q]
-                            )
-                            if wp.length_sq(adj_coverage) > 0.0:
-                                if count == _UNKNOWN_COUNT:
-                                    count = _find_silhouette(
-                                        point,
-                                        corners[corner_batch],
-                                        planes[corner_batch],
-                                        parts,
-                                        part,
-                                        silhouettes[slot],
+    @wp.func
+    def cover(
+        corners: wp.array(dtype=wp.vec3),
+        planes: wp.array(dtype=wp.vec4),
+        bounds: wp.array(dtype=wp.vec4),
+        parts: ConvexArrays,
+        body: int,
+        cells: DirectionCells,
+        radius: float,
+        task: PartsTask,
+    ):
+        """Coverage by a body of cells that no other body covers wholly; returns how many it covers, and lists them."""
+        covered_count = int(0)
+        silhouette = task.silhouette
+        enough = wp.where(parts.signs[parts.first_part[body + 1] - 1] < 0.0, 1.0e30, 1.0)  # seams take off
+        for part in range(parts.first_part[body], parts.first_part[body + 1]):
+            bound = find_bound(task, bounds[part], radius)
+            sign = parts.signs[part]
+            if is_any_above(bound.rise, 0.0):
+                is_found = bool(False)
+                for bundle in range(cells.axes.shape[0]):
+                    if reaches(bound, cells.axes[bundle], cells.half_angles[bundle]):
+                        for q in range(bundle * BUNDLE, (bundle + 1) * BUNDLE):
+                            direction = cells.directions[q]
+                            before = task.coverage[q].share
+                            room = wp.min(Lane(enough) - before, Lane(1.0) - task.sums[q].largest)
+                            if sign < 0.0:
+                                room = wp.min(room, before)  # prisms cover the same cells
+                            effect = wp.min(find_reach(task, bound, direction), room)
+                            if is_any_above(effect, 0.0):
+                                if not is_found:
+                                    count, is_solid = find(task.points, corners, planes, parts, part, silhouette)
+                                    silhouette.count = count
+                                    silhouette.is_solid = is_solid
+                                    is_found = True
+                                by_part = find_coverage(task.points, corners, parts, silhouette, direction, radius)
+                                is_affected = is_positive(effect)
+                                if is_any_above(wp.cw_mul(is_affected, by_part.share), 0.0):
+                                    if not is_any_above(before, 0.0):
+                                        task.covered[covered_count] = q
+                                        covered_count += 1
+                                    factor = sign * is_affected
+                                    task.coverage[q] = Coverages(
+                                        before + wp.cw_mul(factor, by_part.share),
+                                        add(task.coverage[q].moment, scale(factor, by_part.moment)),
                                     )
-                                coverage_adjoint(silhouettes[slot], 0, count, direction, radius, adj_coverage)
-                    adj_point += _silhouette_adjoint(silhouettes[slot], wp.max(count, 0), corner_batch, adj_corners)
+        return covered_count
+
+    @wp.func
+    def cover_all(
+        corners: wp.array(dtype=wp.vec3),
+        planes: wp.array(dtype=wp.vec4),
+        bounds: wp.array(dtype=wp.vec4),
+        parts: ConvexArrays,
+        skip: int,
+        cells: DirectionCells,
+        radius: float,
+        task: PartsTask,
+    ):
+        """Store sums over all bodies for each cell."""
+        for body in range(parts.first_part.shape[0] - 1):
+            if body != skip and parts.blocks[body] == 1:
+                covered_count = cover(corners, planes, bounds, parts, body, cells, radius, task)
+                for k in range(covered_count):
+                    q = task.covered[k]
+                    task.sums[q] = with_blocker(task.sums[q], task.coverage[q])
+                    task.coverage[q] = Coverages()
+
+    return _PartFunctions(begin, find_bound, find_reach, cover, cover_all)
+
+
+@functools.cache
+def _make_cover(lanes: int) -> wp.Kernel:
+    Lane, Coverages, SumsOfBlockers = lane_type(lanes), coverage_type(lanes), sums_type(lanes)
+    fn, functions, joint = make_lane_functions(lanes), _make_part_functions(lanes), make_joint_functions(lanes)
+    find_block, is_any_above, begin, cover_all = fn.find_block, fn.is_any_above, functions.begin, functions.cover_all
+    joint_coverage, store_columns = joint.joint_coverage, joint.store_columns
+
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
+    def cover_cells(
+        first_row: int,
+        worker: int,
+        # in
+        points: wp.array2d(dtype=wp.vec3),
+        horizon_normals: wp.array2d(dtype=wp.vec3),
+        corners: wp.array2d(dtype=wp.vec3),
+        planes: wp.array2d(dtype=wp.vec4),
+        bounds: wp.array2d(dtype=wp.vec4),
+        parts: ConvexArrays,
+        cells: DirectionCells,
+        radius: float,
+        skip: int,
+        # scratch
+        coverage: wp.array2d(dtype=Coverages),
+        covered: wp.array2d(dtype=wp.int32),
+        sums: wp.array2d(dtype=SumsOfBlockers),
+        chord_sums: wp.array2d(dtype=Lane),
+        edge_scratch: wp.array2d(dtype=Lane),
+        numbers: wp.array3d(dtype=wp.int32),
+        # out
+        result: wp.array3d(dtype=wp.vec4),
+    ):
+        """A thread owns a block of receivers."""
+        row = first_row + wp.tid()
+        batch, block = find_block(row, points.shape[1])
+        place, instance = scratch_slot(worker, row), instance_in(batch, corners.shape[0])
+        task = begin(
+            points,
+            horizon_normals,
+            batch,
+            block,
+            coverage[place],
+            covered[place],
+            sums[place],
+            chord_sums[place],
+            edge_scratch[place],
+            edge_scratch[place],
+            numbers[place],
+        )
+        cover_all(corners[instance], planes[instance], bounds[instance], parts, skip, cells, radius, task)
+        for q in range(task.coverage.shape[0]):
+            if is_any_above(task.sums[q].total, 0.0):
+                task.coverage[q] = joint_coverage(task.sums[q])
+        store_columns(task.coverage, block, result[batch])
+
+    return cover_cells
+
+
+@functools.cache
+def _make_cover_adjoint(lanes: int) -> wp.Kernel:
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
+    Coverages, SumsOfBlockers = coverage_type(lanes), sums_type(lanes)
+    fn, functions, joint = make_lane_functions(lanes), _make_part_functions(lanes), make_joint_functions(lanes)
+    find_block, is_any_above, is_positive, scale = fn.find_block, fn.is_any_above, fn.is_positive, fn.scale
+    add, add_vectors = fn.add, fn.add_vectors
+    joint_coverage_adjoint, blocker_adjoint = joint.joint_coverage_adjoint, joint.blocker_adjoint
+    load_columns = joint.load_columns
+    begin, find_bound, find_reach, cover, cover_all = functions
+    find, _find_coverage, coverage_adjoint, silhouette_adjoint = make_silhouette_functions(lanes)
+    ADJOINT_STRIDE = wp.constant(ADJOINT_LANES)
+
+    @wp.func(inline=True)
+    def is_any(coverage: Coverages):
+        """Whether anything is not 0."""
+        moment = coverage.moment
+        highest = wp.max(wp.max(coverage.share, moment.x), wp.max(moment.y, moment.z))
+        lowest = wp.min(wp.min(coverage.share, moment.x), wp.min(moment.y, moment.z))
+        return is_any_above(wp.max(highest, -lowest), 0.0)
+
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
+    def cover_cells_adjoint(
+        first_row: int,
+        worker: int,
+        # in
+        points: wp.array2d(dtype=wp.vec3),
+        horizon_normals: wp.array2d(dtype=wp.vec3),
+        corners: wp.array2d(dtype=wp.vec3),
+        planes: wp.array2d(dtype=wp.vec4),
+        bounds: wp.array2d(dtype=wp.vec4),
+        parts: ConvexArrays,
+        cells: DirectionCells,
+        radius: float,
+        skip: int,
+        adj_result: wp.array3d(dtype=wp.vec4),
+        # scratch
+        coverage: wp.array2d(dtype=Coverages),
+        covered: wp.array2d(dtype=wp.int32),
+        sums: wp.array2d(dtype=SumsOfBlockers),
+        chord_sums: wp.array2d(dtype=Lane),
+        edge_scratch: wp.array2d(dtype=Lane),
+        numbers: wp.array3d(dtype=wp.int32),
+        adj_sums: wp.array2d(dtype=SumsOfBlockers),
+        adj_edge_scratch: wp.array2d(dtype=Lane),
+        # out
+        adj_points: wp.array2d(dtype=wp.vec3),
+        # sums
+        adj_corners: wp.array2d(dtype=wp.vec3),
+    ):
+        """A thread owns a block of receivers; cells that are covered wholly have no gradient."""
+        row = first_row + wp.tid()
+        batch, block = find_block(row, points.shape[1])
+        place, instance = scratch_slot(worker, row), instance_in(batch, corners.shape[0])
+        task = begin(
+            points,
+            horizon_normals,
+            batch,
+            block,
+            coverage[place],
+            covered[place],
+            sums[place],
+            chord_sums[place],
+            edge_scratch[place],
+            adj_edge_scratch[place],
+            numbers[place],
+        )
+        cover_all(corners[instance], planes[instance], bounds[instance], parts, skip, cells, radius, task)
+        load_columns(adj_result[batch], block, task.coverage)
+        for q in range(task.coverage.shape[0]):
+            adj_sums[place, q] = SumsOfBlockers()
+            if is_any_above(task.sums[q].total, 0.0):
+                adj_sums[place, q] = joint_coverage_adjoint(task.sums[q], task.coverage[q])
+            task.coverage[q] = Coverages()
+        silhouette = task.silhouette
+        adj_point = Vectors()
+        for body in range(parts.first_part.shape[0] - 1):
+            covered_count = int(0)
+            if body != skip and parts.blocks[body] == 1:
+                covered_count = cover(
+                    corners[instance], planes[instance], bounds[instance], parts, body, cells, radius, task
+                )
+            affected_count = int(0)
             for k in range(covered_count):
-                coverages[slot, covered_cells[slot, k]] = wp.vec4()
-    if adj_points:
-        adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
+                q = task.covered[k]
+                adj_coverage = blocker_adjoint(task.sums[q], adj_sums[place, q], task.coverage[q])
+                task.coverage[q] = adj_coverage
+                if is_any(adj_coverage):
+                    task.covered[affected_count] = q
+                    affected_count += 1
+            if affected_count > 0:
+                for part in range(parts.first_part[body], parts.first_part[body + 1]):
+                    bound = find_bound(task, bounds[instance, part], radius)
+                    is_found = bool(False)
+                    for k in range(affected_count):
+                        q = task.covered[k]
+                        direction = cells.directions[q]
+                        reach = find_reach(task, bound, direction)
+                        if is_any_above(reach, 0.0):
+                            if not is_found:
+                                count, is_solid = find(
+                                    task.points, corners[instance], planes[instance], parts, part, silhouette
+                                )
+                                silhouette.count = count
+                                silhouette.is_solid = is_solid
+                                is_found = True
+                                for i in range(ADJOINT_STRIDE * count):
+                                    silhouette.adj_edges[i] = Lane(0.0)
+                            factor = parts.signs[part] * is_positive(reach)
+                            adj = Coverages(
+                                wp.cw_mul(factor, task.coverage[q].share), scale(factor, task.coverage[q].moment)
+                            )
+                            coverage_adjoint(task.points, corners[instance], parts, silhouette, direction, radius, adj)
+                    if is_found:
+                        adj_point = add(
+                            adj_point,
+                            silhouette_adjoint(
+                                task.points, corners[instance], parts, silhouette, instance, adj_corners
+                            ),
+                        )
+                for k in range(affected_count):
+                    task.coverage[task.covered[k]] = Coverages()
+        if adj_points:
+            add_vectors(adj_point, block, adj_points[batch])
+
+    return cover_cells_adjoint
 
 
 def part_coverage(
     points: wp.array,
-    placed_parts: PlacedParts,
+    placed: PlacedParts,
     blockers: ConvexBlockers,
     directions: np.ndarray,
     *,
@@ -392,7 +437,7 @@ def part_coverage(
 
     Args:
         points: Receivers [scene units], vec3 of shape [batch, receiver].
-        placed_parts: Where the parts are, from :meth:`.ConvexBlockers.placed`; the batch may be 1.
+        placed: Where the parts are, from :meth:`.ConvexBlockers.placed`; the batch may be 1.
         blockers: The bodies.
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
         radius: Of cells that do not tile the sphere [rad]; by default that of so many even ones, which do.
@@ -402,43 +447,39 @@ def part_coverage(
     Returns:
         vec4 of shape [batch, receiver, direction], for :func:`warpshadow.stages.joint_coverage.transmittance_past`.
 
-    Differentiable: points, placed_parts. Not: horizon_normals, which decides by steps.
+    Differentiable: points, placed. Not: horizon_normals, which decides by steps.
     """
     check.shape("points", points.shape, ("batch", "receiver"))
     check.shape("directions", directions.shape, ("direction", 3))
     if skip is not None:
         check.choice("skip", skip, range(blockers.body_count))
-    points = expand(points, common_batch({"points": points, "corners": placed_parts.corners}))
-    radius_of_cells = cell_radius(len(directions)) if radius is None else radius
+    points = expand(points, common_batch({"points": points, "corners": placed.corners}))
+    own_radius = cell_radius(len(directions)) if radius is None else radius
     cells = make_cells(directions, SOFTNESS, points.device)
-    inputs = [
-        points,
-        horizon_normals,
-        *placed_parts,
-        blockers.arrays,
-        cells,
-        radius_of_cells,
-        -1 if skip is None else skip,
-    ]
-    cell_shape = (len(directions),)
+    inputs = [points, horizon_normals, *placed, blockers.arrays, cells, own_radius, -1 if skip is None else skip]
+    lanes = lane_count(points.device)
+    Lane, sums, edge_count = lane_type(lanes), sums_type(lanes), blockers.edge_count
+    by_cell = (len(directions),)
     scratch = [
-        Scratch((blockers.edge_count,), ViewedEdge),
-        *(Scratch(cell_shape, dtype) for dtype in (wp.float32, wp.vec4, wp.int32, BlockerSums)),
+        *(Scratch(by_cell, dtype) for dtype in (coverage_type(lanes), wp.int32, sums)),
+        Scratch((SUM_LANES,), Lane),
+        Scratch((EDGE_LANES * edge_count,), Lane),
+        Scratch((2, edge_count), wp.int32),
     ]
-    cost = _PART_COST * placed_parts.bounds.shape[1]
+    adj_scratch = [Scratch(by_cell, sums), Scratch((ADJOINT_LANES * edge_count,), Lane)]
+    rows = points.shape[0] * block_count(points.shape[1], lanes)
+    cost = _PART_COST * lanes * placed.bounds.shape[1]
     return differentiable(
-        lambda result: launch(
-            _find_joint_coverage, points.size, inputs=inputs, outputs=[result], scratch=scratch, cost=cost
-        ),
-        lambda adj_joint_coverages: launch(
-            _find_joint_coverage_adjoint,
-            points.size,
-            inputs=[*inputs, adj_joint_coverages],
+        lambda result: launch(_make_cover(lanes), rows, inputs=inputs, outputs=[result], scratch=scratch, cost=cost),
+        lambda adj_result: launch(
+            _make_cover_adjoint(lanes),
+            rows,
+            inputs=[*inputs, adj_result],
             outputs=[points.grad],
-            sums=[placed_parts.corners.grad],
-            scratch=[*scratch, scratch[-1]],
+            sums=[placed.corners.grad],
+            scratch=[*scratch, *adj_scratch],
             cost=3 * cost,
         ),
         result=wp.empty((*points.shape, len(directions)), dtype=wp.vec4, device=points.device),
-        variables=[points, placed_parts.corners],
+        variables=[points, placed.corners],
     )

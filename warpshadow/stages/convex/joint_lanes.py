@@ -1,0 +1,194 @@
+"""Joint coverage of cells, for a block of receivers, by the formulas of :mod:`warpshadow.stages.joint_coverage`."""
+
+import functools
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
+from warpshadow.stages.joint_coverage import MIN_BOUNDS, MOMENT_BOUND
+
+
+@functools.cache
+def coverage_type(lanes: int) -> Any:
+    """Struct of the coverage (h, μ) of a cell for each receiver of a thread, or of its gradient."""
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
+
+    @wp.struct
+    class Coverages:
+        share: Lane
+        moment: Vectors
+
+    return Coverages
+
+
+@functools.cache
+def sums_type(lanes: int) -> Any:
+    """Struct of :class:`warpshadow.stages.joint_coverage.BlockerSums` for each receiver of a thread."""
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
+
+    @wp.struct
+    class SumsOfBlockers:
+        total: Lane
+        product: Lane
+        largest: Lane
+        moment: Vectors
+        squares: Lane
+        bounds: Lane
+        bound_squares: Lane
+
+    return SumsOfBlockers
+
+
+class JointFunctions(NamedTuple):
+    """Kernel functions on the coverage of cells by several blockers."""
+
+    no_blockers: wp.Function
+    with_blocker: wp.Function
+    joint_coverage: wp.Function
+    joint_coverage_adjoint: wp.Function
+    blocker_adjoint: wp.Function
+    load_columns: wp.Function
+    store_columns: wp.Function
+
+
+@functools.cache
+def make_joint_functions(lanes: int) -> JointFunctions:
+    """Make the kernel functions for a number of lanes."""
+    Lane, Coverages, SumsOfBlockers = lane_type(lanes), coverage_type(lanes), sums_type(lanes)
+    fn = make_lane_functions(lanes)
+    add, dot, scale, is_positive = fn.add, fn.dot, fn.scale, fn.is_positive
+
+    @wp.func(inline=True)
+    def moment_bound(share: Lane):
+        u = wp.cw_mul(share, Lane(1.0) - share)
+        return wp.cw_mul(u, Lane(MOMENT_BOUND[0]) + wp.cw_mul(u, Lane(MOMENT_BOUND[1]) + MOMENT_BOUND[2] * u))
+
+    @wp.func(inline=True)
+    def moment_bound_slope(share: Lane):
+        u = wp.cw_mul(share, Lane(1.0) - share)
+        by_u = Lane(MOMENT_BOUND[0]) + wp.cw_mul(u, Lane(2.0 * MOMENT_BOUND[1]) + (3.0 * MOMENT_BOUND[2]) * u)
+        return wp.cw_mul(Lane(1.0) - 2.0 * share, by_u)
+
+    @wp.func(inline=True)
+    def no_blockers():
+        """Sums over nothing."""
+        sums = SumsOfBlockers()
+        sums.product = Lane(1.0)
+        return sums
+
+    @wp.func(inline=True)
+    def with_blocker(sums: SumsOfBlockers, coverage: Coverages):
+        """Sums over one blocker new_sums."""
+        share = wp.min(wp.max(coverage.share, Lane(0.0)), Lane(1.0))
+        bound = moment_bound(share)
+        new_sums = SumsOfBlockers()
+        new_sums.total = sums.total + share
+        new_sums.product = wp.cw_mul(sums.product, Lane(1.0) - share)
+        new_sums.largest = wp.max(sums.largest, share)
+        new_sums.moment = add(sums.moment, coverage.moment)
+        new_sums.squares = sums.squares + dot(coverage.moment, coverage.moment)
+        new_sums.bounds = sums.bounds + bound
+        new_sums.bound_squares = sums.bound_squares + wp.cw_mul(bound, bound)
+        return new_sums
+
+    @wp.func(inline=True)
+    def relate(sums: SumsOfBlockers):
+        """1 / Σ ν ν; k; its weight; 1 where it is below 0; and what is open if blockers are so."""
+        per_bounds = wp.cw_div(Lane(1.0), wp.cw_mul(sums.bounds, sums.bounds) - sums.bound_squares + Lane(MIN_BOUNDS))
+        relation = wp.cw_mul(dot(sums.moment, sums.moment) - sums.squares, per_bounds)
+        weight = wp.min(wp.max(relation, -relation), Lane(1.0))
+        is_beside = is_positive(-relation)
+        related = wp.cw_mul(is_beside, wp.max(Lane(1.0) - sums.total, Lane(0.0)))
+        related += wp.cw_mul(Lane(1.0) - is_beside, Lane(1.0) - sums.largest)
+        return per_bounds, relation, weight, is_beside, related
+
+    @wp.func(inline=True)
+    def joint_share(sums: SumsOfBlockers, weight: Lane, related: Lane):
+        open_share = wp.cw_mul(Lane(1.0) - weight, sums.product) + wp.cw_mul(weight, related)
+        return wp.max(Lane(1.0) - open_share, Lane(0.0))
+
+    @wp.func(inline=True)
+    def joint_coverage(sums: SumsOfBlockers):
+        """Coverage by all blockers together."""
+        _per_bounds, _relation, weight, _is_beside, related = relate(sums)
+        share = joint_share(sums, weight, related)
+        return Coverages(share, scale(wp.cw_div(share, wp.max(sums.total, Lane(1.0e-30))), sums.moment))
+
+    @wp.func(inline=True)
+    def joint_coverage_adjoint(sums: SumsOfBlockers, adj_coverage: Coverages):
+        """Gradients of the sums, 0 where one blocker covers all."""
+        per_bounds, relation, weight, is_beside, related = relate(sums)
+        share = joint_share(sums, weight, related)
+        is_open = is_positive(Lane(1.0) - sums.largest)
+        adj_moment = scale(is_open, adj_coverage.moment)
+        per_total = wp.cw_div(is_positive(share), wp.max(sums.total, Lane(1.0e-30)))
+        of_total = wp.cw_mul(dot(adj_moment, sums.moment), per_total)
+        of_moment = wp.cw_mul(share, per_total)
+        adj_share = wp.cw_mul(is_open, adj_coverage.share) + of_total
+        adj_related = wp.cw_mul(weight, adj_share)
+        is_partial = wp.cw_mul(is_beside, is_positive(Lane(1.0) - sums.total))
+        is_weighed = wp.cw_mul(is_positive(Lane(1.0) - weight), Lane(1.0) - 2.0 * is_beside)
+        adj_relation = wp.cw_mul(wp.cw_mul(is_weighed, adj_share), sums.product - related)
+        adj_pairs = wp.cw_mul(adj_relation, per_bounds)
+        adj = SumsOfBlockers()
+        adj.product = wp.cw_mul(weight - Lane(1.0), adj_share)
+        adj.total = wp.cw_mul(is_partial, adj_related) - wp.cw_mul(of_total, of_moment)
+        adj.largest = wp.cw_mul(Lane(1.0) - is_beside, adj_related)
+        adj.moment = add(scale(2.0 * adj_pairs, sums.moment), scale(of_moment, adj_moment))
+        adj.squares = -adj_pairs
+        adj.bound_squares = wp.cw_mul(adj_pairs, relation)
+        adj.bounds = -2.0 * wp.cw_mul(adj.bound_squares, sums.bounds)
+        return adj
+
+    @wp.func(inline=True)
+    def blocker_adjoint(sums: SumsOfBlockers, adj: SumsOfBlockers, coverage: Coverages):
+        """Gradient of the coverage by one blocker, given those of the sums; 0 where that covers all or nothing."""
+        share = coverage.share
+        rest = Lane(1.0) - share
+        is_partial = wp.cw_mul(is_positive(share), is_positive(rest))
+        difference = wp.max(sums.largest - share, share - sums.largest)
+        adj_share = adj.total - wp.cw_div(wp.cw_mul(adj.product, sums.product), wp.max(rest, Lane(1.0e-30)))
+        adj_share += wp.cw_mul(Lane(1.0) - is_positive(difference), adj.largest)
+        adj_bound = adj.bounds + 2.0 * wp.cw_mul(moment_bound(share), adj.bound_squares)
+        adj_share += wp.cw_mul(adj_bound, moment_bound_slope(share))
+        adj_moment = add(adj.moment, scale(2.0 * adj.squares, coverage.moment))
+        return Coverages(wp.cw_mul(is_partial, adj_share), scale(is_partial, adj_moment))
+
+    @wp.func_native(f"""
+    for (int lane = 0; lane < {lanes}; ++lane) {{
+        const int vertex = block * {lanes} + lane;
+        for (int k = 0; k < rows.shape[1]; ++k) {{
+            wp::vec_t<4, float> value;
+            if (vertex < rows.shape[0])
+                value = wp::index(rows, vertex, k);
+            wp::index(scratch, k).share.c[lane] = value.c[0];
+            wp::index(scratch, k).moment.x.c[lane] = value.c[1];
+            wp::index(scratch, k).moment.y.c[lane] = value.c[2];
+            wp::index(scratch, k).moment.z.c[lane] = value.c[3];
+        }}
+    }}
+    """)
+    def load_columns(rows: wp.array2d(dtype=wp.vec4), block: int, scratch: wp.array(dtype=Coverages)):
+        """scratch[k] = rows[the block's vertices, k], 0 past the last vertex."""
+        ...
+
+    @wp.func_native(f"""
+    const int first = block * {lanes};
+    const int past = first + {lanes} < rows.shape[0] ? first + {lanes} : rows.shape[0];
+    for (int vertex = first; vertex < past; ++vertex)
+        for (int k = 0; k < rows.shape[1]; ++k) {{
+            wp::vec_t<4, float>& value = wp::index(rows, vertex, k);
+            value.c[0] = wp::index(scratch, k).share.c[vertex - first];
+            value.c[1] = wp::index(scratch, k).moment.x.c[vertex - first];
+            value.c[2] = wp::index(scratch, k).moment.y.c[vertex - first];
+            value.c[3] = wp::index(scratch, k).moment.z.c[vertex - first];
+        }}
+    """)
+    def store_columns(scratch: wp.array(dtype=Coverages), block: int, rows: wp.array2d(dtype=wp.vec4)):
+        """rows[the block's vertices, k] = scratch[k]."""
+        ...
+
+    return JointFunctions(
+        no_blockers, with_blocker, joint_coverage, joint_coverage_adjoint, blocker_adjoint, load_columns, store_columns
+    )
