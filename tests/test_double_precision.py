@@ -563,7 +563,7 @@ def test_self_visibility_under_a_rotation(sharp, double, device):
         )
 
     matrices = torch.linalg.qr(torch.tensor(rng.normal(size=(2, 1, 3, 3))))[0]
-    given = matrices.requires_grad_(), torch.tensor(rng.uniform(size=(1, 5, 3))).requires_grad_()
+    given = [values.to(device).requires_grad_() for values in (matrices, torch.tensor(rng.uniform(size=(1, 5, 3))))]
     apply = double("torch").apply
     assert torch.autograd.gradcheck(
         lambda *tensors: apply(see, *tensors, dtypes=(wp.mat33d, wp.vec3d)), given, nondet_tol=CUDA_SUMS, **EXACT

@@ -16,8 +16,8 @@ LOG_SH = 1e-4
 LOG_SH_ROW = 3e-4
 # The golden exponential is converged; quadratic with threshold 1/8 is within 1e-4 of it, rounding included.
 IRRADIANCE = 3e-4
-# Rounding only; measured 2e-7.
-DIRECTIONAL = 2e-6
+# Rounding; measured 2e-7, and 2.1e-6 on a GPU, which leaves out the rest of light receiver by receiver.
+DIRECTIONAL = 4e-6
 
 
 @pytest.fixture(scope="module")

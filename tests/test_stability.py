@@ -29,6 +29,9 @@ VALUE = 1e-4
 # Gradients along random displacements. Measured 5e-3 where receivers meet a sphere (curvature jumps there, which
 # differences of 1e-7 see), else 1e-3 and below.
 GRADIENT = 1e-2
+# Of receivers that spheres enclose, relative to nearly nothing: a GPU, whose blocks are one receiver wide, leaves out
+# what is behind several spheres (2e-5 of the light); measured 0.14, on a CPU 1e-4.
+ENCLOSED_GRADIENT = 0.2
 # An eigenvalue that meets its floor rounds a corner of the log; measured 5e-2.
 CORNER_GRADIENT = 0.1
 # Of coordinates rounded to float32 far from the origin: eps · offset / radius is 2e-3 for the smallest radius here, and
@@ -38,8 +41,9 @@ OFFSET_GRADIENT = 5e-2
 # Squarings double the relative rounding of the base; measured 2e-3 (linear, where 7 of 20 squarings are not held) and
 # 6e-3 (optimal_linear); of gradients 2e-2 (linear, of 10 000 spheres).
 SQUARED = 1e-2
-# The table of `optimal_linear` has corners 1e-3 apart, the twin's elsewhere; measured 0.15 of gradients.
-SQUARED_GRADIENT = {"quadratic": GRADIENT, "linear": 5e-2, "optimal_linear": 0.2}
+# The table of `optimal_linear` has corners 1e-3 apart, the twin's elsewhere; measured 0.15 of gradients. `linear` on a
+# GPU, which rounds elsewhere: 0.095.
+SQUARED_GRADIENT = {"quadratic": GRADIENT, "linear": 0.15, "optimal_linear": 0.2}
 # Barycentrics of triangles of 1e-3 pixels: positions are known to 1e-6 pixels. Measured 1e-5 and 5e-5.
 WEIGHTS = 1e-4
 
@@ -85,7 +89,8 @@ def test_transmittance_and_its_gradient_are_the_twins_in_hard_scenes(case, count
     errors = stability.measure(stability.directional_stage(count), scene, stability.scene_displacements(scene), device)
     assert errors.is_finite
     assert errors.value < (OFFSET_VALUE if "offset" in case else VALUE)
-    assert errors.gradient < (OFFSET_GRADIENT if "offset" in case else GRADIENT)
+    limit = ENCLOSED_GRADIENT if case == "enclosed" and device != "cpu" else GRADIENT
+    assert errors.gradient < (OFFSET_GRADIENT if "offset" in case else limit)
 
 
 @pytest.mark.slow

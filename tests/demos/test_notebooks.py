@@ -5,8 +5,10 @@ import re
 import runpy
 from pathlib import Path
 
-import nbformat
 import pytest
+
+nbformat = pytest.importorskip("nbformat")
+pytest.importorskip("nbclient")
 
 from demos.tools.run_notebooks import NOTEBOOKS, executed, lasting_outputs, tidied
 

@@ -59,7 +59,7 @@ def test_each_call_runs_once_be_it_plain_captured_or_replayed(device):
     python_calls = []
 
     def add():
-        python_calls.append(wp.get_device(device).is_capturing)
+        python_calls.append(bool(wp.get_device(device).is_capturing))
         wp.launch(_sum_cubes, dim=3, inputs=[ones], outputs=[total], device=device)
 
     step = Captured(add, device)

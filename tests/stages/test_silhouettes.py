@@ -318,7 +318,8 @@ def test_every_change_of_the_mask_has_its_edge_also_where_faces_pass_the_eye(dev
     seen = mask(found)
     changes = {(int(pixel), side) for pixel, side in mask_changes(seen)}
     assert len(changes) > 2000
-    assert len(changes - lines(found).keys()) <= 2e-3 * len(changes)  # vertices far off the screen are rounded, too
+    # vertices far off the screen are rounded, too: measured 0.2% on a CPU, 0.4% on a GPU
+    assert len(changes - lines(found).keys()) <= 6e-3 * len(changes)
     assert lines(found).keys() <= changes
 
 
@@ -664,6 +665,11 @@ def gradients(image, silhouettes, clip, weights):
     return [None if array.grad is None else array.grad.numpy().copy() for array in (image, clip)]
 
 
+def assert_sums_equal(got, expected):
+    """But for rounding: threads of a GPU add to one gradient in any order."""
+    np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
+
+
 def test_gradients_are_computed_of_what_requires_them(small, device):
     rng = np.random.default_rng(3)
     image, weights = (wp.array(np.float32(rng.normal(size=(1, 22, 26))), device=device) for _ in range(2))
@@ -672,10 +678,10 @@ def test_gradients_are_computed_of_what_requires_them(small, device):
     variable.grad.zero_()
     moving.grad.zero_()
     alone, nothing = gradients(variable, small.silhouettes, small.clip, weights)
-    np.testing.assert_array_equal(alone, by_image)
+    assert_sums_equal(alone, by_image)
     assert nothing is None
     nothing, alone = gradients(image, small.silhouettes, moving, weights)
-    np.testing.assert_array_equal(alone, by_clip)
+    assert_sums_equal(alone, by_clip)
     assert nothing is None
     assert smooth_silhouettes(image, small.silhouettes, small.clip).grad is None
 
@@ -730,7 +736,7 @@ def test_each_instance_of_a_batch_is_what_it_is_alone(device):
 
     for i in range(2):
         for alone, batched in zip(results([i]), results([0, 1]), strict=True):
-            np.testing.assert_allclose(batched[i], alone[0], rtol=1e-6, atol=1e-6)
+            assert_sums_equal(batched[i], alone[0])
 
 
 def test_silhouettes_of_one_view_serve_many_images(small, device):

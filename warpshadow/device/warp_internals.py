@@ -360,4 +360,5 @@ def load_silently(package: str) -> None:
 def _is_of(module: wp.Module, package: str) -> bool:
     """Whether kernels of a module are a package's; modules of single kernels are named after these alone."""
     kernel = next(iter(module.kernels.values()), None)
-    return kernel is not None and kernel.func.__module__.partition(".")[0] == package
+    # functions that Warp makes itself, as for array operators, have no module
+    return kernel is not None and (kernel.func.__module__ or "").partition(".")[0] == package

@@ -1,6 +1,7 @@
 """Warp in torch's autograd: functions of arrays are applied to tensors."""
 
 import functools
+import math
 import os
 import sys
 import threading
@@ -137,7 +138,9 @@ def _of_memory(tensor: torch.Tensor, dtype: type) -> wp.array:
     shape, item = tuple(tensor.shape), item_shape(dtype)
     leading_shape = shape[: len(shape) - len(item)]
     if tensor.device.type != "cpu" or not tensor.numel() or shape[len(leading_shape) :] != item or not leading_shape:
-        return wp.from_torch(tensor, dtype=dtype, requires_grad=False)
+        # torch calls any stride of a length of 1 contiguous, Warp does not
+        strides = [math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
+        return wp.from_torch(tensor.as_strided(shape, strides), dtype=dtype, requires_grad=False)
     return array_at(tensor.data_ptr(), leading_shape, dtype, owner=tensor)
 
 

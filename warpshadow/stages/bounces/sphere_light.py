@@ -422,8 +422,8 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                             )
                         if adj_transmittance_others:
                             others_batch = instance_in(batch, adj_transmittance_others.shape[0])
-                            adj_transmittance_others[others_batch, vertex, direction] = (
-                                adj_transmittance_others[others_batch, vertex, direction] + adj_blocked[lane]
+                            wp.atomic_add(
+                                adj_transmittance_others, others_batch, vertex, direction, adj_blocked[lane]
                             )
                     task.blocked[slot] = wp.cw_mul(wp.cw_mul(factored_cosine, task.blocked[slot]), inverse)
                     task.adj_cells[slot] = adj_cell
