@@ -68,6 +68,9 @@ if "inline" not in inspect.signature(wp.func).parameters:  # Warp 1.17, whose co
 
 _types = wp._src.types
 
+BLOCK_DIM = 64
+"""Threads of a block on CUDA: with few a block, some thousand receivers reach all multiprocessors."""
+
 _NO_ARRAY = _types.array_t()  # the descriptor of an argument None
 
 
@@ -178,7 +181,9 @@ def bound_kernel(
         return run_plainly
 
     def run_by_warp(dim: Sequence[int], *first: Any) -> None:
-        options = {} if gradients is None else {"adj_inputs": gradients, "adjoint": True}
+        options: dict[str, Any] = {"block_dim": BLOCK_DIM} if device.is_cuda else {}
+        if gradients is not None:
+            options |= {"adj_inputs": gradients, "adjoint": True}
         inputs = [*first, *arguments[len(first) :]]
         wp.launch(kernel, dim=dim, inputs=inputs, device=device, record_tape=False, **options)
 

@@ -16,7 +16,8 @@ from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK
 from warpshadow.stages.transfer import cell_inputs, spread, transfer_chunk
 
-_SLICE = 256  # receivers whose gradients to light a thread sums before it adds them to the others'
+# receivers whose gradients to light a thread sums before it adds them to the others', on a CPU and on a GPU
+_SLICE, _GPU_SLICE = 256, 16
 _COEFFICIENT_COST, _RECEIVER_COST = 0.4, 30.0  # nanoseconds that a coefficient of a receiver takes, and a receiver
 
 
@@ -129,16 +130,17 @@ def _shade_adjoint_light(
     transfer: wp.array3d(dtype=wp.float32),
     transfer_chunks: wp.array3d(dtype=Chunk),
     adj_shading: wp.array2d(dtype=wp.vec3),
+    slice_size: int,
     # out
     adj_light: wp.array3d(dtype=wp.float32),
 ):
-    """A thread owns a chunk of coefficients, the last one the remainder, and a slab of receivers:  L̄ = Σ T s̄."""
+    """A thread owns a chunk of coefficients, the last one the remainder, and a slice of receivers:  L̄ = Σ T s̄."""
     row, batch, slice_index = wp.tid()
     chunk = first_row + row
     transfer_batch = instance_in(batch, transfer.shape[0])
     light_batch = instance_in(batch, adj_light.shape[0])
-    begin = slice_index * _SLICE
-    end = wp.min(begin + _SLICE, transfer.shape[1])
+    begin = slice_index * slice_size
+    end = wp.min(begin + slice_size, transfer.shape[1])
     first_direction = chunk * CHUNK
     if chunk < transfer_chunks.shape[2]:
         red = Chunk(0.0)
@@ -209,12 +211,13 @@ def shade(transfer: wp.array, light: wp.array, *, maximum: float = check.LARGEST
             )
         if light.requires_grad:
             adj_channels = wp.zeros_like(channels)
+            slice_size = _GPU_SLICE if device.is_cuda else _SLICE
             launch(
                 _shade_adjoint_light,
-                (-(-count // CHUNK), instances, -(-transfer.shape[1] // _SLICE)),
-                inputs=[*transfer_inputs, adj_shading],
+                (-(-count // CHUNK), instances, -(-transfer.shape[1] // slice_size)),
+                inputs=[*transfer_inputs, adj_shading, slice_size],
                 outputs=[adj_channels],
-                cost=_COEFFICIENT_COST * CHUNK * _SLICE,
+                cost=_COEFFICIENT_COST * CHUNK * slice_size,
             )
             launch(_join_channels, light.shape, inputs=[adj_channels], outputs=[light.grad])
 

@@ -34,6 +34,7 @@ class ResamplingKernels:
 
     directions: wp.array(dtype=wp.vec3)  # ω [direction]
     cos_radii: wp.array(dtype=wp.float32)  # cos h [direction]
+    cos_reaches: wp.array(dtype=wp.float32)  # cosines that axes of coarse cells exceed which may be sampled [direction]
     uses_rays: wp.array(dtype=wp.int32)  # 1, or 0 for coarse cells [direction]
     rays: wp.array(dtype=wp.vec3)  # directions of rays, and of coarse cells, in the body's frame
     cells: wp.array(dtype=wp.vec3)
@@ -60,14 +61,18 @@ def find_resampling_kernels(
         for radius in map(cell_radius, (ray_count, cell_count))
     )
     uses_rays = ray_count * (1 - np.cos(ray_radii)) / 2 <= _MAX_RAYS
-    cos_radii = np.cos(np.where(uses_rays, ray_radii, cell_radii))
+    radii = np.where(uses_rays, ray_radii, cell_radii)
+    cos_radii = np.cos(radii)
     counts = np.where(uses_rays, ray_count, cell_count) * (1 - cos_radii) / 2
     rays = fibonacci(ray_count)
     cells = rays.reshape(cell_count, RAYS_PER_CELL, 3).sum(axis=1)
     cells /= np.linalg.norm(cells, axis=1, keepdims=True)
+    half_width = np.arccos(np.einsum("crx,cx->cr", rays.reshape(cell_count, RAYS_PER_CELL, 3), cells).min())
+    reaches = np.minimum(radii + np.where(uses_rays, half_width + 1e-3, 0), np.pi)
     kernels = ResamplingKernels()
     kernels.directions = constant(np.asarray(directions), wp.vec3, device)
     kernels.cos_radii = constant(cos_radii, wp.float32, device)
+    kernels.cos_reaches = constant(np.cos(reaches), wp.float32, device)
     kernels.uses_rays = constant(uses_rays.astype(np.int32), wp.int32, device)
     kernels.rays, kernels.cells = constant(rays, wp.vec3, device), constant(cells, wp.vec3, device)
     kernels.max_lookups = int(1.4 * counts.max() + 8)
@@ -122,13 +127,16 @@ def _find_weights(
     _rotated_direction, kernel_axis, cos_radius, candidates = _load_kernel(kernels, rotations[batch, body], direction)
     count = int(0)
     weight_sum = float(0.0)
-    for candidate in range(candidates.shape[0]):
-        profile = _profile(wp.dot(candidates[candidate], kernel_axis), cos_radius)
-        if profile > 0.0 and count < weights.shape[2]:
-            indices[batch, direction, count] = candidate
-            weights[batch, direction, count] = profile * profile
-            weight_sum += profile * profile
-            count += 1
+    width = candidates.shape[0] // kernels.cells.shape[0]
+    for cell in range(kernels.cells.shape[0]):
+        if wp.dot(kernels.cells[cell], kernel_axis) > kernels.cos_reaches[direction]:
+            for candidate in range(width * cell, width * cell + width):
+                profile = _profile(wp.dot(candidates[candidate], kernel_axis), cos_radius)
+                if profile > 0.0 and count < weights.shape[2]:
+                    indices[batch, direction, count] = candidate
+                    weights[batch, direction, count] = profile * profile
+                    weight_sum += profile * profile
+                    count += 1
     counts[batch, direction] = count
     for k in range(weights.shape[2]):
         if k < count:
