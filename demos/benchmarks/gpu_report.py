@@ -2,26 +2,32 @@
 
     make gpu      or      python demos/benchmarks/gpu_report.py [--devices cuda:0] [--folder out/gpu]
 
-For each device, in this order, so that what takes longest comes last:
+For each device, in this order:
 
 - images and all gradients of a small scene, against those of the CPU, with every method;
-- the same launches under compute-sanitizer, where it is on the path;
-- stages of a pose iteration, each waited for, beside the least that their arithmetic and bytes allow an H200;
-- the benchmark, on the device and on the CPU;
-- every test that takes a device.
+- every test that takes a device, in as many processes as there are cores;
+- the launches of the first part under compute-sanitizer, for memory and for races, where it is on the path;
+- kernels of a pose iteration, timed by CUDA's events, beside the least that an H200 would take for all of them;
+- the same iterations held as CUDA graphs;
+- the benchmark, on the device and on the CPU.
 
-It needs no network, and ends within ten minutes: what there was no time for is in the report. The exit status is 1 if
-anything is wrong. ``--devices cpu`` tries it where there is no GPU.
+It needs no network, and ends within ten minutes. The exit status is 1 if anything is wrong; a test that was not reached
+is. ``--devices cpu`` tries it where there is no GPU.
 """
 
 import argparse
+import dataclasses
+import importlib.util
 import json
+import os
+import re
 import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -32,8 +38,10 @@ sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.benchmarks import benchmark
 from demos.benchmarks.lane_choice import cpu_text
+from demos.examples.warp_loop import FreePose, compare
 from demos.scenes import bunny_scene
 from demos.tools import kernel_floor
+from warpshadow.device.cuda_graph import Captured, with_gradients
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
 ROOT = Path(__file__).parents[2]
@@ -44,7 +52,7 @@ AGREEMENT = 1e-4
 SECONDS = 570
 """Time for all of it."""
 
-SHARES = {"sanitizer": 0.2, "benchmark": 0.5}
+SHARES = {"tests": 0.6, "sanitizer": 0.3, "benchmark": 0.8}
 """Most of what is left of the time that a part may take."""
 
 CASES = [
@@ -54,20 +62,8 @@ CASES = [
 ]
 """Methods, and the ground's receivers, that are compared."""
 
-FLOORS = {
-    "clip positions": ["project"],
-    "rasterization": ["rasterize", "visible faces, barycentrics"],
-    "silhouettes": ["silhouettes found", "silhouettes listed"],
-    "sides": ["sides"],
-    "normals": ["normals"],
-    "visibility": ["visibility, directional"],
-    "transfer": ["transfer, directional"],
-    "shading": ["shading, directional"],
-    "reflectance": ["albedo"],
-    "radiance": ["radiance", "slopes"],
-    "smoothing": ["smoothing"],
-}
-"""Stages as a renderer explains them, and as ``kernel_floor.py`` counts them."""
+SHOWN_KERNELS = 12
+"""Kernels of an iteration that the table lists, the longest first."""
 
 
 # ------------------------------------------------------------------------------------------------ agreement
@@ -153,74 +149,109 @@ def relative(got: np.ndarray, expected: np.ndarray) -> float:
 
 def sanitize(device: str, seconds: float) -> str:
     """Launch what :func:`agreement` launches under compute-sanitizer, and say how that ended."""
-    tool = shutil.which("compute-sanitizer")
-    if tool is None or not device.startswith("cuda"):
-        return "left out: " + ("compute-sanitizer is not on the path" if tool is None else "not a CUDA device")
+    executable = shutil.which("compute-sanitizer")
+    if executable is None or not device.startswith("cuda"):
+        return "left out: " + ("compute-sanitizer is not on the path" if executable is None else "not a CUDA device")
     script = f"from demos.benchmarks.gpu_report import *; [image_and_gradients(small_scene(m, 'vertex'), {device!r})"
     script += " for m in ('directional', 'log-sh', 'ray-traced')]"
-    command = [tool, "--error-exitcode", "9", sys.executable, "-c", script]
-    try:
-        run = subprocess.run(command, cwd=ROOT, timeout=seconds, capture_output=True, text=True)
-    except subprocess.TimeoutExpired:
-        return f"left out: not done after {seconds:.0f} s"
-    if run.returncode:
-        return f"failed ({run.returncode}): " + " ".join((run.stdout + run.stderr).split())[-600:]
+    for tool in ("memcheck", "racecheck"):
+        command = [executable, "--tool", tool, "--error-exitcode", "9", sys.executable, "-c", script]
+        try:
+            run = subprocess.run(command, cwd=ROOT, timeout=seconds / 2, capture_output=True, text=True)
+        except subprocess.TimeoutExpired:
+            return f"left out: {tool} was not done after {seconds / 2:.0f} s"
+        if run.returncode:
+            return f"{tool} failed ({run.returncode}): " + " ".join((run.stdout + run.stderr).split())[-600:]
     return "clean"
 
 
-def stages(device: str, runs: int = 10) -> list[dict[str, float | str]]:
-    """Stages of a pose iteration on the bunny scene: milliseconds, each waited for, and the floors of an H200."""
-    scene = bunny_scene()
-    size, rising, reached = kernel_floor.measure(scene)
-    floors = {stage.name: stage for stage in kernel_floor.stages(size, rising, reached)}
-    items = kernel_floor.counts(size)
-    renderer = TorchRenderer(scene, device="cpu" if device == "cpu" else device)
-    renderer.warp.clock.waits = True
-    rotations, translations, scales = renderer.scene_poses()
-    translations.requires_grad_()
-    times: dict[str, list[tuple[float, float]]] = {}
-    for _ in range(runs + 1):
-        renderer(geometry=renderer.placed(rotations, translations, scales)).square().sum().backward()
-        for name, timing in renderer.warp.clock.timings.items():
-            times.setdefault(name, []).append((1e3 * timing.forward, 1e3 * (timing.backward or 0.0)))
-    rows: list[dict[str, float | str]] = []
-    for name, each in times.items():
-        forward, backward = np.median(each[1:], axis=0)
-        parts = [floors[part] for part in FLOORS.get(name, [])]
-        least = [
-            1e3 * sum(kernel_floor.floor(getattr(part, way), items[part.item]) for part in parts)
-            for way in ("forward", "backward")
-        ]
-        rows.append(
-            {
-                "stage": name,
-                "forward": float(forward),
-                "floor of forward": least[0],
-                "backward": float(backward),
-                "floor of backward": least[1],
-            }
-        )
-    return rows
+class KernelTimes(NamedTuple):
+    """Kernels and copies of an iteration by CUDA's events, the longest first."""
+
+    iteration: str
+    kernels: list[tuple[str, int, float]]  # name, launches, milliseconds of all of them
+
+
+def kernel_times(device: str, runs: int = 3) -> list[KernelTimes]:
+    """Times of the kernels of pose iterations of the bunny scene, without and with bounces; none on a CPU."""
+    times = []
+    for bounces in (0, 2) if wp.get_device(device).is_cuda else ():
+        ((label, iterate),) = pose_iterations(device, bounces).items()
+        for _ in range(3):
+            iterate()
+        wp.timing_begin(cuda_filter=wp.TIMING_ALL)
+        for _ in range(runs):
+            iterate()
+        each: dict[str, list[float]] = {}
+        for activity in wp.timing_end():
+            each.setdefault(activity.name, []).append(activity.elapsed)
+        kernels = [(name, len(values) // runs, sum(values) / runs) for name, values in each.items()]
+        times.append(KernelTimes(label, sorted(kernels, key=lambda kernel: -kernel[2])))
+    return times
+
+
+def pose_iterations(device: str, bounces: int) -> dict[str, Callable[[], object]]:
+    """The benchmark's iteration of a pose fit in torch, by its label."""
+    scene = dataclasses.replace(bunny_scene(), bounces=bounces)
+    label = "iteration of a pose fit in torch"
+    return {label + benchmark.BOUNCED * bool(bounces): benchmark.iterations(scene, device)[label]}
+
+
+def least_milliseconds() -> float:
+    """The least that an H200 takes for a pose iteration of the bunny scene, by its operations and bytes."""
+    size, rising, reached = kernel_floor.measure(bunny_scene())
+    return 1e3 * kernel_floor.iteration_floor(kernel_floor.stages(size, rising, reached), size, 1)
+
+
+def captured(device: str, runs: int = 20) -> dict[str, tuple[float, float]]:
+    """Milliseconds of a pose iteration in Warp, and of an image: as calls, and replayed as one CUDA graph each."""
+    times = {}
+    for bounces, words in ((0, ""), (2, benchmark.BOUNCED)):
+        renderer = ws.Renderer(dataclasses.replace(bunny_scene(), bounces=bounces), device=device)
+        pose = FreePose(renderer)
+        target = wp.clone(pose.draw(), requires_grad=False)
+        variables = [pose.turn, pose.translation]
+        functions: dict[str, Callable[[], object]] = {
+            "image": pose.draw,
+            "pose iteration": with_gradients(lambda pose=pose, target=target: compare(pose.draw(), target), variables),
+        }
+        for label, function in functions.items():
+            graph = Captured(function, device)
+            times[f"{label}{words}"] = tuple(mean_milliseconds(each, device, runs) for each in (function, graph))
+    return times
+
+
+def mean_milliseconds(function: Callable[[], object], device: str, runs: int) -> float:
+    for _ in range(3):
+        function()
+    wp.synchronize_device(device)
+    start = time.perf_counter()
+    for _ in range(runs):
+        function()
+    wp.synchronize_device(device)
+    return 1e3 * (time.perf_counter() - start) / runs
 
 
 def run_tests(device: str, seconds: float, folder: Path) -> dict[str, int | list[str]]:
     """Run every test that takes a device; what was not reached in time is counted."""
     report = folder / f"tests_{device.replace(':', '_')}.xml"
-    command = [sys.executable, "-m", "pytest", "--devices", device, "--seconds", str(int(seconds))]
-    command += ["-p", "no:cacheprovider", f"--junitxml={report}"]
+    command = [sys.executable, "-m", "pytest", "--devices", device, "-p", "no:cacheprovider"]
+    listed = subprocess.run([*command, "--collect-only", "-q"], cwd=ROOT, capture_output=True, text=True).stdout
+    total = sum(int(line.rpartition(": ")[2]) for line in listed.splitlines() if re.match(r"\S+\.py: \d+$", line))
+    command += ["--seconds", str(int(seconds)), f"--junitxml={report}"]
+    if importlib.util.find_spec("xdist"):
+        command += ["--numprocesses", str(max(1, (os.cpu_count() or 1) - 1)), "--dist", "loadfile"]
     run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     if not report.exists():
         return {"passed": 0, "failed": [f"pytest: {(run.stdout + run.stderr)[-600:]}"], "skipped": 0, "not reached": 0}
     cases = list(ElementTree.parse(report).iter("testcase"))
     failed = [case for case in cases if case.find("failure") is not None or case.find("error") is not None]
     skipped = [case for case in cases if case.find("skipped") is not None]
-    collected = next(iter(ElementTree.parse(report).iter("property")), None)
-    total = len(cases) if collected is None else int(collected.get("value", len(cases)))
     return {
         "passed": len(cases) - len(failed) - len(skipped),
         "failed": [f"{case.get('classname')}.{case.get('name')}" for case in failed],
         "skipped": len(skipped),
-        "not reached": total - len(cases),
+        "not reached": max(0, total - len(cases)),
     }
 
 
@@ -243,10 +274,11 @@ def report(device: str, folder: Path, seconds: float) -> dict:
         print(f"  {time.monotonic() - start:.0f} s", file=sys.stderr)
 
     part("agreement", lambda: list(agreement(device)))
+    part("tests", lambda: run_tests(device, left("tests"), folder))
     part("sanitizer", lambda: sanitize(device, left("sanitizer")))
-    part("stages", lambda: stages(device))
+    part("kernels", lambda: kernel_times(device))
+    part("captured", lambda: captured(device))
     part("benchmark", lambda: {name: benchmark.measure(name, left("benchmark") / 4) for name in ("cpu", device)})
-    part("tests", lambda: run_tests(device, left() - 20, folder))
     return result
 
 
@@ -259,6 +291,8 @@ def faults(result: dict) -> list[str]:
         ]
     if result["sanitizer"] not in ("clean",) and not str(result["sanitizer"]).startswith("left out"):
         wrong.append(f"sanitizer: {result['sanitizer']}")
+    if result["tests"].get("not reached"):
+        wrong.append(f"tests: {result['tests']['not reached']} were not reached")
     return wrong + list(result["tests"].get("failed", []))
 
 
@@ -281,11 +315,17 @@ def table(result: dict) -> str:
         lines += [f"| {case} | {image:.1e} | {error:.1e} ({at}) |" for case, (image, at, error) in worst.items()]
         lines += [""]
     lines += [f"compute-sanitizer: {result['sanitizer']}", ""]
-    if isinstance(result["stages"], list):
-        lines += ["| stage of a pose iteration, ms | forward (floor) | backward (floor) |", "| --- | --- | --- |"]
-        for row in result["stages"]:
-            cells = (f"{row[way]:.3f} ({row[f'floor of {way}']:.3f})" for way in ("forward", "backward"))
-            lines += [f"| {row['stage']} | " + " | ".join(cells) + " |"]
+    for times in result["kernels"] if isinstance(result["kernels"], list) else ():
+        launches, total = (sum(kernel[k] for kernel in times.kernels) for k in (1, 2))
+        lines += [f"| {times.iteration} | launches | ms |", "| --- | --- | --- |"]
+        lines += [f"| {name} | {count} | {ms:.3f} |" for name, count, ms in times.kernels[:SHOWN_KERNELS]]
+        lines += [
+            f"| all ({least_milliseconds():.2f} ms without bounces at the least) | {launches} | {total:.3f} |",
+            "",
+        ]
+    if "error" not in result["captured"]:
+        lines += ["| in Warp, ms | as calls | as a CUDA graph |", "| --- | --- | --- |"]
+        lines += [f"| {label} | {calls:.2f} | {graph:.2f} |" for label, (calls, graph) in result["captured"].items()]
         lines += [""]
     if "error" not in result["benchmark"]:
         columns = list(result["benchmark"])

@@ -90,26 +90,25 @@ class FreePose:
         return angle, float(np.linalg.norm(self.translation.numpy() - other.translation.numpy()))
 
 
+def compare(image: wp.array, target: wp.array) -> wp.array:
+    """Sum of the squared differences of two images, float32 of shape [1]."""
+    loss = wp.zeros(1, dtype=wp.float32, device=target.device, requires_grad=True)
+    inputs = [image.flatten(), target.flatten()]
+    wp.launch(_sum_squared_differences, dim=target.size, inputs=inputs, outputs=[loss], device=target.device)
+    return loss
+
+
 def recover(pose: FreePose, target: wp.array, iterations: int) -> Iterator[float]:
     """Descend from a pose to that of a target image, vec4 of shape [1, height, width].
 
     Yields:
         The loss of each iteration before it takes its step: the squared difference of a pixel on average.
     """
-    device = target.device
     optimizer = warp.optim.Adam([pose.turn, pose.translation], lr=LEARNING_RATE, betas=MOMENTA)
     for iteration in range(iterations):
         optimizer.lr = 0.5 * LEARNING_RATE * (1 + math.cos(math.pi * iteration / iterations))
-        loss = wp.zeros(1, dtype=wp.float32, device=device, requires_grad=True)
         with wp.Tape() as tape:
-            image = pose.draw()
-            wp.launch(
-                _sum_squared_differences,
-                dim=target.size,
-                inputs=[image.flatten(), target.flatten()],
-                outputs=[loss],
-                device=device,
-            )
+            loss = compare(pose.draw(), target)
         yield float(loss.numpy()[0]) / target.size
         tape.backward(loss)
         optimizer.step([pose.turn.grad, pose.translation.grad])

@@ -6,18 +6,17 @@ import numpy as np
 import pytest
 import warp as wp
 
-import warpshadow as ws
 from demos.benchmarks import gpu_report
-from demos.tools import kernel_floor
 
 REPORT = {
     "device": "a device",
     "alias": "cuda:0",
     "agreement": [("none, vertex receivers", "image", 1e-6), ("none, vertex receivers", "light", 2e-6)],
     "sanitizer": "clean",
-    "stages": [],
+    "kernels": [gpu_report.KernelTimes("iteration of a pose fit in torch", [("forward kernel a", 2, 0.75)])],
+    "captured": {"image": (2.0, 1.0)},
     "benchmark": {"cpu": {"image": 10.0}, "cuda:0": {"image": 1.0}},
-    "tests": {"passed": 3, "failed": [], "skipped": 1, "not reached": 2},
+    "tests": {"passed": 3, "failed": [], "skipped": 1, "not reached": 0},
 }
 
 
@@ -44,13 +43,13 @@ def test_every_gradient_that_is_compared_is_one(monkeypatch):
     assert all(np.isfinite(value).all() and np.abs(value).max() > 0 for value in results.values())
 
 
-def test_floors_belong_to_stages_of_a_renderer():
-    scene = gpu_report.small_scene("directional", "vertex")
-    renderer = ws.Renderer(scene)
-    explained = renderer.explain(geometry=renderer.geometry())
-    assert set(gpu_report.FLOORS) <= set(explained.stages)
-    counted = {stage.name for stage in kernel_floor.stages(kernel_floor.Size(1, 1, 1, 16, 1), 1.0, 1.0)}
-    assert {part for parts in gpu_report.FLOORS.values() for part in parts} <= counted
+def test_kernels_and_graphs_of_pose_iterations_are_timed():
+    """A CPU has no events, and its graphs are plain calls."""
+    assert gpu_report.kernel_times("cpu") == []
+    assert list(gpu_report.pose_iterations("cpu", 2)) == ["iteration of a pose fit in torch, two bounces"]
+    times = gpu_report.captured("cpu", runs=1)
+    assert [label for label in times if label.startswith("pose iteration")]
+    assert all(milliseconds > 0 for pair in times.values() for milliseconds in pair)
 
 
 def test_what_is_not_finite_agrees_with_nothing():
@@ -69,6 +68,10 @@ def test_what_is_not_finite_agrees_with_nothing():
         ),
         ({"sanitizer": "failed (9): Invalid __global__ read"}, "sanitizer: failed (9): Invalid __global__ read"),
         ({"tests": {"passed": 3, "failed": ["test_sh.test_it"], "skipped": 0, "not reached": 0}}, "test_sh.test_it"),
+        (
+            {"tests": {"passed": 3, "failed": [], "skipped": 0, "not reached": 2}},
+            "tests: 2 were not reached",
+        ),
         ({"benchmark": {"error": "RuntimeError: out of memory"}}, "benchmark: RuntimeError: out of memory"),
     ],
 )
@@ -79,18 +82,18 @@ def test_whatever_is_wrong_is_a_fault_and_stands_in_the_table(change, fault):
 
 
 def test_the_report_is_written_as_table_and_json_and_its_parts_fail_alone(monkeypatch, tmp_path, capsys):
-    for part in ("sanitize", "agreement", "run_tests"):
-        value = {"sanitize": "clean", "agreement": [], "run_tests": REPORT["tests"]}[part]
+    values = {"sanitize": "clean", "agreement": [], "run_tests": REPORT["tests"], "kernel_times": [], "captured": {}}
+    for part, value in values.items():
         monkeypatch.setattr(gpu_report, part, lambda *_, value=value: value)
     monkeypatch.setattr(gpu_report.benchmark, "measure", lambda device, seconds: {"image": 2.0})
-    monkeypatch.setattr(gpu_report, "stages", lambda device: 1 / 0)
+    monkeypatch.setattr(gpu_report, "captured", lambda device: 1 / 0)
     assert gpu_report.main(["cpu"], tmp_path) == 1
     (result,) = json.loads((tmp_path / "report.json").read_text())
     assert result["benchmark"] == {"cpu": {"image": 2.0}}
-    assert result["stages"] == {"error": "ZeroDivisionError: division by zero"}
+    assert result["captured"] == {"error": "ZeroDivisionError: division by zero"}
     text = (tmp_path / "report.md").read_text()
     assert "| image | 2.00 |" in text
-    assert "3 passed, 0 failed, 1 skipped, 2 not reached" in text
+    assert "3 passed, 0 failed, 1 skipped, 0 not reached" in text
     assert text in capsys.readouterr().out
 
 
