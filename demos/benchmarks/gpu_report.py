@@ -9,6 +9,7 @@ For each device, in this order:
 - the launches of the first part under compute-sanitizer, for memory and for races, where it is on the path;
 - kernels of a pose iteration, timed by CUDA's events, beside the least that an H200 would take for all of them;
 - the same iterations held as CUDA graphs;
+- many poses in a call;
 - the benchmark, on the device and on the CPU.
 
 It needs no network, and ends within ten minutes. The exit status is 1 if anything is wrong; a test that was not reached
@@ -221,6 +222,26 @@ def captured(device: str, runs: int = 20) -> dict[str, tuple[float, float]]:
     return times
 
 
+def batches(device: str, size: int = 64) -> dict[int, tuple[float, float]]:
+    """Milliseconds for each of many moved poses in a call, images of size², alone and with their gradient, by count."""
+    scene = bunny_scene()
+    camera = scene.camera.resized(size / scene.camera.width)
+    renderer = TorchRenderer(dataclasses.replace(scene, camera=camera), device=device)
+    rotations, translations, scales = renderer.scene_poses()
+    times = {}
+    for count in (1, 8, 64):
+        moved = translations.repeat(count, 1, 1)
+        moved[:, 0] += 0.05 * torch.randn(count, 3, generator=torch.Generator().manual_seed(0)).to(moved.device)
+        batch = rotations.expand(count, *rotations.shape), moved.requires_grad_(), scales
+
+        def draw(batch: tuple = batch) -> torch.Tensor:
+            return renderer(geometry=renderer.placed(*batch))
+
+        functions = torch.no_grad()(draw), lambda draw=draw: draw().square().mean().backward()
+        times[count] = tuple(mean_milliseconds(function, device, 5) / count for function in functions)
+    return times
+
+
 def mean_milliseconds(function: Callable[[], object], device: str, runs: int) -> float:
     for _ in range(3):
         function()
@@ -278,6 +299,7 @@ def report(device: str, folder: Path, seconds: float) -> dict:
     part("sanitizer", lambda: sanitize(device, left("sanitizer")))
     part("kernels", lambda: kernel_times(device))
     part("captured", lambda: captured(device))
+    part("batches", lambda: batches(device))
     part("benchmark", lambda: {name: benchmark.measure(name, left("benchmark") / 4) for name in ("cpu", device)})
     return result
 
@@ -326,6 +348,10 @@ def table(result: dict) -> str:
     if "error" not in result["captured"]:
         lines += ["| in Warp, ms | as calls | as a CUDA graph |", "| --- | --- | --- |"]
         lines += [f"| {label} | {calls:.2f} | {graph:.2f} |" for label, (calls, graph) in result["captured"].items()]
+        lines += [""]
+    if "error" not in result["batches"]:
+        lines += ["| moved poses in a call, 64², ms for each | image | with its gradient |", "| --- | --- | --- |"]
+        lines += [f"| {count} | {image:.2f} | {both:.2f} |" for count, (image, both) in result["batches"].items()]
         lines += [""]
     if "error" not in result["benchmark"]:
         columns = list(result["benchmark"])

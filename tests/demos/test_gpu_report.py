@@ -15,6 +15,7 @@ REPORT = {
     "sanitizer": "clean",
     "kernels": [gpu_report.KernelTimes("iteration of a pose fit in torch", [("forward kernel a", 2, 0.75)])],
     "captured": {"image": (2.0, 1.0)},
+    "batches": {1: (2.0, 4.0)},
     "benchmark": {"cpu": {"image": 10.0}, "cuda:0": {"image": 1.0}},
     "tests": {"passed": 3, "failed": [], "skipped": 1, "not reached": 0},
 }
@@ -47,6 +48,7 @@ def test_kernels_and_graphs_of_pose_iterations_are_timed():
     """A CPU has no events, and its graphs are plain calls."""
     assert gpu_report.kernel_times("cpu") == []
     assert list(gpu_report.pose_iterations("cpu", 2)) == ["iteration of a pose fit in torch, two bounces"]
+    assert list(gpu_report.batches("cpu", size=8)) == [1, 8, 64]
     times = gpu_report.captured("cpu", runs=1)
     assert [label for label in times if label.startswith("pose iteration")]
     assert all(milliseconds > 0 for pair in times.values() for milliseconds in pair)
@@ -82,7 +84,7 @@ def test_whatever_is_wrong_is_a_fault_and_stands_in_the_table(change, fault):
 
 
 def test_the_report_is_written_as_table_and_json_and_its_parts_fail_alone(monkeypatch, tmp_path, capsys):
-    values = {"sanitize": "clean", "agreement": [], "run_tests": REPORT["tests"], "kernel_times": [], "captured": {}}
+    values = {"sanitize": "clean", "agreement": [], "run_tests": REPORT["tests"], "kernel_times": [], "batches": {}}
     for part, value in values.items():
         monkeypatch.setattr(gpu_report, part, lambda *_, value=value: value)
     monkeypatch.setattr(gpu_report.benchmark, "measure", lambda device, seconds: {"image": 2.0})

@@ -24,7 +24,9 @@ FOUND = {
 }
 """What holds after each; measured values stand in the notebooks."""
 
-each_notebook = pytest.mark.parametrize("path", sorted(run_notebooks.NOTEBOOKS.glob("*.ipynb")), ids=lambda path: path.stem)
+each_notebook = pytest.mark.parametrize(
+    "path", sorted(run_notebooks.NOTEBOOKS.glob("*.ipynb")), ids=lambda path: path.stem
+)
 
 
 @pytest.mark.slow

