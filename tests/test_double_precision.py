@@ -155,7 +155,7 @@ def spheres():
 
     Three receivers are at the surface of a sphere, within it, and where it fades out; each sees a sphere fade out below
     its horizon. All is some ten units wide, so that a step is small against the hundredth of a radius in which a cone's
-    edge bends at the surface.
+    edge tolerances at the surface.
     """
     points, turns, centers, radii = (
         10 * a.astype(float) for a in twins.random_scene(3, vertex_count=5, sphere_count=4)
@@ -232,6 +232,28 @@ def test_light_from_spheres(double, device, check, spheres):
     proxy_radiance, unblocked = 1 + random(0, 1, 4, 16, 4) ** 2, 1 + random(1, 1, 5, 16) ** 2
     rest = (wp.vec4d, proxy_radiance), (wp.float64, 0.5 * unblocked), (wp.float64, unblocked)
     check(lambda *scene: sphere_light(*scene, directions, softness=1.2), *spheres, *rest)
+
+
+@pytest.mark.slow
+def test_light_from_spheres_above_their_tangent_planes(double, device, check, spheres):
+    """From points and normals of patches and centers of nodes to light."""
+    directions = double("maths.directions").fibonacci(16)
+    sphere_light = double("stages.bounces.sphere_light").sphere_light
+    find_tangent_planes = double("stages.bounces.tangent_planes").find_tangent_planes
+    proxy_radiance, transmittance = (
+        wp.array(value, dtype=dtype, device=device)
+        for value, dtype in ((1 + random(0, 1, 4, 16, 4) ** 2, wp.vec4d), (0.5 * random(1, 1, 5, 16) ** 2, wp.float64))
+    )
+    starts, patches = np.array([0, 1, 3, 4, 6]), np.array([0, 1, 2, 3, 4, 5])
+    tolerances = np.stack([np.linspace(0, 0.6, 4), np.linspace(0.05, 0.4, 4)], axis=1)
+
+    def light(points, normals, centers, radii, patch_points, patch_normals):
+        planes = find_tangent_planes(patch_points, patch_normals, centers, starts, patches, tolerances)
+        scene = points, normals, centers, radii, proxy_radiance, transmittance, None, directions
+        return sphere_light(*scene, tangent_planes=planes)
+
+    patch_points = spheres[2][1][:, [0, 1, 1, 2, 3, 3]] + random(4, 1, 6, 3)
+    check(light, *spheres, (wp.vec3d, patch_points), (wp.vec3d, unit(random(5, 1, 6, 3))))
 
 
 @pytest.mark.slow

@@ -268,14 +268,27 @@ def find_proxy_radiance(radiosity, shown, weights, areas, patches):
     return table
 
 
-def sphere_light(points, normals, centers, radii, proxy_radiance, passing, unblocked, directions, shares=None):
+def facing_share(points, centers, radii, planes, tolerances):
+    """Part of each sphere's light that receivers see by its tangent plane, [vertex, sphere]."""
+    offsets = points[:, None] - centers
+    heights = (offsets * planes[:, :3]).sum(axis=-1) - planes[:, 3]
+    heights += tolerances[:, 0] * np.linalg.norm(offsets, axis=-1)
+    return smoothstep(1 + heights * tolerances[:, 1] / radii)
+
+
+def sphere_light(
+    points, normals, centers, radii, proxy_radiance, passing, unblocked, directions, shares=None, facing=None
+):
     """Light of spheres, [vertex, 3]: a weighted mean of what they show in each cell, times what the cell lacks.
 
-    ``shares`` are those of nodes whose centers and radii are given, where spheres merge.
+    ``shares`` are those of nodes whose centers and radii are given, where spheres merge; ``facing`` are planes and
+    tolerances.
     """
     shares = blocked_shares(points, centers, radii, directions) if shares is None else shares
     distance2 = ((centers - points[:, None]) ** 2).sum(axis=-1)
     weights = shares / ((distance2 + radii**2 / 16) ** 2)[:, :, None]
+    if facing is not None:
+        weights = weights * facing_share(points, centers, radii, *facing)[:, :, None]
     sums = np.einsum("vsq,sqc->vqc", weights, proxy_radiance)
     is_met = sums[..., 3:] > 0
     mean = np.where(is_met, sums[..., :3] / np.where(is_met, sums[..., 3:], 1), 0)

@@ -72,8 +72,8 @@ class Budget(NamedTuple):
 BUDGETS = {
     "_make_transmit True": {"": Budget(80)},
     "_make_transmit_adjoint True": {"": Budget(112)},
-    "_make_light": {"": Budget(96)},
-    "_make_light_adjoint": {"": Budget(160)},
+    "_make_light": {"": Budget(120)},
+    "_make_light_adjoint": {"": Budget(168)},
     # the stack is that of vectors of eight bands, which loops index
     "_make_accumulate 8 True": {"": Budget(72, 4 * 8)},
     "_make_accumulate_adjoint 8 True": {"": Budget(128, 2 * 4 * 8)},

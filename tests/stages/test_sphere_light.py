@@ -11,6 +11,7 @@ from warpshadow.device import parallel
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.bounces import sphere_light as stage
 from warpshadow.stages.bounces.proxy_radiance import find_proxy_radiance, patches_of_clusters
+from warpshadow.stages.bounces.tangent_planes import TangentPlanes
 from warpshadow.stages.visibility import merging
 from warpshadow.stages.visibility.directional import transmittance
 
@@ -100,6 +101,54 @@ def test_the_adjoint_is_that_of_the_twin(name, device):
     number = NAMES.index(name)
     got = gradients([value[None] for value in values], weights[None], 16, device)[1][number][0]
     expected = differences(lambda *all_: np.sum(weights * twins.sphere_light(*all_, directions)), values, number)
+    assert np.linalg.norm(got - expected) < ADJOINT * np.linalg.norm(expected)
+
+
+def tangent_planes(sphere_count=7):
+    """Planes and tolerances of spheres, some of which receivers see from above, some from below and some between."""
+    rng = np.random.default_rng(2)
+    planes = np.concatenate(
+        [twins.unit(rng.normal(size=(sphere_count, 3))), rng.uniform(-0.5, 0.5, (sphere_count, 1))], 1
+    )
+    return planes, np.stack([rng.uniform(0, 0.6, sphere_count), rng.uniform(0.05, 0.5, sphere_count)], 1)
+
+
+def on_device(planes, tolerances, device, **options):
+    return TangentPlanes(
+        wp.array(np.float32(planes)[None], dtype=wp.vec4, device=device, **options),
+        wp.array(np.float32(tolerances), dtype=wp.vec2, device=device),
+    )
+
+
+def test_nodes_show_nothing_below_their_tangent_planes(device):
+    values, (planes, tolerances) = scene(3), tangent_planes()
+    shares = twins.facing_share(*values[:1], *values[2:4], planes, tolerances)
+    assert (shares == 0).mean() > 0.1 and (shares == 1).mean() > 0.1 and ((shares > 0) & (shares < 1)).mean() > 0.3
+    expected = twins.sphere_light(*values, fibonacci(64), facing=(planes, tolerances))
+    assert np.abs(expected - twins.sphere_light(*values, fibonacci(64))).max() > 0.1 * expected.max()
+    got = light(values, 64, device, tangent_planes=on_device(planes, tolerances, device))
+    assert np.abs(got - expected).max() < FLOAT32 * expected.max()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ("points", "centers", "radii", "planes"))
+def test_the_adjoint_with_tangent_planes_is_that_of_the_twin(name, device):
+    values, directions = scene(3, 16, vertex_count=17, sphere_count=5), fibonacci(16)
+    planes, tolerances = tangent_planes(5)
+    weights = np.random.default_rng(4).normal(size=(17, 3))
+    arrays = put([value[None] for value in values], device, requires_grad=True)
+    facing = on_device(planes, tolerances, device, requires_grad=True)
+    with wp.Tape() as tape:
+        result = stage.sphere_light(*arrays, directions, tangent_planes=facing)
+    result.grad.assign(weights[None].astype(np.float32))
+    tape.backward()
+    number = len(NAMES) if name == "planes" else NAMES.index(name)
+    got = (facing.planes if name == "planes" else arrays[number]).grad.numpy()[0]
+
+    def loss(*all_):
+        return np.sum(weights * twins.sphere_light(*all_[:-1], directions, facing=(all_[-1], tolerances)))
+
+    expected = differences(loss, (*values, planes), number)
     assert np.linalg.norm(got - expected) < ADJOINT * np.linalg.norm(expected)
 
 

@@ -32,10 +32,11 @@ from warpshadow.stages.bounces.proxies import find_depths, place_proxies
 from warpshadow.stages.bounces.proxy_radiance import find_proxy_radiance, patches_of_clusters
 from warpshadow.stages.bounces.self_light import self_light
 from warpshadow.stages.bounces.sphere_light import sphere_light
+from warpshadow.stages.bounces.tangent_planes import TangentPlanes, find_tangent_planes, find_tolerances
 from warpshadow.stages.planes.fronts import NearestBlockers, find_fronts
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneBody
 from warpshadow.stages.receivers import Receivers
-from warpshadow.stages.sparse import SparseMatrix
+from warpshadow.stages.sparse import SparseMatrix, multiply
 from warpshadow.stages.visibility.directional import transmittance
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 
@@ -120,6 +121,7 @@ class ProjectedPatches(NamedTuple):
     centers: wp.array  # of the spheres, vec3 of shape [batch, patch + sphere of dark bodies]
     radii: wp.array  # likewise, 0 for patches of flat bodies
     clusters: ClusterTree
+    tangent_planes: TangentPlanes
 
 
 class Proxies:
@@ -209,6 +211,18 @@ class Proxies:
         return np.concatenate([find_depths(item.centers, item.normals, item.areas) for item in self.senders.patches])
 
     @functools.cached_property
+    def _tolerances(self) -> np.ndarray:
+        """How bent the patches of each proxy and cluster are, from :func:`.tangent_planes.find_tolerances`."""
+        starts, patch_indices = self.patches_of_clusters
+        tolerances = np.ones((len(starts) - 1, 2))  # where patches of several bodies are in one: seen from everywhere
+        places = np.searchsorted(self.senders.first, patch_indices, side="right") - 1
+        for node, (start, end) in enumerate(zip(starts[:-1], starts[1:], strict=True)):
+            if start < end and (places[start:end] == places[start]).all():
+                members = patch_indices[start:end] - self.senders.first[places[start]]
+                tolerances[node] = find_tolerances(self.senders.patches[places[start]], members)
+        return tolerances
+
+    @functools.cached_property
     def blocker_of_sample(self) -> np.ndarray:
         """Sphere nearest to the patch of each patch sample, −1 for none: int32 of shape [patch sample]."""
         return self._blockers[0][self.senders.patch_of_sample]
@@ -246,13 +260,18 @@ class Proxies:
         transmittance = joined([row.reshape((len(row), -1)) for row in rows])
         directions = cells[0].directions
         transmittance = transmittance.reshape((len(transmittance), len(senders.sides), len(directions)))
-        placed = place_proxies(patch_samples, senders.mean, radii, *self._blockers, self._depths)
+        mean_points = multiply(senders.mean, patch_samples.points)
+        mean_normals = multiply(senders.mean, patch_samples.normals)
+        placed = place_proxies(mean_points, mean_normals, radii, *self._blockers, self._depths)
         if self.black_bodies:
             others = self.merged_scene.spheres_of(self.black_bodies, spheres)
             counts = [len(senders.areas), others[1].shape[1]]
             placed = tuple(concatenate(pair, counts) for pair in zip(placed, others, strict=True))
         areas = find_projected_areas(normals, transmittance, senders.mean, directions)
-        return ProjectedPatches(areas, *placed, find_clusters(*placed, self.merging))
+        clusters = find_clusters(*placed, self.merging)
+        nodes = clusters.nodes.centers, *self.patches_of_clusters, self._tolerances
+        tangent_planes = find_tangent_planes(mean_points, mean_normals, *nodes)
+        return ProjectedPatches(areas, *placed, clusters, tangent_planes)
 
 
 class OutgoingRadiance:
@@ -396,4 +415,5 @@ class Gathering:
             clusters=projected_patches.clusters
             if radii is projected_patches.radii and centers is projected_patches.centers
             else None,
+            tangent_planes=projected_patches.tangent_planes,
         )

@@ -79,6 +79,8 @@ class Patches:
         areas: Area of each, float32 of shape [patch].
         centers: Mean position, float32 of shape [patch, 3].
         normals: Mean normal, of unit length, float32 of shape [patch, 3].
+        spreads: Largest angle of its surface to the mean normal [radians], float32 of shape [patch].
+        sagittas: How far its surface lies below the plane of its center and normal, at most, float32 of shape [patch].
         patch_samples: Where they are lit.
         pieces: Their pieces.
         patch_of_pieces: Patch of each piece's front and back, int32 of shape [2, piece]; −1 for sides that send
@@ -89,6 +91,8 @@ class Patches:
     areas: np.ndarray
     centers: np.ndarray
     normals: np.ndarray
+    spreads: np.ndarray
+    sagittas: np.ndarray
     patch_samples: PatchSamples
     pieces: Pieces
     patch_of_pieces: np.ndarray
@@ -171,9 +175,20 @@ def find_patches(
         [areas[:, None] * piece_mesh.centroids, piece_mesh.area_vectors, areas[:, None]], axis=1
     )
     sums = _cluster_sums(labels[is_outside], weighted_moments[is_outside])
+    centers, normals = sums[:, :3] / sums[:, 6:], _normalized(sums[:, 3:6])
+    of_outside = labels[is_outside]
+    cosines = (unit_normals[is_outside] * normals[of_outside]).sum(axis=1)
+    corners = piece_mesh.pieces.positions(positions, faces)[is_outside]
+    heights = ((corners - centers[of_outside, None]) * normals[of_outside, None]).sum(axis=2)
+    spreads, lowest, highest = (np.zeros(len(sums)) for _ in range(3))
+    np.maximum.at(spreads, of_outside, np.arccos(np.clip(cosines, -1, 1)))
+    np.minimum.at(lowest, of_outside, heights.min(axis=1, initial=0))
+    np.maximum.at(highest, of_outside, heights.max(axis=1, initial=0))
     labels[reaches_out] = labels[is_outside][_nearest_center(features[is_outside], features[reaches_out])]
     return Patches(
-        *_repeat_on_sides(side_count, sums[:, 6], sums[:, :3] / sums[:, 6:], _normalized(sums[:, 3:6])),
+        *_repeat_on_sides(side_count, sums[:, 6], centers, normals),
+        np.tile(spreads, side_count).astype(np.float32),
+        np.concatenate([-lowest, highest][:side_count]).astype(np.float32),
         _patch_samples_of(front_samples, side_count, len(sums)),
         piece_mesh.pieces,
         _patches_of_sides(labels, side_count, len(sums)),
@@ -204,6 +219,8 @@ def find_plane_patches(
     areas = grid.covered.ravel() * texel_sizes.prod(axis=1)
     return Patches(
         *_repeat_on_sides(grid.sides, areas, centers, np.tile(frame[2], (len(areas), 1))),
+        np.zeros(grid.sides * len(areas), np.float32),
+        np.zeros(grid.sides * len(areas), np.float32),
         _patch_samples_of([(*point, 1.0) for point in zip(*texel_points, strict=True)], grid.sides, len(areas)),
         piece_mesh.pieces,
         _patches_of_sides(labels, grid.sides, len(areas)),

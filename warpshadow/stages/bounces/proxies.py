@@ -6,7 +6,8 @@ sphere that blocks light beside it. Of a sheet, whose other side has patches of 
 receiver is nearer to visible patches than to the patches behind them. If they were below, too, the sunlit outside of
 a tent shone through: its image with all bounces is 6.8% off so, 3.9% with centers in the sheet, and 3.6% with these.
 So it is with walls and boards that are thinner than their proxies: with a thickness h ≤ 2ρ centers are 3h/8 − ρ/4
-below. With ρ/2 the proxies of both sides change places, and a sunlit wall glows on its inside.
+below. With ρ/2 the proxies of both sides change places, and a sunlit wall glows on its inside. What touches a body is
+within proxies of several of its sides, and sees by ``tangent_planes.py`` those that it is above.
 
 If the spheres that block light stood in for the patches around them, the foot of a ball would be lit by the ball's
 whole side, where it sees the little below, which is dark: at 0.2, 0.4 and 0.6 radii from the contact of a ball with a
@@ -21,8 +22,6 @@ from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.stages.receivers import Receivers
-from warpshadow.stages.sparse import SparseMatrix, multiply
 
 _DEPTH, _DEPTH_OF_SHEETS = 0.5, -0.25  # how far below its patch a center is, in radii
 _OPPOSITE = -0.5  # cosine between the normals of patches on opposite sides of a body, at most
@@ -75,8 +74,8 @@ def _place_proxies(
 
 
 def place_proxies(
-    patch_samples: Receivers,
-    mean: SparseMatrix,
+    points: wp.array,
+    normals: wp.array,
     blocker_radii: wp.array,
     blocker_indices: np.ndarray,
     radius_ratios: np.ndarray,
@@ -85,27 +84,25 @@ def place_proxies(
     """Place the spheres that stand in for patches.
 
     Args:
-        patch_samples: Where patches are lit.
-        mean: The weights of these, [patch, patch sample], from :func:`.radiosity.mean_over_patch_samples`.
+        points, normals: Means of the patches, vec3 of shape [batch, patch].
         blocker_radii: Radii of the spheres that block light [scene units], float32 of shape [batch, sphere].
         blocker_indices: One of them beside each patch, −1 for patches that nothing stands in for, shape [patch].
         radius_ratios: Radius of each proxy in radii of that sphere, shape [patch].
         depths: How far below its patch the center of each is, in radii of the proxy, shape [patch].
     Returns:
         Centers, vec3 of shape [batch, patch], and radii, float32 of the same shape.
-    Differentiable: points and normals of the patch samples, blocker_radii.
+    Differentiable: points, normals, blocker_radii.
     """
-    check.shape("blocker_indices", blocker_indices.shape, (mean.shape[0],))
-    check.shape("radius_ratios", radius_ratios.shape, (mean.shape[0],))
-    check.shape("depths", depths.shape, (mean.shape[0],))
-    batch_count = common_batch(
-        {"patch_samples": patch_samples.points, "normals": patch_samples.normals, "radii": blocker_radii}
-    )
+    patch_count = points.shape[1]
+    check.shape("blocker_indices", blocker_indices.shape, (patch_count,))
+    check.shape("radius_ratios", radius_ratios.shape, (patch_count,))
+    check.shape("depths", depths.shape, (patch_count,))
+    batch_count = common_batch({"points": points, "normals": normals, "radii": blocker_radii})
     device = blocker_radii.device
     centers = empty((batch_count, len(blocker_indices)), dtype=wp.vec3, device=device)
     radii = empty((batch_count, len(blocker_indices)), dtype=wp.float32, device=device)
-    means = multiply(mean, patch_samples.points), multiply(mean, patch_samples.normals)
     patch_arrays = [constant(np.asarray(blocker_indices, np.int32), wp.int32, device)]
     patch_arrays += [constant(values, wp.float32, device) for values in (radius_ratios, depths)]
-    launch(_place_proxies, centers.shape, inputs=[*means, blocker_radii, *patch_arrays], outputs=[centers, radii])
+    inputs = [points, normals, blocker_radii, *patch_arrays]
+    launch(_place_proxies, centers.shape, inputs=inputs, outputs=[centers, radii])
     return centers, radii

@@ -38,6 +38,7 @@ from warpshadow.device.launch import differentiable, launch, varies
 from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_slot
 from warpshadow.maths.directions import BUNDLE, cell_radius
+from warpshadow.stages.bounces.tangent_planes import TangentPlanes, make_facing
 from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres
 from warpshadow.stages.visibility.culling import DirectionCells, make_cap_functions, make_cells, make_cull
 from warpshadow.stages.visibility.directional import PAIR_COST, SOFTNESS
@@ -82,6 +83,9 @@ def _task_type(lanes: int) -> Any:
         adj_light: Vectors
         proxy_radiance: wp.array2d(dtype=wp.vec4)  # [node, direction]
         adj_radiance: wp.array2d(dtype=wp.vec4)
+        planes: wp.array(dtype=wp.vec4)  # [node] tangent planes; none where nodes are seen from everywhere
+        adj_planes: wp.array(dtype=wp.vec4)
+        tolerances: wp.array(dtype=wp.vec2)
         inverse_size: float  # of 1/radius of the largest run of spheres
 
     return LightTask
@@ -94,6 +98,8 @@ class LightInputs:
     traversed: TraversalInputs
     cells: DirectionCells
     proxy_radiance: wp.array3d(dtype=wp.vec4)
+    planes: wp.array2d(dtype=wp.vec4)
+    tolerances: wp.array(dtype=wp.vec2)
     transmittance: wp.array3d(dtype=wp.float32)
     transmittance_others: wp.array3d(dtype=wp.float32)
     factor: float
@@ -132,6 +138,9 @@ def _make_load_task(lanes: int) -> wp.Function:
         task.adj_cells = scratch[slot, 1]
         task.sums = sums[wp.where(inputs.stores_sums, item, slot)]
         task.proxy_radiance = inputs.proxy_radiance[instance_in(batch, inputs.proxy_radiance.shape[0])]
+        if inputs.planes:
+            task.planes = inputs.planes[instance_in(batch, inputs.planes.shape[0])]
+            task.tolerances = inputs.tolerances
         largest_radius = float(TINY_RADIUS)
         for run in range(spheres.run_bounds.shape[1]):
             largest_radius = wp.max(largest_radius, spheres.run_bounds[batch, run][3])
@@ -193,6 +202,7 @@ def _make_light(lanes: int) -> wp.Kernel:
     sqrt, is_any_above, dot_direction, add_vectors = fn.sqrt, fn.is_any_above, fn.dot_direction, fn.add_vectors
     load_task, weigh, falloff = _make_load_task(lanes), _make_weight(lanes), make_falloff(lanes)
     widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(True, lanes)
+    find_facing_share = make_facing(lanes).share
     SUMS = wp.constant(_SUMS)
     MIN_DENOMINATOR = wp.constant(_MIN_DENOMINATOR)
 
@@ -206,6 +216,12 @@ def _make_light(lanes: int) -> wp.Kernel:
             slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
             nearness = weigh(sphere_view.offset, sphere_view.curvature, task.inverse_size)
             opacity = wp.cw_mul(opacity, wp.cw_mul(nearness, nearness))
+            if task.planes:
+                node = sphere_view.node
+                facing_share = find_facing_share(
+                    sphere_view.offset, sphere_view.curvature, task.planes[node], task.tolerances[node]
+                )
+                opacity = wp.cw_mul(opacity, facing_share)
             for k in range(count):
                 bundle = task.reached_bundles[1, k]
                 direction_bundle = task.first_bundle + bundle
@@ -272,6 +288,8 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
     falloff, sphere_adjoint = make_falloff(lanes), make_sphere_adjoint(lanes)
     widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(True, lanes)
     SUMS = wp.constant(_SUMS)
+    facing = make_facing(lanes)
+    find_facing_share, facing_adjoint = facing.share, facing.adjoint
     MIN_DENOMINATOR = wp.constant(_MIN_DENOMINATOR)
     CORE2 = wp.constant(_CORE**2)
 
@@ -292,6 +310,12 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
             slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
             nearness = weigh(sphere_view.offset, sphere_view.curvature, task.inverse_size)
             weight = wp.cw_mul(nearness, nearness)
+            if task.planes:
+                node = sphere_view.node
+                facing_share = find_facing_share(
+                    sphere_view.offset, sphere_view.curvature, task.planes[node], task.tolerances[node]
+                )
+                weight = wp.cw_mul(weight, facing_share)
             is_any_blocked = bool(False)
             sum_adj_t = Lane(0.0)
             sum_t = Lane(0.0)
@@ -348,14 +372,27 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                     sum_t,
                     sum_omega,
                 )
-                # w̄ w = Σ a v w = Ā A
-                adj_nearness = (-4.0 * task.inverse_size) * wp.cw_mul(wp.cw_mul(adj_opacity, opacity), nearness)
+                weighted_adjoint = wp.cw_mul(adj_opacity, opacity)  # w̄ w = Σ a v w = Ā A
+                adj_nearness = (-4.0 * task.inverse_size) * wp.cw_mul(weighted_adjoint, nearness)
                 adj_sphere.is_any = True
                 adj_sphere.weight = adj_weight
                 adj_sphere.offset = add(
                     adj_offset, scale(adj_nearness, scale(Lane(task.inverse_size), sphere_view.offset))
                 )
                 adj_sphere.radius = adj_radius + (CORE2 * task.inverse_size / sphere_view.curvature) * adj_nearness
+                if task.planes:
+                    node = sphere_view.node
+                    adj_facing_offset, adj_facing_radius, adj_plane = facing_adjoint(
+                        sphere_view.offset,
+                        sphere_view.curvature,
+                        task.planes[node],
+                        task.tolerances[node],
+                        weighted_adjoint,
+                    )
+                    adj_sphere.offset = add(adj_sphere.offset, adj_facing_offset)
+                    adj_sphere.radius += adj_facing_radius
+                    if task.adj_planes and not adj_plane == wp.vec4():  # noqa: SIM201 (vectors have no !=)
+                        wp.atomic_add(task.adj_planes, node, adj_plane)
         return adj_sphere
 
     traverse = make_traversal(make_cull(True, LightTask, lanes), visit, LightTask, True, lanes)
@@ -379,6 +416,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         adj_transmittance_others: wp.array3d(dtype=wp.float32),
         # sums
         adj_radiance: wp.array3d(dtype=wp.vec4),
+        adj_planes: wp.array2d(dtype=wp.vec4),
         adj_centers: wp.array2d(dtype=wp.vec3),
         adj_radii: wp.array2d(dtype=wp.float32),
         adj_extents: wp.array2d(dtype=wp.float32),
@@ -393,6 +431,8 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         task.adj_light = load(adj_light[batch], block)
         if adj_radiance:
             task.adj_radiance = adj_radiance[instance_in(batch, inputs.proxy_radiance.shape[0])]
+        if adj_planes:
+            task.adj_planes = adj_planes[instance_in(batch, adj_planes.shape[0])]
         adj_normal = Vectors()
         for bundle in range(task.ends.shape[0]):
             if task.ends[bundle] > 0:
@@ -447,6 +487,7 @@ def sphere_light(
     merging: float = MERGING,
     skip: tuple[int, int] = (0, 0),
     clusters: ClusterTree | None = None,
+    tangent_planes: TangentPlanes | None = None,
 ) -> wp.array:
     """Light that spheres send to receivers, through the cells that they block.
 
@@ -461,16 +502,27 @@ def sphere_light(
             instance. None for 1.
         directions: Unit vectors ω, NumPy of shape [direction, 3], from :func:`warpshadow.fibonacci`.
         softness, merging, skip, clusters: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
+        tangent_planes: Of the nodes, which show nothing below them. A batch of 1 serves every instance. None for nodes
+            that are seen from everywhere.
     Returns:
         Light that a white receiver reflects of it, vec3 of shape [batch, receiver]. (All sides white and bright, 1.)
     Raises:
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii of receivers and spheres, as the transmittance.
-    Differentiable: points, normals, centers, radii, proxy_radiance, transmittance, transmittance_others. (The
-    derivative in T is the one at a fixed blend of spheres.) Not: directions, softness, merging, skip, clusters.
+    Differentiable: points, normals, centers, radii, proxy_radiance, transmittance, transmittance_others, planes of the
+    tangent planes. (The derivative in T is the one at a fixed blend of spheres.) Not: directions, softness, merging,
+    skip, clusters, tolerances.
     """
     cells = make_cells(directions, softness, points.device)
     check_spheres(points, normals, centers, radii)
-    common_batch({"points": points, "proxy_radiance": proxy_radiance, "transmittance_others": transmittance_others})
+    planes, tolerances = (None, None) if tangent_planes is None else tangent_planes
+    common_batch(
+        {
+            "points": points,
+            "proxy_radiance": proxy_radiance,
+            "transmittance_others": transmittance_others,
+            "tangent_planes": planes,
+        }
+    )
     batch_count, vertex_count = points.shape
     node_count = radii.shape[1] + merged_count(radii.shape[1], merging)
     check.shape("proxy_radiance", proxy_radiance.shape, (proxy_radiance.shape[0], node_count, len(directions)))
@@ -481,6 +533,8 @@ def sphere_light(
             transmittance_others.shape,
             (transmittance_others.shape[0], vertex_count, len(directions)),
         )
+    if planes is not None:
+        check.shape("tangent_planes", planes.shape, (planes.shape[0], node_count))
     device = points.device
     lanes = lane_count(device)
     spans = span_count(device, len(directions))
@@ -489,7 +543,7 @@ def sphere_light(
     nodes, traversed = make_inputs(points, normals, centers, radii, merging, cell, skip, clusters)
     row_count = batch_count * block_count(vertex_count, lanes)
     launch_dim = run_dimensions(device, row_count, spans)
-    variables = [points, normals, *nodes, proxy_radiance, transmittance, transmittance_others]
+    variables = [points, normals, *nodes, proxy_radiance, transmittance, transmittance_others, planes]
     stores_sums = varies(variables)
     scratch = [
         Scratch((2, span_direction_count), lane_type(lanes)),
@@ -504,6 +558,8 @@ def sphere_light(
         transmittance,
         transmittance_others,
     )
+    if planes is not None:
+        inputs.planes, inputs.tolerances = planes, tolerances
     inputs.factor, inputs.span_count, inputs.stores_sums = 4 / len(directions), spans, stores_sums
     cost = PAIR_COST * lanes * radii.shape[1] * span_direction_count
     is_shared = transmittance_others is not None and len(transmittance_others) < batch_count
@@ -520,6 +576,7 @@ def sphere_light(
             sums=[
                 *(adj_transmittance_others if is_shared else []),
                 proxy_radiance.grad,
+                None if planes is None else planes.grad,
                 *(array.grad for array in nodes),
             ],
         )

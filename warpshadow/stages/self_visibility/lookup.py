@@ -34,7 +34,7 @@ class ResamplingKernels:
 
     directions: wp.array(dtype=wp.vec3)  # ω [direction]
     cos_radii: wp.array(dtype=wp.float32)  # cos h [direction]
-    cos_reaches: wp.array(dtype=wp.float32)  # cosines that axes of coarse cells exceed which may be sampled [direction]
+    cos_outer_radii: wp.array(dtype=wp.float32)  # cosine that axes of coarse cells exceed if they may be sampled
     uses_rays: wp.array(dtype=wp.int32)  # 1, or 0 for coarse cells [direction]
     rays: wp.array(dtype=wp.vec3)  # directions of rays, and of coarse cells, in the body's frame
     cells: wp.array(dtype=wp.vec3)
@@ -68,11 +68,11 @@ def find_resampling_kernels(
     cells = rays.reshape(cell_count, RAYS_PER_CELL, 3).sum(axis=1)
     cells /= np.linalg.norm(cells, axis=1, keepdims=True)
     half_width = np.arccos(np.einsum("crx,cx->cr", rays.reshape(cell_count, RAYS_PER_CELL, 3), cells).min())
-    reaches = np.minimum(radii + np.where(uses_rays, half_width + 1e-3, 0), np.pi)
+    outer_radii = np.minimum(radii + np.where(uses_rays, half_width + 1e-3, 0), np.pi)
     kernels = ResamplingKernels()
     kernels.directions = constant(np.asarray(directions), wp.vec3, device)
     kernels.cos_radii = constant(cos_radii, wp.float32, device)
-    kernels.cos_reaches = constant(np.cos(reaches), wp.float32, device)
+    kernels.cos_outer_radii = constant(np.cos(outer_radii), wp.float32, device)
     kernels.uses_rays = constant(uses_rays.astype(np.int32), wp.int32, device)
     kernels.rays, kernels.cells = constant(rays, wp.vec3, device), constant(cells, wp.vec3, device)
     kernels.max_lookups = int(1.4 * counts.max() + 8)
@@ -129,7 +129,7 @@ def _find_weights(
     weight_sum = float(0.0)
     width = candidates.shape[0] // kernels.cells.shape[0]
     for cell in range(kernels.cells.shape[0]):
-        if wp.dot(kernels.cells[cell], kernel_axis) > kernels.cos_reaches[direction]:
+        if wp.dot(kernels.cells[cell], kernel_axis) > kernels.cos_outer_radii[direction]:
             for candidate in range(width * cell, width * cell + width):
                 profile = _profile(wp.dot(candidates[candidate], kernel_axis), cos_radius)
                 if profile > 0.0 and count < weights.shape[2]:
