@@ -157,9 +157,9 @@ def _is_sender(grid: PlaneGrid, side: PlaneSide):
 class _Order:
     """Which of two sides is in front where both cover a cell."""
 
-    difference: wp.vec3  # of the inverse distances, g_j − g_k
-    along: float  # of that, the part along the cell's direction
-    place: wp.vec3  # y_k + y_j
+    difference: wp.vec3  # g_j − g_k
+    central_difference: float  # of inverse distances in the middle of the cell
+    shared_centroid: wp.vec3  # y_k + y_j, of the shared part
     slope: float  # of the inverse distances' difference over the cell
     width: float  # range of that over the shared part
     relative: float  # argument of S: −1 wholly behind the other, 1 wholly in front
@@ -169,16 +169,18 @@ class _Order:
 def _find_order(cell: VisibleCell, hit: PlaneHit, other: PlaneHit):
     order = _Order()
     order.difference = other.inverse_distance - hit.inverse_distance
-    order.along = wp.dot(order.difference, cell.direction)
-    order.place = hit.centroid + other.centroid
+    order.central_difference = wp.dot(order.difference, cell.direction)
+    order.shared_centroid = hit.centroid + other.centroid
     order.slope = wp.sqrt(
         wp.length_sq(order.difference)
-        - order.along * order.along
+        - order.central_difference * order.central_difference
         + _TIE * (wp.length_sq(hit.inverse_distance) + wp.length_sq(other.inverse_distance))
     )
     order.width = cell.radius * order.slope * wp.sqrt(hit.coverage * other.coverage)
     if order.width > _MIN_WIDTH:
-        order.relative = (order.along + cell.radius * wp.dot(order.difference, order.place)) / order.width
+        order.relative = (
+            order.central_difference + cell.radius * wp.dot(order.difference, order.shared_centroid)
+        ) / order.width
     return order
 
 
@@ -222,10 +224,10 @@ def _block_each_other_adjoint(
         adj_value = adj_relative / order.width
         adj_log = -adj_relative * order.relative
         adj_squares = adj_log / (order.slope * order.slope)
-    adj_place = (adj_value * cell.radius) * order.difference
+    adj_shared_centroid = (adj_value * cell.radius) * order.difference
     adj_difference = (
-        (adj_value - adj_squares * order.along) * cell.direction
-        + (adj_value * cell.radius) * order.place
+        (adj_value - adj_squares * order.central_difference) * cell.direction
+        + (adj_value * cell.radius) * order.shared_centroid
         + adj_squares * order.difference
     )
     _add_to_hit(
@@ -233,7 +235,7 @@ def _block_each_other_adjoint(
         first_hit,
         k,
         share_behind * adj_by_hit + 0.5 * adj_log / hit.coverage,
-        (share_behind * hit.coverage) * adj_other.blocked_moment + adj_place,
+        (share_behind * hit.coverage) * adj_other.blocked_moment + adj_shared_centroid,
         (_TIE * adj_squares) * hit.inverse_distance - adj_difference,
     )
     _add_to_hit(
@@ -241,13 +243,13 @@ def _block_each_other_adjoint(
         first_hit,
         j,
         share_in_front * adj_by_other + 0.5 * adj_log / other.coverage,
-        (share_in_front * other.coverage) * adj_hit.blocked_moment + adj_place,
+        (share_in_front * other.coverage) * adj_hit.blocked_moment + adj_shared_centroid,
         (_TIE * adj_squares) * other.inverse_distance + adj_difference,
     )
 
 
 @wp.func
-def _shifted_direction(cell: VisibleCell, hit: PlaneHit):
+def _unnormalized_direction(cell: VisibleCell, hit: PlaneHit):
     """Direction ω + ρ z of what others leave open of a side, not of unit length; and the length of (o, m)."""
     length = wp.sqrt(hit.open_share * hit.open_share + wp.length_sq(hit.blocked_moment))
     return cell.direction - (cell.radius / length) * hit.blocked_moment, length
@@ -265,8 +267,8 @@ def _visible_footprint(
     """Direction and footprint of what others leave open of a side."""
     direction = cell.direction
     if hit.open_share < 1.0:
-        shifted, _ = _shifted_direction(cell, hit)
-        direction = wp.normalize(shifted)
+        visible_direction, _ = _unnormalized_direction(cell, hit)
+        direction = wp.normalize(visible_direction)
     footprint = footprint_on_side(scene, grid, side, local_receiver, direction)
     footprint.extent = wp.sqrt(hit.open_share)
     return direction, footprint
@@ -399,8 +401,8 @@ def _visible_radiosity_adjoint(
             scene, grid, side, local_receiver, direction, footprint, adj_mip, adj_store
         )
         if hit.open_share < 1.0:
-            shifted, length = _shifted_direction(cell, hit)
-            adj_centroid = (cell.radius / wp.length(shifted)) * (
+            visible_direction, length = _unnormalized_direction(cell, hit)
+            adj_centroid = (cell.radius / wp.length(visible_direction)) * (
                 adj_direction - wp.dot(adj_direction, direction) * direction
             )
             adj_length = wp.dot(adj_centroid, hit.blocked_moment) / (length * length)
