@@ -89,6 +89,7 @@ class LocalReceiver:
     axis_u: wp.vec3  # axes of unit length
     axis_v: wp.vec3
     normal: wp.vec3  # 0 where the plane has no area
+    scale: float  # of the body
 
 
 @wp.func
@@ -101,6 +102,7 @@ def find_local_receiver(point: wp.vec3, frames: wp.array(dtype=wp.vec3), f: int)
         local_receiver.axis_u = frames[3 * f + 1] / scale_u
         local_receiver.axis_v = frames[3 * f + 2] / scale_v
         local_receiver.normal = wp.cross(local_receiver.axis_u, local_receiver.axis_v)
+        local_receiver.scale = scale_u
         offset = point - frames[3 * f]
         local_receiver.position = wp.vec3(
             wp.dot(offset, local_receiver.axis_u) / scale_u,
@@ -135,8 +137,8 @@ def find_local_receiver_adjoint(
         adj_u = adj_receiver.axis_u + adj_x * offset + wp.cross(local_receiver.axis_v, adj_normal)
         adj_v = adj_receiver.axis_v + adj_y * offset + wp.cross(adj_normal, local_receiver.axis_u)
         # of an axis' direction, and of its length
-        adj_u = (adj_u - wp.dot(adj_u, local_receiver.axis_u) * local_receiver.axis_u) / scale_u - (
-            adj_x * local_receiver.position[0] + adj_height * local_receiver.position[2]
+        adj_u = (adj_u - wp.dot(adj_u, local_receiver.axis_u) * local_receiver.axis_u) / scale_u + (
+            adj_receiver.scale - adj_x * local_receiver.position[0] - adj_height * local_receiver.position[2]
         ) * local_receiver.axis_u
         adj_v = (adj_v - wp.dot(adj_v, local_receiver.axis_v) * local_receiver.axis_v) / scale_v - (
             adj_y * local_receiver.position[1]
@@ -227,6 +229,7 @@ def side_adjoint(
     adj_receiver.axis_u = adj_local_receiver.axis_u + adj_direction[0] * direction
     adj_receiver.axis_v = adj_local_receiver.axis_v + adj_direction[1] * direction
     adj_receiver.normal = adj_local_receiver.normal - (sign * adj_direction[2]) * direction
+    adj_receiver.scale = adj_local_receiver.scale
     return adj_receiver
 
 
@@ -240,6 +243,7 @@ class PlaneFootprint:
     distance: float  # [units of the body]
     per_cosine: float  # 1 / c′, the mean cosine of the part of the cell below the horizon
     center: wp.vec2  # in the plane
+    extent: float  # its width over that of a whole cell's
 
 
 @wp.func
@@ -252,6 +256,7 @@ def find_footprint(scene: PlaneArrays, position: wp.vec3, direction: wp.vec3):
         direction: Direction of the cell along both axes, and its cosine, above −ρ.
     """
     footprint = PlaneFootprint()
+    footprint.extent = 1.0
     cosine = direction[2]
     if cosine < scene.radius:
         u = 0.5 * cosine * scene.per_radius + 0.5
@@ -315,9 +320,8 @@ def find_mip_footprint(grid: PlaneGrid, scene: PlaneArrays, footprint: PlaneFoot
         wp.sign(x) * wp.log(size_x) * grid.texels[0], wp.sign(y) * wp.log(size_y) * grid.texels[1]
     )
     mip.slopes = grid.per_spread * wp.vec2(grid.texels[0] / size_x, grid.texels[1] / size_y)
-    width = (
-        2.0 * footprint.distance * scene.texel_radius * wp.sqrt(mip.slopes[0] * mip.slopes[1] * footprint.per_cosine)
-    )
+    radius = footprint.extent * scene.texel_radius
+    width = 2.0 * footprint.distance * radius * wp.sqrt(mip.slopes[0] * mip.slopes[1] * footprint.per_cosine)
     while mip.level < grid.level_count - 1 and width >= 2.0:
         mip.level = mip.level + 1
         width *= 0.5
@@ -412,7 +416,7 @@ def fetch_adjoint(
     mip: MipFootprint,
     adj_value: wp.vec3,
 ):
-    """Gradients of the place, and of the logarithm of t / √c′, as which the footprint is wide."""
+    """Gradients of the place, and of the logarithm of the footprint's width, which is as t / √c′ and its extent."""
     fine = _find_corners(scene, first_level + mip.level, mip.texel)
     slopes = _interpolation_slopes(texels, fine, adj_value)
     adj_log = float(0.0)

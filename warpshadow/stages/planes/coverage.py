@@ -99,9 +99,7 @@ def side_coverage_adjoint(
         adj_part = wp.vec3(wp.dot(adj_coverage, coverage.outline), 0.0, 0.0)
         mip = find_mip_footprint(grid, scene, footprint)
         adj_mip = fetch_adjoint(scene.covered, grid, scene, grid.first_level, footprint, mip, adj_part)
-        footprint_on_side_adjoint(
-            scene, grid, side, local_receiver, cell.direction, footprint, adj_mip, 0.0, 0.0, adj_store
-        )
+        footprint_on_side_adjoint(scene, grid, side, local_receiver, cell.direction, footprint, adj_mip, adj_store)
     adj_outline = (side.weight * coverage.mesh_share) * adj_coverage
     coverage_adjoint(edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, adj_outline)
 

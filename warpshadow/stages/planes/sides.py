@@ -22,11 +22,13 @@ from warpshadow.stages.planes.cells import (
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 
 # Scratch of a receiver, vec3. Its position relative to each plane f, whose gradients have the same places:
-#     4 f        where it is along both axes, and its height
-#     4 f + 1    the axis u, of unit length; 4 f + 2 the axis v, and 4 f + 3 the normal
-# Sides i that it may meet, from ``4 plane_count`` on:
+#     5 f        where it is along both axes, and its height
+#     5 f + 1    the axis u, of unit length; 5 f + 2 the axis v, and 5 f + 3 the normal
+#     5 f + 4    the scale of the body
+# Sides i that it may meet, from ``5 plane_count`` on:
 #     i          the plane, 1 for its back, and which part of the side is there
-SIDE_ROWS = wp.constant(6)
+_RECEIVER_ROWS = wp.constant(5)
+SIDE_ROWS = wp.constant(7)
 """Rows of scratch for each plane."""
 
 # of an outline as the front and the back see it
@@ -53,7 +55,7 @@ class PlaneSide:
 def load_side(scene: PlaneArrays, i: int, store: wp.array(dtype=wp.vec3)):
     """Load side i of the sides that a receiver sees."""
     side = PlaneSide()
-    side.row = 4 * scene.grids.shape[0] + i
+    side.row = _RECEIVER_ROWS * scene.grids.shape[0] + i
     stored_side = store[side.row]
     side.f = int(stored_side[0])
     side.is_back = stored_side[1] > 0.0
@@ -67,20 +69,24 @@ def load_side(scene: PlaneArrays, i: int, store: wp.array(dtype=wp.vec3)):
 def load_local_receiver(store: wp.array(dtype=wp.vec3), f: int):
     """Load a receiver in the axes of a plane."""
     local_receiver = LocalReceiver()
-    local_receiver.position = store[4 * f]
-    local_receiver.axis_u = store[4 * f + 1]
-    local_receiver.axis_v = store[4 * f + 2]
-    local_receiver.normal = store[4 * f + 3]
+    row = _RECEIVER_ROWS * f
+    local_receiver.position = store[row]
+    local_receiver.axis_u = store[row + 1]
+    local_receiver.axis_v = store[row + 2]
+    local_receiver.normal = store[row + 3]
+    local_receiver.scale = store[row + 4][0]
     return local_receiver
 
 
 @wp.func
 def store_local_receiver(store: wp.array(dtype=wp.vec3), f: int, local_receiver: LocalReceiver):
     """Overwrite it."""
-    store[4 * f] = local_receiver.position
-    store[4 * f + 1] = local_receiver.axis_u
-    store[4 * f + 2] = local_receiver.axis_v
-    store[4 * f + 3] = local_receiver.normal
+    row = _RECEIVER_ROWS * f
+    store[row] = local_receiver.position
+    store[row + 1] = local_receiver.axis_u
+    store[row + 2] = local_receiver.axis_v
+    store[row + 3] = local_receiver.normal
+    store[row + 4] = wp.vec3(local_receiver.scale, 0.0, 0.0)
 
 
 @wp.func
@@ -168,7 +174,7 @@ def _add_side(
     """Store a side with its outline if some of it is there; returns how many sides are stored."""
     if weight <= 0.0:
         return side_count
-    store[4 * scene.grids.shape[0] + side_count] = wp.vec3(float(f), is_back, weight)
+    store[_RECEIVER_ROWS * scene.grids.shape[0] + side_count] = wp.vec3(float(f), is_back, weight)
     _view_outline(scene, scene.grids[f], load_side(scene, side_count, store), local_receiver, edges)
     return side_count + 1
 
@@ -290,20 +296,16 @@ def footprint_on_side_adjoint(
     direction: wp.vec3,
     footprint: PlaneFootprint,
     adj_mip: wp.vec3,
-    adj_distance: float,
-    adj_radius: float,
     adj_store: wp.array(dtype=wp.vec3),
 ):
-    """Add to the gradients of the receiver relative to the plane.
+    """Add to the gradients of the receiver relative to the plane, given those of :func:`.cells.fetch`.
 
-    Given are the gradients of :func:`.cells.fetch`, of the distance t, and of the radius t ρ / c′ of the footprint.
+    Returns the gradient of the direction.
     """
-    adj_cosine = -footprint.per_cosine * (
-        adj_radius * scene.radius * footprint.distance * footprint.per_cosine + 0.5 * adj_mip[2]
-    )
-    adj_t = adj_distance + adj_radius * scene.radius * footprint.per_cosine
-    if adj_mip[2] != 0.0:  # texels are as wide as t / √c′
-        adj_t += adj_mip[2] / footprint.distance
+    adj_cosine = -0.5 * footprint.per_cosine * adj_mip[2]  # texels are as wide as t / √c′
+    adj_t = float(0.0)
+    if adj_mip[2] != 0.0:
+        adj_t = adj_mip[2] / footprint.distance
     local_direction, adj_center = (
         direction_on_side(local_receiver, side.is_back, direction),
         wp.vec2(adj_mip[0], adj_mip[1]),
@@ -315,6 +317,45 @@ def footprint_on_side_adjoint(
         side.f,
         side_adjoint(grid, local_receiver, side.is_back, direction, adj_at, adj_toward, adj_local_receiver),
     )
+    return (
+        adj_toward[0] * local_receiver.axis_u
+        + adj_toward[1] * local_receiver.axis_v
+        + adj_toward[2] * _side_normal(local_receiver, side)
+    )
+
+
+@wp.func
+def inverse_distance_on_side(grid: PlaneGrid, side: PlaneSide, local_receiver: LocalReceiver):
+    """Vector g of a side: along a direction ω its plane is 1/(g·ω) away [scene units]."""
+    height = local_receiver.scale * position_on_side(grid, local_receiver, side.is_back)[2]
+    return _side_normal(local_receiver, side) / height
+
+
+@wp.func
+def inverse_distance_on_side_adjoint(
+    grid: PlaneGrid,
+    side: PlaneSide,
+    local_receiver: LocalReceiver,
+    inverse_distance: wp.vec3,
+    adj_inverse_distance: wp.vec3,
+    adj_store: wp.array(dtype=wp.vec3),
+):
+    """Add to the gradients of the receiver relative to the plane."""
+    height = position_on_side(grid, local_receiver, side.is_back)[2]
+    adj_log = -wp.dot(adj_inverse_distance, inverse_distance)  # of the height in scene units
+    adj_receiver = side_adjoint(
+        grid,
+        local_receiver,
+        side.is_back,
+        wp.vec3(),
+        wp.vec3(0.0, 0.0, adj_log / height),
+        wp.vec3(),
+        load_local_receiver(adj_store, side.f),
+    )
+    sign = wp.where(side.is_back, 1.0, -1.0)
+    adj_receiver.normal = adj_receiver.normal + (sign / (local_receiver.scale * height)) * adj_inverse_distance
+    adj_receiver.scale = adj_receiver.scale + adj_log / local_receiver.scale
+    store_local_receiver(adj_store, side.f, adj_receiver)
 
 
 @wp.func
