@@ -229,9 +229,8 @@ class _Descent:
             return False
         stages = self.stages[self.stage : self.stage + 2]
         if len({tuple(free.name for free in self.problem.free if _descends(free, item)) for item in stages}) > 1:
-            ranked_candidates = [
-                candidate._replace(curvature=None) for candidate in ranked_candidates
-            ]  # of other parameters
+            # curvature of other parameters
+            ranked_candidates = [candidate._replace(curvature=None) for candidate in ranked_candidates]
         self.stage += 1
         self.candidates, self.ended = self._candidates_of_stage(ranked_candidates), []
         self.begin_stage()
@@ -402,7 +401,7 @@ def fit(
     stages = stages_for(stages, problem)
     if not callable(optimizer):
         raise ValueError(
-            f"optimizer: got {check.described(optimizer)}, expected what makes one of tensors and lr, such as "
+            f"optimizer: got {check.described(optimizer)}, expected a function (tensors, lr) → optimizer, such as "
             "torch.optim.Adam"
         )
     torch_device = torch.device(wp.device_to_torch(check.device("device", str(device))))

@@ -94,8 +94,8 @@ class SelfVisibility:
 
     Args:
         merged_scene: The bodies.
-        has_sample_receivers: Bodies on which samples are receivers, bool of shape [body]: they have probes within
-            faces.
+        samples_receive: Bodies on which samples are receivers, bool of shape [body]: they have probes within faces.
+        progress: Whether to show the progress of tracing.
     """
 
     def __init__(self, merged_scene: MergedScene, samples_receive: np.ndarray, *, progress: bool = False):

@@ -287,7 +287,8 @@ class View(LitPoints):
         Args:
             photograph: Linear RGB, vec3 of shape [batch, height, width]; None for nothing, where shadows are coverage,
                 vec4.
-            unshadowed, catches: As for :func:`warpshadow.stages.photograph.find_ratio_image`.
+            unshadowed, catches: ``catcher_light`` and ``is_catcher`` of
+                :func:`warpshadow.stages.photograph.find_ratio_image`.
             light, materials: As for :meth:`image`.
         """
         from warpshadow.stages.photograph import compose, composite_alone, find_ratio_image

@@ -24,9 +24,8 @@ from warpshadow.stages.rasterization import Fragments
 TILE = 16  # pixels of a side of the tiles whose receivers follow each other
 
 MIN_SHARED_COSINE = 0.9  # cosine between normals of samples of a pixel from which they may share a receiver …
-MAX_SHARED_SLOPE = (
-    0.3  # … where a line from one to the other is not steeper than that: the sine of its angle to the surface
-)
+MAX_SHARED_SLOPE = 0.3
+"""… where a line from one to the other is not steeper than that: the sine of its angle to the surface."""
 
 _SHARING_COST, _SAMPLE_COST = 12.0, 3.5  # nanoseconds of a sample, to find whose receiver it shares and to get it
 

@@ -132,7 +132,7 @@ def _shade_adjoint_light(
     # out
     adj_light: wp.array3d(dtype=wp.float32),
 ):
-    """A thread owns a chunk of coefficients, the last one the remainder, and a slab of receivers:  L̄ = Σ T s̄."""
+    """A thread owns a chunk of coefficients, the last one the remainder, and a slice of receivers:  L̄ = Σ T s̄."""
     row, batch, slice_index = wp.tid()
     chunk = first_row + row
     transfer_batch = instance_in(batch, transfer.shape[0])

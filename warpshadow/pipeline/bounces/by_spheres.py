@@ -106,7 +106,7 @@ class PortionedDirectLight(Node):
         others: tuple[Node, ...] = (),
         stages: tuple[NodeStage, ...] = (),
     ):
-        self._visibilities = visibility
+        self._visibility = visibility
         self._shading = NodeStage(f"shading{where}", item_text, inputs=(visibility, projected_light))
         stages = self._shading, *stages
         super().__init__("", None, projected_light, *others, extra_inputs=(visibility,), stages=stages)
@@ -114,11 +114,11 @@ class PortionedDirectLight(Node):
     def compute(self, call: Call) -> Any:
         """Light all portions."""
         (projected_light,) = self.values(call)
-        return [self._light(call, portion, projected_light) for portion in self._visibilities.value(call)]
+        return [self._light(call, portion, projected_light) for portion in self._visibility.value(call)]
 
     def _light(self, call: Call, portion: PortionVisibility, projected_light: Any) -> PortionDirectLight:
         with self.timed(call, self._shading):
-            direct = self._visibilities.method.shade_transfer(portion.transfer, portion.group, projected_light)
+            direct = self._visibility.method.shade_transfer(portion.transfer, portion.group, projected_light)
         return PortionDirectLight(direct, portion.group, portion.cells)
 
 
@@ -231,7 +231,7 @@ class BouncedShading(PortionedDirectLight):
     def compute(self, call: Call) -> wp.array:
         """Light all portions, directly and by the patches' radiosity."""
         projected_light, outgoing = self.values(call)
-        portions = self._visibilities.value(call) if self._visibilities.caches else self._visibilities.portions(call)
+        portions = self._visibility.value(call) if self._visibility.caches else self._visibility.portions(call)
         return joined(
             [self._bounced(call, self._light(call, portion, projected_light), outgoing) for portion in portions]
         )

@@ -50,9 +50,7 @@ that parts block have no proxy in them, which loses light, and light jumps as a 
 class CellTransmittance(NamedTuple):
     """Transmittance of a portion of the receivers in cells of directions."""
 
-    transmittance_self: (
-        wp.array | None
-    )  # [batch, receiver, cell], transmittance past its own body; None where that is 1
+    transmittance_self: wp.array | None  # [batch, receiver, cell], past its own body; None where that is 1
     transmittance_spheres: wp.array  # [batch, receiver, cell], past all bodies but planes, its own included
     directions: np.ndarray  # [cell, 3]
 

@@ -206,9 +206,9 @@ class Directional(SphereMethod):
         transmittance = block(projected_light.directions, **scales(1.0))
         if projected_light.sharp_cells is None:
             return transmittance
-        directions, places, scale = projected_light.sharp_cells
+        directions, slots, scale = projected_light.sharp_cells
         sharp = block(directions, **scales(scale))
-        return blend_sharp_cells(transmittance, sharp, places, projected_light.spot_shares)
+        return blend_sharp_cells(transmittance, sharp, slots, projected_light.spot_shares)
 
     def _scales(self, scale: float) -> dict[str, Any]:
         """Settings in radii of cells, of radii that are so much smaller."""
@@ -303,8 +303,8 @@ class Directional(SphereMethod):
             scale = cell_radius(len(power)) / cell_radius(CHUNK)
             radius = cell_radius(len(power))
         else:
-            directions, places, scale = projected_light.sharp_cells_past_planes
-            light[places[places >= 0]] = power[places >= 0]
+            directions, slots, scale = projected_light.sharp_cells_past_planes
+            light[slots[slots >= 0]] = power[slots >= 0]
             radius = self._edge_radius(projected_light.sharp_cells_past_planes)
         light = light[:, None] * [CHUNK / len(power), 0, 0]
         return SharpestCells(directions, self._on_device(light), scale, radius, power)
@@ -336,9 +336,8 @@ class Directional(SphereMethod):
         lit = shade_cells(transmittance, normals, directions, light, maximum=LARGEST_COEFFICIENT).numpy()[..., 0]
         receiver_normals, towards = normals.numpy(), self.free_projection.directions
         plane_normals = receiver_normals[:, :1]  # points of a plane have this normal or its opposite
-        whole = [
-            4 / len(power) * np.maximum(sign * plane_normals @ towards.T, 0) @ power for sign in (1, -1)
-        ]  # [batch, 1]
+        # [batch, 1]
+        whole = [4 / len(power) * np.maximum(sign * plane_normals @ towards.T, 0) @ power for sign in (1, -1)]
         unblocked = np.where((receiver_normals * plane_normals).sum(axis=2) > 0, *whole)
         return np.divide(lit, unblocked, out=np.zeros_like(lit), where=unblocked > 0)
 

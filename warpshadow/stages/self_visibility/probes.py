@@ -28,12 +28,13 @@ _MAX_SAMPLE_EDGE = 1.2  # longest edge where samples receive, in edges of that e
 _MAX_VERTEX_EDGE = 4.0
 """Longest edge where only vertices receive: probes between them are there for vertices that are buried …"""
 
+_SLIVER_RATIO = 3.0  # … and only on edges longer than a third of all edges by this factor: on edges of slivers
+
 _ENTRY_RATIO = 1 / 3
 """Longest edge that enters another part of the body, as a spoke a hub, over that of others. Images of the cage and of
 the chair, wheel and fence of demos/kinds.py are 7.1 and 5.1% off with 1/3, 7.5 and 5.5% with 1; with 1/8 there are so
 many that probes elsewhere are missing."""
 
-_SLIVER_RATIO = 3.0  # … and only on edges longer than a third of all edges by this factor: on edges of slivers
 _MAX_PROBES = 2**14  # probes of a body at most, as long as it has fewer than half as many vertices
 _LENGTH_STEP = 1.3  # how much longer edges may be at each try to have fewer probes
 

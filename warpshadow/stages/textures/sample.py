@@ -211,7 +211,7 @@ def _sample(
     albedo: wp.array2d(dtype=wp.vec3),
     radiance: wp.array2d(dtype=wp.vec4),
 ):
-    """A thread owns a run of samples: their reflectance or, if samples of white surfaces are given, their exposure."""
+    """A thread owns a run of samples: their reflectance or, if samples of white surfaces are given, their radiance."""
     instance, thread = split_row(first_row + wp.tid(), sample_inputs.texture_ids.shape[1] // sample_inputs.run)
     instance_albedo = vertex_albedo[instance_in(instance, vertex_albedo.shape[0])]
     instance_texels = texels[instance_in(instance, texels.shape[0])]
