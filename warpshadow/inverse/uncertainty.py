@@ -333,9 +333,7 @@ def _pose_uncertainty(free: Pose, normal: NormalMatrix, covariance: np.ndarray) 
 def candidates_along_flat_direction(
     problem: Problem, setting: Setting, values: Mapping[str, Values], count: int
 ) -> list[dict[str, Values]]:
-    """Values displaced along the least determined direction of the poses, both ways, farther and
-    farther; the light is solved for anew.
-    """
+    """Displace values along the least determined direction of the poses, both ways, and solve for the light anew."""
     normal = NormalMatrix(problem, setting, values)
     poses = [index for index, (name, _, _) in enumerate(normal.parameter_entries) if name.startswith(f"{Pose.key}[")]
     weakest_direction = np.zeros(len(normal.parameter_entries))

@@ -190,8 +190,8 @@ def _number_fragments(
 ):
     """A thread owns a run of samples.
 
-    ``receiver_numbers`` are the receivers' numbers; where they cannot be read (a capture), each body gets a range with
-    a place for every sample.
+    ``receiver_numbers`` are the receivers' numbers; where they cannot be read (a capture), each body gets a range of
+    numbers, one for every sample.
     """
     view, thread = split_row(first_row + wp.tid(), sides.shape[1] // run)
     for sample in range(thread * run, (thread + 1) * run):

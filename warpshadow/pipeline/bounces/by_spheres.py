@@ -311,7 +311,7 @@ class SphereBounces:
         proxies: Proxies,
         points: LitPoints,
     ) -> PatchSampleNodes:
-        """Patch samples among the bodies among which points are."""
+        """Nodes of the patch samples of the bodies around points."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
 
         def project(patch_samples: Receivers, visibility: list[PortionVisibility], *arguments: Any) -> ProjectedPatches:

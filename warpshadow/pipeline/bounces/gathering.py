@@ -140,10 +140,10 @@ class Proxies:
             return None
         bodies = []
         for number in numbers:
-            place, body = senders.bodies.index(number), merged_scene.scene.bodies[number]
-            grid = senders.patches[place].grid
+            sender_index, body = senders.bodies.index(number), merged_scene.scene.bodies[number]
+            grid = senders.patches[sender_index].grid
             assert grid is not None
-            starts = int(merged_scene.first_vertex[number]), int(senders.first[place])
+            starts = int(merged_scene.first_vertex[number]), int(senders.first[sender_index])
             bodies.append(PlaneBody(grid, body.mesh.positions, body.mesh.surface.faces, *starts, body.casts_shadow))
         counts = len(senders.areas), int(merged_scene.first_vertex[-1])
         planes = PlaneBlockers.from_bodies(bodies, *counts, device=merged_scene.device)
@@ -171,8 +171,8 @@ class Proxies:
         """Where the proxies of a body begin and end."""
         first = self.senders.first
         if body in self.senders.bodies:
-            place = self.senders.bodies.index(body)
-            return int(first[place]), int(first[place + 1])
+            sender_index = self.senders.bodies.index(body)
+            return int(first[sender_index]), int(first[sender_index + 1])
         begin, end = self.merged_scene.spheres_among(self.black_bodies, body)
         return (int(first[-1]) + begin, int(first[-1]) + end) if end else (0, 0)
 
@@ -193,8 +193,9 @@ class Proxies:
         for body in self.nonplanar_bodies:
             of_body = slice(*first_sphere[body : body + 2])
             if len(radii[of_body]) and body in senders.bodies:
-                place = senders.bodies.index(body)
-                patches, patch_range = senders.patches[place], slice(*senders.first[place : place + 2])
+                sender_index = senders.bodies.index(body)
+                patches = senders.patches[sender_index]
+                patch_range = slice(*senders.first[sender_index : sender_index + 2])
                 nearest = patches.nearest_spheres(centers[of_body], radii[of_body])
                 numbers[patch_range] = start + nearest
                 ratios[patch_range] = np.sqrt(patches.areas / 2) / np.maximum(radii[of_body][nearest], 1e-30)
@@ -277,8 +278,8 @@ class OutgoingRadiance:
 
     def of_body(self, body: int) -> wp.array:
         """Radiosity of the patches of a body, vec3 of shape [batch, patch]."""
-        place = self.senders.bodies.index(body)
-        return cut(self.radiosity, *self.senders.first[place : place + 2].tolist())
+        sender_index = self.senders.bodies.index(body)
+        return cut(self.radiosity, *self.senders.first[sender_index : sender_index + 2].tolist())
 
     @functools.cached_property
     def proxy_radiance(self) -> wp.array:

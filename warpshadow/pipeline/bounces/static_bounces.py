@@ -293,11 +293,11 @@ class StaticBounces:
             body_positions = positions[merged_scene.first_vertex[number] : merged_scene.first_vertex[number + 1]]
             faces = body.mesh.surface.faces
             if number in senders.bodies:
-                place = senders.bodies.index(number)
-                patches = senders.patches[place]
+                sender_index = senders.bodies.index(number)
+                patches = senders.patches[sender_index]
                 corners.append(patches.pieces.positions(body_positions, faces))
                 patch_of_side = np.where(
-                    patches.patch_of_pieces < 0, -1, patches.patch_of_pieces + senders.first[place]
+                    patches.patch_of_pieces < 0, -1, patches.patch_of_pieces + senders.first[sender_index]
                 )
             else:
                 corners.append(body_positions[faces])
@@ -308,7 +308,7 @@ class StaticBounces:
 
 
 def _light_on_patches(at_patch_samples: wp.array, factors: _GeometryFactors) -> wp.array:
-    """Mean light on patches, given that at their patch samples: vec3 of shape [batch, patch]. Differentiable: light."""
+    """Mean light on patches, vec3 of shape [batch, patch], given that at their samples. Differentiable: both."""
     return multiply(factors.patch_sample_means, at_patch_samples)
 
 

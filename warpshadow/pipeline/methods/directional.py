@@ -56,7 +56,7 @@ class ProjectedCells(NamedTuple):
     coefficients: wp.array | None = None  # of known light, vec3 of shape [1, direction]
     mean_directions: np.ndarray | None = None  # to all known light of the cells, by which it falls in [direction, 3]
     spots: np.ndarray | None = None  # where the brightest part of known light is in its cells [direction, 3]
-    spreads: np.ndarray | None = None  # half-angles of where known light comes from in its cells [direction]
+    half_angles: np.ndarray | None = None  # half-angles of where known light comes from in its cells [direction]
     sharp_cells: SharpCells | None = None  # cells that a sun is in, where spheres block it
     sharp_cells_past_planes: SharpCells | None = None  # and where planes do
     spot_shares: np.ndarray | None = None  # share of the light of sharp cells that their spot has [direction]
@@ -143,7 +143,7 @@ class Directional(SphereMethod):
         """Lookups of the receivers of some bodies. Differentiable: rotations."""
         towards = projected_light.directions if projected_light.spots is None else projected_light.spots
         has_sun = projected_light.sun is not None
-        return self.self_visibility.lookups(bodies, rotations, towards, projected_light.spreads, has_sun=has_sun)
+        return self.self_visibility.lookups(bodies, rotations, towards, projected_light.half_angles, has_sun=has_sun)
 
     def find_visibility(self, group: Group, projected_light: ProjectedCells) -> GroupVisibility:
         """Transmittance, float32 of shape [batch, receiver, direction]."""
@@ -423,7 +423,7 @@ class PortionedCellTransmittance(PortionedShading):
     def find(
         self, call: Call, portion: Group, projected_light: ProjectedCells, spheres: tuple[wp.array, wp.array]
     ) -> wp.array:
-        """Find that of a portion."""
+        """Find the transmittance of a portion."""
         return self.find_visibility(call, portion, projected_light).transmittance_total
 
 

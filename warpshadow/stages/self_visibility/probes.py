@@ -56,9 +56,10 @@ class VisibilityProbes(NamedTuple):
     Args:
         positions: Shape [probe, 3], float32.
         normals: Unit normals [probe, 3], float32.
-        pieces: Faces, and then the pieces that they are cut into, int32 of shape [piece, 4]: three probes and a link,
-            −1 for a piece that is whole. Otherwise the link is 3 p + k: the edge across from corner k is cut, and its
-            middle takes the place of corner k + 2 in piece p, and of corner k + 1 in piece p + 1, modulo 3.
+        pieces: Faces, and then the pieces that they are cut into, int32 of shape [piece, 4]: three probes and −1 for
+            a whole piece. A piece that is cut in two has the number 3 p + k in place of −1: its halves are the pieces
+            p and p + 1, and the edge opposite to its corner k is cut. The probe in the middle of that edge replaces
+            corner k + 2 (modulo 3) in piece p, and corner k + 1 in piece p + 1; other corners are the same.
     """
 
     positions: np.ndarray

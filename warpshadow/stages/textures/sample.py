@@ -95,7 +95,7 @@ def _repeated(texel: int, count: int):
 
 @wp.func
 def _cell(level: wp.vec3i, x: float, y: float):
-    """Find the texels around a place in a level, as `_texel_position` has it or beside that."""
+    """Find the texels around a position in a level, that of `_texel_position` or one beside it."""
     cell = _Cell()
     cell.s = x - wp.floor(x)
     cell.t = y - wp.floor(y)

@@ -75,12 +75,13 @@ def _optimal_table(order: int, device: str) -> wp.array:
 def _make_find_squarings(order: int, lanes: int) -> wp.Function:
     """Make the kernel function of the number of squarings.
 
-    It returns, for each lane but the fifth:
-        the number of squarings p, and 2^−p;
-        |f̂|; and |f̂| with f0 as one more coefficient where f0 > 0, as in no visibility, from which p follows;
-        the largest p of all lanes;
-        e^{2^−p f0 / 2√4π}, whose square is the constant factor of the base approximation;
-        the share w that blends the number of squarings, and its derivative by |f̂|.
+    It returns eight values. The fifth is one number, the others have one for each lane:
+        1, 2. the number of squarings p, and 2^−p;
+        3. |f̂|;
+        4. |f̂| with f0 as one more coefficient where f0 > 0, as in no visibility: p follows from it;
+        5. the largest p of all lanes;
+        6. e^{2^−p f0 / 2√4π}, whose square is the constant factor of the base approximation;
+        7, 8. the share w that blends the number of squarings, and its derivative by |f̂|.
     """
     Lane = lane_type(lanes)
     sqrt = make_lane_functions(lanes).sqrt
