@@ -2,9 +2,9 @@
 
 On a body that lies in a plane light changes slowly over the image, but for the edges of shadows. So its receivers are
 the fragments at the corners of squares of 4 × 4 pixels, and squares are cut into four where the light that samples
-interpolate differs from their own (Ward's irradiance caching, in the image). *Probes* tell that: samples at every second
-pixel, or in small images at every one, whose light the caller estimates. In a square of corners a b / c d are two
-triangles a b c and d c b, in which samples interpolate linearly.
+interpolate differs from their own (Ward's irradiance caching, in the image). *Probes* tell that: samples at every
+second pixel, or in small images at every one, whose light the caller estimates. In a square of corners a b / c d are
+two triangles a b c and d c b, in which samples interpolate linearly.
 
 A square is *accepted* if its corners see one side of one body, and samples within it would be off by less than the
 tolerance. Samples within it that see another side, or whose pixel is in no accepted square, are receivers themselves.

@@ -13,8 +13,8 @@ smooth in everything, stays within the radiosities of the patches, and does not 
 root of w a white ball behind a black one sent a tenth of its light past it, and patches behind a contact outshone it.
 
 The traversal is that of the transmittance, with other visits. The adjoint needs both sums of R of the cells in which
-something is blocked; they are kept from the forward launch: 16 bytes a receiver and cell, touched only in bundles of
-cells that are blocked in part (a fifth of them on a ground around a body). N bounces keep N times that.
+something is blocked; the forward launch stores them: 16 bytes a receiver and cell, touched only in bundles of cells
+that are blocked in part (a fifth of them on a ground around a body). N bounces store N times that.
 """
 
 import functools
@@ -230,7 +230,7 @@ def _make_light(lanes: int) -> wp.Kernel:
         # scratch
         scratch: wp.array3d(dtype=Lane),
         reached_bundles: wp.array3d(dtype=wp.int32),
-        # scratch, or out where they are kept
+        # scratch, or out where the adjoint needs them
         sums: wp.array2d(dtype=Lane),
         # out
         light: wp.array2d(dtype=wp.vec3),
