@@ -239,14 +239,16 @@ class StaticBounces:
                     means = scale_rows(means, scaling_factors(1 - sky, means @ (1 - sky[cache_points])))
                 return means, form_factors.factors[is_cache_point]
 
-            at, facing, device = receivers.points.numpy(), receivers.normals.numpy(), positions.device
+            receiver_points, receiver_normals = receivers.points.numpy(), receivers.normals.numpy()
+            shape, device = receiver_points.shape[:2], positions.device
             skies = [None if sky is None else sky.numpy()[..., 0] for sky in (sky_at_patch_samples, sky_at_receivers)]
             at_patch_sample = None if skies[0] is None else skies[0][0]
-            at_receivers = [None] * len(at) if skies[1] is None else np.broadcast_to(skies[1], at.shape[:2])
+            at_receivers = [None] * shape[0] if skies[1] is None else np.broadcast_to(skies[1], shape)
             seen_by_patch_samples = trace(
                 patch_samples.points.numpy()[0], patch_samples.normals.numpy()[0], at_patch_sample
             )
-            receiver_weights, to_cache_points = zip(*map(find_cache_points, at, facing, at_receivers), strict=True)
+            factors = map(find_cache_points, receiver_points, receiver_normals, at_receivers)
+            receiver_weights, to_cache_points = zip(*factors, strict=True)
             means, is_buried = senders.mean.to_scipy(), seen_by_patch_samples.is_buried
             mean = mean_outside(means, is_buried)[senders.nearest_open_patches(means @ ~is_buried > 0)]
             between = (mean @ seen_by_patch_samples.factors).tocoo()
@@ -261,7 +263,7 @@ class StaticBounces:
                 SparseMatrix.from_matrix(between_bodies, device=device),
                 SparseMatrix.from_matrix(vstack(to_cache_points), device=device),
                 SparseMatrix.from_matrix(block_diag(receiver_weights), device=device),
-                at.shape[:2],
+                shape,
             )
 
         def make() -> Node:
