@@ -50,7 +50,7 @@ class PlaneHit:
 
 @wp.func
 def load_hit(store: wp.array(dtype=wp.vec3), first_hit: int, side_index: int):
-    """Load the hit on side i; without coverage, all else in it is old. ``first_hit`` is the row of the first."""
+    """Load the hit on side ``side_index``; without coverage, all else in it is old. ``first_hit`` is side 0's row."""
     row = first_hit + 4 * side_index
     hit = PlaneHit()
     hit.coverage = store[row][0]
@@ -111,7 +111,7 @@ def find_side_hits(
     store: wp.array(dtype=wp.vec3),
     edges: wp.array(dtype=ViewedEdge),
 ):
-    """Store which plane sides this cell hits; return whether any. No part meets nothing."""
+    """Store which plane sides this cell hits; return whether any. A share of 0 hits nothing."""
     if cell_share <= 0.0:
         return False
     first_hit = SIDE_ROWS * scene.grids.shape[0]

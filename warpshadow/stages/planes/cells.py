@@ -294,7 +294,7 @@ class MipFootprint:
     slopes: wp.vec2  # of that by the center in the plane
     level: int  # finer of the two levels
     coarse_share: float  # of the coarser one
-    part_slope: float  # of that by the logarithm of the footprint's width
+    coarse_share_slope: float  # its derivative by the logarithm of the footprint's width
 
 
 @wp.func
@@ -323,7 +323,7 @@ def find_mip_footprint(grid: PlaneGrid, scene: PlaneArrays, footprint: PlaneFoot
         width *= 0.5
     if width > 1.0 and mip.level < grid.level_count - 1:
         mip.coarse_share = width - 1.0
-        mip.part_slope = width
+        mip.coarse_share_slope = width
     return mip
 
 
@@ -387,9 +387,9 @@ def _interpolation_slopes(texels: wp.array(dtype=wp.vec3), corners: _Corners, ad
     b = wp.dot(adj_value, texels[corners.upper_left + corners.column_step])
     c = wp.dot(adj_value, texels[corners.lower_left])
     d = wp.dot(adj_value, texels[corners.lower_left + corners.column_step])
-    slope_u = (1.0 - corners.t) * (b - a) + corners.t * (d - c)
+    slope_s = (1.0 - corners.t) * (b - a) + corners.t * (d - c)
     slope_t = (1.0 - corners.s) * (c - a) + corners.s * (d - b)
-    return wp.vec2(corners.slopes[0] * slope_u, corners.slopes[1] * slope_t)
+    return wp.vec2(corners.slopes[0] * slope_s, corners.slopes[1] * slope_t)
 
 
 @wp.func
@@ -412,14 +412,14 @@ def fetch_adjoint(
     mip: MipFootprint,
     adj_value: wp.vec3,
 ):
-    """Gradients of the place, and of the logarithm of t / √c′, as which the footprint is wide."""
+    """Gradients of the position in the plane, and of the logarithm of t / √c′, as which the footprint is wide."""
     fine = _find_corners(scene, first_level + mip.level, mip.texel)
     slopes = _interpolation_slopes(texels, fine, adj_value)
     adj_log = float(0.0)
     if mip.coarse_share > 0.0:
         coarse = _find_corners(scene, first_level + mip.level + 1, mip.texel)
         slopes = (1.0 - mip.coarse_share) * slopes + mip.coarse_share * _interpolation_slopes(texels, coarse, adj_value)
-        adj_log = mip.part_slope * wp.dot(
+        adj_log = mip.coarse_share_slope * wp.dot(
             adj_value, _interpolate_corners(texels, coarse) - _interpolate_corners(texels, fine)
         )
     adj_x = slopes[0] * mip.slopes[0]

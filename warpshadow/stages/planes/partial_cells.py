@@ -76,7 +76,7 @@ def _sample_weight(scene: PlaneArrays, normal: wp.vec3, direction: wp.vec3):
 
 
 @wp.func
-def _find_coverage(
+def _direction_coverage(
     scene: PlaneArrays,
     direction: wp.vec3,
     normal: wp.vec3,
@@ -85,15 +85,15 @@ def _find_coverage(
     edges: wp.array(dtype=ViewedEdge),
 ):
     """Σ_k h_k of a direction."""
-    weighted_sum = float(0.0)
+    coverage_sum = float(0.0)
     cell = visible_cell(scene, normal, direction)
     for i in range(side_count):
         side = load_side(scene, i, store)
         grid = scene.grids[side.f]
-        if grid.blocks == 1 and weighted_sum < 1.0:
+        if grid.blocks == 1 and coverage_sum < 1.0:
             covered = side_coverage(scene, grid, side, load_local_receiver(store, side.f), cell, edges)
-            weighted_sum += covered.outline[0] * covered.mesh_share
-    return weighted_sum
+            coverage_sum += covered.outline[0] * covered.mesh_share
+    return coverage_sum
 
 
 @wp.func
@@ -111,7 +111,8 @@ def _find_mean_coverage(
     for s in range(samples.shape[0]):
         weight = _sample_weight(scene, normal, samples[s])
         if weight > 0.0:
-            weighted_sum += weight * wp.min(1.0, _find_coverage(scene, samples[s], normal, side_count, store, edges))
+            coverage = _direction_coverage(scene, samples[s], normal, side_count, store, edges)
+            weighted_sum += weight * wp.min(1.0, coverage)
             weights += weight
     if weights > 0.0:
         weighted_sum = weighted_sum / weights
@@ -119,7 +120,7 @@ def _find_mean_coverage(
 
 
 @wp.kernel(enable_backward=False)
-def _sample_light(
+def _refine_coverage(
     first_row: int,
     worker: int,
     # in
@@ -154,7 +155,7 @@ def _sample_light(
 
 
 @wp.kernel(enable_backward=False)
-def _sample_light_adjoint(
+def _refine_coverage_adjoint(
     first_row: int,
     worker: int,
     # in
@@ -198,7 +199,7 @@ def _sample_light_adjoint(
             for s in range(samples.shape[1]):
                 direction = samples[q, s]
                 share = _sample_weight(scene, normal, direction)
-                if share > 0.0 and _find_coverage(scene, direction, normal, side_count, store, edges) < 1.0:
+                if share > 0.0 and _direction_coverage(scene, direction, normal, side_count, store, edges) < 1.0:
                     cell = visible_cell(scene, normal, direction)
                     adj_part = wp.vec4(weight * adj_share * share / weights, 0.0, 0.0, 0.0)
                     for i in range(side_count):
@@ -263,10 +264,10 @@ def coverage_of_light(
     scratch, cost = receiver_scratch(planes), _CELL_COST * len(directions)
     return differentiable(
         lambda refined: launch(
-            _sample_light, points.size, inputs=inputs, scratch=scratch, outputs=[refined], cost=cost
+            _refine_coverage, points.size, inputs=inputs, scratch=scratch, outputs=[refined], cost=cost
         ),
         lambda adj_refined: launch(
-            _sample_light_adjoint,
+            _refine_coverage_adjoint,
             points.size,
             inputs=[*inputs, adj_refined],
             scratch=[*scratch, scratch[0]],

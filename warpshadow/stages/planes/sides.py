@@ -21,13 +21,13 @@ from warpshadow.stages.planes.cells import (
 )
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 
-# Scratch of a receiver, vec3. Its position relative to each plane f, whose gradients have the same places:
-#     4 f        where it is along both axes, and its height
-#     4 f + 1    the axis u, of unit length; 4 f + 2 the axis v, and 4 f + 3 the normal
-# Sides i that it may meet, from ``4 plane_count`` on:
-#     i          the plane, 1 for its back, and which part of the side is there
+# Rows of a receiver's scratch, each a vec3; scratch of gradients has the same rows. Of n planes,
+#     4 f            has the receiver's position in the axes of plane f (:class:`.cells.LocalReceiver`);
+#     4 f + 1, 2, 3  have the plane's axes u and v, of unit length, and its normal;
+#     4 n + i        has side i of the sides that the receiver sees, at most 2 n: the number of its plane, 1 for a back
+#                    or 0 for a front, and the part of the side that the receiver sees.
 SIDE_ROWS = wp.constant(6)
-"""Rows of scratch for each plane."""
+"""Rows of scratch for each plane: four, and one for each of its two sides."""
 
 # of an outline as the front and the back see it
 _VIEWS = wp.constant(2)
