@@ -319,7 +319,7 @@ class SphereBounces:
 
         make = functools.partial(Node, "patch samples", senders.patch_samples, points.vertices, points.normals)
         patch_samples = points.cached("patch samples", senders, lambda: make(items=_patch_sample_text(senders)))
-        lit_samples = self._at(patch_samples, points, points.materials, proxies.blocker_of_sample)
+        lit_samples = self._at(patch_samples, points, points.materials, proxies.nearest_spheres)
         lookups = self_visibility_node(self._method, points, visibility_light)
         lit_samples.cached("self-visibility", id(visibility_light), lambda: lookups)
         visibility = make_visibility(lit_samples, where=_OF_PATCH_SAMPLES)
@@ -380,10 +380,10 @@ class SphereBounces:
         return StaticBounces(self._patches, self._count, self._method.openness, progress=self._method.progress)
 
     def _at(
-        self, patch_samples: Node, points: LitPoints, materials: Materials, blocker_of_point: np.ndarray | None = None
+        self, patch_samples: Node, points: LitPoints, materials: Materials, nearest_spheres: np.ndarray | None = None
     ) -> LitPoints:
         """Make lit points of patch samples, among the same bodies as other points."""
         arguments = self._method.merged_scene, materials, points.vertices, points.spheres, patch_samples, points.call
         return LitPoints(
-            *arguments, normals=points.normals, blocker_kinds=points.blocker_kinds, blocker_of_point=blocker_of_point
+            *arguments, normals=points.normals, blocker_kinds=points.blocker_kinds, nearest_spheres=nearest_spheres
         )

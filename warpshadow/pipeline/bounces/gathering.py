@@ -208,7 +208,7 @@ class Proxies:
         return np.concatenate([find_depths(item.centers, item.normals, item.areas) for item in self.senders.patches])
 
     @functools.cached_property
-    def blocker_of_sample(self) -> np.ndarray:
+    def nearest_spheres(self) -> np.ndarray:
         """Sphere nearest to the patch of each patch sample, −1 for none: int32 of shape [patch sample]."""
         return self._blockers[0][self.senders.patch_of_sample]
 
@@ -230,7 +230,7 @@ class Proxies:
         normals, planes, senders = patch_samples.normals, self.planes, self.senders
         centers, radii = self.merged_scene.spheres_of(self.nonplanar_bodies, spheres)
         if planes is not None:
-            numbers, points, device = self.blocker_of_sample, patch_samples.points, normals.device
+            numbers, points, device = self.nearest_spheres, patch_samples.points, normals.device
             of_patch_samples = NearestBlockers(centers, radii, constant(numbers, wp.int32, device))
             fronts = find_fronts(points, normals, None, of_patch_samples, frames, planes.all)
             if self.overlays is not None:
