@@ -291,7 +291,7 @@ class _Descent:
         for group in self.optimizer.param_groups:
             group["lr"] = stage.rate(len(self.losses[-1]))
         evaluated_losses: list[float] = []
-        earlier: dict[str, Values] = {}
+        evaluated_values: dict[str, Values] = {}
 
         def closure() -> float:
             self.optimizer.zero_grad()
@@ -302,7 +302,7 @@ class _Descent:
                     raise  # values that were bad from the beginning
                 raise _Diverged(str(error)) from error
             if not evaluated_losses:  # with the light that was solved for there
-                earlier.update(_copied(self.values))
+                evaluated_values.update(_copied(self.values))
             self.images = None if images is None else images.detach()
             _check_finite({"the images": images, "the loss": loss})
             loss.backward()
@@ -317,7 +317,7 @@ class _Descent:
         losses = self.losses[-1]
         losses.append(evaluated_losses[0])
         if losses[-1] == min(losses):
-            self.best = earlier
+            self.best = evaluated_values
         _check_finite(self.tensors)
 
 

@@ -406,8 +406,8 @@ def _moving_radiance(
     receivers: Receivers, shading: wp.array, reflectance: wp.array, silhouettes: Silhouettes, clip_positions: wp.array
 ) -> tuple[wp.array, wp.array]:
     """Samples, and the colors at edges."""
-    samples = receivers.fragments, receivers.faces, shading, reflectance
-    return moving_radiance(*samples, silhouettes, clip_positions, receivers.of_vertices)
+    arguments = receivers.fragments, receivers.faces, shading, reflectance
+    return moving_radiance(*arguments, silhouettes, clip_positions, receivers.of_vertices)
 
 
 def _sum_moving(first: tuple[wp.array, wp.array], second: tuple[wp.array, wp.array]) -> tuple[wp.array, wp.array]:

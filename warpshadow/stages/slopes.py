@@ -100,7 +100,7 @@ def _add_shading_gradients(
             receivers = wp.vec3i()
             if face >= 0:
                 receivers = receiver_faces[receiver_face_ids[fragment_batch, sample]]
-            # A sample with receivers that samples see has the gradient of their points instead.
+            # A sample with a sample receiver has the gradient of the receiver's point instead.
             if (
                 face >= 0
                 and receiver_face_ids[fragment_batch, sample] < first_sample_face

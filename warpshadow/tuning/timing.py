@@ -122,10 +122,9 @@ class _SharedTiming:
         neighborhoods = neighborhoods[np.argsort(bodies[receiver_rows[neighborhoods]], kind="stable")]
         self._sample = sides[receiver_rows[neighborhoods]], weights[neighborhoods]
         is_adaptive = any(body.receivers == "adaptive" for body in shadowed_renderer.scene.bodies)
-        result = (
-            shadowed_renderer.view() if is_adaptive else self._view
-        ).receivers  # adaptive ones are where shadows end
-        self.extrapolation = result.points.shape[1] / len(neighborhoods)
+        # adaptive receivers are where shadows end
+        view = shadowed_renderer.view() if is_adaptive else self._view
+        self.extrapolation = view.receivers.points.shape[1] / len(neighborhoods)
 
     def sampled_shading(self, scene: Scene) -> Callable[[], object]:
         """Make the function that shades the sample as a scene does."""

@@ -82,7 +82,7 @@ def _task_type(lanes: int) -> Any:
         adj_light: Vectors
         proxy_radiance: wp.array2d(dtype=wp.vec4)  # [node, direction]
         adj_radiance: wp.array2d(dtype=wp.vec4)
-        inverse_size: float  # of 1/radius of the largest run of spheres
+        inverse_size: float  # 1/radius of the largest run of spheres
 
     return LightTask
 

@@ -191,7 +191,7 @@ def sphere_view_type(lanes: int) -> Any:
 
     @wp.struct
     class SphereView:
-        traversal_index: int  # in the traversal
+        traversal_index: int  # its number in the traversal
         node: int
         offset: Vectors  # from the receivers to its center
         curvature: float  # 1/radius
