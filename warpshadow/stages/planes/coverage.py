@@ -52,7 +52,7 @@ class PlaneCoverage:
     """Coverage of a cell by a side."""
 
     outline: wp.vec4  # (h, μ), by its outline
-    mesh_share: float  # of that, that the mesh covers, by texels
+    mesh_share: float  # share of the outline that the mesh covers, by texels
     footprint: PlaneFootprint  # of these texels
 
 
