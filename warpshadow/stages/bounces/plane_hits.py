@@ -103,7 +103,7 @@ def first_level_of_side(grid: PlaneGrid, is_back: bool):
 
 @wp.func
 def find_side_hits(
-    planes: PlaneArrays,
+    scene: PlaneArrays,
     cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
     cell_share: float,
@@ -114,31 +114,31 @@ def find_side_hits(
     """Store which plane sides this cell hits; return whether any. A share of 0 hits nothing."""
     if cell_share <= 0.0:
         return False
-    first_hit = SIDE_ROWS * planes.grids.shape[0]
+    first_hit = SIDE_ROWS * scene.grids.shape[0]
     is_any_hit = bool(False)
     for side_index in range(side_count):
-        side = load_side(planes, side_index, store)
-        grid = planes.grids[side.f]
+        side = load_side(scene, side_index, store)
+        grid = scene.grids[side.f]
         local_receiver = load_local_receiver(store, side.f)
-        share = outline_coverage_on_side(planes, grid, side, local_receiver, cell, edges)[0]
+        share = outline_coverage_on_side(scene, grid, side, local_receiver, cell, edges)[0]
         clear_hit(store, first_hit, side_index)
         if share > 0.0:
             hit = PlaneHit()
-            footprint = footprint_on_side(planes, grid, side, local_receiver, cell.direction)
+            footprint = footprint_on_side(scene, grid, side, local_receiver, cell.direction)
             hit.outline_coverage = share
             hit.mesh_share = 1.0
             hit.distance = footprint.distance
-            hit.distance_range = footprint.distance * planes.radius * footprint.per_cosine
+            hit.distance_range = footprint.distance * scene.radius * footprint.per_cosine
             hit.per_cosine = footprint.per_cosine
             hit.center = footprint.center
             is_sender = grid.sides == 2 or not side.is_back
             if is_sender or is_covered_by_texels(grid):
                 first_level = first_level_of_side(grid, side.is_back)
-                mip = find_mip_footprint(grid, planes, footprint)
+                mip = find_mip_footprint(grid, scene, footprint)
                 if is_covered_by_texels(grid):
-                    hit.mesh_share = fetch(planes.covered, planes, first_level, mip)[0]
+                    hit.mesh_share = fetch(scene.covered, scene, first_level, mip)[0]
                 if is_sender:
-                    hit.radiosity = fetch(texels, planes, first_level, mip)
+                    hit.radiosity = fetch(texels, scene, first_level, mip)
             hit.coverage = share * hit.mesh_share
             store_hit(store, first_hit, side_index, hit)
             is_any_hit = True
@@ -147,7 +147,7 @@ def find_side_hits(
 
 @wp.func
 def find_side_hits_adjoint(
-    planes: PlaneArrays,
+    scene: PlaneArrays,
     cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
     side_count: int,
@@ -158,12 +158,12 @@ def find_side_hits_adjoint(
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
     """Add to the gradients of a receiver relative to each plane, of viewed edges, and of an instance's texels."""
-    first_hit = SIDE_ROWS * planes.grids.shape[0]
+    first_hit = SIDE_ROWS * scene.grids.shape[0]
     for side_index in range(side_count):
         hit = load_hit(store, first_hit, side_index)
         if hit.coverage > 0.0:
-            side = load_side(planes, side_index, store)
-            grid = planes.grids[side.f]
+            side = load_side(scene, side_index, store)
+            grid = scene.grids[side.f]
             footprint = PlaneFootprint()
             footprint.distance = hit.distance
             footprint.per_cosine = hit.per_cosine
@@ -173,18 +173,18 @@ def find_side_hits_adjoint(
             is_sender = grid.sides == 2 or not side.is_back
             if is_sender or is_covered_by_texels(grid):
                 first_level = first_level_of_side(grid, side.is_back)
-                mip = find_mip_footprint(grid, planes, footprint)
+                mip = find_mip_footprint(grid, scene, footprint)
                 if is_covered_by_texels(grid):
                     adj_covered = wp.vec3(adj_hit.coverage * hit.outline_coverage, 0.0, 0.0)
-                    adj_mip += fetch_adjoint(planes.covered, grid, planes, first_level, footprint, mip, adj_covered)
+                    adj_mip += fetch_adjoint(scene.covered, grid, scene, first_level, footprint, mip, adj_covered)
                 if is_sender:
-                    adj_mip += fetch_adjoint(texels, grid, planes, first_level, footprint, mip, adj_hit.radiosity)
+                    adj_mip += fetch_adjoint(texels, grid, scene, first_level, footprint, mip, adj_hit.radiosity)
                     if adj_texels:
-                        scatter(adj_texels[instance], planes, first_level, mip, adj_hit.radiosity)
+                        scatter(adj_texels[instance], scene, first_level, mip, adj_hit.radiosity)
             local_receiver = load_local_receiver(store, side.f)
             adj_range = adj_hit.distance_range
             footprint_on_side_adjoint(
-                planes,
+                scene,
                 grid,
                 side,
                 local_receiver,

@@ -64,7 +64,7 @@ def _light_receivers(
     frames: wp.array2d(dtype=wp.vec3),
     texels: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
-    planes: PlaneArrays,
+    scene: PlaneArrays,
     directions: wp.array(dtype=wp.vec3),
     # scratch
     scratch: wp.array2d(dtype=wp.vec3),
@@ -74,17 +74,17 @@ def _light_receivers(
 ):
     """A thread owns a receiver."""
     batch, receiver, scratch_row, side_count = prepare_receiver(
-        first_row + wp.tid(), worker, points, frames, fronts, planes, scratch, viewed_edges
+        first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
     )
     store, edges = scratch[scratch_row], viewed_edges[scratch_row]
     texel_radiosity = texels[instance_in(batch, texels.shape[0])]
     normal = normals[batch, receiver]
-    first_hit = SIDE_ROWS * planes.grids.shape[0]
+    first_hit = SIDE_ROWS * scene.grids.shape[0]
     total = wp.vec3()
     for q in range(directions.shape[0]):
         weight = wp.dot(normal, directions[q]) * transmittance[batch, receiver, q]
         if find_side_hits(
-            planes, visible_cell(planes, normal, directions[q]), texel_radiosity, weight, side_count, store, edges
+            scene, visible_cell(scene, normal, directions[q]), texel_radiosity, weight, side_count, store, edges
         ):
             mean, _, total_coverage = mean_radiosity(first_hit, side_count, store)
             total += (weight * wp.min(total_coverage, 1.0)) * mean
@@ -102,7 +102,7 @@ def _light_receivers_adjoint(
     frames: wp.array2d(dtype=wp.vec3),
     texels: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
-    planes: PlaneArrays,
+    scene: PlaneArrays,
     directions: wp.array(dtype=wp.vec3),
     adj_light: wp.array2d(dtype=wp.vec3),
     # scratch
@@ -120,13 +120,13 @@ def _light_receivers_adjoint(
 ):
     """A thread owns a receiver."""
     batch, receiver, scratch_row, side_count = prepare_receiver(
-        first_row + wp.tid(), worker, points, frames, fronts, planes, scratch, viewed_edges
+        first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
     )
     store, edges, adj_store = scratch[scratch_row], viewed_edges[scratch_row], adj_scratch[scratch_row]
     texel_batch = instance_in(batch, texels.shape[0])
     texel_radiosity = texels[texel_batch]
     normal = normals[batch, receiver]
-    first_hit = SIDE_ROWS * planes.grids.shape[0]
+    first_hit = SIDE_ROWS * scene.grids.shape[0]
     for k in range(first_hit):
         adj_store[k] = wp.vec3()
     adj_mean = (4.0 / float(directions.shape[0])) * adj_light[batch, receiver]
@@ -136,8 +136,8 @@ def _light_receivers_adjoint(
         cosine = wp.dot(normal, direction)
         cell_transmittance = transmittance[batch, receiver, q]
         weight = cosine * cell_transmittance
-        cell = visible_cell(planes, normal, direction)
-        if find_side_hits(planes, cell, texel_radiosity, cosine, side_count, store, edges):
+        cell = visible_cell(scene, normal, direction)
+        if find_side_hits(scene, cell, texel_radiosity, cosine, side_count, store, edges):
             mean, weights, total_coverage = mean_radiosity(first_hit, side_count, store)
             value = wp.dot(adj_mean, mean)
             total = wp.min(total_coverage, 1.0) * value
@@ -160,7 +160,7 @@ def _light_receivers_adjoint(
                 adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + cosine * total
             if cell_transmittance > 0.0:
                 find_side_hits_adjoint(
-                    planes, cell, texel_radiosity, side_count, store, edges, adj_store, texel_batch, adj_texels
+                    scene, cell, texel_radiosity, side_count, store, edges, adj_store, texel_batch, adj_texels
                 )
     if adj_normals:
         adj_normals[batch, receiver] = adj_normals[batch, receiver] + adj_normal
@@ -171,7 +171,7 @@ def _light_receivers_adjoint(
         points,
         frames,
         fronts,
-        planes,
+        scene,
         store,
         edges,
         adj_store,
@@ -222,11 +222,11 @@ def plane_light(
     fronts = None if fronts is None else expand_rows(fronts, batch_count)
     scratch = receiver_scratch(planes, HIT_ROWS)
     variables = [points, normals, transmittance, frames, texels, fronts]
-    arrays, cell_directions = (
+    scene, cell_directions = (
         plane_arrays(planes, cell_radius(len(directions)), skip),
         constant(directions, wp.vec3, points.device),
     )
-    inputs = [*variables, arrays, cell_directions]
+    inputs = [*variables, scene, cell_directions]
     return differentiable(
         lambda light: launch(
             _light_receivers,

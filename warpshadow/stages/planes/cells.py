@@ -62,13 +62,13 @@ def plane_arrays(planes: PlaneBlockers, radius: float, skip: int | None, *, tile
 
     Where cells do not tile the sphere, as a sun's alone, texels are half as wide.
     """
-    arrays = PlaneArrays()
-    arrays.grids, arrays.levels, arrays.level_scales = planes.grids, planes.levels, planes.level_scales
-    arrays.covered, arrays.edges, arrays.edge_axes = planes.covered, planes.edges, planes.edge_axes
-    arrays.skip, arrays.radius = -1 if skip is None else skip, radius
-    arrays.texel_radius = arrays.radius if tiles else 0.5 * arrays.radius
-    arrays.per_radius = 1 / arrays.radius
-    return arrays
+    scene = PlaneArrays()
+    scene.grids, scene.levels, scene.level_scales = planes.grids, planes.levels, planes.level_scales
+    scene.covered, scene.edges, scene.edge_axes = planes.covered, planes.edges, planes.edge_axes
+    scene.skip, scene.radius = -1 if skip is None else skip, radius
+    scene.texel_radius = scene.radius if tiles else 0.5 * scene.radius
+    scene.per_radius = 1 / scene.radius
+    return scene
 
 
 @wp.func
@@ -243,19 +243,19 @@ class PlaneFootprint:
 
 
 @wp.func
-def find_footprint(planes: PlaneArrays, position: wp.vec3, direction: wp.vec3):
+def find_footprint(scene: PlaneArrays, position: wp.vec3, direction: wp.vec3):
     """Find the footprint of a cell on a side.
 
     Args:
-        planes: Have the radius of cells.
+        scene: Has the radius of cells.
         position: Where the receiver is: along both axes, and its height above the side.
         direction: Direction of the cell along both axes, and its cosine, above −ρ.
     """
     footprint = PlaneFootprint()
     cosine = direction[2]
-    if cosine < planes.radius:
-        u = 0.5 * cosine * planes.per_radius + 0.5
-        cosine = planes.radius * (1.0 / 3.0 + 2.0 / 3.0 * u * u * u)
+    if cosine < scene.radius:
+        u = 0.5 * cosine * scene.per_radius + 0.5
+        cosine = scene.radius * (1.0 / 3.0 + 2.0 / 3.0 * u * u * u)
     footprint.per_cosine = 1.0 / cosine
     footprint.distance = position[2] * footprint.per_cosine
     footprint.center = wp.vec2(
@@ -266,7 +266,7 @@ def find_footprint(planes: PlaneArrays, position: wp.vec3, direction: wp.vec3):
 
 @wp.func
 def find_footprint_adjoint(
-    planes: PlaneArrays,
+    scene: PlaneArrays,
     direction: wp.vec3,
     footprint: PlaneFootprint,
     adj_distance: float,
@@ -276,8 +276,8 @@ def find_footprint_adjoint(
     """Gradients of ``position`` and ``direction``, given the footprint's and the mean cosine's, c′."""
     adj_t = adj_distance + adj_center[0] * direction[0] + adj_center[1] * direction[1]
     adj_c = adj_cosine - adj_t * footprint.distance * footprint.per_cosine
-    if direction[2] < planes.radius:
-        u = 0.5 * direction[2] * planes.per_radius + 0.5
+    if direction[2] < scene.radius:
+        u = 0.5 * direction[2] * scene.per_radius + 0.5
         adj_c = adj_c * u * u
     adj_position = wp.vec3(adj_center[0], adj_center[1], adj_t * footprint.per_cosine)
     return adj_position, wp.vec3(adj_center[0] * footprint.distance, adj_center[1] * footprint.distance, adj_c)
@@ -304,7 +304,7 @@ def is_covered_by_texels(grid: PlaneGrid):
 
 
 @wp.func
-def find_mip_footprint(grid: PlaneGrid, planes: PlaneArrays, footprint: PlaneFootprint):
+def find_mip_footprint(grid: PlaneGrid, scene: PlaneArrays, footprint: PlaneFootprint):
     """Find where in the mip levels of a grid a footprint lies."""
     mip = MipFootprint()
     x = footprint.center[0] * grid.per_spread
@@ -316,7 +316,7 @@ def find_mip_footprint(grid: PlaneGrid, planes: PlaneArrays, footprint: PlaneFoo
     )
     mip.slopes = grid.per_spread * wp.vec2(grid.texels[0] / size_x, grid.texels[1] / size_y)
     width = (
-        2.0 * footprint.distance * planes.texel_radius * wp.sqrt(mip.slopes[0] * mip.slopes[1] * footprint.per_cosine)
+        2.0 * footprint.distance * scene.texel_radius * wp.sqrt(mip.slopes[0] * mip.slopes[1] * footprint.per_cosine)
     )
     while mip.level < grid.level_count - 1 and width >= 2.0:
         mip.level = mip.level + 1
@@ -346,10 +346,10 @@ class _Corners:
 
 
 @wp.func
-def _find_corners(planes: PlaneArrays, level_index: int, texel: wp.vec2):
+def _find_corners(scene: PlaneArrays, level_index: int, texel: wp.vec2):
     corners = _Corners()
-    level = planes.levels[level_index]
-    scale = planes.level_scales[level_index]
+    level = scene.levels[level_index]
+    scale = scene.level_scales[level_index]
     last_x = float(level[1] - 1)
     last_y = float(level[2] - 1)
     x = texel[0] * scale[0] - 0.5
@@ -393,11 +393,11 @@ def _interpolation_slopes(texels: wp.array(dtype=wp.vec3), corners: _Corners, ad
 
 
 @wp.func
-def fetch(texels: wp.array(dtype=wp.vec3), planes: PlaneArrays, first_level: int, mip: MipFootprint):
+def fetch(texels: wp.array(dtype=wp.vec3), scene: PlaneArrays, first_level: int, mip: MipFootprint):
     """Mean over a footprint, in the mip levels from ``first_level`` on."""
-    value = _interpolate_corners(texels, _find_corners(planes, first_level + mip.level, mip.texel))
+    value = _interpolate_corners(texels, _find_corners(scene, first_level + mip.level, mip.texel))
     if mip.coarse_share > 0.0:
-        coarse = _interpolate_corners(texels, _find_corners(planes, first_level + mip.level + 1, mip.texel))
+        coarse = _interpolate_corners(texels, _find_corners(scene, first_level + mip.level + 1, mip.texel))
         value = (1.0 - mip.coarse_share) * value + mip.coarse_share * coarse
     return value
 
@@ -406,18 +406,18 @@ def fetch(texels: wp.array(dtype=wp.vec3), planes: PlaneArrays, first_level: int
 def fetch_adjoint(
     texels: wp.array(dtype=wp.vec3),
     grid: PlaneGrid,
-    planes: PlaneArrays,
+    scene: PlaneArrays,
     first_level: int,
     footprint: PlaneFootprint,
     mip: MipFootprint,
     adj_value: wp.vec3,
 ):
     """Gradients of the position in the plane, and of the logarithm of t / √c′, as which the footprint is wide."""
-    fine = _find_corners(planes, first_level + mip.level, mip.texel)
+    fine = _find_corners(scene, first_level + mip.level, mip.texel)
     slopes = _interpolation_slopes(texels, fine, adj_value)
     adj_log = float(0.0)
     if mip.coarse_share > 0.0:
-        coarse = _find_corners(planes, first_level + mip.level + 1, mip.texel)
+        coarse = _find_corners(scene, first_level + mip.level + 1, mip.texel)
         slopes = (1.0 - mip.coarse_share) * slopes + mip.coarse_share * _interpolation_slopes(texels, coarse, adj_value)
         adj_log = mip.coarse_share_slope * wp.dot(
             adj_value, _interpolate_corners(texels, coarse) - _interpolate_corners(texels, fine)
@@ -432,13 +432,13 @@ def fetch_adjoint(
 
 @wp.func
 def scatter(
-    adj_texels: wp.array(dtype=wp.vec3), planes: PlaneArrays, first_level: int, mip: MipFootprint, adj_value: wp.vec3
+    adj_texels: wp.array(dtype=wp.vec3), scene: PlaneArrays, first_level: int, mip: MipFootprint, adj_value: wp.vec3
 ):
     """Add to the gradients of texels: the adjoint of :func:`fetch` by its values."""
     level_share = 1.0 - mip.coarse_share
     for coarser in range(2):
         if level_share > 0.0:
-            c = _find_corners(planes, first_level + mip.level + coarser, mip.texel)
+            c = _find_corners(scene, first_level + mip.level + coarser, mip.texel)
             adj_upper = (level_share * (1.0 - c.t)) * adj_value
             adj_lower = (level_share * c.t) * adj_value
             wp.atomic_add(adj_texels, c.upper_left, (1.0 - c.s) * adj_upper)

@@ -50,15 +50,15 @@ class PlaneSide:
 
 
 @wp.func
-def load_side(planes: PlaneArrays, i: int, store: wp.array(dtype=wp.vec3)):
+def load_side(scene: PlaneArrays, i: int, store: wp.array(dtype=wp.vec3)):
     """Load side i of the sides that a receiver sees."""
     side = PlaneSide()
-    side.row = 4 * planes.grids.shape[0] + i
+    side.row = 4 * scene.grids.shape[0] + i
     stored_side = store[side.row]
     side.f = int(stored_side[0])
     side.is_back = stored_side[1] > 0.0
     side.weight = stored_side[2]
-    grid = planes.grids[side.f]
+    grid = scene.grids[side.f]
     side.first_edge = _VIEWS * grid.first_edge + wp.where(side.is_back, grid.edge_count, 0)
     return side
 
@@ -91,7 +91,7 @@ def _side_normal(local_receiver: LocalReceiver, side: PlaneSide):
 
 @wp.func
 def _view_outline(
-    planes: PlaneArrays,
+    scene: PlaneArrays,
     grid: PlaneGrid,
     side: PlaneSide,
     local_receiver: LocalReceiver,
@@ -108,8 +108,8 @@ def _view_outline(
         - position[1] * local_receiver.axis_v
     )
     for e in range(grid.edge_count):
-        edge_ends = planes.edges[grid.first_edge + e]
-        axis = planes.edge_axes[grid.first_edge + e]
+        edge_ends = scene.edges[grid.first_edge + e]
+        axis = scene.edge_axes[grid.first_edge + e]
         a = foot + edge_ends[0] * local_receiver.axis_u + edge_ends[1] * local_receiver.axis_v
         b = foot + edge_ends[2] * local_receiver.axis_u + edge_ends[3] * local_receiver.axis_v
         n = wp.cross(a, axis[0] * local_receiver.axis_u + axis[1] * local_receiver.axis_v)
@@ -120,7 +120,7 @@ def _view_outline(
 
 @wp.func
 def _view_outline_adjoint(
-    planes: PlaneArrays,
+    scene: PlaneArrays,
     grid: PlaneGrid,
     side: PlaneSide,
     local_receiver: LocalReceiver,
@@ -133,8 +133,8 @@ def _view_outline_adjoint(
     adj_foot = wp.vec3()
     for e in range(grid.edge_count):
         edge = edges[side.first_edge + e]
-        edge_ends = planes.edges[grid.first_edge + e]
-        axis = planes.edge_axes[grid.first_edge + e]
+        edge_ends = scene.edges[grid.first_edge + e]
+        axis = scene.edge_axes[grid.first_edge + e]
         adj_n = (sign / edge.length) * edge.adj_normal
         adj_a = wp.cross(axis[0] * local_receiver.axis_u + axis[1] * local_receiver.axis_v, adj_n)
         adj_axis = wp.cross(adj_n, wp.where(side.is_back, edge.begin, edge.end))
@@ -156,7 +156,7 @@ def _view_outline_adjoint(
 
 @wp.func
 def _add_side(
-    planes: PlaneArrays,
+    scene: PlaneArrays,
     f: int,
     is_back: float,
     weight: float,
@@ -168,8 +168,8 @@ def _add_side(
     """Store a side with its outline if some of it is there; returns how many sides are stored."""
     if weight <= 0.0:
         return side_count
-    store[4 * planes.grids.shape[0] + side_count] = wp.vec3(float(f), is_back, weight)
-    _view_outline(planes, planes.grids[f], load_side(planes, side_count, store), local_receiver, edges)
+    store[4 * scene.grids.shape[0] + side_count] = wp.vec3(float(f), is_back, weight)
+    _view_outline(scene, scene.grids[f], load_side(scene, side_count, store), local_receiver, edges)
     return side_count + 1
 
 
@@ -180,7 +180,7 @@ def prepare_receiver(
     points: wp.array2d(dtype=wp.vec3),
     frames: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
-    planes: PlaneArrays,
+    scene: PlaneArrays,
     scratch: wp.array2d(dtype=wp.vec3),
     viewed_edges: wp.array2d(dtype=ViewedEdge),
 ):
@@ -193,14 +193,14 @@ def prepare_receiver(
     store, edges = scratch[scratch_row], viewed_edges[scratch_row]
     frame_batch = instance_in(batch, frames.shape[0])
     side_count = int(0)
-    for f in range(planes.grids.shape[0]):
+    for f in range(scene.grids.shape[0]):
         local_receiver = find_local_receiver(points[batch, receiver], frames[frame_batch], f)
         store_local_receiver(store, f, local_receiver)
-        if f != planes.skip and wp.length_sq(local_receiver.normal) > 0.0:
+        if f != scene.skip and wp.length_sq(local_receiver.normal) > 0.0:
             # below the plane the front fades, and the back takes over
-            front = front_of(fronts, planes.grids[f], local_receiver.position[2], batch, receiver, f)
-            side_count = _add_side(planes, f, 0.0, front, side_count, local_receiver, store, edges)
-            side_count = _add_side(planes, f, 1.0, 1.0 - front, side_count, local_receiver, store, edges)
+            front = front_of(fronts, scene.grids[f], local_receiver.position[2], batch, receiver, f)
+            side_count = _add_side(scene, f, 0.0, front, side_count, local_receiver, store, edges)
+            side_count = _add_side(scene, f, 1.0, 1.0 - front, side_count, local_receiver, store, edges)
     return batch, receiver, scratch_row, side_count
 
 
@@ -212,7 +212,7 @@ def prepare_receiver_adjoint(
     points: wp.array2d(dtype=wp.vec3),
     frames: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
-    planes: PlaneArrays,
+    scene: PlaneArrays,
     store: wp.array(dtype=wp.vec3),
     edges: wp.array(dtype=ViewedEdge),
     adj_store: wp.array(dtype=wp.vec3),
@@ -222,11 +222,11 @@ def prepare_receiver_adjoint(
 ):
     """Add to the gradients of points, fronts and frames."""
     for i in range(side_count):
-        side = load_side(planes, i, store)
-        grid = planes.grids[side.f]
+        side = load_side(scene, i, store)
+        grid = scene.grids[side.f]
         local_receiver = load_local_receiver(store, side.f)
         adj_receiver = _view_outline_adjoint(
-            planes, grid, side, local_receiver, edges, load_local_receiver(adj_store, side.f)
+            scene, grid, side, local_receiver, edges, load_local_receiver(adj_store, side.f)
         )
         adj_front = wp.where(side.is_back, -1.0, 1.0) * adj_store[side.row][2]
         adj_height = front_of_adjoint(
@@ -236,7 +236,7 @@ def prepare_receiver_adjoint(
         store_local_receiver(adj_store, side.f, adj_receiver)
     frame_batch = instance_in(batch, frames.shape[0])
     adj_point = wp.vec3()
-    for f in range(planes.grids.shape[0]):
+    for f in range(scene.grids.shape[0]):
         local_receiver, adj_receiver = load_local_receiver(store, f), load_local_receiver(adj_store, f)
         adj_point += find_local_receiver_adjoint(
             points[batch, receiver], frames[frame_batch], f, local_receiver, adj_receiver, frame_batch, adj_frames
@@ -254,28 +254,28 @@ class VisibleCell:
 
 
 @wp.func
-def visible_cell(planes: PlaneArrays, normal: wp.vec3, direction: wp.vec3):
+def visible_cell(scene: PlaneArrays, normal: wp.vec3, direction: wp.vec3):
     """The largest disc in a cell that is above the horizon of a receiver in a plane; the cell itself for others.
 
     Below its horizon nothing covers the cell but the receiver's own plane, which is not asked.
     """
     cell = VisibleCell()
     cell.direction = direction
-    cell.radius = planes.radius
+    cell.radius = scene.radius
     cosine = wp.dot(normal, direction)
-    if planes.skip >= 0 and cosine > 0.0 and cosine < planes.radius:
-        cell.direction = wp.normalize(direction + (0.5 * (planes.radius - cosine)) * (normal - cosine * direction))
-        cell.radius = 0.5 * (planes.radius + cosine)
+    if scene.skip >= 0 and cosine > 0.0 and cosine < scene.radius:
+        cell.direction = wp.normalize(direction + (0.5 * (scene.radius - cosine)) * (normal - cosine * direction))
+        cell.radius = 0.5 * (scene.radius + cosine)
     return cell
 
 
 @wp.func
 def footprint_on_side(
-    planes: PlaneArrays, grid: PlaneGrid, side: PlaneSide, local_receiver: LocalReceiver, direction: wp.vec3
+    scene: PlaneArrays, grid: PlaneGrid, side: PlaneSide, local_receiver: LocalReceiver, direction: wp.vec3
 ):
     """Find the footprint of a cell on a side."""
     return find_footprint(
-        planes,
+        scene,
         position_on_side(grid, local_receiver, side.is_back),
         direction_on_side(local_receiver, side.is_back, direction),
     )
@@ -283,7 +283,7 @@ def footprint_on_side(
 
 @wp.func
 def footprint_on_side_adjoint(
-    planes: PlaneArrays,
+    scene: PlaneArrays,
     grid: PlaneGrid,
     side: PlaneSide,
     local_receiver: LocalReceiver,
@@ -299,16 +299,16 @@ def footprint_on_side_adjoint(
     Given are the gradients of :func:`.cells.fetch`, of the distance t, and of the radius t ρ / c′ of the footprint.
     """
     adj_cosine = -footprint.per_cosine * (
-        adj_radius * planes.radius * footprint.distance * footprint.per_cosine + 0.5 * adj_mip[2]
+        adj_radius * scene.radius * footprint.distance * footprint.per_cosine + 0.5 * adj_mip[2]
     )
-    adj_t = adj_distance + adj_radius * planes.radius * footprint.per_cosine
+    adj_t = adj_distance + adj_radius * scene.radius * footprint.per_cosine
     if adj_mip[2] != 0.0:  # texels are as wide as t / √c′
         adj_t += adj_mip[2] / footprint.distance
     local_direction, adj_center = (
         direction_on_side(local_receiver, side.is_back, direction),
         wp.vec2(adj_mip[0], adj_mip[1]),
     )
-    adj_at, adj_toward = find_footprint_adjoint(planes, local_direction, footprint, adj_t, adj_cosine, adj_center)
+    adj_at, adj_toward = find_footprint_adjoint(scene, local_direction, footprint, adj_t, adj_cosine, adj_center)
     adj_local_receiver = load_local_receiver(adj_store, side.f)
     store_local_receiver(
         adj_store,
@@ -319,7 +319,7 @@ def footprint_on_side_adjoint(
 
 @wp.func
 def outline_coverage_on_side(
-    planes: PlaneArrays,
+    scene: PlaneArrays,
     grid: PlaneGrid,
     side: PlaneSide,
     local_receiver: LocalReceiver,
@@ -328,7 +328,7 @@ def outline_coverage_on_side(
 ):
     """Coverage (h, μ) of a cell by the outline of a plane, as much of it as is seen of the side."""
     side_normal = _side_normal(local_receiver, side)
-    if wp.dot(side_normal, cell.direction) <= -planes.radius:
+    if wp.dot(side_normal, cell.direction) <= -scene.radius:
         return wp.vec4()
     first_edge_index, count = side.first_edge, grid.edge_count
     if grid.is_convex == 1:
