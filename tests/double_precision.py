@@ -34,7 +34,10 @@ _KERNEL_DECORATORS = ("wp.kernel", "wp.func", "wp.struct")  # so wp.func_native 
 
 
 def build(folder: Path) -> ModuleType:
-    """Write the float64 build into a folder and import it; its modules are imported as ``double_warpshadow.raster``."""
+    """Write the float64 build into a folder and import it.
+
+    Its modules are imported as ``double_warpshadow.stages.rasterization``.
+    """
     package = Path(warpshadow.__file__).parent
     for path in package.rglob("*.py"):
         target = folder / NAME / path.relative_to(package)

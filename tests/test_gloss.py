@@ -75,6 +75,15 @@ def test_an_explanation_changes_no_later_call(bounces):
     np.testing.assert_array_equal(renderer.render(other), ws.Renderer(scene_of(bounces=bounces)).render(other))
 
 
+@pytest.mark.parametrize("sampling", ["independent", "shared"])
+def test_rays_light_the_blockers_of_lobes_again_after_other_light(sampling):
+    visibility = ws.Visibility("ray-traced", samples=64, sampling=sampling)
+    renderer = ws.Renderer(scene_of(bounces=1, visibility=visibility))
+    image = renderer.render()
+    renderer.render(ws.EnvironmentMap.constant())
+    np.testing.assert_array_equal(renderer.render(), image)
+
+
 def test_explanations_and_photographs_take_gloss():
     """In a photograph the ball is as rough as in a scene that says so; a call that gives it samples its lobes again."""
     caught = dataclasses.replace(GROUND, shadow_catcher=True)

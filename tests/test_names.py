@@ -88,6 +88,35 @@ def docstrings(tree: ast.Module) -> Iterator[tuple[str, int]]:
                 yield value.value.strip(), child.lineno
 
 
+CLASSES = {node.name: node for _, tree in trees() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+
+
+def arguments(node: ast.AST) -> set[str]:
+    """Arguments of a function; of a class those of its constructor, and its fields, inherited ones included."""
+    if isinstance(node, ast.FunctionDef):
+        signature = node.args
+        variable = [argument for argument in (signature.vararg, signature.kwarg) if argument is not None]
+        return {item.arg for item in (*signature.posonlyargs, *signature.args, *signature.kwonlyargs, *variable)}
+    names = set()
+    for child in node.body:
+        if isinstance(child, ast.FunctionDef) and child.name == "__init__":
+            names |= arguments(child)
+        elif isinstance(child, ast.AnnAssign):
+            names.add(child.target.id)
+    bases = [CLASSES[base.id] for base in node.bases if isinstance(base, ast.Name) and base.id in CLASSES]
+    return names.union(*map(arguments, bases))
+
+
+def documented_arguments(docstring: str) -> Iterator[str]:
+    """Names of the entries of a docstring's section "Args"."""
+    section = re.search(r"^Args:\n((?: +.*\n?|\n)*)", docstring, re.MULTILINE)
+    lines = section[1].splitlines() if section else []
+    indents = [len(line) - len(line.lstrip()) for line in lines]
+    for line, indent in zip(lines, indents, strict=True):
+        if line.strip() and indent == indents[0]:
+            yield from (name.strip(" *") for name in line.partition(":")[0].split(","))
+
+
 def test_no_two_classes_have_one_name():
     counts = Counter(node.name for _, tree in trees() for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
     assert len(counts) > 200 and not [name for name, count in counts.items() if count > 1]
@@ -110,3 +139,17 @@ def test_no_docstring_begins_with_what():
     texts = [(f"{path}:{line}", text) for path, tree in trees() for text, line in docstrings(tree)]
     assert len(texts) > 1000
     assert not [f"{place}: {text[:60]}" for place, text in texts if text.startswith(FIRST_WORDS)]
+
+
+def test_docstrings_document_arguments_that_are_there():
+    """Of functions, kernels and structs, too: an entry under "Args" is an argument of the signature, or a field."""
+    unknown, count = [], 0
+    for path, tree in trees():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and "Args:" in (
+                docstring := ast.get_docstring(node) or ""
+            ):
+                names, count = list(documented_arguments(docstring)), count + 1
+                assert names, f"{path}:{node.lineno}"
+                unknown += [f"{path}:{node.lineno} {node.name}: {name}" for name in set(names) - arguments(node)]
+    assert count > 450 and not unknown

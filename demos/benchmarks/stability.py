@@ -441,9 +441,8 @@ def plot(overlap: dict[str, list[float]], thresholds: dict[str, list[float]], pa
 
 def main(output: Path) -> None:
     ws.quiet()
-    warnings.filterwarnings(
-        "ignore", message="log-SH visibility"
-    )  # of squarings that are held: some cases are for them
+    # of squarings that are held: some cases are for them
+    warnings.filterwarnings("ignore", message="log-SH visibility")
 
     print_header("scene", "visibility")
     scenes = twins.hard_scenes()

@@ -108,9 +108,8 @@ def recover_light(scene: ws.Scene, target: np.ndarray, iterations: int) -> tuple
     still = ws.Visibility(method="none" if scene.visibility.method == "none" else "ray-traced")
     light = inverse.Light(None, directions=CELLS)
     problem = inverse.Problem(unknown, inverse.Target(target), light, still=still)
-    stage = inverse.Stage(
-        iterations, learning_rate=0.15, scale=0.5
-    )  # a quarter of the pixels tells as much of the light
+    # a quarter of the pixels tells as much of the light
+    stage = inverse.Stage(iterations, learning_rate=0.15, scale=0.5)
     result = inverse.fit(problem, [stage], progress=True)
     return result.scene.light, time.perf_counter() - start
 

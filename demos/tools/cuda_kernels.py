@@ -49,10 +49,10 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
     },
     **{
         f"{make.__name__} {order} {is_shadowed}": partial(make, order, is_shadowed, LANES)
-        for make in (transfer._sh_transfer_kernel, transfer._sh_transfer_adjoint_kernel)
+        for make in (transfer._make_sh_transfer, transfer._make_sh_transfer_adjoint)
         for order, is_shadowed in [(2, True), (8, True), (8, False)]
     },
-    **{f"_sh_product_kernel {order}": partial(transfer._sh_product_kernel, order, LANES) for order in ORDERS},
+    **{f"_make_sh_product {order}": partial(transfer._make_sh_product, order, LANES) for order in ORDERS},
     **{f"_make_evaluate_rotated {order}": partial(lobes._make_evaluate_rotated, order) for order in ORDERS},
     **{
         f"{make.__name__} {dtype.__name__}": partial(make, dtype)

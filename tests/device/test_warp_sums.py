@@ -65,7 +65,7 @@ float __shfl_sync(unsigned mask, float value, int source) {
 }
 
 const int COUNT = 2;
-void sum_of_peers(float* sums, int place) { BODY }
+void sum_of_peers(float* sums, int index) { BODY }
 
 int main() {
     int places[32]; float values[32][COUNT];

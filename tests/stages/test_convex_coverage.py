@@ -145,9 +145,8 @@ def test_prisms_of_a_body_cover_their_seam_once(device):
 
 
 def test_narrow_cells_and_a_receivers_own_body_are_left_to_it(device):
-    toward = (
-        np.concatenate([VERTICES[0], VERTICES[1]])[:16] - POINTS[0] + 0.004
-    )  # beside corners, where silhouettes are
+    # beside corners, where silhouettes are
+    toward = np.concatenate([VERTICES[0], VERTICES[1]])[:16] - POINTS[0] + 0.004
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     got = of_kernel(POINTS[[0]], device, toward, radius=0.02, skip=1)[0]
     expected = twin(POINTS[0], toward, 0.02, BODIES[:1])

@@ -73,9 +73,8 @@ def test_without_its_spot_a_cell_has_the_light_around_it():
     changed = np.flatnonzero((around.radiance != cells.radiance).any(axis=1))
     assert set(found) <= set(changed)
     assert (light.directions()[rest[..., 0] == 0] @ SUN > np.cos(3.5 * HALF_ANGLE)).all()
-    cap = (
-        (1 - np.cos(2 * cells.half_angles[found])) * CELLS / 2
-    )  # its share of a cell; two suns' caps may reach out of it
+    # its share of a cell; two suns' caps may reach out of it
+    cap = (1 - np.cos(2 * cells.half_angles[found])) * CELLS / 2
     assert (around.radiance[found, 0] < 0.21).all()
     assert (around.radiance[found, 0] > 0.2 * (0.75 - cap)).all()
 

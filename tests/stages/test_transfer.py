@@ -145,9 +145,8 @@ def test_a_blocked_receiver_is_darker_by_either_method_and_alike(device):
     centers = wp.array(np.float32([[[0, np.sqrt(2), 0]]]), dtype=wp.vec3, device=device)
     radii = wp.ones((1, 1), dtype=wp.float32, device=device)
     visibility = exponential.exponentiate(log_sh.accumulate(points, normals, centers, radii, order=8))
-    assert (
-        abs(sh_transfer(visibility, normals, order=8).numpy()[0, 0, 0] * twins.UNIT - 0.5) < 0.03
-    )  # truncated to 8 bands
+    # truncated to 8 bands
+    assert abs(sh_transfer(visibility, normals, order=8).numpy()[0, 0, 0] * twins.UNIT - 0.5) < 0.03
     directions = cells.fibonacci(256)
     transmittance = directional.transmittance(points, normals, centers, radii, directions)
     assert abs(directional_transfer(transmittance, normals, directions).numpy().sum() - 0.5) < 0.02

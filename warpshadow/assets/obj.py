@@ -113,9 +113,9 @@ def read_by_line(text: str) -> ObjItems:
                     materials.add(material)
                     corner_counts.append(len(tokens))
                     for token in tokens:
-                        vertex, _, other_lines = token.partition("/")
+                        vertex, _, uv_and_normal = token.partition("/")
                         corners.append(_index(vertex, len(positions)))
-                        if uv := other_lines.partition("/")[0]:
+                        if uv := uv_and_normal.partition("/")[0]:
                             uv_corners.append(_index(uv, len(uvs)))
                 case ["v" | "vt", *coordinates]:
                     raise ValueError(f"{len(coordinates)} coordinates are too few")

@@ -48,9 +48,8 @@ def synthetic_sky(
     sun = sun / np.linalg.norm(sun)
     pixel_directions, weights = sh.equirectangular_directions(height), sh.pixel_solid_angles(height)[:, None]
     edges = np.minimum(np.pi * np.arange(height + 1) / height, np.pi / 2)
-    horizontal_weights = (
-        np.pi / height * np.diff(np.sin(edges) ** 2 / 2)[:, None]
-    )  # ∫ max(cos θ, 0) dω over a pixel of each row
+    # ∫ max(cos θ, 0) dω over a pixel of each row
+    horizontal_weights = np.pi / height * np.diff(np.sin(edges) ** 2 / 2)[:, None]
     heights = pixel_directions[..., 1]
     is_above = heights > 0
     sun_angle = np.arccos(np.clip(pixel_directions @ sun, -1, 1))

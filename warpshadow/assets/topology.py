@@ -258,10 +258,8 @@ def join_faces(positions: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | 
     """Join faces of which none is listed twice."""
     position_ids = number_positions(positions)[faces]
     neighbors = edge_neighbors(position_ids)
-    first, last = (
-        np.roll(position_ids, -1, axis=1),
-        np.roll(position_ids, -2, axis=1),
-    )  # of the edges opposite to corners
+    # of the edges opposite to corners
+    first, last = np.roll(position_ids, -1, axis=1), np.roll(position_ids, -2, axis=1)
     neighbor = np.maximum(neighbors, 0)
     runs_back = (first[neighbor] == last[:, :, None]) & (last[neighbor] == first[:, :, None])
     winds_alike = runs_back.any(axis=2) | (neighbors < 0)

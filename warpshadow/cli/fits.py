@@ -177,8 +177,8 @@ def dataset(
     from warpshadow.dataset import DataSet, load_recipe, write_shards
 
     with clear_errors():
-        loaded_fit = load_recipe(recipe)
-        data_set = DataSet(loaded_fit, device=device_of(device))
+        loaded_recipe = load_recipe(recipe)
+        data_set = DataSet(loaded_recipe, device=device_of(device))
         start, existing_shards = time.perf_counter(), {*output.glob("*.tar")}
         try:
             shards = write_shards(data_set, output, workers=workers)
@@ -191,4 +191,6 @@ def dataset(
             if {*shards} - existing_shards
             else f"all there before; to make them anew, remove {output}"
         )
-        note(f"{output}: {len(shards)} shards, {loaded_fit.images} images, {size / 1e6:.3g} MB, {made_text}", is_quiet)
+        note(
+            f"{output}: {len(shards)} shards, {loaded_recipe.images} images, {size / 1e6:.3g} MB, {made_text}", is_quiet
+        )

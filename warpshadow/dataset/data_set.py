@@ -164,7 +164,7 @@ class _ReadMesh(NamedTuple):
     """A mesh as it was read."""
 
     body: Body  # with its spheres, creased if that is wanted
-    content_hash: str  # hash the file's content, with its colors and texture, but not how it is creased
+    content_hash: str  # of the file's content, with its colors and texture, but not how it is creased
 
 
 @functools.lru_cache(_CACHED_BODIES)

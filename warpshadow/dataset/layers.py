@@ -57,7 +57,7 @@ def _named(names: Sequence[str], values: np.ndarray) -> Channels:
 class Layer(NamedTuple):
     """A layer of pixels."""
 
-    find: Callable[[LazyLayers], Channels]  # find its channels
+    find: Callable[[LazyLayers], Channels]  # finds its channels
     coding: Coding  # how PNG has their numbers
     is_apart: bool = False  # whether each channel is a picture of its own
 

@@ -3,8 +3,8 @@
 PNG has whole numbers, codes. The range of the codes differs from image to image; it is stored beside each picture, so
 that the channels can be decoded, but for rounding:
 
-    values = (low (most − code) + high code) / most,   of most = 255 or 65535, range = [low, high]
-    color  = alpha sRGB⁻¹(code / 255) / 2^exposure,    alpha = code / 255
+    values = (low (maximum − code) + high code) / maximum,   of maximum = 255 or 65535, range = [low, high]
+    color  = alpha sRGB⁻¹(code / 255) / 2^exposure,          alpha = code / 255
 
 Nothing is cut off: a range is as wide, and an exposure as low, as an image needs. Only color below 0, which sRGB has
 not, becomes 0: it is said of which part of the pixels.

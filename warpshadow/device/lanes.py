@@ -168,7 +168,7 @@ def _set_vector_options(module_name: str) -> None:
 
 
 def block_count(vertex_count: int, lanes: int) -> int:
-    """Groups, and so threads, that ``vertex_count`` receivers take."""
+    """Blocks, and so threads, that ``vertex_count`` receivers take."""
     return -(-vertex_count // lanes)
 
 

@@ -99,9 +99,9 @@ def without_gradient(array: wp.array) -> wp.array:
     """View an array without its gradient."""
     if not array.requires_grad:
         return array
-    flat_array = reshaped(array, array.shape)
-    flat_array.requires_grad = False
-    return flat_array
+    view = reshaped(array, array.shape)
+    view.requires_grad = False
+    return view
 
 
 def _require_gradient(output: wp.array, kernel: wp.Kernel) -> None:

@@ -33,7 +33,7 @@ ENVIRONMENT_VARIABLE = "WARPSHADOW_NUM_THREADS"
 _MIN_WORK = 1.0e5  # minimum work of a slice [ns]: waking a thread and fetching its inputs take a third of that
 _MIN_SUMMED_WORK = 3.0e5  # the same where a slice has sums of its own, which are zeroed and added up
 _SLICES_PER_THREAD = 4  # rows differ in cost; threads that finish early take the remaining slices
-_SUMMED_SLICES = 16  # most slices of a launch whose sums are its slices' own
+_SUMMED_SLICES = 16  # most slices of a launch in which each slice has sums of its own
 _SUMMED_SIZE = 100_000  # items that the sums of all slices have at most, beyond two slices: they are to be added up
 
 _thread_count: int | None = None

@@ -1,4 +1,4 @@
-"""Sums over warps: threads of a GPU that add to one place at the same time sum first, and one of them adds.
+"""Sums over warps: threads of a GPU that add to one number at the same time sum first, and one of them adds.
 
 Thousands of receivers add to the gradients of a few dozen spheres, and an atomic for each would queue up at a few
 addresses. The 32 threads of a warp reach a sphere together, so they need one atomic (``warp_lanes.py`` among
@@ -8,7 +8,7 @@ the demos' tools counts them). On a CPU, whose threads have sums of their own, a
 import warp as wp
 
 SUM_OF_PEERS = """
-    const unsigned peers = __match_any_sync(__activemask(), place);
+    const unsigned peers = __match_any_sync(__activemask(), index);
     const int lane = threadIdx.x & 31;
     int rank = __popc(peers & ((1u << lane) - 1u));
     const bool is_first = rank == 0;
@@ -26,10 +26,10 @@ SUM_OF_PEERS = """
     for (int k = 0; k < COUNT; ++k)
         sums[k] = is_first ? sums[k] : 0.0f;
 """
-"""CUDA: sums[COUNT] of the threads with the same place, on the first of them, and 0 on the others.
+"""CUDA: sums[COUNT] of the active threads with the same index, on the first of them, and 0 on the others.
 
-The threads that are here with one place, *peers*, halve their number in each step: peers of odd rank have given their
-sums to the one before and are left out.
+Active threads with one index, *peers*, halve their number in each step: peers of odd rank have given their sums to the
+one before and are left out.
 """
 
 
@@ -43,8 +43,8 @@ sums to the one before and are left out.
     return value;
 #endif
 """)
-def sum_over_warp(value: float, place: int) -> float:  # type: ignore[empty-body]
-    """Sum of the values of a warp's threads that are here with the same place, on one of them; on the others 0."""
+def sum_over_warp(value: float, index: int) -> float:  # type: ignore[empty-body]
+    """Sum of the values of a warp's active threads with the same index, on one of them; on the others 0."""
     ...
 
 
@@ -58,6 +58,6 @@ def sum_over_warp(value: float, place: int) -> float:  # type: ignore[empty-body
     return values;
 #endif
 """)
-def sums_over_warp(values: wp.vec4, place: int) -> wp.vec4:
+def sums_over_warp(values: wp.vec4, index: int) -> wp.vec4:
     """:func:`sum_over_warp` of four values."""
     ...

@@ -113,13 +113,13 @@ def run_tasks(
                 assert worker.has is not None
                 task, attempt = worker.has
                 try:
-                    packed_task = worker.connection.recv_bytes()
+                    packed_result = worker.connection.recv_bytes()
                     if not worker.has_started:  # the first that it says
                         worker.has_started = True
                         busy[connection] = worker
                         continue
                     idle.append(worker)
-                    result, error = unpack(packed_task)
+                    result, error = unpack(packed_result)
                 except (EOFError, OSError):
                     status = worker.end()
                     if not worker.has_started and status is not None and status >= 0:

@@ -229,9 +229,8 @@ class _Descent:
             return False
         stages = self.stages[self.stage : self.stage + 2]
         if len({tuple(free.name for free in self.problem.free if _descends(free, item)) for item in stages}) > 1:
-            ranked_candidates = [
-                candidate._replace(curvature=None) for candidate in ranked_candidates
-            ]  # of other parameters
+            # curvature of other parameters
+            ranked_candidates = [candidate._replace(curvature=None) for candidate in ranked_candidates]
         self.stage += 1
         self.candidates, self.ended = self._candidates_of_stage(ranked_candidates), []
         self.begin_stage()
@@ -292,7 +291,7 @@ class _Descent:
         for group in self.optimizer.param_groups:
             group["lr"] = stage.rate(len(self.losses[-1]))
         evaluated_losses: list[float] = []
-        earlier: dict[str, Values] = {}
+        evaluated_values: dict[str, Values] = {}
 
         def closure() -> float:
             self.optimizer.zero_grad()
@@ -303,7 +302,7 @@ class _Descent:
                     raise  # values that were bad from the beginning
                 raise _Diverged(str(error)) from error
             if not evaluated_losses:  # with the light that was solved for there
-                earlier.update(_copied(self.values))
+                evaluated_values.update(_copied(self.values))
             self.images = None if images is None else images.detach()
             _check_finite({"the images": images, "the loss": loss})
             loss.backward()
@@ -318,7 +317,7 @@ class _Descent:
         losses = self.losses[-1]
         losses.append(evaluated_losses[0])
         if losses[-1] == min(losses):
-            self.best = earlier
+            self.best = evaluated_values
         _check_finite(self.tensors)
 
 
@@ -402,7 +401,7 @@ def fit(
     stages = stages_for(stages, problem)
     if not callable(optimizer):
         raise ValueError(
-            f"optimizer: got {check.described(optimizer)}, expected what makes one of tensors and lr, such as "
+            f"optimizer: got {check.described(optimizer)}, expected a function (tensors, lr) → optimizer, such as "
             "torch.optim.Adam"
         )
     torch_device = torch.device(wp.device_to_torch(check.device("device", str(device))))

@@ -233,13 +233,13 @@ def _file_stamps(file: Path) -> Iterator[str]:
     except ValueError:  # which the fit says, too
         return
     for name in sorted(set(_strings_in(table))):
-        named_fits = file.parent / name
+        named_file = file.parent / name
         with contextlib.suppress(OSError, ValueError):  # a text that is no name of a file
-            if named_fits.is_file():
-                status = named_fits.stat()
+            if named_file.is_file():
+                status = named_file.stat()
                 yield f"{name} {status.st_size} {status.st_mtime_ns}"
-                if named_fits.suffix == ".toml" and named_fits != file:
-                    yield from _file_stamps(named_fits)
+                if named_file.suffix == ".toml" and named_file != file:
+                    yield from _file_stamps(named_file)
 
 
 def _strings_in(value: object) -> Iterator[str]:
@@ -353,50 +353,50 @@ def find_fits(where: AnyPath | Sequence[AnyPath]) -> dict[str, Path]:
         ValueError: where the results of two would be in one folder.
     """
     if not isinstance(where, (str, os.PathLike)):
-        fitted = [check.file("file", item).absolute() for item in where]
-        return _names_of_files(fitted, Path(os.path.commonpath([file.parent for file in fitted])), _FIT_FILE)
+        fit_files = [check.file("file", item).absolute() for item in where]
+        return _names_of_files(fit_files, Path(os.path.commonpath([file.parent for file in fit_files])), _FIT_FILE)
     path, text = Path(where), os.fspath(where)
     if path.is_dir():
-        start, fitted, last = path, sorted(path.rglob(_FIT_FILE)), _FIT_FILE
+        start, fit_files, last = path, sorted(path.rglob(_FIT_FILE)), _FIT_FILE
     elif path.suffix == ".txt":
         lines = (line.strip() for line in check.file("file", path).read_text(encoding="utf-8").splitlines())
-        start, fitted, last = path.parent, [path.parent / line for line in lines if line], _FIT_FILE
+        start, fit_files, last = path.parent, [path.parent / line for line in lines if line], _FIT_FILE
     else:
         start = Path(*itertools.takewhile(lambda part: not glob.has_magic(part), path.parts))
-        fitted = sorted(item for item in map(Path, glob.glob(text, recursive=True)) if item.is_file())
+        fit_files = sorted(item for item in map(Path, glob.glob(text, recursive=True)) if item.is_file())
         last = path.name
-    if not fitted:
+    if not fit_files:
         raise FileNotFoundError(f"{where}: no fit file, expected some")
-    return _names_of_files(fitted, start, last)
+    return _names_of_files(fit_files, start, last)
 
 
 def _names_of_files(files: Iterable[Path], start: Path, last: str) -> dict[str, Path]:
-    """Map each file to its path relative to `start`, without the last component."""
-    named_fits: dict[str, Path] = {}
+    """Name each file by its path relative to ``start``, without ``last``, the name of a file, or else its suffix."""
+    file_of_names: dict[str, Path] = {}
     for file in files:
         relative = PurePath(os.path.relpath(file, start))
         inner = relative.parent if file.name == last else relative.with_suffix("")
         name = "/".join(part for part in inner.parts if part != "..") or start.resolve().name
-        if name in named_fits:
-            raise ValueError(f"got {named_fits[name]} and {file}, whose results would both be called {name!r}")
-        named_fits[name] = file
-    _check_names(named_fits)
-    return named_fits
+        if name in file_of_names:
+            raise ValueError(f"got {file_of_names[name]} and {file}, whose results would both be called {name!r}")
+        file_of_names[name] = file
+    _check_names(file_of_names)
+    return file_of_names
 
 
 def _check_names(names: Collection[str]) -> None:
     """Raise ValueError unless each name is that of a folder of its own."""
-    named_fits: dict[PurePath, str] = {}
+    name_of_paths: dict[PurePath, str] = {}
     for name in names:
         path = PurePath(name)
         if not path.parts or path.is_absolute() or ".." in path.parts or path == PurePath(TABLE):
             raise ValueError(f"fits: got the name {name!r}, expected that of a folder in the folder of results")
-        if path in named_fits:
-            raise ValueError(f"fits: got the names {named_fits[path]!r} and {name!r} of one folder")
-        named_fits[path] = name
-    for path, name in named_fits.items():
+        if path in name_of_paths:
+            raise ValueError(f"fits: got the names {name_of_paths[path]!r} and {name!r} of one folder")
+        name_of_paths[path] = name
+    for path, name in name_of_paths.items():
         for outer in path.parents:
-            if outer in named_fits:
+            if outer in name_of_paths:
                 raise ValueError(
-                    f"fits: got the names {named_fits[outer]!r} and {name!r}, of which one is in the other"
+                    f"fits: got the names {name_of_paths[outer]!r} and {name!r}, of which one is in the other"
                 )

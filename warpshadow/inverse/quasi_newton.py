@@ -118,9 +118,8 @@ class QuasiNewton(torch.optim.Optimizer):
             self._add_curvature_pair(step, change)
         loss_increase = loss - memory["loss"]
         if loss_increase >= 0 and length > 0:
-            lower_bound = (
-                -slope / (2 * (loss_increase - slope)) if loss_increase > slope else _MAX_BOUND_FACTOR
-            )  # of the parabola through both
+            # of the parabola through both
+            lower_bound = -slope / (2 * (loss_increase - slope)) if loss_increase > slope else _MAX_BOUND_FACTOR
             memory["bound"] = length * min(max(lower_bound, _MIN_BOUND_FACTOR), _MAX_BOUND_FACTOR)
             return
         if length > 0.8 * memory["bound"]:

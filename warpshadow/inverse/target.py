@@ -214,7 +214,7 @@ def stacked(targets: Sequence[Target], scale: float, device: torch.device) -> St
 
 
 def area_means(count: int, coarse_count: int) -> torch.Tensor:
-    """Averages of a row of pixels by area, [fewer, count]; ``coarse_count`` need not be a part of ``count``."""
+    """Averages of a row of pixels by area, [coarse_count, count]; ``coarse_count`` need not be a part of ``count``."""
     edges, coarse_edges = np.arange(count + 1), np.arange(coarse_count + 1) * (count / coarse_count)
     ends = np.minimum(edges[1:], coarse_edges[1:, None])
     starts = np.maximum(edges[:-1], coarse_edges[:-1, None])

@@ -212,12 +212,12 @@ class NormalMatrix:
 
     def _difference(self, direction: np.ndarray) -> np.ndarray:
         """Derivative of the residuals along a direction of the numbers."""
-        start, slope_pair = self.values, []
+        start, residual_pair = self.values, []
         for values in (self.moved(_STEP * direction), self.moved(-_STEP * direction)):
             self.values = values
-            slope_pair.append(self._residuals())
+            residual_pair.append(self._residuals())
         self.values = start
-        return (slope_pair[0] - slope_pair[1]) / (2 * _STEP)
+        return (residual_pair[0] - residual_pair[1]) / (2 * _STEP)
 
     def _project_light(self) -> float:
         """Take the best change of the light out of the columns; the relative deviation of its total."""
@@ -312,8 +312,8 @@ def _pose_uncertainty(free: Pose, normal: NormalMatrix, covariance: np.ndarray) 
     rows = [index for index, (name, _, _) in enumerate(normal.parameter_entries) if name in names]
     _, center, scale = normal.posed(free)
     half = setting.extent(free.number) * float(scale)
-    slope_pair = normal.slopes(free, rows)
-    cov = slope_pair @ covariance[np.ix_(rows, rows)] @ slope_pair.T
+    slopes = normal.slopes(free, rows)
+    cov = slopes @ covariance[np.ix_(rows, rows)] @ slopes.T
     units = np.array([1.0] * 3 + [half] * 3)  # a turn by a radian moves vertices about as far
     sizes, directions = np.linalg.eigh(cov * units[:, None] * units)
     weakest_direction = np.sqrt(max(sizes[-1], 0.0)) * directions[:, -1]
@@ -333,9 +333,7 @@ def _pose_uncertainty(free: Pose, normal: NormalMatrix, covariance: np.ndarray) 
 def candidates_along_flat_direction(
     problem: Problem, setting: Setting, values: Mapping[str, Values], count: int
 ) -> list[dict[str, Values]]:
-    """Values displaced along the least determined direction of the poses, both ways, farther and
-    farther; the light is solved for anew.
-    """
+    """Displace values along the least determined direction of the poses, both ways, and solve for the light anew."""
     normal = NormalMatrix(problem, setting, values)
     poses = [index for index, (name, _, _) in enumerate(normal.parameter_entries) if name.startswith(f"{Pose.key}[")]
     weakest_direction = np.zeros(len(normal.parameter_entries))

@@ -71,14 +71,14 @@ def falloff_width(softness: float, count: int) -> float:
 
 
 def brightest_chunk(power: np.ndarray, is_candidate: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The 16 brightest of the chosen cells; where there are fewer, each fills several places among 16.
+    """The 16 brightest of the candidate cells; where there are fewer, each fills several of 16 slots.
 
     Args:
         power: Light of each cell [direction].
         is_candidate: Whether a cell may be among them, bool of shape [direction].
     Returns:
-        Their numbers, ascending, [cell]; which of them fills each place, [16]; and the first place of each of all
-        cells, −1 for the others, [direction].
+        Their numbers, ascending, [cell]; which of them fills each slot, [16]; and the first slot of each of all cells,
+        −1 for the others, [direction].
     """
     cells = np.flatnonzero(is_candidate)
     cells = np.sort(cells[np.argsort(-power[cells], kind="stable")[:CHUNK]])

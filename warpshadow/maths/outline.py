@@ -104,8 +104,9 @@ def cut_outline(points: np.ndarray, edges: np.ndarray, maximum: int) -> list[np.
 
 
 class _Cuts:
-    """An outline, and the lines that cut it: ends of lines from each corner, counterclockwise, first the edge after it
-    and last the edge before it.
+    """An outline, and the lines that cut it.
+
+    It lists the ends of the lines from each corner, counterclockwise: first the edge after it, last the edge before it.
     """
 
     def __init__(self, points: np.ndarray, edges: np.ndarray):

@@ -243,8 +243,8 @@ class PortionedShading(Node):
         self_visibility = self_visibility_node(method, points, projected_light)
         shadows = _static_shadows(method, points, light)
         planes = points.blocker_kinds.planes
-        place = functools.partial(method.blockers, points.blocker_kinds)
-        blockers = points.cached("blockers", None, lambda: Node("", place, points.vertices, spheres))
+        place_blockers = functools.partial(method.blockers, points.blocker_kinds)
+        blockers = points.cached("blockers", None, lambda: Node("", place_blockers, points.vertices, spheres))
         self._is_shaded = light is not None and is_shaded
         self._is_transferred = not (self._is_shaded and method.shades_transmittance)
         self._visibility = NodeStage(

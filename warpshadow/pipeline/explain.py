@@ -120,9 +120,8 @@ def decide(image: Node, call: Call) -> dict[Node, Decision]:
         if reason:
             requested.add(node)
         node_decision = _decision(node, call, reason)
-        is_idle = (
-            not node_decision and node.value_if_known(call) is None
-        )  # an idle node passes the question on to its inputs
+        # an idle node passes the question on to its inputs
+        is_idle = not node_decision and node.value_if_known(call) is None
         for item in node.before:
             visit(item, reason if is_idle else node_decision)
         decisions[node] = node_decision

@@ -85,11 +85,11 @@ def splice(whole: wp.array, runs: Sequence[tuple[int, int]], part_of: Callable[[
 
     Args:
         whole: Shape [batch, item].
-        runs: Where each begins and ends, rising.
+        runs: Where each range begins and ends, rising.
         part_of: Returns the replacement of a range, shape [batch, item], given its begin and end.
     Returns:
         Shape [batch, item], memory of its own; batches of 1 serve every instance of the others.
-    Differentiable: whole, where nothing takes its place, and parts.
+    Differentiable: whole, where no part replaces it, and the parts.
     """
     pieces, last = [] if runs else [whole], 0
     for first, end in runs:

@@ -157,7 +157,7 @@ def _spans(is_glossy: np.ndarray, receivers: Receivers) -> list[Span]:
 
 
 def _numbers(is_glossy: np.ndarray, receivers: Receivers) -> wp.array:
-    """Of each receiver of a view among the glossy ones, −1 for diffuse ones, int32 of shape [receiver]."""
+    """Index of each receiver of a view among the glossy ones, −1 for diffuse ones, int32 of shape [receiver]."""
     first = len(receivers.on_static)
     numbers, count = np.full(first + receivers.points.shape[1], -1, np.int32), 0
     for span in _spans(is_glossy, receivers):
@@ -167,7 +167,7 @@ def _numbers(is_glossy: np.ndarray, receivers: Receivers) -> wp.array:
 
 
 def _chosen(light: wp.array, receivers: Receivers, is_glossy: np.ndarray) -> wp.array:
-    """Light or else of the glossy ones among a view's receivers, shape [batch, receiver]. Differentiable: light."""
+    """Select light, or another value, of the glossy ones among a view's receivers. Differentiable: light."""
     return _of_spans(light, _spans(is_glossy, receivers), -len(receivers.on_static))
 
 

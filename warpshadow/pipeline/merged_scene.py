@@ -136,7 +136,7 @@ class MergedScene:
 
     @functools.cached_property
     def two_sided_faces(self) -> wp.array:
-        """Faces of open bodies, int32 of shape [item]."""
+        """Indices of the faces of open bodies, int32 of shape [two-sided face]."""
         return self._array(np.flatnonzero(self.is_two_sided[self.body_of_face]), wp.int32)
 
     @functools.cached_property
@@ -270,7 +270,7 @@ class MergedScene:
         )
 
     def take_spheres(self, other: "MergedScene", bodies: Sequence[int]) -> None:
-        """Have the spheres of this scene's bodies in another, with its ground, once they are asked for."""
+        """Take the spheres of this scene's bodies, some of another's, from the other when they are first asked for."""
         self._take_spheres = lambda: [other._spheres[number] for number in bodies]
 
     def part(self, geometry: Geometry, bodies: Sequence[int]) -> Geometry:
@@ -291,9 +291,7 @@ class MergedScene:
         )
 
     def spheres_of(self, bodies: Collection[int], spheres: tuple[wp.array, wp.array]) -> tuple[wp.array, wp.array]:
-        """Centers and radii of the spheres of some bodies, taken from the arrays of all spheres.
-        Differentiable: spheres.
-        """
+        """Centers and radii of the spheres of some bodies, from those of all. Differentiable: spheres."""
         runs = self.runs(self.first_sphere, bodies)
         if runs == [(0, spheres[1].shape[1])]:
             return spheres

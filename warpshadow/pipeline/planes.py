@@ -61,9 +61,7 @@ class ScenePlanes:
         return self._blockers[key]
 
     def frames(self, bodies: tuple[int, ...], positions: wp.array) -> wp.array:
-        """Where some flat bodies are, of vertices [batch, vertex]; see :meth:`PlaneBlockers.frames`.
-        Differentiable in them.
-        """
+        """Frames of some flat bodies, see :meth:`.PlaneBlockers.frames`. Differentiable: positions."""
         return self.blockers(bodies, bodies).frames(positions)
 
     @functools.cached_property
@@ -77,7 +75,7 @@ class ScenePlanes:
 
     @functools.cached_property
     def _corners(self) -> list[np.ndarray]:
-        """Of each body the vertices that are farthest out in some direction."""
+        """For each body, the vertices that are farthest out in some direction."""
         directions = np.concatenate([fibonacci(_CORNERS), np.eye(3), -np.eye(3)])
         result = []
         for body in self._merged_scene.scene.bodies:

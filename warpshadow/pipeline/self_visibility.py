@@ -94,8 +94,8 @@ class SelfVisibility:
 
     Args:
         merged_scene: The bodies.
-        has_sample_receivers: Bodies on which samples are receivers, bool of shape [body]: they have probes within
-            faces.
+        samples_receive: Bodies on which samples are receivers, bool of shape [body]: they have probes within faces.
+        progress: Whether to show the progress of tracing.
     """
 
     def __init__(self, merged_scene: MergedScene, samples_receive: np.ndarray, *, progress: bool = False):
@@ -126,9 +126,7 @@ class SelfVisibility:
         return any(map(self._sends_rays, range(len(self._samples_receive))))
 
     def _sends_rays(self, body: int) -> bool:
-        """Whether receivers of a body send rays: receivers at pixels do.
-        Between vertices an edge would be too sharp.
-        """
+        """Whether receivers of a body send rays: at pixels, since between vertices an edge would be too sharp."""
         return self._how(body) == "rays" and bool(self._samples_receive[body])
 
     def _how(self, body: int) -> str:
@@ -202,14 +200,14 @@ class SelfVisibility:
         bodies: tuple[int, ...],
         rotations: wp.array,
         directions: np.ndarray,
-        spreads: np.ndarray | None,
+        half_angles: np.ndarray | None,
         *,
         has_sun: bool = False,
     ) -> dict[int, SelfVisibilityLookup]:
         """Lookups of bodies' receivers for cells, as for find_resampling_kernels. Differentiable: rotations.
 
         Args:
-            bodies, rotations, directions, spreads: The inputs of the lookup.
+            bodies, rotations, directions, half_angles: The inputs of the lookup.
             has_sun: Whether there are sun cells, to which receivers of some bodies send rays.
         """
         self._announce(bodies)
@@ -217,7 +215,7 @@ class SelfVisibility:
         for body in bodies:
             if not self._merged_scene.is_flat[body]:
                 rows = self.rows(body)
-                kernels = find_resampling_kernels(directions, spreads, rows.ray_count, rotations.device)
+                kernels = find_resampling_kernels(directions, half_angles, rows.ray_count, rotations.device)
                 rays = (self._ray_probes(body), rotations) if has_sun and self._sends_rays(body) else None
                 result[body] = SelfVisibilityLookup(
                     rows, find_resampling_weights(rotations, body, kernels), kernels, rays

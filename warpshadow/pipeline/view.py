@@ -287,7 +287,8 @@ class View(LitPoints):
         Args:
             photograph: Linear RGB, vec3 of shape [batch, height, width]; None for nothing, where shadows are coverage,
                 vec4.
-            unshadowed, catches: As for :func:`warpshadow.stages.photograph.find_ratio_image`.
+            unshadowed, catches: ``catcher_light`` and ``is_catcher`` of
+                :func:`warpshadow.stages.photograph.find_ratio_image`.
             light, materials: As for :meth:`image`.
         """
         from warpshadow.stages.photograph import compose, composite_alone, find_ratio_image
@@ -405,8 +406,8 @@ def _moving_radiance(
     receivers: Receivers, shading: wp.array, reflectance: wp.array, silhouettes: Silhouettes, clip_positions: wp.array
 ) -> tuple[wp.array, wp.array]:
     """Samples, and the colors at edges."""
-    samples = receivers.fragments, receivers.faces, shading, reflectance
-    return moving_radiance(*samples, silhouettes, clip_positions, receivers.of_vertices)
+    arguments = receivers.fragments, receivers.faces, shading, reflectance
+    return moving_radiance(*arguments, silhouettes, clip_positions, receivers.of_vertices)
 
 
 def _sum_moving(first: tuple[wp.array, wp.array], second: tuple[wp.array, wp.array]) -> tuple[wp.array, wp.array]:

@@ -127,7 +127,7 @@ def _on_grounds(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> t
 
 
 def around(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Points outside a body, most of them near it, a third anywhere within its bounds: positions, and toward it."""
+    """Draw points outside a body, most near it, a third anywhere within its bounds: positions, directions toward it."""
     shell_count = count - count // 3
     away = rng.normal(size=(shell_count, 3))
     away *= rng.uniform(size=(shell_count, 1)) ** 2 * 0.5 * mesh.longest / np.linalg.norm(away, axis=1, keepdims=True)

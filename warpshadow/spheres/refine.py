@@ -332,7 +332,7 @@ class DescentState(NamedTuple):
     def from_optimizer(
         cls, spheres: np.ndarray, adam: Adam, queue: np.ndarray, rng: np.random.Generator
     ) -> DescentState:
-        """Copy it."""
+        """Copy the state of the optimizer, of the spheres that it moves, and of the random numbers."""
         random = np.array(json.dumps(rng.bit_generator.state))
         return cls(spheres.copy(), adam.mean.copy(), adam.square.copy(), np.array(adam.age), queue, random)
 

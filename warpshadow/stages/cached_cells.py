@@ -1,4 +1,4 @@
-"""Kept visibility of static bodies, combined with that of moving bodies."""
+"""Cached visibility of static bodies, combined with the visibility past moving bodies."""
 
 from typing import NamedTuple
 

@@ -133,7 +133,7 @@ def average(samples: wp.array, supersampling: int) -> wp.array:
     """Average the samples of each pixel.
 
     Args:
-        samples: vec4 of shape [batch, height·across, width·across].
+        samples: vec4 of shape [batch, height·supersampling, width·supersampling].
         supersampling: Samples of a pixel across and down.
     Returns:
         vec4 of shape [batch, height, width].

@@ -221,13 +221,12 @@ def _attenuate_adjoint(
 
 
 def transmittance_past(transmittance: wp.array | None, coverages: wp.array, others: wp.array | None = None) -> wp.array:
-    """Transmittance past blockers whose coverage of cells is known, and past all else.
+    """Transmittance past blockers whose coverage of cells is known, and past all else. Any batch may be 1.
 
     Args:
         transmittance: Past all else, float32 of shape [batch, receiver, direction]; None where nothing else blocks.
         coverages: Coverage (h, μ) by some blockers, vec4 of the same shape; an h of 1 and more covers all.
         others: Likewise, by others that may cover the same parts of cells; None for none.
-        Any batch may be 1.
     Returns:
         Float32 of the same shape.
     Differentiable: all.

@@ -70,7 +70,7 @@ def _split_samples(
 
 
 class RatioImage(NamedTuple):
-    """Light that samples reflect, vec3 of shape [batch, height, width], and the photograph beside that."""
+    """Light that samples reflect, and factors of the photograph, vec3 of shape [batch, height, width]."""
 
     body_light: wp.array  # where they see a body that is drawn
     inverse_light: wp.array  # r where they see a catcher, 0 elsewhere

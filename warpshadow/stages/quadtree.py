@@ -2,13 +2,13 @@
 
 On a body that lies in a plane light changes slowly over the image, but for the edges of shadows. So its receivers are
 the fragments at the corners of squares of 4 × 4 pixels, and squares are cut into four where the light that samples
-interpolate differs from their own (Ward's irradiance caching, in the image). That is told by *probes*, at every second
-pixel, or in small images at every one, at which somebody knows the light well enough. In a square of corners a b / c d
-are two triangles a b c and d c b, in which samples interpolate linearly.
+interpolate differs from their own (Ward's irradiance caching, in the image). *Probes* tell that: samples at every
+second pixel, or in small images at every one, whose light the caller estimates. In a square of corners a b / c d are
+two triangles a b c and d c b, in which samples interpolate linearly.
 
-A square holds if its corners see one side of one body, and samples within it would be off by less than the tolerance.
-Samples within it that see another side, or whose pixel is no part of a square that holds, are receivers themselves. (As
-squares of one pixel they blurred the edges of the sun: the ground of a barn was 26% off, and is 12%.)
+A square is *accepted* if its corners see one side of one body, and samples within it would be off by less than the
+tolerance. Samples within it that see another side, or whose pixel is in no accepted square, are receivers themselves.
+(As squares of one pixel they blurred the edges of the sun: the ground of a barn was 26% off, and is 12%.)
 """
 
 from typing import NamedTuple
@@ -31,7 +31,7 @@ TOLERANCE = 0.02  # error of interpolation at which a square is cut, as a part o
 
 
 class Quadtree(NamedTuple):
-    """Squares that hold."""
+    """The accepted squares."""
 
     sizes: wp.array  # [view, row, column] int32, side of the square that a pixel is in [pixels], 0 for none
     numbers: wp.array  # [view, row, column] int32, number of the square, at its first pixel
@@ -74,7 +74,7 @@ def sample_at(row: int, column: int, supersampling: int, height: int, width: int
 
 @wp.func
 def _has_key(keys: wp.array2d(dtype=wp.int32), row: int, column: int, key: int):
-    """Whether there is a probe at a place, and it has a key."""
+    """Whether there is a probe in a row and column, and it has a key."""
     if row < 0 or column < 0 or row >= keys.shape[0] or column >= keys.shape[1]:
         return False
     return keys[row, column] == key
@@ -123,10 +123,10 @@ def _probe_error(shares: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.int3
 
 
 @wp.func
-def _holds_between_probes(
+def _is_accepted_between_probes(
     shares: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.int32), row: int, column: int, tolerance: float
 ):
-    """Whether a square of neighboring probes holds, by how much the light bends at these."""
+    """Whether a square of neighboring probes is accepted: by the curvature of the light at these."""
     min_share = wp.min(shares[row, column], shares[row, column + 1])
     min_share = wp.min(min_share, wp.min(shares[row + 1, column], shares[row + 1, column + 1]))
     max_share = wp.max(shares[row, column], shares[row, column + 1])
@@ -153,7 +153,7 @@ def _cut_squares(
     sizes: wp.array3d(dtype=wp.int32),
     is_first: wp.array3d(dtype=wp.bool),
 ):
-    """A thread owns a row of the largest squares: pixels get the side of the square that holds there, 0 for none.
+    """A thread owns a row of the largest squares: pixels get the side of their accepted square, 0 for none.
 
     The first pixel of a square is its upper left.
     """
@@ -164,18 +164,18 @@ def _cut_squares(
     for j in range(view_keys.shape[1] / side):
         row = side * i
         column = side * j
-        holds = _is_one_side(view_keys, row, column, side)
-        holds = holds and _probe_error(shares, view_keys, row, column, side) <= tolerance
+        is_accepted = _is_one_side(view_keys, row, column, side)
+        is_accepted = is_accepted and _probe_error(shares, view_keys, row, column, side) <= tolerance
         for quarter in range(4):
             size = int(4)
             top = row + quarter / 2 * (side / 2)
             left = column + quarter % 2 * (side / 2)
-            if not holds:
+            if not is_accepted:
                 size = 0
                 if _is_one_side(view_keys, top, left, side / 2):
                     if spacing == 1 and _probe_error(shares, view_keys, top, left, 2) <= tolerance:
                         size = 2
-                    if spacing == 2 and _holds_between_probes(shares, view_keys, top, left, tolerance):
+                    if spacing == 2 and _is_accepted_between_probes(shares, view_keys, top, left, tolerance):
                         size = 2
             for pixel in range(4):
                 y = spacing * top + pixel / 2

@@ -47,9 +47,8 @@ def build_face_tree(positions: np.ndarray, faces: np.ndarray, device: wp.DeviceL
     """
     corners = np.asarray(positions, np.float32)[np.asarray(faces)]
     face_count, depth = len(corners), max(int(np.ceil(np.log2(max(len(corners), 1) / _LEAF))), 0)
-    lower_corners, upper_corners = (
-        np.ascontiguousarray(end(corners, axis=1).T) for end in (np.min, np.max)
-    )  # [3, face]
+    # [3, face]
+    lower_corners, upper_corners = (np.ascontiguousarray(end(corners, axis=1).T) for end in (np.min, np.max))
     centers, permutation = (lower_corners + upper_corners) / 2, np.arange(face_count)
     for level in range(depth):
         bounds, halves = _bounds(face_count, level), _bounds(face_count, level + 1)[1::2]
@@ -98,7 +97,7 @@ def make_find_open() -> wp.Function:
     Vectors = vectors_type(PACKET)
 
     # In plain Warp, which copies lanes at every call, it takes eight times as long.
-    # A face that the receiver lies on is moved down as seen_from has it.
+    # A face that the receiver lies on is moved down as by `ray_tracing._face_from_receiver`.
     @wp.func_native(f"""
     const int face_count = corners.shape[0];
     float x[{PACKET}], y[{PACKET}], z[{PACKET}], a[{PACKET}], b[{PACKET}], c[{PACKET}], open[{PACKET}];

@@ -196,9 +196,12 @@ def trace_visibility(mesh: wp.Mesh | None, points: wp.array, normals: wp.array, 
 def trace_visibility_on_host(
     mesh: wp.Mesh | None, points: np.ndarray, normals: np.ndarray, directions: np.ndarray, device: wp.DeviceLike
 ) -> np.ndarray:
-    """The same for NumPy's arrays of one batch, of shape [vertex, 3] and [direction, 3]: bool [vertex, direction]."""
-    at, facing, towards = (wp.array(values, dtype=wp.vec3, device=device) for values in (points, normals, directions))
-    visibility: np.ndarray = trace_visibility(mesh, at.reshape((1, -1)), facing.reshape((1, -1)), towards).numpy()[0]
+    """Trace as :func:`trace_visibility` does, of NumPy arrays of one instance: bool of shape [vertex, direction]."""
+    point_array, normal_array, direction_array = (
+        wp.array(values, dtype=wp.vec3, device=device) for values in (points, normals, directions)
+    )
+    receivers = point_array.reshape((1, -1)), normal_array.reshape((1, -1))
+    visibility: np.ndarray = trace_visibility(mesh, *receivers, direction_array).numpy()[0]
     return visibility.astype(bool)
 
 

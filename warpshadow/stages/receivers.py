@@ -36,7 +36,7 @@ class Receivers(NamedTuple):
 
     points: wp.array  # [batch, receiver − on static] vec3
     normals: wp.array  # [batch, receiver − on static] vec3
-    faces: wp.array  # [face or side + own + triangle] vec3i, indices of receivers
+    faces: wp.array  # [face or side + sample receiver + triangle] vec3i, indices of receivers
     of_vertices: wp.array  # [vertex, then their backs if fragments have sides] int32, receiver or -1 for none
     fragments: Fragments  # of these faces
     on_static: np.ndarray = np.empty(0, int)  # [on static], the vertices that the first receivers are
@@ -127,7 +127,7 @@ def _add_faces(
     # out
     receiver_faces: wp.array(dtype=wp.vec3i),
 ):
-    """A thread owns a face: of the mesh, or of an own receiver."""
+    """A thread owns a face: of the mesh, or of a sample receiver."""
     face = wp.tid()  # the array may have room for triangles after these
     receiver = receiver_count + face - faces.shape[0]
     corners = wp.vec3i(receiver, receiver, receiver)
@@ -139,9 +139,8 @@ def _add_faces(
 class Numbering(NamedTuple):
     """Vertices that are receivers, and their indices."""
 
-    vertices: (
-        wp.array | None
-    )  # [receiver − on static] int32, receivers not on static bodies; None for all vertices as they are
+    # [receiver − on static] int32, receivers not on static bodies; None for all vertices as they are
+    vertices: wp.array | None
     on_static: np.ndarray  # [on static], the receivers on static bodies, which come first
     faces: wp.array  # [face or side] vec3i
     of_vertices: wp.array  # [vertex, and their backs] int32, -1 for none
@@ -226,8 +225,7 @@ def find_receivers(
         wants_samples: Faces whose samples have receivers of their own, bool of shape [face].
         bodies: Body of each face, −1 for faces that need not be told apart, shape [face]; None where all share their
             blockers, as for :func:`number_receivers`.
-        supersampling: Supersampling, the samples of a pixel across and down: samples of a pixel with the same face
-            share a receiver.
+        supersampling: Samples of a pixel across and down: samples of a pixel with the same face share a receiver.
         quadtree: Squares in which samples of faces that want them interpolate; None for none.
         smooth_pieces: Smooth piece of each face, int32 of shape [face], where samples that see different faces of one
             share a receiver, too; None where they do not.

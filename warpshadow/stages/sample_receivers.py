@@ -24,9 +24,8 @@ from warpshadow.stages.rasterization import Fragments
 TILE = 16  # pixels of a side of the tiles whose receivers follow each other
 
 MIN_SHARED_COSINE = 0.9  # cosine between normals of samples of a pixel from which they may share a receiver …
-MAX_SHARED_SLOPE = (
-    0.3  # … where a line from one to the other is not steeper than that: the sine of its angle to the surface
-)
+MAX_SHARED_SLOPE = 0.3
+"""… where a line from one to the other is not steeper than that: the sine of its angle to the surface."""
 
 _SHARING_COST, _SAMPLE_COST = 12.0, 3.5  # nanoseconds of a sample, to find whose receiver it shares and to get it
 
@@ -191,8 +190,8 @@ def _number_fragments(
 ):
     """A thread owns a run of samples.
 
-    ``receiver_numbers`` are the receivers' numbers; where they cannot be read (a capture), each body gets a range with
-    a place for every sample.
+    ``receiver_numbers`` are the receivers' numbers; where they cannot be read (a capture), each body gets a range of
+    numbers, one for every sample.
     """
     view, thread = split_row(first_row + wp.tid(), sides.shape[1] // run)
     for sample in range(thread * run, (thread + 1) * run):

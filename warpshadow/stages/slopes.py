@@ -76,7 +76,7 @@ def _add_shading_gradients(
     entries: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
     edge_colors: wp.array3d(dtype=wp.vec4),
-    first_own: int,
+    first_sample_face: int,
     run: int,
     adj_samples: wp.array2d(dtype=wp.vec4),
     # out
@@ -100,8 +100,12 @@ def _add_shading_gradients(
             receivers = wp.vec3i()
             if face >= 0:
                 receivers = receiver_faces[receiver_face_ids[fragment_batch, sample]]
-            # A sample with receivers that samples see has the gradient of their points instead.
-            if face >= 0 and receiver_face_ids[fragment_batch, sample] < first_own and wp.length_sq(adj_color) > 0.0:
+            # A sample with a sample receiver has the gradient of the receiver's point instead.
+            if (
+                face >= 0
+                and receiver_face_ids[fragment_batch, sample] < first_sample_face
+                and wp.length_sq(adj_color) > 0.0
+            ):
                 adj_light = wp.cw_mul(adj_color, albedo[albedo_batch, sample])
                 sample_light = light[light_batch, sample]
                 color = samples[batch, sample]

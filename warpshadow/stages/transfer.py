@@ -44,7 +44,7 @@ wp.set_module_options({"max_unroll": 1})
 
 
 @functools.cache
-def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
+def _make_sh_transfer(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
     Lane, Zonal = lane_type(lanes), zonal_type(order, lanes)
     fn = make_lane_functions(lanes)
     find_block, dot, load, load_rows, store_rows = fn.find_block, fn.dot, fn.load, fn.load_rows, fn.store_rows
@@ -91,7 +91,7 @@ def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
 
 
 @functools.cache
-def _sh_transfer_adjoint_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
+def _make_sh_transfer_adjoint(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
     Lane, Zonal = lane_type(lanes), zonal_type(order, lanes)
     fn = make_lane_functions(lanes)
     find_block, dot, load, load_rows = fn.find_block, fn.dot, fn.load, fn.load_rows
@@ -178,7 +178,7 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
     lit_bands = tuple(band for band in range(order) if band < 2 or band % 2 == 0)  # of a clamped cosine
     return differentiable(
         lambda transfer: launch(
-            _sh_transfer_kernel(order, is_shadowed, lanes),
+            _make_sh_transfer(order, is_shadowed, lanes),
             row_count,
             inputs=[*variables, product_table(order, str(device), lit_bands, bands)],
             scratch=scratch,
@@ -186,7 +186,7 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
             cost=cost,
         ),
         lambda adj_transfer: launch(
-            _sh_transfer_adjoint_kernel(order, is_shadowed, lanes),
+            _make_sh_transfer_adjoint(order, is_shadowed, lanes),
             row_count,
             inputs=[*variables, product_table(order, str(device), tuple(range(bands))), adj_transfer],
             scratch=scratch,
@@ -199,7 +199,7 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
 
 
 @functools.cache
-def _sh_product_kernel(order: int, lanes: int) -> wp.Kernel:
+def _make_sh_product(order: int, lanes: int) -> wp.Kernel:
     Lane, fn = lane_type(lanes), make_lane_functions(lanes)
     find_block, load_rows, add_rows = fn.find_block, fn.load_rows, fn.add_rows
     multiply = make_multiply(order, lanes)
@@ -256,7 +256,7 @@ def sh_product(visibility: wp.array, lobes: wp.array, *, order: int, bands: int 
 
     def add_product(first: wp.array, second: wp.array, table: ProductTable, total: wp.array) -> None:
         launch(
-            _sh_product_kernel(order, lanes),
+            _make_sh_product(order, lanes),
             row_count,
             inputs=[first, second, table],
             scratch=[Scratch((3, order**2), lane_type(lanes))],

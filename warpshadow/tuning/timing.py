@@ -108,9 +108,8 @@ class _SharedTiming:
         self._view = self._renderer.view()
         self.draw = whole_image(self._renderer)
         visible_samples = np.flatnonzero(self._view.fragments.face_ids.numpy()[0] >= 0)
-        sides, vertices, barycentrics = seen_on_faces(
-            self._view, visible_samples[:: scene.supersampling**2]
-        )  # one a pixel
+        one_per_pixel = visible_samples[:: scene.supersampling**2]
+        sides, vertices, barycentrics = seen_on_faces(self._view, one_per_pixel)
         merged_scene = self._renderer.merged_scene
         bodies = merged_scene.body_of_face[sides % len(merged_scene.body_of_face)]
         samples_receive = np.array([body.receivers != "vertex" for body in self._renderer.scene.bodies])
@@ -119,15 +118,13 @@ class _SharedTiming:
             vertices[receiver_rows] % merged_scene.first_vertex[-1]
         ]
         neighborhoods = _neighborhoods(np.einsum("rk,rkc->rc", weights, corners))
-        neighborhoods = neighborhoods[
-            np.argsort(bodies[receiver_rows[neighborhoods]], kind="stable")
-        ]  # as on_faces wants them
+        # as on_faces wants them
+        neighborhoods = neighborhoods[np.argsort(bodies[receiver_rows[neighborhoods]], kind="stable")]
         self._sample = sides[receiver_rows[neighborhoods]], weights[neighborhoods]
         is_adaptive = any(body.receivers == "adaptive" for body in shadowed_renderer.scene.bodies)
-        result = (
-            shadowed_renderer.view() if is_adaptive else self._view
-        ).receivers  # adaptive ones are where shadows end
-        self.extrapolation = result.points.shape[1] / len(neighborhoods)
+        # adaptive receivers are where shadows end
+        view = shadowed_renderer.view() if is_adaptive else self._view
+        self.extrapolation = view.receivers.points.shape[1] / len(neighborhoods)
 
     def sampled_shading(self, scene: Scene) -> Callable[[], object]:
         """Make the function that shades the sample as a scene does."""

@@ -281,8 +281,8 @@ def error_picture(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     Returns:
         uint8 of shape [height, width, 3].
     """
-    is_covered = reference[reference[..., 3] > 0, :3]
-    mean = float(is_covered.mean()) if len(is_covered) else 0.0
+    covered_colors = reference[reference[..., 3] > 0, :3]
+    mean = float(covered_colors.mean()) if len(covered_colors) else 0.0
     excess = (
         np.clip((image - reference)[..., :3].mean(axis=-1) / (0.2 * mean), -1, 1) if mean > 0 else 0 * image[..., 0]
     )

@@ -143,6 +143,5 @@ def test_closed_patches_have_the_nearest_open_one_of_their_body_for_a_stand_in(m
     steps = np.linalg.norm(ball.centers[closed][:, None] - ball.centers[is_open[:end]], axis=2).min(axis=1)
     np.testing.assert_allclose(away, steps, atol=0.05)  # normals count, too, which are a ball's places
     is_open[:end] = False
-    np.testing.assert_array_equal(
-        senders.nearest_open_patches(is_open), np.arange(last)
-    )  # nothing stands in for a body
+    # nothing stands in for a body
+    np.testing.assert_array_equal(senders.nearest_open_patches(is_open), np.arange(last))

@@ -106,7 +106,7 @@ class PortionedDirectLight(Node):
         others: tuple[Node, ...] = (),
         stages: tuple[NodeStage, ...] = (),
     ):
-        self._visibilities = visibility
+        self._visibility = visibility
         self._shading = NodeStage(f"shading{where}", item_text, inputs=(visibility, projected_light))
         stages = self._shading, *stages
         super().__init__("", None, projected_light, *others, extra_inputs=(visibility,), stages=stages)
@@ -114,11 +114,11 @@ class PortionedDirectLight(Node):
     def compute(self, call: Call) -> Any:
         """Light all portions."""
         (projected_light,) = self.values(call)
-        return [self._light(call, portion, projected_light) for portion in self._visibilities.value(call)]
+        return [self._light(call, portion, projected_light) for portion in self._visibility.value(call)]
 
     def _light(self, call: Call, portion: PortionVisibility, projected_light: Any) -> PortionDirectLight:
         with self.timed(call, self._shading):
-            direct = self._visibilities.method.shade_transfer(portion.transfer, portion.group, projected_light)
+            direct = self._visibility.method.shade_transfer(portion.transfer, portion.group, projected_light)
         return PortionDirectLight(direct, portion.group, portion.cells)
 
 
@@ -231,7 +231,7 @@ class BouncedShading(PortionedDirectLight):
     def compute(self, call: Call) -> wp.array:
         """Light all portions, directly and by the patches' radiosity."""
         projected_light, outgoing = self.values(call)
-        portions = self._visibilities.value(call) if self._visibilities.caches else self._visibilities.portions(call)
+        portions = self._visibility.value(call) if self._visibility.caches else self._visibility.portions(call)
         return joined(
             [self._bounced(call, self._light(call, portion, projected_light), outgoing) for portion in portions]
         )
@@ -311,7 +311,7 @@ class SphereBounces:
         proxies: Proxies,
         points: LitPoints,
     ) -> PatchSampleNodes:
-        """Patch samples among the bodies among which points are."""
+        """Nodes of the patch samples of the bodies around points."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
 
         def project(patch_samples: Receivers, visibility: list[PortionVisibility], *arguments: Any) -> ProjectedPatches:
@@ -319,7 +319,7 @@ class SphereBounces:
 
         make = functools.partial(Node, "patch samples", senders.patch_samples, points.vertices, points.normals)
         patch_samples = points.cached("patch samples", senders, lambda: make(items=_patch_sample_text(senders)))
-        lit_samples = self._at(patch_samples, points, points.materials, proxies.blocker_of_sample)
+        lit_samples = self._at(patch_samples, points, points.materials, proxies.nearest_spheres)
         lookups = self_visibility_node(self._method, points, visibility_light)
         lit_samples.cached("self-visibility", id(visibility_light), lambda: lookups)
         visibility = make_visibility(lit_samples, where=_OF_PATCH_SAMPLES)
@@ -380,10 +380,10 @@ class SphereBounces:
         return StaticBounces(self._patches, self._count, self._method.openness, progress=self._method.progress)
 
     def _at(
-        self, patch_samples: Node, points: LitPoints, materials: Materials, blocker_of_point: np.ndarray | None = None
+        self, patch_samples: Node, points: LitPoints, materials: Materials, nearest_spheres: np.ndarray | None = None
     ) -> LitPoints:
         """Make lit points of patch samples, among the same bodies as other points."""
         arguments = self._method.merged_scene, materials, points.vertices, points.spheres, patch_samples, points.call
         return LitPoints(
-            *arguments, normals=points.normals, blocker_kinds=points.blocker_kinds, blocker_of_point=blocker_of_point
+            *arguments, normals=points.normals, blocker_kinds=points.blocker_kinds, nearest_spheres=nearest_spheres
         )

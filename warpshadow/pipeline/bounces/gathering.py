@@ -51,9 +51,7 @@ that parts block have no proxy in them, which loses light, and light jumps as a 
 class CellTransmittance(NamedTuple):
     """Transmittance of a portion of the receivers in cells of directions."""
 
-    transmittance_self: (
-        wp.array | None
-    )  # [batch, receiver, cell], transmittance past its own body; None where that is 1
+    transmittance_self: wp.array | None  # [batch, receiver, cell], past its own body; None where that is 1
     transmittance_spheres: wp.array  # [batch, receiver, cell], past all bodies but planes, its own included
     directions: np.ndarray  # [cell, 3]
 
@@ -144,10 +142,10 @@ class Proxies:
             return None
         bodies = []
         for number in numbers:
-            place, body = senders.bodies.index(number), merged_scene.scene.bodies[number]
-            grid = senders.patches[place].grid
+            sender_index, body = senders.bodies.index(number), merged_scene.scene.bodies[number]
+            grid = senders.patches[sender_index].grid
             assert grid is not None
-            starts = int(merged_scene.first_vertex[number]), int(senders.first[place])
+            starts = int(merged_scene.first_vertex[number]), int(senders.first[sender_index])
             bodies.append(PlaneBody(grid, body.mesh.positions, body.mesh.surface.faces, *starts, body.casts_shadow))
         counts = len(senders.areas), int(merged_scene.first_vertex[-1])
         planes = PlaneBlockers.from_bodies(bodies, *counts, device=merged_scene.device)
@@ -175,8 +173,8 @@ class Proxies:
         """Where the proxies of a body begin and end."""
         first = self.senders.first
         if body in self.senders.bodies:
-            place = self.senders.bodies.index(body)
-            return int(first[place]), int(first[place + 1])
+            sender_index = self.senders.bodies.index(body)
+            return int(first[sender_index]), int(first[sender_index + 1])
         begin, end = self.merged_scene.spheres_among(self.black_bodies, body)
         return (int(first[-1]) + begin, int(first[-1]) + end) if end else (0, 0)
 
@@ -197,8 +195,9 @@ class Proxies:
         for body in self.nonplanar_bodies:
             of_body = slice(*first_sphere[body : body + 2])
             if len(radii[of_body]) and body in senders.bodies:
-                place = senders.bodies.index(body)
-                patches, patch_range = senders.patches[place], slice(*senders.first[place : place + 2])
+                sender_index = senders.bodies.index(body)
+                patches = senders.patches[sender_index]
+                patch_range = slice(*senders.first[sender_index : sender_index + 2])
                 nearest = patches.nearest_spheres(centers[of_body], radii[of_body])
                 numbers[patch_range] = start + nearest
                 ratios[patch_range] = np.sqrt(patches.areas / 2) / np.maximum(radii[of_body][nearest], 1e-30)
@@ -223,7 +222,7 @@ class Proxies:
         return tolerances
 
     @functools.cached_property
-    def blocker_of_sample(self) -> np.ndarray:
+    def nearest_spheres(self) -> np.ndarray:
         """Sphere nearest to the patch of each patch sample, −1 for none: int32 of shape [patch sample]."""
         return self._blockers[0][self.senders.patch_of_sample]
 
@@ -245,7 +244,7 @@ class Proxies:
         normals, planes, senders = patch_samples.normals, self.planes, self.senders
         centers, radii = self.merged_scene.spheres_of(self.nonplanar_bodies, spheres)
         if planes is not None:
-            numbers, points, device = self.blocker_of_sample, patch_samples.points, normals.device
+            numbers, points, device = self.nearest_spheres, patch_samples.points, normals.device
             of_patch_samples = NearestBlockers(centers, radii, constant(numbers, wp.int32, device))
             fronts = find_fronts(points, normals, None, of_patch_samples, frames, planes.all)
             if self.overlays is not None:
@@ -298,8 +297,8 @@ class OutgoingRadiance:
 
     def of_body(self, body: int) -> wp.array:
         """Radiosity of the patches of a body, vec3 of shape [batch, patch]."""
-        place = self.senders.bodies.index(body)
-        return cut(self.radiosity, *self.senders.first[place : place + 2].tolist())
+        sender_index = self.senders.bodies.index(body)
+        return cut(self.radiosity, *self.senders.first[sender_index : sender_index + 2].tolist())
 
     @functools.cached_property
     def proxy_radiance(self) -> wp.array:

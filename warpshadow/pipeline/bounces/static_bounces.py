@@ -239,14 +239,16 @@ class StaticBounces:
                     means = scale_rows(means, scaling_factors(1 - sky, means @ (1 - sky[cache_points])))
                 return means, form_factors.factors[is_cache_point]
 
-            at, facing, device = receivers.points.numpy(), receivers.normals.numpy(), positions.device
+            receiver_points, receiver_normals = receivers.points.numpy(), receivers.normals.numpy()
+            shape, device = receiver_points.shape[:2], positions.device
             skies = [None if sky is None else sky.numpy()[..., 0] for sky in (sky_at_patch_samples, sky_at_receivers)]
             at_patch_sample = None if skies[0] is None else skies[0][0]
-            at_receivers = [None] * len(at) if skies[1] is None else np.broadcast_to(skies[1], at.shape[:2])
+            at_receivers = [None] * shape[0] if skies[1] is None else np.broadcast_to(skies[1], shape)
             seen_by_patch_samples = trace(
                 patch_samples.points.numpy()[0], patch_samples.normals.numpy()[0], at_patch_sample
             )
-            receiver_weights, to_cache_points = zip(*map(find_cache_points, at, facing, at_receivers), strict=True)
+            factors = map(find_cache_points, receiver_points, receiver_normals, at_receivers)
+            receiver_weights, to_cache_points = zip(*factors, strict=True)
             means, is_buried = senders.mean.to_scipy(), seen_by_patch_samples.is_buried
             mean = mean_outside(means, is_buried)[senders.nearest_open_patches(means @ ~is_buried > 0)]
             between = (mean @ seen_by_patch_samples.factors).tocoo()
@@ -261,7 +263,7 @@ class StaticBounces:
                 SparseMatrix.from_matrix(between_bodies, device=device),
                 SparseMatrix.from_matrix(vstack(to_cache_points), device=device),
                 SparseMatrix.from_matrix(block_diag(receiver_weights), device=device),
-                at.shape[:2],
+                shape,
             )
 
         def make() -> Node:
@@ -293,11 +295,11 @@ class StaticBounces:
             body_positions = positions[merged_scene.first_vertex[number] : merged_scene.first_vertex[number + 1]]
             faces = body.mesh.surface.faces
             if number in senders.bodies:
-                place = senders.bodies.index(number)
-                patches = senders.patches[place]
+                sender_index = senders.bodies.index(number)
+                patches = senders.patches[sender_index]
                 corners.append(patches.pieces.positions(body_positions, faces))
                 patch_of_side = np.where(
-                    patches.patch_of_pieces < 0, -1, patches.patch_of_pieces + senders.first[place]
+                    patches.patch_of_pieces < 0, -1, patches.patch_of_pieces + senders.first[sender_index]
                 )
             else:
                 corners.append(body_positions[faces])
@@ -308,7 +310,7 @@ class StaticBounces:
 
 
 def _light_on_patches(at_patch_samples: wp.array, factors: _GeometryFactors) -> wp.array:
-    """Mean light on patches, given that at their patch samples: vec3 of shape [batch, patch]. Differentiable: light."""
+    """Mean light on patches, vec3 of shape [batch, patch], given that at their samples. Differentiable: both."""
     return multiply(factors.patch_sample_means, at_patch_samples)
 
 

@@ -56,7 +56,7 @@ class ProjectedCells(NamedTuple):
     coefficients: wp.array | None = None  # of known light, vec3 of shape [1, direction]
     mean_directions: np.ndarray | None = None  # to all known light of the cells, by which it falls in [direction, 3]
     spots: np.ndarray | None = None  # where the brightest part of known light is in its cells [direction, 3]
-    spreads: np.ndarray | None = None  # half-angles of where known light comes from in its cells [direction]
+    half_angles: np.ndarray | None = None  # half-angles of where known light comes from in its cells [direction]
     sharp_cells: SharpCells | None = None  # cells that a sun is in, where spheres block it
     sharp_cells_past_planes: SharpCells | None = None  # and where planes do
     spot_shares: np.ndarray | None = None  # share of the light of sharp cells that their spot has [direction]
@@ -143,7 +143,7 @@ class Directional(SphereMethod):
         """Lookups of the receivers of some bodies. Differentiable: rotations."""
         towards = projected_light.directions if projected_light.spots is None else projected_light.spots
         has_sun = projected_light.sun is not None
-        return self.self_visibility.lookups(bodies, rotations, towards, projected_light.spreads, has_sun=has_sun)
+        return self.self_visibility.lookups(bodies, rotations, towards, projected_light.half_angles, has_sun=has_sun)
 
     def find_visibility(self, group: Group, projected_light: ProjectedCells) -> GroupVisibility:
         """Transmittance, float32 of shape [batch, receiver, direction]."""
@@ -206,9 +206,9 @@ class Directional(SphereMethod):
         transmittance = block(projected_light.directions, **scales(1.0))
         if projected_light.sharp_cells is None:
             return transmittance
-        directions, places, scale = projected_light.sharp_cells
+        directions, slots, scale = projected_light.sharp_cells
         sharp = block(directions, **scales(scale))
-        return blend_sharp_cells(transmittance, sharp, places, projected_light.spot_shares)
+        return blend_sharp_cells(transmittance, sharp, slots, projected_light.spot_shares)
 
     def _scales(self, scale: float) -> dict[str, Any]:
         """Settings in radii of cells, of radii that are so much smaller."""
@@ -303,8 +303,8 @@ class Directional(SphereMethod):
             scale = cell_radius(len(power)) / cell_radius(CHUNK)
             radius = cell_radius(len(power))
         else:
-            directions, places, scale = projected_light.sharp_cells_past_planes
-            light[places[places >= 0]] = power[places >= 0]
+            directions, slots, scale = projected_light.sharp_cells_past_planes
+            light[slots[slots >= 0]] = power[slots >= 0]
             radius = self._edge_radius(projected_light.sharp_cells_past_planes)
         light = light[:, None] * [CHUNK / len(power), 0, 0]
         return SharpestCells(directions, self._on_device(light), scale, radius, power)
@@ -336,9 +336,8 @@ class Directional(SphereMethod):
         lit = shade_cells(transmittance, normals, directions, light, maximum=LARGEST_COEFFICIENT).numpy()[..., 0]
         receiver_normals, towards = normals.numpy(), self.free_projection.directions
         plane_normals = receiver_normals[:, :1]  # points of a plane have this normal or its opposite
-        whole = [
-            4 / len(power) * np.maximum(sign * plane_normals @ towards.T, 0) @ power for sign in (1, -1)
-        ]  # [batch, 1]
+        # [batch, 1]
+        whole = [4 / len(power) * np.maximum(sign * plane_normals @ towards.T, 0) @ power for sign in (1, -1)]
         unblocked = np.where((receiver_normals * plane_normals).sum(axis=2) > 0, *whole)
         return np.divide(lit, unblocked, out=np.zeros_like(lit), where=unblocked > 0)
 
@@ -424,7 +423,7 @@ class PortionedCellTransmittance(PortionedShading):
     def find(
         self, call: Call, portion: Group, projected_light: ProjectedCells, spheres: tuple[wp.array, wp.array]
     ) -> wp.array:
-        """Find that of a portion."""
+        """Find the transmittance of a portion."""
         return self.find_visibility(call, portion, projected_light).transmittance_total
 
 

@@ -84,9 +84,8 @@ class LogSH(SphereMethod):
             )
         if visibility.transmittance_total is None:
             return lobes
-        lobes = expand_rows(
-            lobes, len(visibility.transmittance_total)
-        )  # where cameras share the rotations, but not the receivers
+        # where cameras share the rotations, but not the receivers
+        lobes = expand_rows(lobes, len(visibility.transmittance_total))
         return sh_product(visibility.transmittance_total, lobes, order=self._order, bands=projected_light.bands)
 
     def _self_visibility_lobes(

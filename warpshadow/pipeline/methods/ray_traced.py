@@ -48,21 +48,9 @@ class Rays(Method):
         form factors rays find once.
         """
         meshes = self._blockers(points, points.receivers_node)
-
-        def shaded() -> Node:
-            return Node(
-                "shading",
-                self._shade_shared if self.shares_directions else self._shade,
-                meshes,
-                points.receivers_node,
-                light,
-                items=lambda: receiver_text(points),
-                stages=(NodeStage("transfer", idle="rays shade known light at once"),),
-            )
-
         if not self.merged_scene.scene.bounces:
-            return shaded()
-        direct = points.cached("direct", light, shaded)
+            return self._direct_shading(points, meshes, light)
+        direct = points.cached("direct", light, lambda: self._direct_shading(points, meshes, light))
         if materials is points.materials and not self.shares_directions:
             from warpshadow.pipeline.bounces.paths import path_traced
 
@@ -118,9 +106,8 @@ class Rays(Method):
         if light.is_free:
             direct = super().free_shading(view, light, view.materials)
         else:
-            direct = view.cached(
-                "direct", light, lambda: Node("", self._shade, self._meshes(view), view.receivers_node)
-            )
+            meshes = self._blockers(view, view.receivers_node)
+            direct = view.cached("direct", light, lambda: self._direct_shading(view, meshes, light))
         trees = self._trees_around(points)
         openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
         return Node("light of blockers", blocked_radiance, diffuse, choose(direct), openness)
@@ -137,6 +124,18 @@ class Rays(Method):
         if node.requires_grad:
             node.function = _refuse
         return node
+
+    def _direct_shading(self, points: LitPoints, meshes: Node, light: Input) -> Node:
+        """Node of the direct shading of points in known light, given the meshes, or trees, that block it."""
+        return Node(
+            "shading",
+            self._shade_shared if self.shares_directions else self._shade,
+            meshes,
+            points.receivers_node,
+            light,
+            items=lambda: receiver_text(points),
+            stages=(NodeStage("transfer", idle="rays shade known light at once"),),
+        )
 
     def _blockers(self, points: LitPoints, receivers: Node) -> Node:
         """Node of the blockers of rays in known light: trees of all vertices, or meshes of the receivers' instances."""

@@ -47,9 +47,9 @@ def find_squares(
     sides = fragments.face_ids if fragments.sides is None else fragments.sides
     keys = _keys(is_adaptive.tobytes(), merged_scene.first_face.tobytes())
     row, column = probe_grid(sides.shape[1:], supersampling)
-    places = _by_tiles(len(row), len(column))
-    probes = (row[:, None] * sides.shape[2] + column).ravel()[places]
-    probe_keys = keys_of(sides, keys, supersampling).reshape(len(sides), -1)[:, places]
+    permutation = _by_tiles(len(row), len(column))
+    probes = (row[:, None] * sides.shape[2] + column).ravel()[permutation]
+    probe_keys = keys_of(sides, keys, supersampling).reshape(len(sides), -1)[:, permutation]
     body_of_probe = np.where(probe_keys < 0, -1, probe_keys % len(is_adaptive))
     shares = np.zeros(probe_keys.shape, np.float32)
     with unrecorded():
@@ -59,13 +59,13 @@ def find_squares(
                 continue
             samples = np.where(columns < 0, -1, probes[columns])
             seen = fragments_of_samples(fragments, samples)
-            facing = points_of_fragments(positions, normals, merged_scene.faces, seen)
-            group = blockers.around_plane(*facing, body)
+            points_and_normals = points_of_fragments(positions, normals, merged_scene.faces, seen)
+            group = blockers.around_plane(*points_and_normals, body)
             portions = [sharp_share(portion) for portion in group.portions()]
             known = [portion for portion in portions if portion is not None]
             if known:
-                view, place = np.nonzero(columns >= 0)
-                shares[view, places[columns[view, place]]] = np.concatenate(known, axis=1)[view, place]
+                view, item = np.nonzero(columns >= 0)
+                shares[view, permutation[columns[view, item]]] = np.concatenate(known, axis=1)[view, item]
     return find_quadtree(sides, keys, shares.reshape(len(shares), len(row), len(column)), supersampling)
 
 

@@ -279,7 +279,7 @@ def _longest_edges(corners: np.ndarray, camera: Camera) -> np.ndarray:
     first = np.where(starts[..., 3] < camera.near, to_near, 0.0)
     last = np.where(ends[..., 3] < camera.near, to_near, 1.0)
     size = np.array([camera.width, camera.height])
-    points = (starts + np.clip(place, 0, 1)[..., None] * steps for place in (first, last))
+    points = (starts + np.clip(position, 0, 1)[..., None] * steps for position in (first, last))
     start, end = (point[..., :2] / np.maximum(point[..., 3:], camera.near) * size / 2 for point in points)
     return np.minimum(np.linalg.norm(end - start, axis=-1).max(axis=1), np.linalg.norm(size))
 

@@ -194,37 +194,40 @@ def find_groups(
         cached_rows: Cached transmittance past static bodies, for receivers on them.
         static_normals: Normals of all vertices of static bodies; None where any may move.
     """
-    groups = list(_groups_that_move(receivers, blockers, self_lookups or {}, points.blocker_of_point))
-    if points.static_bodies is None or not len(receivers.on_static):
+    groups = list(_groups_that_move(receivers, blockers, self_lookups or {}, points.nearest_spheres))
+    static_bodies = points.static_bodies
+    if static_bodies is None or not len(receivers.on_static):
         return groups
     assert static_normals is not None
-    moving, facing = points.static_bodies.moving, points.static_bodies.receivers(receivers.on_static, static_normals)
+    moving = static_bodies.moving
+    points_and_normals = static_bodies.receivers(receivers.on_static, static_normals)
     planes, parts = blockers.planes_around(of_bodies=moving), blockers.convex_parts_around(of_bodies=moving)
-    group = Group(*facing, *blockers.spheres_of(moving), cached_rows, planes=planes, convex_parts_around=parts)
+    spheres = blockers.spheres_of(moving)
+    group = Group(*points_and_normals, *spheres, cached_rows, planes=planes, convex_parts_around=parts)
     return [group, *groups] if receivers.points.shape[1] else [group]
 
 
 def _groups_that_move(
-    receivers: Receivers, blockers: Blockers, self_lookups: dict[int, Any], blocker_of_point: np.ndarray | None
+    receivers: Receivers, blockers: Blockers, self_lookups: dict[int, Any], nearest_spheres: np.ndarray | None
 ) -> Iterator[Group]:
     """Groups of receivers that may move."""
     sphere_bodies = blockers.sphere_blockers(blockers.bodies)
     spheres, none = blockers.spheres_of(sphere_bodies), blockers.spheres_of([])
     has_planes = blockers.blocker_kinds.planes or (blockers.planes.numbers and blockers.merged_scene.scene.bounces)
     corners = blockers.planes.corners(blockers.positions) if has_planes and receivers.spans else None
-    clusters, nearest_blockers = None, _nearest_blockers(blocker_of_point, blockers)
+    clusters, nearest_blockers = None, _nearest_blockers(nearest_spheres, blockers)
     if not receivers.spans:
-        facing = receivers.points, receivers.normals
-        yield Group(*facing, *spheres, planes=blockers.planes_around(), nearest_blockers=nearest_blockers)
+        points_and_normals = receivers.points, receivers.normals
+        yield Group(*points_and_normals, *spheres, planes=blockers.planes_around(), nearest_blockers=nearest_blockers)
     for span in receivers.spans:
-        facing = receivers.points, receivers.normals
+        points_and_normals = receivers.points, receivers.normals
         assert receivers.vertices is not None
         if span.first < receivers.vertices.size and len(blockers.positions) == 1:  # all cameras see the same vertices
-            facing = receivers.points[:1], receivers.normals[:1]
+            points_and_normals = receivers.points[:1], receivers.normals[:1]
         is_traced = span.body in blockers.blocker_kinds.traced
         skip = blockers.merged_scene.spheres_among(sphere_bodies, span.body) if is_traced else (0, 0)
         others = none if skip == (0, spheres[1].shape[1]) else spheres
-        points, normals = (cut(array, span.first, span.end) for array in facing)
+        points, normals = (cut(array, span.first, span.end) for array in points_and_normals)
         planes, parts = blockers.planes_around(span.body), blockers.convex_parts_around(span.body)
         group = Group(points, normals, *others, planes=planes, convex_parts_around=parts)
         if others is spheres:
@@ -241,10 +244,10 @@ def _groups_that_move(
         yield group
 
 
-def _nearest_blockers(numbers: np.ndarray | None, blockers: Blockers) -> NearestBlockers | None:
+def _nearest_blockers(nearest_spheres: np.ndarray | None, blockers: Blockers) -> NearestBlockers | None:
     """The blockers nearest to the receivers; None where these are not patch samples."""
-    if numbers is None:
+    if nearest_spheres is None:
         return None
     merged_scene = blockers.merged_scene
     sphere_arrays = merged_scene.spheres_of(nonplanar_bodies(merged_scene), blockers.spheres)
-    return NearestBlockers(*sphere_arrays, constant(numbers, wp.int32, merged_scene.device))
+    return NearestBlockers(*sphere_arrays, constant(nearest_spheres, wp.int32, merged_scene.device))

@@ -49,8 +49,8 @@ class LitPoints:
         normals: Node of the normals of all vertices, vec3 of shape [batch, vertex]; by default its own.
         blocker_kinds: Which bodies block light by something else than their spheres.
         is_scene_view: Whether bodies and points are where the scene and its camera have them, for good.
-        blocker_of_point: Of points that send light, the number of the blocker nearest to the patch of each, among the
-            spheres of bodies that are not flat, −1 for none: NumPy of shape [receiver].
+        nearest_spheres: Where the points are patch samples, the sphere nearest to the patch of each: its index among
+            the spheres of bodies that are not flat, −1 for none; NumPy of shape [receiver]. None for other points.
     """
 
     def __init__(
@@ -65,9 +65,9 @@ class LitPoints:
         normals: Node | None = None,
         blocker_kinds: BlockerKinds = ONLY_SPHERES,
         is_scene_view: bool = False,
-        blocker_of_point: np.ndarray | None = None,
+        nearest_spheres: np.ndarray | None = None,
     ):
-        self.blocker_kinds, self.is_scene_view, self.blocker_of_point = blocker_kinds, is_scene_view, blocker_of_point
+        self.blocker_kinds, self.is_scene_view, self.nearest_spheres = blocker_kinds, is_scene_view, nearest_spheres
         self.materials, self.merged_scene = materials, merged_scene
         self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
         self.call, self.static_bodies = call, static_bodies

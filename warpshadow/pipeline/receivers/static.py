@@ -115,9 +115,7 @@ class StaticBodies:
 
     @property
     def rotations(self) -> wp.array | None:
-        """Rotations of all bodies, mat33 of shape [1, body]; rotations of moving bodies are undefined.
-        None if unknown.
-        """
+        """Rotations of all bodies, mat33 of shape [1, body], undefined for moving bodies; None if unknown."""
         return self._geometry.rotations
 
     def spheres_of(self, bodies: list[int]) -> tuple[wp.array, wp.array]:

@@ -54,11 +54,12 @@ def light_unevenness(
     mesh = merged_scene.casting_mesh(vertices)
     normals = vertex_normals(vertices.reshape((1, -1)), merged_scene.faces).numpy()[0]
     corners = merged_scene.faces.numpy()[seen[rows]]
-    points, facing = (_with_middles(values[corners]) for values in (positions, normals))
-    is_behind = ((eyes[rows] - points[:, 3]) * facing[:, 3]).sum(axis=1) < 0
+    points, point_normals = (_with_middles(values[corners]) for values in (positions, normals))
+    is_behind = ((eyes[rows] - points[:, 3]) * point_normals[:, 3]).sum(axis=1) < 0
     is_behind &= merged_scene.is_two_sided[merged_scene.body_of_face[seen[rows]]]
-    facing *= np.where(is_behind, -1, 1)[:, None, None] / np.linalg.norm(facing, axis=2, keepdims=True).clip(1e-30)
-    received = _irradiance(mesh, points, facing, light, device)
+    lengths = np.linalg.norm(point_normals, axis=2, keepdims=True)
+    point_normals *= np.where(is_behind, -1, 1)[:, None, None] / lengths.clip(1e-30)
+    received = _irradiance(mesh, points, point_normals, light, device)
     at_middles, errors = received[:, 3], received[:, :3].mean(axis=1) - received[:, 3]
     first = 0
     for number, part in enumerate(chosen):
@@ -86,8 +87,8 @@ def _irradiance(
     power = np.cumsum(np.maximum(cells.radiance @ LUMINANCE, 0))
     chosen, counts = np.unique(np.searchsorted(power, power[-1] * (np.arange(_RAYS) + 0.5) / _RAYS), return_counts=True)
     directions = (cells.directions if cells.spots is None else cells.spots)[chosen]
-    at, facing = points.reshape(-1, 3), normals.reshape(-1, 3)
-    visibility = trace_visibility_on_host(mesh, at, facing, directions, device)
+    receivers = points.reshape(-1, 3), normals.reshape(-1, 3)
+    visibility = trace_visibility_on_host(mesh, *receivers, directions, device)
     shaded = visibility.reshape(*points.shape[:2], -1) * np.maximum(normals @ directions.T, 0)
     result: np.ndarray = shaded @ (power[-1] / _RAYS * counts)
     return result

@@ -22,7 +22,7 @@ GOLDEN_TURN = (5**0.5 - 1) / 2  # turn from ray to ray, as a part of a full turn
 
 
 BLACK_ENTRIES = ("black surfaces", "insides of closed bodies")
-"""Places for rays that meet surfaces which send nothing, told apart from the sky: after all patches."""
+"""Entries for rays that meet surfaces which send nothing, told apart from the sky: after all patches."""
 
 _BURIED_SHARE = 0.5
 """Part of its hemisphere from which a point that sees insides of closed bodies counts as inside one itself."""

@@ -10,7 +10,7 @@ with T the transmittance past all bodies but planes, and w the weights of patch 
 patch is Σ_s w_ps f_s L_s. Seen from outside, parts of a patch count just by how open they are.
 
 A patch that other bodies bury wholly counts hardly at all beside others, in a texel of a plane or among the proxies
-that a receiver sees through a cell, by the share of its own body's openness that other bodies leave open, too:
+that a receiver sees through a cell, by the share of the openness past its own body that other bodies leave:
 
     v_p = r⁴ / (r⁴ + 0.1⁴),  r_p = Σ_s w_ps (⟨T⟩_s + ε) / Σ_s w_ps (⟨T_self⟩_s + ε)
 

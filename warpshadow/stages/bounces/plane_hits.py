@@ -79,7 +79,7 @@ class PlaneHit:
 
 @wp.func
 def load_hit(store: wp.array(dtype=wp.vec3), first_hit: int, side_index: int):
-    """Load the hit on side i; without coverage, all else in it is old. ``first_hit`` is the row of the first."""
+    """Load the hit on side ``side_index``; without coverage, all else in it is old. ``first_hit`` is side 0's row."""
     row = first_hit + 5 * side_index
     hit = PlaneHit()
     hit.coverage = store[row][0]
@@ -257,7 +257,7 @@ def _unnormalized_direction(cell: VisibleCell, hit: PlaneHit):
 
 @wp.func
 def _visible_footprint(
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     grid: PlaneGrid,
     side: PlaneSide,
     local_receiver: LocalReceiver,
@@ -269,14 +269,14 @@ def _visible_footprint(
     if hit.open_share < 1.0:
         visible_direction, _ = _unnormalized_direction(cell, hit)
         direction = wp.normalize(visible_direction)
-    footprint = footprint_on_side(scene, grid, side, local_receiver, direction)
+    footprint = footprint_on_side(planes, grid, side, local_receiver, direction)
     footprint.extent = wp.sqrt(hit.open_share)
     return direction, footprint
 
 
 @wp.func
 def find_side_hits(
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
     cell_share: float,
@@ -284,16 +284,16 @@ def find_side_hits(
     store: wp.array(dtype=wp.vec3),
     edges: wp.array(dtype=ViewedEdge),
 ):
-    """Store which plane sides this cell hits; return how many. No part meets nothing."""
+    """Store which plane sides this cell hits; return how many. A share of 0 hits nothing."""
     hit_count = int(0)
     if cell_share <= 0.0:
         return hit_count
-    first_hit = SIDE_ROWS * scene.grids.shape[0]
+    first_hit = SIDE_ROWS * planes.grids.shape[0]
     for side_index in range(side_count):
-        side = load_side(scene, side_index, store)
-        grid = scene.grids[side.f]
+        side = load_side(planes, side_index, store)
+        grid = planes.grids[side.f]
         local_receiver = load_local_receiver(store, side.f)
-        outline = outline_coverage_on_side(scene, grid, side, local_receiver, cell, edges)
+        outline = outline_coverage_on_side(planes, grid, side, local_receiver, cell, edges)
         clear_hit(store, first_hit, side_index)
         if outline[0] > 0.0:
             hit = PlaneHit()
@@ -301,32 +301,32 @@ def find_side_hits(
             hit.open_share = 1.0
             if _is_sender(grid, side) or is_covered_by_texels(grid):
                 first_level = first_level_of_side(grid, side.is_back)
-                footprint = footprint_on_side(scene, grid, side, local_receiver, cell.direction)
-                mip = find_mip_footprint(grid, scene, footprint)
+                footprint = footprint_on_side(planes, grid, side, local_receiver, cell.direction)
+                mip = find_mip_footprint(grid, planes, footprint)
                 if is_covered_by_texels(grid):
-                    hit.mesh_share = fetch(scene.covered, scene, first_level, mip)[0]
+                    hit.mesh_share = fetch(planes.covered, planes, first_level, mip)[0]
                 if _is_sender(grid, side):
-                    hit.radiosity = fetch(texels, scene, first_level, mip)
+                    hit.radiosity = fetch(texels, planes, first_level, mip)
             hit.coverage = outline[0] * hit.mesh_share
             hit.centroid = wp.vec3(outline[1], outline[2], outline[3]) / outline[0]
             hit.inverse_distance = inverse_distance_on_side(grid, side, local_receiver)
             store_hit(store, first_hit, side_index, hit)
             hit_count += 1
     if hit_count > 1:
-        _find_visible_parts(scene, cell, texels, side_count, store)
+        _find_visible_parts(planes, cell, texels, side_count, store)
     return hit_count
 
 
 @wp.func
 def _find_visible_parts(
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
     side_count: int,
     store: wp.array(dtype=wp.vec3),
 ):
     """Find what nearer sides leave open of each hit, and the radiosity of that."""
-    first_hit = SIDE_ROWS * scene.grids.shape[0]
+    first_hit = SIDE_ROWS * planes.grids.shape[0]
     for k in range(1, side_count):
         for j in range(k):
             if is_hit(store, first_hit, k) and is_hit(store, first_hit, j):
@@ -335,19 +335,19 @@ def _find_visible_parts(
         hit = load_hit(store, first_hit, side_index)
         if hit.coverage > 0.0 and hit.open_share < 1.0:
             hit.open_share = wp.max(hit.open_share, _MIN_OPEN)
-            side = load_side(scene, side_index, store)
-            grid = scene.grids[side.f]
+            side = load_side(planes, side_index, store)
+            grid = planes.grids[side.f]
             if _is_sender(grid, side):
                 local_receiver = load_local_receiver(store, side.f)
-                _, footprint = _visible_footprint(scene, grid, side, local_receiver, cell, hit)
-                mip = find_mip_footprint(grid, scene, footprint)
-                hit.radiosity = fetch(texels, scene, first_level_of_side(grid, side.is_back), mip)
+                _, footprint = _visible_footprint(planes, grid, side, local_receiver, cell, hit)
+                mip = find_mip_footprint(grid, planes, footprint)
+                hit.radiosity = fetch(texels, planes, first_level_of_side(grid, side.is_back), mip)
             store_hit(store, first_hit, side_index, hit)
 
 
 @wp.func
 def find_side_hits_adjoint(
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
     hit_count: int,
@@ -359,10 +359,10 @@ def find_side_hits_adjoint(
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
     """Add to the gradients of a receiver relative to each plane, of viewed edges, and of an instance's texels."""
-    first_hit = SIDE_ROWS * scene.grids.shape[0]
+    first_hit = SIDE_ROWS * planes.grids.shape[0]
     for side_index in range(side_count):
         if is_hit(store, first_hit, side_index):
-            _visible_radiosity_adjoint(scene, cell, texels, side_index, store, adj_store, instance, adj_texels)
+            _visible_radiosity_adjoint(planes, cell, texels, side_index, store, adj_store, instance, adj_texels)
     if hit_count > 1:
         for k in range(1, side_count):
             for j in range(k):
@@ -370,12 +370,12 @@ def find_side_hits_adjoint(
                     _block_each_other_adjoint(cell, k, j, first_hit, store, adj_store)
     for side_index in range(side_count):
         if is_hit(store, first_hit, side_index):
-            _outline_hit_adjoint(scene, cell, side_index, hit_count == 1, store, edges, adj_store)
+            _outline_hit_adjoint(planes, cell, side_index, hit_count == 1, store, edges, adj_store)
 
 
 @wp.func
 def _visible_radiosity_adjoint(
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
     side_index: int,
@@ -385,20 +385,20 @@ def _visible_radiosity_adjoint(
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
     """Add to the gradients of a receiver relative to a plane, of what others leave open of it, and of its texels."""
-    side = load_side(scene, side_index, store)
-    grid = scene.grids[side.f]
-    first_hit = SIDE_ROWS * scene.grids.shape[0]
+    side = load_side(planes, side_index, store)
+    grid = planes.grids[side.f]
+    first_hit = SIDE_ROWS * planes.grids.shape[0]
     hit, adj_hit = load_hit(store, first_hit, side_index), load_hit(adj_store, first_hit, side_index)
     if _is_sender(grid, side):
         first_level = first_level_of_side(grid, side.is_back)
         local_receiver = load_local_receiver(store, side.f)
-        direction, footprint = _visible_footprint(scene, grid, side, local_receiver, cell, hit)
-        mip = find_mip_footprint(grid, scene, footprint)
-        adj_mip = fetch_adjoint(texels, grid, scene, first_level, footprint, mip, adj_hit.radiosity)
+        direction, footprint = _visible_footprint(planes, grid, side, local_receiver, cell, hit)
+        mip = find_mip_footprint(grid, planes, footprint)
+        adj_mip = fetch_adjoint(texels, grid, planes, first_level, footprint, mip, adj_hit.radiosity)
         if adj_texels:
-            scatter(adj_texels[instance], scene, first_level, mip, adj_hit.radiosity)
+            scatter(adj_texels[instance], planes, first_level, mip, adj_hit.radiosity)
         adj_direction = footprint_on_side_adjoint(
-            scene, grid, side, local_receiver, direction, footprint, adj_mip, adj_store
+            planes, grid, side, local_receiver, direction, footprint, adj_mip, adj_store
         )
         if hit.open_share < 1.0:
             visible_direction, length = _unnormalized_direction(cell, hit)
@@ -413,7 +413,7 @@ def _visible_radiosity_adjoint(
 
 @wp.func
 def _outline_hit_adjoint(
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     cell: VisibleCell,
     side_index: int,
     is_alone: bool,
@@ -422,19 +422,19 @@ def _outline_hit_adjoint(
     adj_store: wp.array(dtype=wp.vec3),
 ):
     """Add to the gradients of a receiver relative to a plane, and of viewed edges."""
-    side = load_side(scene, side_index, store)
-    grid = scene.grids[side.f]
-    first_hit = SIDE_ROWS * scene.grids.shape[0]
+    side = load_side(planes, side_index, store)
+    grid = planes.grids[side.f]
+    first_hit = SIDE_ROWS * planes.grids.shape[0]
     hit, adj_hit = load_hit(store, first_hit, side_index), load_hit(adj_store, first_hit, side_index)
     local_receiver = load_local_receiver(store, side.f)
     outline_share = hit.coverage / hit.mesh_share
     if is_covered_by_texels(grid):
-        footprint = footprint_on_side(scene, grid, side, local_receiver, cell.direction)
-        mip = find_mip_footprint(grid, scene, footprint)
+        footprint = footprint_on_side(planes, grid, side, local_receiver, cell.direction)
+        mip = find_mip_footprint(grid, planes, footprint)
         first_level = first_level_of_side(grid, side.is_back)
         adj_covered = wp.vec3(adj_hit.coverage * outline_share, 0.0, 0.0)
-        adj_mip = fetch_adjoint(scene.covered, grid, scene, first_level, footprint, mip, adj_covered)
-        footprint_on_side_adjoint(scene, grid, side, local_receiver, cell.direction, footprint, adj_mip, adj_store)
+        adj_mip = fetch_adjoint(planes.covered, grid, planes, first_level, footprint, mip, adj_covered)
+        footprint_on_side_adjoint(planes, grid, side, local_receiver, cell.direction, footprint, adj_mip, adj_store)
     adj_share = adj_hit.coverage * hit.mesh_share
     adj_outline = wp.vec4(adj_share * side.weight, 0.0, 0.0, 0.0)
     if not is_alone:

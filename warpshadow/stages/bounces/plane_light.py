@@ -62,7 +62,7 @@ def _light_receivers(
     frames: wp.array2d(dtype=wp.vec3),
     texels: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     directions: wp.array(dtype=wp.vec3),
     # scratch
     scratch: wp.array2d(dtype=wp.vec3),
@@ -72,17 +72,17 @@ def _light_receivers(
 ):
     """A thread owns a receiver."""
     batch, receiver, scratch_row, side_count = prepare_receiver(
-        first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
+        first_row + wp.tid(), worker, points, frames, fronts, planes, scratch, viewed_edges
     )
     store, edges = scratch[scratch_row], viewed_edges[scratch_row]
     texel_radiosity = texels[instance_in(batch, texels.shape[0])]
     normal = normals[batch, receiver]
-    first_hit = SIDE_ROWS * scene.grids.shape[0]
+    first_hit = SIDE_ROWS * planes.grids.shape[0]
     total = wp.vec3()
     for q in range(directions.shape[0]):
         weight = wp.dot(normal, directions[q]) * transmittance[batch, receiver, q]
-        cell = visible_cell(scene, normal, directions[q])
-        if find_side_hits(scene, cell, texel_radiosity, weight, side_count, store, edges) > 0:
+        cell = visible_cell(planes, normal, directions[q])
+        if find_side_hits(planes, cell, texel_radiosity, weight, side_count, store, edges) > 0:
             mean, _, total_coverage = mean_radiosity(first_hit, side_count, store)
             total += (weight * wp.min(total_coverage, 1.0)) * mean
     light[batch, receiver] = (4.0 / float(directions.shape[0])) * total
@@ -99,7 +99,7 @@ def _light_receivers_adjoint(
     frames: wp.array2d(dtype=wp.vec3),
     texels: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     directions: wp.array(dtype=wp.vec3),
     adj_light: wp.array2d(dtype=wp.vec3),
     # scratch
@@ -117,13 +117,13 @@ def _light_receivers_adjoint(
 ):
     """A thread owns a receiver."""
     batch, receiver, scratch_row, side_count = prepare_receiver(
-        first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
+        first_row + wp.tid(), worker, points, frames, fronts, planes, scratch, viewed_edges
     )
     store, edges, adj_store = scratch[scratch_row], viewed_edges[scratch_row], adj_scratch[scratch_row]
     texel_batch = instance_in(batch, texels.shape[0])
     texel_radiosity = texels[texel_batch]
     normal = normals[batch, receiver]
-    first_hit = SIDE_ROWS * scene.grids.shape[0]
+    first_hit = SIDE_ROWS * planes.grids.shape[0]
     for k in range(first_hit):
         adj_store[k] = wp.vec3()
     adj_mean = (4.0 / float(directions.shape[0])) * adj_light[batch, receiver]
@@ -133,8 +133,8 @@ def _light_receivers_adjoint(
         cosine = wp.dot(normal, direction)
         cell_transmittance = transmittance[batch, receiver, q]
         weight = cosine * cell_transmittance
-        cell = visible_cell(scene, normal, direction)
-        hit_count = find_side_hits(scene, cell, texel_radiosity, cosine, side_count, store, edges)
+        cell = visible_cell(planes, normal, direction)
+        hit_count = find_side_hits(planes, cell, texel_radiosity, cosine, side_count, store, edges)
         if hit_count > 0:
             mean, weights, total_coverage = mean_radiosity(first_hit, side_count, store)
             value = wp.dot(adj_mean, mean)
@@ -155,7 +155,7 @@ def _light_receivers_adjoint(
                 adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + cosine * total
             if cell_transmittance > 0.0:
                 find_side_hits_adjoint(
-                    scene,
+                    planes,
                     cell,
                     texel_radiosity,
                     hit_count,
@@ -175,7 +175,7 @@ def _light_receivers_adjoint(
         points,
         frames,
         fronts,
-        scene,
+        planes,
         store,
         edges,
         adj_store,
@@ -226,11 +226,11 @@ def plane_light(
     fronts = None if fronts is None else expand_rows(fronts, batch_count)
     scratch = receiver_scratch(planes, HIT_ROWS)
     variables = [points, normals, transmittance, frames, texels, fronts]
-    scene, cell_directions = (
+    arrays, cell_directions = (
         plane_arrays(planes, cell_radius(len(directions)), skip),
         constant(directions, wp.vec3, points.device),
     )
-    inputs = [*variables, scene, cell_directions]
+    inputs = [*variables, arrays, cell_directions]
     return differentiable(
         lambda light: launch(
             _light_receivers,

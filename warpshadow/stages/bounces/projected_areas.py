@@ -15,7 +15,7 @@ lit. But receivers above a ground hardly see patches that face it and are near i
 which is at height d, is seen from the ground not at the slope at which its middle is seen, but at d / (d + r) of that:
 so the part of a normal that points into a plane with normal N fades,
 
-    n′ = n + c max(−n·N, 0) N,  c = f r² / (d² + r²) · Π_axes [S((y_most − y) / r) − S((y_least − y) / r)]
+    n′ = n + c max(−n·N, 0) N,  c = f r² / (d² + r²) · Π_axes [S((y_max − y) / r) − S((y_min − y) / r)]
 
 which is about 1 − d / (d + r), but smooth where bodies lie: S is the smoothstep from 0 at −1 to 1 at 1, y
 where the patch sample is along the plane, and f the part of the front that it sees; so it is for the back, with −N.
@@ -42,7 +42,7 @@ _HIDDEN = wp.constant(0.1)  # β, by which parts count that their own body hides
 
 @wp.func
 def _share_within(position: float, lower_bound: float, upper_bound: float, half_width: float):
-    """Part of an interval around a place that lies between two others."""
+    """Share of an interval around a position that lies between two bounds."""
     lower_offset, upper_offset = (lower_bound - position) / half_width, (upper_bound - position) / half_width
     return wp.smoothstep(-1.0, 1.0, upper_offset) - wp.smoothstep(-1.0, 1.0, lower_offset)
 

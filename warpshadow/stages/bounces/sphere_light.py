@@ -13,8 +13,8 @@ smooth in everything, stays within the radiosities of the patches, and does not 
 root of w a white ball behind a black one sent a tenth of its light past it, and patches behind a contact outshone it.
 
 The traversal is that of the transmittance, with other visits. The adjoint needs both sums of R of the cells in which
-something is blocked; they are kept from the forward launch: 16 bytes a receiver and cell, touched only in bundles of
-cells that are blocked in part (a fifth of them on a ground around a body). N bounces keep N times that.
+something is blocked; the forward launch stores them: 16 bytes a receiver and cell, touched only in bundles of cells
+that are blocked in part (a fifth of them on a ground around a body). N bounces store N times that.
 """
 
 import functools
@@ -60,9 +60,9 @@ _CORE = 0.25  # radii within which a sphere's weight hardly grows any more
 _NEAREST2 = 1.0e-12
 """The least d² + (r/4)², in squares of the radius of the largest run of spheres: so √w is at most 1e12."""
 
-_MIN_DENOMINATOR = (
-    1.0e-30  # the least denominator of R; spheres that block so little of a cell that they have less leave T at F
-)
+_MIN_DENOMINATOR = 1.0e-30
+"""The least denominator of R: spheres that block so little of a cell that they have less leave T at F."""
+
 _SUMS = 4  # Σ w a L, of three colors, and Σ w a S
 
 
@@ -86,7 +86,7 @@ def _task_type(lanes: int) -> Any:
         planes: wp.array(dtype=wp.vec4)  # [node] tangent planes; none where nodes are seen from everywhere
         adj_planes: wp.array(dtype=wp.vec4)
         tolerances: wp.array(dtype=wp.vec2)
-        inverse_size: float  # of 1/radius of the largest run of spheres
+        inverse_size: float  # 1/radius of the largest run of spheres
 
     return LightTask
 
@@ -175,8 +175,8 @@ def _make_load_task(lanes: int) -> wp.Function:
 
 
 @functools.cache
-def _make_weight(lanes: int) -> wp.Function:
-    """Make the kernel function of √w, in units of the largest run of spheres: offsets, 1/r → √w."""
+def _make_nearness(lanes: int) -> wp.Function:
+    """Make the kernel function of the nearness √w, in units of the largest run of spheres: offsets, 1/r → √w."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
     fn = make_lane_functions(lanes)
     dot, scale = fn.dot, fn.scale
@@ -184,14 +184,14 @@ def _make_weight(lanes: int) -> wp.Function:
     NEAREST2 = wp.constant(_NEAREST2)
 
     @wp.func(inline=True)
-    def weight(offset: Vectors, curvature: float, inverse_size: float):
+    def find_nearness(offset: Vectors, curvature: float, inverse_size: float):
         scaled_offset = scale(Lane(inverse_size), offset)
         core_radius = CORE * inverse_size / curvature
         return wp.cw_div(
             Lane(1.0), wp.max(dot(scaled_offset, scaled_offset) + Lane(core_radius * core_radius), Lane(NEAREST2))
         )
 
-    return weight
+    return find_nearness
 
 
 @functools.cache
@@ -200,7 +200,7 @@ def _make_light(lanes: int) -> wp.Kernel:
     ReceiverLanes, SphereView, LightTask = receiver_lanes_type(lanes), sphere_view_type(lanes), _task_type(lanes)
     fn = make_lane_functions(lanes)
     sqrt, is_any_above, dot_direction, add_vectors = fn.sqrt, fn.is_any_above, fn.dot_direction, fn.add_vectors
-    load_task, weigh, falloff = _make_load_task(lanes), _make_weight(lanes), make_falloff(lanes)
+    load_task, find_nearness, falloff = _make_load_task(lanes), _make_nearness(lanes), make_falloff(lanes)
     widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(True, lanes)
     find_facing_share = make_facing(lanes).share
     SUMS = wp.constant(_SUMS)
@@ -214,7 +214,7 @@ def _make_light(lanes: int) -> wp.Kernel:
         cap = widen_cone(cone.axis, cone.cosine, sine, cells)
         if is_above_horizon(cap, receivers.normals):
             slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
-            nearness = weigh(sphere_view.offset, sphere_view.curvature, task.inverse_size)
+            nearness = find_nearness(sphere_view.offset, sphere_view.curvature, task.inverse_size)
             opacity = wp.cw_mul(opacity, wp.cw_mul(nearness, nearness))
             if task.planes:
                 node = sphere_view.node
@@ -246,7 +246,7 @@ def _make_light(lanes: int) -> wp.Kernel:
         # scratch
         scratch: wp.array3d(dtype=Lane),
         reached_bundles: wp.array3d(dtype=wp.int32),
-        # scratch, or out where they are kept
+        # scratch, or out where the adjoint needs them
         sums: wp.array2d(dtype=Lane),
         # out
         light: wp.array2d(dtype=wp.vec3),
@@ -284,7 +284,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
     fn = make_lane_functions(lanes)
     sqrt, is_any_above, dot_direction, dot, scale = fn.sqrt, fn.is_any_above, fn.dot_direction, fn.dot, fn.scale
     add, load, total, add_vectors = fn.add, fn.load, fn.total, fn.add_vectors
-    load_task, weigh = _make_load_task(lanes), _make_weight(lanes)
+    load_task, find_nearness = _make_load_task(lanes), _make_nearness(lanes)
     falloff, sphere_adjoint = make_falloff(lanes), make_sphere_adjoint(lanes)
     widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(True, lanes)
     SUMS = wp.constant(_SUMS)
@@ -308,7 +308,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         cap = widen_cone(cone.axis, cone.cosine, sine, cells)
         if is_above_horizon(cap, receivers.normals):
             slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
-            nearness = weigh(sphere_view.offset, sphere_view.curvature, task.inverse_size)
+            nearness = find_nearness(sphere_view.offset, sphere_view.curvature, task.inverse_size)
             weight = wp.cw_mul(nearness, nearness)
             if task.planes:
                 node = sphere_view.node

@@ -19,7 +19,7 @@ def _add_light(
     # out
     total: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a receiver of an instance; the last two of four parts may be missing."""
+    """A thread owns a receiver of an instance; the last two of four summands may be missing."""
     batch, receiver = wp.tid()
     light = first[instance_in(batch, first.shape[0]), receiver] + second[instance_in(batch, second.shape[0]), receiver]
     if third:

@@ -272,19 +272,19 @@ def _make_cover(lanes: int) -> wp.Kernel:
         """A thread owns a block of receivers."""
         row = first_row + wp.tid()
         batch, block = find_block(row, points.shape[1])
-        place, instance = scratch_slot(worker, row), instance_in(batch, corners.shape[0])
+        slot, instance = scratch_slot(worker, row), instance_in(batch, corners.shape[0])
         task = begin(
             points,
             horizon_normals,
             batch,
             block,
-            coverage[place],
-            covered[place],
-            sums[place],
-            chord_sums[place],
-            edge_scratch[place],
-            edge_scratch[place],
-            numbers[place],
+            coverage[slot],
+            covered[slot],
+            sums[slot],
+            chord_sums[slot],
+            edge_scratch[slot],
+            edge_scratch[slot],
+            numbers[slot],
         )
         cover_all(corners[instance], planes[instance], bounds[instance], parts, skip, cells, radius, task)
         for q in range(task.coverage.shape[0]):
@@ -348,26 +348,26 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
         """A thread owns a block of receivers; cells that are covered wholly have no gradient."""
         row = first_row + wp.tid()
         batch, block = find_block(row, points.shape[1])
-        place, instance = scratch_slot(worker, row), instance_in(batch, corners.shape[0])
+        slot, instance = scratch_slot(worker, row), instance_in(batch, corners.shape[0])
         task = begin(
             points,
             horizon_normals,
             batch,
             block,
-            coverage[place],
-            covered[place],
-            sums[place],
-            chord_sums[place],
-            edge_scratch[place],
-            adj_edge_scratch[place],
-            numbers[place],
+            coverage[slot],
+            covered[slot],
+            sums[slot],
+            chord_sums[slot],
+            edge_scratch[slot],
+            adj_edge_scratch[slot],
+            numbers[slot],
         )
         cover_all(corners[instance], planes[instance], bounds[instance], parts, skip, cells, radius, task)
         load_columns(adj_result[batch], block, task.coverage)
         for q in range(task.coverage.shape[0]):
-            adj_sums[place, q] = SumsOfBlockers()
+            adj_sums[slot, q] = SumsOfBlockers()
             if is_any_above(task.sums[q].total, 0.0):
-                adj_sums[place, q] = joint_coverage_adjoint(task.sums[q], task.coverage[q])
+                adj_sums[slot, q] = joint_coverage_adjoint(task.sums[q], task.coverage[q])
             task.coverage[q] = Coverages()
         silhouette = task.silhouette
         adj_point = Vectors()
@@ -380,7 +380,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
             affected_count = int(0)
             for k in range(covered_count):
                 q = task.covered[k]
-                adj_coverage = blocker_adjoint(task.sums[q], adj_sums[place, q], task.coverage[q])
+                adj_coverage = blocker_adjoint(task.sums[q], adj_sums[slot, q], task.coverage[q])
                 task.coverage[q] = adj_coverage
                 if is_any(adj_coverage):
                     task.covered[affected_count] = q

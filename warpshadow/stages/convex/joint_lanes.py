@@ -79,7 +79,7 @@ def make_joint_functions(lanes: int) -> JointFunctions:
 
     @wp.func(inline=True)
     def with_blocker(sums: SumsOfBlockers, coverage: Coverages):
-        """Sums over one blocker new_sums."""
+        """Sums over one blocker more."""
         share = wp.min(wp.max(coverage.share, Lane(0.0)), Lane(1.0))
         bound = moment_bound(share)
         new_sums = SumsOfBlockers()
@@ -94,7 +94,7 @@ def make_joint_functions(lanes: int) -> JointFunctions:
 
     @wp.func(inline=True)
     def relate(sums: SumsOfBlockers):
-        """1 / Σ ν ν; k; its weight; 1 where it is below 0; and what is open if blockers are so."""
+        """1 / Σ ν ν; k; its weight; 1 where it is below 0; and the share that is open if blockers are so related."""
         per_bounds = wp.cw_div(Lane(1.0), wp.cw_mul(sums.bounds, sums.bounds) - sums.bound_squares + Lane(MIN_BOUNDS))
         relation = wp.cw_mul(dot(sums.moment, sums.moment) - sums.squares, per_bounds)
         weight = wp.min(wp.max(relation, -relation), Lane(1.0))

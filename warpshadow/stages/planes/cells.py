@@ -62,13 +62,13 @@ def plane_arrays(planes: PlaneBlockers, radius: float, skip: int | None, *, tile
 
     Where cells do not tile the sphere, as a sun's alone, texels are half as wide.
     """
-    scene = PlaneArrays()
-    scene.grids, scene.levels, scene.level_scales = planes.grids, planes.levels, planes.level_scales
-    scene.covered, scene.edges, scene.edge_axes = planes.covered, planes.edges, planes.edge_axes
-    scene.skip, scene.radius = -1 if skip is None else skip, radius
-    scene.texel_radius = scene.radius if tiles else 0.5 * scene.radius
-    scene.per_radius = 1 / scene.radius
-    return scene
+    arrays = PlaneArrays()
+    arrays.grids, arrays.levels, arrays.level_scales = planes.grids, planes.levels, planes.level_scales
+    arrays.covered, arrays.edges, arrays.edge_axes = planes.covered, planes.edges, planes.edge_axes
+    arrays.skip, arrays.radius = -1 if skip is None else skip, radius
+    arrays.texel_radius = arrays.radius if tiles else 0.5 * arrays.radius
+    arrays.per_radius = 1 / arrays.radius
+    return arrays
 
 
 @wp.func
@@ -247,20 +247,20 @@ class PlaneFootprint:
 
 
 @wp.func
-def find_footprint(scene: PlaneArrays, position: wp.vec3, direction: wp.vec3):
+def find_footprint(planes: PlaneArrays, position: wp.vec3, direction: wp.vec3):
     """Find the footprint of a cell on a side.
 
     Args:
-        scene: Has the radius of cells.
+        planes: Have the radius of cells.
         position: Where the receiver is: along both axes, and its height above the side.
         direction: Direction of the cell along both axes, and its cosine, above −ρ.
     """
     footprint = PlaneFootprint()
     footprint.extent = 1.0
     cosine = direction[2]
-    if cosine < scene.radius:
-        u = 0.5 * cosine * scene.per_radius + 0.5
-        cosine = scene.radius * (1.0 / 3.0 + 2.0 / 3.0 * u * u * u)
+    if cosine < planes.radius:
+        u = 0.5 * cosine * planes.per_radius + 0.5
+        cosine = planes.radius * (1.0 / 3.0 + 2.0 / 3.0 * u * u * u)
     footprint.per_cosine = 1.0 / cosine
     footprint.distance = position[2] * footprint.per_cosine
     footprint.center = wp.vec2(
@@ -271,7 +271,7 @@ def find_footprint(scene: PlaneArrays, position: wp.vec3, direction: wp.vec3):
 
 @wp.func
 def find_footprint_adjoint(
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     direction: wp.vec3,
     footprint: PlaneFootprint,
     adj_distance: float,
@@ -281,8 +281,8 @@ def find_footprint_adjoint(
     """Gradients of ``position`` and ``direction``, given the footprint's and the mean cosine's, c′."""
     adj_t = adj_distance + adj_center[0] * direction[0] + adj_center[1] * direction[1]
     adj_c = adj_cosine - adj_t * footprint.distance * footprint.per_cosine
-    if direction[2] < scene.radius:
-        u = 0.5 * direction[2] * scene.per_radius + 0.5
+    if direction[2] < planes.radius:
+        u = 0.5 * direction[2] * planes.per_radius + 0.5
         adj_c = adj_c * u * u
     adj_position = wp.vec3(adj_center[0], adj_center[1], adj_t * footprint.per_cosine)
     return adj_position, wp.vec3(adj_center[0] * footprint.distance, adj_center[1] * footprint.distance, adj_c)
@@ -299,7 +299,7 @@ class MipFootprint:
     slopes: wp.vec2  # of that by the center in the plane
     level: int  # finer of the two levels
     coarse_share: float  # of the coarser one
-    part_slope: float  # of that by the logarithm of the footprint's width
+    coarse_share_slope: float  # its derivative by the logarithm of the footprint's width
 
 
 @wp.func
@@ -309,7 +309,7 @@ def is_covered_by_texels(grid: PlaneGrid):
 
 
 @wp.func
-def find_mip_footprint(grid: PlaneGrid, scene: PlaneArrays, footprint: PlaneFootprint):
+def find_mip_footprint(grid: PlaneGrid, planes: PlaneArrays, footprint: PlaneFootprint):
     """Find where in the mip levels of a grid a footprint lies."""
     mip = MipFootprint()
     x = footprint.center[0] * grid.per_spread
@@ -320,14 +320,14 @@ def find_mip_footprint(grid: PlaneGrid, scene: PlaneArrays, footprint: PlaneFoot
         wp.sign(x) * wp.log(size_x) * grid.texels[0], wp.sign(y) * wp.log(size_y) * grid.texels[1]
     )
     mip.slopes = grid.per_spread * wp.vec2(grid.texels[0] / size_x, grid.texels[1] / size_y)
-    radius = footprint.extent * scene.texel_radius
+    radius = footprint.extent * planes.texel_radius
     width = 2.0 * footprint.distance * radius * wp.sqrt(mip.slopes[0] * mip.slopes[1] * footprint.per_cosine)
     while mip.level < grid.level_count - 1 and width >= 2.0:
         mip.level = mip.level + 1
         width *= 0.5
     if width > 1.0 and mip.level < grid.level_count - 1:
         mip.coarse_share = width - 1.0
-        mip.part_slope = width
+        mip.coarse_share_slope = width
     return mip
 
 
@@ -350,10 +350,10 @@ class _Corners:
 
 
 @wp.func
-def _find_corners(scene: PlaneArrays, level_index: int, texel: wp.vec2):
+def _find_corners(planes: PlaneArrays, level_index: int, texel: wp.vec2):
     corners = _Corners()
-    level = scene.levels[level_index]
-    scale = scene.level_scales[level_index]
+    level = planes.levels[level_index]
+    scale = planes.level_scales[level_index]
     last_x = float(level[1] - 1)
     last_y = float(level[2] - 1)
     x = texel[0] * scale[0] - 0.5
@@ -391,17 +391,17 @@ def _interpolation_slopes(texels: wp.array(dtype=wp.vec3), corners: _Corners, ad
     b = wp.dot(adj_value, texels[corners.upper_left + corners.column_step])
     c = wp.dot(adj_value, texels[corners.lower_left])
     d = wp.dot(adj_value, texels[corners.lower_left + corners.column_step])
-    slope_u = (1.0 - corners.t) * (b - a) + corners.t * (d - c)
+    slope_s = (1.0 - corners.t) * (b - a) + corners.t * (d - c)
     slope_t = (1.0 - corners.s) * (c - a) + corners.s * (d - b)
-    return wp.vec2(corners.slopes[0] * slope_u, corners.slopes[1] * slope_t)
+    return wp.vec2(corners.slopes[0] * slope_s, corners.slopes[1] * slope_t)
 
 
 @wp.func
-def fetch(texels: wp.array(dtype=wp.vec3), scene: PlaneArrays, first_level: int, mip: MipFootprint):
+def fetch(texels: wp.array(dtype=wp.vec3), planes: PlaneArrays, first_level: int, mip: MipFootprint):
     """Mean over a footprint, in the mip levels from ``first_level`` on."""
-    value = _interpolate_corners(texels, _find_corners(scene, first_level + mip.level, mip.texel))
+    value = _interpolate_corners(texels, _find_corners(planes, first_level + mip.level, mip.texel))
     if mip.coarse_share > 0.0:
-        coarse = _interpolate_corners(texels, _find_corners(scene, first_level + mip.level + 1, mip.texel))
+        coarse = _interpolate_corners(texels, _find_corners(planes, first_level + mip.level + 1, mip.texel))
         value = (1.0 - mip.coarse_share) * value + mip.coarse_share * coarse
     return value
 
@@ -410,20 +410,20 @@ def fetch(texels: wp.array(dtype=wp.vec3), scene: PlaneArrays, first_level: int,
 def fetch_adjoint(
     texels: wp.array(dtype=wp.vec3),
     grid: PlaneGrid,
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     first_level: int,
     footprint: PlaneFootprint,
     mip: MipFootprint,
     adj_value: wp.vec3,
 ):
-    """Gradients of the place, and of the logarithm of the footprint's width, which is as t / √c′ and its extent."""
-    fine = _find_corners(scene, first_level + mip.level, mip.texel)
+    """Gradients of the position in the plane, and of the logarithm of the footprint's width, t / √c′ and its extent."""
+    fine = _find_corners(planes, first_level + mip.level, mip.texel)
     slopes = _interpolation_slopes(texels, fine, adj_value)
     adj_log = float(0.0)
     if mip.coarse_share > 0.0:
-        coarse = _find_corners(scene, first_level + mip.level + 1, mip.texel)
+        coarse = _find_corners(planes, first_level + mip.level + 1, mip.texel)
         slopes = (1.0 - mip.coarse_share) * slopes + mip.coarse_share * _interpolation_slopes(texels, coarse, adj_value)
-        adj_log = mip.part_slope * wp.dot(
+        adj_log = mip.coarse_share_slope * wp.dot(
             adj_value, _interpolate_corners(texels, coarse) - _interpolate_corners(texels, fine)
         )
     adj_x = slopes[0] * mip.slopes[0]
@@ -436,13 +436,13 @@ def fetch_adjoint(
 
 @wp.func
 def scatter(
-    adj_texels: wp.array(dtype=wp.vec3), scene: PlaneArrays, first_level: int, mip: MipFootprint, adj_value: wp.vec3
+    adj_texels: wp.array(dtype=wp.vec3), planes: PlaneArrays, first_level: int, mip: MipFootprint, adj_value: wp.vec3
 ):
     """Add to the gradients of texels: the adjoint of :func:`fetch` by its values."""
     level_share = 1.0 - mip.coarse_share
     for coarser in range(2):
         if level_share > 0.0:
-            c = _find_corners(scene, first_level + mip.level + coarser, mip.texel)
+            c = _find_corners(planes, first_level + mip.level + coarser, mip.texel)
             adj_upper = (level_share * (1.0 - c.t)) * adj_value
             adj_lower = (level_share * c.t) * adj_value
             wp.atomic_add(adj_texels, c.upper_left, (1.0 - c.s) * adj_upper)

@@ -52,13 +52,13 @@ class PlaneCoverage:
     """Coverage of a cell by a side."""
 
     outline: wp.vec4  # (h, μ), by its outline
-    mesh_share: float  # of that, that the mesh covers, by texels
+    mesh_share: float  # share of the outline that the mesh covers, by texels
     footprint: PlaneFootprint  # of these texels
 
 
 @wp.func
 def side_coverage(
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     grid: PlaneGrid,
     side: PlaneSide,
     local_receiver: LocalReceiver,
@@ -68,17 +68,17 @@ def side_coverage(
     """Coverage of a cell by a side."""
     coverage = PlaneCoverage()
     coverage.mesh_share = 1.0
-    coverage.outline = outline_coverage_on_side(scene, grid, side, local_receiver, cell, edges)
+    coverage.outline = outline_coverage_on_side(planes, grid, side, local_receiver, cell, edges)
     if is_covered_by_texels(grid) and coverage.outline[0] > 0.0:
-        coverage.footprint = footprint_on_side(scene, grid, side, local_receiver, cell.direction)
-        mip = find_mip_footprint(grid, scene, coverage.footprint)
-        coverage.mesh_share = fetch(scene.covered, scene, grid.first_level, mip)[0]
+        coverage.footprint = footprint_on_side(planes, grid, side, local_receiver, cell.direction)
+        mip = find_mip_footprint(grid, planes, coverage.footprint)
+        coverage.mesh_share = fetch(planes.covered, planes, grid.first_level, mip)[0]
     return coverage
 
 
 @wp.func
 def side_coverage_adjoint(
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     grid: PlaneGrid,
     side: PlaneSide,
     local_receiver: LocalReceiver,
@@ -91,15 +91,15 @@ def side_coverage_adjoint(
     coverage = PlaneCoverage()
     coverage.mesh_share = 1.0
     if side.weight < 1.0 or is_covered_by_texels(grid):
-        coverage = side_coverage(scene, grid, side, local_receiver, cell, edges)
+        coverage = side_coverage(planes, grid, side, local_receiver, cell, edges)
         adj_weight = coverage.mesh_share * wp.dot(adj_coverage, coverage.outline) / side.weight
         adj_store[side.row] = adj_store[side.row] + wp.vec3(0.0, 0.0, adj_weight)
     if is_covered_by_texels(grid) and coverage.outline[0] > 0.0:
         footprint = coverage.footprint
         adj_part = wp.vec3(wp.dot(adj_coverage, coverage.outline), 0.0, 0.0)
-        mip = find_mip_footprint(grid, scene, footprint)
-        adj_mip = fetch_adjoint(scene.covered, grid, scene, grid.first_level, footprint, mip, adj_part)
-        footprint_on_side_adjoint(scene, grid, side, local_receiver, cell.direction, footprint, adj_mip, adj_store)
+        mip = find_mip_footprint(grid, planes, footprint)
+        adj_mip = fetch_adjoint(planes.covered, grid, planes, grid.first_level, footprint, mip, adj_part)
+        footprint_on_side_adjoint(planes, grid, side, local_receiver, cell.direction, footprint, adj_mip, adj_store)
     adj_outline = (side.weight * coverage.mesh_share) * adj_coverage
     coverage_adjoint(edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, adj_outline)
 
@@ -127,7 +127,7 @@ def _find_coverage(
     horizon_normals: wp.array2d(dtype=wp.vec3),
     frames: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     directions: wp.array(dtype=wp.vec3),
     # scratch
     scratch: wp.array2d(dtype=wp.vec3),
@@ -137,7 +137,7 @@ def _find_coverage(
 ):
     """A thread owns a receiver."""
     batch, receiver, scratch_row, side_count = prepare_receiver(
-        first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
+        first_row + wp.tid(), worker, points, frames, fronts, planes, scratch, viewed_edges
     )
     store, edges = scratch[scratch_row], viewed_edges[scratch_row]
     normal = horizon_normal(horizon_normals, batch, receiver)
@@ -145,15 +145,15 @@ def _find_coverage(
     for q in range(directions.shape[0]):
         coverage[q] = wp.vec4()
     for i in range(side_count):
-        side = load_side(scene, i, store)
-        grid = scene.grids[side.f]
+        side = load_side(planes, i, store)
+        grid = planes.grids[side.f]
         local_receiver = load_local_receiver(store, side.f)
         if grid.blocks == 1:
             for q in range(directions.shape[0]):
                 direction = directions[q]
                 if is_above_horizon(normal, direction) and coverage[q][0] < 1.0:
-                    cell = visible_cell(scene, normal, direction)
-                    coverage_of_side = side_coverage(scene, grid, side, local_receiver, cell, edges)
+                    cell = visible_cell(planes, normal, direction)
+                    coverage_of_side = side_coverage(planes, grid, side, local_receiver, cell, edges)
                     if coverage_of_side.outline[0] > 0.0:
                         coverage[q] = coverage[q] + coverage_of_side.mesh_share * coverage_of_side.outline
 
@@ -167,7 +167,7 @@ def _find_coverage_adjoint(
     horizon_normals: wp.array2d(dtype=wp.vec3),
     frames: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     directions: wp.array(dtype=wp.vec3),
     adj_coverages: wp.array3d(dtype=wp.vec4),
     # scratch
@@ -182,22 +182,22 @@ def _find_coverage_adjoint(
 ):
     """A thread owns a receiver; cells that are covered wholly are taken to have no gradient."""
     batch, receiver, scratch_row, side_count = prepare_receiver(
-        first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
+        first_row + wp.tid(), worker, points, frames, fronts, planes, scratch, viewed_edges
     )
     store, edges, adj_store = scratch[scratch_row], viewed_edges[scratch_row], adj_scratch[scratch_row]
     normal = horizon_normal(horizon_normals, batch, receiver)
-    for k in range(SIDE_ROWS * scene.grids.shape[0]):
+    for k in range(SIDE_ROWS * planes.grids.shape[0]):
         adj_store[k] = wp.vec3()
     for i in range(side_count):
-        side = load_side(scene, i, store)
-        grid = scene.grids[side.f]
+        side = load_side(planes, i, store)
+        grid = planes.grids[side.f]
         local_receiver = load_local_receiver(store, side.f)
         if grid.blocks == 1:
             for q in range(directions.shape[0]):
                 adj_coverage = adj_coverages[batch, receiver, q]
                 if wp.length_sq(adj_coverage) > 0.0 and is_above_horizon(normal, directions[q]):
-                    cell = visible_cell(scene, normal, directions[q])
-                    side_coverage_adjoint(scene, grid, side, local_receiver, cell, adj_coverage, edges, adj_store)
+                    cell = visible_cell(planes, normal, directions[q])
+                    side_coverage_adjoint(planes, grid, side, local_receiver, cell, adj_coverage, edges, adj_store)
     prepare_receiver_adjoint(
         batch,
         receiver,
@@ -205,7 +205,7 @@ def _find_coverage_adjoint(
         points,
         frames,
         fronts,
-        scene,
+        planes,
         store,
         edges,
         adj_store,
@@ -249,11 +249,11 @@ def plane_coverage(
     count = common_batch({"points": points, "frames": frames, "fronts": fronts})
     points, fronts = expand(points, count), None if fronts is None else expand_rows(fronts, count)
     radius_of_cells = cell_radius(len(directions)) if radius is None else radius
-    scene = plane_arrays(planes, radius_of_cells, skip, tiles=radius is None)
+    arrays = plane_arrays(planes, radius_of_cells, skip, tiles=radius is None)
     if not set(planes.is_blocking) - {skip}:
         return None
     cells = constant(directions, wp.vec3, points.device)
-    inputs, cost = [points, horizon_normals, frames, fronts, scene, cells], _CELL_COST * cells.size * planes.count
+    inputs, cost = [points, horizon_normals, frames, fronts, arrays, cells], _CELL_COST * cells.size * planes.count
     scratch = receiver_scratch(planes)
     return differentiable(
         lambda coverages: launch(

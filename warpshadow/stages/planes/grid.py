@@ -78,7 +78,10 @@ class PlaneTexture(NamedTuple):
         return row * width + column
 
     def points(self, points_per_texel: int) -> np.ndarray:
-        """Points evenly over every texel, ``points_per_texel`` along each side: [row · split, column · split, 2]."""
+        """Points evenly over every texel, ``points_per_texel`` along each side.
+
+        Float64 of shape [row · points_per_texel, column · points_per_texel, 2].
+        """
         height, width = self.covered.shape
         axes = [
             self.spread * stretched(low + (high - low) * (np.arange(axis_count) + 0.5) / axis_count)

@@ -64,20 +64,20 @@ def _partial_weight_slope(coverage: float):
 
 
 @wp.func
-def _sample_weight(scene: PlaneArrays, normal: wp.vec3, direction: wp.vec3):
+def _sample_weight(planes: PlaneArrays, normal: wp.vec3, direction: wp.vec3):
     """Weight of a direction in the mean: its cosine for receivers in a plane; for others 1 above their horizon."""
     cosine = wp.dot(normal, direction)
     weight = wp.where(cosine > 0.0, 1.0, 0.0)
     if wp.length_sq(normal) == 0.0:
         weight = 1.0
-    elif scene.skip >= 0:
+    elif planes.skip >= 0:
         weight = wp.max(cosine, 0.0)
     return weight
 
 
 @wp.func
-def _find_coverage(
-    scene: PlaneArrays,
+def _direction_coverage(
+    planes: PlaneArrays,
     direction: wp.vec3,
     normal: wp.vec3,
     side_count: int,
@@ -85,20 +85,20 @@ def _find_coverage(
     edges: wp.array(dtype=ViewedEdge),
 ):
     """Σ_k h_k of a direction."""
-    weighted_sum = float(0.0)
-    cell = visible_cell(scene, normal, direction)
+    coverage_sum = float(0.0)
+    cell = visible_cell(planes, normal, direction)
     for i in range(side_count):
-        side = load_side(scene, i, store)
-        grid = scene.grids[side.f]
-        if grid.blocks == 1 and weighted_sum < 1.0:
-            covered = side_coverage(scene, grid, side, load_local_receiver(store, side.f), cell, edges)
-            weighted_sum += covered.outline[0] * covered.mesh_share
-    return weighted_sum
+        side = load_side(planes, i, store)
+        grid = planes.grids[side.f]
+        if grid.blocks == 1 and coverage_sum < 1.0:
+            covered = side_coverage(planes, grid, side, load_local_receiver(store, side.f), cell, edges)
+            coverage_sum += covered.outline[0] * covered.mesh_share
+    return coverage_sum
 
 
 @wp.func
 def _find_mean_coverage(
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     samples: wp.array(dtype=wp.vec3),
     normal: wp.vec3,
     side_count: int,
@@ -109,9 +109,10 @@ def _find_mean_coverage(
     weighted_sum = float(0.0)
     weights = float(0.0)
     for s in range(samples.shape[0]):
-        weight = _sample_weight(scene, normal, samples[s])
+        weight = _sample_weight(planes, normal, samples[s])
         if weight > 0.0:
-            weighted_sum += weight * wp.min(1.0, _find_coverage(scene, samples[s], normal, side_count, store, edges))
+            coverage = _direction_coverage(planes, samples[s], normal, side_count, store, edges)
+            weighted_sum += weight * wp.min(1.0, coverage)
             weights += weight
     if weights > 0.0:
         weighted_sum = weighted_sum / weights
@@ -119,7 +120,7 @@ def _find_mean_coverage(
 
 
 @wp.kernel(enable_backward=False)
-def _sample_light(
+def _refine_coverage(
     first_row: int,
     worker: int,
     # in
@@ -128,7 +129,7 @@ def _sample_light(
     covered: wp.array3d(dtype=wp.vec4),
     frames: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     samples: wp.array2d(dtype=wp.vec3),
     # scratch
     scratch: wp.array2d(dtype=wp.vec3),
@@ -138,7 +139,7 @@ def _sample_light(
 ):
     """A thread owns a receiver."""
     batch, receiver, scratch_row, side_count = prepare_receiver(
-        first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
+        first_row + wp.tid(), worker, points, frames, fronts, planes, scratch, viewed_edges
     )
     store, edges = scratch[scratch_row], viewed_edges[scratch_row]
     normal = horizon_normal(horizon_normals, batch, receiver)
@@ -147,14 +148,14 @@ def _sample_light(
         coverage = cell[0]
         weight = _partial_weight(coverage)
         if weight > 0.0:
-            mean_coverage, weights = _find_mean_coverage(scene, samples[q], normal, side_count, store, edges)
+            mean_coverage, weights = _find_mean_coverage(planes, samples[q], normal, side_count, store, edges)
             if weights > 0.0:
                 coverage = coverage + weight * (mean_coverage - coverage)
         refined[batch, receiver, q] = wp.vec4(coverage, cell[1], cell[2], cell[3])
 
 
 @wp.kernel(enable_backward=False)
-def _sample_light_adjoint(
+def _refine_coverage_adjoint(
     first_row: int,
     worker: int,
     # in
@@ -163,7 +164,7 @@ def _sample_light_adjoint(
     covered: wp.array3d(dtype=wp.vec4),
     frames: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     samples: wp.array2d(dtype=wp.vec3),
     adj_refined: wp.array3d(dtype=wp.vec4),
     # scratch
@@ -179,11 +180,11 @@ def _sample_light_adjoint(
 ):
     """A thread owns a receiver; a direction that is covered wholly has no gradient."""
     batch, receiver, scratch_row, side_count = prepare_receiver(
-        first_row + wp.tid(), worker, points, frames, fronts, scene, scratch, viewed_edges
+        first_row + wp.tid(), worker, points, frames, fronts, planes, scratch, viewed_edges
     )
     store, edges, adj_store = scratch[scratch_row], viewed_edges[scratch_row], adj_scratch[scratch_row]
     normal = horizon_normal(horizon_normals, batch, receiver)
-    for k in range(SIDE_ROWS * scene.grids.shape[0]):
+    for k in range(SIDE_ROWS * planes.grids.shape[0]):
         adj_store[k] = wp.vec3()
     for q in range(samples.shape[0]):
         coverage = covered[batch, receiver, q][0]
@@ -192,21 +193,21 @@ def _sample_light_adjoint(
         weight = _partial_weight(coverage)
         slope = float(1.0)
         if adj_share != 0.0 and weight > 0.0:
-            mean_coverage, weights = _find_mean_coverage(scene, samples[q], normal, side_count, store, edges)
+            mean_coverage, weights = _find_mean_coverage(planes, samples[q], normal, side_count, store, edges)
             if weights > 0.0:
                 slope = 1.0 - weight + _partial_weight_slope(coverage) * (mean_coverage - coverage)
             for s in range(samples.shape[1]):
                 direction = samples[q, s]
-                share = _sample_weight(scene, normal, direction)
-                if share > 0.0 and _find_coverage(scene, direction, normal, side_count, store, edges) < 1.0:
-                    cell = visible_cell(scene, normal, direction)
+                share = _sample_weight(planes, normal, direction)
+                if share > 0.0 and _direction_coverage(planes, direction, normal, side_count, store, edges) < 1.0:
+                    cell = visible_cell(planes, normal, direction)
                     adj_part = wp.vec4(weight * adj_share * share / weights, 0.0, 0.0, 0.0)
                     for i in range(side_count):
-                        side = load_side(scene, i, store)
-                        grid = scene.grids[side.f]
+                        side = load_side(planes, i, store)
+                        grid = planes.grids[side.f]
                         if grid.blocks == 1:
                             local_receiver = load_local_receiver(store, side.f)
-                            side_coverage_adjoint(scene, grid, side, local_receiver, cell, adj_part, edges, adj_store)
+                            side_coverage_adjoint(planes, grid, side, local_receiver, cell, adj_part, edges, adj_store)
         if adj_covered:
             adj_covered[batch, receiver, q] = adj_covered[batch, receiver, q] + wp.vec4(
                 slope * adj_share, adj_cell[1], adj_cell[2], adj_cell[3]
@@ -218,7 +219,7 @@ def _sample_light_adjoint(
         points,
         frames,
         fronts,
-        scene,
+        planes,
         store,
         edges,
         adj_store,
@@ -257,16 +258,16 @@ def coverage_of_light(
     count = common_batch({"points": points, "frames": frames, "fronts": fronts, "covered": covered})
     points, covered = expand(points, count), expand_rows(covered, count)
     fronts = None if fronts is None else expand_rows(fronts, count)
-    scene = plane_arrays(planes, cell_radius(SAMPLES * len(directions)), skip, tiles=False)
+    arrays = plane_arrays(planes, cell_radius(SAMPLES * len(directions)), skip, tiles=False)
     samples_on_device = constant(np.asarray(samples, np.float32), wp.vec3, points.device)
-    inputs = [points, horizon_normals, covered, frames, fronts, scene, samples_on_device]
+    inputs = [points, horizon_normals, covered, frames, fronts, arrays, samples_on_device]
     scratch, cost = receiver_scratch(planes), _CELL_COST * len(directions)
     return differentiable(
         lambda refined: launch(
-            _sample_light, points.size, inputs=inputs, scratch=scratch, outputs=[refined], cost=cost
+            _refine_coverage, points.size, inputs=inputs, scratch=scratch, outputs=[refined], cost=cost
         ),
         lambda adj_refined: launch(
-            _sample_light_adjoint,
+            _refine_coverage_adjoint,
             points.size,
             inputs=[*inputs, adj_refined],
             scratch=[*scratch, scratch[0]],

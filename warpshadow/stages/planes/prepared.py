@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 MAX_EDGES = 128
 """Edges of an outline at most: beyond, it is that of the rectangle, of which the mesh takes its share by texels."""
 
-_NEIGHBOR_WEIGHT = (
-    0.002  # how much texels count in their neighbors, which have their light if nothing of their own is seen
-)
+_NEIGHBOR_WEIGHT = 0.002
+"""How much texels count in their neighbors, which have their light if nothing of their own is seen."""
+
 _MARGIN = 0.001  # margin of planes, in widths of the smallest texel
 
 
@@ -31,7 +31,7 @@ class PlaneBody(NamedTuple):
 
     grid: PlaneTexture
     positions: np.ndarray  # its vertices at rest, in its own frame, shape [vertex, 3]
-    faces: np.ndarray  # its faces, indices into all faces, shape [face, 3]
+    faces: np.ndarray  # its faces, indices of its vertices, shape [face, 3]
     first_vertex: int  # offset of its vertices among the vertices of all bodies
     first_patch: int  # offset of its patches among the patches of all bodies
     blocks: bool  # whether it casts shadows

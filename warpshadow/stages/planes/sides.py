@@ -21,15 +21,15 @@ from warpshadow.stages.planes.cells import (
 )
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 
-# Scratch of a receiver, vec3. Its position relative to each plane f, whose gradients have the same places:
-#     5 f        where it is along both axes, and its height
-#     5 f + 1    the axis u, of unit length; 5 f + 2 the axis v, and 5 f + 3 the normal
-#     5 f + 4    the scale of the body
-# Sides i that it may meet, from ``5 plane_count`` on:
-#     i          the plane, 1 for its back, and which part of the side is there
+# Rows of a receiver's scratch, each a vec3; scratch of gradients has the same rows. Of n planes,
+#     5 f            has the receiver's position in the axes of plane f (:class:`.cells.LocalReceiver`);
+#     5 f + 1, 2, 3  have the plane's axes u and v, of unit length, and its normal;
+#     5 f + 4        has the scale of its body;
+#     5 n + i        has side i of the sides that the receiver sees, at most 2 n: the number of its plane, 1 for a back
+#                    or 0 for a front, and the part of the side that the receiver sees.
 _RECEIVER_ROWS = wp.constant(5)
 SIDE_ROWS = wp.constant(7)
-"""Rows of scratch for each plane."""
+"""Rows of scratch for each plane: five, and one for each of its two sides."""
 
 # of an outline as the front and the back see it
 _VIEWS = wp.constant(2)
@@ -52,15 +52,15 @@ class PlaneSide:
 
 
 @wp.func
-def load_side(scene: PlaneArrays, i: int, store: wp.array(dtype=wp.vec3)):
+def load_side(planes: PlaneArrays, i: int, store: wp.array(dtype=wp.vec3)):
     """Load side i of the sides that a receiver sees."""
     side = PlaneSide()
-    side.row = _RECEIVER_ROWS * scene.grids.shape[0] + i
+    side.row = _RECEIVER_ROWS * planes.grids.shape[0] + i
     stored_side = store[side.row]
     side.f = int(stored_side[0])
     side.is_back = stored_side[1] > 0.0
     side.weight = stored_side[2]
-    grid = scene.grids[side.f]
+    grid = planes.grids[side.f]
     side.first_edge = _VIEWS * grid.first_edge + wp.where(side.is_back, grid.edge_count, 0)
     return side
 
@@ -97,7 +97,7 @@ def _side_normal(local_receiver: LocalReceiver, side: PlaneSide):
 
 @wp.func
 def _view_outline(
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     grid: PlaneGrid,
     side: PlaneSide,
     local_receiver: LocalReceiver,
@@ -114,8 +114,8 @@ def _view_outline(
         - position[1] * local_receiver.axis_v
     )
     for e in range(grid.edge_count):
-        edge_ends = scene.edges[grid.first_edge + e]
-        axis = scene.edge_axes[grid.first_edge + e]
+        edge_ends = planes.edges[grid.first_edge + e]
+        axis = planes.edge_axes[grid.first_edge + e]
         a = foot + edge_ends[0] * local_receiver.axis_u + edge_ends[1] * local_receiver.axis_v
         b = foot + edge_ends[2] * local_receiver.axis_u + edge_ends[3] * local_receiver.axis_v
         n = wp.cross(a, axis[0] * local_receiver.axis_u + axis[1] * local_receiver.axis_v)
@@ -126,7 +126,7 @@ def _view_outline(
 
 @wp.func
 def _view_outline_adjoint(
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     grid: PlaneGrid,
     side: PlaneSide,
     local_receiver: LocalReceiver,
@@ -139,8 +139,8 @@ def _view_outline_adjoint(
     adj_foot = wp.vec3()
     for e in range(grid.edge_count):
         edge = edges[side.first_edge + e]
-        edge_ends = scene.edges[grid.first_edge + e]
-        axis = scene.edge_axes[grid.first_edge + e]
+        edge_ends = planes.edges[grid.first_edge + e]
+        axis = planes.edge_axes[grid.first_edge + e]
         adj_n = (sign / edge.length) * edge.adj_normal
         adj_a = wp.cross(axis[0] * local_receiver.axis_u + axis[1] * local_receiver.axis_v, adj_n)
         adj_axis = wp.cross(adj_n, wp.where(side.is_back, edge.begin, edge.end))
@@ -162,7 +162,7 @@ def _view_outline_adjoint(
 
 @wp.func
 def _add_side(
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     f: int,
     is_back: float,
     weight: float,
@@ -174,8 +174,8 @@ def _add_side(
     """Store a side with its outline if some of it is there; returns how many sides are stored."""
     if weight <= 0.0:
         return side_count
-    store[_RECEIVER_ROWS * scene.grids.shape[0] + side_count] = wp.vec3(float(f), is_back, weight)
-    _view_outline(scene, scene.grids[f], load_side(scene, side_count, store), local_receiver, edges)
+    store[_RECEIVER_ROWS * planes.grids.shape[0] + side_count] = wp.vec3(float(f), is_back, weight)
+    _view_outline(planes, planes.grids[f], load_side(planes, side_count, store), local_receiver, edges)
     return side_count + 1
 
 
@@ -186,7 +186,7 @@ def prepare_receiver(
     points: wp.array2d(dtype=wp.vec3),
     frames: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     scratch: wp.array2d(dtype=wp.vec3),
     viewed_edges: wp.array2d(dtype=ViewedEdge),
 ):
@@ -199,14 +199,14 @@ def prepare_receiver(
     store, edges = scratch[scratch_row], viewed_edges[scratch_row]
     frame_batch = instance_in(batch, frames.shape[0])
     side_count = int(0)
-    for f in range(scene.grids.shape[0]):
+    for f in range(planes.grids.shape[0]):
         local_receiver = find_local_receiver(points[batch, receiver], frames[frame_batch], f)
         store_local_receiver(store, f, local_receiver)
-        if f != scene.skip and wp.length_sq(local_receiver.normal) > 0.0:
+        if f != planes.skip and wp.length_sq(local_receiver.normal) > 0.0:
             # below the plane the front fades, and the back takes over
-            front = front_of(fronts, scene.grids[f], local_receiver.position[2], batch, receiver, f)
-            side_count = _add_side(scene, f, 0.0, front, side_count, local_receiver, store, edges)
-            side_count = _add_side(scene, f, 1.0, 1.0 - front, side_count, local_receiver, store, edges)
+            front = front_of(fronts, planes.grids[f], local_receiver.position[2], batch, receiver, f)
+            side_count = _add_side(planes, f, 0.0, front, side_count, local_receiver, store, edges)
+            side_count = _add_side(planes, f, 1.0, 1.0 - front, side_count, local_receiver, store, edges)
     return batch, receiver, scratch_row, side_count
 
 
@@ -218,7 +218,7 @@ def prepare_receiver_adjoint(
     points: wp.array2d(dtype=wp.vec3),
     frames: wp.array2d(dtype=wp.vec3),
     fronts: wp.array3d(dtype=wp.float32),
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     store: wp.array(dtype=wp.vec3),
     edges: wp.array(dtype=ViewedEdge),
     adj_store: wp.array(dtype=wp.vec3),
@@ -228,11 +228,11 @@ def prepare_receiver_adjoint(
 ):
     """Add to the gradients of points, fronts and frames."""
     for i in range(side_count):
-        side = load_side(scene, i, store)
-        grid = scene.grids[side.f]
+        side = load_side(planes, i, store)
+        grid = planes.grids[side.f]
         local_receiver = load_local_receiver(store, side.f)
         adj_receiver = _view_outline_adjoint(
-            scene, grid, side, local_receiver, edges, load_local_receiver(adj_store, side.f)
+            planes, grid, side, local_receiver, edges, load_local_receiver(adj_store, side.f)
         )
         adj_front = wp.where(side.is_back, -1.0, 1.0) * adj_store[side.row][2]
         adj_height = front_of_adjoint(
@@ -242,7 +242,7 @@ def prepare_receiver_adjoint(
         store_local_receiver(adj_store, side.f, adj_receiver)
     frame_batch = instance_in(batch, frames.shape[0])
     adj_point = wp.vec3()
-    for f in range(scene.grids.shape[0]):
+    for f in range(planes.grids.shape[0]):
         local_receiver, adj_receiver = load_local_receiver(store, f), load_local_receiver(adj_store, f)
         adj_point += find_local_receiver_adjoint(
             points[batch, receiver], frames[frame_batch], f, local_receiver, adj_receiver, frame_batch, adj_frames
@@ -260,28 +260,28 @@ class VisibleCell:
 
 
 @wp.func
-def visible_cell(scene: PlaneArrays, normal: wp.vec3, direction: wp.vec3):
+def visible_cell(planes: PlaneArrays, normal: wp.vec3, direction: wp.vec3):
     """The largest disc in a cell that is above the horizon of a receiver in a plane; the cell itself for others.
 
     Below its horizon nothing covers the cell but the receiver's own plane, which is not asked.
     """
     cell = VisibleCell()
     cell.direction = direction
-    cell.radius = scene.radius
+    cell.radius = planes.radius
     cosine = wp.dot(normal, direction)
-    if scene.skip >= 0 and cosine > 0.0 and cosine < scene.radius:
-        cell.direction = wp.normalize(direction + (0.5 * (scene.radius - cosine)) * (normal - cosine * direction))
-        cell.radius = 0.5 * (scene.radius + cosine)
+    if planes.skip >= 0 and cosine > 0.0 and cosine < planes.radius:
+        cell.direction = wp.normalize(direction + (0.5 * (planes.radius - cosine)) * (normal - cosine * direction))
+        cell.radius = 0.5 * (planes.radius + cosine)
     return cell
 
 
 @wp.func
 def footprint_on_side(
-    scene: PlaneArrays, grid: PlaneGrid, side: PlaneSide, local_receiver: LocalReceiver, direction: wp.vec3
+    planes: PlaneArrays, grid: PlaneGrid, side: PlaneSide, local_receiver: LocalReceiver, direction: wp.vec3
 ):
     """Find the footprint of a cell on a side."""
     return find_footprint(
-        scene,
+        planes,
         position_on_side(grid, local_receiver, side.is_back),
         direction_on_side(local_receiver, side.is_back, direction),
     )
@@ -289,7 +289,7 @@ def footprint_on_side(
 
 @wp.func
 def footprint_on_side_adjoint(
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     grid: PlaneGrid,
     side: PlaneSide,
     local_receiver: LocalReceiver,
@@ -310,7 +310,7 @@ def footprint_on_side_adjoint(
         direction_on_side(local_receiver, side.is_back, direction),
         wp.vec2(adj_mip[0], adj_mip[1]),
     )
-    adj_at, adj_toward = find_footprint_adjoint(scene, local_direction, footprint, adj_t, adj_cosine, adj_center)
+    adj_at, adj_toward = find_footprint_adjoint(planes, local_direction, footprint, adj_t, adj_cosine, adj_center)
     adj_local_receiver = load_local_receiver(adj_store, side.f)
     store_local_receiver(
         adj_store,
@@ -360,7 +360,7 @@ def inverse_distance_on_side_adjoint(
 
 @wp.func
 def outline_coverage_on_side(
-    scene: PlaneArrays,
+    planes: PlaneArrays,
     grid: PlaneGrid,
     side: PlaneSide,
     local_receiver: LocalReceiver,
@@ -369,7 +369,7 @@ def outline_coverage_on_side(
 ):
     """Coverage (h, μ) of a cell by the outline of a plane, as much of it as is seen of the side."""
     side_normal = _side_normal(local_receiver, side)
-    if wp.dot(side_normal, cell.direction) <= -scene.radius:
+    if wp.dot(side_normal, cell.direction) <= -planes.radius:
         return wp.vec4()
     first_edge_index, count = side.first_edge, grid.edge_count
     if grid.is_convex == 1:

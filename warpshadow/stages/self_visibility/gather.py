@@ -152,7 +152,7 @@ def _make_probe_functions(lanes: int) -> _ProbeFunctions:
 @functools.cache
 def _make_gather(lanes: int) -> wp.Kernel:
     Lane, fn = lane_type(lanes), make_lane_functions(lanes)
-    load_block, _spread, load_share = _make_probe_functions(lanes)
+    load_block, _add_cell_shares, load_share = _make_probe_functions(lanes)
     store_columns, dot_direction, is_any_above = fn.store_columns, fn.dot_direction, fn.is_any_above
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
@@ -298,15 +298,15 @@ def gather_self_transmittance(
         normals: Unit normals of the receivers, vec3 of shape [batch, receiver].
         probe_weights: Where they lie on the body.
         resampling_weights: Lookups of the cells of directions.
-        kernels: From which the lookup is.
+        kernels: Kernels of these weights.
         rows: Visibility of the probes.
     Returns:
         Transmittance T_self in [0, 1], float32 of shape [batch, receiver, direction].
-    Differentiable: weights of probe_weights and of the resampling_weights. Not: normals (they only cut off directions
+    Differentiable: weights of probe_weights and of resampling_weights. Not: normals (they only cut off directions
     below the horizon).
     """
     batch_count = common_batch(
-        {"normals": normals, "probe_weights": probe_weights.rows, "rotations": resampling_weights.counts}
+        {"normals": normals, "probe_weights": probe_weights.rows, "resampling_weights": resampling_weights.counts}
     )
     direction_count = kernels.directions.size
     shape = batch_count, normals.shape[1], direction_count

@@ -268,7 +268,7 @@ def self_visibility_lobes(
         bands: Number of bands to be found; all by default.
     Returns:
         K, float32 of shape [batch, receiver, bands²].
-    Differentiable: rotations, as they turn on; weights of the probes.
+    Differentiable: the body's rotation, as it turns on; weights of the probes.
     """
     bands = order if bands is None else bands
     rotations, body, harmonic_rotations = rotation
@@ -280,9 +280,9 @@ def self_visibility_lobes(
     rotated_lobes = empty(shape, dtype=wp.float32, device=device)
     cost = _ROTATION_COST * bands**3
 
-    def forward(open_rays: wp.array) -> None:
+    def forward(result: wp.array) -> None:
         inputs = [lobes, *probe_weights, harmonic_rotations, bands]
-        launch(_rotate_lobes, shape[0] * shape[1], inputs=inputs, outputs=[open_rays], cost=cost)
+        launch(_rotate_lobes, shape[0] * shape[1], inputs=inputs, outputs=[result], cost=cost)
 
     def adjoint(adj_rotated_lobes: wp.array) -> None:
         first, index, vectors = _generator_rows(bands)

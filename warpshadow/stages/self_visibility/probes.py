@@ -28,12 +28,13 @@ _MAX_SAMPLE_EDGE = 1.2  # longest edge where samples receive, in edges of that e
 _MAX_VERTEX_EDGE = 4.0
 """Longest edge where only vertices receive: probes between them are there for vertices that are buried …"""
 
+_SLIVER_RATIO = 3.0  # … and only on edges longer than a third of all edges by this factor: on edges of slivers
+
 _ENTRY_RATIO = 1 / 3
 """Longest edge that enters another part of the body, as a spoke a hub, over that of others. Images of the cage and of
 the chair, wheel and fence of demos/kinds.py are 7.1 and 5.1% off with 1/3, 7.5 and 5.5% with 1; with 1/8 there are so
 many that probes elsewhere are missing."""
 
-_SLIVER_RATIO = 3.0  # … and only on edges longer than a third of all edges by this factor: on edges of slivers
 _MAX_PROBES = 2**14  # probes of a body at most, as long as it has fewer than half as many vertices
 _LENGTH_STEP = 1.3  # how much longer edges may be at each try to have fewer probes
 
@@ -55,9 +56,10 @@ class VisibilityProbes(NamedTuple):
     Args:
         positions: Shape [probe, 3], float32.
         normals: Unit normals [probe, 3], float32.
-        pieces: Faces, and then the pieces that they are cut into, int32 of shape [piece, 4]: three probes and a link,
-            −1 for a piece that is whole. Otherwise the link is 3 p + k: the edge across from corner k is cut, and its
-            middle takes the place of corner k + 2 in piece p, and of corner k + 1 in piece p + 1, modulo 3.
+        pieces: Faces, and then the pieces that they are cut into, int32 of shape [piece, 4]: three probes and −1 for
+            a whole piece. A piece that is cut in two has the number 3 p + k in place of −1: its halves are the pieces
+            p and p + 1, and the edge opposite to its corner k is cut. The probe in the middle of that edge replaces
+            corner k + 2 (modulo 3) in piece p, and corner k + 1 in piece p + 1; other corners are the same.
     """
 
     positions: np.ndarray

@@ -89,7 +89,7 @@ def _make_trace() -> wp.Kernel:
         # out
         transmittance: wp.array3d(dtype=wp.float32),
     ):
-        """A thread owns a receiver. A cell's first place has its rays, and the others copy it."""
+        """A thread owns a receiver. A cell's first slot has its rays, and the others copy it."""
         batch, receiver = split_row(first_row + wp.tid(), transmittance.shape[1])
         rows = probe_rows[instance_in(batch, probe_rows.shape[0]), receiver]
         weights = probe_weights[instance_in(batch, probe_weights.shape[0]), receiver]

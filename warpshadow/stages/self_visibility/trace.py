@@ -236,8 +236,8 @@ def trace_rows(
         row_count, _BLOCK_RAYS // count, progress, "tracing self-shadows", first=first_row
     ):
         inputs = [tree, point_array[row_slice], normal_array[row_slice], packets, mirror_sine, trace_sine, nearest_rays]
-        rows_per_radian = row_slice.stop - row_slice.start
-        launch(_make_trace(), rows_per_radian, inputs=inputs, outputs=[rows.bits[row_slice]], cost=_RAY_COST * count)
+        slice_count = row_slice.stop - row_slice.start
+        launch(_make_trace(), slice_count, inputs=inputs, outputs=[rows.bits[row_slice]], cost=_RAY_COST * count)
         if store_bits is not None:
             store_bits(rows.bits[: row_slice.stop])
     launch(

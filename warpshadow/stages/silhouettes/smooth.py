@@ -94,7 +94,8 @@ def _make_blend_adjoint(dtype: type) -> wp.Kernel:
     ):
         """A thread owns an entry's sample of an image; ``adj_image`` already holds the part by the sample's own color.
 
-        Edges pull by the contrast of the colors that both surfaces have there; without them, by that of the samples.
+        Gradients of edges go by the contrast of the colors that both surfaces have there; without these, by the
+        contrast of the samples.
         """
         instance, entry = wp.tid()
         sample = samples[entry]
@@ -137,8 +138,8 @@ def smooth_silhouettes(
         silhouettes: Of :func:`warpshadow.stages.silhouettes.find.find_silhouettes`; if their batch is 1 they serve
             every image.
         clip_positions: The vertices that the silhouettes were found for, vec4 of shape [batch, vertex]; they are moved.
-        edge_colors: Of :func:`warpshadow.stages.silhouettes.edge_colors.find_edge_colors`, by which edges pull at
-            vertices; by default the colors of samples.
+        edge_colors: Of :func:`warpshadow.stages.silhouettes.edge_colors.find_edge_colors`, by which gradients of edges
+            go; by default the colors of samples.
     Returns:
         Smoothed image, like ``image``; a sample lies within the range of itself and its four neighbors.
     Differentiable: image, clip_positions. Without edge colors an edge has the colors of the samples beside it: where

@@ -95,7 +95,7 @@ def _repeated(texel: int, count: int):
 
 @wp.func
 def _cell(level: wp.vec3i, x: float, y: float):
-    """Find the texels around a place in a level, as `_texel_position` has it or beside that."""
+    """Find the texels around a position in a level, that of `_texel_position` or one beside it."""
     cell = _Cell()
     cell.s = x - wp.floor(x)
     cell.t = y - wp.floor(y)
@@ -103,9 +103,8 @@ def _cell(level: wp.vec3i, x: float, y: float):
     top = int(wp.floor(y))
     right_column = left_column + 1
     bottom = top + 1
-    if (
-        wp.min(left_column, top) < 0 or right_column >= level[1] or bottom >= level[2]
-    ):  # few do, and remainders take long
+    # few do, and remainders take long
+    if wp.min(left_column, top) < 0 or right_column >= level[1] or bottom >= level[2]:
         left_column = _repeated(left_column, level[1])
         right_column = _repeated(right_column, level[1])
         top = _repeated(top, level[2])
@@ -211,7 +210,7 @@ def _sample(
     albedo: wp.array2d(dtype=wp.vec3),
     radiance: wp.array2d(dtype=wp.vec4),
 ):
-    """A thread owns a run of samples: their reflectance or, if samples of white surfaces are given, their exposure."""
+    """A thread owns a run of samples: their reflectance or, if samples of white surfaces are given, their radiance."""
     instance, thread = split_row(first_row + wp.tid(), sample_inputs.texture_ids.shape[1] // sample_inputs.run)
     instance_albedo = vertex_albedo[instance_in(instance, vertex_albedo.shape[0])]
     instance_texels = texels[instance_in(instance, texels.shape[0])]
@@ -242,8 +241,9 @@ def _sample_adjoint_by_colors(
     for sample in range(thread * sample_inputs.run, (thread + 1) * sample_inputs.run):
         adj_color = wp.vec3()
         if adj_radiance:
-            adj_color_ = wp.cw_mul(white[instance_in(instance, white.shape[0]), sample], adj_radiance[instance, sample])
-            adj_color = wp.vec3(adj_color_[0], adj_color_[1], adj_color_[2])
+            light = white[instance_in(instance, white.shape[0]), sample]
+            adj_color_and_alpha = wp.cw_mul(light, adj_radiance[instance, sample])
+            adj_color = wp.vec3(adj_color_and_alpha[0], adj_color_and_alpha[1], adj_color_and_alpha[2])
         else:
             adj_color = adj_albedo[instance, sample]
         texture = sample_inputs.texture_ids[footprint_batch, sample]
@@ -346,8 +346,8 @@ def _sample_adjoint_by_coordinates(
             face = sample_inputs.face_ids[fragment_batch, sample]
             if face >= 0:
                 instance_albedo = vertex_albedo[instance_in(instance, vertex_albedo.shape[0])]
-                adj_color_ = interpolate_weights_adjoint(instance_albedo, sample_inputs.faces[face], adj_color)
-                wp.atomic_add(adj_barycentrics, fragment_batch, sample, adj_color_)
+                adj_weights = interpolate_weights_adjoint(instance_albedo, sample_inputs.faces[face], adj_color)
+                wp.atomic_add(adj_barycentrics, fragment_batch, sample, adj_weights)
 
 
 def sample_albedo(

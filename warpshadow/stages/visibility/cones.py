@@ -19,7 +19,7 @@ from warpshadow import check
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 
 BLEND = 0.01  # the exact formula ends at D = (1 + BLEND) r
-FADE_RADIUS = 0.25  # the sphere fades out from D = FADE·r to its center
+FADE_RADIUS = 0.25  # the sphere fades out from D = FADE_RADIUS · r to its center
 TINY_RADIUS = 1.0e-19  # spheres no larger block nothing: the largest distance, over one that is, is still a float32
 
 _MIN_DISTANCE2 = 1.0e-37  # (D/r)² is kept where its root and the inverse of that are float32

@@ -118,7 +118,7 @@ def make_cull(has_horizon: bool, Task: type, lanes: int) -> wp.Function:
         Task: Struct that has
 
             - ``cells`` and ``first_bundle``: the thread's bundles begin there;
-            - ``ends`` [bundle], int32: the place in the traversal from which on nothing matters to a bundle;
+            - ``ends`` [bundle], int32: the traversal index from which on no sphere matters to a bundle;
             - ``reached_bundles`` [2, bundle], int32: bundles that a run, and then a cluster, may reach, where they are
               listed.
 

@@ -60,7 +60,7 @@ def _task_type(lanes: int) -> Any:
     class TransmittanceTask:
         cells: DirectionCells
         first_bundle: int
-        ends: wp.array(dtype=wp.int32)  # [bundle] the place in the traversal where nothing is left to block
+        ends: wp.array(dtype=wp.int32)  # [bundle] the traversal index from which on nothing is left to block
         reached_bundles: wp.array2d(dtype=wp.int32)  # bundles that a run, and then a cluster, may reach
         transmittances: wp.array(dtype=Lane)  # [direction] transmittance; for the adjoint its product with its adjoint
 

@@ -75,12 +75,13 @@ def _optimal_table(order: int, device: str) -> wp.array:
 def _make_find_squarings(order: int, lanes: int) -> wp.Function:
     """Make the kernel function of the number of squarings.
 
-    It returns, for each lane but the fifth:
-        the number of squarings p, and 2^−p;
-        |f̂|; and |f̂| with f0 as one more coefficient where f0 > 0, as in no visibility, from which p follows;
-        the largest p of all lanes;
-        e^{2^−p f0 / 2√4π}, whose square is the constant factor of the base approximation;
-        the share w that blends the number of squarings, and its derivative by |f̂|.
+    It returns eight values. The fifth is one number, the others have one for each lane:
+        1, 2. the number of squarings p, and 2^−p;
+        3. |f̂|;
+        4. |f̂| with f0 as one more coefficient where f0 > 0, as in no visibility: p follows from it;
+        5. the largest p of all lanes;
+        6. e^{2^−p f0 / 2√4π}, whose square is the constant factor of the base approximation;
+        7, 8. the share w that blends the number of squarings, and its derivative by |f̂|.
     """
     Lane = lane_type(lanes)
     sqrt = make_lane_functions(lanes).sqrt
@@ -336,18 +337,18 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
             adj_row[i] = wp.cw_mul(wp.cw_mul(factor, base_share), adj_row[i])
             half_dot += wp.cw_mul(product[i], log[i])
         row_dot = wp.cw_mul(wp.cw_mul(factor, base_share), row_dot)
-        radial_adjoint = Lane(0.0)
+        adj_radial = Lane(0.0)
         if wp.static(base == "optimal_linear"):
-            radial_adjoint = UNIT * wp.cw_mul(adj_row[0], constant_change) + wp.cw_mul(row_dot, slope_change)
-            radial_adjoint += UNIT * wp.cw_mul(product[0], half_constant_change)
-            radial_adjoint += 0.5 * wp.cw_mul(half_dot, half_slope_change)
-            radial_adjoint = wp.cw_div(radial_adjoint, wp.max(length, Lane(1.0e-20)))
+            adj_radial = UNIT * wp.cw_mul(adj_row[0], constant_change) + wp.cw_mul(row_dot, slope_change)
+            adj_radial += UNIT * wp.cw_mul(product[0], half_constant_change)
+            adj_radial += 0.5 * wp.cw_mul(half_dot, half_slope_change)
+            adj_radial = wp.cw_div(adj_radial, wp.max(length, Lane(1.0e-20)))
         for i in range(wp.static(order**2)):
-            summed_adjoint = adj_row[i] + 0.5 * product[i]
+            adj_sum = adj_row[i] + 0.5 * product[i]
             adj_row[i] = (
-                wp.cw_mul(slope, adj_row[i]) + wp.cw_mul(half_slope, product[i]) + wp.cw_mul(radial_adjoint, log[i])
+                wp.cw_mul(slope, adj_row[i]) + wp.cw_mul(half_slope, product[i]) + wp.cw_mul(adj_radial, log[i])
             )
-            product[i] = summed_adjoint
+            product[i] = adj_sum
         if wp.static(base == "quadratic"):
             multiply(log, product, table, square_term)
             for i in range(wp.static(order**2)):

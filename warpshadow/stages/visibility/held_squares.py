@@ -75,9 +75,8 @@ def make_square(order: int, lanes: int) -> wp.Function:
 def make_square_adjoint(order: int, lanes: int) -> wp.Function:
     """Make the adjoint of :func:`make_square`: H̄ → v̄; returns Σ H̄ H(v) and |f̂|¯.
 
-    Γ is symmetric, so v̄ = H̄ + w (2 v * H̄ − H̄), w̄ = Σ v (v * H̄ − H̄) and, as (v * v)_0 = |v|²/√4π, with the
-    overshoot λ = |f̂| (|v|²/4π − v0/√4π) and λ̄ = w̄ w' where it is held also v̄ += λ̄ |f̂| (2v/4π − e0/√4π), |f̂|¯ =
-    λ̄ λ/|f̂|.
+    Γ is symmetric, so v̄ = H̄ + w (2 v * H̄ − H̄), w̄ = Σ v (v * H̄ − H̄). As (v * v)_0 = |v|²/√4π, the overshoot is
+    λ = |f̂| (|v|²/4π − v0/√4π), and λ̄ = w̄ w'. Where it is held, also v̄ += λ̄ |f̂| (2v/4π − e0/√4π), |f̂|¯ = λ̄ λ/|f̂|.
     """
     Lane = lane_type(lanes)
     find_square_share, multiply = _make_square_share(lanes), make_multiply(order, lanes)

@@ -57,8 +57,8 @@ def _make_horizon(lanes: int) -> wp.Function:
     @wp.func(inline=True)
     def horizon(height: Lane):
         t = wp.min(wp.max((height + Lane(1.0)) / HORIZON_FADE, Lane(0.0)), Lane(1.0))
-        zonal_slopes = 6.0 / HORIZON_FADE * wp.cw_mul(t, Lane(1.0) - t)
-        return smoothstep(t), zonal_slopes
+        fade_slope = 6.0 / HORIZON_FADE * wp.cw_mul(t, Lane(1.0) - t)
+        return smoothstep(t), fade_slope
 
     return horizon
 

@@ -194,13 +194,11 @@ class Gradients:
 def make_add_to_node(lanes: int) -> wp.Function:
     """Make the kernel function that adds a block's share to the gradients of a node."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
-    squared_sum = make_lane_functions(lanes).total
+    total = make_lane_functions(lanes).total
 
     @wp.func(inline=True)
     def add_to_node(adj_offset: Vectors, adj_radius: Lane, batch: int, node: int, gradients: Gradients):
-        adj = wp.vec4(
-            squared_sum(adj_offset.x), squared_sum(adj_offset.y), squared_sum(adj_offset.z), squared_sum(adj_radius)
-        )
+        adj = wp.vec4(total(adj_offset.x), total(adj_offset.y), total(adj_offset.z), total(adj_radius))
         if wp.static(lanes == 1):
             node_count = wp.max(gradients.centers.shape[1], gradients.radii.shape[1])
             adj = sums_over_warp(adj, batch * node_count + node)
@@ -275,19 +273,15 @@ def make_cluster_share(lanes: int) -> wp.Function:
 
 @functools.cache
 def make_cluster_share_adjoint(lanes: int) -> wp.Function:
-    """Make the adjoint of :func:`make_cluster_share`'s function: m̄ → that of the offset to a cluster, added to its
-    own.
+    """Make the adjoint of the cluster share: m̄ → the adjoint of the offset to a cluster, added to the cluster's own.
 
     With x = d/E and X² = |x|²:  X̄² = m' m̄,  d̄ = 2 x X̄² / E,  Ē = −2 X² X̄² / E.
     """
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
-    blend_share, offset_over_extent, add_to_node = (
-        _make_blend_share(lanes),
-        _make_offset_over_extent(lanes),
-        make_add_to_node(lanes),
-    )
+    blend_share, offset_over_extent = _make_blend_share(lanes), _make_offset_over_extent(lanes)
+    add_to_node = make_add_to_node(lanes)
     fn = make_lane_functions(lanes)
-    is_any_above, scale, dot, squared_sum = fn.is_any_above, fn.scale, fn.dot, fn.total
+    is_any_above, scale, dot, total = fn.is_any_above, fn.scale, fn.dot, fn.total
 
     @wp.func
     def adjoint(
@@ -308,7 +302,7 @@ def make_cluster_share_adjoint(lanes: int) -> wp.Function:
                 adj_offset = scale((2.0 * inverse_extent) * wp.cw_mul(adj_cluster_share, slope), relative_offset)
                 add_to_node(adj_offset, Lane(0.0), batch, spheres.count + cluster, gradients)
                 if gradients.extents:
-                    adj_extent = -squared_sum(dot(adj_offset, relative_offset))
+                    adj_extent = -total(dot(adj_offset, relative_offset))
                     if wp.static(lanes == 1):
                         adj_extent = sum_over_warp(adj_extent, batch * gradients.extents.shape[1] + cluster)
                     if adj_extent != 0.0:

@@ -3,7 +3,7 @@
 Where nothing is known of the light in a cell, the soft edge of a shadow, w = κρ, is as wide as cells ask for. A spot of
 half-angle s has a penumbra of ±s. So a sharp cell gets the edge of cells of radius ρ = 2.4 s: at κ = 0.35 it is ±0.84
 s, a smoothstep about as steep as that penumbra. κ scales it as it does all edges. The transmittance T′ of sharp cells
-is found by itself, and blended with their first, T, by the share σ of the cell's light that is the spot's:
+is found by itself, and blended with that by wide edges, T, by the share σ of the cell's light that is the spot's:
 
     T ← T + σ (T′ − T)
 
@@ -152,11 +152,11 @@ def blend_sharp_cells(
         lambda result: launch(
             _blend_sharp_cells, row_count, inputs=[sharp_cells, *inputs], outputs=[result], cost=cost
         ),
-        lambda adj_cell: launch(
+        lambda adj_blended: launch(
             _blend_sharp_cells_adjoint,
             row_count,
             inputs=inputs,
-            outputs=[adj_cell, sharp_cells.grad, transmittance.grad if is_copied else None],
+            outputs=[adj_blended, sharp_cells.grad, transmittance.grad if is_copied else None],
             cost=cost,
         ),
         result=blended,

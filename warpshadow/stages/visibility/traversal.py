@@ -191,7 +191,7 @@ def sphere_view_type(lanes: int) -> Any:
 
     @wp.struct
     class SphereView:
-        traversal_index: int  # in the traversal
+        traversal_index: int  # its number in the traversal
         node: int
         offset: Vectors  # from the receivers to its center
         curvature: float  # 1/radius
@@ -227,11 +227,11 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
     """Make the kernel function that visits the spheres that a block of receivers can see.
 
     Args:
-        cull: (receivers, bound, place, candidates, task) → to how many candidates the spheres in a bound may matter.
-            ``traversal_index`` is the first sphere's in the traversal. ``candidates`` is how many there are:
+        cull: (receivers, bound, traversal_index, candidates, task) → to how many candidates the spheres in a bound may
+            matter. ``traversal_index`` is the first sphere's in the traversal. ``candidates`` is how many there are:
             :data:`ALL_BUNDLES` for a run, and for a cluster the bundles that its run may reach.
-        visit: (receivers, seen, count, task), called for each sphere with the count of its cluster; for an adjoint →
-            SphereAdjoint.
+        visit: (receivers, sphere_view, count, task), called for each sphere with the count of its cluster; for an
+            adjoint → SphereAdjoint.
         Task: Struct of all else that these two read and write.
         is_adjoint: Whether to sum the results of the visits.
         lanes: Receivers of a block.
