@@ -100,6 +100,8 @@ def expand(array: wp.array, instances: int) -> wp.array:
 
 def expand_rows(rows: wp.array, instances: int) -> wp.array:
     """Repeat an array of shape [1, row, item] for every instance, as :func:`expand` does. Differentiable: rows."""
+    if rows.shape[0] == instances:
+        return rows
     return expand(rows.reshape((rows.shape[0], -1)), instances).reshape((instances, *rows.shape[1:]))
 
 

@@ -1,6 +1,7 @@
 """Cells of the sphere of directions: Q directions, each standing for a solid angle of 4π/Q, in compact bundles of 4."""
 
 import functools
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -52,7 +53,7 @@ def fibonacci(count: int) -> np.ndarray:
 
 def cell_radius(count: int) -> float:
     """Angular radius ρ = 2/√Q of a disc with a cell's solid angle [rad]."""
-    return 2 / np.sqrt(count)
+    return 2 / math.sqrt(count)
 
 
 def falloff_width(softness: float, count: int) -> float:

@@ -28,6 +28,11 @@ class GroupPlanes(NamedTuple):
     frames: wp.array  # where they are, vec3 of shape [batch, 3 · plane]
     skip: int | None = None  # the one that the receivers are part of
 
+    @property
+    def blocking(self) -> set[int]:
+        """Numbers of those that block the receivers' light."""
+        return set(self.planes.is_blocking) - {self.skip}
+
 
 class ScenePlanes:
     """The flat bodies of a scene, each prepared when it is first asked for.

@@ -158,6 +158,8 @@ class Directional(SphereMethod):
         if points.size and group.convex_parts_around is not None:
             cover = functools.partial(group.convex_parts_around.coverage, points, horizon_normals)
             parts = self._coverages(cover, projected_light)
+        if group.is_before_planes and self.bounces is None:  # nobody asks for transmittance past all else
+            return GroupVisibility(None, transmittance_self, transmittance_curved=curved, part_coverages=parts)
         total = curved if parts is None else self._past_coverages(curved, parts, None, projected_light)
         if total is None:
             shape = *points.shape, len(projected_light.directions)
@@ -228,7 +230,7 @@ class Directional(SphereMethod):
     ) -> GroupVisibility:
         """Transmittance past the flat bodies around a group, too."""
         planes = group.planes
-        if planes is None or not group.points.size or not set(planes.planes.is_blocking) - {planes.skip}:
+        if planes is None or not group.is_before_planes:
             return visibility
         horizon_normals = group.normals if group.cached_rows is None else None
         points, fronts = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
@@ -325,7 +327,7 @@ class Directional(SphereMethod):
         if group.convex_parts_around is not None:
             coverages.append(group.convex_parts_around.coverage(points, normals, directions, radius))
         planes = group.planes
-        if planes is not None and set(planes.planes.is_blocking) - {planes.skip}:
+        if planes is not None and group.is_before_planes:
             lifted, fronts = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
             options: dict[str, Any] = {"radius": radius, "horizon_normals": normals, "fronts": fronts}
             coverages.append(

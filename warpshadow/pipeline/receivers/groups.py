@@ -51,6 +51,11 @@ class Group(NamedTuple):
     skip: tuple[int, int] = (0, 0)  # spheres that do not block: the first, and the one after the last
     clusters: ClusterTree | None = None  # of the spheres, where they are found already
 
+    @property
+    def is_before_planes(self) -> bool:
+        """Whether planes block light of its receivers."""
+        return self.planes is not None and bool(self.points.size and self.planes.blocking)
+
     def lifted_points_and_fronts(
         self, frames: wp.array, planes: PlaneBlockers, skip: int | None
     ) -> tuple[wp.array, wp.array]:

@@ -6,6 +6,7 @@ some of them have on their silhouette has the sign 0 for the others. One receive
 """
 
 import functools
+import math
 from typing import Any, NamedTuple
 
 import warp as wp
@@ -66,6 +67,24 @@ _CHORD = """
     const float length = crosses ? end - begin : (float)0;
 """
 """The chord of an edge: an end behind the receiver is at the disc's border."""
+
+_ARCTANGENT = functools.reduce(
+    lambda rest, k: f"((float){(-1) ** k / (2 * k + 1)!r} + t2 * {rest})", reversed(range(12)), "(float)0"
+)
+"""Σ (−1)ᵏ t²ᵏ / (2k + 1), the arctangent of t over t: up to t = tan π/8 terms left out are below 1e-11."""
+
+_ANGLE = f"""
+    const float size_x = x > (float)0 ? x : -x, size_y = y > (float)0 ? y : -y;
+    const float larger = size_x > size_y ? size_x : size_y, smaller = size_x > size_y ? size_y : size_x;
+    const bool is_past = smaller > (float){math.tan(math.pi / 8)!r} * larger;
+    const float t = (is_past ? smaller - larger : smaller) / (is_past ? smaller + larger : larger), t2 = t * t;
+    const float octant = t * {_ARCTANGENT} + (is_past ? (float){math.pi / 4!r} : (float)0);
+    const float quadrant = size_y > size_x ? (float){math.pi / 2!r} - octant : octant;
+    const float half = x < (float)0 ? (float){math.pi!r} - quadrant : quadrant;
+    const float angle = y < (float)0 ? -half : half;
+"""
+"""The angle of x + iy, by the series of the arctangent up to π/8. With the C library's, which takes one lane after
+another, coverage by sixty boxes and rods took a quarter longer."""
 
 _DIRECTION = "const float dx = direction.c[0], dy = direction.c[1], dz = direction.c[2];"
 
@@ -186,15 +205,14 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
     const float per_moment = (float)1 / ((float)3 * pi * radius * radius * radius);
     wp::vec_t<{lanes}, float> share;
     for (int lane = 0; lane < {lanes}; ++lane) {{
-        const float cosine = nearest.c[lane];
-        share.c[lane] = cosine >= radius ? is_solid.c[lane] : (float)0;
-        if (cosine < radius && cosine > -radius) {{
-            const float angle = wp::atan2(wp::index(sums, 2).c[lane], wp::index(sums, 1).c[lane]);
-            const float sector = (float)0.5 * radius * radius * (angle + (float)2 * pi * wp::index(sums, 3).c[lane]);
-            const float part = (wp::index(sums, 0).c[lane] + sector) / (pi * radius * radius);
-            const float within = (cosine > (float)0 ? (float)1 : (float)0) + part;
-            share.c[lane] = is_solid.c[lane] * (within < (float)0 ? (float)0 : within > (float)1 ? (float)1 : within);
-        }}
+        const float cosine = nearest.c[lane], x = wp::index(sums, 1).c[lane], y = wp::index(sums, 2).c[lane];
+        {_ANGLE}
+        const float sector = (float)0.5 * radius * radius * (angle + (float)2 * pi * wp::index(sums, 3).c[lane]);
+        const float part = (wp::index(sums, 0).c[lane] + sector) / (pi * radius * radius);
+        const float sum = (cosine > (float)0 ? (float)1 : (float)0) + part;
+        const float within = sum < (float)0 ? (float)0 : sum > (float)1 ? (float)1 : sum;
+        const float covered = cosine >= radius ? (float)1 : cosine > -radius ? within : (float)0;
+        share.c[lane] = is_solid.c[lane] * covered;
     }}
     for (int lane = 0; lane < {lanes}; ++lane) {{
         const bool crosses = nearest.c[lane] < radius && share.c[lane] > (float)0;

@@ -19,6 +19,8 @@ No receiver is nearer to a side than a margin, so that t is not 0. Which side it
 alone the front fades away and the back appears from the plane to a margin below it.
 """
 
+import functools
+
 import numpy as np
 import warp as wp
 
@@ -57,6 +59,7 @@ def check_planes(
         check.choice("skip", skip, range(planes.count))
 
 
+@functools.lru_cache(64)
 def plane_arrays(planes: PlaneBlockers, radius: float, skip: int | None, *, tiles: bool = True) -> PlaneArrays:
     """Plane blockers as seen in cells of a radius [rad] by receivers that are part of one, or of none.
 

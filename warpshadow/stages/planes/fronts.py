@@ -42,6 +42,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 
 _FRONT_RADIUS_RATIO = wp.constant(1.25)
@@ -213,7 +214,7 @@ def find_fronts(
     arguments = {"points": points, "normals": normals, "centers": centers, "radii": radii, "frames": frames}
     count = common_batch({**arguments, "corners": corners})
     body_sides = None if corners is None else _body_sides(corners, frames, planes)
-    fronts = wp.empty((count, points.shape[1], planes.count), dtype=wp.float32, device=points.device)
+    fronts = empty((count, points.shape[1], planes.count), dtype=wp.float32, device=points.device)
     inputs = [points, normals, body_sides, centers, radii, blocker_indices, frames, planes.grids]
     launch(_find_fronts, fronts.shape, inputs=inputs, outputs=[fronts])
     return fronts
@@ -222,9 +223,9 @@ def find_fronts(
 def _body_sides(corners: wp.array, frames: wp.array, planes: PlaneBlockers) -> wp.array:
     """Find the side b of each plane on which a body lies, [batch, plane]. Differentiable: corners, frames."""
     count = common_batch({"corners": corners, "frames": frames})
-    extremes = wp.empty((count, planes.count), dtype=wp.vec2i, device=corners.device)
+    extremes = empty((count, planes.count), dtype=wp.vec2i, device=corners.device)
     launch(_find_extremes, extremes.shape, inputs=[corners, frames], outputs=[extremes])
-    body_sides = wp.empty((count, planes.count), dtype=wp.float32, device=corners.device)
+    body_sides = empty((count, planes.count), dtype=wp.float32, device=corners.device)
     inputs = [corners, frames, planes.grids, extremes]
     launch(_find_body_sides, body_sides.shape, inputs=inputs, outputs=[body_sides])
     return body_sides
@@ -273,7 +274,7 @@ def lifted_points(
         Points, vec3 of shape [batch, receiver].
     Differentiable: points, fronts, frames.
     """
-    lifted = wp.empty(fronts.shape[:2], dtype=wp.vec3, device=points.device)
+    lifted = empty(fronts.shape[:2], dtype=wp.vec3, device=points.device)
     inputs = [points, fronts, frames, planes.grids, -1 if skip is None else skip]
     launch(_lift_points, lifted.shape, inputs=inputs, outputs=[lifted])
     return lifted

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.device.constants import constant
+from warpshadow.device.constants import cached_by_values, constant
 from warpshadow.device.launch import differentiable, launch, varies
 from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK, MIN_WIDTH, brightest_chunk, cell_radius
@@ -124,6 +124,15 @@ def _blend_sharp_cells_adjoint(
             )
 
 
+@cached_by_values
+def _find_pairs(slots: np.ndarray, shares: np.ndarray | None, device: wp.Device) -> tuple[wp.array, wp.array, bool]:
+    """Sharp cells and their slots, the shares of their spots, and whether any is below 1."""
+    cells = np.flatnonzero(slots >= 0)
+    spot_shares = np.ones(len(cells)) if shares is None else shares[cells]
+    pairs = constant(np.stack([cells, slots[cells]], axis=1), wp.vec2i, device)
+    return pairs, constant(spot_shares.astype(np.float32), wp.float32, device), bool((spot_shares < 1).any())
+
+
 def blend_sharp_cells(
     transmittance: wp.array, sharp_cells: wp.array, slots: np.ndarray, shares: np.ndarray | None = None
 ) -> wp.array:
@@ -141,13 +150,11 @@ def blend_sharp_cells(
         float32 of shape [batch, receiver, direction].
     Differentiable: transmittance, sharp_cells.
     """
-    device, row_count = transmittance.device, transmittance.shape[0] * transmittance.shape[1]
-    cells = np.flatnonzero(slots >= 0)
-    spot_shares = np.ones(len(cells)) if shares is None else shares[cells]
-    is_copied = varies([transmittance]) and bool((spot_shares < 1).any())
+    row_count = transmittance.shape[0] * transmittance.shape[1]
+    pairs, spot_shares, is_partial = _find_pairs(slots, shares, transmittance.device)
+    is_copied = is_partial and varies([transmittance])
     blended = wp.clone(transmittance, requires_grad=False) if is_copied else transmittance
-    pairs = constant(np.stack([cells, slots[cells]], axis=1), wp.vec2i, device)
-    inputs, cost = [pairs, constant(spot_shares.astype(np.float32), wp.float32, device)], _CELL_COST * len(cells)
+    inputs, cost = [pairs, spot_shares], _CELL_COST * pairs.size
     return differentiable(
         lambda result: launch(
             _blend_sharp_cells, row_count, inputs=[sharp_cells, *inputs], outputs=[result], cost=cost
