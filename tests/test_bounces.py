@@ -168,7 +168,7 @@ def box(size: tuple[float, float, float], segments: int = 6) -> ws.Mesh:
 
 
 def test_in_a_white_furnace_a_box_has_no_dark_ground_beside_it():
-    """Its bottom, which lies on the ground and is black, does not count. Measured 0.034, and 0.216 if it does."""
+    """Its bottom, which lies on the ground and is black, does not count. Measured 0.005, and 0.216 if it does."""
     size, radius, counts = (1.6, 0.5, 1.0), 0.19, (6, 2, 4)
     most = 0.5 * np.array(size) - 0.95 * radius
     centers = np.stack(np.meshgrid(*map(np.linspace, -most, most, counts)), axis=-1).reshape(-1, 3)
@@ -177,7 +177,7 @@ def test_in_a_white_furnace_a_box_has_no_dark_ground_beside_it():
     ground = ws.Body(ws.plane(6.0, 24), albedo=(1, 1, 1), blockers=1)
     light = ws.EnvironmentMap.constant(1.0, height=16)
     shading = ws.Renderer(ws.Scene([body, ground], light, ON_BOTH, bounces=8)).shade().numpy()
-    assert abs(shading - 1).max() < 0.045
+    assert abs(shading - 1).max() < 0.01
 
 
 def test_bounces_add_ever_less_light():

@@ -273,7 +273,7 @@ def facing_share(points, centers, radii, planes, tolerances):
     offsets = points[:, None] - centers
     heights = (offsets * planes[:, :3]).sum(axis=-1) - planes[:, 3]
     heights += tolerances[:, 0] * np.linalg.norm(offsets, axis=-1)
-    return smoothstep(1 + heights * tolerances[:, 1] / radii)
+    return 1e-8 + (1 - 1e-8) * smoothstep(heights * tolerances[:, 1] / radii)
 
 
 def sphere_light(

@@ -5,10 +5,10 @@
 For each device, in this order:
 
 - images and all gradients of a small scene, against those of the CPU, with every method;
-- every test that takes a device, in as many processes as there are cores;
+- every test that takes a device, in a process a core but one;
 - the launches of the first part under compute-sanitizer, for memory and for races, where it is on the path;
 - kernels of a pose iteration, timed by CUDA's events, beside the least that an H200 would take for all of them;
-- the same iterations held as CUDA graphs;
+- images and pose iterations in Warp, as calls and as CUDA graphs;
 - many poses in a call;
 - the benchmark, on the device and on the CPU.
 
@@ -54,7 +54,7 @@ SECONDS = 570
 """Time for all of it."""
 
 SHARES = {"tests": 0.6, "sanitizer": 0.3, "benchmark": 0.8}
-"""Most of what is left of the time that a part may take."""
+"""Largest share of the remaining time for a part."""
 
 CASES = [
     *((method, "vertex") for method in ("directional", "log-sh", "none", "ray-traced")),
@@ -149,7 +149,7 @@ def relative(got: np.ndarray, expected: np.ndarray) -> float:
 
 
 def sanitize(device: str, seconds: float) -> str:
-    """Launch what :func:`agreement` launches under compute-sanitizer, and say how that ended."""
+    """Launch some of what :func:`agreement` launches under compute-sanitizer, and say how that ended."""
     executable = shutil.which("compute-sanitizer")
     if executable is None or not device.startswith("cuda"):
         return "left out: " + ("compute-sanitizer is not on the path" if executable is None else "not a CUDA device")

@@ -104,11 +104,11 @@ def test_the_adjoint_is_that_of_the_twin(name, device):
     assert np.linalg.norm(got - expected) < ADJOINT * np.linalg.norm(expected)
 
 
-def tangent_planes(sphere_count=7):
+def tangent_planes(sphere_count=7, heights=(-0.5, 0.5)):
     """Planes and tolerances of spheres, some of which receivers see from above, some from below and some between."""
     rng = np.random.default_rng(2)
     planes = np.concatenate(
-        [twins.unit(rng.normal(size=(sphere_count, 3))), rng.uniform(-0.5, 0.5, (sphere_count, 1))], 1
+        [twins.unit(rng.normal(size=(sphere_count, 3))), rng.uniform(*heights, (sphere_count, 1))], 1
     )
     return planes, np.stack([rng.uniform(0, 0.6, sphere_count), rng.uniform(0.05, 0.5, sphere_count)], 1)
 
@@ -123,9 +123,9 @@ def on_device(planes, tolerances, device, **options):
 def test_nodes_show_nothing_below_their_tangent_planes(device):
     values, (planes, tolerances) = scene(3), tangent_planes()
     shares = twins.facing_share(*values[:1], *values[2:4], planes, tolerances)
-    assert (shares == 0).mean() > 0.1 and (shares == 1).mean() > 0.1 and ((shares > 0) & (shares < 1)).mean() > 0.3
+    assert all(((shares > low) & (shares < high)).mean() > 0.1 for low, high in ((0, 1e-6), (1e-3, 0.999), (0.999, 2)))
     expected = twins.sphere_light(*values, fibonacci(64), facing=(planes, tolerances))
-    assert np.abs(expected - twins.sphere_light(*values, fibonacci(64))).max() > 0.1 * expected.max()
+    assert np.abs(expected - twins.sphere_light(*values, fibonacci(64))).max() > 0.05 * expected.max()
     got = light(values, 64, device, tangent_planes=on_device(planes, tolerances, device))
     assert np.abs(got - expected).max() < FLOAT32 * expected.max()
 
@@ -134,7 +134,7 @@ def test_nodes_show_nothing_below_their_tangent_planes(device):
 @pytest.mark.parametrize("name", ("points", "centers", "radii", "planes"))
 def test_the_adjoint_with_tangent_planes_is_that_of_the_twin(name, device):
     values, directions = scene(3, 16, vertex_count=17, sphere_count=5), fibonacci(16)
-    planes, tolerances = tangent_planes(5)
+    planes, tolerances = tangent_planes(5, (-2, 0))
     weights = np.random.default_rng(4).normal(size=(17, 3))
     arrays = put([value[None] for value in values], device, requires_grad=True)
     facing = on_device(planes, tolerances, device, requires_grad=True)

@@ -33,13 +33,13 @@ def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np
     )
     first, last = edge_ends.reshape(-1, 2).T
     lines, owners = first * (faces.max(initial=0) + 1) + last, np.repeat(proper, 3)
-    order = np.argsort(lines)
+    permutation = np.argsort(lines)
     is_next = np.zeros(len(lines) + 2, bool)  # of the same edge as the one before
-    is_next[1:-2] = lines[order[1:]] == lines[order[:-1]]
+    is_next[1:-2] = lines[permutation[1:]] == lines[permutation[:-1]]
     neighbors = np.full(len(lines), -1, np.int32)
-    neighbors[order[is_next[:-2] | is_next[1:-1]]] = _NOT_MANIFOLD
+    neighbors[permutation[is_next[:-2] | is_next[1:-1]]] = _NOT_MANIFOLD
     pair_starts = np.flatnonzero(~is_next[:-2] & is_next[1:-1] & ~is_next[2:])
-    one, other = order[pair_starts], order[pair_starts + 1]
+    one, other = permutation[pair_starts], permutation[pair_starts + 1]
     neighbors[one], neighbors[other] = owners[other], owners[one]
     neighbor[proper] = neighbors.reshape(-1, 3)
     return neighbor

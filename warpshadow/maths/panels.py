@@ -104,8 +104,8 @@ def _principal_axes(local_points: np.ndarray) -> np.ndarray:
 def _cuts(points: np.ndarray, region: np.ndarray) -> list[list[np.ndarray]]:
     """Halves of a region, across each of its principal axes."""
     centroids = points[region].mean(axis=1)
-    order = np.argsort(centroids @ _principal_axes(centroids).T, axis=0, kind="stable")
-    return [[region[half] for half in np.array_split(column, 2)] for column in order.T]
+    permutations = np.argsort(centroids @ _principal_axes(centroids).T, axis=0, kind="stable")
+    return [[region[half] for half in np.array_split(column, 2)] for column in permutations.T]
 
 
 def _deviation(points: np.ndarray, region: np.ndarray) -> float:

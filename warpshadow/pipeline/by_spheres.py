@@ -337,8 +337,8 @@ def _pairs(method: SphereMethod, points: LitPoints) -> str:
     spheres, parts = _sphere_counts(method, points), _part_counts(method, points)
 
     def blockers(bodies: list[int]) -> str:
-        solids = f" and {parts[bodies].sum():,} convex parts" if parts[bodies].sum() else ""
-        return f"up to {spheres[bodies].sum():,} spheres{solids}"  # some are culled, or merged
+        part_text = f" and {parts[bodies].sum():,} convex parts" if parts[bodies].sum() else ""
+        return f"up to {spheres[bodies].sum():,} spheres{part_text}"  # some are culled, or merged
 
     item_text = f"{receiver_text(points, static=False)} × {blockers(list(range(len(spheres))))}"
     if points.static_bodies is None:

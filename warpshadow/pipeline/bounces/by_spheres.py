@@ -134,7 +134,7 @@ class PatchSampleNodes(NamedTuple):
     visibility: PortionedVisibility  # of the patch samples, for any light
     frames: Node  # of flat bodies
     projected_patches: Node  # patches as receivers see them
-    openness: Node  # how open they are, and their patches
+    openness: Node  # how open patch samples are, and their patches
 
 
 class Radiosity(Node):

@@ -40,7 +40,7 @@ def find_overlays(senders: Senders, depths: np.ndarray) -> Overlays | None:
     normals = np.concatenate([item.normals @ body.rotation_matrix().T for body, item in placed])
     centers = np.concatenate([body.to_world(item.centers) for body, item in placed])
     radii = np.sqrt(senders.areas / 2)
-    is_solid = ~is_flat[senders.body_of_patch]
+    is_nonplanar = ~is_flat[senders.body_of_patch]
     weights = np.zeros((0, 3))
     for number, first, end in zip(senders.bodies, senders.first[:-1], senders.first[1:], strict=True):
         texels = first + np.flatnonzero(senders.areas[first:end] > 0)
@@ -49,9 +49,9 @@ def find_overlays(senders: Senders, depths: np.ndarray) -> Overlays | None:
             points = centers[side]
             heights = (centers - points[0]) @ facing
             chosen = np.flatnonzero(
-                is_solid & (heights < 0) & (heights > -_NEAR * radii) & (normals @ facing > _FACING)
+                is_nonplanar & (heights < 0) & (heights > -_NEAR * radii) & (normals @ facing > _FACING)
             )
-            seeing = senders.body_of_patch[is_solid & (heights > _REACH * np.linalg.norm(np.ptp(points, axis=0)))]
+            seeing = senders.body_of_patch[is_nonplanar & (heights > _REACH * np.linalg.norm(np.ptp(points, axis=0)))]
             chosen = chosen[[np.any(seeing != body) for body in senders.body_of_patch[chosen]]]
             if not len(chosen):
                 continue

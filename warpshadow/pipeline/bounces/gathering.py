@@ -214,11 +214,11 @@ class Proxies:
         """How bent the patches of each proxy and cluster are, from :func:`.tangent_planes.find_tolerances`."""
         starts, patch_indices = self.patches_of_clusters
         tolerances = np.ones((len(starts) - 1, 2))  # where patches of several bodies are in one: seen from everywhere
-        places = np.searchsorted(self.senders.first, patch_indices, side="right") - 1
+        sender_indices = np.searchsorted(self.senders.first, patch_indices, side="right") - 1
         for node, (start, end) in enumerate(zip(starts[:-1], starts[1:], strict=True)):
-            if start < end and (places[start:end] == places[start]).all():
-                members = patch_indices[start:end] - self.senders.first[places[start]]
-                tolerances[node] = find_tolerances(self.senders.patches[places[start]], members)
+            if start < end and (sender_indices[start:end] == sender_indices[start]).all():
+                members = patch_indices[start:end] - self.senders.first[sender_indices[start]]
+                tolerances[node] = find_tolerances(self.senders.patches[sender_indices[start]], members)
         return tolerances
 
     @functools.cached_property
@@ -361,7 +361,7 @@ class Gathering:
     def lights(
         self, node: Node, call: Call, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance
     ) -> list[wp.array]:
-        """Bounced light of a group by each path: planes, spheres, its own body; vec3 of shape [batch, receiver].
+        """Bounced light of a group by each path: its own body, planes, spheres; vec3 of shape [batch, receiver].
 
         ``node`` has the stages.
         """

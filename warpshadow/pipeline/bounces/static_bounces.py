@@ -242,10 +242,10 @@ class StaticBounces:
             receiver_points, receiver_normals = receivers.points.numpy(), receivers.normals.numpy()
             shape, device = receiver_points.shape[:2], positions.device
             skies = [None if sky is None else sky.numpy()[..., 0] for sky in (sky_at_patch_samples, sky_at_receivers)]
-            at_patch_sample = None if skies[0] is None else skies[0][0]
+            sky_of_samples = None if skies[0] is None else skies[0][0]
             at_receivers = [None] * shape[0] if skies[1] is None else np.broadcast_to(skies[1], shape)
             seen_by_patch_samples = trace(
-                patch_samples.points.numpy()[0], patch_samples.normals.numpy()[0], at_patch_sample
+                patch_samples.points.numpy()[0], patch_samples.normals.numpy()[0], sky_of_samples
             )
             factors = map(find_cache_points, receiver_points, receiver_normals, at_receivers)
             receiver_weights, to_cache_points = zip(*factors, strict=True)
@@ -310,7 +310,7 @@ class StaticBounces:
 
 
 def _light_on_patches(at_patch_samples: wp.array, factors: _GeometryFactors) -> wp.array:
-    """Mean light on patches, vec3 of shape [batch, patch], given that at their samples. Differentiable: both."""
+    """Mean light on patches, vec3 of shape [batch, patch], of that at their samples, in which it is differentiable."""
     return multiply(factors.patch_sample_means, at_patch_samples)
 
 

@@ -100,7 +100,7 @@ def clear_hit(store: wp.array(dtype=wp.vec3), first_hit: int, side_index: int):
 
 @wp.func
 def is_hit(store: wp.array(dtype=wp.vec3), first_hit: int, side_index: int):
-    """Whether side i covers a part of the cell."""
+    """Whether side ``side_index`` covers a part of the cell."""
     return store[first_hit + 5 * side_index][0] > 0.0
 
 
@@ -154,7 +154,7 @@ def _is_sender(grid: PlaneGrid, side: PlaneSide):
 
 
 @wp.struct
-class _Order:
+class _Overlap:
     """Which of two sides is in front where both cover a cell."""
 
     difference: wp.vec3  # g_j − g_k
@@ -166,29 +166,29 @@ class _Order:
 
 
 @wp.func
-def _find_order(cell: VisibleCell, hit: PlaneHit, other: PlaneHit):
-    order = _Order()
-    order.difference = other.inverse_distance - hit.inverse_distance
-    order.central_difference = wp.dot(order.difference, cell.direction)
-    order.shared_centroid = hit.centroid + other.centroid
-    order.slope = wp.sqrt(
-        wp.length_sq(order.difference)
-        - order.central_difference * order.central_difference
+def _find_overlap(cell: VisibleCell, hit: PlaneHit, other: PlaneHit):
+    overlap = _Overlap()
+    overlap.difference = other.inverse_distance - hit.inverse_distance
+    overlap.central_difference = wp.dot(overlap.difference, cell.direction)
+    overlap.shared_centroid = hit.centroid + other.centroid
+    overlap.slope = wp.sqrt(
+        wp.length_sq(overlap.difference)
+        - overlap.central_difference * overlap.central_difference
         + _TIE * (wp.length_sq(hit.inverse_distance) + wp.length_sq(other.inverse_distance))
     )
-    order.width = cell.radius * order.slope * wp.sqrt(hit.coverage * other.coverage)
-    if order.width > _MIN_WIDTH:
-        order.relative = (
-            order.central_difference + cell.radius * wp.dot(order.difference, order.shared_centroid)
-        ) / order.width
-    return order
+    overlap.width = cell.radius * overlap.slope * wp.sqrt(hit.coverage * other.coverage)
+    if overlap.width > _MIN_WIDTH:
+        overlap.relative = (
+            overlap.central_difference + cell.radius * wp.dot(overlap.difference, overlap.shared_centroid)
+        ) / overlap.width
+    return overlap
 
 
 @wp.func
 def _block_each_other(cell: VisibleCell, k: int, j: int, first_hit: int, store: wp.array(dtype=wp.vec3)):
     """Take from each of two hits what the other blocks of it."""
     hit, other = load_hit(store, first_hit, k), load_hit(store, first_hit, j)
-    share_in_front = wp.smoothstep(-1.0, 1.0, _find_order(cell, hit, other).relative)
+    share_in_front = wp.smoothstep(-1.0, 1.0, _find_overlap(cell, hit, other).relative)
     by_other = share_in_front * other.coverage
     by_hit = (1.0 - share_in_front) * hit.coverage
     _add_to_open_part(store, first_hit, k, -by_other, by_other * other.centroid)
@@ -207,8 +207,8 @@ def _block_each_other_adjoint(
     """Add to the gradients of two hits."""
     hit, other = load_hit(store, first_hit, k), load_hit(store, first_hit, j)
     adj_hit, adj_other = load_hit(adj_store, first_hit, k), load_hit(adj_store, first_hit, j)
-    order = _find_order(cell, hit, other)
-    share_in_front = wp.smoothstep(-1.0, 1.0, order.relative)
+    overlap = _find_overlap(cell, hit, other)
+    share_in_front = wp.smoothstep(-1.0, 1.0, overlap.relative)
     share_behind = 1.0 - share_in_front
     adj_by_other = wp.dot(adj_hit.blocked_moment, other.centroid)
     if hit.open_share > _MIN_OPEN:
@@ -216,19 +216,19 @@ def _block_each_other_adjoint(
     adj_by_hit = wp.dot(adj_other.blocked_moment, hit.centroid)
     if other.open_share > _MIN_OPEN:
         adj_by_hit -= adj_other.open_share
-    adj_relative = (other.coverage * adj_by_other - hit.coverage * adj_by_hit) * smoothstep_slope(order.relative)
+    adj_relative = (other.coverage * adj_by_other - hit.coverage * adj_by_hit) * smoothstep_slope(overlap.relative)
     adj_value = float(0.0)  # of the difference of inverse distances where both are
     adj_log = float(0.0)  # of its range
     adj_squares = float(0.0)  # of the slope's square, halved
-    if adj_relative != 0.0 and order.width > _MIN_WIDTH:
-        adj_value = adj_relative / order.width
-        adj_log = -adj_relative * order.relative
-        adj_squares = adj_log / (order.slope * order.slope)
-    adj_shared_centroid = (adj_value * cell.radius) * order.difference
+    if adj_relative != 0.0 and overlap.width > _MIN_WIDTH:
+        adj_value = adj_relative / overlap.width
+        adj_log = -adj_relative * overlap.relative
+        adj_squares = adj_log / (overlap.slope * overlap.slope)
+    adj_shared_centroid = (adj_value * cell.radius) * overlap.difference
     adj_difference = (
-        (adj_value - adj_squares * order.central_difference) * cell.direction
-        + (adj_value * cell.radius) * order.shared_centroid
-        + adj_squares * order.difference
+        (adj_value - adj_squares * overlap.central_difference) * cell.direction
+        + (adj_value * cell.radius) * overlap.shared_centroid
+        + adj_squares * overlap.difference
     )
     _add_to_hit(
         adj_store,
@@ -279,14 +279,14 @@ def find_side_hits(
     planes: PlaneArrays,
     cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
-    cell_share: float,
+    weight: float,
     side_count: int,
     store: wp.array(dtype=wp.vec3),
     edges: wp.array(dtype=ViewedEdge),
 ):
     """Store which plane sides this cell hits; return how many. A share of 0 hits nothing."""
     hit_count = int(0)
-    if cell_share <= 0.0:
+    if weight <= 0.0:
         return hit_count
     first_hit = SIDE_ROWS * planes.grids.shape[0]
     for side_index in range(side_count):

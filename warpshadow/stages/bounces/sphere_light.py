@@ -496,8 +496,8 @@ def sphere_light(
         proxy_radiance: Light and area that spheres, and the clusters that they merge into, show towards cells, vec4 of
             shape [batch, node, direction], from :func:`.proxy_radiance.find_proxy_radiance`. A batch of 1 serves every
             instance.
-        transmittance: T past these spheres, float32 of shape [batch, receiver, direction], made with the same
-            directions, softness, merging and skip.
+        transmittance: T past these spheres and all else that F is past, float32 of shape [batch, receiver, direction],
+            made with the same directions, softness, merging and skip.
         transmittance_others: F, the factor of T without these spheres, of the same shape; a batch of 1 serves every
             instance. None for 1.
         directions: Unit vectors ω, NumPy of shape [direction, 3], from :func:`warpshadow.fibonacci`.
@@ -505,7 +505,8 @@ def sphere_light(
         tangent_planes: Of the nodes, which show nothing below them. A batch of 1 serves every instance. None for nodes
             that are seen from everywhere.
     Returns:
-        Light that a white receiver reflects of it, vec3 of shape [batch, receiver]. (All sides white and bright, 1.)
+        Light that a white receiver reflects of it, vec3 of shape [batch, receiver]: 1 where all patches are white and
+        radiant by 1.
     Raises:
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii of receivers and spheres, as the transmittance.
     Differentiable: points, normals, centers, radii, proxy_radiance, transmittance, transmittance_others, planes of the

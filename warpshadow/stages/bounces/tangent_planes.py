@@ -1,14 +1,16 @@
 """Tangent planes of nodes: a receiver below the plane of a proxy's patches sees nothing of them.
 
-What a patch shows towards a direction says which side of it is seen from afar. A receiver beside or inside its proxy,
-such as a wall that carries a roof, looks into all directions from there, and would see the sunlit top of the roof
+The area that a patch shows towards a direction tells which side of it is seen from afar. A receiver beside or inside
+its proxy, such as a wall that carries a roof, has the proxy in all directions, and would see the sunlit top of the roof
 through those that the top faces. So a node with mean normal n and mean point p of its patches, σ the largest angle of
 their surface to n, counts for a receiver x, at a distance d from the node's center, by
 
-    f = smoothstep(1 + (n·(x − p) + d sin σ) / w),  w = b + r/20,
+    f = ε + (1 − ε) smoothstep((n·(x − p) + d sin σ) / w),  w = b + r/20,
 
-with b how far the surface lies below the plane, and r the node's radius. What is flat is seen from above alone, a ball
-by σ from farther below. Without f, planks under the eaves of a barn had five times the roof's light.
+with b how far the surface lies below the plane, and r the node's radius. A flat patch is seen from above alone, one of
+a ball by σ from farther below. ε is small beside the weight of what is seen; where nothing is, in cells that are
+blocked by spheres that bulge out of a flat side, it leaves the mean of all. Without f, planks under a barn's eaves got
+five times as much light from the roof.
 """
 
 import functools
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from warpshadow.stages.bounces.patches import Patches
 
 _MIN_WIDTH = 0.05  # least w, in radii
+_HIDDEN = 1.0e-8  # ε
 _TINY = 1.0e-18  # distance that has a derivative
 
 
@@ -126,6 +129,7 @@ def make_facing(lanes: int) -> FacingFunctions:
     fn = make_lane_functions(lanes)
     sqrt, dot, dot_direction, total, scale, add = fn.sqrt, fn.dot, fn.dot_direction, fn.total, fn.scale, fn.add
     TINY = wp.constant(_TINY)
+    HIDDEN = wp.constant(_HIDDEN)
 
     @wp.func(inline=True)
     def height(offset: Vectors, plane: wp.vec4, tolerance: wp.vec2):
@@ -135,17 +139,18 @@ def make_facing(lanes: int) -> FacingFunctions:
 
     @wp.func(inline=True)
     def share(offset: Vectors, curvature: float, plane: wp.vec4, tolerance: wp.vec2):
-        x = Lane(1.0) + (tolerance[1] * curvature) * height(offset, plane, tolerance)
+        x = (tolerance[1] * curvature) * height(offset, plane, tolerance)
         x = wp.min(wp.max(x, Lane(0.0)), Lane(1.0))
-        return wp.cw_mul(wp.cw_mul(x, x), Lane(3.0) - 2.0 * x)
+        return Lane(HIDDEN) + (1.0 - HIDDEN) * wp.cw_mul(wp.cw_mul(x, x), Lane(3.0) - 2.0 * x)
 
     @wp.func(inline=True)
     def adjoint(offset: Vectors, curvature: float, plane: wp.vec4, tolerance: wp.vec2, weighted_adjoint: Lane):
-        """With f = x²(3 − 2x): f' / f = 6 (1 − x) / (x (3 − 2x)), and f f̄ is no more than f."""
+        """With f = ε + (1 − ε) x² (3 − 2x): f' / f = (1 − ε) 6 x (1 − x) / f."""
         receiver_height = height(offset, plane, tolerance)
-        x = Lane(1.0) + (tolerance[1] * curvature) * receiver_height
-        x = wp.min(wp.max(x, Lane(1.0e-6)), Lane(1.0))
-        relative_slope = wp.cw_div(6.0 * (Lane(1.0) - x), wp.cw_mul(x, Lane(3.0) - 2.0 * x))
+        x = (tolerance[1] * curvature) * receiver_height
+        x = wp.min(wp.max(x, Lane(0.0)), Lane(1.0))
+        slope = (6.0 * (1.0 - HIDDEN)) * wp.cw_mul(x, Lane(1.0) - x)
+        relative_slope = wp.cw_div(slope, share(offset, curvature, plane, tolerance))
         adj_height = (tolerance[1] * curvature) * wp.cw_mul(relative_slope, weighted_adjoint)
         adj_normal = scale(-adj_height, offset)
         adj_plane = wp.vec4(total(adj_normal.x), total(adj_normal.y), total(adj_normal.z), -total(adj_height))

@@ -3,8 +3,8 @@
 Each body covers h_q = Σ_parts h, with the moment Σ_parts μ, of cell q: h and μ are the coverage by the silhouette of a
 convex part (:mod:`warpshadow.stages.cell_coverage`), the edges between a face that a receiver sees and one that it does
 not. Parts of one body are beside each other, so they cover different parts of a cell. Prisms into which a body is cut
-both cover their seam, the face between them, where they are seen at a slant: it is taken off. How bodies are to each
-other, :mod:`.joint_coverage` tells. Edges are exact, and so are thin parts: spheres bulge out of them.
+both cover their seam, the face between them, where they are seen at a slant: it is taken off. How bodies relate,
+:mod:`warpshadow.stages.joint_coverage` tells. Edges are exact, and so are thin parts: spheres bulge out of them.
 """
 
 import functools
@@ -454,9 +454,9 @@ def part_coverage(
     if skip is not None:
         check.choice("skip", skip, range(blockers.body_count))
     points = expand(points, common_batch({"points": points, "corners": placed.corners}))
-    own_radius = cell_radius(len(directions)) if radius is None else radius
+    radius_of_cells = cell_radius(len(directions)) if radius is None else radius
     cells = make_cells(directions, SOFTNESS, points.device)
-    inputs = [points, horizon_normals, *placed, blockers.arrays, cells, own_radius, -1 if skip is None else skip]
+    inputs = [points, horizon_normals, *placed, blockers.arrays, cells, radius_of_cells, -1 if skip is None else skip]
     lanes = lane_count(points.device)
     Lane, sums, edge_count = lane_type(lanes), sums_type(lanes), blockers.edge_count
     by_cell = (len(directions),)

@@ -171,7 +171,7 @@ def front_of_adjoint(
     f: int,
     adj_fronts: wp.array3d(dtype=wp.float32),
 ):
-    """Add to the gradient of the height."""
+    """Add to the gradient of the fronts, or return that of the height where there are none."""
     if fronts:
         if adj_fronts:
             adj_fronts[batch, receiver, f] = adj_fronts[batch, receiver, f] + adj_front
@@ -246,7 +246,7 @@ class PlaneFootprint:
     distance: float  # [units of the body]
     per_cosine: float  # 1 / c′, the mean cosine of the part of the cell below the horizon
     center: wp.vec2  # in the plane
-    extent: float  # its width over that of a whole cell's
+    extent: float  # its width over a whole cell's
 
 
 @wp.func
@@ -346,7 +346,7 @@ class _Corners:
 
     upper_left: int  # the left one above
     lower_left: int
-    column_step: int  # step from the right texel to the next: 1, or 0 in a level of one column
+    column_step: int  # step from the left texel to the right one: 1, or 0 in a level of one column
     s: float
     t: float
     slopes: wp.vec2  # of s and t by the texel of the finest level

@@ -264,7 +264,7 @@ def _lift_points(
 def lifted_points(
     points: wp.array, fronts: wp.array, frames: wp.array, planes: PlaneBlockers, skip: int | None
 ) -> wp.array:
-    """Lift receivers off the planes in whose planes they lie.
+    """Lift receivers off the planes in which they lie.
 
     Args:
         points, frames, planes: As for :func:`find_fronts`.

@@ -244,7 +244,7 @@ def coverage_of_light(
     """Coverage of the light of cells, C′: more exact than that of cells where planes cover them in part.
 
     Args:
-        points, frames, planes, directions, horizon_normals, fronts, skip: As for :func:`.plane_coverage`.
+        points, frames, planes, directions, horizon_normals, fronts, skip: As for :func:`.coverage.plane_coverage`.
         covered: Its result, (C, μ), vec4 of shape [batch, receiver, direction].
         samples: Eight directions drawn from the light of each cell, NumPy of shape [direction, 8, 3].
     Returns:

@@ -31,7 +31,7 @@ _RECEIVER_ROWS = wp.constant(5)
 SIDE_ROWS = wp.constant(7)
 """Rows of scratch for each plane: five, and one for each of its two sides."""
 
-# of an outline as the front and the back see it
+# Views of an outline: the front's and the back's.
 _VIEWS = wp.constant(2)
 
 
@@ -152,12 +152,12 @@ def _view_outline_adjoint(
             adj_local_receiver.axis_v + (edge_ends[1] - position[1]) * adj_a + axis[1] * adj_axis
         )
     adj_local_receiver.normal = adj_local_receiver.normal + (sign * position[2]) * adj_foot
-    adj_at = wp.vec3(
+    adj_position = wp.vec3(
         -wp.dot(adj_foot, local_receiver.axis_u),
         -wp.dot(adj_foot, local_receiver.axis_v),
         sign * wp.dot(adj_foot, local_receiver.normal),
     )
-    return side_adjoint(grid, local_receiver, side.is_back, wp.vec3(), adj_at, wp.vec3(), adj_local_receiver)
+    return side_adjoint(grid, local_receiver, side.is_back, wp.vec3(), adj_position, wp.vec3(), adj_local_receiver)
 
 
 @wp.func
@@ -303,24 +303,26 @@ def footprint_on_side_adjoint(
     Returns the gradient of the direction.
     """
     adj_cosine = -0.5 * footprint.per_cosine * adj_mip[2]  # texels are as wide as t / √c′
-    adj_t = float(0.0)
+    adj_distance = float(0.0)
     if adj_mip[2] != 0.0:
-        adj_t = adj_mip[2] / footprint.distance
+        adj_distance = adj_mip[2] / footprint.distance
     local_direction, adj_center = (
         direction_on_side(local_receiver, side.is_back, direction),
         wp.vec2(adj_mip[0], adj_mip[1]),
     )
-    adj_at, adj_toward = find_footprint_adjoint(planes, local_direction, footprint, adj_t, adj_cosine, adj_center)
+    adj_position, adj_direction = find_footprint_adjoint(
+        planes, local_direction, footprint, adj_distance, adj_cosine, adj_center
+    )
     adj_local_receiver = load_local_receiver(adj_store, side.f)
     store_local_receiver(
         adj_store,
         side.f,
-        side_adjoint(grid, local_receiver, side.is_back, direction, adj_at, adj_toward, adj_local_receiver),
+        side_adjoint(grid, local_receiver, side.is_back, direction, adj_position, adj_direction, adj_local_receiver),
     )
     return (
-        adj_toward[0] * local_receiver.axis_u
-        + adj_toward[1] * local_receiver.axis_v
-        + adj_toward[2] * _side_normal(local_receiver, side)
+        adj_direction[0] * local_receiver.axis_u
+        + adj_direction[1] * local_receiver.axis_v
+        + adj_direction[2] * _side_normal(local_receiver, side)
     )
 
 
