@@ -10,6 +10,7 @@ import warp as wp
 
 from warpshadow.assets.basis import Basis, HarmonicBasis, conversion
 from warpshadow.assets.harmonic_light import KnownLight, as_light
+from warpshadow.device.constants import constant
 from warpshadow.pipeline.geometry import Geometry
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node
@@ -159,7 +160,7 @@ class Method:
         return self._prefiltered_from_scene if light is self.light else Node("prefiltering", self._prefilter, light)
 
     def _prefilter(self, light: KnownLight) -> wp.array:
-        return wp.array(prefilter(light.radiance)[None], dtype=wp.vec3, device=self.merged_scene.device)
+        return constant(prefilter(light.radiance)[None], wp.vec3, self.merged_scene.device)
 
     def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input) -> Node:
         """Transmittance towards the samples of lobes of points, float32 of shape [batch, receiver, sample].

@@ -11,6 +11,7 @@ from warpshadow.assets.basis import Basis, CellBasis
 from warpshadow.assets.cells import draw_in_cells, gather_cells, without_spots
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.harmonic_light import KnownLight
+from warpshadow.device.constants import constant
 from warpshadow.device.memory import empty
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
@@ -132,7 +133,7 @@ class Directional(SphereMethod):
         return drawn
 
     def _on_device(self, coefficients: np.ndarray) -> wp.array:
-        return wp.array(coefficients[None], dtype=wp.vec3, device=self.merged_scene.device)
+        return constant(coefficients[None], wp.vec3, self.merged_scene.device)
 
     def coefficient_count(self, light: Input | None) -> int:
         """Number of coefficients that take part: all."""
