@@ -130,6 +130,16 @@ def test_on_a_gpu_an_array_of_a_tensor_that_was_not_written_to_is_the_same(monke
     assert Input.renewed("spheres", (given,), first) is not first
 
 
+def test_while_a_graph_is_captured_no_array_is_the_same(monkeypatch):
+    """A graph has to hold the launches that its replays repeat on what is written to the array later."""
+    given, tensor = array(), object()
+    given.origin, given.version = tensor, 7
+    first = Input.renewed("spheres", given, None)
+    assert Input.renewed("spheres", given, first) is first
+    monkeypatch.setattr(wp.Device, "is_capturing", True)
+    assert Input.renewed("spheres", given, first) is not first
+
+
 def test_what_has_a_gradient_is_never_the_same():
     given = array(requires_grad=True)
     first = Input.renewed("vertices", given, None)

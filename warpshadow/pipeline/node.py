@@ -55,6 +55,7 @@ class Input:
 
         On a CPU values are compared. On a GPU, which would have to wait for that, an array is the same if it has the
         same ``origin``, the tensor whose memory it is, and the same ``version``, which counts the writes to that.
+        While a graph is captured none is: replays read what is written to it later.
         """
         result = cls(name, value)
         if result.requires_grad:
@@ -88,6 +89,8 @@ def _is_same(new_value: Any, last: Input) -> bool:
 
 def _is_same_array(array: wp.array, before: wp.array, copy: wp.array) -> bool:
     """Whether an array equals a stored copy; on a GPU, whether it is the array before, not written to since."""
+    if array.device.is_capturing:
+        return False
     if is_readable(array.device):  # it sees writes by NumPy, which torch does not count
         return np.array_equal(np.asarray(array), np.asarray(copy))
     origin = getattr(array, "origin", None)

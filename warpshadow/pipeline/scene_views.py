@@ -66,7 +66,9 @@ class SceneViews:
         return view.vertices is self.vertices and view.cameras is self.clip_matrices
 
     def keep(self, view: View) -> None:
-        """Cache a view whose receivers are found, to be used again."""
+        """Cache a view whose receivers are found, to be used again, unless its values belong to a graph."""
+        if self._merged_scene.device.is_capturing:
+            return
         self._last_cameras = view.cameras
         if view.static_bodies is not None:
             self._static[view.static_bodies.moving] = view.static_bodies
