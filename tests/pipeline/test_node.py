@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 
 from warpshadow.assets.harmonic_light import HarmonicLight
+from warpshadow.device.constants import collected
 from warpshadow.device.tape import recorded
 from warpshadow.pipeline.explain import Explanation, decide
 from warpshadow.pipeline.node import Call, Clock, Input, Node, NodeStage, detached
@@ -138,6 +139,16 @@ def test_while_a_graph_is_captured_no_array_is_the_same(monkeypatch):
     assert Input.renewed("spheres", given, first) is first
     monkeypatch.setattr(wp.Device, "is_capturing", True)
     assert Input.renewed("spheres", given, first) is not first
+
+
+def test_values_that_were_there_before_are_noted_while_they_are_collected(clock):
+    source = Input("vertices", array())
+    node, other = Node("first", lambda given: [given], source), Node("second", type, source, caches=False)
+    value = node.value(Call(clock))
+    with collected() as held:
+        node.value(Call(clock))
+        other.value(Call(clock))
+    assert [item is expected for item, expected in zip(held, (value, source.value()), strict=True)] == [True, True]
 
 
 def test_what_has_a_gradient_is_never_the_same():

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from warpshadow.device.constants import use
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.memory import copied
 from warpshadow.device.tape import record
@@ -42,6 +43,7 @@ class Input:
         """The value."""
         if callable(self._value):
             self._value = self._value()
+        use(self._value)
         return self._value
 
     @property
@@ -168,6 +170,7 @@ class Node:
     def value(self, call: "Call") -> Any:
         """The value, which is computed unless it is cached or the call has it."""
         if self.is_cached:
+            use(self._cached)
             return self._cached
         if self not in call:
             value = self.compute(call)

@@ -10,6 +10,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.device.batch import common_batch
+from warpshadow.device.constants import use
 from warpshadow.pipeline.geometry import PLACED, Geometry
 from warpshadow.pipeline.method import Method
 from warpshadow.pipeline.node import Call, Clock, Input, Node, identity
@@ -96,6 +97,7 @@ class SceneViews:
             static_bodies = self._static.get(geometry.moving)
             if static_bodies is None or not static_bodies.matches(geometry):
                 static_bodies = StaticBodies(self._merged_scene, geometry)
+            use(static_bodies)
         arguments = vertices, spheres, cameras, static_bodies, self._blocker_kinds(geometry, last)
         for view in self.last:
             if view is not None and view.dependencies == arguments:
