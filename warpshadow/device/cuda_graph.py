@@ -50,7 +50,7 @@ class Captured(Generic[Result]):
         function: The function to call. It may read arrays back at the first call only (``device.is_capturing`` tells).
     Raises:
         RuntimeError: by a call, for a device without the stream-ordered allocator, and where the function reads back,
-            synchronizes or copies from the host while it is captured. It is then captured anew at the next call.
+            synchronizes or copies from the host while it is captured. The next call is then as the first one.
     """
 
     def __init__(self, function: Callable[[], Result], device: wp.DeviceLike):
@@ -67,7 +67,9 @@ class Captured(Generic[Result]):
             self._has_run = True
             return result
         if self._captured is None:
+            self._has_run = False  # unless the capture succeeds: caches may lack what it asked for
             self._captured = self._capture()
+            self._has_run = True
         graph, result, _ = self._captured
         wp.capture_launch(graph)
         return result
