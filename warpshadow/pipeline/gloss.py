@@ -105,15 +105,14 @@ class GlossyPoints(LitPoints):
 
     def _interpolate(self, receivers: Receivers, values: wp.array) -> wp.array:
         """Numbers of the receivers, from those of all vertices."""
-        faces, samples = self.merged_scene.faces, receivers.sample_fragments
+        samples = receivers.sample_fragments
         assert samples is not None
         if not samples.face_ids.size:
-            return wp.empty((1, 0), dtype=wp.float32, device=faces.device)
-        sides = constant(np.tile(faces.numpy(), (2, 1)), wp.vec3i, faces.device)
+            return wp.empty((1, 0), dtype=wp.float32, device=values.device)
         fragments = Fragments(
             *(array.reshape((len(array), 1, -1)) for array in (samples.face_ids, samples.barycentrics))
         )
-        return rows(interpolate(fragments, sides, values))
+        return rows(interpolate(fragments, self.merged_scene.side_faces, values))
 
     def _sample(self, fragments: Fragments, values: wp.array, textures: Textures, footprints: Footprints) -> wp.array:
         """Numbers of the view's samples: of textures and, on bodies without one, of vertices."""

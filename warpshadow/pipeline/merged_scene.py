@@ -88,6 +88,11 @@ class MergedScene:
         return self._array(self.body_of_face, wp.int32) if len(self.scene.bodies) > 1 else None
 
     @functools.cached_property
+    def side_faces(self) -> wp.array:
+        """Corners of the fronts of all faces, and then of their backs, vec3i of shape [2 · face]."""
+        return self._array(np.tile(self.faces.numpy(), (2, 1)), wp.vec3i)
+
+    @functools.cached_property
     def edges(self) -> wp.array:
         """Face across each edge, vec3i of shape [face]: :func:`warpshadow.maths.adjacency.edge_neighbors`."""
         parts = [body.mesh.surface.neighbors for body in self.scene.bodies]
