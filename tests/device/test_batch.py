@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpshadow.device.batch import common_batch, concatenate, expand
+from warpshadow.device import batch
+from warpshadow.device.batch import common_batch, concatenate, cut, expand
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -55,3 +56,17 @@ def test_expanding_repeats_one_instance_and_leaves_several_alone(device):
     one, several = random(device, 1, 3), random(device, 2, 3)
     np.testing.assert_array_equal(expand(one, 2).numpy(), np.repeat(one.numpy(), 2, axis=0))
     assert expand(several, 2) is several
+
+
+@pytest.mark.parametrize("has_quick_views", [True, False])
+def test_items_of_one_instance_are_cut_out_as_a_contiguous_view(has_quick_views, device, monkeypatch):
+    """Only a CPU makes quick views, and not while it captures a graph."""
+    if not has_quick_views:
+        monkeypatch.setattr(batch, "contiguous_view", lambda *arguments, **options: None)
+    values = wp.array(np.arange(15.0).reshape(1, 5, 3), dtype=wp.vec3, device=device, requires_grad=True)
+    items = cut(values, 1, 4)
+    assert items.is_contiguous
+    assert items.ptr == values.ptr + 12
+    np.testing.assert_array_equal(items.numpy(), values.numpy()[:, 1:4])
+    items.grad.fill_(1.0)
+    np.testing.assert_array_equal(values.grad.numpy()[0, :, 0], [0, 1, 1, 1, 0])

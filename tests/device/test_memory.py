@@ -9,6 +9,7 @@ import warp as wp
 
 from warpshadow.device import memory
 from warpshadow.device.memory import in_huge_pages, require_gradient
+from warpshadow.device.warp_internals import check_strides
 
 SIZE = 2**24
 MAPPINGS = Path("/proc/self/smaps")
@@ -83,3 +84,15 @@ def test_views_share_values_and_gradients_and_hold_the_memory(device):
     assert view.numpy().ravel().tolist() == [*range(24)]
     with pytest.raises(RuntimeError):
         memory.reshaped(view, (7,))
+
+
+@pytest.mark.parametrize("shape", [(2, 2**29), (2, 2**20, 1024), (3, 2**30, 1, 1)])
+def test_arrays_beyond_the_reach_of_strides_are_refused(shape, device):
+    """Warp's are int32: kernels would write elsewhere. Nothing is allocated."""
+    with pytest.raises(MemoryError, match=r"fewer directions"):
+        memory.empty(shape, wp.float32, device)
+
+
+@pytest.mark.parametrize("shape", [(2, 2**29 - 1), (1, 2**20, 1024), (2**30,), (2**30, 1), (2, 2**29, 0)])
+def test_arrays_whose_items_strides_reach_may_be_larger(shape):
+    check_strides(shape, wp.float32)

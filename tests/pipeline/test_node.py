@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 
 from warpshadow.assets.harmonic_light import HarmonicLight
+from warpshadow.device.constants import collected
 from warpshadow.device.tape import recorded
 from warpshadow.pipeline.explain import Explanation, decide
 from warpshadow.pipeline.node import Call, Clock, Input, Node, NodeStage, detached
@@ -128,6 +129,26 @@ def test_on_a_gpu_an_array_of_a_tensor_that_was_not_written_to_is_the_same(monke
     assert Input.renewed("spheres", (again(tensor, 8),), first) is not first
     assert Input.renewed("spheres", (again(other, 7),), first) is not first  # versions of another begin at 0 again
     assert Input.renewed("spheres", (given,), first) is not first
+
+
+def test_while_a_graph_is_captured_no_array_is_the_same(monkeypatch):
+    """A graph has to hold the launches that its replays repeat on what is written to the array later."""
+    given, tensor = array(), object()
+    given.origin, given.version = tensor, 7
+    first = Input.renewed("spheres", given, None)
+    assert Input.renewed("spheres", given, first) is first
+    monkeypatch.setattr(wp.Device, "is_capturing", True)
+    assert Input.renewed("spheres", given, first) is not first
+
+
+def test_values_that_were_there_before_are_noted_while_they_are_collected(clock):
+    source = Input("vertices", array())
+    node, other = Node("first", lambda given: [given], source), Node("second", type, source, caches=False)
+    value = node.value(Call(clock))
+    with collected() as held:
+        node.value(Call(clock))
+        other.value(Call(clock))
+    assert [item is expected for item, expected in zip(held, (value, source.value()), strict=True)] == [True, True]
 
 
 def test_what_has_a_gradient_is_never_the_same():

@@ -180,3 +180,8 @@ def test_numbers_are_grays_and_back(device):
     np.testing.assert_array_equal(grays.numpy(), values[..., None].repeat(3, axis=-1))
     np.testing.assert_array_equal(numbers.as_scalars(grays).numpy(), values.reshape(2, 12))
     assert numbers.as_colors(grays) is grays
+
+
+@pytest.mark.parametrize(("runs", "expected"), [([], [-1] * 6), ([(1, 3), (5, 6)], [-1, 0, 1, -1, -1, 2])])
+def test_receivers_of_runs_are_numbered_through(runs, expected, device):
+    assert reflection.number_runs(6, runs, device).numpy().tolist() == expected

@@ -82,7 +82,11 @@ def cut(array: wp.array, first: int, end: int) -> wp.array:
         return array
     if len(array) == 1 and end > first:
         view = contiguous_view(array, (1, end - first), array.dtype, first=first * array.strides[1])
-        return array[:, first:end] if view is None else view
+        if view is not None:
+            return view
+        items = array[0][first:end]  # array[:, first:end] would not count as contiguous
+        if items.is_contiguous:
+            return items.reshape((1, end - first))
     return concatenate([array[:, first:end]], [end - first])
 
 

@@ -13,18 +13,21 @@ R = TypeVar("R")
 
 _MAX_RESULTS = 256  # results of a function that are cached; the oldest go first
 
-_collections: dict[int, list[wp.array]] = {}  # by their identity
+_collections: dict[int, list[Any]] = {}  # by their identity
 
 
 @contextlib.contextmanager
-def collected() -> Iterator[list[wp.array]]:
-    """Collect the constants that are used meanwhile. Whoever reads them later, as a graph does, must hold them."""
-    arrays: list[wp.array] = []
-    _collections[id(arrays)] = arrays
+def collected() -> Iterator[list[Any]]:
+    """Collect the constants and cached values that are used meanwhile.
+
+    Whoever reads them later, as a graph does, must hold them: caches let them go.
+    """
+    values: list[Any] = []
+    _collections[id(values)] = values
     try:
-        yield arrays
+        yield values
     finally:
-        del _collections[id(arrays)]
+        del _collections[id(values)]
 
 
 def cached_by_values(function: Callable[P, R]) -> Callable[P, R]:
@@ -32,7 +35,7 @@ def cached_by_values(function: Callable[P, R]) -> Callable[P, R]:
 
     Nobody may change a result. The constants that it used count as used at every call.
     """
-    results: dict[Hashable, tuple[R, list[wp.array]]] = {}
+    results: dict[Hashable, tuple[R, list[Any]]] = {}
 
     @functools.wraps(function)
     def cached(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -58,10 +61,10 @@ def _key(value: Any) -> Hashable:
     return str(value) if isinstance(value, wp.Device) else value
 
 
-def use(*arrays: wp.array) -> None:
-    """Note that constants are used."""
+def use(*values: Any) -> None:
+    """Note that constants or cached values are used: arrays, or objects that hold some."""
     for collection in list(_collections.values()):
-        collection.extend(arrays)
+        collection.extend(values)
 
 
 @cached_by_values

@@ -15,11 +15,11 @@ meanwhile: inputs are not checked for NaN and indices, and images have room for 
 function of other shapes takes a graph of its own.
 
 Memory that is allocated inside belongs to the graph (by CUDA's stream-ordered allocator, Warp's default), so tapes and
-arrays that the function makes and lets go cost nothing at a replay.
+arrays that the function makes and lets go cost nothing at a replay. Cached values that it reads, the graph holds.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import warp as wp
 
@@ -50,14 +50,14 @@ class Captured(Generic[Result]):
         function: The function to call. It may read arrays back at the first call only (``device.is_capturing`` tells).
     Raises:
         RuntimeError: by a call, for a device without the stream-ordered allocator, and where the function reads back,
-            synchronizes or copies from the host while it is captured. It is then captured anew at the next call.
+            synchronizes or copies from the host while it is captured. The next call is then as the first one.
     """
 
     def __init__(self, function: Callable[[], Result], device: wp.DeviceLike):
         self._function = function
         self._device = wp.get_device(device)
         self._has_run = False
-        self._captured: tuple[wp.Graph, Result, list[wp.array]] | None = None
+        self._captured: tuple[wp.Graph, Result, list[Any]] | None = None
 
     @one_at_a_time
     def __call__(self) -> Result:
@@ -67,17 +67,20 @@ class Captured(Generic[Result]):
             self._has_run = True
             return result
         if self._captured is None:
+            self._has_run = False  # unless the capture succeeds: caches may lack what it asked for
             self._captured = self._capture()
-        graph, result, _constants = self._captured
+            self._has_run = True
+        graph, result, _ = self._captured
         wp.capture_launch(graph)
         return result
 
-    def _capture(self) -> tuple[wp.Graph, Result, list[wp.array]]:
+    def _capture(self) -> tuple[wp.Graph, Result, list[Any]]:
+        """The graph, the result that it writes, and the constants and cached values that it reads."""
         if self._device.is_cuda and not wp.is_mempool_enabled(self._device):
             raise RuntimeError(f"{self._device}: a capture that allocates needs wp.set_mempool_enabled")
-        with collected() as constants, wp.ScopedCapture(device=self._device) as capture:
+        with collected() as cached_values, wp.ScopedCapture(device=self._device) as capture:
             result = self._function()
-        return capture.graph, result, constants
+        return capture.graph, result, cached_values
 
 
 def with_gradients(loss: Callable[[], wp.array], variables: Sequence[wp.array]) -> Callable[[], wp.array]:

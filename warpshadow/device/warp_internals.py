@@ -71,6 +71,8 @@ _types = wp._src.types
 BLOCK_DIM = 64
 """Threads of a block on CUDA: with few a block, some thousand receivers reach all multiprocessors."""
 
+_MAX_STRIDE = 2**31 - 1  # bytes from one item of an axis to the next
+
 _NO_ARRAY = _types.array_t()  # the descriptor of an argument None
 
 
@@ -209,6 +211,7 @@ def _fields(signature: tuple, arguments: Sequence[Any], gradients: Sequence[Any]
 @functools.lru_cache(maxsize=4096)
 def _cpu_array(shape: Any, dtype: type) -> tuple[dict[str, Any], bytes, int]:
     """Attributes of a new CPU array but for its memory, its descriptor, and its bytes."""
+    check_strides(shape, dtype)
     array = wp.empty(shape, dtype, device="cpu")
     attributes = dict(vars(array)) | {"deleter": _free}
     return attributes, bytes(array.__ctype__()), array.capacity
@@ -225,10 +228,24 @@ def _free(pointer: int, size: int) -> None:
     _spare_memory.give_back(pointer, size)
 
 
+def check_strides(shape: int | Sequence[int], dtype: type) -> None:
+    """Raise MemoryError for an array whose items Warp's strides, int32, do not reach: kernels would miss them."""
+    stride = wp.types.type_size_in_bytes(dtype)
+    for length in (shape,) if isinstance(shape, int) else tuple(shape)[::-1]:
+        if stride > _MAX_STRIDE and length > 1:
+            raise MemoryError(
+                f"got an array of shape {shape}, parts of which take {stride:,} bytes, expected up to {_MAX_STRIDE:,} "
+                "of each part where there are several: instances in calls of their own, or fewer directions, "
+                "receivers or pixels take less"
+            )
+        stride *= length
+
+
 def new_array(shape: int | Sequence[int], dtype: type, device: wp.Device) -> wp.array:
     """Make an array of uninitialized memory, in a third of the time of ``wp.empty``."""
     runtime = wp._src.context.runtime
     if not device.is_cpu or runtime._apic_capture is not None:
+        check_strides(shape, dtype)
         return wp.empty(shape, dtype, device=device)
     attributes, descriptor, size = _cpu_array(shape if isinstance(shape, int) else tuple(shape), dtype)
     pointer = _spare_memory.take(size) if size else None

@@ -22,7 +22,7 @@ from warpshadow.pipeline.transfers import Light, change_basis
 from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.stages.gloss.lobes import sample_lobes
 from warpshadow.stages.gloss.prefilter import look_up_light, prefilter
-from warpshadow.stages.gloss.reflection import mix_reflection, sum_lobes
+from warpshadow.stages.gloss.reflection import mix_reflection, number_runs, sum_lobes
 from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import Receivers
@@ -105,15 +105,14 @@ class GlossyPoints(LitPoints):
 
     def _interpolate(self, receivers: Receivers, values: wp.array) -> wp.array:
         """Numbers of the receivers, from those of all vertices."""
-        faces, samples = self.merged_scene.faces, receivers.sample_fragments
+        samples = receivers.sample_fragments
         assert samples is not None
         if not samples.face_ids.size:
-            return wp.empty((1, 0), dtype=wp.float32, device=faces.device)
-        sides = constant(np.tile(faces.numpy(), (2, 1)), wp.vec3i, faces.device)
+            return wp.empty((1, 0), dtype=wp.float32, device=values.device)
         fragments = Fragments(
             *(array.reshape((len(array), 1, -1)) for array in (samples.face_ids, samples.barycentrics))
         )
-        return rows(interpolate(fragments, sides, values))
+        return rows(interpolate(fragments, self.merged_scene.side_faces, values))
 
     def _sample(self, fragments: Fragments, values: wp.array, textures: Textures, footprints: Footprints) -> wp.array:
         """Numbers of the view's samples: of textures and, on bodies without one, of vertices."""
@@ -159,11 +158,8 @@ def _spans(is_glossy: np.ndarray, receivers: Receivers) -> list[Span]:
 def _numbers(is_glossy: np.ndarray, receivers: Receivers) -> wp.array:
     """Index of each receiver of a view among the glossy ones, −1 for diffuse ones, int32 of shape [receiver]."""
     first = len(receivers.on_static)
-    numbers, count = np.full(first + receivers.points.shape[1], -1, np.int32), 0
-    for span in _spans(is_glossy, receivers):
-        numbers[first + span.first : first + span.end] = count + np.arange(span.end - span.first)
-        count += span.end - span.first
-    return wp.array(numbers, dtype=wp.int32, device=receivers.points.device)
+    runs = [(first + span.first, first + span.end) for span in _spans(is_glossy, receivers)]
+    return number_runs(first + receivers.points.shape[1], runs, receivers.points.device)
 
 
 def _chosen(light: wp.array, receivers: Receivers, is_glossy: np.ndarray) -> wp.array:

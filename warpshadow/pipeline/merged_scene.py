@@ -10,6 +10,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch, concatenate
+from warpshadow.device.constants import constant
 from warpshadow.device.memory import empty
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.maths.spatial_sort import z_order
@@ -85,6 +86,11 @@ class MergedScene:
     def face_bodies(self) -> wp.array | None:
         """Number of the body that each face belongs to, int32 of shape [face]; None where there is one."""
         return self._array(self.body_of_face, wp.int32) if len(self.scene.bodies) > 1 else None
+
+    @functools.cached_property
+    def side_faces(self) -> wp.array:
+        """Corners of the fronts of all faces, and then of their backs, vec3i of shape [2 · face]."""
+        return self._array(np.tile(self.faces.numpy(), (2, 1)), wp.vec3i)
 
     @functools.cached_property
     def edges(self) -> wp.array:
@@ -187,7 +193,7 @@ class MergedScene:
         )
 
     def pivots(self, pivot: str | npt.ArrayLike | wp.array) -> wp.array:
-        """Pivots of the bodies, each in its own space, vec3 of shape [batch, body]."""
+        """Pivots of the bodies, each in its own space, vec3 of shape [batch, body]. Not to be written to."""
         if isinstance(pivot, wp.array):
             return pivot
         if isinstance(pivot, str):
@@ -198,7 +204,7 @@ class MergedScene:
             points = check.numbers("pivot", pivot, expected=f"'center', or a point, [3], or one a body, [{count}, 3]")
             check.shape("pivot", points.shape, (3,) if points.ndim < 2 else (count, 3), "in a body's own space")
             check.finite("pivot", points)
-        return self._array(np.broadcast_to(points, (len(self.scene.bodies), 3))[None], wp.vec3)
+        return constant(np.broadcast_to(points, (len(self.scene.bodies), 3))[None], wp.vec3, self.device)
 
     def scene_poses(self, *, pivot: Pivot = None) -> Poses:
         """Where the scene has its bodies; the batch is 1. Not to be written to.

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 
 import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import Basis, HarmonicBasis, conversion
 from warpshadow.assets.harmonic_light import KnownLight, as_light
+from warpshadow.device.constants import constant
 from warpshadow.pipeline.geometry import Geometry
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds, LitPoints, receiver_text
+from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.transfers import Light, check_light, shade_free
 from warpshadow.stages.gloss.prefilter import prefilter
@@ -43,7 +45,7 @@ class Method:
         self.basis = native_basis if basis is None else basis
         self.visibility = merged_scene.scene.visibility
         self.light = Input("light", merged_scene.scene.known_light)
-        self._numberings: dict[tuple[tuple[int, ...], ...], list[Numbering]] = {}
+        self._numberings: dict[Hashable, list[Numbering]] = {}
         self._can_receive: dict[tuple[int, ...], np.ndarray] = {}  # by the bodies out of which spheres bulge
 
     def blocker_kinds(self, geometry: Geometry | None, rotations: Input | None) -> BlockerKinds:
@@ -83,9 +85,15 @@ class Method:
         separate = {*blocker_kinds.traced, *blocker_kinds.planes, *np.flatnonzero(self.merged_scene.is_glossy).tolist()}
         return np.array([body if body in separate else -1 for body in bodies]) if separate else None
 
-    def numbering(self, blocker_kinds: BlockerKinds, has_backs: bool) -> Numbering:
-        """Number all vertices, or all with their backs; the first call makes both, so that a capture finds them."""
-        key = blocker_kinds.traced, blocker_kinds.planes, blocker_kinds.bulging
+    def numbering(
+        self, blocker_kinds: BlockerKinds, has_backs: bool, static_bodies: StaticBodies | None = None
+    ) -> Numbering:
+        """Number all vertices, or all with their backs; the first call makes both, so that a capture finds them.
+
+        Those on static bodies are the same in both, as results about them are cached.
+        """
+        moving = None if static_bodies is None else static_bodies.moving
+        key = blocker_kinds.traced, blocker_kinds.planes, blocker_kinds.bulging, moving
         if key not in self._numberings:
             faces, can_receive, separate_bodies = (
                 self.merged_scene.faces,
@@ -93,8 +101,12 @@ class Method:
                 self.separate_bodies(blocker_kinds),
             )
             bodies = None if separate_bodies is None else separate_bodies[self.merged_scene.body_of_vertex]
-            sides = can_receive[:1], can_receive
-            self._numberings[key] = [number_receivers(faces, item, bodies=bodies) for item in sides]
+            is_static = None if static_bodies is None else static_bodies.has_vertex
+            fronts = can_receive[:1]
+            if is_static is not None and (can_receive[1] & is_static).any():
+                fronts = np.stack([can_receive[0], can_receive[1] & is_static])
+            sides = fronts, can_receive
+            self._numberings[key] = [number_receivers(faces, item, is_static, bodies=bodies) for item in sides]
         return self._numberings[key][has_backs]
 
     def shading(self, points: LitPoints, light: Light | None, materials: Materials | None = None) -> Node:
@@ -159,7 +171,7 @@ class Method:
         return self._prefiltered_from_scene if light is self.light else Node("prefiltering", self._prefilter, light)
 
     def _prefilter(self, light: KnownLight) -> wp.array:
-        return wp.array(prefilter(light.radiance)[None], dtype=wp.vec3, device=self.merged_scene.device)
+        return constant(prefilter(light.radiance)[None], wp.vec3, self.merged_scene.device)
 
     def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input) -> Node:
         """Transmittance towards the samples of lobes of points, float32 of shape [batch, receiver, sample].

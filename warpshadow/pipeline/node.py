@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from warpshadow.device.constants import use
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.memory import copied
 from warpshadow.device.tape import record
@@ -42,6 +43,7 @@ class Input:
         """The value."""
         if callable(self._value):
             self._value = self._value()
+        use(self._value)
         return self._value
 
     @property
@@ -55,6 +57,7 @@ class Input:
 
         On a CPU values are compared. On a GPU, which would have to wait for that, an array is the same if it has the
         same ``origin``, the tensor whose memory it is, and the same ``version``, which counts the writes to that.
+        While a graph is captured none is: replays read what is written to it later.
         """
         result = cls(name, value)
         if result.requires_grad:
@@ -88,6 +91,8 @@ def _is_same(new_value: Any, last: Input) -> bool:
 
 def _is_same_array(array: wp.array, before: wp.array, copy: wp.array) -> bool:
     """Whether an array equals a stored copy; on a GPU, whether it is the array before, not written to since."""
+    if array.device.is_capturing:
+        return False
     if is_readable(array.device):  # it sees writes by NumPy, which torch does not count
         return np.array_equal(np.asarray(array), np.asarray(copy))
     origin = getattr(array, "origin", None)
@@ -165,6 +170,7 @@ class Node:
     def value(self, call: "Call") -> Any:
         """The value, which is computed unless it is cached or the call has it."""
         if self.is_cached:
+            use(self._cached)
             return self._cached
         if self not in call:
             value = self.compute(call)

@@ -10,6 +10,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.device.batch import common_batch
+from warpshadow.device.constants import use
 from warpshadow.pipeline.geometry import PLACED, Geometry
 from warpshadow.pipeline.method import Method
 from warpshadow.pipeline.node import Call, Clock, Input, Node, identity
@@ -66,7 +67,9 @@ class SceneViews:
         return view.vertices is self.vertices and view.cameras is self.clip_matrices
 
     def keep(self, view: View) -> None:
-        """Cache a view whose receivers are found, to be used again."""
+        """Cache a view whose receivers are found, to be used again, unless its values belong to a graph."""
+        if self._merged_scene.device.is_capturing:
+            return
         self._last_cameras = view.cameras
         if view.static_bodies is not None:
             self._static[view.static_bodies.moving] = view.static_bodies
@@ -94,6 +97,7 @@ class SceneViews:
             static_bodies = self._static.get(geometry.moving)
             if static_bodies is None or not static_bodies.matches(geometry):
                 static_bodies = StaticBodies(self._merged_scene, geometry)
+            use(static_bodies)
         arguments = vertices, spheres, cameras, static_bodies, self._blocker_kinds(geometry, last)
         for view in self.last:
             if view is not None and view.dependencies == arguments:

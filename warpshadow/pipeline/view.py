@@ -162,10 +162,8 @@ class View(LitPoints):
                 place = functools.partial(method.blockers, self.blocker_kinds)
                 seen = positions, normals, fragments, spheres
                 quadtree = find_squares(place, method.sharp_share, *seen, is_adaptive, self._supersampling)
-        elif on_static_body is None:
-            numbering = method.numbering(self.blocker_kinds, has_backs)
         else:
-            numbering = number_receivers(merged_scene.faces, keeps_vertex, on_static_body, bodies=bodies)
+            numbering = method.numbering(self.blocker_kinds, has_backs, self.static_bodies)
         bodies = None if separate_bodies is None else separate_bodies[merged_scene.body_of_face]
         arguments = (
             positions,

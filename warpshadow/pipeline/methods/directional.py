@@ -11,6 +11,8 @@ from warpshadow.assets.basis import Basis, CellBasis
 from warpshadow.assets.cells import draw_in_cells, gather_cells, without_spots
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.harmonic_light import KnownLight
+from warpshadow.device.constants import constant
+from warpshadow.device.memory import empty
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.pipeline.by_spheres import PortionedShading, SphereMethod
@@ -131,7 +133,7 @@ class Directional(SphereMethod):
         return drawn
 
     def _on_device(self, coefficients: np.ndarray) -> wp.array:
-        return wp.array(coefficients[None], dtype=wp.vec3, device=self.merged_scene.device)
+        return constant(coefficients[None], wp.vec3, self.merged_scene.device)
 
     def coefficient_count(self, light: Input | None) -> int:
         """Number of coefficients that take part: all."""
@@ -162,8 +164,8 @@ class Directional(SphereMethod):
             return GroupVisibility(None, transmittance_self, transmittance_curved=curved, part_coverages=parts)
         total = curved if parts is None else self._past_coverages(curved, parts, None, projected_light)
         if total is None:
-            shape = *points.shape, len(projected_light.directions)
-            total = wp.full(shape, 1.0, dtype=wp.float32, device=points.device)
+            total = empty((*points.shape, len(projected_light.directions)), dtype=wp.float32, device=points.device)
+            total.fill_(1.0)
         return GroupVisibility(total, transmittance_self, transmittance_curved=curved, part_coverages=parts)
 
     def _coverages(self, cover: Callable[..., wp.array], projected_light: ProjectedCells) -> CellCoverages:

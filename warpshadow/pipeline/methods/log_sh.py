@@ -9,6 +9,7 @@ import warp as wp
 from warpshadow.assets.basis import Basis, HarmonicBasis
 from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.device.batch import expand_rows
+from warpshadow.device.constants import constant
 from warpshadow.device.memory import zeros
 from warpshadow.pipeline.by_spheres import SphereMethod
 from warpshadow.pipeline.merged_scene import MergedScene
@@ -47,7 +48,7 @@ class LogSH(SphereMethod):
         """The bands that the light has."""
         count = light.bands(self._order)
         coefficients = light.sh(self._order)[None, : count**2]
-        return ProjectedBands(count, wp.array(coefficients, dtype=wp.vec3, device=self.merged_scene.device))
+        return ProjectedBands(count, constant(coefficients, wp.vec3, self.merged_scene.device))
 
     def coefficient_count(self, light: Input | None) -> int:
         """Number of coefficients that take part."""

@@ -14,6 +14,7 @@ from collections.abc import Callable, Hashable
 import numpy as np
 import warp as wp
 
+from warpshadow.device.constants import use
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.memory import empty, from_numpy
 from warpshadow.pipeline.geometry import Geometry, splice
@@ -100,6 +101,7 @@ class StaticBodies:
         """
         if not np.array_equal(vertices, self._gathered[0]):
             self._gathered = vertices, *self.gathered(vertices, normals)
+        use(*self._gathered[1:])
         return self._gathered[1:]
 
     def gathered(self, vertices: np.ndarray, normals: wp.array) -> tuple[wp.array, wp.array]:
@@ -190,6 +192,7 @@ class VertexRows:
         if self._index is None or not np.array_equal(vertices, self._vertices):
             self._vertices = vertices
             self._index = from_numpy(self._row_of_vertex[vertices], dtype=wp.int32, device=self._rows.device)
+        use(self._rows, self._index)
         return CachedRows(self._rows, self._index)
 
     def _append(self, rows: wp.array) -> None:

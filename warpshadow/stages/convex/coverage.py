@@ -24,6 +24,7 @@ from warpshadow.device.lanes import (
     vectors_type,
 )
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, scratch_slot
 from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.convex.joint_lanes import coverage_type, make_joint_functions, sums_type
@@ -480,6 +481,6 @@ def part_coverage(
             scratch=[*scratch, *adj_scratch],
             cost=3 * cost,
         ),
-        result=wp.empty((*points.shape, len(directions)), dtype=wp.vec4, device=points.device),
+        result=empty((*points.shape, len(directions)), dtype=wp.vec4, device=points.device),
         variables=[points, placed.corners],
     )

@@ -12,6 +12,7 @@ E' is diffuse light times (1 − v·h)⁵: of even light it is E e(μ), which is
 """
 
 import functools
+from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
@@ -19,6 +20,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 
 DIELECTRIC_F0 = 0.04  # f₀ of all that is not metal: an index of refraction of 1.5
@@ -194,6 +196,38 @@ def _mix_reflection(
         white[batch, receiver] = (1.0 - m) * s * (
             DIELECTRIC_F0 * lobe + (1.0 - DIELECTRIC_F0) * grazing_lobe
         ) + m * grazing_lobe
+
+
+@wp.kernel(enable_backward=False)
+def _count_from(
+    # in
+    first: int,
+    # out
+    numbers: wp.array(dtype=wp.int32),
+):
+    """A thread owns an item."""
+    numbers[wp.tid()] = first + wp.tid()
+
+
+def number_runs(count: int, runs: Sequence[tuple[int, int]], device: wp.DeviceLike) -> wp.array:
+    """Number the items of runs, one run after another; −1 for other items.
+
+    It is done on the device: where samples are receivers, the runs of a graph are other ones than before its capture.
+
+    Args:
+        count: Number of items.
+        runs: Begin and end of each run.
+
+    Returns:
+        int32 of shape [item].
+    """
+    numbers = empty(count, dtype=wp.int32, device=device)
+    numbers.fill_(-1)
+    first = 0
+    for begin, end in runs:
+        launch(_count_from, end - begin, inputs=[first], outputs=[numbers[begin:end]])
+        first += end - begin
+    return numbers
 
 
 def mix_reflection(

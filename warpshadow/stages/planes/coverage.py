@@ -15,6 +15,7 @@ import warp as wp
 from warpshadow.device.batch import common_batch, expand, expand_rows, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import empty
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.cell_coverage import ViewedEdge, coverage_adjoint
 from warpshadow.stages.planes.cells import (
@@ -268,6 +269,6 @@ def plane_coverage(
             sums=[frames.grad],
             cost=2 * cost,
         ),
-        result=wp.empty((*points.shape, cells.size), dtype=wp.vec4, device=points.device),
+        result=empty((*points.shape, cells.size), dtype=wp.vec4, device=points.device),
         variables=[points, frames, fronts],
     )

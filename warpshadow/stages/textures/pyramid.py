@@ -7,7 +7,6 @@ that it covers.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -17,6 +16,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import accumulate, common_batch, rows
+from warpshadow.device.constants import cached_by_values, constant
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import run_length
@@ -94,8 +94,8 @@ class _Layout:
             for level, (height, width) in enumerate(texture_levels):
                 self.levels[texture, level] = self.texel_count, width, height
                 self.texel_count += width * height
-        self.device_levels = wp.array(self.levels, dtype=wp.vec3i, device=device)
-        self.device_level_counts = wp.array(self.level_counts, dtype=wp.int32, device=device)
+        self.device_levels = constant(self.levels, wp.vec3i, device)
+        self.device_level_counts = constant(np.array(self.level_counts), wp.int32, device)
 
     def steps(self, texture: int, coarsest: int | None) -> list[tuple[wp.vec3i, wp.vec3i]]:
         """Each level of a texture with the next, coarser one, from the finest to the coarsest that is wanted."""
@@ -106,7 +106,7 @@ class _Layout:
         return list(zip(levels[:-1], levels[1:], strict=True))
 
 
-@functools.lru_cache(maxsize=64)
+@cached_by_values
 def _layout(sizes: Sizes, device: str) -> _Layout:
     return _Layout(sizes, device)
 

@@ -402,7 +402,7 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
     blocks = block_count(vertex_count, lanes)
     row_count = batch_count * blocks
     scratch = [Scratch((4, order**2), lane_type(lanes))]
-    # memory that no squaring reaches is never touched
+    # room for the most squarings; a CPU never touches the memory of squarings that are not done, a GPU reserves all
     powers_shape = batch_count, blocks, MAX_SQUARINGS + 1, order**2
     powers = empty(powers_shape, dtype=lane_type(lanes), device=device) if log_sh.requires_grad else None
     optimal = _optimal_table(order, str(device)) if base == "optimal_linear" else None
