@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from demos.benchmarks import gpu_report
+from demos.benchmarks import benchmark, gpu_report
 
 REPORT = {
     "device": "a device",
@@ -47,7 +47,7 @@ def test_every_gradient_that_is_compared_is_one(monkeypatch):
 def test_kernels_and_graphs_of_pose_iterations_are_timed():
     """A CPU has no events, and its graphs are plain calls."""
     assert gpu_report.kernel_times("cpu") == []
-    assert list(gpu_report.pose_iterations("cpu", 2)) == ["iteration of a pose fit in torch, two bounces"]
+    assert gpu_report.POSE_ITERATION in benchmark.iterations(benchmark.small_scene(), "cpu")
     assert list(gpu_report.batches("cpu", size=8)) == [1, 8, 64]
     times = gpu_report.captured("cpu", runs=1)
     assert [label for label in times if label.startswith("pose iteration")]

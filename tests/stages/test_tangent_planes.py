@@ -8,19 +8,30 @@ from warpshadow.stages.bounces.patches import find_patches
 from warpshadow.stages.bounces.tangent_planes import find_tolerances
 
 
+def of_each(patches):
+    """Of nodes of a patch each."""
+    return find_tolerances([patches], np.arange(patches.count + 1), np.arange(patches.count))
+
+
+def test_a_node_of_none_or_of_several_bodies_is_seen_from_everywhere():
+    box = trimesh.creation.box((1, 1, 1))
+    patches = find_patches(np.asarray(box.vertices), np.asarray(box.faces), is_two_sided=False)
+    found = find_tolerances([patches, patches], np.array([0, 1, 1, 3]), np.array([0, 1, patches.count]))
+    np.testing.assert_allclose(found, [(0, 20), (1, 1), (1, 1)], atol=1e-3)
+
+
 def test_what_is_flat_bends_by_nothing_and_a_ball_by_the_angle_of_its_patches():
     box = trimesh.creation.box((1, 1, 1))
     patches = find_patches(np.asarray(box.vertices), np.asarray(box.faces), is_two_sided=False)
-    for patch in range(patches.count):
-        np.testing.assert_allclose(find_tolerances(patches, np.array([patch])), (0, 20), atol=1e-3)
+    np.testing.assert_allclose(of_each(patches), np.tile((0, 20), (patches.count, 1)), atol=1e-3)
     ball = ws.icosphere(1.0, 4)
     patches = find_patches(ball.positions, ball.faces, is_two_sided=False, count=64)
-    sines, ratios = np.transpose([find_tolerances(patches, np.array([k])) for k in range(patches.count)])
+    sines, ratios = of_each(patches).T
     radii = np.sqrt(patches.areas / np.pi)  # of discs
     assert 0.8 < sines.mean() / radii.mean() < 1.6
     assert 3 < ratios.mean() < 10
     opposite = np.array([0, np.argmin(patches.normals @ patches.normals[0])])
-    assert find_tolerances(patches, opposite)[0] == 1
+    assert find_tolerances([patches], np.array([0, 2]), opposite)[0, 0] == 1
 
 
 def test_a_wall_has_no_light_of_the_top_of_the_roof_that_lies_on_it():

@@ -212,14 +212,7 @@ class Proxies:
     @functools.cached_property
     def _tolerances(self) -> np.ndarray:
         """How bent the patches of each proxy and cluster are, from :func:`.tangent_planes.find_tolerances`."""
-        starts, patch_indices = self.patches_of_clusters
-        tolerances = np.ones((len(starts) - 1, 2))  # where patches of several bodies are in one: seen from everywhere
-        sender_indices = np.searchsorted(self.senders.first, patch_indices, side="right") - 1
-        for node, (start, end) in enumerate(zip(starts[:-1], starts[1:], strict=True)):
-            if start < end and (sender_indices[start:end] == sender_indices[start]).all():
-                members = patch_indices[start:end] - self.senders.first[sender_indices[start]]
-                tolerances[node] = find_tolerances(self.senders.patches[sender_indices[start]], members)
-        return tolerances
+        return find_tolerances(self.senders.patches, *self.patches_of_clusters)
 
     @functools.cached_property
     def nearest_spheres(self) -> np.ndarray:

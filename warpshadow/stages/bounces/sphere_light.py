@@ -4,13 +4,14 @@ The spheres that block cell q in part are blended without sorting [McGuire and B
 order-independent transparency], each by its share a_jq of the blocked light, and by nearness:
 
     I = 4/Q Σ_q max(n·ω_q, 0) (F_q − T_q) R_q
-    R_q = Σ_j w_j a_jq L_jq / Σ_j w_j a_jq S_jq,   w_j = 1 / (d_j² + (r_j/4)²)²
+    R_q = Σ_j w_j a_jq L_jq / Σ_j w_j a_jq S_jq,   w_j = f_j / (d_j² + (r_j/4)²)²
 
 T_q is the transmittance past the spheres, F_q that without them, so the light is all that a cell lacks; a_jq are the
 very shares of the transmittance, T_q = F_q Π_j (1 − a_jq); L and S are the light and the area that patches of a sphere
-show (:mod:`warpshadow.stages.bounces.proxy_radiance`); d is the distance to a sphere's center, r its radius. R is
-smooth in everything, stays within the radiosities of the patches, and does not depend on the scene's units. With the
-root of w a white ball behind a black one sent a tenth of its light past it, and patches behind a contact outshone it.
+show (:mod:`warpshadow.stages.bounces.proxy_radiance`); d is the distance to a sphere's center, r its radius, and f
+whether the receiver is above the patches (:mod:`warpshadow.stages.bounces.tangent_planes`). R is smooth in everything,
+stays within the radiosities of the patches, and does not depend on the scene's units. With the root of w a white ball
+behind a black one sent a tenth of its light past it, and patches behind a contact outshone it.
 
 The traversal is that of the transmittance, with other visits. The adjoint needs both sums of R of the cells in which
 something is blocked; the forward launch stores them: 16 bytes a receiver and cell, touched only in bundles of cells
@@ -175,23 +176,29 @@ def _make_load_task(lanes: int) -> wp.Function:
 
 
 @functools.cache
-def _make_nearness(lanes: int) -> wp.Function:
-    """Make the kernel function of the nearness √w, in units of the largest run of spheres: offsets, 1/r → √w."""
-    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
+def _make_weight(lanes: int) -> wp.Function:
+    """Make the kernel function of a node's nearness √(w/f), in units of the largest run of spheres, and weight w."""
+    Lane, SphereView, LightTask = lane_type(lanes), sphere_view_type(lanes), _task_type(lanes)
     fn = make_lane_functions(lanes)
-    dot, scale = fn.dot, fn.scale
+    dot, scale, find_facing_share = fn.dot, fn.scale, make_facing(lanes).share
     CORE = wp.constant(_CORE)
     NEAREST2 = wp.constant(_NEAREST2)
 
     @wp.func(inline=True)
-    def find_nearness(offset: Vectors, curvature: float, inverse_size: float):
-        scaled_offset = scale(Lane(inverse_size), offset)
-        core_radius = CORE * inverse_size / curvature
-        return wp.cw_div(
+    def find_weight(sphere_view: SphereView, task: LightTask):
+        offset, curvature = sphere_view.offset, sphere_view.curvature
+        scaled_offset = scale(Lane(task.inverse_size), offset)
+        core_radius = CORE * task.inverse_size / curvature
+        nearness = wp.cw_div(
             Lane(1.0), wp.max(dot(scaled_offset, scaled_offset) + Lane(core_radius * core_radius), Lane(NEAREST2))
         )
+        weight = wp.cw_mul(nearness, nearness)
+        if task.planes:
+            node = sphere_view.node
+            weight = wp.cw_mul(weight, find_facing_share(offset, curvature, task.planes[node], task.tolerances[node]))
+        return nearness, weight
 
-    return find_nearness
+    return find_weight
 
 
 @functools.cache
@@ -200,9 +207,8 @@ def _make_light(lanes: int) -> wp.Kernel:
     ReceiverLanes, SphereView, LightTask = receiver_lanes_type(lanes), sphere_view_type(lanes), _task_type(lanes)
     fn = make_lane_functions(lanes)
     sqrt, is_any_above, dot_direction, add_vectors = fn.sqrt, fn.is_any_above, fn.dot_direction, fn.add_vectors
-    load_task, find_nearness, falloff = _make_load_task(lanes), _make_nearness(lanes), make_falloff(lanes)
+    load_task, find_weight, falloff = _make_load_task(lanes), _make_weight(lanes), make_falloff(lanes)
     widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(True, lanes)
-    find_facing_share = make_facing(lanes).share
     SUMS = wp.constant(_SUMS)
     MIN_DENOMINATOR = wp.constant(_MIN_DENOMINATOR)
 
@@ -214,14 +220,8 @@ def _make_light(lanes: int) -> wp.Kernel:
         cap = widen_cone(cone.axis, cone.cosine, sine, cells)
         if is_above_horizon(cap, receivers.normals):
             slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
-            nearness = find_nearness(sphere_view.offset, sphere_view.curvature, task.inverse_size)
-            opacity = wp.cw_mul(opacity, wp.cw_mul(nearness, nearness))
-            if task.planes:
-                node = sphere_view.node
-                facing_share = find_facing_share(
-                    sphere_view.offset, sphere_view.curvature, task.planes[node], task.tolerances[node]
-                )
-                opacity = wp.cw_mul(opacity, facing_share)
+            _nearness, weight = find_weight(sphere_view, task)
+            opacity = wp.cw_mul(opacity, weight)
             for k in range(count):
                 bundle = task.reached_bundles[1, k]
                 direction_bundle = task.first_bundle + bundle
@@ -284,12 +284,11 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
     fn = make_lane_functions(lanes)
     sqrt, is_any_above, dot_direction, dot, scale = fn.sqrt, fn.is_any_above, fn.dot_direction, fn.dot, fn.scale
     add, load, total, add_vectors = fn.add, fn.load, fn.total, fn.add_vectors
-    load_task, find_nearness = _make_load_task(lanes), _make_nearness(lanes)
+    load_task, find_weight = _make_load_task(lanes), _make_weight(lanes)
     falloff, sphere_adjoint = make_falloff(lanes), make_sphere_adjoint(lanes)
     widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(True, lanes)
     SUMS = wp.constant(_SUMS)
-    facing = make_facing(lanes)
-    find_facing_share, facing_adjoint = facing.share, facing.adjoint
+    facing_adjoint = make_facing(lanes).adjoint
     MIN_DENOMINATOR = wp.constant(_MIN_DENOMINATOR)
     CORE2 = wp.constant(_CORE**2)
 
@@ -308,14 +307,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         cap = widen_cone(cone.axis, cone.cosine, sine, cells)
         if is_above_horizon(cap, receivers.normals):
             slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
-            nearness = find_nearness(sphere_view.offset, sphere_view.curvature, task.inverse_size)
-            weight = wp.cw_mul(nearness, nearness)
-            if task.planes:
-                node = sphere_view.node
-                facing_share = find_facing_share(
-                    sphere_view.offset, sphere_view.curvature, task.planes[node], task.tolerances[node]
-                )
-                weight = wp.cw_mul(weight, facing_share)
+            nearness, weight = find_weight(sphere_view, task)
             is_any_blocked = bool(False)
             sum_adj_t = Lane(0.0)
             sum_t = Lane(0.0)

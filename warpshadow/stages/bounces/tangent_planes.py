@@ -14,6 +14,7 @@ five times as much light from the roof.
 """
 
 import functools
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -46,20 +47,38 @@ class TangentPlanes(NamedTuple):
     tolerances: wp.array
 
 
-def find_tolerances(patches: "Patches", members: np.ndarray) -> tuple[float, float]:
-    """Find sin σ and r/w of a node.
+def find_tolerances(patches: "Sequence[Patches]", starts: np.ndarray, patch_indices: np.ndarray) -> np.ndarray:
+    """Find sin σ and r/w of nodes.
 
     Args:
-        patches: Of one body.
-        members: Those of the node, at least one.
+        patches: Of each body, one after another.
+        starts, patch_indices: The patches of each node, from :func:`.proxy_radiance.patches_of_clusters`. A node of
+            none, or of patches of several bodies, is seen from everywhere.
+    Returns:
+        Shape [node, 2].
     """
-    normals, centers = patches.normals[members], patches.centers[members]
-    normal = normals.sum(axis=0)
-    normal /= max(np.linalg.norm(normal), 1e-30)
-    angles = np.arccos(np.clip(normals @ normal, -1, 1)) + patches.spreads[members]
-    below = ((centers.mean(axis=0) - centers) @ normal + patches.sagittas[members]).max()
-    radius = max(float(np.sqrt(patches.areas[members].sum() / 2)), 1e-30)
-    return float(np.sin(min(angles.max(), np.pi / 2))), radius / (max(below, 0.0) + _MIN_WIDTH * radius)
+    bodies = np.repeat(np.arange(len(patches)), [item.count for item in patches])[patch_indices]
+    normals, centers, areas, spreads, sagittas = (
+        np.concatenate([getattr(item, name) for item in patches])[patch_indices]
+        for name in ("normals", "centers", "areas", "spreads", "sagittas")
+    )
+    node_count = len(starts) - 1
+    nodes = np.repeat(np.arange(node_count), np.diff(starts))  # of each patch
+
+    def gathered(ufunc: np.ufunc, values: np.ndarray, initial: float = 0.0) -> np.ndarray:
+        result = np.full((node_count, *values.shape[1:]), initial)
+        ufunc.at(result, nodes, values)
+        return result
+
+    normal_sums = gathered(np.add, normals)
+    node_normals = (normal_sums / np.maximum(np.linalg.norm(normal_sums, axis=1, keepdims=True), 1e-30))[nodes]
+    node_centers = (gathered(np.add, centers) / np.maximum(np.diff(starts), 1)[:, None])[nodes]
+    angles = gathered(np.maximum, np.arccos(np.clip((normals * node_normals).sum(axis=1), -1, 1)) + spreads)
+    depths = gathered(np.maximum, ((node_centers - centers) * node_normals).sum(axis=1) + sagittas)
+    radii = np.maximum(np.sqrt(gathered(np.add, areas) / 2), 1e-30)
+    tolerances = np.stack([np.sin(np.minimum(angles, np.pi / 2)), radii / (depths + _MIN_WIDTH * radii)], axis=1)
+    is_of_one_body = gathered(np.maximum, bodies, -1) == gathered(np.minimum, bodies, len(patches))
+    return np.where(is_of_one_body[:, None], tolerances, 1.0)
 
 
 @wp.kernel
