@@ -62,11 +62,13 @@ class Material(NamedTuple):
     Attributes:
         texture: Linear RGB, shape [height, width, 3].
         roughness, metallic: glTF's, one number [1], one for each vertex [vertex], or a texture [height, width].
+        emission: Radiance, linear RGB, of the whole mesh [3] or of each vertex [vertex, 3].
     """
 
     texture: np.ndarray | None = None
     roughness: np.ndarray | None = None
     metallic: np.ndarray | None = None
+    emission: np.ndarray | None = None
 
 
 def load_mesh(path: MeshSource) -> Mesh:

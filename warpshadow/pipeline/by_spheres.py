@@ -166,6 +166,12 @@ class SphereMethod(Method):
         """Node of known light, projected; the scene's is cached."""
         return self._projected_from_scene if light is self.light else Node("", self.project_light, light)
 
+    def emitted_light(self, points: LitPoints, materials: Materials) -> Node:
+        """Direct light of emitters on points, by the same blockers."""
+        from warpshadow.pipeline.emitters import emitted_light
+
+        return emitted_light(self, self.emitters, points, materials)
+
     def known_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
         """Shading of points in known light, which bounces from the materials."""
         projected_light = self.projected(light)
@@ -239,12 +245,11 @@ class PortionedShading(Node):
     ):
         self.method, self._points = method, points
         self._finish, self._progress = finish, method.progress and light is not None
-        receivers, spheres, item_text = points.receivers_node, points.spheres, functools.partial(receiver_text, points)
+        receivers, item_text = points.receivers_node, functools.partial(receiver_text, points)
         self_visibility = self_visibility_node(method, points, projected_light)
         shadows = _static_shadows(method, points, light)
         planes = points.blocker_kinds.planes
-        place_blockers = functools.partial(method.blockers, points.blocker_kinds)
-        blockers = points.cached("blockers", None, lambda: Node("", place_blockers, points.vertices, spheres))
+        blockers = placed_blockers(method, points)
         self._is_shaded = light is not None and is_shaded
         self._is_transferred = not (self._is_shaded and method.shades_transmittance)
         self._visibility = NodeStage(
@@ -359,6 +364,12 @@ def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
     ):
         return ""
     return "no moving body has blockers" if static else "nothing is seen"
+
+
+def placed_blockers(method: SphereMethod, points: LitPoints) -> Node:
+    """Node of the blockers around points, where they are in the world."""
+    place = functools.partial(method.blockers, points.blocker_kinds)
+    return points.cached("blockers", None, lambda: Node("", place, points.vertices, points.spheres))
 
 
 def self_visibility_node(method: SphereMethod, points: LitPoints, projected_light: Any) -> Node:

@@ -56,7 +56,9 @@ class GlossyPoints(LitPoints):
         )
         self._numbers = Node("", functools.partial(_numbers, glossy), detached(view.receivers_node))
 
-    def mixed(self, view: LitPoints, diffuse: Node, light: Light | None, materials: Materials) -> tuple[Node, Node]:
+    def mixed(
+        self, view: LitPoints, diffuse: Node, light: Light | None, materials: Materials, bounced: Node
+    ) -> tuple[Node, Node]:
         """Light that colored and that white surfaces reflect, of all receivers of the view: vec3 [batch, receiver].
 
         Args:
@@ -64,6 +66,7 @@ class GlossyPoints(LitPoints):
             diffuse: Node of the view's shading.
             light: As for :meth:`.Method.shading`.
             materials: Of the bodies.
+            bounced: Node of the view's shading without direct light of emitters.
         """
         item_text = functools.partial(receiver_text, self)
         roughness, metallic, specular = (self._values(materials, name) for name in GLOSS_ARGUMENTS)
@@ -81,7 +84,7 @@ class GlossyPoints(LitPoints):
         through = self.method.lobe_transmittance(self, directions, source)
         blocked = None
         if self.merged_scene.scene.bounces:
-            blocked = self.method.blocked_radiance(self, self.chosen(diffuse), source, view, self.chosen)
+            blocked = self.method.blocked_radiance(self, self.chosen(bounced), source, view, self.chosen)
         sums = Node("gloss", sum_lobes, filters, radiance, through, blocked, items=item_text)
         straight, grazing = (Node("", operator.itemgetter(part), sums) for part in range(2))
         arguments = self._numbers, diffuse, straight, grazing, cosines, metallic, specular

@@ -3,6 +3,7 @@
 import copy
 import functools
 from collections.abc import Callable, Collection, Iterable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +23,9 @@ from warpshadow.spheres import MANY, Spheres
 from warpshadow.stages.bound_spheres import SphereBinding
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.poses import Poses
+
+if TYPE_CHECKING:  # it is imported where a body emits
+    from warpshadow.stages.emitters.traced import EmittingFaces
 
 
 class MergedScene:
@@ -139,6 +143,19 @@ class MergedScene:
     def is_glossy(self) -> np.ndarray:
         """Bodies that shine, bool of shape [body]."""
         return np.array([body.is_glossy for body in self.scene.bodies])
+
+    @functools.cached_property
+    def is_emitter(self) -> np.ndarray:
+        """Bodies that emit light, bool of shape [body]."""
+        return np.array([body.is_emitter for body in self.scene.bodies])
+
+    def emitting_faces(self, positions: wp.array, emission: wp.array) -> "EmittingFaces":
+        """Prepare the faces of emitters for rays, given positions and radiance of all vertices, vec3 of [vertex]."""
+        from warpshadow.stages.emitters.traced import emitting_faces
+
+        is_emitting = self.is_emitter[self.body_of_face]
+        faces = self._array(self.faces.numpy()[is_emitting], wp.vec3i)
+        return emitting_faces(positions, emission, faces, self.is_two_sided[self.body_of_face[is_emitting]])
 
     @functools.cached_property
     def two_sided_faces(self) -> wp.array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Hashable
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -20,6 +21,9 @@ from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.transfers import Light, check_light, shade_free
 from warpshadow.stages.gloss.prefilter import prefilter
 from warpshadow.stages.receivers import Numbering, number_receivers
+
+if TYPE_CHECKING:  # it is imported where a body emits
+    from warpshadow.pipeline.emitters import SceneEmitters
 
 
 class Method:
@@ -47,6 +51,7 @@ class Method:
         self.light = Input("light", merged_scene.scene.known_light)
         self._numberings: dict[Hashable, list[Numbering]] = {}
         self._can_receive: dict[tuple[int, ...], np.ndarray] = {}  # by the bodies out of which spheres bulge
+        self.has_emitters = bool(merged_scene.is_emitter.any())
 
     def blocker_kinds(self, geometry: Geometry | None, rotations: Input | None) -> BlockerKinds:
         """Choose the kind of blocker that each body of a geometry is; the scene's geometry by default.
@@ -64,9 +69,12 @@ class Method:
 
     @functools.cached_property
     def is_adaptive(self) -> np.ndarray:
-        """Flat bodies on which samples interpolate between receivers, bool of shape [body]."""
+        """Flat bodies on which samples interpolate between receivers, bool of shape [body].
+
+        None where a body emits: where its shadows have edges, nobody knows.
+        """
         adaptive = np.array([body.receivers == "adaptive" for body in self.merged_scene.scene.bodies])
-        return adaptive & self.merged_scene.is_flat & (not self.lights_samples)
+        return adaptive & self.merged_scene.is_flat & (not self.lights_samples) & (not self.has_emitters)
 
     def can_receive(self, blocker_kinds: BlockerKinds) -> np.ndarray:
         """Vertices that may be receivers, and vertices whose backs may be, bool of shape [2, vertex]."""
@@ -80,7 +88,7 @@ class Method:
     def separate_bodies(self, blocker_kinds: BlockerKinds) -> np.ndarray | None:
         """Number of each body whose receivers form a group, −1 for others, shape [body]; None where all share one."""
         bodies = range(len(self.merged_scene.scene.bodies))
-        if self.merged_scene.scene.bounces:
+        if self.merged_scene.scene.bounces or self.has_emitters:
             return np.array(bodies)
         separate = {*blocker_kinds.traced, *blocker_kinds.planes, *np.flatnonzero(self.merged_scene.is_glossy).tolist()}
         return np.array([body if body in separate else -1 for body in bodies]) if separate else None
@@ -113,8 +121,37 @@ class Method:
         """Light reflected by points as white surfaces, vec3 of shape [batch, receiver]; None: the scene's.
 
         Results for the scene's light and the last other known light are cached. Materials, by default the scene's,
-        matter where light bounces.
+        matter where light bounces, and where bodies emit.
         """
+        without_emitters = self.shading_without_emitters(points, light, materials)
+        return self.with_emitters(without_emitters, points, materials or points.materials)
+
+    @functools.cached_property
+    def emitters(self) -> SceneEmitters:
+        """The bodies that emit."""
+        from warpshadow.pipeline.emitters import SceneEmitters
+
+        return SceneEmitters(self.merged_scene)
+
+    def with_emitters(self, direct: Node, points: LitPoints, materials: Materials) -> Node:
+        """Add direct light of emitters to other direct light on points; nothing where no body emits."""
+        if not materials.emission:
+            return direct
+        emitted = self.light_of_emitters(points, materials)
+        return points.cached("direct with emitters", (direct, emitted), lambda: Node("", _sum, direct, emitted))
+
+    def light_of_emitters(self, points: LitPoints, materials: Materials) -> Node:
+        """Direct light of emitters on points, vec3 of shape [batch, receiver], cached for the last emission."""
+        return points.cached("emitted", materials.emission, lambda: self.emitted_light(points, materials))
+
+    def emitted_light(self, points: LitPoints, materials: Materials) -> Node:
+        """Direct light of emitters on points, past the blockers between, vec3 of shape [batch, receiver]."""
+        raise NotImplementedError
+
+    def shading_without_emitters(
+        self, points: LitPoints, light: Light | None, materials: Materials | None = None
+    ) -> Node:
+        """The same without direct light of emitters, but with that which bounces."""
         check_light(light)
         if materials is None or not self.merged_scene.scene.bounces:
             materials = points.materials
@@ -201,3 +238,9 @@ class Method:
     def openness(self, points: LitPoints) -> Node | None:
         """Light that points reflect as white surfaces under an even sky of 1; None where rays find it on average."""
         return None
+
+
+def _sum(*summands: wp.array) -> wp.array:
+    from warpshadow.stages.bounces.total import total_light
+
+    return total_light(summands)

@@ -25,6 +25,9 @@ BodyArrays = Sequence[wp.array | None] | None
 """For each body an array, or None for the scene's own; None for all bodies' own."""
 
 
+_COLORS = ("albedo", "emission")  # inputs that are never textures
+
+
 class SampleReflectance(NamedTuple):
     """Nodes of the samples' reflectance."""
 
@@ -90,10 +93,11 @@ class Materials:
     Args:
         merged_scene: The bodies.
         inputs: Arrays of each body, by name: "albedo", vec3 of shape [batch, 1] or [batch, vertex]; "textures", vec3 of
-            shape [batch, height, width], None without one; and where a body shines, those of GLOSS_ARGUMENTS, float32
-            of shape [batch, 1], [batch, vertex] or, a texture, [batch, height, width].
+            shape [batch, height, width], None without one; where a body shines, those of GLOSS_ARGUMENTS, float32
+            of shape [batch, 1], [batch, vertex] or, a texture, [batch, height, width]; and where one emits, "emission",
+            as albedo.
     Attributes:
-        albedo, textures, roughness: These inputs; None where no body shines.
+        albedo, textures, roughness, emission: These inputs; None where no body shines, and where none emits.
         vertex_albedo: Node of the reflectance of all vertices.
         textures_of: By name, the textures among an input's arrays.
     """
@@ -106,10 +110,10 @@ class Materials:
     def _wire(self, changed: Collection[str]) -> None:
         """Make the nodes of inputs that changed."""
         self.albedo, self.textures = self._inputs["albedo"], self._inputs["textures"]
-        self.roughness = self._inputs.get("roughness")
+        self.roughness, self.emission = self._inputs.get("roughness"), self._inputs.get("emission")
         if "albedo" in changed:
             self.vertex_albedo = self.of_vertices("albedo")
-        textures = {name: BodyTextures(self.merged_scene, self._inputs[name]) for name in changed if name != "albedo"}
+        textures = {name: BodyTextures(self.merged_scene, self._inputs[name]) for name in changed if name not in _COLORS}
         self.textures_of = self.textures_of | textures
 
     @classmethod
@@ -126,6 +130,9 @@ class Materials:
         }
         if merged_scene.is_glossy.any():
             arrays |= {name: _of_bodies(merged_scene, name) for name in GLOSS_ARGUMENTS}
+        if merged_scene.is_emitter.any():
+            emission = [np.zeros(3) if body.emission is None else body.emission for body in bodies]
+            arrays["emission"] = [array(np.atleast_2d(colors)) for colors in emission]
         return cls(merged_scene, {name: Input(name, values) for name, values in arrays.items()})
 
     def is_black(self, number: int) -> bool:
@@ -168,6 +175,8 @@ class Materials:
         if name in GLOSS_ARGUMENTS and not body.is_glossy:
             expected = "one for bodies that have roughness in the scene"
             raise ValueError(f"{where}: got some for {body.called!r}, expected {expected}")
+        if name == "emission" and body.emission is None:
+            raise ValueError(f"{where}: got some for {body.called!r}, expected one for bodies that have it in the scene")
         if name == "textures" or (name in GLOSS_ARGUMENTS and array.ndim == 3):
             check.shape(where, array.shape, ("batch", "height", "width"))
             if body.mesh.uvs is None:
@@ -180,7 +189,7 @@ class Materials:
         else:
             check.shape(where, array.shape, ("batch", 1 if array.shape[1:] == (1,) else body.mesh.vertex_count))
         check.finite_arrays({where: array})
-        if name not in GLOSS_ARGUMENTS:
+        if name in ("albedo", "textures"):
             self._warn_of_growth(where, array)
 
     def _warn_of_growth(self, name: str, values: wp.array) -> None:

@@ -289,10 +289,11 @@ class SceneRenderer:
         albedo: PerBody[wp.array] | None,
         textures: PerBody[wp.array] | None,
         gloss: Mapping[str, PerBody[wp.array]] | None = None,
+        emission: PerBody[wp.array] | None = None,
     ) -> Materials:
         """The scene's materials with others in their place, checked."""
         check.known_keys("gloss", gloss or {}, GLOSS_ARGUMENTS)
-        replacements = {"albedo": albedo, "textures": textures, **(gloss or {})}
+        replacements = {"albedo": albedo, "textures": textures, "emission": emission, **(gloss or {})}
         return self._materials.replaced(
             {name: self.scene.per_body(values, name) for name, values in replacements.items()}
         )
@@ -307,6 +308,7 @@ class SceneRenderer:
         albedo: PerBody[wp.array] | None = None,
         textures: PerBody[wp.array] | None = None,
         gloss: Mapping[str, PerBody[wp.array]] | None = None,
+        emission: PerBody[wp.array] | None = None,
         view: View | None = None,
     ) -> wp.array:
         """Draw images.
@@ -317,14 +319,15 @@ class SceneRenderer:
             textures: As for :meth:`reflect`.
             gloss: "roughness", "metallic" and "specular" of bodies that have roughness in the scene, each float32 of
                 shape [batch, 1], [batch, vertex] or, as a texture, [batch, height, width], as albedo is given.
+            emission: Of bodies that have it in the scene, linear RGB, as albedo is given.
             view: From :meth:`view`, by default the scene's own.
                 Batches of 1 serve every instance of the others.
         Returns:
             Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]; the background is 0.
-        Differentiable: light, albedo, textures, gloss, view.
+        Differentiable: light, albedo, textures, gloss, emission, view.
         """
         view = self._checked(view)
-        return view.image(light, self._given_materials(albedo, textures, gloss)).value(self._views.call(view))
+        return view.image(light, self._given_materials(albedo, textures, gloss, emission)).value(self._views.call(view))
 
     @check.keywords(**dict.fromkeys(("camera", "cameras"), "renderer.with_cameras([camera]).render()"))
     def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:
@@ -354,6 +357,7 @@ class SceneRenderer:
         albedo: PerBody[wp.array] | None = None,
         textures: PerBody[wp.array] | None = None,
         gloss: Mapping[str, PerBody[wp.array]] | None = None,
+        emission: PerBody[wp.array] | None = None,
         geometry: Geometry[wp.array] | None = None,
         clip_matrices: wp.array | None = None,
     ) -> wp.array:
@@ -364,7 +368,7 @@ class SceneRenderer:
                 for nothing, where shadows on catchers are coverage.
             light: As for :meth:`draw`.
             albedo: As for :meth:`draw`; a catcher's matters where light bounces.
-            textures, gloss: As for :meth:`draw`.
+            textures, gloss, emission: As for :meth:`draw`.
             geometry: As for :meth:`view`; but static bodies have no cached rows.
             clip_matrices: As for :meth:`view`. Batches of 1 serve every instance of the others.
         Returns:
@@ -380,7 +384,7 @@ class SceneRenderer:
         if photograph is not None:
             check.shape("photograph", photograph.shape, ("batch", *self._size))
             check.finite_arrays({"photograph": photograph})
-        catchers, materials, alone = self._catchers_alone, self._given_materials(albedo, textures, gloss), None
+        catchers, materials, alone = self._catchers_alone, self._given_materials(albedo, textures, gloss, emission), None
         if geometry is not None:
             geometry = as_geometry("geometry", geometry)
             alone = catchers.moved_geometry(geometry)
@@ -465,6 +469,7 @@ class SceneRenderer:
         albedo: PerBody[wp.array] | None = None,
         textures: PerBody[wp.array] | None = None,
         gloss: Mapping[str, PerBody[wp.array]] | None = None,
+        emission: PerBody[wp.array] | None = None,
         view: View | None = None,
         geometry: Geometry[wp.array] | None = None,
         clip_matrices: wp.array | None = None,
@@ -472,7 +477,7 @@ class SceneRenderer:
         """List the stages that the next call computes and skips, and why.
 
         Args:
-            light, albedo, textures, gloss: As for :meth:`draw`.
+            light, albedo, textures, gloss, emission: As for :meth:`draw`.
             view: As for :meth:`draw`: then only the stages after it are explained.
             geometry, clip_matrices: As for :meth:`view`, which is explained with them.
         Returns:
@@ -485,7 +490,7 @@ class SceneRenderer:
             hidden = {*decide(view.receivers_node, view.call), view.silhouettes}
         else:
             view = self._views.view(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
-        image = view.preview().image(light, self._given_materials(albedo, textures, gloss))
+        image = view.preview().image(light, self._given_materials(albedo, textures, gloss, emission))
         is_host = self.device.is_cpu or self.clock.waits
         of_receivers = receiver_notes(self._given_scene, self._choices, view.blocker_kinds.bulging)
         notes = [*of_receivers, *bounce_notes(self.scene.bounces)]

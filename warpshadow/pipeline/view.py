@@ -15,6 +15,7 @@ from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, re
 from warpshadow.pipeline.reflectance import Materials, SampleReflectance
 from warpshadow.pipeline.transfers import Light
 from warpshadow.stages.film import average, sample_radiance, sum_radiance
+from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.project import to_clip
 from warpshadow.stages.rasterization import Fragments, rasterize
@@ -211,8 +212,8 @@ class View(LitPoints):
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""
         item_text, clip, fragments = self._samples, self.clip_positions, self.fragments_node
         shading, reflectance = self.shading(light, materials), self.reflectance(materials)
-        if materials.roughness:
-            samples = self._glossy(shading, light, materials, reflectance.samples)
+        if materials.roughness or materials.emission:
+            samples = self._shining(shading, light, materials, reflectance.samples)
         elif reflectance.pyramids.requires_grad and not (shading.requires_grad or clip.requires_grad):
             replaced_stages = (NodeStage("reflectance", idle="found with the radiance"),)
             reflectance_inputs = reflectance.vertex_albedo, reflectance.pyramids, reflectance.footprints
@@ -257,15 +258,35 @@ class View(LitPoints):
         textures, footprints = (node.value(self.call) for node in (reflectance.pyramids, reflectance.footprints))
         return seen_texels(textures, footprints)[sum(has_texture[:number])].sum(axis=0)
 
+    def _shining(self, shading: Node, light: Light | None, materials: Materials, reflectance: Node) -> Node:
+        """Node of the samples where bodies shine or emit."""
+        if materials.roughness:
+            reflected = self._glossy(shading, light, materials, reflectance)
+        else:
+            reflected = self._radiance(shading, reflectance)
+        if not materials.emission:
+            return reflected
+        of_vertices = materials.of_vertices("emission")
+        emission = Node("emission", interpolate, self.fragments_node, self.merged_scene.faces, of_vertices)
+        emitted = self._radiance(Node("", _white_shading, self.receivers_node), emission)
+        return self._sum_of(reflected, emitted)
+
+    def _sum_of(self, first: Node, second: Node) -> Node:
+        """Node of the samples, of light of two kinds."""
+        add = _sum_moving if self._is_moving else sum_radiance
+        return Node("radiance", add, first, second, caches=False)
+
     def _glossy(self, shading: Node, light: Light | None, materials: Materials, reflectance: Node) -> Node:
         """Node of the samples where bodies shine: of light in the surface's color, and of light that has its own."""
         from warpshadow.pipeline.gloss import GlossyPoints
 
         arguments = self.cameras, self.fragments_node, self.clip_positions
         points = self.cached("gloss", None, lambda: GlossyPoints(self.method, self, *arguments))
-        colored, white = points.mixed(self, shading, light, materials)
-        parts = self._radiance(colored, reflectance), self._radiance(white, self._white_reflectance)
-        return Node("radiance", _sum_moving if self._is_moving else sum_radiance, *parts, caches=False)
+        blockers_light = shading
+        if materials.emission:
+            blockers_light = self.method.shading_without_emitters(self, light, materials)
+        colored, white = points.mixed(self, shading, light, materials, blockers_light)
+        return self._sum_of(self._radiance(colored, reflectance), self._radiance(white, self._white_reflectance))
 
     @property
     def _is_moving(self) -> bool:
@@ -302,8 +323,8 @@ class View(LitPoints):
             Node("", operator.itemgetter(part), ratio, caches=False) for part in range(3)
         )
         parts = (
-            self._glossy(shading, light, materials, body_light)
-            if materials.roughness
+            self._shining(shading, light, materials, body_light)
+            if materials.roughness or materials.emission
             else self._radiance(shading, body_light)
         )
         surfaces = parts, self._radiance(shading, inverse_light)
@@ -423,3 +444,9 @@ def _white_radiance(receivers: Receivers, shading: wp.array) -> wp.array:
     _, height, width = receivers.fragments.face_ids.shape
     white = wp.full((1, height, width), wp.vec3(1.0), dtype=wp.vec3, device=shading.device)
     return sample_radiance(receivers.fragments, receivers.faces, shading, white)
+
+
+def _white_shading(receivers: Receivers) -> wp.array:
+    """Light of 1 on all receivers, vec3 of shape [1, receiver]."""
+    count = len(receivers.on_static) + receivers.points.shape[1]
+    return wp.full((1, count), wp.vec3(1.0), dtype=wp.vec3, device=receivers.points.device)

@@ -91,6 +91,11 @@ class Body:
             black in it, so metals want bounces.
         metallic: Likewise, how much of it is metal, which reflects its albedo and has no diffuse light; by default 0.
         specular: Likewise, strength of the reflection of all but metal, of which 1, the default, is 4% straight on.
+        emission: Radiance that its surface emits, linear RGB, 0 or more, for the body [3] or for each vertex
+            [vertex, 3], or an .npy file of it: a lamp, which lights the other bodies past all that is between, from
+            where it is. None, the default, is no emission, or that of the mesh's file, if that is glTF and neither
+            ``albedo`` nor ``texture`` is given. Open bodies emit to both sides. A body gets none of its own emission
+            directly. All methods but "log-sh" have it.
     """
 
     mesh: Mesh
@@ -107,6 +112,7 @@ class Body:
     roughness: np.ndarray | None
     metallic: np.ndarray | None
     specular: np.ndarray | None
+    emission: np.ndarray | None
 
     @check.keywords(**LIKELY_MISTAKES, spheres="blockers", path="mesh", size="Body(…).on_ground(size=…)")
     def __init__(
@@ -125,11 +131,12 @@ class Body:
         roughness: npt.ArrayLike | AnyPath | None = None,
         metallic: npt.ArrayLike | AnyPath | None = None,
         specular: npt.ArrayLike | AnyPath | None = None,
+        emission: npt.ArrayLike | AnyPath | None = None,
     ):
         vars(self).update(mesh=mesh, albedo=albedo, texture=texture, blockers=blockers)
         vars(self).update(rotation=rotation, translation=translation, scale=scale, receivers=receivers, name=name)
         vars(self).update(self_shadows=self_shadows, shadow_catcher=check.flag("shadow_catcher", shadow_catcher))
-        vars(self).update(roughness=roughness, metallic=metallic, specular=specular)
+        vars(self).update(roughness=roughness, metallic=metallic, specular=specular, emission=emission)
         self._read_mesh()
         self._read_files()
         expected = "a Mesh or the path of a file, or a mesh of trimesh; Mesh(positions, faces) makes one of arrays"
@@ -153,6 +160,8 @@ class Body:
             )
         check.choice("receivers", self.receivers, RECEIVERS)
         self._check_gloss()
+        if self.emission is not None:
+            object.__setattr__(self, "emission", self._checked_emission(self.emission))
         if self.self_shadows is not None:
             check.choice("self_shadows", self.self_shadows, SELF_SHADOWS)
         if self.name is not None and not (isinstance(self.name, str) and self.name):
@@ -206,12 +215,15 @@ class Body:
         is_diffuse = self.shadow_catcher or self.receivers in ("vertex", "adaptive")
         if all(getattr(self, name) is None for name in GLOSS_ARGUMENTS) and not is_diffuse:
             vars(self).update({item.name: getattr(material, item.name) for item in MATERIAL_FIELDS if item.is_in_files})
+        if self.emission is None and not self.shadow_catcher:
+            vars(self).update(emission=material.emission)
 
     def _read_files(self) -> None:
         """Replace paths by the content of their files."""
         readers: tuple[tuple[str, Callable[[Path], Any], str, type[ValueError]], ...] = (
             ("texture", read_rgb, "", ImageError),
             ("albedo", _read_colors, COLORS_SUFFIX, ValueError),
+            ("emission", _read_colors, COLORS_SUFFIX, ValueError),
             ("blockers", Spheres.read, _SPHERES_SUFFIX, ValueError),
             *((name, _read_values, VALUES_SUFFIX, ValueError) for name in GLOSS_ARGUMENTS),
         )
@@ -235,6 +247,18 @@ class Body:
         if getattr(self.albedo, "dtype", None) == np.uint8:  # as it is, all but black
             check.pixels("albedo", self.albedo, expected=expected)
         return albedo
+
+    def _checked_emission(self, radiance: npt.ArrayLike) -> np.ndarray:
+        count = self.mesh.vertex_count
+        expected = "a linear color of 0 or more such as (5, 4, 3), one for each vertex, [vertex, 3], or an .npy file"
+        emission = check.numbers("emission", radiance, expected=expected)
+        if emission.shape not in ((3,), (count, 3)):
+            raise ValueError(f"emission: got shape {emission.shape}, expected [3] or [{count}, 3] (one for each vertex)")
+        check.finite("emission", emission, minimum=0)
+        if self.shadow_catcher:
+            raise ValueError("emission: got some for a shadow catcher, expected None: it is not drawn")
+        emission.setflags(write=False)
+        return emission
 
     def _checked_texture(self, image: np.ndarray) -> np.ndarray:
         if self.mesh.uvs is None:
@@ -281,6 +305,11 @@ class Body:
             )
 
     @property
+    def is_emitter(self) -> bool:
+        """Whether it emits light."""
+        return self.emission is not None
+
+    @property
     def is_glossy(self) -> bool:
         """Whether it shines."""
         return self.roughness is not None
@@ -302,8 +331,10 @@ class Body:
             for name, array in values.items()
             if np.shape(array) == self.mesh.positions.shape[:1]
         }
-        colors = self.albedo if self.albedo.ndim == 1 else self.albedo[mesh.origins]
-        return replace(self, mesh=mesh, albedo=colors, **of_vertices)
+        for name in ("albedo", "emission"):
+            if np.ndim(getattr(self, name)) == 2:
+                of_vertices[name] = getattr(self, name)[mesh.origins]
+        return replace(self, mesh=mesh, **of_vertices)
 
     @check.keywords(rotation="Body(…, rotation=…).on_ground(…)", scale="size", height="size", translation="foot")
     def on_ground(self, foot: npt.ArrayLike = (0.0, 0.0, 0.0), *, size: float | None = None) -> Body:

@@ -201,8 +201,9 @@ def _body(table: Table, folder: Path) -> Body:
     place: Table = {"mesh": mesh} | {key: table[key] for key in _PLACE_KEYS if key in table}
     if "texture" in place:
         place["texture"] = toml_tables.file(table, "texture", folder)
-    if isinstance(place.get("albedo"), str) and place["albedo"].endswith(COLORS_SUFFIX):
-        place["albedo"] = toml_tables.file(table, "albedo", folder)
+    for name in ("albedo", "emission"):
+        if isinstance(place.get(name), str) and place[name].endswith(COLORS_SUFFIX):
+            place[name] = toml_tables.file(table, name, folder)
     for name in GLOSS_ARGUMENTS:
         if isinstance(place.get(name), str) and place[name].endswith(VALUES_SUFFIX):
             place[name] = toml_tables.file(table, name, folder)
@@ -318,6 +319,14 @@ def _write_body(body: Body, stem: Path) -> tuple[Table, list[Path]]:
                 np.save(unfinished, values)
             place[name] = path.name
             written.append(path)
+    if np.ndim(body.emission) == 1:
+        place["emission"] = _numbers(body.emission)
+    elif body.emission is not None:
+        path = stem.with_name(f"{stem.name}_emission{COLORS_SUFFIX}")
+        with files.atomic_write(path) as unfinished:
+            np.save(unfinished, body.emission)
+        place["emission"] = path.name
+        written.append(path)
     if body.self_shadows is not None:
         place["self_shadows"] = body.self_shadows
     if body.shadow_catcher:

@@ -6,7 +6,7 @@ n bounces the receiver gets
     I = Σ_{k=1..n} a(x_1) ⋯ a(x_k) S(x_k)                [Kajiya 1986; Veach 1997, section 10.2]
 
 on average over paths whose directions are drawn in proportion to the cosine: a albedo and S the direct shading of a
-white surface. A hit is a receiver of its own: on the side of its face that the ray meets, with the normal of the
+white surface, by the sky and by a point of the emitters if there are any. A hit is a receiver of its own: on the side of its face that the ray meets, with the normal of the
 vertices, interpolated.
 """
 
@@ -19,6 +19,7 @@ import warp as wp
 
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
+from warpshadow.stages.emitters.traced import EmittingFaces, light_of_point
 from warpshadow.stages.interpolation import interpolate_at
 from warpshadow.stages.light_samples import LightSamples
 from warpshadow.stages.ray_tracing import RAY_COST, escapes, first_hit, mesh_id, progress_slices
@@ -44,6 +45,7 @@ class PathSurfaces(NamedTuple):
         texture_of_face: Texture of each face, -1 for none, int32 of shape [face].
         uvs: Texture coordinates, vec2 of shape [uv].
         uv_faces: Indices of uvs, vec3i of shape [face].
+        emitters: Faces that emit; None without any.
     """
 
     mesh: wp.Mesh
@@ -55,6 +57,7 @@ class PathSurfaces(NamedTuple):
     texture_of_face: wp.array
     uvs: wp.array
     uv_faces: wp.array
+    emitters: EmittingFaces | None = None
 
 
 @wp.struct
@@ -72,6 +75,7 @@ class _SurfaceArrays:
     texture_of_face: wp.array(dtype=wp.int32)
     uvs: wp.array(dtype=wp.vec2)
     uv_faces: wp.array(dtype=wp.vec3i)
+    emitters: EmittingFaces
 
 
 @wp.func
@@ -146,6 +150,14 @@ def _trace_bounces(
             cosine = wp.dot(normal, directions[sample_set])
             if cosine > 0.0 and escapes(surfaces.blocker_mesh, point, normal, directions[sample_set]):
                 total += cosine * wp.cw_mul(throughput, radiance[sample_set])
+            if surfaces.emitters.distribution.shape[0] > 0:
+                share = wp.randf(state)
+                emitter_u = wp.randf(state)
+                emitter_v = wp.randf(state)
+                emitted, _unblocked = light_of_point(
+                    surfaces.emitters, surfaces.blocker_mesh, point, normal, share, emitter_u, emitter_v
+                )
+                total += wp.cw_mul(throughput, emitted)
             u = wp.randf(state)
             v = wp.randf(state)
     light[receiver] = total / float(path_count)
@@ -211,4 +223,5 @@ def _surface_arrays(surfaces: PathSurfaces) -> _SurfaceArrays:
     struct.uvs, struct.uv_faces = surfaces.uvs, surfaces.uv_faces
     if surfaces.textures is not None:
         struct.texels, struct.levels = surfaces.textures.texels[0], surfaces.textures.levels
+    struct.emitters = EmittingFaces() if surfaces.emitters is None else surfaces.emitters
     return struct

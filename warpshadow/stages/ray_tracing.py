@@ -28,6 +28,9 @@ in front of it then, against rounding.
 MIN_HIT_HEIGHT = 1.0e-4
 
 
+SURFACE = 1.0e-4  # how far before a point the surface may be met that it is on, as a part of the point's distance
+
+
 @wp.func
 def _face_from_receiver(mesh: wp.uint64, face: int, point: wp.vec3, normal: wp.vec3):
     """A face as a receiver sees it: corners relative to it and their normal, in float64, where they are exact.
@@ -109,6 +112,22 @@ def any_hit(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, ray_direction: wp.
 def escapes(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, ray_direction: wp.vec3):
     """Whether a ray from a receiver meets no face of a mesh; 0 is the mesh that has none."""
     return any_hit(mesh, point, normal, ray_direction) < 0
+
+
+@wp.func
+def sees_point(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, ray_direction: wp.vec3, distance: float):
+    """Whether no face of a mesh lies between a receiver and a point at a distance; 0 is the mesh that has none."""
+    if mesh == wp.uint64(0):
+        return True
+    query = wp.bvh_query_ray(wp.mesh_get_bvh(mesh), point, _nonzero_direction(ray_direction))
+    face = int(0)
+    while wp.bvh_query_next(query, face, distance):
+        a, b, c, face_normal, _is_on_face = _face_from_receiver(mesh, face, point, normal)
+        if _is_hit(ray_direction, a, face_normal, _volumes(ray_direction, a, b, c)):
+            hit_distance = float(wp.dot(face_normal, a) / wp.dot(face_normal, wp.vec3d(ray_direction)))
+            if hit_distance < distance * (1.0 - SURFACE):
+                return False
+    return True
 
 
 @wp.struct

@@ -177,6 +177,7 @@ class TorchRenderer(torch.nn.Module):
         *,
         albedo: PerBody[torch.Tensor] | None = None,
         textures: PerBody[torch.Tensor] | None = None,
+        emission: PerBody[torch.Tensor] | None = None,
         geometry: Geometry[torch.Tensor] | None = None,
         clip_matrices: torch.Tensor | None = None,
         **gloss: PerBody[torch.Tensor] | None,
@@ -192,6 +193,7 @@ class TorchRenderer(torch.nn.Module):
                 are: free ones may pass 1 on their way.
             textures: Reflectance of bodies as images, [height, width, 3] or [batch, height, width, 3], which needs uvs;
                 a list or a mapping likewise.
+            emission: Radiance that bodies emit which have emission in the scene, linear RGB, as albedo.
             geometry: Vertices and spheres in world space, from :meth:`placed`; by default the scene's, which stand
                 still.
             clip_matrices: Cameras, [4, 4] or [batch, 4, 4], from :meth:`clip_matrices` or
@@ -208,7 +210,7 @@ class TorchRenderer(torch.nn.Module):
             others raise NotImplementedError then.
         """
         arguments, inputs = self._checked_inputs(
-            light, geometry, clip_matrices, {"albedo": albedo, "textures": textures, **gloss}
+            light, geometry, clip_matrices, {"albedo": albedo, "textures": textures, "emission": emission, **gloss}
         )
 
         def draw(inputs: dict[str, Any]) -> wp.array:
@@ -254,6 +256,7 @@ class TorchRenderer(torch.nn.Module):
         *,
         albedo: PerBody[torch.Tensor] | None = None,
         textures: PerBody[torch.Tensor] | None = None,
+        emission: PerBody[torch.Tensor] | None = None,
         geometry: Geometry[torch.Tensor] | None = None,
         clip_matrices: torch.Tensor | None = None,
         **gloss: PerBody[torch.Tensor] | None,
@@ -263,7 +266,7 @@ class TorchRenderer(torch.nn.Module):
         Args:
             photograph: Linear RGB, of radiance in the units of the light, of the size of the cameras' images,
                 [height, width, 3] or [batch, height, width, 3].
-            light, albedo, textures, geometry, clip_matrices, gloss: As for :meth:`forward`.
+            light, albedo, textures, emission, geometry, clip_matrices, gloss: As for :meth:`forward`.
         Returns:
             Linear RGB, [height, width, 3] or [batch, height, width, 3]; see :mod:`warpshadow.stages.photograph`.
         Raises:
@@ -271,7 +274,7 @@ class TorchRenderer(torch.nn.Module):
         Differentiable: all, as :meth:`forward` is; both the light with and that without the other bodies are.
         """
         arguments, inputs = self._checked_inputs(
-            light, geometry, clip_matrices, {"albedo": albedo, "textures": textures, **gloss}
+            light, geometry, clip_matrices, {"albedo": albedo, "textures": textures, "emission": emission, **gloss}
         )
         camera = self.cameras[0]
         size = camera.height, camera.width
@@ -288,13 +291,14 @@ class TorchRenderer(torch.nn.Module):
         *,
         albedo: PerBody[torch.Tensor] | None = None,
         textures: PerBody[torch.Tensor] | None = None,
+        emission: PerBody[torch.Tensor] | None = None,
         geometry: Geometry[torch.Tensor] | None = None,
         clip_matrices: torch.Tensor | None = None,
         **gloss: PerBody[torch.Tensor] | None,
     ) -> Explanation:
         """List the stages that a call with the same arguments computes and skips, as :meth:`Renderer.explain` does."""
         arguments, inputs = self._checked_inputs(
-            light, geometry, clip_matrices, {"albedo": albedo, "textures": textures, **gloss}
+            light, geometry, clip_matrices, {"albedo": albedo, "textures": textures, "emission": emission, **gloss}
         )
         return self.warp.explain(**arguments.filled(inputs))
 
@@ -344,7 +348,7 @@ class TorchRenderer(torch.nn.Module):
         """A tensor of a body as rows of items, their dtype, the shape to expect, and a remedy."""
         if name == "textures":
             return tensor, wp.vec3, ("height", "width"), check.channels_last(np.shape(tensor))
-        dtype = wp.vec3 if name == "albedo" else wp.float32
+        dtype = wp.vec3 if name in ("albedo", "emission") else wp.float32
         item, mesh = item_shape(dtype), self.scene.bodies[number].mesh
         if name in GLOSS_ARGUMENTS and mesh.uvs is not None:
             is_texture = np.ndim(tensor) == 2 and np.shape(tensor)[1] not in (1, mesh.vertex_count)

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from warpshadow.device.batch import cut
 from warpshadow.pipeline.bounces.gathering import (
     ALL_FLAT,
     CellTransmittance,
@@ -128,9 +129,20 @@ def _openness(senders: Senders, visibility: list[PortionVisibility]) -> Openness
     return open_shares(joined(portions), senders.mean, senders.patch_of_sample)
 
 
+def _add_emitted(lit: list[PortionDirectLight], emitted: wp.array) -> list[PortionDirectLight]:
+    """Add direct light of emitters, vec3 of shape [batch, receiver], to that of portions."""
+    result, first = [], 0
+    for portion in lit:
+        end = first + portion.direct.shape[1]
+        result.append(portion._replace(direct=total_light([portion.direct, cut(emitted, first, end)])))
+        first = end
+    return result
+
+
 class PatchSampleNodes(NamedTuple):
     """Nodes of the points at which patches are lit."""
 
+    points: LitPoints
     visibility: PortionedVisibility  # of the patch samples, for any light
     frames: Node  # of flat bodies
     projected_patches: Node  # patches as receivers see them
@@ -150,7 +162,7 @@ class Radiosity(Node):
         albedo: Node,
         patch_samples: PatchSampleNodes,
     ):
-        _, frames, projected_patches, openness = patch_samples
+        _, _, frames, projected_patches, openness = patch_samples
         self._count, self._proxies, self._self_form_factors, self._gathering = (
             count,
             proxies,
@@ -325,18 +337,19 @@ class SphereBounces:
         visibility = make_visibility(lit_samples, where=_OF_PATCH_SAMPLES)
         frames = Node("", planes.all.frames if planes else lambda _: None, points.vertices)
         projected_patches = Node("", project, patch_samples, visibility, spheres, frames)
-        return PatchSampleNodes(
-            visibility, frames, projected_patches, Node("", functools.partial(_openness, senders), visibility)
-        )
+        openness = Node("", functools.partial(_openness, senders), visibility)
+        return PatchSampleNodes(lit_samples, visibility, frames, projected_patches, openness)
 
     def _radiosity(
         self, patch_samples: PatchSampleNodes, projected_light: Node, proxies: Proxies, materials: Materials
     ) -> Radiosity:
         """Radiosity of the patches, given the light at their patch samples."""
         senders, why_not = proxies.senders, "light bounces once" if self._count == 1 else ""
-        lit = PortionedDirectLight(
+        lit: Node = PortionedDirectLight(
             patch_samples.visibility, projected_light, _patch_sample_text(senders), _OF_PATCH_SAMPLES
         )
+        if materials.emission:
+            lit = Node("", _add_emitted, lit, self._method.light_of_emitters(patch_samples.points, materials))
         albedo = self._patches.albedo(materials, senders.bodies)
         among_senders = self._gathering(
             senders, _patch_sample_text(senders), _OF_PATCH_SAMPLES, why_not, only_others=True
@@ -358,6 +371,7 @@ class SphereBounces:
             PortionedShading, self._method, at_patch_samples, projected_light, light, joined, where=_OF_PATCH_SAMPLES
         )
         lit = points.cached("direct at patch samples", (light, patch_samples), make)
+        lit = self._method.with_emitters(lit, at_patch_samples, materials)
         return self._static_bounces.add_bounces(direct, lit, points, materials)
 
     def cached_bounced_free_shading(self, direct: Node, points: LitPoints, light: Input, materials: Materials) -> Node:
@@ -366,6 +380,9 @@ class SphereBounces:
         transfers = points.cached(
             "transfer", patch_samples, lambda: self._method.transfers(at_patch_samples, _OF_PATCH_SAMPLES)
         )
+        if materials.emission:
+            lit = self._method.light_of_emitters(at_patch_samples, materials)
+            direct = self._static_bounces.add_bounces(direct, lit, points, materials)
         return self._static_bounces.add_free_bounces(direct, transfers, light, points, materials)
 
     def _cached_patch_samples(self, points: LitPoints, materials: Materials) -> tuple[Node, LitPoints]:

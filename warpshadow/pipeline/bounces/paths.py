@@ -52,9 +52,12 @@ def path_traced(
         known_light: KnownLight,
         vertex_albedo: wp.array,
         textures: Textures | None,
+        emission: wp.array | None,
     ) -> wp.array:
         texels = None if textures is None else textures.texels
-        count = common_batch({"geometry": shading, "albedo": vertex_albedo, "textures": texels})
+        count = common_batch(
+            {"geometry": shading, "albedo": vertex_albedo, "textures": texels, "emission": emission}
+        )
         drawn = sample_map(known_light.radiance, _LIGHT_SAMPLES, seed=1)
         bounced = empty((count, *shading.shape[1:]), dtype=wp.vec3, device=shading.device)
 
@@ -72,6 +75,7 @@ def path_traced(
                 colors.texture_of_face,
                 merged_scene.uvs[0],
                 merged_scene.uv_faces,
+                None if emission is None else merged_scene.emitting_faces(of_instance(positions), of_instance(emission)),
             )
             places = of_instance(receivers.points), of_instance(receivers.normals)
             light = trace_bounces(surfaces, *places, drawn, bounces=bounces, paths=paths, progress=progress)
@@ -89,6 +93,7 @@ def path_traced(
         light,
         materials.vertex_albedo,
         colors.pyramids if colors.images else None,
+        materials.of_vertices("emission") if materials.emission else None,
         items=lambda: f"{receiver_text(points)} × {paths:,} paths of {maximum} bounces",
         has_adjoint=False,
     )

@@ -9,6 +9,7 @@ import warp as wp
 
 from warpshadow.assets.basis import Basis, HarmonicBasis
 from warpshadow.assets.harmonic_light import KnownLight
+from warpshadow.device.batch import common_batch
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.method import Method
 from warpshadow.pipeline.node import Input, Node, NodeStage, detached
@@ -63,6 +64,13 @@ class Rays(Method):
             return Node("", shade, self._blockers(points, patch_samples), patch_samples, light)
 
         at_patch_samples = points.cached("direct at patch samples", (light, patch_samples), shaded_patch_samples)
+        if materials.emission:
+            emitted = self._light_of_emitters_at(points, patch_samples, materials)
+            at_patch_samples = points.cached(
+                "emitters at patch samples",
+                (at_patch_samples, materials.emission),
+                lambda: Node("", _sum, at_patch_samples, emitted),
+            )
         return self._bounces.add_bounces(direct, at_patch_samples, points, materials)
 
     def free_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
@@ -75,8 +83,48 @@ class Rays(Method):
         def transfers() -> Node:
             return Node("", self._transfer, self._meshes_for(points, patch_samples), patch_samples)
 
+        if materials.emission:
+            emitted = self._light_of_emitters_at(points, patch_samples, materials)
+            direct = self._bounces.add_bounces(direct, emitted, points, materials)
         at_patch_samples = points.cached("transfer of patch samples", patch_samples, transfers)
         return self._bounces.add_free_bounces(direct, at_patch_samples, light, points, materials)
+
+    def emitted_light(self, points: LitPoints, materials: Materials) -> Node:
+        """Direct light of emitters on points, by rays to points of their surfaces."""
+        items = functools.partial(receiver_text, points)
+        return self._light_of_emitters_at(points, points.receivers_node, materials, "light of emitters", items)
+
+    def _light_of_emitters_at(
+        self, points: LitPoints, receivers: Node, materials: Materials, name: str = "", items: Callable[[], str] | str = ""
+    ) -> Node:
+        """The same on other receivers among the same bodies."""
+        unblocked = self.emitters.unblocked_light(points, receivers, materials) if self.shares_directions else None
+        arguments = points.vertices, receivers, materials.of_vertices("emission"), unblocked
+        return Node(name, self._trace_emitters, *arguments, items=items, has_adjoint=False)
+
+    def _trace_emitters(
+        self, positions: wp.array, receivers: Receivers, emission: wp.array, unblocked: wp.array | None
+    ) -> wp.array:
+        from warpshadow.stages.emitters.traced import EMITTER_RAYS, trace_emitters
+
+        points, normals = _checked_points(receivers.points), receivers.normals
+        if emission.requires_grad:
+            raise ValueError(
+                "emission: got an array that requires a gradient, which rays to emitters do not have; expected none, or "
+                "method = 'directional'"
+            )
+        count = common_batch({"geometry": points, "emission": emission})
+        options = {"rays": EMITTER_RAYS if self.shares_directions else self._sample_count, "progress": self.progress}
+        light, meshes = wp.empty((count, points.shape[1]), dtype=wp.vec3, device=points.device), {}
+        for instance in range(count if points.size else 0):
+            number, point_number = min(instance, len(positions) - 1), min(instance, len(points) - 1)
+            if number not in meshes:
+                meshes = {number: self.merged_scene.casting_mesh(positions[number])}
+            faces = self.merged_scene.emitting_faces(positions[number], emission[min(instance, len(emission) - 1)])
+            lit = points[point_number], normals[min(point_number, len(normals) - 1)]
+            whole = None if unblocked is None else unblocked[min(instance, len(unblocked) - 1)]
+            wp.copy(light[instance], trace_emitters(faces, meshes[number], *lit, unblocked=whole, **options))
+        return light
 
     @functools.cached_property
     def _bounces(self) -> "StaticBounces":
@@ -243,6 +291,12 @@ def _openness(trees: list[FaceTree], receivers: Receivers) -> wp.array:
         arguments = trees[min(instance, len(trees) - 1)], points[instance], normals[instance], samples
         wp.copy(result[instance], trace_shared(*arguments))
     return result
+
+
+def _sum(first: wp.array, second: wp.array) -> wp.array:
+    from warpshadow.stages.bounces.total import total_light
+
+    return total_light([first, second])
 
 
 def _checked_points(points: wp.array) -> wp.array:

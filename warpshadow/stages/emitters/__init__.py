@@ -1,0 +1,1 @@
+"""Emitters: bodies whose surfaces send light of their own, as lamps do."""

@@ -1,0 +1,144 @@
+"""Light of emitters on receivers: a sum over samples, each as a disc.
+
+    E(x) = Σ_k L_k T_k max(n·ω_k, 0) max(−A_k·ω_k, 0) / (π d_k² + |A_k|)
+
+L_k is the radiance of sample k, A_k its area vector, d_k and ω_k the distance and the direction to its middle, T_k the
+transmittance on the way. E is over π, as all shading is. Far away this is the point-to-patch form factor; the |A_k| in
+the denominator makes it that of a disc above a receiver that faces it, exact on the axis [Howell's catalog, B-13], so
+nothing is infinite. An open body sends light to both sides: |A_k·ω_k| is in place of the maximum.
+"""
+
+import warp as wp
+
+from warpshadow.device.batch import common_batch, expand, expand_rows, instance_in
+from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
+from warpshadow.device.parallel import split_row
+from warpshadow.stages.emitters.samples import PlacedSamples
+
+_COST = 6.0  # nanoseconds that a sample takes
+
+wp.set_module_options({"max_unroll": 1})
+
+
+@wp.kernel
+def _find_directions(
+    # in
+    points: wp.array2d(dtype=wp.vec3),
+    sample_points: wp.array2d(dtype=wp.vec3),
+    first_sample: int,
+    # out
+    directions: wp.array3d(dtype=wp.vec3),
+):
+    """A thread owns a receiver and a sample."""
+    batch, receiver, i = wp.tid()
+    sample_point = sample_points[instance_in(batch, sample_points.shape[0]), first_sample + i]
+    directions[batch, receiver, i] = wp.normalize(sample_point - points[instance_in(batch, points.shape[0]), receiver])
+
+
+def directions_to_samples(points: wp.array, samples: PlacedSamples, span: tuple[int, int]) -> wp.array:
+    """Unit vectors from receivers to the samples of an emitter, vec3 of shape [batch, receiver, sample].
+
+    Differentiable: points, samples.
+    """
+    count = common_batch({"points": points, "emitters": samples.points})
+    directions = empty((count, points.shape[1], span[1] - span[0]), dtype=wp.vec3, device=points.device)
+    launch(_find_directions, directions.shape, inputs=[points, samples.points, span[0]], outputs=[directions])
+    return directions
+
+
+@wp.kernel
+def _sum_light(
+    first_row: int,
+    worker: int,
+    # in
+    points: wp.array2d(dtype=wp.vec3),
+    normals: wp.array2d(dtype=wp.vec3),
+    sample_points: wp.array2d(dtype=wp.vec3),
+    sample_areas: wp.array2d(dtype=wp.vec3),
+    radiance: wp.array2d(dtype=wp.vec3),
+    first_sample: int,
+    sample_count: int,
+    is_two_sided: int,
+    log_of_spheres: wp.array3d(dtype=wp.float32),
+    log_of_planes: wp.array3d(dtype=wp.float32),
+    transmittance_self: wp.array3d(dtype=wp.float32),
+    # out
+    light: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a receiver of an instance."""
+    batch, receiver = split_row(first_row + wp.tid(), light.shape[1])
+    point = points[batch, receiver]
+    normal = normals[batch, receiver]
+    sample_batch = instance_in(batch, sample_points.shape[0])
+    radiance_batch = instance_in(batch, radiance.shape[0])
+    total = wp.vec3()
+    for i in range(sample_count):
+        beam = sample_points[sample_batch, first_sample + i] - point
+        area = sample_areas[sample_batch, first_sample + i]
+        cosine = wp.dot(beam, normal)
+        facing_area = -wp.dot(beam, area)
+        if is_two_sided == 1:
+            facing_area = wp.abs(facing_area)
+        if cosine > 0.0 and facing_area > 0.0:
+            exponent = float(0.0)
+            if log_of_spheres:
+                exponent += log_of_spheres[batch, receiver, i]
+            if log_of_planes:
+                exponent += log_of_planes[batch, receiver, i]
+            factor = cosine * facing_area * wp.exp(exponent)
+            if transmittance_self:
+                factor = factor * transmittance_self[batch, receiver, i]
+            distance2 = wp.length_sq(beam)
+            factor = factor / (distance2 * (wp.pi * distance2 + wp.length(area)))
+            total += factor * radiance[radiance_batch, first_sample + i]
+    light[batch, receiver] = total
+
+
+def sum_light(
+    points: wp.array,
+    normals: wp.array,
+    samples: PlacedSamples,
+    radiance: wp.array,
+    span: tuple[int, int],
+    *,
+    is_two_sided: bool,
+    log_of_spheres: wp.array | None = None,
+    log_of_planes: wp.array | None = None,
+    transmittance_self: wp.array | None = None,
+) -> wp.array:
+    """Light of an emitter on receivers.
+
+    Args:
+        points: Receivers [scene units], vec3 of shape [batch, receiver].
+        normals: Their unit normals, vec3 of shape [batch, receiver].
+        samples: Of all emitters.
+        radiance: Of the samples, linear RGB, vec3 of shape [batch, sample].
+        span: Where the samples of the emitter begin and end.
+        is_two_sided: Whether it is open.
+        log_of_spheres, log_of_planes: Logarithms of transmittance, float32 of shape [batch, receiver, sample].
+        transmittance_self: Past the receivers' own body, float32 of shape [batch, receiver, sample].
+            Any batch may be 1; None where nothing blocks.
+    Returns:
+        vec3 of shape [batch, receiver].
+    Differentiable: points, normals, samples, radiance and all transmittance.
+    """
+    arrays = {"points": points, "normals": normals, "emitters": samples.points, "emission": radiance}
+    rows = {"spheres": log_of_spheres, "planes": log_of_planes, "self-visibility": transmittance_self}
+    count = common_batch(arrays | rows)
+    points, normals = expand(points, count), expand(normals, count)
+    transmittances = [None if item is None else expand_rows(item, count) for item in rows.values()]
+    light = empty((count, points.shape[1]), dtype=wp.vec3, device=points.device)
+    launch(
+        _sum_light,
+        count * points.shape[1],
+        inputs=[
+            *(points, normals, samples.points, samples.areas, radiance, span[0], span[1] - span[0]),
+            int(is_two_sided),
+            *transmittances,
+        ],
+        outputs=[light],
+        shared=[samples.points, samples.areas, radiance],
+        cost=_COST * (span[1] - span[0]),
+    )
+    return light

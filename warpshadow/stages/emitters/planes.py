@@ -1,0 +1,168 @@
+"""Transmittance of plane blockers, such as walls, between receivers and the samples of an emitter.
+
+The line from a receiver x to a sample meets a plane in h, if both are on different sides of it. There the beam of the
+sample, a disc of radius R at a distance d, has the radius b = R |h − x| / d, and with s the distance of h from the
+outline of the plane, positive inside, along m, the plane takes the share
+
+    a = S((s / w + 1) / 2),   w² = b² (1 + (ω·m / ω·n)²)
+
+of it, S the smoothstep and n the plane's normal: the projection of the beam reaches w along m.
+"""
+
+import warp as wp
+
+from warpshadow.device.batch import common_batch, expand, instance_in
+from warpshadow.device.launch import launch
+from warpshadow.device.memory import zeros
+from warpshadow.device.parallel import split_row
+from warpshadow.stages.emitters.samples import PlacedSamples, sample_radius
+from warpshadow.stages.emitters.spheres import log_transmittance
+from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
+
+_COST = 5.0  # nanoseconds that a plane takes for a sample
+_MIN_WIDTH = 1.0e-6  # least half-width of an edge, in distances of the sample
+
+wp.set_module_options({"max_unroll": 1})
+
+
+@wp.func
+def _nearest_edge(edges: wp.array(dtype=wp.vec4), first_edge: int, edge_count: int, u: float, v: float):
+    """The edge of an outline that is nearest to a point, counted from 1; negative where the point is outside."""
+    nearest_edge = int(0)
+    min_distance2 = float(wp.inf)
+    crossings = int(0)
+    for e in range(edge_count):
+        edge = edges[first_edge + e]
+        x = edge[2] - edge[0]
+        y = edge[3] - edge[1]
+        position = wp.clamp(((u - edge[0]) * x + (v - edge[1]) * y) / wp.max(x * x + y * y, 1.0e-30), 0.0, 1.0)
+        gap_u = u - edge[0] - position * x
+        gap_v = v - edge[1] - position * y
+        distance2 = gap_u * gap_u + gap_v * gap_v
+        if distance2 < min_distance2:
+            min_distance2 = distance2
+            nearest_edge = e + 1
+        if (edge[1] > v) != (edge[3] > v) and u < edge[0] + (v - edge[1]) / y * x:
+            crossings += 1
+    return wp.where(crossings % 2 == 1, nearest_edge, -nearest_edge)
+
+
+@wp.func_grad(_nearest_edge)
+def _nearest_edge_adjoint(
+    edges: wp.array(dtype=wp.vec4), first_edge: int, edge_count: int, u: float, v: float, adj_result: int
+):
+    return
+
+
+@wp.func
+def _covered_share(
+    grid: PlaneGrid,
+    edges: wp.array(dtype=wp.vec4),
+    origin: wp.vec3,
+    axis_u: wp.vec3,
+    axis_v: wp.vec3,
+    point: wp.vec3,
+    beam: wp.vec3,
+    disc_radius: float,
+):
+    """The share a, given the plane's frame, x, y − x and R; 0 where the line does not meet the plane."""
+    normal = wp.normalize(wp.cross(axis_u, axis_v))
+    scale = wp.length(axis_u)
+    distance = wp.length(beam)
+    height = wp.dot(point - origin, normal)
+    rise = wp.dot(beam, normal)
+    end_height = height + rise
+    share = float(0.0)
+    if height * end_height < 0.0 and wp.abs(end_height) > grid.margin * scale:
+        position = -height / rise
+        hit = point + position * beam - origin
+        u = wp.dot(hit, axis_u) / (scale * scale)
+        v = wp.dot(hit, axis_v) / (scale * scale)
+        number = _nearest_edge(edges, grid.first_edge, grid.edge_count, u, v)
+        edge = edges[grid.first_edge + wp.abs(number) - 1]
+        x = edge[2] - edge[0]
+        y = edge[3] - edge[1]
+        along_edge = wp.clamp(((u - edge[0]) * x + (v - edge[1]) * y) / wp.max(x * x + y * y, 1.0e-30), 0.0, 1.0)
+        gap = wp.vec2(u - edge[0] - along_edge * x, v - edge[1] - along_edge * y)
+        outward = wp.normalize(gap)
+        slope = (outward[0] * wp.dot(beam, axis_u) + outward[1] * wp.dot(beam, axis_v)) / (scale * rise)
+        width = wp.max(disc_radius * position, _MIN_WIDTH * distance) * wp.sqrt(1.0 + slope * slope)
+        signed_distance = wp.where(number > 0, 1.0, -1.0) * scale * wp.length(gap)
+        share = wp.smoothstep(-1.0, 1.0, signed_distance / width)
+    return share
+
+
+@wp.kernel
+def _block_by_planes(
+    first_row: int,
+    worker: int,
+    # in
+    points: wp.array2d(dtype=wp.vec3),
+    normals: wp.array2d(dtype=wp.vec3),
+    sample_points: wp.array2d(dtype=wp.vec3),
+    sample_areas: wp.array2d(dtype=wp.vec3),
+    first_sample: int,
+    frames: wp.array2d(dtype=wp.vec3),
+    grids: wp.array(dtype=PlaneGrid),
+    edges: wp.array(dtype=wp.vec4),
+    skipped: wp.vec2i,
+    # out
+    log_transmittances: wp.array3d(dtype=wp.float32),
+):
+    """A thread owns a receiver of an instance."""
+    batch, receiver = split_row(first_row + wp.tid(), log_transmittances.shape[1])
+    point = points[batch, receiver]
+    normal = normals[instance_in(batch, normals.shape[0]), receiver]
+    sample_batch = instance_in(batch, sample_points.shape[0])
+    frame_batch = instance_in(batch, frames.shape[0])
+    for f in range(grids.shape[0]):
+        axis_u = frames[frame_batch, 3 * f + 1]
+        if f != skipped[0] and f != skipped[1] and grids[f].blocks == 1 and wp.length_sq(axis_u) > 0.0:
+            origin = frames[frame_batch, 3 * f]
+            axis_v = frames[frame_batch, 3 * f + 2]
+            for i in range(log_transmittances.shape[2]):
+                area = sample_areas[sample_batch, first_sample + i]
+                beam = sample_points[sample_batch, first_sample + i] - point
+                if wp.dot(beam, normal) > 0.0 and wp.length_sq(area) > 0.0:
+                    share = _covered_share(
+                        grids[f], edges, origin, axis_u, axis_v, point, beam, sample_radius(area)
+                    )
+                    if share > 0.0:
+                        wp.atomic_add(log_transmittances, batch, receiver, i, log_transmittance(share))
+
+
+def find_log_transmittance_of_planes(
+    points: wp.array,
+    normals: wp.array,
+    samples: PlacedSamples,
+    span: tuple[int, int],
+    frames: wp.array,
+    planes: PlaneBlockers,
+    skipped: tuple[int, int],
+) -> wp.array:
+    """Logarithm of the transmittance of plane blockers between receivers and an emitter.
+
+    Args:
+        points: Receivers, lifted off the planes that they lie in, vec3 of shape [batch, receiver].
+        normals, samples, span: As for :func:`.spheres.find_log_transmittance`.
+        frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`.PlaneBlockers.frames`.
+        skipped: Planes that do not block, −1 for none: the receivers' and the emitter's.
+    Returns:
+        Float32 of shape [batch, receiver, sample].
+    Differentiable: points, samples, frames. Not: normals.
+    """
+    count = common_batch({"points": points, "emitters": samples.points, "planes": frames})
+    points = expand(points, count)
+    result = zeros((count, points.shape[1], span[1] - span[0]), dtype=wp.float32, device=points.device)
+    launch(
+        _block_by_planes,
+        count * points.shape[1],
+        inputs=[
+            *(points, normals, samples.points, samples.areas, span[0]),
+            *(frames, planes.grids, planes.edges, wp.vec2i(*skipped)),
+        ],
+        outputs=[result],
+        shared=[normals, samples.points, samples.areas, frames],
+        cost=_COST * planes.count * result.shape[2],
+    )
+    return result

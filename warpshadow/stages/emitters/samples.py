@@ -1,0 +1,165 @@
+"""Samples of emitters: points of their surfaces, each of which stands for a patch of it.
+
+A patch k has a middle y_k and an area vector A_k, its normal times its area. Both are sums over vertices and faces that
+move with the body: of pieces p of faces f, with middles z_p,
+
+    y_k = Σ_p |A_p| z_p / Σ_p |A_p|,   A_k = s_k Σ_p A_p,   A_p = share_p (b_f − a_f) × (c_f − a_f) / 2
+
+s_k, which is 1 for flat patches, gives bent ones their whole area at rest: the mean of max(A_k·ω, 0) over all directions
+ω is then that of the surface, of which the curvature within patches would take 2%.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
+from warpshadow.maths.spatial_sort import z_order
+from warpshadow.stages.bounces.patches import find_patches
+from warpshadow.stages.sparse import SparseMatrix, multiply
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+BUNDLE = 8
+"""Samples next to each other that blockers are culled for together; an emitter has a multiple of them."""
+
+SAMPLES = 64  # samples of an emitter
+
+_MAX_STRETCH = 4.0  # greatest s
+
+
+class SampleWeights(NamedTuple):
+    """Weights of the samples of a body, whose count is a multiple of BUNDLE."""
+
+    vertices: csr_matrix  # of its vertices in the samples' middles, [sample, vertex]
+    faces: csr_matrix  # of its faces' area vectors in those of samples, [sample, face]
+
+
+def find_sample_weights(
+    positions: np.ndarray, faces: np.ndarray, *, is_two_sided: bool, device: wp.DeviceLike
+) -> SampleWeights:
+    """Find the samples of an emitter.
+
+    Args:
+        positions: Vertices at rest [units of the body], shape [vertex, 3].
+        faces: Faces that wind alike, shape [face, 3].
+        is_two_sided: Whether the body is open; samples of both sides are the same.
+    """
+    from scipy.sparse import csr_matrix, diags
+
+    count = SAMPLES * (2 if is_two_sided else 1)
+    patches = find_patches(positions, faces, is_two_sided=is_two_sided, count=count, patch_samples=1, device=device)
+    pieces, labels = patches.pieces, patches.patch_of_pieces[0]
+    corners = pieces.positions(positions, faces)
+    piece_vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    is_used = labels >= 0
+    labels, owners, vectors = labels[is_used], pieces.faces[is_used], piece_vectors[is_used]
+    areas, patch_count = np.linalg.norm(vectors, axis=1), int(labels.max(initial=-1)) + 1
+    shares = np.abs(np.linalg.det(pieces.corners[is_used].astype(np.float64)))
+    sums = np.zeros((patch_count, 4))
+    np.add.at(sums, labels, np.column_stack([vectors, areas]))
+    stretch = np.minimum(sums[:, 3] / np.maximum(np.linalg.norm(sums[:, :3], axis=1), 1e-30), _MAX_STRETCH)
+    middles = (areas / sums[labels, 3])[:, None] * pieces.corners[is_used].mean(axis=1)
+    of_vertices = csr_matrix(
+        (middles.ravel(), (np.repeat(labels, 3), faces[owners].ravel())), shape=(patch_count, len(positions))
+    )
+    of_faces = diags(stretch) @ csr_matrix((shares, (labels, owners)), shape=(patch_count, len(faces)))
+    permutation = z_order(of_vertices @ positions.astype(np.float64))
+    padding = np.full(-patch_count % BUNDLE, permutation[-1] if patch_count else 0)
+    is_real = np.repeat([1.0, 0.0], [patch_count, len(padding)])
+    chosen = np.concatenate([permutation, padding]).astype(int)
+    return SampleWeights(of_vertices[chosen].tocsr(), (diags(is_real) @ of_faces[chosen]).tocsr())
+
+
+class EmitterSamples(NamedTuple):
+    """Samples of all emitters of a scene.
+
+    Args:
+        vertices: Weights of all vertices in the samples' middles, [sample, vertex].
+        face_shares: Weights of the emitting faces in the samples' area vectors, [sample, face].
+        faces: Emitting faces, vec3i of shape [face].
+        bodies: The emitters, by number.
+        first: Where the samples of each begin, and the end of the last, shape [emitter + 1].
+    """
+
+    vertices: SparseMatrix
+    face_shares: SparseMatrix
+    faces: wp.array
+    bodies: tuple[int, ...]
+    first: np.ndarray
+
+
+class PlacedSamples(NamedTuple):
+    """Samples of emitters where they are in the world.
+
+    Args:
+        points: Middles y [scene units], vec3 of shape [batch, sample].
+        areas: Area vectors A [square of scene units], vec3 of shape [batch, sample].
+        bundles: Middle and radius of a sphere around each bundle, vec4 of shape [batch, bundle], without a gradient.
+    """
+
+    points: wp.array
+    areas: wp.array
+    bundles: wp.array
+
+
+@wp.kernel
+def _find_area_vectors(
+    # in
+    positions: wp.array2d(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    # out
+    vectors: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a face of an instance."""
+    batch, face = wp.tid()
+    corners = faces[face]
+    a = positions[batch, corners[0]]
+    vectors[batch, face] = 0.5 * wp.cross(positions[batch, corners[1]] - a, positions[batch, corners[2]] - a)
+
+
+@wp.kernel(enable_backward=False)
+def _find_bundles(
+    # in
+    points: wp.array2d(dtype=wp.vec3),
+    areas: wp.array2d(dtype=wp.vec3),
+    # out
+    bundles: wp.array2d(dtype=wp.vec4),
+):
+    """A thread owns a bundle of an instance."""
+    batch, bundle = wp.tid()
+    middle = wp.vec3()
+    for i in range(BUNDLE):
+        middle += points[batch, bundle * BUNDLE + i] / float(BUNDLE)
+    radius = float(0.0)
+    for i in range(BUNDLE):
+        sample = bundle * BUNDLE + i
+        radius = wp.max(radius, wp.length(points[batch, sample] - middle) + sample_radius(areas[batch, sample]))
+    bundles[batch, bundle] = wp.vec4(middle[0], middle[1], middle[2], radius)
+
+
+@wp.func
+def sample_radius(area: wp.vec3):
+    """Radius of a disc of a sample's area."""
+    return wp.sqrt(wp.length(area) / wp.pi)
+
+
+def place_samples(positions: wp.array, samples: EmitterSamples) -> PlacedSamples:
+    """Place the samples of emitters by the vertices of all bodies.
+
+    Args:
+        positions: Of all vertices [scene units], vec3 of shape [batch, vertex].
+    Differentiable: positions.
+    """
+    count, device = len(positions), positions.device
+    vectors = empty((count, len(samples.faces)), dtype=wp.vec3, device=device)
+    launch(_find_area_vectors, vectors.shape, inputs=[positions, samples.faces], outputs=[vectors])
+    points, areas = multiply(samples.vertices, positions), multiply(samples.face_shares, vectors)
+    bundles = empty((count, points.shape[1] // BUNDLE), dtype=wp.vec4, device=device)
+    launch(_find_bundles, bundles.shape, inputs=[points, areas], outputs=[bundles])
+    return PlacedSamples(points, areas, bundles)
