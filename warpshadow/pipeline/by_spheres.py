@@ -374,11 +374,12 @@ def placed_blockers(method: SphereMethod, points: LitPoints) -> Node:
 
 def self_visibility_node(method: SphereMethod, points: LitPoints, projected_light: Any) -> Node:
     """Node of the receivers' self-visibility lookups, by body; the same for any receivers among the same bodies."""
-    make = functools.partial(_self_visibility, method, points, projected_light)
+    make = functools.partial(self_lookups_node, method, points, projected_light)
     return points.cached("self-visibility", id(projected_light), make)
 
 
-def _self_visibility(method: SphereMethod, points: LitPoints, projected_light: Any) -> Node:
+def self_lookups_node(method: SphereMethod, points: LitPoints, projected_light: Any) -> Node:
+    """The same, not cached for the points."""
     bodies, rotations = points.blocker_kinds.traced, points.blocker_kinds.rotations
     curved_bodies = [body for body in bodies if not method.merged_scene.is_flat[body]]
     if not curved_bodies or rotations is None:

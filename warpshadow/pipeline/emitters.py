@@ -13,8 +13,10 @@ from collections.abc import Iterator
 import numpy as np
 import warp as wp
 
-from warpshadow.pipeline.by_spheres import SphereMethod, placed_blockers, self_visibility_node
+from warpshadow.maths.directions import fibonacci
+from warpshadow.pipeline.by_spheres import SphereMethod, placed_blockers, self_lookups_node
 from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.methods.directional import ProjectedCells
 from warpshadow.pipeline.node import Node
 from warpshadow.pipeline.receivers.groups import Blockers, Group, find_groups
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
@@ -24,12 +26,22 @@ from warpshadow.pipeline.transfers import joined
 from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.emitters.light import directions_to_samples, sum_light
 from warpshadow.stages.emitters.planes import find_log_transmittance_of_planes
-from warpshadow.stages.emitters.samples import EmitterSamples, PlacedSamples, find_sample_weights, place_samples
+from warpshadow.stages.emitters.samples import (
+    EmitterSamples,
+    EmitterSpan,
+    PlacedSamples,
+    find_sample_weights,
+    place_samples,
+)
 from warpshadow.stages.emitters.spheres import find_log_transmittance
 from warpshadow.stages.gloss.transmittance import transmittance_of_directions
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.self_visibility.gather import gather_self_transmittance
 from warpshadow.stages.sparse import SparseMatrix, multiply
+
+_SELF_CELLS = fibonacci(512)
+"""Cells in which receivers look up the self-visibility of their body. With 128 in place of 512, a bear and a bunny at
+vertices in a room with a lamp were 16.6 and 3.2% off in direct light in place of 12.7 and 1.9%."""
 
 
 class SceneEmitters:
@@ -65,7 +77,8 @@ class SceneEmitters:
         faces = wp.array(merged_scene.faces.numpy()[is_emitting], dtype=wp.vec3i, device=merged_scene.device)
         matrices = (SparseMatrix.from_matrix(vstack(parts), device=merged_scene.device) for parts in (of_vertices, of_faces))
         first = np.cumsum([0, *(matrix.shape[0] for matrix in of_vertices)])
-        return EmitterSamples(*matrices, faces, tuple(bodies), first)
+        is_open = tuple(merged_scene.is_two_sided[bodies].tolist())
+        return EmitterSamples(*matrices, faces, tuple(bodies), is_open, first)
 
     def placed(self, points: LitPoints) -> Node:
         """Node of the samples among the bodies around points."""
@@ -81,16 +94,10 @@ class SceneEmitters:
 
     def _find_unblocked(self, receivers: Receivers, placed_samples: PlacedSamples, radiance: wp.array) -> wp.array:
         lights = [
-            sum_light(receivers.points, receivers.normals, placed_samples, radiance, span, is_two_sided=is_two_sided)
-            for _, span, is_two_sided in self.spans()
+            sum_light(receivers.points, receivers.normals, placed_samples, radiance, span)
+            for span in self.samples.spans()
         ]
         return functools.reduce(lambda first, second: total_light([first, second]), lights)
-
-    def spans(self) -> Iterator[tuple[int, tuple[int, int], bool]]:
-        """Each emitter: its number, where its samples begin and end, and whether it is open."""
-        first = self.samples.first.tolist()
-        for body, begin, end in zip(self.samples.bodies, first[:-1], first[1:], strict=True):
-            yield body, (begin, end), bool(self._merged_scene.is_two_sided[body])
 
 
 def emitted_light(method: SphereMethod, emitters: SceneEmitters, points: LitPoints, materials: Materials) -> Node:
@@ -100,11 +107,19 @@ def emitted_light(method: SphereMethod, emitters: SceneEmitters, points: LitPoin
         functools.partial(_find_light, method, emitters, points),
         points.receivers_node,
         placed_blockers(method, points),
-        self_visibility_node(method, points, method.free_projection),
+        _self_lookups(method, points),
         emitters.placed(points),
         emitters.radiance(materials),
         items=lambda: f"{receiver_text(points)} × {emitters.samples.first[-1]} samples",
     )
+
+
+def _self_lookups(method: SphereMethod, points: LitPoints) -> Node:
+    """Node of the self-visibility of bodies in fine cells, by body."""
+    if not method.traces_self_visibility:
+        return Node("", None)
+    make = functools.partial(self_lookups_node, method, points, ProjectedCells(_SELF_CELLS))
+    return points.cached("self-visibility towards emitters", None, make)
 
 
 def _find_light(
@@ -141,19 +156,16 @@ def _light_of(
     spheres = merged_scene.spheres_of(sphere_bodies, blockers.spheres)
     traced_body = group.body if group.body in blockers.blocker_kinds.traced else None
     total = wp.zeros(points.shape, dtype=wp.vec3, device=points.device)
-    for body, span, is_two_sided in emitters.spans():
+    for body, span in zip(emitters.samples.bodies, emitters.samples.spans(), strict=True):
         if body == group.body:
             continue
         skipped_bodies = tuple(merged_scene.spheres_among(sphere_bodies, number) for number in (traced_body, body))
         transmittance_self = None
         if cells is not None:
             towards = directions_to_samples(points, placed_samples, span)
-            transmittance_self = transmittance_of_directions(
-                cells, normals, towards, method.free_projection.directions
-            )
+            transmittance_self = transmittance_of_directions(cells, normals, towards, _SELF_CELLS)
         light = sum_light(
             *(points, normals, placed_samples, radiance, span),
-            is_two_sided=is_two_sided,
             log_of_spheres=find_log_transmittance(points, normals, placed_samples, span, *spheres, skipped_bodies),
             log_of_planes=_log_of_planes(group, blockers, placed_samples, span, body),
             transmittance_self=transmittance_self,
@@ -172,7 +184,7 @@ def _self_transmittance(group: Group) -> wp.array | None:
 
 
 def _log_of_planes(
-    group: Group, blockers: Blockers, placed_samples: PlacedSamples, span: tuple[int, int], body: int
+    group: Group, blockers: Blockers, placed_samples: PlacedSamples, span: EmitterSpan, body: int
 ) -> wp.array | None:
     """Logarithm of the transmittance of planes between a group and an emitter; None without any."""
     planes, numbers = group.planes, blockers.blocker_kinds.planes

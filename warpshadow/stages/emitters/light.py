@@ -14,7 +14,7 @@ from warpshadow.device.batch import common_batch, expand, expand_rows, instance_
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
-from warpshadow.stages.emitters.samples import PlacedSamples
+from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, is_lit
 
 _COST = 6.0  # nanoseconds that a sample takes
 
@@ -36,14 +36,14 @@ def _find_directions(
     directions[batch, receiver, i] = wp.normalize(sample_point - points[instance_in(batch, points.shape[0]), receiver])
 
 
-def directions_to_samples(points: wp.array, samples: PlacedSamples, span: tuple[int, int]) -> wp.array:
+def directions_to_samples(points: wp.array, samples: PlacedSamples, span: EmitterSpan) -> wp.array:
     """Unit vectors from receivers to the samples of an emitter, vec3 of shape [batch, receiver, sample].
 
     Differentiable: points, samples.
     """
     count = common_batch({"points": points, "emitters": samples.points})
-    directions = empty((count, points.shape[1], span[1] - span[0]), dtype=wp.vec3, device=points.device)
-    launch(_find_directions, directions.shape, inputs=[points, samples.points, span[0]], outputs=[directions])
+    directions = empty((count, points.shape[1], span.count), dtype=wp.vec3, device=points.device)
+    launch(_find_directions, directions.shape, inputs=[points, samples.points, span.first], outputs=[directions])
     return directions
 
 
@@ -76,17 +76,14 @@ def _sum_light(
     for i in range(sample_count):
         beam = sample_points[sample_batch, first_sample + i] - point
         area = sample_areas[sample_batch, first_sample + i]
-        cosine = wp.dot(beam, normal)
-        facing_area = -wp.dot(beam, area)
-        if is_two_sided == 1:
-            facing_area = wp.abs(facing_area)
-        if cosine > 0.0 and facing_area > 0.0:
+        if is_lit(beam, area, normal, is_two_sided):
+            facing_area = wp.abs(wp.dot(beam, area))
             exponent = float(0.0)
             if log_of_spheres:
                 exponent += log_of_spheres[batch, receiver, i]
             if log_of_planes:
                 exponent += log_of_planes[batch, receiver, i]
-            factor = cosine * facing_area * wp.exp(exponent)
+            factor = wp.dot(beam, normal) * facing_area * wp.exp(exponent)
             if transmittance_self:
                 factor = factor * transmittance_self[batch, receiver, i]
             distance2 = wp.length_sq(beam)
@@ -100,9 +97,8 @@ def sum_light(
     normals: wp.array,
     samples: PlacedSamples,
     radiance: wp.array,
-    span: tuple[int, int],
+    span: EmitterSpan,
     *,
-    is_two_sided: bool,
     log_of_spheres: wp.array | None = None,
     log_of_planes: wp.array | None = None,
     transmittance_self: wp.array | None = None,
@@ -114,8 +110,7 @@ def sum_light(
         normals: Their unit normals, vec3 of shape [batch, receiver].
         samples: Of all emitters.
         radiance: Of the samples, linear RGB, vec3 of shape [batch, sample].
-        span: Where the samples of the emitter begin and end.
-        is_two_sided: Whether it is open.
+        span: Those of the emitter.
         log_of_spheres, log_of_planes: Logarithms of transmittance, float32 of shape [batch, receiver, sample].
         transmittance_self: Past the receivers' own body, float32 of shape [batch, receiver, sample].
             Any batch may be 1; None where nothing blocks.
@@ -133,12 +128,12 @@ def sum_light(
         _sum_light,
         count * points.shape[1],
         inputs=[
-            *(points, normals, samples.points, samples.areas, radiance, span[0], span[1] - span[0]),
-            int(is_two_sided),
+            *(points, normals, samples.points, samples.areas, radiance, span.first, span.count),
+            int(span.is_two_sided),
             *transmittances,
         ],
         outputs=[light],
         shared=[samples.points, samples.areas, radiance],
-        cost=_COST * (span[1] - span[0]),
+        cost=_COST * (span.count),
     )
     return light

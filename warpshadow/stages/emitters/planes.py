@@ -15,7 +15,7 @@ from warpshadow.device.batch import common_batch, expand, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import zeros
 from warpshadow.device.parallel import split_row
-from warpshadow.stages.emitters.samples import PlacedSamples, sample_radius
+from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, is_lit, sample_radius
 from warpshadow.stages.emitters.spheres import log_transmittance
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 
@@ -102,6 +102,7 @@ def _block_by_planes(
     sample_points: wp.array2d(dtype=wp.vec3),
     sample_areas: wp.array2d(dtype=wp.vec3),
     first_sample: int,
+    is_two_sided: int,
     frames: wp.array2d(dtype=wp.vec3),
     grids: wp.array(dtype=PlaneGrid),
     edges: wp.array(dtype=wp.vec4),
@@ -123,7 +124,7 @@ def _block_by_planes(
             for i in range(log_transmittances.shape[2]):
                 area = sample_areas[sample_batch, first_sample + i]
                 beam = sample_points[sample_batch, first_sample + i] - point
-                if wp.dot(beam, normal) > 0.0 and wp.length_sq(area) > 0.0:
+                if is_lit(beam, area, normal, is_two_sided):
                     share = _covered_share(
                         grids[f], edges, origin, axis_u, axis_v, point, beam, sample_radius(area)
                     )
@@ -135,7 +136,7 @@ def find_log_transmittance_of_planes(
     points: wp.array,
     normals: wp.array,
     samples: PlacedSamples,
-    span: tuple[int, int],
+    span: EmitterSpan,
     frames: wp.array,
     planes: PlaneBlockers,
     skipped: tuple[int, int],
@@ -153,12 +154,12 @@ def find_log_transmittance_of_planes(
     """
     count = common_batch({"points": points, "emitters": samples.points, "planes": frames})
     points = expand(points, count)
-    result = zeros((count, points.shape[1], span[1] - span[0]), dtype=wp.float32, device=points.device)
+    result = zeros((count, points.shape[1], span.count), dtype=wp.float32, device=points.device)
     launch(
         _block_by_planes,
         count * points.shape[1],
         inputs=[
-            *(points, normals, samples.points, samples.areas, span[0]),
+            *(points, normals, samples.points, samples.areas, span.first, int(span.is_two_sided)),
             *(frames, planes.grids, planes.edges, wp.vec2i(*skipped)),
         ],
         outputs=[result],

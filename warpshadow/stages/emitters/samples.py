@@ -11,11 +11,14 @@ s_k, which is 1 for flat patches, gives bent ones their whole area at rest: the 
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import warp as wp
 
+from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.spatial_sort import z_order
@@ -76,6 +79,20 @@ def find_sample_weights(
     return SampleWeights(of_vertices[chosen].tocsr(), (diags(is_real) @ of_faces[chosen]).tocsr())
 
 
+class EmitterSpan(NamedTuple):
+    """Samples of one emitter among those of all."""
+
+    emitter: int  # its number among the emitters
+    first: int  # of the samples
+    end: int
+    is_two_sided: bool  # whether it is open
+
+    @property
+    def count(self) -> int:
+        """Number of its samples."""
+        return self.end - self.first
+
+
 class EmitterSamples(NamedTuple):
     """Samples of all emitters of a scene.
 
@@ -84,6 +101,7 @@ class EmitterSamples(NamedTuple):
         face_shares: Weights of the emitting faces in the samples' area vectors, [sample, face].
         faces: Emitting faces, vec3i of shape [face].
         bodies: The emitters, by number.
+        is_two_sided: Whether each is open.
         first: Where the samples of each begin, and the end of the last, shape [emitter + 1].
     """
 
@@ -91,7 +109,13 @@ class EmitterSamples(NamedTuple):
     face_shares: SparseMatrix
     faces: wp.array
     bodies: tuple[int, ...]
+    is_two_sided: tuple[bool, ...]
     first: np.ndarray
+
+    def spans(self) -> Iterator[EmitterSpan]:
+        """The samples of each emitter."""
+        for number, span in enumerate(itertools.pairwise(self.first.tolist())):
+            yield EmitterSpan(number, *span, self.is_two_sided[number])
 
 
 class PlacedSamples(NamedTuple):
@@ -101,11 +125,13 @@ class PlacedSamples(NamedTuple):
         points: Middles y [scene units], vec3 of shape [batch, sample].
         areas: Area vectors A [square of scene units], vec3 of shape [batch, sample].
         bundles: Middle and radius of a sphere around each bundle, vec4 of shape [batch, bundle], without a gradient.
+        balls: The same of each emitter, vec4 of shape [batch, emitter].
     """
 
     points: wp.array
     areas: wp.array
     bundles: wp.array
+    balls: wp.array
 
 
 @wp.kernel
@@ -143,10 +169,40 @@ def _find_bundles(
     bundles[batch, bundle] = wp.vec4(middle[0], middle[1], middle[2], radius)
 
 
+@wp.kernel(enable_backward=False)
+def _find_balls(
+    # in
+    bundles: wp.array2d(dtype=wp.vec4),
+    first_samples: wp.array(dtype=wp.int32),
+    # out
+    balls: wp.array2d(dtype=wp.vec4),
+):
+    """A thread owns an emitter of an instance."""
+    batch, emitter = wp.tid()
+    first = first_samples[emitter] // BUNDLE
+    end = first_samples[emitter + 1] // BUNDLE
+    middle = wp.vec3()
+    for bundle in range(first, end):
+        middle += wp.vec3(bundles[batch, bundle][0], bundles[batch, bundle][1], bundles[batch, bundle][2])
+    middle = middle / float(wp.max(end - first, 1))
+    radius = float(0.0)
+    for bundle in range(first, end):
+        center = wp.vec3(bundles[batch, bundle][0], bundles[batch, bundle][1], bundles[batch, bundle][2])
+        radius = wp.max(radius, wp.length(center - middle) + bundles[batch, bundle][3])
+    balls[batch, emitter] = wp.vec4(middle[0], middle[1], middle[2], radius)
+
+
 @wp.func
 def sample_radius(area: wp.vec3):
     """Radius of a disc of a sample's area."""
     return wp.sqrt(wp.length(area) / wp.pi)
+
+
+@wp.func
+def is_lit(beam: wp.vec3, area: wp.vec3, normal: wp.vec3, is_two_sided: int):
+    """Whether a receiver and a sample face each other, given the way from the receiver to the sample."""
+    facing = wp.dot(beam, area)
+    return wp.dot(beam, normal) > 0.0 and (facing < 0.0 or (facing > 0.0 and is_two_sided == 1))
 
 
 def place_samples(positions: wp.array, samples: EmitterSamples) -> PlacedSamples:
@@ -162,4 +218,6 @@ def place_samples(positions: wp.array, samples: EmitterSamples) -> PlacedSamples
     points, areas = multiply(samples.vertices, positions), multiply(samples.face_shares, vectors)
     bundles = empty((count, points.shape[1] // BUNDLE), dtype=wp.vec4, device=device)
     launch(_find_bundles, bundles.shape, inputs=[points, areas], outputs=[bundles])
-    return PlacedSamples(points, areas, bundles)
+    balls = empty((count, len(samples.bodies)), dtype=wp.vec4, device=device)
+    launch(_find_balls, balls.shape, inputs=[bundles, constant(samples.first, wp.int32, device)], outputs=[balls])
+    return PlacedSamples(points, areas, bundles, balls)

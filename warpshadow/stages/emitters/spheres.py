@@ -18,12 +18,12 @@ from warpshadow.device.batch import common_batch, expand, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import zeros
 from warpshadow.device.parallel import split_row
-from warpshadow.stages.emitters.samples import BUNDLE, PlacedSamples, sample_radius
+from warpshadow.stages.emitters.samples import BUNDLE, EmitterSpan, PlacedSamples, is_lit, sample_radius
 
 _SOFTNESS = 0.05  # κ: least half-width of the edge of a sphere's shadow, in its radii
 _MIN_TRANSMITTANCE = 1.0e-4  # of a sphere
 _REACH = 1.1  # radii beyond which a sphere blocks nothing of a beam that does not touch it
-_CULL_COST, _PAIR_COST = 3.0, 2.0  # nanoseconds for a sphere and a bundle; and a sample, on average
+_COST = 15.0  # nanoseconds that a sphere takes, most of which do not block
 
 wp.set_module_options({"max_unroll": 1})
 
@@ -55,12 +55,12 @@ def _blocked_share(offset: wp.vec3, beam: wp.vec3, disc_radius: float, radius: f
 
 
 @wp.func
-def _reaches_bundle(offset: wp.vec3, radius: float, axis: wp.vec3, bundle_radius: float):
-    """Whether a sphere may touch the cone from a receiver to a bundle, given c − x and the middle of the bundle − x."""
+def _reaches(offset: wp.vec3, radius: float, axis: wp.vec3, ball_radius: float):
+    """Whether a sphere may touch the cone from a receiver to a ball, given c − x and the middle of the ball − x."""
     distance = wp.length(axis)
-    sine = wp.min(bundle_radius / wp.max(distance, 1.0e-20), 1.0)
+    sine = wp.min(ball_radius / wp.max(distance, 1.0e-20), 1.0)
     depth = wp.dot(offset, axis) / wp.max(distance, 1.0e-20)
-    if depth > distance + bundle_radius + radius or depth < -bundle_radius - radius:
+    if depth > distance + ball_radius + radius or depth < -ball_radius - radius:
         return False
     height = wp.sqrt(wp.max(wp.length_sq(offset) - depth * depth, 0.0))
     return height * wp.sqrt(1.0 - sine * sine) - wp.max(depth, 0.0) * sine < _REACH * radius
@@ -76,7 +76,10 @@ def _block(
     sample_points: wp.array2d(dtype=wp.vec3),
     sample_areas: wp.array2d(dtype=wp.vec3),
     bundles: wp.array2d(dtype=wp.vec4),
+    balls: wp.array2d(dtype=wp.vec4),
+    emitter: int,
     first_sample: int,
+    is_two_sided: int,
     centers: wp.array2d(dtype=wp.vec3),
     radii: wp.array2d(dtype=wp.float32),
     skipped: wp.vec4i,
@@ -89,34 +92,41 @@ def _block(
     normal = normals[instance_in(batch, normals.shape[0]), receiver]
     sample_batch = instance_in(batch, sample_points.shape[0])
     sphere_batch = instance_in(batch, radii.shape[0])
-    for bundle in range(log_transmittances.shape[2] // BUNDLE):
-        first = first_sample + bundle * BUNDLE
-        ball = bundles[sample_batch, first // BUNDLE]
-        axis = wp.vec3(ball[0], ball[1], ball[2]) - point
-        if wp.dot(axis, normal) > -ball[3]:
-            for sphere in range(radii.shape[1]):
-                is_skipped = (sphere >= skipped[0] and sphere < skipped[1]) or (
-                    sphere >= skipped[2] and sphere < skipped[3]
-                )
-                radius = radii[sphere_batch, sphere]
-                offset = centers[sphere_batch, sphere] - point
-                if not is_skipped and radius > 0.0 and _reaches_bundle(offset, radius, axis, ball[3]):
-                    for i in range(BUNDLE):
-                        area = sample_areas[sample_batch, first + i]
-                        beam = sample_points[sample_batch, first + i] - point
-                        if wp.dot(beam, normal) > 0.0 and wp.length_sq(area) > 0.0:
-                            share = _blocked_share(offset, beam, sample_radius(area), radius)
-                            if share > 0.0:
-                                wp.atomic_add(
-                                    log_transmittances, batch, receiver, bundle * BUNDLE + i, log_transmittance(share)
-                                )
+    ball = balls[sample_batch, emitter]
+    ball_axis = wp.vec3(ball[0], ball[1], ball[2]) - point
+    if wp.dot(ball_axis, normal) > -ball[3]:
+        for sphere in range(radii.shape[1]):
+            is_skipped = (sphere >= skipped[0] and sphere < skipped[1]) or (
+                sphere >= skipped[2] and sphere < skipped[3]
+            )
+            radius = radii[sphere_batch, sphere]
+            offset = centers[sphere_batch, sphere] - point
+            if not is_skipped and radius > 0.0 and _reaches(offset, radius, ball_axis, ball[3]):
+                for bundle in range(log_transmittances.shape[2] // BUNDLE):
+                    first = first_sample + bundle * BUNDLE
+                    bundle_ball = bundles[sample_batch, first // BUNDLE]
+                    bundle_axis = wp.vec3(bundle_ball[0], bundle_ball[1], bundle_ball[2]) - point
+                    if _reaches(offset, radius, bundle_axis, bundle_ball[3]):
+                        for i in range(BUNDLE):
+                            area = sample_areas[sample_batch, first + i]
+                            beam = sample_points[sample_batch, first + i] - point
+                            if is_lit(beam, area, normal, is_two_sided):
+                                share = _blocked_share(offset, beam, sample_radius(area), radius)
+                                if share > 0.0:
+                                    wp.atomic_add(
+                                        log_transmittances,
+                                        batch,
+                                        receiver,
+                                        bundle * BUNDLE + i,
+                                        log_transmittance(share),
+                                    )
 
 
 def find_log_transmittance(
     points: wp.array,
     normals: wp.array,
     samples: PlacedSamples,
-    span: tuple[int, int],
+    span: EmitterSpan,
     centers: wp.array,
     radii: wp.array,
     skipped: tuple[tuple[int, int], tuple[int, int]],
@@ -127,7 +137,7 @@ def find_log_transmittance(
         points: Receivers [scene units], vec3 of shape [batch, receiver].
         normals: Their unit normals, vec3 of shape [batch, receiver]: samples below horizons are left at 0.
         samples: Of all emitters.
-        span: Where those of the emitter begin and end.
+        span: Those of the emitter.
         centers: Of the spheres [scene units], vec3 of shape [batch, sphere].
         radii: Of the spheres [scene units], float32 of shape [batch, sphere].
         skipped: Two spans of spheres that do not block: the first, and the one after the last.
@@ -138,16 +148,19 @@ def find_log_transmittance(
     """
     count = common_batch({"points": points, "emitters": samples.points, "spheres": radii})
     points = expand(points, count)
-    result = zeros((count, points.shape[1], span[1] - span[0]), dtype=wp.float32, device=points.device)
+    result = zeros((count, points.shape[1], span.count), dtype=wp.float32, device=points.device)
     if not radii.shape[1]:
         return result
     skip_values = wp.vec4i(*skipped[0], *skipped[1])
     launch(
         _block,
         count * points.shape[1],
-        inputs=[points, normals, *samples, span[0], centers, radii, skip_values],
+        inputs=[
+            *(points, normals, *samples, span.emitter, span.first, int(span.is_two_sided)),
+            *(centers, radii, skip_values),
+        ],
         outputs=[result],
         shared=[normals, samples.points, samples.areas, centers, radii],
-        cost=radii.shape[1] * (_CULL_COST * result.shape[2] / BUNDLE + _PAIR_COST * result.shape[2] / BUNDLE),
+        cost=radii.shape[1] * _COST,
     )
     return result
