@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from warpshadow.assets.mesh import Gloss
+from warpshadow.assets.color import srgb_to_linear
+from warpshadow.assets.mesh import Gloss, MeshPart
 
 Factors = Mapping[tuple[int, ...], tuple[float, ...]]
 """Linear factors of materials, by the codes that trimesh rounds them to."""
@@ -48,6 +49,41 @@ def base_color_factor(material, factors: Factors) -> tuple[float, ...] | None:
         return None
     codes = tuple(factor[:3].tolist())
     return factors.get(codes, tuple(code / 255 for code in codes))
+
+
+def emission_of(material) -> tuple[float, float, float] | None:
+    """The radiance of a material of trimesh: its emissive factor, times the mean of a texture; None for no emission."""
+    factor, image = getattr(material, "emissiveFactor", None), getattr(material, "emissiveTexture", None)
+    if factor is None or not np.any(factor):
+        return None
+    radiance = np.array(factor, np.float64)
+    if image is not None:
+        radiance = radiance * srgb_to_linear(np.asarray(image.convert("RGB")) / 255).mean(axis=(0, 1))
+    red, green, blue = radiance.tolist()
+    return red, green, blue
+
+
+def emissive_strengths(tree: dict) -> Mapping[tuple[float, ...], float]:
+    """Strengths of KHR_materials_emissive_strength, which trimesh does not read, by the factors of their materials."""
+    return {
+        _rounded(material.get("emissiveFactor", (0, 0, 0))): extension["emissiveStrength"]
+        for material in tree.get("materials", [])
+        if "emissiveStrength"
+        in (extension := material.get("extensions", {}).get("KHR_materials_emissive_strength", {}))
+    }
+
+
+def _rounded(factor: Sequence[float]) -> tuple[float, ...]:
+    return tuple(np.array(factor, np.float32).tolist())
+
+
+def stronger(part: MeshPart, strengths: Mapping[tuple[float, ...], float]) -> MeshPart:
+    """A part that emits as much stronger as the strength of its material says."""
+    if part.emission is None:
+        return part
+    strength = strengths.get(_rounded(part.emission), 1.0)
+    red, green, blue = (strength * color for color in part.emission)
+    return part._replace(emission=(red, green, blue))
 
 
 def gloss_of(material) -> Gloss | None:

@@ -339,7 +339,8 @@ class MeshPart(NamedTuple):
     """One piece of a file; ``welded`` vertices lost their faces to the first of their duplicates.
 
     ``colors`` are linear, [vertex, 3]; ``colorless`` says why colors that it has are not. ``pictures`` has one for each
-    material, None for a material without one. ``gloss`` is None where the file says none.
+    material, None for a material without one. ``gloss`` and ``emission``, linear RGB, are None where the file
+    says none.
     """
 
     positions: np.ndarray
@@ -352,6 +353,7 @@ class MeshPart(NamedTuple):
     colorless: str = ""
     pictures: tuple[BaseColor | None, ...] = (None,)
     gloss: Gloss | None = None
+    emission: tuple[float, float, float] | None = None
 
 
 def moved_part(part: MeshPart, linear: np.ndarray, translation: np.ndarray) -> MeshPart:

@@ -17,8 +17,11 @@ from warpshadow.assets.gltf import (
     base_color_factor,
     base_color_factors,
     cuts_colors,
+    emission_of,
+    emissive_strengths,
     gloss_of,
     gltf_tree,
+    stronger,
 )
 from warpshadow.assets.image import read_rgb
 from warpshadow.assets.mesh import BaseColor, Mesh, MeshError, MeshPart, checked_indices, moved_part, turned_over
@@ -114,6 +117,7 @@ def load_material(path: MeshSource) -> tuple[Mesh, Material]:
     A texture is the base color of glTF (times its factor), the ``map_Kd`` of OBJ, or the image of PLY, where all faces
     have the same one, and uvs. USD colors are not read. glTF's materials have roughness and metallic: factors, times
     the green and the blue of a texture, which are linear, likewise if all faces have the same; else its means count.
+    They emit by their emissive factor and strength, times the mean of a texture.
 
     Args:
         path: As there.
@@ -121,7 +125,7 @@ def load_material(path: MeshSource) -> tuple[Mesh, Material]:
         As there; of a texture that cannot be read, or that counts in place of colors; and of textures of roughness of
         which the means count.
     """
-    mesh, picture, gloss, remarks, of_colors, of_gloss = _read(path)
+    mesh, picture, gloss, emission, remarks, of_colors, of_gloss = _read(path)
     texture = None
     if picture is not None:
         try:
@@ -131,7 +135,8 @@ def load_material(path: MeshSource) -> tuple[Mesh, Material]:
         except (OSError, ValueError) as error:
             of_colors.append(f"its texture dropped ({error})")
     _remark(path, remarks + of_colors + of_gloss)
-    return mesh, Material(texture, *(gloss or ()))
+    roughness, metallic = gloss or (None, None)
+    return mesh, Material(texture, roughness, metallic, emission)
 
 
 def load_shape(path: MeshSource) -> Mesh:
@@ -200,6 +205,7 @@ def _read_trimesh(path: Path) -> list[MeshPart]:
     tree = gltf_tree(path) if path.suffix.lower() in (".gltf", ".glb") else {}
     loaded_scene = trimesh.load_scene(path, process=False, maintain_order=True, fix_texture=False)
     parts = _trimesh_parts(loaded_scene, of_file=True, factors=base_color_factors(tree))
+    parts = [stronger(part, emissive_strengths(tree)) for part in parts]
     if path.suffix.lower() == ".stl":
         if not any(len(part.faces) for part in parts):
             raise MeshError(f"faces: got none, expected at least one triangle{_stl_fault(path.read_bytes())}")
@@ -264,7 +270,8 @@ def _trimesh_part(shape, of_file: bool, factors: Factors) -> MeshPart:
     material = getattr(shape.visual, "material", None)
     pictures = (_trimesh_picture(material, factors),)
     positions, faces = np.asarray(shape.vertices, np.float32), np.asarray(shape.faces)
-    part = _trimesh_colored(MeshPart(positions, faces, pictures=pictures, gloss=gloss_of(material)), shape, factors)
+    part = MeshPart(positions, faces, pictures=pictures, gloss=gloss_of(material), emission=emission_of(material))
+    part = _trimesh_colored(part, shape, factors)
     corner_uvs = ply_corner_uvs(shape)
     if corner_uvs is not None and len(corner_uvs) == 3 * len(faces):
         return part._replace(uvs=corner_uvs, uv_faces=np.arange(len(corner_uvs)).reshape(-1, 3))

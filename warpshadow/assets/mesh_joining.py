@@ -16,12 +16,14 @@ from warpshadow.assets.topology import CREASE, first_at_positions, is_listed_fir
 class JoinedMesh(NamedTuple):
     """A mesh, the picture that all its faces share, its gloss, and remarks on surprises: on shape, colors and gloss.
 
-    ``gloss`` has roughness and metallic of the body, each [1], of each vertex, [vertex], or a texture [height, width].
+    ``gloss`` has roughness and metallic of the body, each [1], of each vertex, [vertex], or a texture [height, width];
+    ``emission`` radiance of the body, [3], or of each vertex, [vertex, 3].
     """
 
     mesh: Mesh
     picture: BaseColor | None
     gloss: tuple[np.ndarray, np.ndarray] | None
+    emission: np.ndarray | None
     remarks: list[str]
     of_colors: list[str]
     of_gloss: list[str]
@@ -64,7 +66,17 @@ def join_parts(parts: list[MeshPart], name: str) -> JoinedMesh:
         reason = "which need uvs" if mesh.uvs is None else "since a body takes one that all its faces have"
         of_gloss.append(f"of textures of roughness and metallic the means count, {reason}")
     gloss = _joined_gloss(glosses, [len(part.positions) for part in parts], has_textures=not of_gloss)
-    return JoinedMesh(mesh, pictures[0] if is_one else None, gloss, remarks, of_colors, of_gloss)
+    picture, emission = pictures[0] if is_one else None, _joined_emission(parts)
+    return JoinedMesh(mesh, picture, gloss, emission, remarks, of_colors, of_gloss)
+
+
+def _joined_emission(parts: list[MeshPart]) -> np.ndarray | None:
+    """Radiance of all parts, of each vertex where they differ; None if no part emits."""
+    radiance = np.array([part.emission or (0.0, 0.0, 0.0) for part in parts], np.float32)
+    if not radiance.any():
+        return None
+    is_one = (radiance == radiance[0]).all()
+    return radiance[0] if is_one else np.repeat(radiance, [len(part.positions) for part in parts], axis=0)
 
 
 def _joined_gloss(

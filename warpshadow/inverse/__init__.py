@@ -10,6 +10,7 @@ from warpshadow.inverse.diagnostics import DiagnosticWarning
 from warpshadow.inverse.fit_file import Fit, FitFileError, load_fit
 from warpshadow.inverse.found_light import FoundLight
 from warpshadow.inverse.free.base import Free
+from warpshadow.inverse.free.emission import Emission
 from warpshadow.inverse.free.gloss import Metallic, Roughness
 from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.free.plane import Plane
@@ -34,6 +35,7 @@ __all__ = [
     "CheckpointError",
     "Deformation",
     "DiagnosticWarning",
+    "Emission",
     "Ending",
     "Exposure",
     "Fit",

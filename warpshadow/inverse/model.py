@@ -89,9 +89,9 @@ class Model:
 class LightModel(Model):
     """Model where light alone is free and differences are squared: a quadratic form, computed without images.
 
-    Images are linear in the light, I_c = J_c L_c for each color c, so the loss is Σ_c L_cᵀ G_c L_c − 2 g_c·L_c + const
-    with G_c = J_cᵀ W J_c and g_c = J_cᵀ W t_c, W the pixels' shares in the loss. Sums are float64: near the
-    end they are small differences of large numbers.
+    Images, without the light of emitters, are linear in the light, I_c = J_c L_c for each color c, so the loss is
+    Σ_c L_cᵀ G_c L_c − 2 g_c·L_c + const with G_c = J_cᵀ W J_c and g_c = J_cᵀ W t_c, W the pixels' shares in the loss.
+    Sums are float64: near the end they are small differences of large numbers.
     """
 
     def __init__(self, problem: Problem, setting: Setting, stage: Stage):
@@ -101,9 +101,11 @@ class LightModel(Model):
         self.light = light
         roots = problem.loss.pixel_shares(self.weights).sqrt()[..., None] / setting.unit
         with torch.no_grad():
-            columns = torch.cat([(image[..., :3] * roots).reshape(1, -1, 3) for image in self._images_of_units()])
-            target = (self.targets[..., :3] * roots).reshape(-1, 3)
             black_image = self.renderer(torch.zeros(light.basis.size, 3, device=setting.device))
+            emitted = black_image[..., :3].reshape(self.targets[..., :3].shape)  # black where no body emits
+            images = (image[..., :3] - emitted for image in self._images_of_units())
+            columns = torch.cat([(image * roots).reshape(1, -1, 3) for image in images])
+            target = ((self.targets[..., :3] - emitted) * roots).reshape(-1, 3)
             covered_targets = torch.cat([self.targets[..., :3], black_image[..., 3:]], dim=-1)  # but for coverage
             coverage = problem.loss(covered_targets, self.targets, self.weights, setting.unit).double()
         columns, target = columns.permute(2, 0, 1), target.T[..., None]  # [color, coefficient, pixel]

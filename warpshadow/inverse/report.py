@@ -167,9 +167,13 @@ def found_values(result: Result) -> list[str]:
     """Describe the changes of a fit, a line each: poses, colors, exposures, and where light is strongest."""
     lines, start, scene = [], result.problem.scene, result.scene
     for before, after in zip(start.bodies, scene.bodies, strict=True):
-        for name, unit in (("translation", ""), ("rotation", "°"), ("scale", ""), ("albedo", "")):
+        for name, unit in (("translation", ""), ("rotation", "°"), ("scale", ""), ("albedo", ""), ("emission", "")):
             values = np.asarray(getattr(after, name))
-            if not np.array_equal(values, getattr(before, name)) and values.size <= 3:
+            if (
+                getattr(after, name) is not None
+                and not np.array_equal(values, getattr(before, name))
+                and values.size <= 3
+            ):
                 rounded_text = ", ".join(f"{value:.4g}" for value in values.ravel())
                 lines.append(f"{after.called}: {name} ({rounded_text}){unit}")
     if scene.light is not start.light:

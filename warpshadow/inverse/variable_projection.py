@@ -1,6 +1,7 @@
 """Variable projection: a light that is solved for at each geometry, not descended to [Golub and Pereyra 1973].
 
-For known geometry and reflectance images are linear in the light, I = A L. The loss at the best light,
+For known geometry and reflectance images are linear in the light, I = A L, beside the light of emitters, which is
+subtracted from the images. The loss at the best light,
 
     f(θ) = min_{L ≥ 0} loss(A(θ) L, I),
 
@@ -50,21 +51,31 @@ class ProjectedModel(Model):
             self.solve(values)
         return super().loss(values)
 
-    def design(self, values: Mapping[str, Values]) -> torch.Tensor:
-        """Images in light of which one coefficient is 1, [coefficient, view, height, width, 3]."""
+    def emitted(self, values: Mapping[str, Values]) -> torch.Tensor | float:
+        """Images by emitters alone, [view, height, width, 3]; 0 where no body emits."""
+        if not any(body.is_emitter for body in self.setting.scene.bodies):
+            return 0.0
+        world = self.world(values)
+        world.light = torch.zeros(self.light.basis.size, 3, device=self.setting.device)
+        return world.images().reshape(*self.targets.shape[:3], 4)[..., :3]
+
+    def design(self, values: Mapping[str, Values], emitted: torch.Tensor | float = 0.0) -> torch.Tensor:
+        """Images by single coefficients of light, less those by emitters: [coefficient, view, height, width, 3]."""
         world = self.world(values)
         units = torch.eye(self.light.basis.size, device=self.setting.device)[..., None].expand(-1, -1, 3).contiguous()
         images = []
         for part in units if len(self.cameras) > 1 else units.split(_LIGHTS_AT_ONCE):
             world.light = part
-            images.append(world.images().reshape(-1, len(self.cameras), *self.targets.shape[1:3], 4)[..., :3])
+            lit = world.images().reshape(-1, len(self.cameras), *self.targets.shape[1:3], 4)
+            images.append(lit[..., :3] - emitted)
         return torch.cat(images)
 
     def solve(self, values: Mapping[str, Values]) -> None:
         """Set the light to that of the least loss, for the other values."""
-        design = self.design(values).permute(4, 0, 1, 2, 3).flatten(2)  # [color, coefficient, pixel]
+        emitted = self.emitted(values)
+        design = self.design(values, emitted).permute(4, 0, 1, 2, 3).flatten(2)  # [color, coefficient, pixel]
         design = torch.einsum("ak,ckp->cap", torch.from_numpy(self.atoms).to(design), design)
-        target = (self.targets[..., :3] / self.setting.unit).permute(3, 0, 1, 2).flatten(1)
+        target = ((self.targets[..., :3] - emitted) / self.setting.unit).permute(3, 0, 1, 2).flatten(1)
         share = self.problem.loss.pixel_shares(self.weights).flatten()
         prior = self.prior()
         weights, radiance = share.expand_as(target), np.zeros((3, design.shape[1]))

@@ -23,6 +23,7 @@ from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.self_visibility import SelfVisibility
 from warpshadow.pipeline.transfers import LARGEST_COEFFICIENT, change_basis, joined
+from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.shading import shade
 
 
@@ -46,6 +47,11 @@ class SphereMethod(Method):
     sees_cells = False
     shades_transmittance = False
     bounces: Any = None
+
+    @functools.cached_property
+    def emitter_projection(self) -> Any:
+        """Even light in the cells in which self-visibility towards emitters is looked up; None where nothing is."""
+        return None
 
     @functools.cached_property
     def plane_blockers(self) -> tuple[int, ...]:
@@ -168,9 +174,31 @@ class SphereMethod(Method):
 
     def emitted_light(self, points: LitPoints, materials: Materials) -> Node:
         """Direct light of emitters on points, by the same blockers."""
-        from warpshadow.pipeline.emitters import emitted_light
+        from warpshadow.pipeline.emitters import find_emitted_light
 
-        return emitted_light(self, self.emitters, points, materials)
+        samples = self.emitters.samples
+
+        def find(
+            receivers: Receivers, blockers: Blockers, self_lookups: dict[int, Any] | None, *placed: Any
+        ) -> wp.array:
+            groups = find_groups(points, receivers, blockers, self_lookups, None, None)
+            return find_emitted_light(samples, groups, blockers, *placed)
+
+        def lookups() -> Node:
+            if self.emitter_projection is None:
+                return Node("", None)
+            return _self_visibility(self, points, self.emitter_projection)
+
+        return Node(
+            "light of emitters",
+            find,
+            points.receivers_node,
+            placed_blockers(self, points),
+            points.cached("self-visibility towards emitters", None, lookups),
+            self.emitters.placed(points),
+            self.emitters.radiance(materials),
+            items=lambda: f"{receiver_text(points)} × {samples.first[-1]} samples",
+        )
 
     def known_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
         """Shading of points in known light, which bounces from the materials."""
@@ -374,12 +402,11 @@ def placed_blockers(method: SphereMethod, points: LitPoints) -> Node:
 
 def self_visibility_node(method: SphereMethod, points: LitPoints, projected_light: Any) -> Node:
     """Node of the receivers' self-visibility lookups, by body; the same for any receivers among the same bodies."""
-    make = functools.partial(self_lookups_node, method, points, projected_light)
+    make = functools.partial(_self_visibility, method, points, projected_light)
     return points.cached("self-visibility", id(projected_light), make)
 
 
-def self_lookups_node(method: SphereMethod, points: LitPoints, projected_light: Any) -> Node:
-    """The same, not cached for the points."""
+def _self_visibility(method: SphereMethod, points: LitPoints, projected_light: Any) -> Node:
     bodies, rotations = points.blocker_kinds.traced, points.blocker_kinds.rotations
     curved_bodies = [body for body in bodies if not method.merged_scene.is_flat[body]]
     if not curved_bodies or rotations is None:

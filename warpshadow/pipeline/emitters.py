@@ -1,25 +1,23 @@
-"""Emitters: the light of bodies that emit, on receivers that the blockers between stand before.
+"""Emitters: the light of bodies that emit, on receivers, past the blockers between.
 
-A body with emission is a part of the direct light: the sum over its samples at a receiver (:mod:`.stages.emitters`) adds
-to the light of the map, bounces as that does, and is blocked by the bodies between, not by bodies behind it. In the
-image its surface has its radiance beside the light that it reflects.
+A body with emission is a part of the direct light: the sum over its samples at a receiver (:mod:`.stages.emitters`)
+adds to the light of the map, and bounces as that does. Bodies between block it, bodies behind it do not. In the image
+its surface has its radiance beside the light that it reflects.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterable
 
 import numpy as np
 import warp as wp
 
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.by_spheres import SphereMethod, placed_blockers, self_lookups_node
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.methods.directional import ProjectedCells
 from warpshadow.pipeline.node import Node
-from warpshadow.pipeline.receivers.groups import Blockers, Group, find_groups
-from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
+from warpshadow.pipeline.receivers.groups import Blockers, Group
+from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.self_visibility import SelfVisibilityLookup
 from warpshadow.pipeline.transfers import joined
@@ -39,7 +37,7 @@ from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.self_visibility.gather import gather_self_transmittance
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
-_SELF_CELLS = fibonacci(512)
+EMITTER_CELLS = fibonacci(512)
 """Cells in which receivers look up the self-visibility of their body. With 128 in place of 512, a bear and a bunny at
 vertices in a room with a lamp were 16.6 and 3.2% off in direct light in place of 12.7 and 1.9%."""
 
@@ -57,28 +55,28 @@ class SceneEmitters:
     @functools.cached_property
     def samples(self) -> EmitterSamples:
         """Samples of all emitters."""
-        from scipy.sparse import csr_matrix, vstack
+        from scipy.sparse import block_diag, csr_matrix
 
-        merged_scene, of_vertices, of_faces = self._merged_scene, [], []
+        merged_scene = self._merged_scene
         bodies = np.flatnonzero(merged_scene.is_emitter).tolist()
-        counts = [len(merged_scene.scene.bodies[body].mesh.surface.faces) for body in bodies]
-        first_face = np.cumsum([0, *counts])
-        for body, face in zip(bodies, first_face[:-1], strict=True):
-            mesh = merged_scene.scene.bodies[body].mesh
-            arguments = mesh.positions, mesh.surface.faces
-            is_two_sided = bool(merged_scene.is_two_sided[body])
-            weights = find_sample_weights(*arguments, is_two_sided=is_two_sided, device=merged_scene.device)
-            sizes = (int(merged_scene.first_vertex[-1]), int(first_face[-1]))
-            starts = int(merged_scene.first_vertex[body]), int(face)
-            for matrix, parts, start, size in zip(weights, (of_vertices, of_faces), starts, sizes, strict=True):
-                moved = csr_matrix((matrix.data, matrix.indices + start, matrix.indptr), (matrix.shape[0], size))
-                parts.append(moved)
+        weights = []
+        for body in bodies:
+            mesh, is_open = merged_scene.scene.bodies[body].mesh, bool(merged_scene.is_two_sided[body])
+            surface = mesh.positions, mesh.surface.faces
+            weights.append(find_sample_weights(*surface, is_two_sided=is_open, device=merged_scene.device))
+        of_vertices = block_diag([item.vertices for item in weights], format="csr")
+        vertices = np.flatnonzero(np.isin(merged_scene.body_of_vertex, bodies))
+        shape = of_vertices.shape[0], int(merged_scene.first_vertex[-1])
+        of_vertices = csr_matrix((of_vertices.data, vertices[of_vertices.indices], of_vertices.indptr), shape)
         is_emitting = np.isin(merged_scene.body_of_face, bodies)
-        faces = wp.array(merged_scene.faces.numpy()[is_emitting], dtype=wp.vec3i, device=merged_scene.device)
-        matrices = (SparseMatrix.from_matrix(vstack(parts), device=merged_scene.device) for parts in (of_vertices, of_faces))
-        first = np.cumsum([0, *(matrix.shape[0] for matrix in of_vertices)])
-        is_open = tuple(merged_scene.is_two_sided[bodies].tolist())
-        return EmitterSamples(*matrices, faces, tuple(bodies), is_open, first)
+        return EmitterSamples(
+            SparseMatrix.from_matrix(of_vertices, device=merged_scene.device),
+            SparseMatrix.from_matrix(block_diag([item.faces for item in weights]), device=merged_scene.device),
+            wp.array(merged_scene.faces.numpy()[is_emitting], dtype=wp.vec3i, device=merged_scene.device),
+            tuple(bodies),
+            tuple(merged_scene.is_two_sided[bodies].tolist()),
+            np.cumsum([0, *(item.vertices.shape[0] for item in weights)]),
+        )
 
     def placed(self, points: LitPoints) -> Node:
         """Node of the samples among the bodies around points."""
@@ -100,73 +98,51 @@ class SceneEmitters:
         return functools.reduce(lambda first, second: total_light([first, second]), lights)
 
 
-def emitted_light(method: SphereMethod, emitters: SceneEmitters, points: LitPoints, materials: Materials) -> Node:
-    """Node of the direct light of emitters on points, vec3 of shape [batch, receiver]."""
-    return Node(
-        "light of emitters",
-        functools.partial(_find_light, method, emitters, points),
-        points.receivers_node,
-        placed_blockers(method, points),
-        _self_lookups(method, points),
-        emitters.placed(points),
-        emitters.radiance(materials),
-        items=lambda: f"{receiver_text(points)} × {emitters.samples.first[-1]} samples",
-    )
-
-
-def _self_lookups(method: SphereMethod, points: LitPoints) -> Node:
-    """Node of the self-visibility of bodies in fine cells, by body."""
-    if not method.traces_self_visibility:
-        return Node("", None)
-    make = functools.partial(self_lookups_node, method, points, ProjectedCells(_SELF_CELLS))
-    return points.cached("self-visibility towards emitters", None, make)
-
-
-def _find_light(
-    method: SphereMethod,
-    emitters: SceneEmitters,
-    points: LitPoints,
-    receivers: Receivers,
+def find_emitted_light(
+    emitters: EmitterSamples,
+    groups: Iterable[Group],
     blockers: Blockers,
-    self_lookups: dict[int, SelfVisibilityLookup] | None,
     placed_samples: PlacedSamples,
     radiance: wp.array,
 ) -> wp.array:
-    lights = []
-    for group in find_groups(points, receivers, blockers, self_lookups, None, None):
-        for portion in group.portions():
-            lights.append(_light_of(method, emitters, portion, blockers, placed_samples, radiance))
-    return joined(lights)
+    """Direct light of emitters on groups of receivers, vec3 of shape [batch, receiver].
+
+    Args:
+        emitters: Their samples.
+        groups: The receivers, with the self-visibility of their bodies in EMITTER_CELLS.
+        blockers: All of them.
+        placed_samples: Where the samples are.
+        radiance: Of the samples, vec3 of shape [batch, sample].
+    Differentiable: blockers, receivers of the groups, placed_samples, radiance.
+    """
+    portions = (portion for group in groups for portion in group.portions())
+    return joined([_light_of(emitters, portion, blockers, placed_samples, radiance) for portion in portions])
 
 
 def _light_of(
-    method: SphereMethod,
-    emitters: SceneEmitters,
-    group: Group,
-    blockers: Blockers,
-    placed_samples: PlacedSamples,
-    radiance: wp.array,
+    emitters: EmitterSamples, group: Group, blockers: Blockers, placed_samples: PlacedSamples, radiance: wp.array
 ) -> wp.array:
     """Light of all emitters but the group's own body on a portion of the receivers."""
-    merged_scene, points, normals = method.merged_scene, group.points, group.normals
+    merged_scene, points, normals = blockers.merged_scene, group.points, group.normals
+    total = wp.zeros(points.shape, dtype=wp.vec3, device=points.device)
     if not points.size:
-        return wp.zeros(points.shape, dtype=wp.vec3, device=points.device)
+        return total
     cells = _self_transmittance(group)
     sphere_bodies = [number for number in blockers.bodies if number not in blockers.blocker_kinds.planes]
     spheres = merged_scene.spheres_of(sphere_bodies, blockers.spheres)
     traced_body = group.body if group.body in blockers.blocker_kinds.traced else None
-    total = wp.zeros(points.shape, dtype=wp.vec3, device=points.device)
-    for body, span in zip(emitters.samples.bodies, emitters.samples.spans(), strict=True):
+    own_spheres = merged_scene.spheres_among(sphere_bodies, traced_body)
+    for body, span in zip(emitters.bodies, emitters.spans(), strict=True):
         if body == group.body:
             continue
-        skipped_bodies = tuple(merged_scene.spheres_among(sphere_bodies, number) for number in (traced_body, body))
+        skipped = own_spheres, merged_scene.spheres_among(sphere_bodies, body)
         transmittance_self = None
         if cells is not None:
             towards = directions_to_samples(points, placed_samples, span)
-            transmittance_self = transmittance_of_directions(cells, normals, towards, _SELF_CELLS)
+            transmittance_self = transmittance_of_directions(cells, normals, towards, EMITTER_CELLS)
         light = sum_light(
             *(points, normals, placed_samples, radiance, span),
-            log_of_spheres=find_log_transmittance(points, normals, placed_samples, span, *spheres, skipped_bodies),
+            log_of_spheres=find_log_transmittance(points, normals, placed_samples, span, *spheres, skipped),
             log_of_planes=_log_of_planes(group, blockers, placed_samples, span, body),
             transmittance_self=transmittance_self,
         )

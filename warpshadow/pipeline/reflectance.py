@@ -113,7 +113,9 @@ class Materials:
         self.roughness, self.emission = self._inputs.get("roughness"), self._inputs.get("emission")
         if "albedo" in changed:
             self.vertex_albedo = self.of_vertices("albedo")
-        textures = {name: BodyTextures(self.merged_scene, self._inputs[name]) for name in changed if name not in _COLORS}
+        textures = {
+            name: BodyTextures(self.merged_scene, self._inputs[name]) for name in changed if name not in _COLORS
+        }
         self.textures_of = self.textures_of | textures
 
     @classmethod
@@ -176,7 +178,9 @@ class Materials:
             expected = "one for bodies that have roughness in the scene"
             raise ValueError(f"{where}: got some for {body.called!r}, expected {expected}")
         if name == "emission" and body.emission is None:
-            raise ValueError(f"{where}: got some for {body.called!r}, expected one for bodies that have it in the scene")
+            raise ValueError(
+                f"{where}: got some for {body.called!r}, expected one for bodies that have it in the scene"
+            )
         if name == "textures" or (name in GLOSS_ARGUMENTS and array.ndim == 3):
             check.shape(where, array.shape, ("batch", "height", "width"))
             if body.mesh.uvs is None:

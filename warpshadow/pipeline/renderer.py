@@ -384,7 +384,11 @@ class SceneRenderer:
         if photograph is not None:
             check.shape("photograph", photograph.shape, ("batch", *self._size))
             check.finite_arrays({"photograph": photograph})
-        catchers, materials, alone = self._catchers_alone, self._given_materials(albedo, textures, gloss, emission), None
+        catchers, materials, alone = (
+            self._catchers_alone,
+            self._given_materials(albedo, textures, gloss, emission),
+            None,
+        )
         if geometry is not None:
             geometry = as_geometry("geometry", geometry)
             alone = catchers.moved_geometry(geometry)

@@ -15,7 +15,7 @@ from warpshadow.stages.receivers import Receivers
 
 
 def shading_ratio(view: View, call: Call) -> np.ndarray:
-    """Divide a view's white image in direct light by that without blockers; 1 where there is no light.
+    """Divide a view's white image in the map's direct light by that without blockers; 1 where there is no light.
 
     Returns:
         float32 of shape [view, height, width, 3].
@@ -26,8 +26,10 @@ def shading_ratio(view: View, call: Call) -> np.ndarray:
     receivers = Node("", Receivers.without_bodies, view.receivers_node)
     spheres = Input("spheres", tuple(empty((1, 0), dtype=dtype, device=device) for dtype in (wp.vec3, wp.float32)))
     free = LitPoints(without_blockers.merged_scene, view.materials, view.vertices, spheres, receivers, call)
-    images = (
-        view.white_image(shading).value(call) for shading in (view.shading(None), without_blockers.shading(free, None))
+    shadings = (
+        view.method.shading_without_emitters(view, None),
+        without_blockers.shading_without_emitters(free, None),
     )
+    images = (view.white_image(shading).value(call) for shading in shadings)
     received, unblocked = (image.numpy()[..., :3].copy() for image in images)
     return np.divide(received, unblocked, out=np.ones_like(received), where=unblocked > 0)

@@ -253,7 +253,9 @@ class Body:
         expected = "a linear color of 0 or more such as (5, 4, 3), one for each vertex, [vertex, 3], or an .npy file"
         emission = check.numbers("emission", radiance, expected=expected)
         if emission.shape not in ((3,), (count, 3)):
-            raise ValueError(f"emission: got shape {emission.shape}, expected [3] or [{count}, 3] (one for each vertex)")
+            raise ValueError(
+                f"emission: got shape {emission.shape}, expected [3] or [{count}, 3] (one for each vertex)"
+            )
         check.finite("emission", emission, minimum=0)
         if self.shadow_catcher:
             raise ValueError("emission: got some for a shadow catcher, expected None: it is not drawn")

@@ -319,7 +319,7 @@ def _write_body(body: Body, stem: Path) -> tuple[Table, list[Path]]:
                 np.save(unfinished, values)
             place[name] = path.name
             written.append(path)
-    if np.ndim(body.emission) == 1:
+    if body.emission is not None and body.emission.ndim == 1:
         place["emission"] = _numbers(body.emission)
     elif body.emission is not None:
         path = stem.with_name(f"{stem.name}_emission{COLORS_SUFFIX}")

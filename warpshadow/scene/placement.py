@@ -41,14 +41,14 @@ def misplacements(scene: Scene) -> list[str]:
     """Say which bodies are broader than any ground below, or above or below it by more than their size.
 
     Grounds are flat and face +y; the size is the longest edge of the bounds. A body over another that is near enough, a
-    cup on a table, does not float.
+    cup on a table, does not float; nor does a lamp.
     """
     boxes = [_Box(points.min(axis=0), points.max(axis=0)) for points in (b.world_points() for b in scene.bodies)]
     grounds = {number for number, body in enumerate(scene.bodies) if _is_ground(body, boxes[number])}
     remarks = []
     for number, (body, box) in enumerate(zip(scene.bodies, boxes, strict=True)):
         below = [other for other in grounds - {number} if box.is_over(boxes[other])]
-        if number in grounds or not below:
+        if number in grounds or not below or body.is_emitter:
             continue
         broadest = max(below, key=lambda other: boxes[other].breadth)
         if box.breadth > _CEILING_RATIO * boxes[broadest].breadth:

@@ -150,7 +150,7 @@ class Scene:
         emitter = next((body for body in self.bodies if body.is_emitter), None)
         if emitter is not None and self.visibility.method not in (*GLOSS_METHODS, None):
             raise ValueError(
-                f"emission: got some for body {emitter.called!r}, whose light {self.visibility.method!r} does not find, "
+                f"emission: got some for body {emitter.called!r}, whose light {self.visibility.method!r} lacks, "
                 f"expected None, or method = one of {', '.join(map(repr, GLOSS_METHODS))}"
             )
         if self.bounces and self.visibility.method not in (*BOUNCE_METHODS, None):

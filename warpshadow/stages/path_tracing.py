@@ -6,8 +6,8 @@ n bounces the receiver gets
     I = Σ_{k=1..n} a(x_1) ⋯ a(x_k) S(x_k)                [Kajiya 1986; Veach 1997, section 10.2]
 
 on average over paths whose directions are drawn in proportion to the cosine: a albedo and S the direct shading of a
-white surface, by the sky and by a point of the emitters if there are any. A hit is a receiver of its own: on the side of its face that the ray meets, with the normal of the
-vertices, interpolated.
+white surface, by the sky and, if bodies emit, by a point of their surfaces. A hit is a receiver of its own: on the side
+of its face that the ray meets, with the normal of the vertices, interpolated.
 """
 
 from __future__ import annotations

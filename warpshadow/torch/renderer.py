@@ -205,7 +205,7 @@ class TorchRenderer(torch.nn.Module):
         Returns:
             Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4], or [batch, height, width, 4]
             where an argument has a batch dimension or the renderer's own cameras have; the background is 0.
-        Differentiable: all; stages/README.md says how exactly. Gradients to light,
+        Differentiable: all; stages/README.md says how exactly. Gradients to light and emission,
             and where no light bounces to albedo and textures, may be differentiated again, in all of these;
             others raise NotImplementedError then.
         """
@@ -217,7 +217,12 @@ class TorchRenderer(torch.nn.Module):
             geometry_and_cameras = inputs.pop("geometry"), inputs.pop("clip_matrices")
             return self.warp.draw(**inputs, view=self.warp.view(*geometry_and_cameras))
 
-        is_affine = {"light": True, "albedo": not self.scene.bounces, "textures": not self.scene.bounces}
+        is_affine = {
+            "light": True,
+            "emission": True,
+            "albedo": not self.scene.bounces,
+            "textures": not self.scene.bounces,
+        }
         affine = [name for name in arguments.names if is_affine.get(name.partition("[")[0])]
         return arguments.apply(draw, inputs, affine=affine)
 

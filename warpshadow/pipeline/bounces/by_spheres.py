@@ -370,8 +370,8 @@ class SphereBounces:
         make = functools.partial(
             PortionedShading, self._method, at_patch_samples, projected_light, light, joined, where=_OF_PATCH_SAMPLES
         )
-        lit = points.cached("direct at patch samples", (light, patch_samples), make)
-        lit = self._method.with_emitters(lit, at_patch_samples, materials)
+        by_map = points.cached("direct at patch samples", (light, patch_samples), make)
+        lit = self._method.with_emitters(by_map, at_patch_samples, materials)
         return self._static_bounces.add_bounces(direct, lit, points, materials)
 
     def cached_bounced_free_shading(self, direct: Node, points: LitPoints, light: Input, materials: Materials) -> Node:

@@ -55,9 +55,7 @@ def path_traced(
         emission: wp.array | None,
     ) -> wp.array:
         texels = None if textures is None else textures.texels
-        count = common_batch(
-            {"geometry": shading, "albedo": vertex_albedo, "textures": texels, "emission": emission}
-        )
+        count = common_batch({"geometry": shading, "albedo": vertex_albedo, "textures": texels, "emission": emission})
         drawn = sample_map(known_light.radiance, _LIGHT_SAMPLES, seed=1)
         bounced = empty((count, *shading.shape[1:]), dtype=wp.vec3, device=shading.device)
 
@@ -75,7 +73,9 @@ def path_traced(
                 colors.texture_of_face,
                 merged_scene.uvs[0],
                 merged_scene.uv_faces,
-                None if emission is None else merged_scene.emitting_faces(of_instance(positions), of_instance(emission)),
+                None
+                if emission is None
+                else merged_scene.emitting_faces(of_instance(positions), of_instance(emission)),
             )
             places = of_instance(receivers.points), of_instance(receivers.normals)
             light = trace_bounces(surfaces, *places, drawn, bounces=bounces, paths=paths, progress=progress)

@@ -219,6 +219,13 @@ class Directional(SphereMethod):
         return {"softness": scale * self.visibility.softness, "merging": scale * self.visibility.merging}
 
     @functools.cached_property
+    def emitter_projection(self) -> ProjectedCells:
+        """Even light in cells that are finer than those of the map: emitters are small."""
+        from warpshadow.pipeline.emitters import EMITTER_CELLS
+
+        return ProjectedCells(EMITTER_CELLS)
+
+    @functools.cached_property
     def plane_blockers(self) -> tuple[int, ...]:
         """Bodies of the scene that block light as planes."""
         return blocking_planes(self.merged_scene.scene)

@@ -95,7 +95,12 @@ class Rays(Method):
         return self._light_of_emitters_at(points, points.receivers_node, materials, "light of emitters", items)
 
     def _light_of_emitters_at(
-        self, points: LitPoints, receivers: Node, materials: Materials, name: str = "", items: Callable[[], str] | str = ""
+        self,
+        points: LitPoints,
+        receivers: Node,
+        materials: Materials,
+        name: str = "",
+        items: Callable[[], str] | str = "",
     ) -> Node:
         """The same on other receivers among the same bodies."""
         unblocked = self.emitters.unblocked_light(points, receivers, materials) if self.shares_directions else None
@@ -110,11 +115,11 @@ class Rays(Method):
         points, normals = _checked_points(receivers.points), receivers.normals
         if emission.requires_grad:
             raise ValueError(
-                "emission: got an array that requires a gradient, which rays to emitters do not have; expected none, or "
-                "method = 'directional'"
+                "emission: got an array that requires a gradient, which rays to emitters do not have; expected none, "
+                "or method = 'directional'"
             )
         count = common_batch({"geometry": points, "emission": emission})
-        options = {"rays": EMITTER_RAYS if self.shares_directions else self._sample_count, "progress": self.progress}
+        rays = EMITTER_RAYS if self.shares_directions else self._sample_count
         light, meshes = wp.empty((count, points.shape[1]), dtype=wp.vec3, device=points.device), {}
         for instance in range(count if points.size else 0):
             number, point_number = min(instance, len(positions) - 1), min(instance, len(points) - 1)
@@ -123,7 +128,7 @@ class Rays(Method):
             faces = self.merged_scene.emitting_faces(positions[number], emission[min(instance, len(emission) - 1)])
             lit = points[point_number], normals[min(point_number, len(normals) - 1)]
             whole = None if unblocked is None else unblocked[min(instance, len(unblocked) - 1)]
-            wp.copy(light[instance], trace_emitters(faces, meshes[number], *lit, unblocked=whole, **options))
+            wp.copy(light[instance], trace_emitters(faces, meshes[number], *lit, unblocked=whole, rays=rays))
         return light
 
     @functools.cached_property

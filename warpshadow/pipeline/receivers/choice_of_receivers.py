@@ -128,7 +128,9 @@ def choose_receivers(
     limits = np.where(has_few, 1.0, largest)
     chosen = np.where([size.exceeds(limit) for size, limit in zip(sizes, limits, strict=True)], "pixel", "vertex")
     is_seen_large = np.array([size.area > SMALL_FACE for size in sizes])
-    chosen = np.where(merged_scene.is_flat & is_sharp & is_seen_large, "adaptive", chosen)
+    # where the shadows of emitters have edges, probes do not tell
+    where_edges_are = "pixel" if merged_scene.is_emitter.any() else "adaptive"
+    chosen = np.where(merged_scene.is_flat & is_sharp & is_seen_large, where_edges_are, chosen)
     is_open = (chosen == "vertex") & (np.array(requested) == AUTO) & ~merged_scene.is_flat
     unevenness = np.zeros(len(chosen))
     if is_open.any() and merged_scene.scene.visibility.method != "none":

@@ -42,7 +42,7 @@ def directions_to_samples(points: wp.array, samples: PlacedSamples, span: Emitte
     Differentiable: points, samples.
     """
     count = common_batch({"points": points, "emitters": samples.points})
-    directions = empty((count, points.shape[1], span.count), dtype=wp.vec3, device=points.device)
+    directions = empty((count, points.shape[1], span.size), dtype=wp.vec3, device=points.device)
     launch(_find_directions, directions.shape, inputs=[points, samples.points, span.first], outputs=[directions])
     return directions
 
@@ -128,12 +128,12 @@ def sum_light(
         _sum_light,
         count * points.shape[1],
         inputs=[
-            *(points, normals, samples.points, samples.areas, radiance, span.first, span.count),
+            *(points, normals, samples.points, samples.areas, radiance, span.first, span.size),
             int(span.is_two_sided),
             *transmittances,
         ],
         outputs=[light],
         shared=[samples.points, samples.areas, radiance],
-        cost=_COST * (span.count),
+        cost=_COST * (span.size),
     )
     return light

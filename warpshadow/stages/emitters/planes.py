@@ -125,9 +125,7 @@ def _block_by_planes(
                 area = sample_areas[sample_batch, first_sample + i]
                 beam = sample_points[sample_batch, first_sample + i] - point
                 if is_lit(beam, area, normal, is_two_sided):
-                    share = _covered_share(
-                        grids[f], edges, origin, axis_u, axis_v, point, beam, sample_radius(area)
-                    )
+                    share = _covered_share(grids[f], edges, origin, axis_u, axis_v, point, beam, sample_radius(area))
                     if share > 0.0:
                         wp.atomic_add(log_transmittances, batch, receiver, i, log_transmittance(share))
 
@@ -154,7 +152,7 @@ def find_log_transmittance_of_planes(
     """
     count = common_batch({"points": points, "emitters": samples.points, "planes": frames})
     points = expand(points, count)
-    result = zeros((count, points.shape[1], span.count), dtype=wp.float32, device=points.device)
+    result = zeros((count, points.shape[1], span.size), dtype=wp.float32, device=points.device)
     launch(
         _block_by_planes,
         count * points.shape[1],

@@ -5,8 +5,8 @@ move with the body: of pieces p of faces f, with middles z_p,
 
     y_k = Σ_p |A_p| z_p / Σ_p |A_p|,   A_k = s_k Σ_p A_p,   A_p = share_p (b_f − a_f) × (c_f − a_f) / 2
 
-s_k, which is 1 for flat patches, gives bent ones their whole area at rest: the mean of max(A_k·ω, 0) over all directions
-ω is then that of the surface, of which the curvature within patches would take 2%.
+s_k, which is 1 for flat patches, gives bent ones their whole area at rest: the mean of max(A_k·ω, 0) over all
+directions ω is then that of the surface.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class EmitterSpan(NamedTuple):
     is_two_sided: bool  # whether it is open
 
     @property
-    def count(self) -> int:
+    def size(self) -> int:
         """Number of its samples."""
         return self.end - self.first
 

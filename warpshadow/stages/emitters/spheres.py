@@ -148,7 +148,7 @@ def find_log_transmittance(
     """
     count = common_batch({"points": points, "emitters": samples.points, "spheres": radii})
     points = expand(points, count)
-    result = zeros((count, points.shape[1], span.count), dtype=wp.float32, device=points.device)
+    result = zeros((count, points.shape[1], span.size), dtype=wp.float32, device=points.device)
     if not radii.shape[1]:
         return result
     skip_values = wp.vec4i(*skipped[0], *skipped[1])

@@ -1,6 +1,6 @@
 """Light of emitters by rays, to points drawn from their surfaces: it judges the sums over samples, and stills have it.
 
-A point y of a face is drawn in proportion to area and luminance, with the density p. Of N of them a receiver gets
+A point y of a face is drawn in proportion to area and mean radiance, with the density p. Of N of them a receiver gets
 
     E(x) = 1/N Σ L(y) V max(n·ω, 0) max(−m·ω, 0) / (π d² p)                   [Shirley et al. 1996, "Monte Carlo
                                                                                Techniques for Direct Lighting"]
@@ -11,7 +11,6 @@ m the normal of the face; of an open body |m·ω| counts.
 import numpy as np
 import warp as wp
 
-from warpshadow.assets.color import LUMINANCE
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.stages.interpolation import interpolate_at
@@ -37,9 +36,7 @@ class EmittingFaces:
     emission: wp.array(dtype=wp.vec3)  # of all vertices
 
 
-def emitting_faces(
-    positions: wp.array, emission: wp.array, faces: wp.array, is_two_sided: np.ndarray
-) -> EmittingFaces:
+def emitting_faces(positions: wp.array, emission: wp.array, faces: wp.array, is_two_sided: np.ndarray) -> EmittingFaces:
     """Prepare the faces of emitters.
 
     Args:
@@ -53,7 +50,7 @@ def emitting_faces(
     corner_ids, device = faces.numpy(), positions.device
     corners = positions.numpy().astype(np.float64)[corner_ids]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    power = areas * (emission.numpy()[corner_ids].mean(axis=1) @ LUMINANCE)
+    power = areas * (emission.numpy()[corner_ids].mean(axis=(1, 2)))
     sums = np.cumsum(power)
     has_power = bool(len(sums) and sums[-1] > 0)
     result.distribution = wp.array(sums / sums[-1] if has_power else [], dtype=wp.float32, device=device)

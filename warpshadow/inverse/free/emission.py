@@ -1,0 +1,70 @@
+"""Free emission of a body: the radiance of a lamp."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from warpshadow import check
+from warpshadow.inverse.free.base import FreeOfBody, Values
+from warpshadow.inverse.world import FittedScene, Setting, World
+from warpshadow.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Emission(FreeOfBody):
+    """The radiance of a body that emits in the scene, from where the fit starts: one color, or one for each vertex.
+
+    Args:
+        body: The body, its number or name.
+        per_vertex: A color for each vertex.
+    """
+
+    key: ClassVar[str] = "emission"
+
+    per_vertex: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check.flag("per_vertex", self.per_vertex)
+
+    def check_scene(self, scene: Scene) -> None:
+        """Raise ValueError for a body that does not emit."""
+        if scene.bodies[self.number].emission is None:
+            raise ValueError(f"body: got {self.number}, which does not emit; expected one that has emission")
+
+    def _unit(self, setting: Setting) -> float:
+        """Radiance that counts as 1: a lamp is far brighter than its image."""
+        start = setting.scene.bodies[self.number].emission
+        assert start is not None
+        return float(start.mean()) or setting.unit
+
+    def start(self, setting: Setting) -> Values:
+        """The body's radiance; the mean of its vertices', where one is free."""
+        body = setting.scene.bodies[self.number]
+        radiance = np.atleast_2d(np.asarray(body.emission)) / self._unit(setting)
+        if self.per_vertex:
+            return {"radiance": setting.tensor(np.broadcast_to(radiance, (body.mesh.vertex_count, 3)))}
+        return {"radiance": setting.tensor(radiance.mean(axis=0)[None])}
+
+    def apply(self, values: Values, setting: Setting, world: World) -> None:
+        """Let the body emit it."""
+        world.emission[self.number] = values["radiance"] * self._unit(setting)
+
+    def project(self, values: Values) -> None:
+        """Radiance is 0 or more."""
+        values["radiance"].clamp_(min=0)
+
+    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
+        """Let the body emit it."""
+        radiance = (values["radiance"] * self._unit(setting)).cpu().numpy()
+        fitted.change_body(self.number, emission=radiance if self.per_vertex else radiance[0])
+
+    def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
+        """The radiance, of a body that has one."""
+        emission = fitted.scene.bodies[self.number].emission
+        return {} if self.per_vertex or emission is None else {f"{self.called(fitted)}.emission": emission}
