@@ -563,3 +563,47 @@ def transmittance_near(transmittance, normals, directions, cells, reach):
     rise = np.clip(0.5 + 0.5 / radius * normals @ cells.T, 0, 1)
     above = (rise**2 * (3 - 2 * rise))[:, :, None]
     return (near * np.minimum(transmittance[:, :, None], above)).sum(axis=-1) / (near * above).sum(axis=-1)
+
+
+# ---------------------------------------------------------------------------------------------------- emitters
+
+
+def light_of_samples(points, normals, samples, areas, radiance, transmittance, is_two_sided=False):
+    """Σ L T cos max(−A·ω, 0) / √(π² d⁴ + |A|²), [receiver, 3]."""
+    beams = samples - points[:, None]
+    distances = np.linalg.norm(beams, axis=-1)
+    cosines = np.maximum(np.einsum("rsx,rx->rs", beams, normals) / distances, 0)
+    facing = -np.einsum("rsx,sx->rs", beams, areas) / distances
+    facing = np.abs(facing) if is_two_sided else np.maximum(facing, 0)
+    factors = cosines * facing / np.hypot(np.pi * distances**2, np.linalg.norm(areas, axis=-1))
+    return (factors * transmittance) @ radiance
+
+
+def share_of_sphere(center, radius, beam, disc_radius, softness=0.05):
+    """The share of the beam of a disc that a sphere takes; the receiver is the origin."""
+    distance = np.linalg.norm(beam)
+    depth = center @ beam / distance
+    height = np.linalg.norm(center - depth * beam / distance)
+    width = np.hypot(disc_radius * np.clip(depth / distance, 0, 1), softness * radius)
+    middle = np.sqrt(radius**2 - min(width, radius) ** 2 / 5)
+    high, low = middle + width, max(middle - width, 0)
+    opacity = min(1, radius**2 / (((high + low) / 2) ** 2 + (high - low) ** 2 / 20))
+    around = smoothstep(depth / radius + 0.5) * smoothstep((distance - depth) / radius + 0.5)
+    return opacity * smoothstep((high - height) / (high - low)) * around
+
+
+def share_of_rectangle(size, point, beam, disc_radius):
+    """The share of the beam of a disc that a rectangle takes, in the plane y = 0 around the origin."""
+    position = -point[1] / beam[1]
+    if not 0 < position < 1:
+        return 0.0
+    hit = (point + position * beam)[[0, 2]]
+    gaps = np.array(size) / 2 - np.abs(hit)
+    if (gaps >= 0).all():
+        axis = int(np.argmin(gaps))
+        distance, towards = gaps[axis], np.eye(2)[axis]
+    else:
+        away = np.maximum(-gaps, 0)
+        distance, towards = -np.linalg.norm(away), away * np.sign(hit) / np.linalg.norm(away)
+    slope = towards @ beam[[0, 2]] / beam[1]
+    return smoothstep((distance / (disc_radius * position * np.sqrt(1 + slope**2)) + 1) / 2)

@@ -86,16 +86,18 @@ class SceneEmitters:
         """Node of the samples' radiance, vec3 of shape [batch, sample]."""
         return Node("", lambda emission: multiply(self.samples.vertices, emission), materials.of_vertices("emission"))
 
-    def unblocked_light(self, points: LitPoints, receivers: Node, materials: Materials) -> Node:
-        """Node of their light without blockers on receivers among the bodies around points."""
-        return Node("", self._find_unblocked, receivers, self.placed(points), self.radiance(materials))
+    def traced_light(self, receivers: Node, placed: Node, radiance: Node, transmittance: Node, name: str) -> Node:
+        """Node of their light on receivers, given the transmittance to the samples of each, a list."""
 
-    def _find_unblocked(self, receivers: Receivers, placed_samples: PlacedSamples, radiance: wp.array) -> wp.array:
-        lights = [
-            sum_light(receivers.points, receivers.normals, placed_samples, radiance, span)
-            for span in self.samples.spans()
-        ]
-        return functools.reduce(lambda first, second: total_light([first, second]), lights)
+        def light(
+            receivers: Receivers, placed_samples: PlacedSamples, radiance: wp.array, transmittance: list[wp.array]
+        ) -> wp.array:
+            lit = receivers.points, receivers.normals, placed_samples, radiance
+            pairs = zip(self.samples.spans(), transmittance, strict=True)
+            lights = [sum_light(*lit, span, transmittance=item) for span, item in pairs]
+            return functools.reduce(lambda first, second: total_light([first, second]), lights)
+
+        return Node(name, light, receivers, placed, radiance, transmittance)
 
 
 def find_emitted_light(
@@ -144,7 +146,7 @@ def _light_of(
             *(points, normals, placed_samples, radiance, span),
             log_of_spheres=find_log_transmittance(points, normals, placed_samples, span, *spheres, skipped),
             log_of_planes=_log_of_planes(group, blockers, placed_samples, span, body),
-            transmittance_self=transmittance_self,
+            transmittance=transmittance_self,
         )
         total = total_light([total, light])
     return total

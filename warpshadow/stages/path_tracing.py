@@ -154,7 +154,7 @@ def _trace_bounces(
                 share = wp.randf(state)
                 emitter_u = wp.randf(state)
                 emitter_v = wp.randf(state)
-                emitted, _unblocked = light_of_point(
+                emitted = light_of_point(
                     surfaces.emitters, surfaces.blocker_mesh, point, normal, share, emitter_u, emitter_v
                 )
                 total += wp.cw_mul(throughput, emitted)

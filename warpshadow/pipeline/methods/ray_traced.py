@@ -24,8 +24,9 @@ from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.shared_rays import find_corners, find_shares, trace_shared
 from warpshadow.stages.traced_transfer import trace_transfer
 
-if TYPE_CHECKING:  # it is imported where light bounces
+if TYPE_CHECKING:  # they are imported where light bounces, and where bodies emit
     from warpshadow.pipeline.bounces.static_bounces import StaticBounces
+    from warpshadow.stages.emitters.samples import PlacedSamples
 
 Meshes = list[wp.Mesh | None]  # mesh that blocks the light of each instance of receivers; None for no blocker
 _EVEN_RAYS = 128  # directions in which receivers that shine look for how much of the hemisphere is open
@@ -90,46 +91,46 @@ class Rays(Method):
         return self._bounces.add_free_bounces(direct, at_patch_samples, light, points, materials)
 
     def emitted_light(self, points: LitPoints, materials: Materials) -> Node:
-        """Direct light of emitters on points, by rays to points of their surfaces."""
-        items = functools.partial(receiver_text, points)
-        return self._light_of_emitters_at(points, points.receivers_node, materials, "light of emitters", items)
+        """Direct light of emitters on points, by rays to their samples."""
+        return self._light_of_emitters_at(points, points.receivers_node, materials, "light of emitters")
 
-    def _light_of_emitters_at(
-        self,
-        points: LitPoints,
-        receivers: Node,
-        materials: Materials,
-        name: str = "",
-        items: Callable[[], str] | str = "",
-    ) -> Node:
-        """The same on other receivers among the same bodies."""
-        unblocked = self.emitters.unblocked_light(points, receivers, materials) if self.shares_directions else None
-        arguments = points.vertices, receivers, materials.of_vertices("emission"), unblocked
-        return Node(name, self._trace_emitters, *arguments, items=items, has_adjoint=False)
+    def _light_of_emitters_at(self, points: LitPoints, receivers: Node, materials: Materials, name: str = "") -> Node:
+        """The same on other receivers among the same bodies. Differentiable: emission."""
+        placed, items = self.emitters.placed(points), functools.partial(receiver_text, points)
+
+        def traced() -> Node:
+            arguments = points.vertices, receivers, placed
+            return Node(name and "rays to emitters", self._trace_emitters, *arguments, items=items, has_adjoint=False)
+
+        transmittance = points.cached(f"rays to emitters {name}", receivers, traced)
+        return self.emitters.traced_light(receivers, placed, self.emitters.radiance(materials), transmittance, name)
 
     def _trace_emitters(
-        self, positions: wp.array, receivers: Receivers, emission: wp.array, unblocked: wp.array | None
-    ) -> wp.array:
-        from warpshadow.stages.emitters.traced import EMITTER_RAYS, trace_emitters
+        self, positions: wp.array, receivers: Receivers, placed_samples: "PlacedSamples"
+    ) -> list[wp.array]:
+        """Transmittance to the samples of each emitter, float32 of shape [batch, receiver, sample]."""
+        from warpshadow.stages.emitters.samples import SAMPLES
+        from warpshadow.stages.emitters.traced import trace_transmittance
 
-        points, normals = _checked_points(receivers.points), receivers.normals
-        if emission.requires_grad:
-            raise ValueError(
-                "emission: got an array that requires a gradient, which rays to emitters do not have; expected none, "
-                "or method = 'directional'"
-            )
-        count = common_batch({"geometry": points, "emission": emission})
-        rays = EMITTER_RAYS if self.shares_directions else self._sample_count
-        light, meshes = wp.empty((count, points.shape[1]), dtype=wp.vec3, device=points.device), {}
-        for instance in range(count if points.size else 0):
-            number, point_number = min(instance, len(positions) - 1), min(instance, len(points) - 1)
-            if number not in meshes:
-                meshes = {number: self.merged_scene.casting_mesh(positions[number])}
-            faces = self.merged_scene.emitting_faces(positions[number], emission[min(instance, len(emission) - 1)])
-            lit = points[point_number], normals[min(point_number, len(normals) - 1)]
-            whole = None if unblocked is None else unblocked[min(instance, len(unblocked) - 1)]
-            wp.copy(light[instance], trace_emitters(faces, meshes[number], *lit, unblocked=whole, rays=rays))
-        return light
+        points, normals, samples = _checked_points(receivers.points), receivers.normals, self.emitters.samples
+        count, result = common_batch({"points": points, "geometry": positions}), []
+        rays = max(1, (self.visibility.ray_count if self.shares_directions else self._sample_count) // (4 * SAMPLES))
+        for body, span in zip(samples.bodies, samples.spans(), strict=True):
+            others = [number for number in self.merged_scene.casting if number != body]
+            traced = wp.empty((count, points.shape[1], span.size), dtype=wp.float32, device=points.device)
+            for instance in range(count if points.size else 0):
+                position_number, point_number = min(instance, len(positions) - 1), min(instance, len(points) - 1)
+                rows = trace_transmittance(
+                    self.merged_scene.casting_mesh(positions[position_number], others),
+                    *(points[point_number], normals[point_number]),
+                    *(placed_samples.points[position_number], placed_samples.areas[position_number]),
+                    span,
+                    rays=rays,
+                    progress=self.progress,
+                )
+                wp.copy(traced[instance], rows)
+            result.append(traced)
+        return result
 
     @functools.cached_property
     def _bounces(self) -> "StaticBounces":

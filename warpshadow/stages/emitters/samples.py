@@ -21,7 +21,7 @@ import warp as wp
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.maths.spatial_sort import z_order
+from warpshadow.maths.spatial_sort import compact_order
 from warpshadow.stages.bounces.patches import find_patches
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
@@ -72,7 +72,7 @@ def find_sample_weights(
         (middles.ravel(), (np.repeat(labels, 3), faces[owners].ravel())), shape=(patch_count, len(positions))
     )
     of_faces = diags(stretch) @ csr_matrix((shares, (labels, owners)), shape=(patch_count, len(faces)))
-    permutation = z_order(of_vertices @ positions.astype(np.float64))
+    permutation = compact_order(of_vertices @ positions.astype(np.float64), runs=(BUNDLE,))
     padding = np.full(-patch_count % BUNDLE, permutation[-1] if patch_count else 0)
     is_real = np.repeat([1.0, 0.0], [patch_count, len(padding)])
     chosen = np.concatenate([permutation, padding]).astype(int)

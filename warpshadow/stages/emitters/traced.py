@@ -1,9 +1,9 @@
-"""Light of emitters by rays, to points drawn from their surfaces: it judges the sums over samples, and stills have it.
+"""Emitters and rays: the transmittance between receivers and samples, and, for paths, light of points of the surfaces.
 
-A point y of a face is drawn in proportion to area and mean radiance, with the density p. Of N of them a receiver gets
+A point y of a face is drawn in proportion to area and mean radiance, with the density p. On average a receiver gets
 
-    E(x) = 1/N Σ L(y) V max(n·ω, 0) max(−m·ω, 0) / (π d² p)                   [Shirley et al. 1996, "Monte Carlo
-                                                                               Techniques for Direct Lighting"]
+    L(y) V max(n·ω, 0) max(−m·ω, 0) / (π d² p)               [Shirley et al. 1996, "Monte Carlo Techniques for Direct
+                                                              Lighting Calculations"]
 
 m the normal of the face; of an open body |m·ω| counts.
 """
@@ -13,16 +13,12 @@ import warp as wp
 
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
+from warpshadow.stages.emitters.samples import EmitterSpan, is_lit, sample_radius
 from warpshadow.stages.interpolation import interpolate_at
 from warpshadow.stages.ray_tracing import RAY_COST, mesh_id, progress_slices, sees_point
 
 _SEED = 43
 _MIN_DISTANCE2 = 1.0e-12
-
-_STEP_U, _STEP_V, _STEP_FACE = wp.uint32(3518319155), wp.uint32(2882110345), wp.uint32(2360945575)
-"""Roberts' R3 sequence, which spreads the points of a receiver, in parts of 2³²."""
-
-EMITTER_RAYS = 64  # rays of a receiver to emitters
 
 
 @wp.struct
@@ -68,10 +64,7 @@ def light_of_point(
     u: float,
     v: float,
 ):
-    """Light of a point of the emitters on a receiver over the point's density, given three numbers even in [0, 1).
-
-    Returns it past the blockers, and as it would be without them.
-    """
+    """Light of a point of the emitters on a receiver over the point's density, given three numbers even in [0, 1)."""
     index = wp.lower_bound(emitters.distribution, share)
     index = wp.min(index, emitters.distribution.shape[0] - 1)
     probability = emitters.distribution[index]
@@ -91,101 +84,92 @@ def light_of_point(
         facing_area = wp.abs(facing_area)
     cosine = wp.dot(ray_direction, normal)
     light = wp.vec3()
-    unblocked_light = wp.vec3()
-    if facing_area > 0.0 and cosine > 0.0 and probability > 0.0:
+    is_facing = facing_area > 0.0 and cosine > 0.0 and probability > 0.0
+    if is_facing and sees_point(mesh, point, normal, ray_direction, distance):
         radiance = interpolate_at(emitters.emission, corners, weights)
-        unblocked_light = cosine * facing_area / (wp.pi * distance2 * probability) * radiance
-        if sees_point(mesh, point, normal, ray_direction, distance):
-            light = unblocked_light
-    return light, unblocked_light
-
-
-@wp.func
-def _quasi_random(shift: wp.uint32, step: wp.uint32, number: int):
-    """A number of a low-discrepancy sequence, from 0 to 1."""
-    return float((shift + step * wp.uint32(number)) >> wp.uint32(8)) / 16777216.0
+        light = cosine * facing_area / (wp.pi * distance2 * probability) * radiance
+    return light
 
 
 @wp.kernel(enable_backward=False)
-def _trace_emitters(
+def _trace_transmittance(
     first_row: int,
     worker: int,
     # in
-    emitters: EmittingFaces,
     mesh: wp.uint64,
     points: wp.array(dtype=wp.vec3),
     normals: wp.array(dtype=wp.vec3),
     first_receiver: int,
+    sample_points: wp.array(dtype=wp.vec3),
+    sample_areas: wp.array(dtype=wp.vec3),
+    first_sample: int,
+    is_two_sided: int,
     ray_count: int,
-    unblocked: wp.array(dtype=wp.vec3),
     # out
-    light: wp.array(dtype=wp.vec3),
+    transmittance: wp.array2d(dtype=wp.float32),
 ):
     """A thread owns a receiver."""
     receiver = first_row + wp.tid()
     state = wp.rand_init(_SEED, first_receiver + receiver)
-    shift_u = wp.randu(state)
-    shift_v = wp.randu(state)
-    shift_face = wp.randu(state)
-    total = wp.vec3()
-    unblocked_total = wp.vec3()
-    for ray in range(ray_count):
-        ray_light, unblocked_light = light_of_point(
-            emitters,
-            mesh,
-            points[receiver],
-            normals[receiver],
-            _quasi_random(shift_face, _STEP_FACE, ray),
-            _quasi_random(shift_u, _STEP_U, ray),
-            _quasi_random(shift_v, _STEP_V, ray),
-        )
-        total += ray_light
-        unblocked_total += unblocked_light
-    if unblocked:
-        for channel in range(3):
-            share = total[channel] / wp.max(unblocked_total[channel], 1.0e-30)
-            light[receiver][channel] = share * unblocked[receiver][channel]
-    else:
-        light[receiver] = total / float(ray_count)
+    point = points[receiver]
+    normal = normals[receiver]
+    for i in range(transmittance.shape[1]):
+        area = sample_areas[first_sample + i]
+        middle = sample_points[first_sample + i]
+        share = float(1.0)
+        if is_lit(middle - point, area, normal, is_two_sided):
+            radius = sample_radius(area)
+            axis = wp.normalize(area)
+            side = wp.normalize(
+                wp.cross(axis, wp.where(wp.abs(axis[0]) < 0.5, wp.vec3(1.0, 0.0, 0.0), wp.vec3(0.0, 1.0, 0.0)))
+            )
+            open_count = int(0)
+            for _ray in range(ray_count):
+                distance_in_disc = radius * wp.sqrt(wp.randf(state))
+                angle = 2.0 * wp.pi * wp.randf(state)
+                across_disc = wp.cos(angle) * side + wp.sin(angle) * wp.cross(axis, side)
+                beam = middle + distance_in_disc * across_disc - point
+                distance = wp.length(beam)
+                if sees_point(mesh, point, normal, beam / distance, distance):
+                    open_count += 1
+            share = float(open_count) / float(ray_count)
+        transmittance[receiver, i] = share
 
 
-def trace_emitters(
-    emitters: EmittingFaces,
+def trace_transmittance(
     mesh: wp.Mesh | None,
     points: wp.array,
     normals: wp.array,
+    sample_points: wp.array,
+    sample_areas: wp.array,
+    span: EmitterSpan,
     *,
-    rays: int = EMITTER_RAYS,
-    unblocked: wp.array | None = None,
+    rays: int,
     progress: bool = False,
 ) -> wp.array:
-    """Trace the direct light of emitters on receivers, as white surfaces reflect it.
+    """Trace the transmittance between receivers and the samples of an emitter, by rays to points of their discs.
 
     Args:
-        emitters: Their faces.
-        mesh: The blockers, emitters among them; None for none.
+        mesh: The blockers, without the emitter; None for none.
         points: Receivers [scene units], vec3 of shape [receiver].
         normals: Their unit normals, vec3 of shape [receiver].
-        rays: Of each receiver.
-        unblocked: The light without blockers, from :func:`.light.sum_light`, vec3 of shape [receiver]: rays then find
-            but the share of it that is left, without grain where nothing blocks. None for the light by rays alone.
+        sample_points, sample_areas: Of :class:`.samples.PlacedSamples`, of one instance.
+        span: Samples of the emitter.
+        rays: To each sample.
     Returns:
-        vec3 of shape [receiver].
+        Float32 of shape [receiver, sample]; 1 where a sample sends nothing.
     Differentiable: no.
     """
-    light = empty(points.shape, dtype=wp.vec3, device=points.device)
-    if not emitters.distribution.size:
-        light.zero_()
-        return light
-    for receivers in progress_slices(points.shape[0], 2**20 // rays, progress):
+    transmittance = empty((len(points), span.size), dtype=wp.float32, device=points.device)
+    for receivers in progress_slices(len(points), 2**20 // (rays * span.size), progress):
         launch(
-            _trace_emitters,
+            _trace_transmittance,
             receivers.stop - receivers.start,
             inputs=[
-                *(emitters, mesh_id(mesh), points[receivers], normals[receivers], receivers.start, rays),
-                None if unblocked is None else unblocked[receivers],
+                *(mesh_id(mesh), points[receivers], normals[receivers], receivers.start),
+                *(sample_points, sample_areas, span.first, int(span.is_two_sided), rays),
             ],
-            outputs=[light[receivers]],
-            cost=RAY_COST * rays,
+            outputs=[transmittance[receivers]],
+            cost=RAY_COST * rays * span.size,
         )
-    return light
+    return transmittance

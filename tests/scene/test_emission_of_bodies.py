@@ -1,0 +1,81 @@
+"""Emission of bodies: its checks, scene files that have it, and glTF files."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+
+import warpshadow as ws
+from warpshadow.scene.files import write_scene
+
+BALL = ws.icosphere(0.5, 1)
+SKY = ws.EnvironmentMap.constant(1.0)
+
+
+@pytest.mark.parametrize(
+    ("emission", "message"),
+    [
+        ((1, 2), r"emission: got shape \(2,\), expected \[3\] or \[42, 3\]"),
+        ((1, -2, 0), "emission: got 1 values out of range"),
+        ((np.nan, 1, 1), "emission: got 1 NaN"),
+        ("bright", "emission: got 'bright', expected a linear color of 0 or more"),
+    ],
+)
+def test_values_that_no_lamp_has_are_refused(emission, message):
+    with pytest.raises(ValueError, match=message):
+        ws.Body(BALL, emission=emission)
+
+
+def test_a_catcher_does_not_emit():
+    with pytest.raises(ValueError, match="emission: got some for a shadow catcher"):
+        ws.Body(BALL, emission=(1, 1, 1), shadow_catcher=True)
+
+
+def test_scene_files_read_back_the_same_emission(tmp_path):
+    colors = np.random.default_rng(0).uniform(size=(42, 3)).astype(np.float32)
+    emissions = [None, np.float32([40, 0.1, 7]), colors]
+    bodies = [ws.Body(BALL, emission=emission, name=str(number)) for number, emission in enumerate(emissions)]
+    write_scene(ws.Scene(bodies, SKY), tmp_path)
+    for body, emission in zip(ws.load_scene(tmp_path / "scene.toml").bodies, emissions, strict=True):
+        assert body.emission is None if emission is None else np.array_equal(body.emission, emission)
+
+
+def test_emission_of_vertices_follows_creases():
+    box = ws.Mesh.of(trimesh.creation.box()) if hasattr(ws.Mesh, "of") else ws.load_mesh(trimesh.creation.box())
+    body = ws.Body(box, emission=np.arange(3 * box.vertex_count).reshape(-1, 3)).creased()
+    np.testing.assert_array_equal(body.emission[:, 0] / 3, body.mesh.origins)
+
+
+def write(path, *factors):
+    scene = trimesh.Scene()
+    for number, factor in enumerate(factors):
+        ball = trimesh.creation.icosphere(subdivisions=1)
+        material = trimesh.visual.material.PBRMaterial(emissiveFactor=factor)
+        ball.visual = trimesh.visual.TextureVisuals(uv=np.zeros((42, 2)), material=material)
+        scene.add_geometry(ball, transform=trimesh.transformations.translation_matrix((3 * number, 0, 0)))
+    scene.export(path)
+    return path
+
+
+def test_a_body_has_the_emission_of_its_file(tmp_path):
+    path = write(tmp_path / "a.glb", (0.5, 0.25, 0.125))
+    np.testing.assert_array_equal(ws.Body(path).emission, np.float32([0.5, 0.25, 0.125]))
+    assert ws.Body(path, albedo=(1, 1, 1)).emission is None
+    assert ws.Body(path, shadow_catcher=True).emission is None
+    np.testing.assert_array_equal(ws.Body(path, emission=(9, 9, 9)).emission, (9, 9, 9))
+    assert ws.Body(write(tmp_path / "b.glb", None)).emission is None
+
+
+def test_parts_that_emit_do_so_at_their_vertices(tmp_path):
+    body = ws.Body(write(tmp_path / "a.glb", (0.5, 0.25, 0.125), None))
+    is_first = body.mesh.positions[:, :1] < 1.5
+    np.testing.assert_array_equal(body.emission, np.where(is_first, np.float32([0.5, 0.25, 0.125]), 0))
+
+
+def test_the_strength_of_an_emissive_material_counts(tmp_path):
+    path = write(tmp_path / "a.gltf", (0.5, 0.25, 0.125))
+    tree = json.loads(path.read_text())
+    tree["materials"][0]["extensions"] = {"KHR_materials_emissive_strength": {"emissiveStrength": 20.0}}
+    path.write_text(json.dumps(tree))
+    np.testing.assert_allclose(ws.Body(path).emission, (10, 5, 2.5))

@@ -1,0 +1,216 @@
+"""Bodies that emit, as a whole: images by kept renderers, stills and paths, and gradients of images."""
+
+import dataclasses
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+import warpshadow as ws
+from warpshadow import inverse
+from warpshadow.torch import TorchRenderer, rotation_matrices
+
+# Relative L2 of gradients against differences of images, where nothing moves at a silhouette. Measured 1e-4 to 2e-3.
+SMOOTH = 5e-3
+# Relative L2 of images in the dark, kept against stills, whose 64 rays a pixel have grain at edges. Measured 3 to 4%.
+KEPT = 0.06
+# Mean of bounced light of stills against paths, which draw points of the lamp's surface. Measured 0.1%.
+BOUNCED = 0.02
+# The same of kept renderers. Measured 5.5 and 6%; 3.3 and 3.9% of the light of the sky, which is wider.
+KEPT_BOUNCED = 0.08
+
+DARK = ws.EnvironmentMap.constant(0.0)
+SKY = ws.synthetic_sky((-0.7, 0.5, 0.2), sun_radius=12, sun_strength=3, height=32)
+SMALL = ws.icosphere(0.3, 2)
+BALL = ws.Body(ws.icosphere(0.5, 3), albedo=(0.8, 0.5, 0.3), translation=(0.4, 0.5, 0), name="ball")
+GROUND = ws.Body(ws.plane(6.0, 8), albedo=(0.3, 0.5, 0.6), name="ground")
+ONE = ws.Spheres([(0, 0, 0)], [0.29])
+LAMP = ws.Body(SMALL, (0, 0, 0), blockers=ONE, translation=(-2.3, 2.2, 0.9), emission=(6, 5, 4), name="lamp")
+POST = ws.Body(SMALL, blockers=ONE, translation=(-1.3, 1.6, 0.8), name="post")
+WALL = ws.Body(ws.plane(1.2, 2), rotation=(0, 0, 90), translation=(-1.5, 1.3, 0.4), name="wall")
+
+ABOVE = ws.Camera.look_at((0.5, 4.6, 3.6), (-0.2, 0.3, 0.3), fov_y=20, size=(32, 32))
+"""Sees ground and ball, and neither the lamp nor what blocks it."""
+
+
+def scene_of(*bodies, light=SKY, camera=ABOVE, **options):
+    return ws.Scene(bodies or (LAMP, BALL, GROUND), light, camera, supersampling=1, **options)
+
+
+def image_of(*bodies, **options):
+    return ws.Renderer(scene_of(*bodies, **options)).render()[..., :3]
+
+
+def unlike(image, other):
+    return np.linalg.norm(image - other) / np.linalg.norm(other)
+
+
+def without_emission(*bodies):
+    return [dataclasses.replace(body, emission=None) for body in bodies]
+
+
+def test_a_scene_without_emission_imports_and_computes_nothing_of_it():
+    code = (
+        "import sys, warpshadow as ws; renderer = ws.Renderer(ws.Scene([ws.Body(ws.plane(1.0))], "
+        "ws.EnvironmentMap.constant(), visibility=ws.Visibility('directional'))); renderer.render(); "
+        "assert not [name for name in sys.modules if 'emitters' in name]; assert 'emit' not in str(renderer.explain())"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+def test_an_emitter_shows_its_radiance():
+    near = ws.Camera.look_at((-2.3, 2.2, 3.2), (-2.3, 2.2, 0.9), fov_y=10, size=(16, 16))
+    for method in ("directional", "none", "ray-traced"):
+        image = image_of(camera=near, light=DARK, visibility=ws.Visibility(method))
+        np.testing.assert_allclose(image, np.broadcast_to((6, 5, 4), image.shape), rtol=1e-6)
+    gray = dataclasses.replace(LAMP, albedo=(0.5, 0.5, 0.5))
+    lit, unlit = (image_of(*bodies, camera=near) for bodies in ([gray], without_emission(gray)))
+    np.testing.assert_allclose(lit - unlit, np.broadcast_to((6, 5, 4), lit.shape), rtol=1e-5)
+
+
+def test_kept_renderers_and_stills_agree_in_the_light_of_a_lamp():
+    kept = image_of(light=DARK, visibility=ws.Visibility("directional"))
+    still = image_of(light=DARK, visibility=ws.Visibility("ray-traced", sampling="shared"))
+    assert unlike(kept, still) < KEPT and still.mean() > 0.01
+    assert kept.mean() == pytest.approx(still.mean(), rel=0.01)
+
+
+def test_a_body_between_blocks_and_a_body_behind_does_not():
+    open_ground = image_of(LAMP, GROUND, light=DARK)
+    for blocker in (POST, WALL):
+        behind = dataclasses.replace(blocker, translation=(-3.2, 2.8, 1.2), receivers="vertex")
+        blocked, free = (image_of(LAMP, GROUND, body, light=DARK) for body in (blocker, behind))
+        np.testing.assert_allclose(free, open_ground, atol=1e-5)
+        assert (blocked < 0.1 * open_ground).mean() > 0.01 and blocked.mean() < 0.99 * open_ground.mean()
+
+
+@pytest.mark.parametrize("bounces", [0, 2, "all"])
+def test_light_of_emitters_adds_to_that_of_the_map_and_is_linear_in_emission(bounces):
+    twice = dataclasses.replace(LAMP, emission=(12, 10, 8))
+    options = {"bounces": bounces, "visibility": ws.Visibility("directional")}
+    dark, sky = image_of(light=DARK, **options), image_of(*without_emission(LAMP, BALL, GROUND), **options)
+    np.testing.assert_allclose(image_of(twice, BALL, GROUND, light=DARK, **options), 2 * dark, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(image_of(**options), sky + dark, rtol=0.05, atol=5e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bounces", [1, "all"])
+def test_light_of_emitters_bounces_as_along_paths(bounces):
+    walls = [GROUND, dataclasses.replace(GROUND, rotation=(90, 0, 0), translation=(0, 0, -1), name="back")]
+    bodies = LAMP, BALL, *walls
+    kinds = {"kept": {"method": "directional"}, "still": {"method": "ray-traced", "sampling": "shared"}}
+    kinds["paths"] = {"method": "ray-traced", "samples": 1024}
+    bounced = {}
+    for name, settings in kinds.items():
+        options = {"light": DARK, "visibility": ws.Visibility(**settings)}
+        bounced[name] = (image_of(*bodies, bounces=bounces, **options) - image_of(*bodies, **options)).mean()
+    assert bounced["kept"] == pytest.approx(bounced["paths"], rel=KEPT_BOUNCED)
+    assert bounced["still"] == pytest.approx(bounced["paths"], rel=BOUNCED)
+
+
+def weights():
+    row, column = np.mgrid[0:1:32j, 0:1:32j]
+    return torch.tensor(np.stack([np.sin(3 * row + 2 * column), np.cos(2 * row), 1 + column, 0 * row], -1)).float()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bounces", [0, 1])
+@pytest.mark.parametrize("blocker", [POST, WALL], ids=["post", "wall"])
+def test_gradients_of_images_agree_with_differences(blocker, bounces):
+    """To the poses of the lamp and of what blocks it, to its radiance and to the albedo of the ground."""
+    renderer = TorchRenderer(scene_of(LAMP, blocker, GROUND, bounces=bounces), progress=False)
+    rotations, translations, scales = renderer.scene_poses()
+
+    def loss(lamp, between, turn, emission, albedo):
+        turned = torch.stack([rotations[0], rotation_matrices(turn) @ rotations[1], rotations[2]])
+        placed = renderer.placed(turned, translations + torch.stack([lamp, between, 0 * lamp]), scales)
+        image = renderer(geometry=placed, emission={"lamp": emission}, albedo={"ground": albedo})
+        return (image * weights()).sum()
+
+    zero = torch.zeros(3)
+    values = {"lamp": zero, "between": zero, "turn": zero}
+    values |= {"emission": torch.tensor([6.0, 5.0, 4.0]), "albedo": torch.tensor([0.3, 0.5, 0.6])}
+    for name, step in {"lamp": 3e-3, "between": 3e-3, "turn": 3e-3, "emission": 0.5, "albedo": 0.05}.items():
+        if name == "turn" and blocker is POST:
+            continue
+        value = values[name].clone().requires_grad_()
+        loss(**values | {name: value}).backward()
+        with torch.no_grad():
+            sides = [[loss(**values | {name: values[name] + s * step * e}) for s in (1, -1)] for e in torch.eye(3)]
+        differences = torch.tensor([float(up - down) / (2 * step) for up, down in sides])
+        assert (value.grad - differences).norm() < SMOOTH * differences.norm(), name
+
+
+def test_emission_takes_a_batch_and_vertices_and_rays_have_its_gradient():
+    for visibility in (ws.Visibility("directional"), ws.Visibility("ray-traced", samples=64)):
+        renderer = TorchRenderer(scene_of(visibility=visibility), progress=False)
+        colors = torch.tensor([[[6.0, 5.0, 4.0]], [[0.0, 1.0, 0.0]]], requires_grad=True)
+        images = renderer(emission={"lamp": colors})
+        assert images.shape == (2, 32, 32, 4)
+        torch.testing.assert_close(images[0].detach(), renderer().detach(), atol=1e-6, rtol=1e-5)
+        images.sum().backward()
+        with torch.no_grad():
+            brighter = renderer(emission={"lamp": torch.tensor([7.0, 5.0, 4.0])})
+        change = (brighter - images[0]).sum().item()
+        assert colors.grad[0, 0, 0].item() == pytest.approx(change, rel=1e-3)
+        count = LAMP.mesh.vertex_count
+        of_vertices = renderer(emission={"lamp": torch.tensor([[6.0, 5.0, 4.0]]).expand(count, 3)})
+        torch.testing.assert_close(of_vertices, images[0].detach(), atol=1e-5, rtol=1e-4)
+
+
+def test_one_side_of_a_body_that_emits_lights_that_side():
+    halves = np.where(SMALL.positions[:, :1] > 0, (9.0, 9.0, 9.0), (0.0, 0.0, 0.0))
+    lamp = dataclasses.replace(LAMP, emission=halves, translation=(0, 1.0, 0.3))
+    image = image_of(lamp, GROUND, light=DARK)
+    assert image[:, 20:].mean() > 4 * image[:, :8].mean()
+
+
+def test_emission_of_bodies_without_it_is_refused():
+    renderer = TorchRenderer(scene_of(), progress=False)
+    with pytest.raises(ValueError, match=r"emission\[1\]: got some for 'ball', expected one for bodies that have"):
+        renderer(emission={"ball": torch.ones(3)})
+    with pytest.raises(ValueError, match="emission: got some for body 'lamp', whose light 'log-sh' lacks"):
+        scene_of(visibility=ws.Visibility("log-sh"))
+
+
+def test_a_lamp_lights_a_photograph():
+    caught = dataclasses.replace(GROUND, shadow_catcher=True)
+    renderer = TorchRenderer(scene_of(LAMP, BALL, caught), progress=False)
+    bare = TorchRenderer(scene_of(*without_emission(LAMP), BALL, caught), progress=False)
+    photograph = torch.full((32, 32, 3), 0.5)
+    lit, unlit = renderer.insert(photograph), bare.insert(photograph)
+    assert (lit - unlit).mean() > 0.005 and (lit > unlit - 0.01).all()
+
+
+def test_explanations_tell_of_emitters():
+    renderer = ws.Renderer(scene_of())
+    renderer.render()
+    text = str(renderer.explain())
+    assert "light of emitters" in text and "64 samples" not in text
+    assert "64 samples" in str(ws.Renderer(scene_of()).explain())
+
+
+def test_the_shadow_of_a_scene_is_that_of_its_map():
+    np.testing.assert_allclose(
+        ws.Renderer(scene_of()).shadow(),
+        ws.Renderer(
+            scene_of(*without_emission(LAMP), *(BALL, dataclasses.replace(GROUND, receivers="pixel")))
+        ).shadow(),
+        atol=0.02,
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("free", ["emission", "emission and light", "emission and pose"])
+def test_a_fit_finds_emission(free):
+    dim = dataclasses.replace(LAMP, emission=(2, 2, 2))
+    scene, start = (scene_of(lamp, BALL, GROUND, light=ws.EnvironmentMap.constant(0.01)) for lamp in (LAMP, dim))
+    target = ws.Renderer(scene).render()
+    parameters = [inverse.Emission("lamp")]
+    parameters += {"emission and light": [inverse.Light(2)], "emission and pose": [inverse.Pose("ball")]}.get(free, [])
+    still = None if free == "emission and pose" else ws.Visibility("directional")
+    problem = inverse.Problem(start, inverse.Target(target), parameters, still=still)
+    result = inverse.fit(problem, [inverse.Stage(40)], progress=False)
+    np.testing.assert_allclose(result.scene.bodies[0].emission, (6, 5, 4), rtol=0.05)
