@@ -119,7 +119,7 @@ class Request:
             digest.update(f"{body.mesh.content_hash} {body.casts_shadow} {body.scale}".encode())
             texture = np.zeros(0) if body.texture is None else body.texture
             arrays += [body.albedo, texture, body.rotation, body.translation]
-            arrays += [value for name in GLOSS_ARGUMENTS if (value := getattr(body, name)) is not None]
+            arrays += [value for name in (*GLOSS_ARGUMENTS, "emission") if (value := getattr(body, name)) is not None]
         for array in arrays:
             digest.update(f"{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
         digest.update(f"{camera.width} {camera.height} {camera.near} {_ACROSS}".encode())

@@ -179,7 +179,7 @@ class RayTracer:
         self.scene = mi.load_dict(
             {
                 "type": "scene",
-                "integrator": {**integrator, "hide_emitters": True},
+                "integrator": {**integrator, "hide_emitters": not any(body.is_emitter for body in scene.bodies)},
                 "sensor": _sensor(scene.camera),
                 "light": {"type": "envmap", "bitmap": mi.Bitmap(map_nodes(scene.light))},
                 **bodies,
@@ -230,6 +230,9 @@ def _mesh(body: ws.Body, number: int, gloss: str) -> Any:
     has_texture = any(np.ndim(getattr(body, name)) > 1 for name in GLOSS_ARGUMENTS) or body.texture is not None
     side = surface(body, gloss) if body.is_glossy else {"type": "diffuse", "reflectance": _reflectance(body)}
     properties["bsdf"] = mi.load_dict({"type": "twosided", "side": side})
+    if body.emission is not None:
+        radiance = {"type": "rgb", "value": body.emission.tolist()}
+        properties["emitter"] = mi.load_dict({"type": "area", "radiance": radiance})
     if has_texture:
         positions, normals = positions[faces.ravel()], normals[faces.ravel()]
         faces = np.arange(len(positions)).reshape(-1, 3)
