@@ -592,6 +592,29 @@ def share_of_sphere(center, radius, beam, disc_radius, softness=0.05):
     return opacity * smoothstep((high - height) / (high - low)) * around
 
 
+def share_of_box(size, point, beam, disc_radius):
+    """The share of the beam of a disc that a box around the origin takes."""
+    half = np.array(size) / 2
+    seen = [(axis, sign) for axis in range(3) for sign in (-1, 1) if sign * point[axis] > half[axis]]
+    if not seen:
+        return 0.0
+    depth = min(half[axis] - sign * (point + beam)[axis] for axis, sign in seen)
+    direction, sines = beam / np.linalg.norm(beam), []
+    for axis in range(3):
+        first, second = (other for other in range(3) if other != axis)
+        for signs in np.ndindex(2, 2):
+            sides = (first, 2 * signs[0] - 1), (second, 2 * signs[1] - 1)
+            if (sides[0] in seen) != (sides[1] in seen):  # the edge between them is on the silhouette
+                ends = np.zeros((2, 3))
+                for other, sign in sides:
+                    ends[:, other] = sign * half[other]
+                ends[:, axis] = half[axis], -half[axis]
+                normal = unit(np.cross(ends[0] - point, ends[1] - point))
+                sines.append(np.sign(-normal @ point) * normal @ direction)
+    width = disc_radius / np.linalg.norm(beam)
+    return smoothstep((min(sines) / width + 1) / 2) * smoothstep((depth / disc_radius + 1) / 2)
+
+
 def share_of_rectangle(size, point, beam, disc_radius):
     """The share of the beam of a disc that a rectangle takes, in the plane y = 0 around the origin."""
     position = -point[1] / beam[1]

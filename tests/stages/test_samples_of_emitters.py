@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+import trimesh
 import twins
 import warp as wp
 
 import warpshadow as ws
 from warpshadow.device.tape import recorded
-from warpshadow.stages.emitters import light, planes, spheres, traced
+from warpshadow.stages.convex.prepared import ConvexBlockers, ConvexBody
+from warpshadow.stages.emitters import convex, light, planes, spheres, traced
 from warpshadow.stages.emitters.samples import (
     BUNDLE,
     EmitterSamples,
@@ -185,6 +187,37 @@ def test_planes_block_as_the_twin_does(device):
     assert not none.numpy().any()
 
 
+def box(size, device):
+    mesh = ws.load_mesh(trimesh.creation.box(size))
+    blockers = ConvexBlockers.from_bodies([ConvexBody(mesh.convex_parts, 0)], mesh.vertex_count, device=device)
+    return blockers, mesh.positions
+
+
+def test_convex_parts_block_as_the_twin_does(device):
+    size = (0.8, 0.3, 0.6)
+    blockers, vertices = box(size, device)
+    rng = np.random.default_rng(6)
+    points = rng.uniform(-1, 1, size=(60, 3)) * (1.5, 0.2, 1.2) - (0, 1, 0)
+    normals = np.tile([[0, 1.0, 0]], (60, 1))
+    arrays = [wp.array(item[None], dtype=wp.vec3, device=device) for item in (points, normals)]
+    samples = samples_of(BALL, device)
+    own = placed(samples, BALL.positions + np.float32([0.2, 1.3, 0.1]), device)
+    parts = blockers.placed(wp.array(vertices[None], dtype=wp.vec3, device=device))
+    span = next(samples.spans())
+    got = numbers(convex.find_log_transmittance_of_parts(*arrays, own, span, parts, blockers, (-1, -1)))
+    sample_points, areas = numbers(own.points), numbers(own.areas)
+    expected = np.zeros(got.shape)
+    for receiver, sample in np.ndindex(*got.shape):
+        beam, area = sample_points[sample] - points[receiver], areas[sample]
+        if beam @ normals[receiver] > 0 and beam @ area < 0:
+            share = twins.share_of_box(size, points[receiver], beam, np.sqrt(np.linalg.norm(area) / np.pi))
+            expected[receiver, sample] = np.log(max(1 - share, 1e-4))
+    assert (expected < -0.5).sum() > 100 and (expected == 0).sum() > 200
+    np.testing.assert_allclose(np.exp(got), np.exp(expected), atol=100 * FLOAT32)
+    none = convex.find_log_transmittance_of_parts(*arrays, own, span, parts, blockers, (-1, 0))
+    assert not none.numpy().any()
+
+
 def test_rays_meet_what_is_between_and_not_what_is_behind(device):
     mesh = ws.plane(3.0, 2)
     at = np.array([[0, -2.0, 0]]), np.array([[0, 1.0, 0]])
@@ -201,7 +234,7 @@ def test_rays_meet_what_is_between_and_not_what_is_behind(device):
         assert far.numpy()[0, 0, 0] == (height < -2)
 
 
-@pytest.mark.parametrize("between", ["nothing", "spheres", "planes"])
+@pytest.mark.parametrize("between", ["nothing", "spheres", "planes", "parts"])
 def test_gradients_of_light_agree_with_differences(between, device):
     """To receivers, the emitter's vertices and radiance, and to the blockers."""
     rng = np.random.default_rng(5)
@@ -211,7 +244,13 @@ def test_gradients_of_light_agree_with_differences(between, device):
     points = rng.uniform(-1, 1, size=(1, 30, 3)) * (1.0, 0.2, 0.8) - (0, 1.5, 0)
     normals = twins.unit(np.array([0, 1.0, 0]) + 0.2 * rng.normal(size=points.shape))
     inputs = [points, normals, BALL.positions[None] + np.float32([0.2, 1.5, 0.1]), rng.uniform(size=(1, 64, 3))]
-    inputs += {"nothing": [], "spheres": [rng.normal(size=(1, 6, 3)) * 0.5], "planes": [frames.numpy()]}[between]
+    box_blockers, box_vertices = box((0.8, 0.3, 0.6), device)
+    inputs += {
+        "nothing": [],
+        "parts": [box_vertices[None]],
+        "spheres": [rng.normal(size=(1, 6, 3)) * 0.5],
+        "planes": [frames.numpy()],
+    }[between]
     radii = wp.array(rng.uniform(0.2, 0.5, size=(1, 6)), dtype=wp.float32, device=device)
 
     def light_of(arrays):
@@ -223,6 +262,10 @@ def test_gradients_of_light_agree_with_differences(between, device):
         if between == "planes":
             found = planes.find_log_transmittance_of_planes(*seen, arrays[4], blockers, (-1, -1))
             logs = {"log_of_planes": found}
+        if between == "parts":
+            parts = box_blockers.placed(arrays[4])
+            found = convex.find_log_transmittance_of_parts(*seen, parts, box_blockers, (-1, -1))
+            logs = {"log_of_parts": found}
         return light.sum_light(*arrays[:2], own, arrays[3], span, **logs)
 
     arrays = [wp.array(item, dtype=wp.vec3, device=device, requires_grad=True) for item in inputs]
@@ -236,7 +279,8 @@ def test_gradients_of_light_agree_with_differences(between, device):
         return (weights * made.numpy()).sum()
 
     for number, (array, values) in enumerate(zip(arrays, inputs, strict=True)):
-        shift = STEP * rng.normal(size=values.shape)
+        is_box = between == "parts" and number == 4  # whose sides stay flat
+        shift = STEP * np.broadcast_to(rng.normal(size=(1, 1, 3) if is_box else values.shape), values.shape)
         sides = [[*inputs[:number], values + sign * shift, *inputs[number + 1 :]] for sign in (1, -1)]
         difference, gradient = (loss(sides[0]) - loss(sides[1])) / 2, array.grad.numpy()
         scale = STEP * float(np.linalg.norm(gradient))

@@ -22,6 +22,7 @@ from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.self_visibility import SelfVisibilityLookup
 from warpshadow.pipeline.transfers import joined
 from warpshadow.stages.bounces.total import total_light
+from warpshadow.stages.emitters.convex import find_log_transmittance_of_parts
 from warpshadow.stages.emitters.light import directions_to_samples, sum_light
 from warpshadow.stages.emitters.planes import find_log_transmittance_of_planes
 from warpshadow.stages.emitters.samples import (
@@ -130,7 +131,7 @@ def _light_of(
     if not points.size:
         return total
     cells = _self_transmittance(group)
-    sphere_bodies = [number for number in blockers.bodies if number not in blockers.blocker_kinds.planes]
+    sphere_bodies = blockers.sphere_blockers(blockers.bodies)
     spheres = merged_scene.spheres_of(sphere_bodies, blockers.spheres)
     traced_body = group.body if group.body in blockers.blocker_kinds.traced else None
     own_spheres = merged_scene.spheres_among(sphere_bodies, traced_body)
@@ -146,6 +147,7 @@ def _light_of(
             *(points, normals, placed_samples, radiance, span),
             log_of_spheres=find_log_transmittance(points, normals, placed_samples, span, *spheres, skipped),
             log_of_planes=_log_of_planes(group, blockers, placed_samples, span, body),
+            log_of_parts=_log_of_parts(group, blockers, placed_samples, span, body),
             transmittance=transmittance_self,
         )
         total = total_light([total, light])
@@ -172,4 +174,17 @@ def _log_of_planes(
     skipped = -1 if planes.skip is None else planes.skip, numbers.index(body) if body in numbers else -1
     return find_log_transmittance_of_planes(
         points, group.normals, placed_samples, span, planes.frames, planes.planes, skipped
+    )
+
+
+def _log_of_parts(
+    group: Group, blockers: Blockers, placed_samples: PlacedSamples, span: EmitterSpan, body: int
+) -> wp.array | None:
+    """Logarithm of the transmittance of convex parts between a group and an emitter; None without any."""
+    parts, numbers = group.convex_parts_around, blockers.blocker_kinds.convex
+    if parts is None:
+        return None
+    skipped = -1 if parts.skip is None else parts.skip, numbers.index(body) if body in numbers else -1
+    return find_log_transmittance_of_parts(
+        group.points, group.normals, placed_samples, span, parts.placed, parts.blockers, skipped
     )

@@ -64,6 +64,7 @@ def _sum_light(
     is_two_sided: int,
     log_of_spheres: wp.array3d(dtype=wp.float32),
     log_of_planes: wp.array3d(dtype=wp.float32),
+    log_of_parts: wp.array3d(dtype=wp.float32),
     transmittance: wp.array3d(dtype=wp.float32),
     # out
     light: wp.array2d(dtype=wp.vec3),
@@ -85,6 +86,8 @@ def _sum_light(
                 exponent += log_of_spheres[batch, receiver, i]
             if log_of_planes:
                 exponent += log_of_planes[batch, receiver, i]
+            if log_of_parts:
+                exponent += log_of_parts[batch, receiver, i]
             factor = wp.dot(beam, normal) * facing_area * wp.exp(exponent)
             if transmittance:
                 factor = factor * transmittance[batch, receiver, i]
@@ -103,6 +106,7 @@ def sum_light(
     *,
     log_of_spheres: wp.array | None = None,
     log_of_planes: wp.array | None = None,
+    log_of_parts: wp.array | None = None,
     transmittance: wp.array | None = None,
 ) -> wp.array:
     """Light of an emitter on receivers.
@@ -113,7 +117,8 @@ def sum_light(
         samples: Of all emitters.
         radiance: Of the samples, linear RGB, vec3 of shape [batch, sample].
         span: Those of the emitter.
-        log_of_spheres, log_of_planes: Logarithms of transmittance, float32 of shape [batch, receiver, sample].
+        log_of_spheres, log_of_planes, log_of_parts: Logarithms of transmittance, float32 of shape [batch, receiver,
+            sample].
         transmittance: A factor beside them, such as that of the receivers' own body, float32 of the same shape.
             Any batch may be 1; None where nothing blocks.
     Returns:
@@ -121,7 +126,8 @@ def sum_light(
     Differentiable: points, normals, samples, radiance and all transmittance.
     """
     arrays = {"points": points, "normals": normals, "emitters": samples.points, "emission": radiance}
-    rows = {"spheres": log_of_spheres, "planes": log_of_planes, "others": transmittance}
+    rows = {"spheres": log_of_spheres, "planes": log_of_planes, "parts": log_of_parts}
+    rows["others"] = transmittance
     count = common_batch(arrays | rows)
     points, normals = expand(points, count), expand(normals, count)
     transmittances = [None if item is None else expand_rows(item, count) for item in rows.values()]

@@ -55,7 +55,7 @@ def _blocked_share(offset: wp.vec3, beam: wp.vec3, disc_radius: float, radius: f
 
 
 @wp.func
-def _reaches(offset: wp.vec3, radius: float, axis: wp.vec3, ball_radius: float):
+def reaches_ball(offset: wp.vec3, radius: float, axis: wp.vec3, ball_radius: float):
     """Whether a sphere may touch the cone from a receiver to a ball, given c − x and the middle of the ball − x."""
     distance = wp.length(axis)
     sine = wp.min(ball_radius / wp.max(distance, 1.0e-20), 1.0)
@@ -101,12 +101,12 @@ def _block(
             )
             radius = radii[sphere_batch, sphere]
             offset = centers[sphere_batch, sphere] - point
-            if not is_skipped and radius > 0.0 and _reaches(offset, radius, ball_axis, ball[3]):
+            if not is_skipped and radius > 0.0 and reaches_ball(offset, radius, ball_axis, ball[3]):
                 for bundle in range(log_transmittances.shape[2] // BUNDLE):
                     first = first_sample + bundle * BUNDLE
                     bundle_ball = bundles[sample_batch, first // BUNDLE]
                     bundle_axis = wp.vec3(bundle_ball[0], bundle_ball[1], bundle_ball[2]) - point
-                    if _reaches(offset, radius, bundle_axis, bundle_ball[3]):
+                    if reaches_ball(offset, radius, bundle_axis, bundle_ball[3]):
                         for i in range(BUNDLE):
                             area = sample_areas[sample_batch, first + i]
                             beam = sample_points[sample_batch, first + i] - point
