@@ -124,7 +124,7 @@ class PortionedDirectLight(Node):
 
 def _openness(senders: Senders, visibility: list[PortionVisibility]) -> Openness:
     """How open patch samples and patches are."""
-    portions = [find_openness(portion.group.normals, *portion.cells) for portion in visibility]
+    portions = [find_openness(portion.group.normals, *portion.cells[:3]) for portion in visibility]
     return open_shares(joined(portions), senders.mean, senders.patch_of_sample)
 
 

@@ -54,6 +54,7 @@ class CellTransmittance(NamedTuple):
     transmittance_self: wp.array | None  # [batch, receiver, cell], past its own body; None where that is 1
     transmittance_spheres: wp.array  # [batch, receiver, cell], past all bodies but planes, its own included
     directions: np.ndarray  # [cell, 3]
+    part_coverages: wp.array | None = None  # coverage by convex parts, vec4 of shape [batch, receiver, cell]
 
 
 def find_cell_transmittance(
@@ -89,7 +90,8 @@ def find_cell_transmittance(
         transmittance_spheres = wp.full(
             (*group.points.shape, len(directions)), 1.0, wp.float32, device=group.points.device
         )
-    return CellTransmittance(transmittance_self, transmittance_spheres, directions)
+    parts = None if visibility.part_coverages is None else visibility.part_coverages.cells
+    return CellTransmittance(transmittance_self, transmittance_spheres, directions, parts)
 
 
 def _transmittance(
@@ -380,7 +382,7 @@ class Gathering:
         # ball on a ground lost 4% of the ground's light by the former.
         middles = fibonacci(len(cells.directions))
         arguments = points, group.normals, cells.transmittance_spheres, outgoing.frames, outgoing.texels, planes.all
-        return plane_light(*arguments, middles, fronts=fronts, skip=skip)
+        return plane_light(*arguments, middles, coverages=cells.part_coverages, fronts=fronts, skip=skip)
 
     def _from_spheres(self, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
         if not any(body != group.body and not self._is_flat[body] for body in outgoing.senders.bodies):

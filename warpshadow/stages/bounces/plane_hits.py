@@ -12,17 +12,19 @@ open, and block with a moment,
 
     o_k = 1 − Σ_j S_kj h_j,  m_k = Σ_j S_kj μ_j
 
-So of a side the share h_k o_k is seen, and its centroid is that of what others leave open,
+So of a side the share h_k o_k is seen, and its centroid is that of what blockers leave open,
 
-    z_k = −m_k / √(o_k² + |m_k|²)
+    z_k = −m / √(o² + |m|²),  o = o_k (1 − h₀),  m = m_k + μ₀
 
-away from where it is without them; the root holds it in the cell. Its radiosity is looked up along ω + ρ z_k, over a
-footprint √o_k as wide.
+away from where it is without them; the root holds it in the cell. Here (h₀, μ₀) is the coverage by bodies before all
+planes (:mod:`warpshadow.stages.convex.coverage`), which takes light in the transmittance. The radiosity is looked up
+along ω + ρ z_k, over a footprint √o as wide.
 
 A mean over all of a side in a cell has parts that nearer ones hide. Behind the front wall of a garage, which is open up
 to one half of its height, lies ground in the sun. With sides looked up along ω and ordered by their distances there,
 light of planes on receivers in the garage was 6.5% off (relative L2) and 4.5% too strong, and by this 2.6% and 1.4%; by
-S alone 3.5%.
+S alone 3.5%. In a barn of planks with the sun outside, without (h₀, μ₀) the light of the ground on the roof from below
+was 43 to 56% too strong, and by it 26 to 28%.
 """
 
 from __future__ import annotations
@@ -249,10 +251,28 @@ def _block_each_other_adjoint(
 
 
 @wp.func
-def _unnormalized_direction(cell: VisibleCell, hit: PlaneHit):
-    """Direction ω + ρ z of what others leave open of a side, not of unit length; and the length of (o, m)."""
-    length = wp.sqrt(hit.open_share * hit.open_share + wp.length_sq(hit.blocked_moment))
-    return cell.direction - (cell.radius / length) * hit.blocked_moment, length
+def _moment_of(coverage: wp.vec4):
+    return wp.vec3(coverage[1], coverage[2], coverage[3])
+
+
+@wp.func
+def _open_part(hit: PlaneHit, before: wp.vec4):
+    """Share of a side that neither others nor bodies before all planes block, and the moment of all that do."""
+    share = wp.max(hit.open_share * (1.0 - before[0]), _MIN_OPEN)
+    return share, hit.blocked_moment + _moment_of(before)
+
+
+@wp.func
+def _is_wholly_open(hit: PlaneHit, before: wp.vec4):
+    """Whether nothing blocks a side in the cell."""
+    return hit.open_share >= 1.0 and before[0] <= 0.0
+
+
+@wp.func
+def _unnormalized_direction(cell: VisibleCell, open_share: float, blocked_moment: wp.vec3):
+    """Direction ω + ρ z of what is open of a side, not of unit length; and the length of (o, m)."""
+    length = wp.sqrt(open_share * open_share + wp.length_sq(blocked_moment))
+    return cell.direction - (cell.radius / length) * blocked_moment, length
 
 
 @wp.func
@@ -263,14 +283,18 @@ def _visible_footprint(
     local_receiver: LocalReceiver,
     cell: VisibleCell,
     hit: PlaneHit,
+    before: wp.vec4,
 ):
-    """Direction and footprint of what others leave open of a side."""
+    """Direction and footprint of what is open of a side."""
     direction = cell.direction
-    if hit.open_share < 1.0:
-        visible_direction, _ = _unnormalized_direction(cell, hit)
+    extent = float(1.0)
+    if not _is_wholly_open(hit, before):
+        open_share, blocked_moment = _open_part(hit, before)
+        visible_direction, _ = _unnormalized_direction(cell, open_share, blocked_moment)
         direction = wp.normalize(visible_direction)
+        extent = wp.sqrt(open_share)
     footprint = footprint_on_side(planes, grid, side, local_receiver, direction)
-    footprint.extent = wp.sqrt(hit.open_share)
+    footprint.extent = extent
     return direction, footprint
 
 
@@ -280,11 +304,12 @@ def find_side_hits(
     cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
     weight: float,
+    before: wp.vec4,
     side_count: int,
     store: wp.array(dtype=wp.vec3),
     edges: wp.array(dtype=ViewedEdge),
 ):
-    """Store which plane sides this cell hits; return how many. A share of 0 hits nothing."""
+    """Store which plane sides this cell hits; return how many. A weight of 0 hits nothing."""
     hit_count = int(0)
     if weight <= 0.0:
         return hit_count
@@ -306,6 +331,9 @@ def find_side_hits(
                 if is_covered_by_texels(grid):
                     hit.mesh_share = fetch(planes.covered, planes, first_level, mip)[0]
                 if _is_sender(grid, side):
+                    if before[0] > 0.0:
+                        _, visible_footprint = _visible_footprint(planes, grid, side, local_receiver, cell, hit, before)
+                        mip = find_mip_footprint(grid, planes, visible_footprint)
                     hit.radiosity = fetch(texels, planes, first_level, mip)
             hit.coverage = outline[0] * hit.mesh_share
             hit.centroid = wp.vec3(outline[1], outline[2], outline[3]) / outline[0]
@@ -313,7 +341,7 @@ def find_side_hits(
             store_hit(store, first_hit, side_index, hit)
             hit_count += 1
     if hit_count > 1:
-        _find_visible_parts(planes, cell, texels, side_count, store)
+        _find_visible_parts(planes, cell, texels, before, side_count, store)
     return hit_count
 
 
@@ -322,6 +350,7 @@ def _find_visible_parts(
     planes: PlaneArrays,
     cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
+    before: wp.vec4,
     side_count: int,
     store: wp.array(dtype=wp.vec3),
 ):
@@ -339,7 +368,7 @@ def _find_visible_parts(
             grid = planes.grids[side.f]
             if _is_sender(grid, side):
                 local_receiver = load_local_receiver(store, side.f)
-                _, footprint = _visible_footprint(planes, grid, side, local_receiver, cell, hit)
+                _, footprint = _visible_footprint(planes, grid, side, local_receiver, cell, hit, before)
                 mip = find_mip_footprint(grid, planes, footprint)
                 hit.radiosity = fetch(texels, planes, first_level_of_side(grid, side.is_back), mip)
             store_hit(store, first_hit, side_index, hit)
@@ -350,6 +379,7 @@ def find_side_hits_adjoint(
     planes: PlaneArrays,
     cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
+    before: wp.vec4,
     hit_count: int,
     side_count: int,
     store: wp.array(dtype=wp.vec3),
@@ -358,11 +388,17 @@ def find_side_hits_adjoint(
     instance: int,
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
-    """Add to the gradients of a receiver relative to each plane, of viewed edges, and of an instance's texels."""
+    """Add to the gradients of a receiver relative to each plane, of viewed edges, and of an instance's texels.
+
+    Returns the gradient of ``before``.
+    """
     first_hit = SIDE_ROWS * planes.grids.shape[0]
+    adj_before = wp.vec4()
     for side_index in range(side_count):
         if is_hit(store, first_hit, side_index):
-            _visible_radiosity_adjoint(planes, cell, texels, side_index, store, adj_store, instance, adj_texels)
+            adj_before += _visible_radiosity_adjoint(
+                planes, cell, texels, before, side_index, store, adj_store, instance, adj_texels
+            )
     if hit_count > 1:
         for k in range(1, side_count):
             for j in range(k):
@@ -371,6 +407,7 @@ def find_side_hits_adjoint(
     for side_index in range(side_count):
         if is_hit(store, first_hit, side_index):
             _outline_hit_adjoint(planes, cell, side_index, hit_count == 1, store, edges, adj_store)
+    return adj_before
 
 
 @wp.func
@@ -378,13 +415,18 @@ def _visible_radiosity_adjoint(
     planes: PlaneArrays,
     cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
+    before: wp.vec4,
     side_index: int,
     store: wp.array(dtype=wp.vec3),
     adj_store: wp.array(dtype=wp.vec3),
     instance: int,
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
-    """Add to the gradients of a receiver relative to a plane, of what others leave open of it, and of its texels."""
+    """Add to the gradients of a receiver relative to a plane, of what others leave open of it, and of its texels.
+
+    Returns the gradient of ``before``.
+    """
+    adj_before = wp.vec4()
     side = load_side(planes, side_index, store)
     grid = planes.grids[side.f]
     first_hit = SIDE_ROWS * planes.grids.shape[0]
@@ -392,7 +434,7 @@ def _visible_radiosity_adjoint(
     if _is_sender(grid, side):
         first_level = first_level_of_side(grid, side.is_back)
         local_receiver = load_local_receiver(store, side.f)
-        direction, footprint = _visible_footprint(planes, grid, side, local_receiver, cell, hit)
+        direction, footprint = _visible_footprint(planes, grid, side, local_receiver, cell, hit, before)
         mip = find_mip_footprint(grid, planes, footprint)
         adj_mip = fetch_adjoint(texels, grid, planes, first_level, footprint, mip, adj_hit.radiosity)
         if adj_texels:
@@ -400,15 +442,21 @@ def _visible_radiosity_adjoint(
         adj_direction = footprint_on_side_adjoint(
             planes, grid, side, local_receiver, direction, footprint, adj_mip, adj_store
         )
-        if hit.open_share < 1.0:
-            visible_direction, length = _unnormalized_direction(cell, hit)
+        if not _is_wholly_open(hit, before):
+            open_share, blocked_moment = _open_part(hit, before)
+            visible_direction, length = _unnormalized_direction(cell, open_share, blocked_moment)
             adj_centroid = (cell.radius / wp.length(visible_direction)) * (
                 adj_direction - wp.dot(adj_direction, direction) * direction
             )
-            adj_length = wp.dot(adj_centroid, hit.blocked_moment) / (length * length)
-            adj_open = 0.5 * adj_mip[2] / hit.open_share + adj_length * hit.open_share / length
-            adj_moment = (adj_length * hit.blocked_moment - adj_centroid) / length
+            adj_length = wp.dot(adj_centroid, blocked_moment) / (length * length)
+            adj_open = float(0.0)
+            if open_share > _MIN_OPEN:
+                adj_open = 0.5 * adj_mip[2] / open_share + adj_length * open_share / length
+            adj_moment = (adj_length * blocked_moment - adj_centroid) / length
+            adj_before = wp.vec4(-adj_open * hit.open_share, adj_moment[0], adj_moment[1], adj_moment[2])
+            adj_open *= 1.0 - before[0]
             _add_to_open_part(adj_store, first_hit, side_index, adj_open, adj_moment)
+    return adj_before
 
 
 @wp.func

@@ -11,9 +11,9 @@ distance d below the receiver:
 
 The part of the cell that the plane takes, h, is that within its outline (:mod:`warpshadow.stages.cell_coverage`); where
 edges are many, that within its rectangle, multiplied with the mesh's share of the footprint, by texels. Radiosity is
-bilinear in two mip levels of the grid, which are blended so that their texels are as wide as the footprint is in the
-mean of both axes, 2 t ρ / √c′: twice the disc of the cell, as interpolation between means is, so that together cells
-see all texels alike. For a sun alone that is too wide: there texels are half as wide.
+bilinear in two mip levels of the grid, which are blended so that their texels are half as wide as the footprint is in
+the mean of both axes, t ρ / √c′. With texels as wide as it, bilinear means reach twice as far as the cell: under the
+roof of a barn with the sun outside light of the ground was 17 to 23% too strong, and is within 7% so.
 
 No receiver is nearer to a side than a margin, so that t is not 0. Which side it is on, :mod:`.fronts` says; by height
 alone the front fades away and the back appears from the plane to a margin below it.
@@ -40,7 +40,6 @@ class PlaneArrays:
     edge_axes: wp.array(dtype=wp.vec2)
     skip: int  # the plane that the receivers are part of, -1 for none
     radius: float  # ρ
-    texel_radius: float  # half the width of texels, for a unit of distance
     per_radius: float
 
 
@@ -60,16 +59,12 @@ def check_planes(
 
 
 @functools.lru_cache(64)
-def plane_arrays(planes: PlaneBlockers, radius: float, skip: int | None, *, tiles: bool = True) -> PlaneArrays:
-    """Plane blockers as seen in cells of a radius [rad] by receivers that are part of one, or of none.
-
-    Where cells do not tile the sphere, as a sun's alone, texels are half as wide.
-    """
+def plane_arrays(planes: PlaneBlockers, radius: float, skip: int | None) -> PlaneArrays:
+    """Plane blockers as seen in cells of a radius [rad] by receivers that are part of one, or of none."""
     arrays = PlaneArrays()
     arrays.grids, arrays.levels, arrays.level_scales = planes.grids, planes.levels, planes.level_scales
     arrays.covered, arrays.edges, arrays.edge_axes = planes.covered, planes.edges, planes.edge_axes
     arrays.skip, arrays.radius = -1 if skip is None else skip, radius
-    arrays.texel_radius = arrays.radius if tiles else 0.5 * arrays.radius
     arrays.per_radius = 1 / arrays.radius
     return arrays
 
@@ -323,8 +318,8 @@ def find_mip_footprint(grid: PlaneGrid, planes: PlaneArrays, footprint: PlaneFoo
         wp.sign(x) * wp.log(size_x) * grid.texels[0], wp.sign(y) * wp.log(size_y) * grid.texels[1]
     )
     mip.slopes = grid.per_spread * wp.vec2(grid.texels[0] / size_x, grid.texels[1] / size_y)
-    radius = footprint.extent * planes.texel_radius
-    width = 2.0 * footprint.distance * radius * wp.sqrt(mip.slopes[0] * mip.slopes[1] * footprint.per_cosine)
+    width = footprint.distance * footprint.extent * planes.radius
+    width *= wp.sqrt(mip.slopes[0] * mip.slopes[1] * footprint.per_cosine)
     while mip.level < grid.level_count - 1 and width >= 2.0:
         mip.level = mip.level + 1
         width *= 0.5

@@ -250,7 +250,7 @@ def plane_coverage(
     count = common_batch({"points": points, "frames": frames, "fronts": fronts})
     points, fronts = expand(points, count), None if fronts is None else expand_rows(fronts, count)
     radius_of_cells = cell_radius(len(directions)) if radius is None else radius
-    arrays = plane_arrays(planes, radius_of_cells, skip, tiles=radius is None)
+    arrays = plane_arrays(planes, radius_of_cells, skip)
     if not set(planes.is_blocking) - {skip}:
         return None
     cells = constant(directions, wp.vec3, points.device)

@@ -258,7 +258,7 @@ def coverage_of_light(
     count = common_batch({"points": points, "frames": frames, "fronts": fronts, "covered": covered})
     points, covered = expand(points, count), expand_rows(covered, count)
     fronts = None if fronts is None else expand_rows(fronts, count)
-    arrays = plane_arrays(planes, cell_radius(SAMPLES * len(directions)), skip, tiles=False)
+    arrays = plane_arrays(planes, cell_radius(SAMPLES * len(directions)), skip)
     samples_on_device = constant(np.asarray(samples, np.float32), wp.vec3, points.device)
     inputs = [points, horizon_normals, covered, frames, fronts, arrays, samples_on_device]
     scratch, cost = receiver_scratch(planes), _CELL_COST * len(directions)
