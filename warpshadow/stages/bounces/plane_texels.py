@@ -9,8 +9,7 @@ little [normalized convolution: Knutsson and Westin 1993]:
 with v the weight of a patch by its openness (:mod:`.openness`), and k its share of the mesh in the texel, or 0.002
 of that in a texel beside it. A texel of buried patches alone has the light of those beside it, others hardly any of it.
 
-Without it the foot of a thick wall in the sun was 10% too dark with all bounces, and 35% too bright with the sun behind
-it; so it is 4% too dark, and 10% too bright.
+Without it the foot of a thick wall in the sun is 2.5% too dark with all bounces, with it 0.04%.
 """
 
 import warp as wp
