@@ -41,7 +41,7 @@ from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.transfers import joined
 from warpshadow.scene.scene import Bounces
-from warpshadow.stages.bounces.openness import Openness, find_openness, open_shares
+from warpshadow.stages.bounces.patch_weights import PatchWeights, find_mean_transmittance, find_patch_weights
 from warpshadow.stages.bounces.radiosity import patch_radiosity
 from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.receivers import Receivers
@@ -122,10 +122,10 @@ class PortionedDirectLight(Node):
         return PortionDirectLight(direct, portion.group, portion.cells)
 
 
-def _openness(senders: Senders, visibility: list[PortionVisibility]) -> Openness:
-    """How open patch samples and patches are."""
-    portions = [find_openness(portion.group.normals, *portion.cells) for portion in visibility]
-    return open_shares(joined(portions), senders.mean, senders.patch_of_sample)
+def _patch_weights(senders: Senders, visibility: list[PortionVisibility]) -> PatchWeights:
+    """Weights of patch samples and patches by how open they are."""
+    portions = [find_mean_transmittance(portion.group.normals, *portion.cells) for portion in visibility]
+    return find_patch_weights(joined(portions), senders.mean, senders.patch_of_sample)
 
 
 class PatchSampleNodes(NamedTuple):
@@ -134,7 +134,7 @@ class PatchSampleNodes(NamedTuple):
     visibility: PortionedVisibility  # of the patch samples, for any light
     frames: Node  # of flat bodies
     projected_patches: Node  # patches as receivers see them
-    openness: Node  # how open patch samples are, and their patches
+    weights: Node  # of patch samples and patches, by how open they are
 
 
 class Radiosity(Node):
@@ -150,7 +150,7 @@ class Radiosity(Node):
         albedo: Node,
         patch_samples: PatchSampleNodes,
     ):
-        _, frames, projected_patches, openness = patch_samples
+        _, frames, projected_patches, weights = patch_samples
         self._count, self._proxies, self._self_form_factors, self._gathering = (
             count,
             proxies,
@@ -163,11 +163,11 @@ class Radiosity(Node):
         self._reflection = NodeStage("radiosity", item_text)
         self._self_reflection = NodeStage("self light of patches", item_text, idle)
         stages = self._reflection, self._self_reflection, *gathering.stages
-        super().__init__("", None, lit, albedo, projected_patches, frames, openness, stages=stages)
+        super().__init__("", None, lit, albedo, projected_patches, frames, weights, stages=stages)
 
     def compute(self, call: Call) -> OutgoingRadiance:
         """Reflect direct light, then light that has bounced once, and so on; more often between patches of one body."""
-        lit, albedo, projected_patches, frames, openness = self.values(call)
+        lit, albedo, projected_patches, frames, weights = self.values(call)
         senders, count = self._proxies.senders, self._count
         between = (
             None
@@ -176,7 +176,7 @@ class Radiosity(Node):
         )
 
         def sent(radiosity: wp.array) -> OutgoingRadiance:
-            return OutgoingRadiance(self._proxies, radiosity, projected_patches, frames, openness.weights)
+            return OutgoingRadiance(self._proxies, radiosity, projected_patches, frames, weights.weights)
 
         def radiosity_by_others(radiosity: wp.array | None) -> wp.array:
             """Radiosity of patches by light from the sky and from other bodies."""
@@ -186,7 +186,7 @@ class Radiosity(Node):
                 outgoing = sent(radiosity)
                 portions = [self._light(call, portion, outgoing) for portion in lit]
             with self.timed(call, self._reflection):
-                return patch_radiosity(albedo, joined(portions), senders.mean, openness.shares)
+                return patch_radiosity(albedo, joined(portions), senders.mean, weights.shares)
 
         def add_radiosity_by_self(by_others: wp.array, radiosity: wp.array | None) -> wp.array:
             if between is None or radiosity is None:
@@ -326,7 +326,7 @@ class SphereBounces:
         frames = Node("", planes.all.frames if planes else lambda _: None, points.vertices)
         projected_patches = Node("", project, patch_samples, visibility, spheres, frames)
         return PatchSampleNodes(
-            visibility, frames, projected_patches, Node("", functools.partial(_openness, senders), visibility)
+            visibility, frames, projected_patches, Node("", functools.partial(_patch_weights, senders), visibility)
         )
 
     def _radiosity(

@@ -261,8 +261,8 @@ class Proxies:
             placed = tuple(concatenate(pair, counts) for pair in zip(placed, others, strict=True))
         areas = find_projected_areas(normals, transmittance, senders.mean, directions)
         clusters = find_clusters(*placed, self.merging)
-        nodes = clusters.nodes.centers, *self.patches_of_clusters, self._tolerances
-        tangent_planes = find_tangent_planes(mean_points, mean_normals, *nodes)
+        proxies = clusters.nodes.centers, *self.patches_of_clusters, self._tolerances
+        tangent_planes = find_tangent_planes(mean_points, mean_normals, *proxies)
         return ProjectedPatches(areas, *placed, clusters, tangent_planes)
 
 
@@ -274,7 +274,7 @@ class OutgoingRadiance:
         radiosity: Of the patches, vec3 of shape [batch, patch].
         projected_patches: The patches as receivers see them.
         frames: Where flat bodies are, vec3 of shape [batch, 3 · plane].
-        open_weights: Of the patches by their openness, vec3 of shape [batch, patch].
+        patch_weights: Of the patches, vec3 of shape [batch, patch].
     """
 
     def __init__(
@@ -283,10 +283,10 @@ class OutgoingRadiance:
         radiosity: wp.array,
         projected_patches: ProjectedPatches,
         frames: wp.array,
-        open_weights: wp.array,
+        patch_weights: wp.array,
     ):
         self.proxies, self.senders, self.radiosity = proxies, proxies.senders, radiosity
-        self.projected_patches, self.frames, self.open_weights = projected_patches, frames, open_weights
+        self.projected_patches, self.frames, self.patch_weights = projected_patches, frames, patch_weights
 
     def of_body(self, body: int) -> wp.array:
         """Radiosity of the patches of a body, vec3 of shape [batch, patch]."""
@@ -295,19 +295,19 @@ class OutgoingRadiance:
 
     @functools.cached_property
     def proxy_radiance(self) -> wp.array:
-        """Light that proxies of patches send towards cells, vec4 of shape [batch, node, cell]."""
+        """Light that proxies of patches send towards cells, vec4 of shape [batch, proxy, cell]."""
         proxies, radiosity, patches = self.proxies, self.radiosity, self.projected_patches
         if proxies.overlays is not None:
             radiosity = overlaid_radiosity(radiosity, cut(patches.centers, 0, radiosity.shape[1]), *proxies.overlays)
         return find_proxy_radiance(
-            radiosity, patches.areas, self.open_weights, self.senders.areas, *proxies.patches_of_clusters
+            radiosity, patches.areas, self.patch_weights, self.senders.areas, *proxies.patches_of_clusters
         )
 
     @functools.cached_property
     def texels(self) -> wp.array:
         """Radiosity of the flat bodies, vec3 of shape [batch, texel]."""
         assert self.proxies.planes is not None
-        return find_texels(self.radiosity, self.open_weights, self.proxies.planes.all)
+        return find_texels(self.radiosity, self.patch_weights, self.proxies.planes.all)
 
 
 class Gathering:

@@ -171,7 +171,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
     @wp.func
     def cover(
         corners: wp.array(dtype=wp.vec3),
-        planes: wp.array(dtype=wp.vec4),
+        face_planes: wp.array(dtype=wp.vec4),
         bounds: wp.array(dtype=wp.vec4),
         parts: ConvexArrays,
         body: int,
@@ -199,7 +199,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
                             effect = wp.min(find_reach(task, bound, direction), room)
                             if is_any_above(effect, 0.0):
                                 if not is_found:
-                                    count, is_solid = find(task.points, corners, planes, parts, part, silhouette)
+                                    count, is_solid = find(task.points, corners, face_planes, parts, part, silhouette)
                                     silhouette.count = count
                                     silhouette.is_solid = is_solid
                                     is_found = True
@@ -219,7 +219,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
     @wp.func
     def cover_all(
         corners: wp.array(dtype=wp.vec3),
-        planes: wp.array(dtype=wp.vec4),
+        face_planes: wp.array(dtype=wp.vec4),
         bounds: wp.array(dtype=wp.vec4),
         parts: ConvexArrays,
         skip: int,
@@ -230,7 +230,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         """Store sums over all bodies for each cell."""
         for body in range(parts.first_part.shape[0] - 1):
             if body != skip and parts.blocks[body] == 1:
-                covered_count = cover(corners, planes, bounds, parts, body, cells, radius, task)
+                covered_count = cover(corners, face_planes, bounds, parts, body, cells, radius, task)
                 for k in range(covered_count):
                     q = task.covered[k]
                     task.sums[q] = with_blocker(task.sums[q], task.coverage[q])
@@ -254,7 +254,7 @@ def _make_cover(lanes: int) -> wp.Kernel:
         points: wp.array2d(dtype=wp.vec3),
         horizon_normals: wp.array2d(dtype=wp.vec3),
         corners: wp.array2d(dtype=wp.vec3),
-        planes: wp.array2d(dtype=wp.vec4),
+        face_planes: wp.array2d(dtype=wp.vec4),
         bounds: wp.array2d(dtype=wp.vec4),
         parts: ConvexArrays,
         cells: DirectionCells,
@@ -287,7 +287,7 @@ def _make_cover(lanes: int) -> wp.Kernel:
             edge_scratch[slot],
             numbers[slot],
         )
-        cover_all(corners[instance], planes[instance], bounds[instance], parts, skip, cells, radius, task)
+        cover_all(corners[instance], face_planes[instance], bounds[instance], parts, skip, cells, radius, task)
         for q in range(task.coverage.shape[0]):
             if is_any_above(task.sums[q].total, 0.0):
                 task.coverage[q] = joint_coverage(task.sums[q])
@@ -325,7 +325,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
         points: wp.array2d(dtype=wp.vec3),
         horizon_normals: wp.array2d(dtype=wp.vec3),
         corners: wp.array2d(dtype=wp.vec3),
-        planes: wp.array2d(dtype=wp.vec4),
+        face_planes: wp.array2d(dtype=wp.vec4),
         bounds: wp.array2d(dtype=wp.vec4),
         parts: ConvexArrays,
         cells: DirectionCells,
@@ -363,7 +363,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
             adj_edge_scratch[slot],
             numbers[slot],
         )
-        cover_all(corners[instance], planes[instance], bounds[instance], parts, skip, cells, radius, task)
+        cover_all(corners[instance], face_planes[instance], bounds[instance], parts, skip, cells, radius, task)
         load_columns(adj_result[batch], block, task.coverage)
         for q in range(task.coverage.shape[0]):
             adj_sums[slot, q] = SumsOfBlockers()
@@ -376,7 +376,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
             covered_count = int(0)
             if body != skip and parts.blocks[body] == 1:
                 covered_count = cover(
-                    corners[instance], planes[instance], bounds[instance], parts, body, cells, radius, task
+                    corners[instance], face_planes[instance], bounds[instance], parts, body, cells, radius, task
                 )
             affected_count = int(0)
             for k in range(covered_count):
@@ -397,7 +397,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
                         if is_any_above(reach, 0.0):
                             if not is_found:
                                 count, is_solid = find(
-                                    task.points, corners[instance], planes[instance], parts, part, silhouette
+                                    task.points, corners[instance], face_planes[instance], parts, part, silhouette
                                 )
                                 silhouette.count = count
                                 silhouette.is_solid = is_solid

@@ -308,7 +308,7 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
     def find(
         points: Vectors,
         corners: wp.array(dtype=wp.vec3),
-        planes: wp.array(dtype=wp.vec4),
+        face_planes: wp.array(dtype=wp.vec4),
         parts: ConvexArrays,
         part: int,
         silhouette: Silhouette,
@@ -318,8 +318,8 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
         face_count = parts.first_face[part + 1] - first_face
         outside = int(0)
         for face in range(face_count):
-            plane = planes[first_face + face]
-            height = dot_direction(wp.vec3(plane[0], plane[1], plane[2]), points) - Lane(plane[3])
+            face_plane = face_planes[first_face + face]
+            height = dot_direction(wp.vec3(face_plane[0], face_plane[1], face_plane[2]), points) - Lane(face_plane[3])
             bits = bits_above(height, 0.0)
             silhouette.facing[face] = bits
             outside = outside | bits
