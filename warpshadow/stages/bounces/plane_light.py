@@ -28,20 +28,20 @@ from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty, zeros
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.bounces.plane_hits import (
-    HIT_ROWS,
     PlaneHit,
     find_side_hits,
     find_side_hits_adjoint,
+    hit_scratch,
     is_hit,
-    load_hit,
     mean_radiosity,
-    store_hit,
 )
 from warpshadow.stages.cell_coverage import ViewedEdge
-from warpshadow.stages.planes.cells import PlaneArrays, check_planes, plane_arrays
+from warpshadow.stages.planes.cells import check_planes, plane_arrays
 from warpshadow.stages.planes.prepared import PlaneBlockers
 from warpshadow.stages.planes.sides import (
-    SIDE_ROWS,
+    PlaneInputs,
+    StoredSide,
+    plane_inputs,
     prepare_receiver,
     prepare_receiver_adjoint,
     receiver_scratch,
@@ -56,36 +56,32 @@ def _light_receivers(
     first_row: int,
     worker: int,
     # in
-    points: wp.array2d(dtype=wp.vec3),
+    inputs: PlaneInputs,
     normals: wp.array2d(dtype=wp.vec3),
     transmittance: wp.array3d(dtype=wp.float32),
-    frames: wp.array2d(dtype=wp.vec3),
     texels: wp.array2d(dtype=wp.vec3),
-    fronts: wp.array3d(dtype=wp.float32),
-    planes: PlaneArrays,
     directions: wp.array(dtype=wp.vec3),
     # scratch
-    scratch: wp.array2d(dtype=wp.vec3),
-    viewed_edges: wp.array2d(dtype=ViewedEdge),
+    sides: wp.array2d(dtype=StoredSide),
+    edges: wp.array2d(dtype=ViewedEdge),
+    hits: wp.array2d(dtype=PlaneHit),
     # out
     light: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver."""
-    batch, receiver, scratch_row, side_count = prepare_receiver(
-        first_row + wp.tid(), worker, points, frames, fronts, planes, scratch, viewed_edges
-    )
-    store, edges = scratch[scratch_row], viewed_edges[scratch_row]
+    receiver = prepare_receiver(first_row + wp.tid(), worker, inputs, sides, edges)
+    batch, index = receiver.batch, receiver.index
+    hits_of_cell = hits[receiver.slot]
     texel_radiosity = texels[instance_in(batch, texels.shape[0])]
-    normal = normals[batch, receiver]
-    first_hit = SIDE_ROWS * planes.grids.shape[0]
+    normal = normals[batch, index]
     total = wp.vec3()
     for q in range(directions.shape[0]):
-        weight = wp.dot(normal, directions[q]) * transmittance[batch, receiver, q]
-        cell = visible_cell(planes, normal, directions[q])
-        if find_side_hits(planes, cell, texel_radiosity, weight, side_count, store, edges) > 0:
-            mean, _, total_coverage = mean_radiosity(first_hit, side_count, store)
+        weight = wp.dot(normal, directions[q]) * transmittance[batch, index, q]
+        cell = visible_cell(inputs.planes, normal, directions[q])
+        if find_side_hits(inputs.planes, cell, texel_radiosity, weight, receiver, hits_of_cell) > 0:
+            mean, _, total_coverage = mean_radiosity(receiver.side_count, hits_of_cell)
             total += (weight * wp.min(total_coverage, 1.0)) * mean
-    light[batch, receiver] = (4.0 / float(directions.shape[0])) * total
+    light[receiver.batch, receiver.index] = (4.0 / float(directions.shape[0])) * total
 
 
 @wp.kernel(enable_backward=False)
@@ -93,19 +89,17 @@ def _light_receivers_adjoint(
     first_row: int,
     worker: int,
     # in
-    points: wp.array2d(dtype=wp.vec3),
+    inputs: PlaneInputs,
     normals: wp.array2d(dtype=wp.vec3),
     transmittance: wp.array3d(dtype=wp.float32),
-    frames: wp.array2d(dtype=wp.vec3),
     texels: wp.array2d(dtype=wp.vec3),
-    fronts: wp.array3d(dtype=wp.float32),
-    planes: PlaneArrays,
     directions: wp.array(dtype=wp.vec3),
     adj_light: wp.array2d(dtype=wp.vec3),
     # scratch
-    scratch: wp.array2d(dtype=wp.vec3),
-    viewed_edges: wp.array2d(dtype=ViewedEdge),
-    adj_scratch: wp.array2d(dtype=wp.vec3),
+    sides: wp.array2d(dtype=StoredSide),
+    edges: wp.array2d(dtype=ViewedEdge),
+    hits: wp.array2d(dtype=PlaneHit),
+    adj_hits: wp.array2d(dtype=PlaneHit),
     # out
     adj_points: wp.array2d(dtype=wp.vec3),
     adj_normals: wp.array2d(dtype=wp.vec3),
@@ -116,73 +110,54 @@ def _light_receivers_adjoint(
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver."""
-    batch, receiver, scratch_row, side_count = prepare_receiver(
-        first_row + wp.tid(), worker, points, frames, fronts, planes, scratch, viewed_edges
-    )
-    store, edges, adj_store = scratch[scratch_row], viewed_edges[scratch_row], adj_scratch[scratch_row]
+    receiver = prepare_receiver(first_row + wp.tid(), worker, inputs, sides, edges)
+    batch, index = receiver.batch, receiver.index
+    hits_of_cell, adj_hits_of_cell = hits[receiver.slot], adj_hits[receiver.slot]
     texel_batch = instance_in(batch, texels.shape[0])
     texel_radiosity = texels[texel_batch]
-    normal = normals[batch, receiver]
-    first_hit = SIDE_ROWS * planes.grids.shape[0]
-    for k in range(first_hit):
-        adj_store[k] = wp.vec3()
-    adj_mean = (4.0 / float(directions.shape[0])) * adj_light[batch, receiver]
+    normal = normals[batch, index]
+    adj_mean = (4.0 / float(directions.shape[0])) * adj_light[batch, index]
     adj_normal = wp.vec3()
     for q in range(directions.shape[0]):
         direction = directions[q]
         cosine = wp.dot(normal, direction)
-        cell_transmittance = transmittance[batch, receiver, q]
+        cell_transmittance = transmittance[batch, index, q]
         weight = cosine * cell_transmittance
-        cell = visible_cell(planes, normal, direction)
-        hit_count = find_side_hits(planes, cell, texel_radiosity, cosine, side_count, store, edges)
+        cell = visible_cell(inputs.planes, normal, direction)
+        hit_count = find_side_hits(inputs.planes, cell, texel_radiosity, cosine, receiver, hits_of_cell)
         if hit_count > 0:
-            mean, weights, total_coverage = mean_radiosity(first_hit, side_count, store)
+            mean, weights, total_coverage = mean_radiosity(receiver.side_count, hits_of_cell)
             value = wp.dot(adj_mean, mean)
             total = wp.min(total_coverage, 1.0) * value
             factor = weight * wp.min(total_coverage, 1.0) / weights
             adj_coverage = wp.where(total_coverage < 1.0, weight * value, 0.0)
-            for i in range(side_count):
-                if is_hit(store, first_hit, i):
-                    hit = load_hit(store, first_hit, i)
+            for i in range(receiver.side_count):
+                if is_hit(hits_of_cell, i):
+                    hit = hits_of_cell[i]
                     adj_weight = factor * (wp.dot(adj_mean, hit.radiosity) - value)
                     adj_hit = PlaneHit()
                     adj_hit.coverage = adj_coverage + hit.open_share * adj_weight
                     adj_hit.open_share = hit.coverage * adj_weight
                     adj_hit.radiosity = (factor * hit.coverage * hit.open_share) * adj_mean
-                    store_hit(adj_store, first_hit, i, adj_hit)
+                    adj_hits_of_cell[i] = adj_hit
             adj_normal += (cell_transmittance * total) * direction
             if adj_transmittance:
-                adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + cosine * total
+                adj_transmittance[batch, index, q] = adj_transmittance[batch, index, q] + cosine * total
             if cell_transmittance > 0.0:
                 find_side_hits_adjoint(
-                    planes,
+                    inputs.planes,
                     cell,
                     texel_radiosity,
                     hit_count,
-                    side_count,
-                    store,
-                    edges,
-                    adj_store,
+                    receiver,
+                    hits_of_cell,
+                    adj_hits_of_cell,
                     texel_batch,
                     adj_texels,
                 )
     if adj_normals:
-        adj_normals[batch, receiver] = adj_normals[batch, receiver] + adj_normal
-    prepare_receiver_adjoint(
-        batch,
-        receiver,
-        side_count,
-        points,
-        frames,
-        fronts,
-        planes,
-        store,
-        edges,
-        adj_store,
-        adj_points,
-        adj_fronts,
-        adj_frames,
-    )
+        adj_normals[batch, index] = adj_normals[batch, index] + adj_normal
+    prepare_receiver_adjoint(receiver, inputs, adj_points, adj_fronts, adj_frames)
 
 
 def plane_light(
@@ -224,19 +199,17 @@ def plane_light(
     points, normals = (expand(array, batch_count) for array in (points, normals))
     transmittance = expand_rows(transmittance, batch_count)
     fronts = None if fronts is None else expand_rows(fronts, batch_count)
-    scratch = receiver_scratch(planes, HIT_ROWS)
     variables = [points, normals, transmittance, frames, texels, fronts]
-    arrays, cell_directions = (
-        plane_arrays(planes, cell_radius(len(directions)), skip),
-        constant(directions, wp.vec3, points.device),
-    )
-    inputs = [*variables, arrays, cell_directions]
+    arrays = plane_arrays(planes, cell_radius(len(directions)), skip)
+    cell_directions = constant(directions, wp.vec3, points.device)
+    inputs = [plane_inputs(points, frames, fronts, arrays), normals, transmittance, texels, cell_directions]
+    scratch, hits = receiver_scratch(planes), hit_scratch(planes)
     return differentiable(
         lambda light: launch(
             _light_receivers,
             points.size,
             inputs=inputs,
-            scratch=scratch,
+            scratch=[*scratch, hits],
             outputs=[light],
             cost=_CELL_COST * len(directions),
         ),
@@ -244,7 +217,7 @@ def plane_light(
             _light_receivers_adjoint,
             points.size,
             inputs=[*inputs, adj_light],
-            scratch=[*scratch, scratch[0]],
+            scratch=[*scratch, hits, hits],
             outputs=[points.grad, normals.grad, transmittance.grad, None if fronts is None else fronts.grad],
             sums=[frames.grad, texels.grad],
             cost=2 * _CELL_COST * len(directions),

@@ -191,51 +191,6 @@ def front_weight_slope(grid: PlaneGrid, height: float):
     return smoothstep_slope(1.0 + 2.0 * height / grid.margin) * 2.0 / grid.margin
 
 
-@wp.func
-def position_on_side(grid: PlaneGrid, local_receiver: LocalReceiver, is_back: bool):
-    """Position of a receiver above a side: at least a margin high, and its own height from two margins on."""
-    height = wp.where(is_back, -local_receiver.position[2], local_receiver.position[2])
-    front_ramp = wp.clamp(height / grid.margin, 0.0, 2.0)
-    return wp.vec3(
-        local_receiver.position[0],
-        local_receiver.position[1],
-        grid.margin * (1.0 + 0.25 * front_ramp * front_ramp) + wp.max(height - 2.0 * grid.margin, 0.0),
-    )
-
-
-@wp.func
-def direction_on_side(local_receiver: LocalReceiver, is_back: bool, direction: wp.vec3):
-    """Direction along the axes of a plane, and its cosine with a side."""
-    along_normal = wp.dot(direction, local_receiver.normal)
-    return wp.vec3(
-        wp.dot(direction, local_receiver.axis_u),
-        wp.dot(direction, local_receiver.axis_v),
-        wp.where(is_back, along_normal, -along_normal),
-    )
-
-
-@wp.func
-def side_adjoint(
-    grid: PlaneGrid,
-    local_receiver: LocalReceiver,
-    is_back: bool,
-    direction: wp.vec3,
-    adj_position: wp.vec3,
-    adj_direction: wp.vec3,
-    adj_local_receiver: LocalReceiver,
-):
-    """Add the gradients of :func:`position_on_side` and :func:`direction_on_side` to that of a receiver."""
-    sign = wp.where(is_back, -1.0, 1.0)
-    adj_height = sign * wp.clamp(0.5 * sign * local_receiver.position[2] / grid.margin, 0.0, 1.0) * adj_position[2]
-    adj_receiver = LocalReceiver()
-    adj_receiver.position = adj_local_receiver.position + wp.vec3(adj_position[0], adj_position[1], adj_height)
-    adj_receiver.axis_u = adj_local_receiver.axis_u + adj_direction[0] * direction
-    adj_receiver.axis_v = adj_local_receiver.axis_v + adj_direction[1] * direction
-    adj_receiver.normal = adj_local_receiver.normal - (sign * adj_direction[2]) * direction
-    adj_receiver.scale = adj_local_receiver.scale
-    return adj_receiver
-
-
 # ---------------------------------------------------------------------------------------------------- footprints
 
 
