@@ -1,8 +1,12 @@
-"""Patches: parts of a body's surface that send light as one, and the points at which they are lit.
+"""Patches: the parts of a body's surface that send light as one, and the patch samples at which they are lit.
 
-Most bodies are cut into pieces of about one size, and k-means of position and normal makes patches of them. A body that
-lies in a plane has a grid instead, finer near the other bodies, whose shadows it shows. All is found once, in the
-body's own frame and at rest; patches move with the body.
+Faces are cut at their longest edges into pieces of about one size, and patches are clusters of pieces by position and
+normal (k-means): 256 at most, of 8 pieces or more. A body that lies in a plane has a grid of texels instead, which are
+small near the other bodies, whose shadows it shows (:mod:`warpshadow.stages.planes.grid`). A patch has up to four patch
+samples, with weights by area. Pieces inside another part of the body belong to no patch.
+
+All is found once, in the body's own frame and at rest; patches move with the body. The patches of an open surface's
+backs follow those of its fronts.
 """
 
 from __future__ import annotations

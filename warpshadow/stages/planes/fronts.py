@@ -1,36 +1,28 @@
-"""Fronts: which side of a plane receivers are on.
+"""Fronts: which side of a plane receivers are on, from 1 in front of it to 0 behind it.
 
-Where bodies touch, as two walls at their seam or a box and the ground that it stands on, points lie in the plane of
-another body, or within float32 of it. They are on the side on which their own body lies. Of a receiver at height h and
-of normal n, on a body that reaches from height l to height u over a plane with normal N,
+Where bodies touch, points lie in the plane of another body, or within float32 of it; they are on the side on which
+their own body lies. With h the height of a receiver, n its normal, N the plane's, and l to u the heights of its body,
 
     front = S(b + (1 − b²) n·N + 2 h / m),  b = (u + l) / max(u − l, m), from −1 to 1
 
-S is the smoothstep from 0 at −1 to 1 at 1, and m the margin of the plane, a thousandth of a texel. So
+S is the smoothstep from 0 at −1 to 1 at 1, and m the margin of the plane, a thousandth of a texel. So a body wholly in
+front of the plane (b = 1) or behind it (b = −1) has all its receivers there; one that the plane cuts has them where
+their heights are; and in the same plane (b = 0, h = 0) normals decide. The height term has no gradient: over so short a
+way as the margin it would be hundreds of times that of receivers beside it.
 
-- a body wholly in front of the plane (b = 1) has all its receivers in front, one wholly behind it (b = −1) all behind;
-- a body that the plane cuts has its receivers where their heights are;
-- of a body in the same plane (b = 0, h = 0) the normals decide.
-
-The height term has no gradient. Over so short a way as the margin it would be steep: a row of vertices of a wall in the
-plane of a ground had 280 times the gradient of the rows beside it.
-
-Where two or three planes meet, a receiver on the seam must see each of them as one before it does: at its own place it
-is at the border of both, and half of each would cover nothing. So receivers within 2 k of planes are lit where they are
-lifted to, off all of them, k = 5 m:
+Receivers within 2 k of planes, k = 5 m, are lit where they are lifted to, off all of them: on a seam of planes half of
+each would cover nothing.
 
     x + Σ_f (2 front_f − 1) k (1 − (h_f / 2 k)²)² N_f
 
-A body that has sunk into a ground a little has patch samples on its surface below. A point there gets the light of the
-ground's back: the light of the sky there. But receivers do not see the patch samples, they see spheres. So a patch
-sample is on the side of a plane on which the blocker nearest to its patch is:
+A patch sample is on the side on which the blocker nearest to its patch is, with c the height of that sphere's center
+and r its radius:
 
     front = S(1.25 (h + c) / r)
 
-c is the height of that sphere's center, and r its radius. A sphere that touches a plane from above has all its patch
-samples in front, and one that touches it from below, behind; 1.25 leaves room for spheres that bulge out of their mesh.
-So the light at a patch sample changes over the depth of a sphere. With a margin of a tenth of a texel it jumped: the
-gradient of a ball that touches a ground held for steps of 1/5000 of its radius.
+So a sphere that touches a plane from above has all its patch samples in front, also where the body has sunk into the
+ground a little, since receivers see its proxies. 1.25 leaves room for spheres that bulge out of their mesh. The light
+of a patch sample so changes over the depth of a sphere, not of a margin.
 """
 
 from __future__ import annotations
