@@ -14,7 +14,7 @@ import warp as wp
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
 from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance
-from warpshadow.pipeline.bounces.covered import find_overlays
+from warpshadow.pipeline.bounces.overlays import find_overlays
 from warpshadow.pipeline.bounces.patches import Senders
 from warpshadow.pipeline.receivers.groups import nonplanar_bodies
 from warpshadow.pipeline.transfers import joined

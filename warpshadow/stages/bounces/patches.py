@@ -84,7 +84,7 @@ class Patches:
         centers: Mean position, float32 of shape [patch, 3].
         normals: Mean normal, of unit length, float32 of shape [patch, 3].
         spreads: Largest angle of its surface to the mean normal [radians], float32 of shape [patch].
-        sagittas: How far its surface lies below the plane of its center and normal, at most, float32 of shape [patch].
+        sagittas: How far its surface lies below its tangent plane, at most, float32 of shape [patch].
         patch_samples: Where they are lit.
         pieces: Their pieces.
         patch_of_pieces: Patch of each piece's front and back, int32 of shape [2, piece]; −1 for sides that send
