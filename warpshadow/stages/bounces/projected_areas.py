@@ -62,16 +62,16 @@ def _tilt_normals(
     if spheres[patch_sample] >= 0:
         radius = radii[instance_in(batch, radii.shape[0]), spheres[patch_sample]]
         frame_batch = instance_in(batch, frames.shape[0])
-        for f in range(grids.shape[0]):
-            grid = grids[f]
-            u = frames[frame_batch, 3 * f + 1]
-            v = frames[frame_batch, 3 * f + 2]
+        for plane in range(grids.shape[0]):
+            grid = grids[plane]
+            u = frames[frame_batch, 3 * plane + 1]
+            v = frames[frame_batch, 3 * plane + 2]
             plane_normal = wp.normalize(wp.cross(u, v))
             up_component = wp.dot(normal, plane_normal)
-            front = fronts[instance_in(batch, fronts.shape[0]), patch_sample, f]
+            front = fronts[instance_in(batch, fronts.shape[0]), patch_sample, plane]
             tilt = front * wp.max(-up_component, 0.0) - (1.0 - front) * wp.max(up_component, 0.0)
             if grid.blocks != 0 and radius > 0.0:
-                offset = point - frames[frame_batch, 3 * f]
+                offset = point - frames[frame_batch, 3 * plane]
                 height = wp.dot(offset, plane_normal) / radius
                 x = wp.dot(offset, u) / wp.length(u)
                 y = wp.dot(offset, v) / wp.length(v)

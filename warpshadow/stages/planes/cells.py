@@ -96,17 +96,17 @@ class LocalReceiver:
 
 
 @wp.func
-def find_local_receiver(point: wp.vec3, frames: wp.array(dtype=wp.vec3), f: int):
+def find_local_receiver(point: wp.vec3, frames: wp.array(dtype=wp.vec3), plane: int):
     """Transform a receiver to the axes of a plane."""
     local_receiver = LocalReceiver()
-    scale_u = wp.length(frames[3 * f + 1])
-    scale_v = wp.length(frames[3 * f + 2])
+    scale_u = wp.length(frames[3 * plane + 1])
+    scale_v = wp.length(frames[3 * plane + 2])
     if scale_u > 0.0 and scale_v > 0.0:
-        local_receiver.axis_u = frames[3 * f + 1] / scale_u
-        local_receiver.axis_v = frames[3 * f + 2] / scale_v
+        local_receiver.axis_u = frames[3 * plane + 1] / scale_u
+        local_receiver.axis_v = frames[3 * plane + 2] / scale_v
         local_receiver.normal = wp.cross(local_receiver.axis_u, local_receiver.axis_v)
         local_receiver.scale = scale_u
-        offset = point - frames[3 * f]
+        offset = point - frames[3 * plane]
         local_receiver.position = wp.vec3(
             wp.dot(offset, local_receiver.axis_u) / scale_u,
             wp.dot(offset, local_receiver.axis_v) / scale_v,
@@ -119,18 +119,18 @@ def find_local_receiver(point: wp.vec3, frames: wp.array(dtype=wp.vec3), f: int)
 def find_local_receiver_adjoint(
     point: wp.vec3,
     frames: wp.array(dtype=wp.vec3),
-    f: int,
+    plane: int,
     local_receiver: LocalReceiver,
     adj_receiver: LocalReceiver,
     instance: int,
     adj_frames: wp.array2d(dtype=wp.vec3),
 ):
     """Add to the gradients of the frames of an instance; returns that of the point."""
-    scale_u = wp.length(frames[3 * f + 1])
-    scale_v = wp.length(frames[3 * f + 2])
+    scale_u = wp.length(frames[3 * plane + 1])
+    scale_v = wp.length(frames[3 * plane + 2])
     if not (scale_u > 0.0 and scale_v > 0.0):
         return wp.vec3()
-    offset = point - frames[3 * f]
+    offset = point - frames[3 * plane]
     adj_x = adj_receiver.position[0] / scale_u
     adj_y = adj_receiver.position[1] / scale_v
     adj_height = adj_receiver.position[2] / scale_u
@@ -146,17 +146,19 @@ def find_local_receiver_adjoint(
         adj_v = (adj_v - wp.dot(adj_v, local_receiver.axis_v) * local_receiver.axis_v) / scale_v - (
             adj_y * local_receiver.position[1]
         ) * local_receiver.axis_v
-        wp.atomic_add(adj_frames, instance, 3 * f, -adj_offset)
-        wp.atomic_add(adj_frames, instance, 3 * f + 1, adj_u)
-        wp.atomic_add(adj_frames, instance, 3 * f + 2, adj_v)
+        wp.atomic_add(adj_frames, instance, 3 * plane, -adj_offset)
+        wp.atomic_add(adj_frames, instance, 3 * plane + 1, adj_u)
+        wp.atomic_add(adj_frames, instance, 3 * plane + 2, adj_v)
     return adj_offset
 
 
 @wp.func
-def front_of(fronts: wp.array3d(dtype=wp.float32), grid: PlaneGrid, height: float, batch: int, receiver: int, f: int):
+def front_of(
+    fronts: wp.array3d(dtype=wp.float32), grid: PlaneGrid, height: float, batch: int, receiver: int, plane: int
+):
     """Part of the front that a receiver sees, as it is given or by its height."""
     if fronts:
-        return fronts[batch, receiver, f]
+        return fronts[batch, receiver, plane]
     return front_weight(grid, height)
 
 
@@ -168,13 +170,13 @@ def front_of_adjoint(
     adj_front: float,
     batch: int,
     receiver: int,
-    f: int,
+    plane: int,
     adj_fronts: wp.array3d(dtype=wp.float32),
 ):
     """Add to the gradient of the fronts, or return that of the height where there are none."""
     if fronts:
         if adj_fronts:
-            adj_fronts[batch, receiver, f] = adj_fronts[batch, receiver, f] + adj_front
+            adj_fronts[batch, receiver, plane] = adj_fronts[batch, receiver, plane] + adj_front
         return float(0.0)
     return adj_front * front_weight_slope(grid, height)
 

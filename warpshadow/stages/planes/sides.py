@@ -51,7 +51,7 @@ def plane_inputs(points: wp.array, frames: wp.array, fronts: wp.array | None, pl
 class StoredSide:
     """A side that a receiver sees, as it is stored, with its gradients."""
 
-    f: int  # number of the plane
+    plane: int  # its number
     is_back: wp.bool
     weight: float  # part of the side that is there
     local_receiver: LocalReceiver
@@ -81,7 +81,7 @@ class PlaneSide:
     """A side of a plane, as a receiver sees it."""
 
     index: int  # among the sides that the receiver sees
-    f: int  # number of the plane
+    plane: int  # its number
     is_back: wp.bool
     weight: float  # part of the side that is there
     first_edge: int  # of its viewed edges
@@ -94,10 +94,10 @@ def load_side(planes: PlaneArrays, receiver: PlaneReceiver, index: int):
     """Load one of the sides that a receiver sees."""
     side = PlaneSide()
     side.index = index
-    side.f = receiver.sides[index].f
+    side.plane = receiver.sides[index].plane
     side.is_back = receiver.sides[index].is_back
     side.weight = receiver.sides[index].weight
-    side.grid = planes.grids[side.f]
+    side.grid = planes.grids[side.plane]
     side.first_edge = _SIDES * side.grid.first_edge + wp.where(side.is_back, side.grid.edge_count, 0)
     side.local_receiver = receiver.sides[index].local_receiver
     return side
@@ -218,13 +218,18 @@ def _view_outline_adjoint(
 
 @wp.func
 def _with_side(
-    planes: PlaneArrays, f: int, is_back: bool, weight: float, local_receiver: LocalReceiver, receiver: PlaneReceiver
+    planes: PlaneArrays,
+    plane: int,
+    is_back: bool,
+    weight: float,
+    local_receiver: LocalReceiver,
+    receiver: PlaneReceiver,
 ):
     """Store a side with its outline if some of it is there; returns how many sides are stored."""
     if weight <= 0.0:
         return receiver.side_count
     side = StoredSide()
-    side.f = f
+    side.plane = plane
     side.is_back = is_back
     side.weight = weight
     side.local_receiver = local_receiver
@@ -251,14 +256,14 @@ def prepare_receiver(
     receiver.edges = edges[receiver.slot]
     planes = inputs.planes
     frame_batch = instance_in(batch, inputs.frames.shape[0])
-    for f in range(planes.grids.shape[0]):
-        if f != planes.skip:
-            local_receiver = find_local_receiver(inputs.points[batch, index], inputs.frames[frame_batch], f)
+    for plane in range(planes.grids.shape[0]):
+        if plane != planes.skip:
+            local_receiver = find_local_receiver(inputs.points[batch, index], inputs.frames[frame_batch], plane)
             if wp.length_sq(local_receiver.normal) > 0.0:
                 # below the plane the front fades, and the back takes over
-                front = front_of(inputs.fronts, planes.grids[f], local_receiver.position[2], batch, index, f)
-                receiver.side_count = _with_side(planes, f, False, front, local_receiver, receiver)
-                receiver.side_count = _with_side(planes, f, True, 1.0 - front, local_receiver, receiver)
+                front = front_of(inputs.fronts, planes.grids[plane], local_receiver.position[2], batch, index, plane)
+                receiver.side_count = _with_side(planes, plane, False, front, local_receiver, receiver)
+                receiver.side_count = _with_side(planes, plane, True, 1.0 - front, local_receiver, receiver)
     return receiver
 
 
@@ -280,10 +285,10 @@ def prepare_receiver_adjoint(
         adj_local = _view_outline_adjoint(inputs.planes, side, receiver.edges, receiver.sides[i].adj_local_receiver)
         adj_front = wp.where(side.is_back, -1.0, 1.0) * receiver.sides[i].adj_weight
         height = side.local_receiver.position[2]
-        adj_height = front_of_adjoint(inputs.fronts, side.grid, height, adj_front, batch, index, side.f, adj_fronts)
+        adj_height = front_of_adjoint(inputs.fronts, side.grid, height, adj_front, batch, index, side.plane, adj_fronts)
         adj_local.position = adj_local.position + wp.vec3(0.0, 0.0, adj_height)
         adj_point += find_local_receiver_adjoint(
-            point, frames, side.f, side.local_receiver, adj_local, frame_batch, adj_frames
+            point, frames, side.plane, side.local_receiver, adj_local, frame_batch, adj_frames
         )
     if adj_points:
         adj_points[batch, index] = adj_points[batch, index] + adj_point
