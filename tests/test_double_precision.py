@@ -383,14 +383,14 @@ def test_what_patches_show(double, planes, check, device):
 
 
 def test_how_much_patch_samples_count(double, device, check):
-    patch_samples, radiosity = double("stages.bounces.openness"), double("stages.bounces.radiosity")
+    patch_samples, radiosity = double("stages.bounces.patch_weights"), double("stages.bounces.radiosity")
     directions, owners = double("maths.directions").fibonacci(16), np.array([0, 0, 2])
     mean = radiosity.mean_over_patch_samples(owners, np.array([0.3, 0.7, 1]), 3, device=device)
     past_self = np.random.default_rng(1).random((1, 3, 16))
 
     def shown(albedo, light, normals, past_self, past_all):
-        openness = patch_samples.find_openness(normals, past_self, past_all, directions)
-        shares, weights = patch_samples.open_shares(openness, mean, owners)
+        means = patch_samples.find_mean_transmittance(normals, past_self, past_all, directions)
+        shares, weights = patch_samples.find_patch_weights(means, mean, owners)
         return radiosity.reflect(weights, radiosity.patch_radiosity(albedo, light, mean, shares))
 
     colors = (wp.vec3d, random(2, 1, 3, 3)), (wp.vec3d, random(3, 2, 3, 3))

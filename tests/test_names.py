@@ -42,6 +42,7 @@ BANNED = {
     *("own_shares", "own_sides", "place_receiver", "place_weights", "PlaneCover", "points_seen", "radiosity_before"),
     *("ReceiverInPlane", "scaled_to_sky", "see_samples", "SeenSurface", "trace_factors", "transmittance_towards"),
     *("turn_from_planes", "unblocked_batch", "with_rows", "with_tail", "without_owners"),
+    *("find_openness", "HIT_ROWS", "load_hit", "node_centers", "open_shares", "open_weights", "Openness", "SIDE_ROWS"),
 }
 BANNED_PARTS = {"asked", "kept", "meant", "most", "pull", "pulled", "said", "taken", "told", "wanted"}
 """Words that no name has among its parts. A preposition may be one, as in ``planes_around``, where an object follows it

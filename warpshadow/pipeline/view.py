@@ -155,8 +155,8 @@ class View(LitPoints):
                 merged_scene.faces, keeps_vertex, on_static_body, merged_scene.vertex_order, bodies
             )
             if spheres is not None and (is_adaptive := method.is_adaptive & wants_samples).any():
-                from warpshadow.pipeline.by_spheres import SphereMethod
                 from warpshadow.pipeline.receivers.adaptive import find_squares
+                from warpshadow.pipeline.sphere_method import SphereMethod
 
                 assert isinstance(method, SphereMethod)
                 place = functools.partial(method.blockers, self.blocker_kinds)

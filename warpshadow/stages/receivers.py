@@ -18,7 +18,8 @@ from warpshadow.device.parallel import run_length
 from warpshadow.stages.interpolation import interpolate_at
 from warpshadow.stages.quadtree import Quadtree
 from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.sample_receivers import Span, VisibleSurface, find_sample_receivers, spans_of
+from warpshadow.stages.receiver_means import VisibleSurface
+from warpshadow.stages.sample_receivers import Span, find_sample_receivers, spans_of
 from warpshadow.stages.sides import split_side, split_sides
 from warpshadow.stages.silhouettes.find import Silhouettes
 

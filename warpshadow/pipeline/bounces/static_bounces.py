@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
+from warpshadow.pipeline.bounces.patches import ScenePatches, Senders, lit_patch_samples
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
@@ -268,9 +268,8 @@ class StaticBounces:
 
         def make() -> Node:
             patch_samples = self.patch_samples(points, materials)
-            arguments = points.merged_scene, materials, points.vertices, points.spheres, patch_samples, points.call
-            at_patch_samples = LitPoints(*arguments, normals=points.normals, blocker_kinds=points.blocker_kinds)
-            skies = [self._openness(item) for item in (at_patch_samples, points)]
+            lit_samples = lit_patch_samples(patch_samples, points, materials)
+            skies = [self._openness(item) for item in (lit_samples, points)]
             return Node(
                 "form factors",
                 find,

@@ -1,14 +1,12 @@
-"""Sharp cells: cells whose light comes from a spot much smaller than they are, as a sun's.
-
-Where nothing is known of the light in a cell, the soft edge of a shadow, w = κρ, is as wide as cells ask for. A spot of
-half-angle s has a penumbra of ±s. So a sharp cell gets the edge of cells of radius ρ = 2.4 s: at κ = 0.35 it is ±0.84
-s, a smoothstep about as steep as that penumbra. κ scales it as it does all edges. The transmittance T′ of sharp cells
-is found by itself, and blended with that by wide edges, T, by the share σ of the cell's light that is the spot's:
+"""Sharp cells: transmittance of cells whose light comes from a spot much smaller than they are, as a sun's.
 
     T ← T + σ (T′ − T)
 
-Around a sun the sky is bright: 7% of the light of its cell. By σ = 1 the spot of a sun on the floor of a closed room
-was 4% too bright, and a ball above it, which sees that sky and not the sun, 15% too dark.
+with T the transmittance by edges as wide as cells ask for, w = κρ, T′ that by the edge of cells of radius 2.4 s, s the
+half-angle of the spot, and σ the share of the cell's light that is the spot's. A spot has a penumbra of ±s; at κ = 0.35
+the edge is ±0.84 s, a smoothstep about as steep. κ scales it as it does all edges.
+
+By σ = 1 a ball in a room that sees the sky around the sun and not the sun was 15% too dark.
 """
 
 from typing import NamedTuple

@@ -6,7 +6,7 @@ import pytest
 import warp as wp
 from test_projected_areas import DIRECTIONS, compare
 
-from warpshadow.stages.bounces.openness import find_openness, open_shares
+from warpshadow.stages.bounces.patch_weights import find_mean_transmittance, find_patch_weights
 from warpshadow.stages.bounces.radiosity import mean_over_patch_samples, patch_radiosity
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
@@ -22,8 +22,8 @@ def sums(normals, *transmittances):
 
 
 def twin_shares(normals, past_self, past_all):
-    (openness,) = sums(normals, past_all)
-    return np.repeat((openness / np.bincount(PATCHES, WEIGHTS * openness)[PATCHES])[:, None], 3, axis=1)
+    (means,) = sums(normals, past_all)
+    return np.repeat((means / np.bincount(PATCHES, WEIGHTS * means)[PATCHES])[:, None], 3, axis=1)
 
 
 def twin_weights(normals, past_self, past_all):
@@ -34,7 +34,7 @@ def twin_weights(normals, past_self, past_all):
 
 def find(normals, past_self, past_all, device):
     mean = mean_over_patch_samples(PATCHES, WEIGHTS, 3, device=device)
-    return open_shares(find_openness(normals, past_self, past_all, DIRECTIONS), mean, PATCHES)
+    return find_patch_weights(find_mean_transmittance(normals, past_self, past_all, DIRECTIONS), mean, PATCHES)
 
 
 def shares(normals, past_self, past_all, device):
@@ -78,4 +78,4 @@ def test_what_does_not_fit_is_refused(device):
     normals = wp.zeros((1, 5), dtype=wp.vec3, device=device)
     passing = wp.zeros((1, 5, 8), dtype=wp.float32, device=device)
     with pytest.raises(ValueError, match=r"transmittance_spheres: got shape \(1, 5, 8\), expected \[batch, 5, 32\]"):
-        find_openness(normals, None, passing, DIRECTIONS)
+        find_mean_transmittance(normals, None, passing, DIRECTIONS)
