@@ -118,7 +118,7 @@ def test_a_white_metal_in_a_white_furnace_loses_what_single_scattering_loses(rou
 
 
 @pytest.mark.parametrize("metallic", [0.0, 1.0])
-def test_stills_and_kept_renderers_show_the_same_gloss(metallic):
+def test_stills_and_renderers_show_the_same_gloss(metallic):
     body = dataclasses.replace(BALL, metallic=metallic)
     kept, still = ws.Renderer(scene_of(body, GROUND, POST)).render(), ws.render(scene_of(body, GROUND, POST))
     assert np.linalg.norm(kept - still) < 0.06 * np.linalg.norm(still)

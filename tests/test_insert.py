@@ -174,7 +174,7 @@ def test_several_catchers_catch_and_shadow_each_other_as_in_the_photograph():
 
 
 def test_shadows_are_caught_pixel_by_pixel():
-    """By a ground that would have its receivers at its vertices in a renderer that is kept."""
+    """By a ground that would have its receivers at its vertices in a renderer."""
     photograph = np.full((36, 48, 3), 0.5, np.float32)
     images = [
         ws.insert(scene_of(bodies=[ball(), ground(receivers=receivers)]), photograph)

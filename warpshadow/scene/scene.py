@@ -166,7 +166,7 @@ class Scene:
         return as_light(self.light)
 
     def with_method(self) -> Scene:
-        """The scene as renderers that are kept have it: "directional" where no method is named."""
+        """The scene as renderers have it: "directional" where no method is named."""
         return self if self.visibility.method else replace(self, visibility=self.visibility.with_method())
 
     def background(self) -> np.ndarray:
