@@ -1,5 +1,6 @@
 """Pages are true: links lead somewhere, names exist, commands start, and snippets run as they stand."""
 
+import ast
 import dataclasses
 import importlib
 import re
@@ -143,14 +144,35 @@ def resolved(path):
     return False
 
 
-ROLES = re.compile(r":(func|class|meth|data|mod|attr):`~?(warpshadow\.[\w.]+)`")
+SOURCES = {file: file.read_text("utf-8") for file in sorted((ROOT / "warpshadow").rglob("*.py"))}
+DEFINED = {name for file in SOURCES for name in (file.stem, file.parent.name)} | {
+    getattr(node, key)
+    for text in SOURCES.values()
+    for node in ast.walk(ast.parse(text))
+    for key in ("name", "id", "attr", "arg")
+    if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.arg) or isinstance(getattr(node, "ctx", None), ast.Store)
+    if hasattr(node, key)
+}
+ROLES = re.compile(r":(func|class|meth|data|mod|attr):`~?([\w.]+)`")
 
 
-@pytest.mark.parametrize("file", sorted((ROOT / "warpshadow").rglob("*.py")), ids=name_of)
-def test_what_docstrings_refer_to_exists(file):
-    for role, path in ROLES.findall(file.read_text("utf-8")):
-        assert resolved(path), path
-        assert (path in sys.modules) == (role == "mod"), path
+@pytest.mark.parametrize("file", SOURCES, ids=name_of)
+def test_names_that_docstrings_refer_to_exist(file):
+    for role, path in ROLES.findall(SOURCES[file]):
+        if path.startswith("warpshadow."):
+            assert resolved(path), path
+            assert (path in sys.modules) == (role == "mod"), path
+        else:
+            assert DEFINED.issuperset(path.strip(".").split(".")), path
+
+
+@each_page_of_today
+def test_methods_and_constants_that_a_page_names_exist(page):
+    texts = code(page)
+    for owner, name in (match.groups() for text in texts if (match := re.match(r"([A-Z]\w*)\.(\w+)(?:$|\()", text))):
+        assert owner not in DEFINED or name in DEFINED, f"{owner}.{name}"
+    for name in (text for text in texts if re.fullmatch(r"(?!WARP_|MALLOC_|G?OMP_)_?[A-Z]+(?:_[A-Z]+)+", text)):
+        assert any(name in text for text in SOURCES.values()), name
 
 
 # ------------------------------------------------------------------------------------------------ figures

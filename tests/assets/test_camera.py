@@ -122,7 +122,7 @@ def test_a_turned_camera_sees_what_the_camera_sees_of_things_turned_with_it():
         ("shown: got 7", 7, {}),
         ("shown: got nothing", [], {}),
         ("shown[1]: got 'bunny.obj'", [ws.icosphere(), "bunny.obj"], {}),
-        ("shown: got what is a point or a line along", ws.Mesh([[1, 2, 3]], [[0, 0, 0]]), {}),
+        ("shown: got a point or a line along", ws.Mesh([[1, 2, 3]], [[0, 0, 0]]), {}),
         ("shown: got what is a point", ws.Mesh([[0, 0, 0], [0, 0, 1]], [[0, 1, 1]]), {"direction": (0, 0, 2)}),
         ("direction: got [0.0, 0.0, 0.0]", ws.icosphere(), {"direction": (0, 0, 0)}),
         ("direction: got [0.0, 1.0, 0.0], parallel to up", ws.icosphere(), {"direction": (0, 1, 0)}),

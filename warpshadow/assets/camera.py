@@ -196,7 +196,7 @@ class Camera:
         minimum, maximum = (x - z[:, None] * tangents).max(axis=0), (x + z[:, None] * tangents).min(axis=0)
         depth = ((maximum - minimum) / (2.0 * tangents)).min()
         if not depth < z.min() - 1e-9 * np.ptp(points, axis=0).max():
-            raise ValueError(f"shown: got what is a point or a line along {away.tolist()}, expected a surface")
+            raise ValueError(f"shown: got a point or a line along {away.tolist()}, expected a surface")
         eye = np.array([*(minimum + maximum) / 2, depth])
         near = _NEAR * (z.min() - depth) if near is None else near
         return cls(intrinsics, rotation, -eye - rotation @ center, width, height, near)

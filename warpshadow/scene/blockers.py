@@ -63,8 +63,8 @@ def blocking_parts(scene: Scene) -> dict[int, list[ConvexPart]]:
     """Find the convex parts as which bodies block the light of others, in place of their spheres, by their numbers.
 
     By method "directional" these are those of all bodies that consist of some, unless how many spheres they have, or
-    that these block their own light, was asked for. Panels are chords of what bends. Over land these would stand before
-    it, and shade what lies between; so a body with a solid behind it (:mod:`.scene.height_fields`) has panels only
+    that these block their own light, was asked for. Panels are chords of bent sheets. Over land they would shade the
+    air behind them; so a body with a solid behind it (:mod:`.scene.height_fields`) has panels only
     where it is flat, such as the walls of a room.
     """
     visibility = scene.visibility.with_method()

@@ -236,7 +236,7 @@ class Scene:
         if not isinstance(value, Sequence) or isinstance(value, str):
             raise ValueError(
                 f"{argument}: got {check.described(value)}, expected a list of {count} items, one for each body, None "
-                "for what the scene has; or some by their bodies, such as {0: …}"
+                "for the scene's own; or some by their bodies, such as {0: …}"
             )
         if len(value) != count:
             raise ValueError(f"{argument}: got {len(value)} items, expected {count}, one for each body")

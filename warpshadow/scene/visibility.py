@@ -118,8 +118,8 @@ class Visibility:
                 readers = " or ".join(map(repr, METHODS_OF_SETTING[name]))
                 raise ValueError(
                     f"{name}: got {getattr(self, name)!r}, which {reader!r} does not read, expected the default, "
-                    f"{getattr(Visibility, name)!r}, or method = {readers}; visibility.by({reader!r}) leaves behind "
-                    "what a method does not read"
+                    f"{getattr(Visibility, name)!r}, or method = {readers}; visibility.by({reader!r}) leaves such "
+                    "settings out"
                 )
         if self.method is None and set(changed) & _DIRECTIONAL_SETTINGS:
             object.__setattr__(self, "method", DEFAULT_METHOD)

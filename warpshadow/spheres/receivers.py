@@ -71,10 +71,8 @@ class FitReceivers:
     GROUND, SURFACE = 0.55, 0.25  # shares of the receivers on grounds and on the mesh; the others lie around it
     VISIBLE_FLOOR = 0.2  # weight of receivers that nothing can see, next to 1 for receivers in the open
     SHEET = 0.05
-    """Weight of receivers on a sheet, next to 1 for receivers on a solid. A sphere in a sheet bulges out of it and
-    darkens its surface, so spheres shrank until light came through: with a weight of 1 the shadow that 128 spheres of a
-    tent cast is off by 40%, the light around it by 40 and on it by 26%; with this one by 8, 29 and 40%. What a body
-    blocks of its own light is traced."""
+    """Weight of receivers on a sheet, next to 1 on a solid: spheres bulge out of it and darken it, and shrink for that
+    until light comes through. The shadow that 128 spheres of a tent cast is 8% off, with a weight of 1 40%."""
 
     def __init__(self, mesh: NormalizedMesh, count: int, rng: np.random.Generator, *, sharpness: float = SHARPNESS):
         ground, surface = int(self.GROUND * count), int(self.SURFACE * count)
