@@ -3,9 +3,10 @@
     python demos/benchmarks/scenes_of_all_kinds.py [--scenes NAME ...] [--data FOLDER] [--size 256] [--jobs 1]
         [--settings still-direct renderer-direct still-full renderer-full] [--mitsuba] [--output FOLDER]
 
-The scenes are those of demos/kinds.py. A still is ``ws.render``, an image of a renderer ``ws.Renderer(scene).render()``. Direct light
-is compared with rays, full light, ``bounces = "all"`` (or as many as ``--bounces`` says), with paths of all bounces,
-both by method "ray-traced". For each scene and setting the demo prints, in percent
+The scenes are those of demos/kinds.py. A still is ``ws.render``, an image of a renderer
+``ws.Renderer(scene).render()``. Direct light is compared with rays, full light, ``bounces = "all"`` (or as many as
+``--bounces`` says), with paths of all bounces, both by method "ray-traced". For each scene and setting the demo prints,
+in percent
 
     error    relative L2 error of color over wholly covered pixels, as in the other demos
     bodies   of each body, how much brighter its pixels are on average: the worst first, as many as --bodies says
@@ -15,14 +16,14 @@ References are rendered twice, the second time with scene and light turned about
 first two figures are against the mean of both, with its noise, half their difference, taken off. They stay in
 OUTPUT/references by a hash of all that they depend on, so that a second run renders ours alone.
 
-Where a still and a renderer's image of one light are asked for, "still to renderer" is their relative L2 difference over pixels
-that are wholly covered.
+Where a still and a renderer's image of one light are asked for, "still to renderer" is their relative L2 difference
+over pixels that are wholly covered.
 
 Also printed: CPU seconds of the first image (* where the cache lacked a fit, self-shadows or form factors of it; the
 very first run also compiles kernels); CPU milliseconds of an image after all bodies moved; the most memory that the
-scene's process had up to each setting. With
-``--mitsuba`` the references are compared with Mitsuba's, and ours with both. A contact sheet for each scene shows
-reference, still and renderer, and in red where they are too bright, in blue where too dark. results.json has all figures.
+scene's process had up to each setting. With ``--mitsuba`` the references are compared with Mitsuba's, and ours with
+both. A contact sheet for each scene shows reference, still and renderer, and in red where they are too bright, in blue
+where too dark. results.json has all figures.
 """
 
 import argparse

@@ -1,7 +1,7 @@
 """Spare memory: large blocks that arrays are done with, for the next arrays of about their size.
 
-An iteration frees memory that the next one takes again. The C library gives large blocks back to the system at once, and every
-page of a new one stops the kernel that first writes to it: a fifth of an iteration of a pose.
+An iteration frees memory that the next one takes again. The C library gives large blocks back to the system at once,
+and every page of a new one stops the kernel that first writes to it: a fifth of an iteration of a pose.
 """
 
 import threading
