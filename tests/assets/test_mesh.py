@@ -751,25 +751,6 @@ def test_normals_of_a_welded_seam_are_smooth_across_it(tmp_path, device):
     assert lower[0] > 0.9 > np.sqrt(0.5)  # the normal of either quad
 
 
-def test_the_gradient_of_vertex_normals_equals_central_differences(device, verified_tape):
-    random = np.random.default_rng(1)
-    mesh = icosphere(1.0, 1)
-    start = mesh.positions + 0.1 * random.normal(size=mesh.positions.shape)
-    start = start.astype(np.float32).astype(np.float64)
-    weights = random.normal(size=start.shape)
-    positions = wp.array(start[None], dtype=wp.vec3, device=device, requires_grad=True)
-    with wp.Tape() as tape:
-        normals = vertex_normals(positions, wp.array(mesh.faces, dtype=wp.vec3i, device=device))
-    tape.backward(grads={normals: wp.array(weights[None], dtype=wp.vec3, device=device)})
-    expected = np.zeros_like(start)
-    for index in np.ndindex(*start.shape):
-        step = np.zeros_like(start)
-        step[index] = 1e-5
-        change = normals_twin(start + step, mesh.faces) - normals_twin(start - step, mesh.faces)
-        expected[index] = np.sum(weights * change) / 2e-5
-    np.testing.assert_allclose(positions.grad.numpy()[0], expected, rtol=1e-4, atol=1e-4)
-
-
 def test_faces_without_area_give_zero_normals_and_zero_gradients(device, verified_tape):
     points = np.float32([[0, 0, 0], [1, 0, 0], [2, 0, 0], [7, 7, 7]])  # three on a line, and one without a face
     positions = wp.array(points[None], dtype=wp.vec3, device=device, requires_grad=True)
