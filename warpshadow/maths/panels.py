@@ -10,24 +10,12 @@ from warpshadow.maths.outline import cut_outline, find_outline
 from warpshadow.maths.plane import is_flat, principal_axes
 
 TOLERANCES = (0.02, 0.03)
-"""Thickness and mean gap of a panel at most, over the size of the mesh: the second where the first takes too many.
-
-The tent of demos/kinds.py has 6 panels, and its image by pixel is 3.1% off; with 0.01 it has 16, and the image is 2.9%
-off, in 1.5 times the time. With spheres it was 10.2% off. With 0.04 light comes through between the panels of half a
-shell.
-"""
+"""Thickness and mean gap of a panel at most, over the size of the mesh: the second where the first takes too many. With
+0.04 light comes through between the panels of half a shell."""
 
 FLAT = 1e-3  # the same for flat panels, which shade nothing that lies on the mesh
-
-MAX_PANELS = 64
-"""Panels of a mesh at most: beyond, spheres are faster.
-
-With a panel for each of the 162 leaves of the tree of demos/kinds.py its image takes 2.4 times as long, and is 5.3% off
-in place of 5.6%. An umbrella of eight arched fields has 48.
-"""
-
-_CREASE = 0.94
-"""Cosine of the angle between neighboring triangles, 20°, beyond which there is a crease between them."""
+MAX_PANELS = 64  # of a mesh: beyond, spheres are faster. An umbrella of eight arched fields has 48
+_CREASE = 0.94  # cosine of the angle between neighboring triangles, 20°, beyond which there is a crease between them
 
 
 def find_panels(points: np.ndarray, triangles: np.ndarray, tolerance: float, maximum: int) -> list[np.ndarray] | None:
