@@ -382,7 +382,7 @@ def test_gradients_of_projected_areas_are_exact(double, planes, check, device):
     check(lambda n, t: areas.find_projected_areas(n, t, mean, directions), *rest)
 
 
-def test_gradients_of_weights_of_patch_samples_are_exact(double, device, check):
+def test_how_much_patch_samples_count(double, device, check):
     patch_samples, radiosity = double("stages.bounces.openness"), double("stages.bounces.radiosity")
     directions, owners = double("maths.directions").fibonacci(16), np.array([0, 0, 2])
     mean = radiosity.mean_over_patch_samples(owners, np.array([0.3, 0.7, 1]), 3, device=device)

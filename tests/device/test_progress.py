@@ -36,7 +36,7 @@ def lines(monkeypatch, capsys):
     monkeypatch.setattr(progress, "_can_be_seen", lambda: False)
     monkeypatch.setattr(progress, "_DELAY", 0.02)
     monkeypatch.setattr(progress, "_LINE_INTERVAL", 0.2)
-    for name, value in {"_reporter": None, "_said": -math.inf, "_ended": -math.inf}.items():
+    for name, value in {"_reporter": None, "_line_time": -math.inf, "_end_time": -math.inf}.items():
         monkeypatch.setattr(progress, name, value)
     return lambda: capsys.readouterr().err.splitlines()
 

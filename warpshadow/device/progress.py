@@ -143,7 +143,7 @@ class Wait:
 _waits: list[Wait] = []  # of all threads, the innermost last
 _lock = threading.RLock()  # guards them, and the bar
 _reporter: threading.Thread | None = None  # while there are any
-_said = _ended = -math.inf  # when the last line was said, and a wait ended
+_line_time = _end_time = -math.inf  # when the last line was said, and a wait ended
 _is_hidden = False  # whether a call is under way that says nothing
 
 
@@ -161,10 +161,10 @@ if hasattr(os, "register_at_fork"):
 @contextlib.contextmanager
 def _reported(wait: Wait) -> Iterator[None]:
     """Report a wait while a block runs."""
-    global _reporter, _said, _ended
+    global _reporter, _line_time, _end_time
     with _lock:
-        if not _waits and time.monotonic() - _ended >= _LINE_INTERVAL:
-            _said = time.monotonic()
+        if not _waits and time.monotonic() - _end_time >= _LINE_INTERVAL:
+            _line_time = time.monotonic()
         _waits.append(wait)
         if _reporter is None:
             _reporter = threading.Thread(target=_report, name="warpshadow-progress", daemon=True)
@@ -177,12 +177,12 @@ def _reported(wait: Wait) -> Iterator[None]:
             if wait.bar is not None:
                 wait.bar.close()
             _name_inner_work(refresh=False)
-            _ended = time.monotonic()
+            _end_time = time.monotonic()
 
 
 def _report() -> None:
     """Draw the bar, or say lines, until no wait is left."""
-    global _reporter, _said
+    global _reporter, _line_time
     while True:
         time.sleep(min(_DELAY, _LINE_INTERVAL) / 2)
         with _lock:
@@ -193,9 +193,9 @@ def _report() -> None:
                 _name_inner_work(refresh=True)
                 continue
             long_waits = [wait for wait in _waits if wait.age >= _DELAY]
-            is_due = time.monotonic() - _said >= _LINE_INTERVAL
+            is_due = time.monotonic() - _line_time >= _LINE_INTERVAL
             if is_due and long_waits and long_waits[0].age >= long_waits[0].patience:
-                _said = time.monotonic()
+                _line_time = time.monotonic()
                 say("; ".join(wait.line() for wait in long_waits))
 
 

@@ -1,6 +1,6 @@
 """Plane hits: the sides of planes that a cell of a receiver meets, and how they hide each other.
 
-Of each side k its coverage h_k is known, the centroid y_k = μ_k / h_k of that part, in radii ρ from the middle of
+Of each side k its coverage h_k is known, the centroid y_k = μ_k / h_k of what it covers, in radii ρ from the middle of
 the cell, and the inverse of its distance along a direction ω, which is g_k·ω, g_k = N_k / d_k. Sides are taken to
 cover parts of a cell that do not depend on each other. So k and j share a part around ω + ρ (y_k + y_j). In a share
 
@@ -12,7 +12,7 @@ open, and block with a moment,
 
     o_k = 1 − Σ_j S_kj h_j,  m_k = Σ_j S_kj μ_j
 
-So of a side the share h_k o_k is seen, and its centroid, of the part that others leave open, is
+So of a side the share h_k o_k is seen, and its centroid is that of what others leave open,
 
     z_k = −m_k / √(o_k² + |m_k|²)
 
@@ -186,7 +186,7 @@ def _find_overlap(cell: VisibleCell, hit: PlaneHit, other: PlaneHit):
 
 @wp.func
 def _block_each_other(cell: VisibleCell, k: int, j: int, first_hit: int, store: wp.array(dtype=wp.vec3)):
-    """Take from each of two hits the part that the other blocks."""
+    """Take from each of two hits what the other blocks of it."""
     hit, other = load_hit(store, first_hit, k), load_hit(store, first_hit, j)
     share_in_front = wp.smoothstep(-1.0, 1.0, _find_overlap(cell, hit, other).relative)
     by_other = share_in_front * other.coverage
@@ -250,7 +250,7 @@ def _block_each_other_adjoint(
 
 @wp.func
 def _unnormalized_direction(cell: VisibleCell, hit: PlaneHit):
-    """Direction ω + ρ z of the part of a side that others leave open, not of unit length; and the length of (o, m)."""
+    """Direction ω + ρ z of what others leave open of a side, not of unit length; and the length of (o, m)."""
     length = wp.sqrt(hit.open_share * hit.open_share + wp.length_sq(hit.blocked_moment))
     return cell.direction - (cell.radius / length) * hit.blocked_moment, length
 
@@ -264,7 +264,7 @@ def _visible_footprint(
     cell: VisibleCell,
     hit: PlaneHit,
 ):
-    """Direction and footprint of the part of a side that others leave open."""
+    """Direction and footprint of what others leave open of a side."""
     direction = cell.direction
     if hit.open_share < 1.0:
         visible_direction, _ = _unnormalized_direction(cell, hit)
@@ -325,7 +325,7 @@ def _find_visible_parts(
     side_count: int,
     store: wp.array(dtype=wp.vec3),
 ):
-    """Find the part of each hit that nearer sides leave open, and its radiosity."""
+    """Find what nearer sides leave open of each hit, and the radiosity of that."""
     first_hit = SIDE_ROWS * planes.grids.shape[0]
     for k in range(1, side_count):
         for j in range(k):
@@ -384,7 +384,7 @@ def _visible_radiosity_adjoint(
     instance: int,
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
-    """Add to the gradients of a receiver relative to a plane, of the part that others leave open, and of its texels."""
+    """Add to the gradients of a receiver relative to a plane, of what others leave open of it, and of its texels."""
     side = load_side(planes, side_index, store)
     grid = planes.grids[side.f]
     first_hit = SIDE_ROWS * planes.grids.shape[0]

@@ -2,7 +2,7 @@
 
 Their patches are the texels of a grid; :mod:`warpshadow.stages.planes.cells` has the footprint of a cell on it, and
 :mod:`.plane_hits` the coverage h of it by each side, the share o that nearer sides leave open of that, and the
-radiosity B of the visible part.
+radiosity B of what is seen.
 
 A plane blocker is seen from both sides; its back is black unless it has patches there. Plane blockers send all that
 they block of a cell (:mod:`warpshadow.stages.planes.coverage`), as much of it as is seen of each:

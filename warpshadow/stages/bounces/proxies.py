@@ -3,11 +3,11 @@
 A patch of area A has a sphere of radius ρ = √(A/2), whose center is ρ/2 below it: as wide as the diagonal of a square
 patch, so that neighbors overlap, bulging out of the body by ρ/2. As bodies grow, so does it, by the radius of the
 sphere that blocks light beside it. Of a sheet, whose other side has patches of its own, centers are ρ/4 above: a
-receiver is nearer to visible patches than to the patches behind them. If they were below, too, the sunlit outside of a
-tent shone through: its image with all bounces is 6.8% off so, 3.9% with centers in the sheet, and 3.6% with these. So
-it is with walls and boards that are thinner than their proxies: with a thickness h ≤ 2ρ centers are 3h/8 − ρ/4 below.
-With ρ/2 the proxies of both sides change places, and a sunlit wall glows on its inside. A receiver that touches a body
-is within proxies of several of its sides, and sees by ``tangent_planes.py`` those that it is above.
+receiver is nearer to visible patches than to the patches behind them. If they were below, too, the sunlit outside of
+a tent shone through: its image with all bounces is 6.8% off so, 3.9% with centers in the sheet, and 3.6% with these.
+So it is with walls and boards that are thinner than their proxies: with a thickness h ≤ 2ρ centers are 3h/8 − ρ/4
+below. With ρ/2 the proxies of both sides change places, and a sunlit wall glows on its inside. What touches a body is
+within proxies of several of its sides, and sees by ``tangent_planes.py`` those that it is above.
 
 If the spheres that block light stood in for the patches around them, the foot of a ball would be lit by the ball's
 whole side, where it sees the little below, which is dark: at 0.2, 0.4 and 0.6 radii from the contact of a ball with a

@@ -8,7 +8,7 @@ their surface to n, counts for a receiver x, at a distance d from the node's cen
     f = ε + (1 − ε) smoothstep((n·(x − p) + d sin σ) / w),  w = b + r/20,
 
 with b how far the surface lies below the plane, and r the node's radius. A flat patch is seen from above alone, one of
-a ball by σ from farther below. ε is small beside the weight of visible nodes; where there are none, in cells that are
+a ball by σ from farther below. ε is small beside the weight of what is seen; where nothing is, in cells that are
 blocked by spheres that bulge out of a flat side, it leaves the mean of all. Without f, planks under a barn's eaves got
 five times as much light from the roof.
 """
