@@ -304,7 +304,7 @@ def test_another_method_stays_as_it_is(method):
     assert resolved(scene) is scene
 
 
-def test_where_none_is_named_it_is_that_of_renderers_that_are_kept():
+def test_where_none_is_named_it_is_that_of_renderers():
     assert resolved(make_scene()).visibility.method == "directional"
 
 

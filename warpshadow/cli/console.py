@@ -37,7 +37,7 @@ Quiet = Annotated[
     typer.Option(
         "-q",
         "--quiet",
-        help="Print reports, warnings and errors alone: no progress, and not what was written.",
+        help="Print reports, warnings and errors alone: no progress, and no names of files.",
         callback=_start,
     ),
 ]

@@ -162,7 +162,7 @@ def _resumable(folder: Path) -> Iterator[None]:
 def dataset(
     recipe: Annotated[Path, typer.Argument(help="Recipe, TOML; warpshadow/dataset/README.md lists its keys.")],
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="Folder for the shards; what was interrupted there goes on.")
+        Path, typer.Option("-o", "--output", help="Folder for the shards; an interrupted run there goes on.")
     ],
     workers: Annotated[
         Optional[int], typer.Option(help="Processes that render; by default one a core, on a GPU one.", min=1)

@@ -63,7 +63,7 @@ def render(
     ] = None,
     tone: Annotated[
         Literal["clip", "filmic"],
-        typer.Option(help="What becomes of bright color: cut off, or bent.", rich_help_panel=_PICTURES),
+        typer.Option(help="Tone curve of bright color: cut off, or bent.", rich_help_panel=_PICTURES),
     ] = "clip",
     background: Annotated[
         str,

@@ -132,7 +132,7 @@ def tune(
     """Measure settings on a scene, and print the cheapest that reach an error, as lines to put into the scene file.
 
     Errors are printed before times are measured. Exit status 1: no setting reaches the error; the message names the
-    nearest one, and what to try next.
+    nearest one, and the next attempt.
     """
     from warpshadow.tuning.tune import describe
     from warpshadow.tuning.tune import tune as tune_scene

@@ -1,9 +1,7 @@
 """Memory: new arrays, huge pages for large ones, and views of arrays.
 
-Memory that is new to a process comes in pages of 4 kB, each of which stops the kernel that first writes to it. Of
-receivers × directions there are 100 MB: their pages took a fifth of a forward call on 64 small images, and a quarter of
-one with gradients. Huge pages, of 2 MB, take a fourth of that. Linux gives them on request; other systems are not
-asked.
+Memory that is new to a process comes in pages of 4 kB, each of which stops the kernel that first writes to it: a fifth
+of a call on 64 small images. Huge pages, of 2 MB, take a fourth of that. Linux gives them on request.
 """
 
 import ctypes

@@ -72,12 +72,7 @@ class Fit:
     """A fit, ready to run.
 
     Args:
-        problem: The problem to fit.
-        stages: Stages in order.
-        optimizer: Makes an optimizer of a list of tensors and ``lr``.
-        tolerance: A stage has converged when over 25 iterations, or by the last and the next step of a QuasiNewton, its
-            loss falls by less than this part.
-        seed: Seed of the random starts of stages with candidates.
+        problem, stages, optimizer, tolerance, seed: As of :func:`warpshadow.inverse.fit`.
     """
 
     problem: Problem

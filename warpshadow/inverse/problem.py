@@ -73,7 +73,7 @@ class Problem:
         for number, target in enumerate(self.targets):
             check.instance(f"targets[{number}]", target, Target, "a Target, as Target(image) makes it, or an image")
         for number, item in enumerate(self.free):
-            check.instance(f"free[{number}]", item, Free, "what is free, such as Pose(0) or Light()")
+            check.instance(f"free[{number}]", item, Free, "a free parameter, such as Pose(0) or Light()")
         object.__setattr__(self, "free", with_planes_last(tuple(self._numbered())))
         shapes = {target.image.shape for target in self.targets}
         if len(shapes) > 1:

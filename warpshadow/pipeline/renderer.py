@@ -180,7 +180,7 @@ class SceneRenderer:
         return view
 
     def _warn_of_nothing(self, view: View) -> None:
-        """Say once why an image shows nothing, and of the scene itself what is likely to be wrong."""
+        """Say once why an image shows nothing, and the likely mistakes in the scene itself."""
         is_of_scene, device = self._views.is_of_scene(view), self.device
         if not self._has_warned and (is_readable(device) or (is_of_scene and not device.is_capturing)):
             self._has_warned = warn_of_view(view, self.cameras if is_of_scene else None)

@@ -253,7 +253,7 @@ class PortionedShading(Node):
         self._planes = NodeStage(
             f"planes{where}",
             lambda: f"{item_text()} × {len(planes)} flat {'body' if len(planes) == 1 else 'bodies'}",
-            "" if planes else "spheres stand in for what casts shadows",
+            "" if planes else "spheres stand in for the bodies that cast shadows",
         )
         self._transfer = NodeStage(
             f"transfer{where}",

@@ -166,7 +166,7 @@ class Scene:
         return as_light(self.light)
 
     def with_method(self) -> Scene:
-        """The scene as renderers that are kept have it: "directional" where no method is named."""
+        """The scene as renderers have it: "directional" where no method is named."""
         return self if self.visibility.method else replace(self, visibility=self.visibility.with_method())
 
     def background(self) -> np.ndarray:
@@ -236,7 +236,7 @@ class Scene:
         if not isinstance(value, Sequence) or isinstance(value, str):
             raise ValueError(
                 f"{argument}: got {check.described(value)}, expected a list of {count} items, one for each body, None "
-                "for what the scene has; or some by their bodies, such as {0: …}"
+                "for the scene's own; or some by their bodies, such as {0: …}"
             )
         if len(value) != count:
             raise ValueError(f"{argument}: got {len(value)} items, expected {count}, one for each body")

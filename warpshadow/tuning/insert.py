@@ -80,8 +80,8 @@ def _overexposure(image: np.ndarray, photograph: np.ndarray, coverage: np.ndarra
         return None
     stops = math.floor(10 * (exposure - math.log2(np.percentile(bright_values, 99)))) / 10
     return (
-        f"{share:.0%} of what is inserted is brighter than white, as is {usual:.0%} of the photograph; with exposure = "
-        f"{stops:.1f} (--exposure {stops:.1f}) 1% is, or scale the light by {2 ** (stops - exposure):.2g}"
+        f"{share:.0%} of the inserted pixels are brighter than white, as is {usual:.0%} of the photograph; with "
+        f"exposure = {stops:.1f} (--exposure {stops:.1f}) 1% is, or scale the light by {2 ** (stops - exposure):.2g}"
     )
 
 

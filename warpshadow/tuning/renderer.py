@@ -58,7 +58,7 @@ def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = True
 
     By "directional" flat bodies, such as grounds, are shaded by pixel unless they say otherwise, so that shadows have
     smooth edges there; under a sun so are all, and their pixels find by rays where they lie in their own body's shadow.
-    A renderer that is kept has vertices, which take less time, where faces are small: its own :meth:`Renderer.render`
+    A renderer has vertices, which take less time, where faces are small: its own :meth:`Renderer.render`
     is the image to compare with its others. With ``Body(…, receivers="pixel")`` and ``Visibility(self_shadows="rays")``
     both are the same.
 
