@@ -112,9 +112,9 @@ def rounds_edges(surface: MeshTopology, positions: np.ndarray) -> bool:
     long (bunny, cow, monkey, man). In voxels, whose steps normals round on purpose, they are longer than 25 diagonals.
     Such pieces, as many boxes are, have most of the sharp edges, longer in all than the diagonal of the mesh.
 
-    So has a mesh whose edges of 20° to 50° are long, such as a vase of 16 sides, if most sharp edges are in long chains,
-    as around its lip (:func:`_chained_length`): 0.87 to 1 of their length in a machine part, a car and vases, and at
-    most 0.71 in 15 organic meshes.
+    A mesh whose edges of 20° to 50° are long, such as a vase of 16 sides, has many, too, if most sharp edges are in
+    long chains, as around its lip (:func:`_chained_length`): 0.87 to 1 of their length in a machine part, a car and
+    vases, and at most 0.71 in 15 organic meshes.
     """
     corners = positions[surface.faces].astype(np.float64)
     face, edge, neighbor, cosines = _bends(surface, positions)
