@@ -228,6 +228,8 @@ class Body:
         if isinstance(self.albedo, str):
             raise ValueError(f"albedo: got {self.albedo!r}, expected {expected}{_css_color_hint(self.albedo)}")
         albedo = check.numbers("albedo", self.albedo, expected=expected)
+        if albedo.ndim == 0:
+            raise ValueError(f"albedo: got {albedo:g}, expected {expected}; that gray is {(float(albedo),) * 3}")
         if albedo.shape not in ((3,), (count, 3)):
             raise ValueError(f"albedo: got shape {albedo.shape}, expected [3] or [{count}, 3] (one for each vertex)")
         check.reflectance("albedo", albedo)

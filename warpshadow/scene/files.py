@@ -26,7 +26,7 @@ from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
 from warpshadow.scene.body import COLORS_SUFFIX, LIKELY_MISTAKES, VALUES_SUFFIX, Body
 from warpshadow.scene.material import GLOSS_ARGUMENTS
-from warpshadow.scene.scene import SCENE_TYPES, Bounces, Scene, check_bounces, check_supersampling
+from warpshadow.scene.scene import Bounces, Scene, check_bounces, check_scene, check_supersampling
 from warpshadow.scene.toml_tables import Table
 from warpshadow.scene.visibility import METHODS_OF_SETTING, Visibility
 from warpshadow.spheres import Spheres
@@ -242,7 +242,7 @@ def write_scene(scene: Scene, folder: AnyPath, *, stems: Sequence[str] | None = 
     Returns:
         The files.
     """
-    check.instance("scene", scene, Scene, SCENE_TYPES)
+    check_scene(scene)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -15,16 +16,16 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.harmonic_light import KnownLight, as_light
 from warpshadow.assets.image import ImageError
 from warpshadow.assets.light import LIGHT, EnvironmentMap, check_coefficients
+from warpshadow.assets.mesh import Mesh
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.scene.body import Body
-from warpshadow.scene.visibility import BOUNCE_METHODS, GLOSS_METHODS, Visibility
+from warpshadow.scene.visibility import BOUNCE_METHODS, DEFAULT_METHOD, GLOSS_METHODS, METHODS, Visibility
 
 MAX_BOUNCES = 16
 
 Bounces = int | Literal["all"]  # how often light bounces
 
-SCENE_TYPES = "a Scene; load_scene(path) reads one"  # the types of scenes that functions accept, for messages
 BodyLike = int | str  # a body of a scene: its number, from 0, or its name
 
 Item = TypeVar("Item")
@@ -35,6 +36,22 @@ PerBody = Sequence[Item | None] | Mapping[int, Item | None] | Mapping[str, Item 
 _DEFAULT_VISIBILITY = Visibility()
 
 _SEVERAL_CAMERAS = "several go to Renderer(scene, cameras=[…]), or in a torch loop to TorchRenderer(scene, cameras=[…])"
+
+
+def check_scene(value: object) -> None:
+    """Raise ValueError unless it is a scene; the message says how to make one of the value."""
+    remedy, own_scene = "", getattr(value, "scene", None)
+    items = value if isinstance(value, (list, tuple)) else [value]
+    if check.is_path(value):
+        is_scene_file = Path(value).suffix.lower() == ".toml"
+        remedy = f"; {'load' if is_scene_file else 'default'}_scene({str(value)!r}) makes one of that file"
+    elif isinstance(value, (Body, Mesh)):
+        remedy = f"; default_scene({type(value).__name__.lower()}) puts it on a ground under a sky"
+    elif items and all(isinstance(item, Body) for item in items):
+        remedy = "; Scene([…], synthetic_sky()) makes one of bodies"
+    elif isinstance(own_scene, Scene) and not isinstance(value, type):
+        remedy = f"; renderer.scene is its, and renderer{'' if callable(value) else '.render'}() is an image of it"
+    check.instance("scene", value, Scene, f"a Scene; load_scene(path) reads one{remedy}")
 
 
 def check_supersampling(count: object) -> None:
@@ -126,7 +143,8 @@ class Scene:
         if camera is None:
             object.__setattr__(self, "camera", Camera.framing(self.bodies))
         check.instance("camera", self.camera, Camera, f"a Camera; {_SEVERAL_CAMERAS}")
-        check.instance("visibility", self.visibility, Visibility, "a Visibility, such as Visibility('directional')")
+        method = self.visibility if str(self.visibility) in METHODS else DEFAULT_METHOD
+        check.instance("visibility", self.visibility, Visibility, f"a Visibility, such as Visibility({method!r})")
         value: Any = self.light
         if check.is_path(value):
             path = check.file("light", value)
@@ -204,8 +222,10 @@ class Scene:
     def body_numbers(self, bodies: Iterable[BodyLike], argument: str = "bodies") -> tuple[int, ...]:
         """Numbers of some bodies, given numbers or names."""
         if not isinstance(bodies, Iterable) or isinstance(bodies, str):
-            got = check.described(bodies)
-            raise ValueError(f"{argument}: got {got}, expected a list of bodies, by numbers or names, such as [0]")
+            got, example = check.described(bodies), [bodies] if isinstance(bodies, str) else [0]
+            raise ValueError(
+                f"{argument}: got {got}, expected a list of bodies, by numbers or names, such as {example}"
+            )
         return tuple(self.body_number(body, argument) for body in bodies)
 
     @property

@@ -23,7 +23,7 @@ from warpshadow.device.progress import progress_bar
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.scene import toml_tables
 from warpshadow.scene.blockers import fitted_counts, fitted_meshes
-from warpshadow.scene.scene import SCENE_TYPES, Bounces, Scene, change_bodies, check_bounces
+from warpshadow.scene.scene import Bounces, Scene, change_bodies, check_bounces, check_scene
 from warpshadow.scene.visibility import AUTO, METHOD_TRAITS, SPHERE_METHODS, Visibility
 from warpshadow.spheres import Spheres, fit_spheres, is_fitted
 from warpshadow.stages.visibility.zonal_logs import LOGS
@@ -220,7 +220,7 @@ def tune(
     Warns:
         Where the machine is busy already: its load average is above its number of cores.
     """
-    check.instance("scene", scene, Scene, SCENE_TYPES)
+    check_scene(scene)
     device = check.device("device", device)
     arguments = {"error": error, "milliseconds": milliseconds}
     requested = next((value for value in arguments.values() if value is not None), None)
