@@ -251,7 +251,7 @@ def write_scene(scene: Scene, folder: AnyPath, *, stems: Sequence[str] | None = 
     stems = [f"body_{number}" for number in range(len(names))] if stems is None else stems
     for body, stem in zip(scene.bodies, stems, strict=True):
         table, files = _write_body(body, folder / stem)
-        if body.name is not None or names.count(body.called) == 1:
+        if body.has_own_name or names.count(body.name) == 1:
             table["name"] = body.called
         bodies.append(table)
         written += files
