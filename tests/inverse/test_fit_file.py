@@ -267,7 +267,7 @@ def test_several_views_are_several_targets(load, tmp_path):
     ],
 )
 def test_an_unknown_key_of_any_table_names_the_nearest_known_key(refused, text, where, nearest):
-    refused(text, where, "unknown key", f"did you mean '{nearest}'?")
+    refused(text, f"{where}: unknown key", f"did you mean '{nearest}'?")
 
 
 @pytest.mark.parametrize(

@@ -136,7 +136,7 @@ def _fit(table: Table, folder: Path) -> Fit:
 
 def _target(table: Table, folder: Path) -> Target:
     toml_tables.check_table(table)
-    check.known_keys("key", table, _TARGET_KEYS)
+    check.known_keys("", table, _TARGET_KEYS)
     path = toml_tables.file(table, "image", folder)
     options: Table = {key: table[key] for key in _PHOTOGRAPH_KEYS if key in table}
     if is_curve_file(options.get("encoding")):
@@ -185,7 +185,7 @@ def _check_framing(path: Path, problem: Problem) -> None:
 def _free(table: Table, scene: Scene) -> list[Free]:
     with check.located("[free]"):
         toml_tables.check_table(table)
-        check.known_keys("key", table, (*_FREE_OF_SCENE, *_FREE_OF_BODIES))
+        check.known_keys("", table, (*_FREE_OF_SCENE, *_FREE_OF_BODIES))
     free: list[Free] = []
     for key, kind in _FREE_OF_SCENE.items():
         entry = table.get(key, False)
@@ -229,7 +229,7 @@ def _optimizer(table: Table) -> Callable[..., torch.optim.Optimizer]:
     name = table.get("name", "adam")
     check.choice("name", name, _OPTIMIZERS)
     kind, checks = _OPTIMIZERS[name]
-    check.known_keys("key", table, ("name", *checks))
+    check.known_keys("", table, ("name", *checks))
     options = {key: checks[key](key, value) for key, value in table.items() if key != "name"}
     if name == "adam" and not options:
         return short_adam
