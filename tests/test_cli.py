@@ -243,6 +243,16 @@ def test_files_of_a_pattern_that_the_shell_has_expanded_are_many_fits(tmp_path):
     assert result.exit_code == 1 and "a failed: " in result.output and "b failed: " in result.output
 
 
+def test_files_that_are_no_fits_are_refused_before_any_starts(scene, tmp_path):
+    (tmp_path / "a.toml").write_text("x = 3")
+    options = "-o", tmp_path / "out"
+    named = f'{scene}: got a scene file, expected a fit file, which names it: scene = "{scene.name}"'
+    fails("fit", scene, *options, parts=(named,))
+    fails("fit", tmp_path / "a.toml", scene, *options, parts=(named,))
+    fails("fit", tmp_path / "a.toml", tmp_path / "truth.png", *options, parts=("truth.png: got extension '.png'",))
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_turntable_goes_around_at_one_exposure(scene, tmp_path):
     from PIL import Image, ImageSequence
 
@@ -696,7 +706,7 @@ def test_a_fit_that_is_interrupted_before_a_checkpoint_says_so(fit_file, tmp_pat
     with monkeypatch.context() as patched:
         patched.setattr("warpshadow.inverse.fit_file.fit", interrupt)
         result = run("fit", fit_file, "-o", tmp_path / "out")
-    assert result.exit_code == 130 and "interrupted before a checkpoint" in result.stderr
+    assert result.exit_code == 130 and "interrupted before a checkpoint; the same command starts over" in result.stderr
     assert run("fit", fit_file, "-o", tmp_path / "out").exit_code == 0
 
 
