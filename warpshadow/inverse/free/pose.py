@@ -40,7 +40,7 @@ class Pose(FreeOfBody):
         spread: Angle by which candidates are turned [radians]: about each axis, either way, then about the eight
             directions between, then about any; a pose with one axis about that, farther and farther.
         stands_on: A flat body, its number or name, that the body touches from above; three degrees of freedom stay.
-        resting: How it stands: "stable", turned onto the support of its convex hull that needs the least turn, if that is
+        resting: How it stands: "stable", turned onto the support of its convex hull that needs the least turn, if by
             more than 1°; "given", as the scene has it; "free", any way, so that five degrees of freedom stay. Its
             height always follows.
         upright: Whether it turns about the world's y alone.
