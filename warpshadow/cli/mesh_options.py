@@ -38,9 +38,9 @@ def _with_whole_size(args: list[str]) -> list[str]:
     if "--size" not in args:
         return args
     place = args.index("--size") + 1
-    text, following = [*args[place:], "", ""][:2]
+    text, next_argument = [*args[place:], "", ""][:2]
     width, x, height = text.partition("x")
-    if (width + height).isdecimal() and (x or not following.isdecimal()):
+    if (width + height).isdecimal() and (x or not next_argument.isdecimal()):
         return [*args[:place], width, height or width, *args[place + 1 :]]
     return args
 
