@@ -161,6 +161,27 @@ def test_the_axis_that_points_up_can_be_said(cone, tmp_path):
     assert np.abs(one - other).max() > 0.1
 
 
+@pytest.mark.parametrize(("size", "expected"), [(("8",), (8, 8)), (("8x6",), (8, 6)), (("8", "6"), (8, 6))])
+def test_a_size_is_one_number_or_two(cone, tmp_path, size, expected):
+    result = run("render", cone, "--size", *size, "--method", "none", "-o", tmp_path / "x.exr")
+    assert result.exit_code == 0, result.output
+    assert ws.read_image(tmp_path / "x.exr").shape == (*expected[::-1], 4)
+    fails("render", cone, "-o", "x.exr", "--size", "8xx", "6", parts=("expected width and height",), status=2)
+
+
+def test_a_mesh_gets_its_albedo(cone, tmp_path):
+    options = "--albedo", 0.8, 0.4, 0.2, "--size", 16
+    result = run("render", cone, "-o", tmp_path / "x.exr", "--up", "z", "--method", "none", *options)
+    assert result.exit_code == 0, result.output
+    scene = ws.default_scene(ws.Body(cone, albedo=(0.8, 0.4, 0.2)), up="z", size=(16, 16))
+    unshadowed = dataclasses.replace(scene, visibility=ws.Visibility("none"))
+    np.testing.assert_array_equal(ws.read_image(tmp_path / "x.exr"), ws.render(unshadowed))
+    assert run("scene", cone, "-o", tmp_path / "cone.toml", *options).exit_code == 0
+    np.testing.assert_array_equal(ws.load_scene(tmp_path / "cone.toml").bodies[0].albedo, scene.bodies[0].albedo)
+    fails("scene", cone, "-q", "-o", tmp_path / "cone.toml", parts=("cone.toml: got a file", "-o other.toml"))
+    fails("scene", cone, "-q", "--albedo", 200, 100, 50, parts=("albedo: got values from 50.0 to 200.0",))
+
+
 def test_the_camera_and_the_light_of_a_mesh_can_be_turned(cone, tmp_path):
     options = "--direction", -1, 0.5, 0, "--light-rotation", 90, "--method", "none", "--size", 16, 16
     result = run("render", cone, "-o", tmp_path / "x.exr", "--up", "z", *options)
@@ -232,6 +253,16 @@ def test_files_of_a_pattern_that_the_shell_has_expanded_are_many_fits(tmp_path):
         (tmp_path / f"{name}.toml").write_text("x = 3")
     result = run("fit", tmp_path / "a.toml", tmp_path / "b.toml", "-o", tmp_path / "out", "--workers", 1)
     assert result.exit_code == 1 and "a failed: " in result.output and "b failed: " in result.output
+
+
+def test_files_that_are_no_fits_are_refused_before_any_starts(scene, tmp_path):
+    (tmp_path / "a.toml").write_text("x = 3")
+    options = "-o", tmp_path / "out"
+    named = f'{scene}: got a scene file, expected a fit file, which names it: scene = "{scene.name}"'
+    fails("fit", scene, *options, parts=(named,))
+    fails("fit", tmp_path / "a.toml", scene, *options, parts=(named,))
+    fails("fit", tmp_path / "a.toml", tmp_path / "truth.png", *options, parts=("truth.png: got extension '.png'",))
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_turntable_goes_around_at_one_exposure(scene, tmp_path):
@@ -390,6 +421,8 @@ def test_an_unknown_device_names_the_known_ones(scene, tmp_path, command, name):
     [
         (("render", "scene.toml"), "--output"),
         (("render", "scene.toml", "-o", "x.exr", "--method", "rays"), "rays"),
+        (("render", "scene.toml", "-o", "x.exr", "--method", "raytraced"), "(did you mean 'ray-traced'?)"),
+        (("explain", "scene.toml"), "No such command 'explain': in Python, Renderer(scene).explain()"),
         (("render", "scene.toml", "-o", "x.exr", "--samples", "0"), "samples"),
         (("render", "scene.toml", "-o", "x.exr", "--colour", "red"), "--colour"),
         (
@@ -654,7 +687,7 @@ def test_a_fit_that_is_interrupted_before_a_checkpoint_says_so(fit_file, tmp_pat
     with monkeypatch.context() as patched:
         patched.setattr("warpshadow.inverse.fit_file.fit", interrupt)
         result = run("fit", fit_file, "-o", tmp_path / "out")
-    assert result.exit_code == 130 and "interrupted before a checkpoint" in result.stderr
+    assert result.exit_code == 130 and "interrupted before a checkpoint; the same command starts over" in result.stderr
     assert run("fit", fit_file, "-o", tmp_path / "out").exit_code == 0
 
 

@@ -49,13 +49,20 @@ def choice(name: str, value: object, choices: Iterable[object]) -> None:
     raise ValueError(f"{name}: got {value!r}, expected one of {accepted}{_suggestion(value, choices)}")
 
 
-def known_keys(where: str, keys: Iterable[str], known: Iterable[str]) -> None:
-    """Raise ValueError for the first of ``keys`` that is not ``known``; the message names the nearest one."""
+def known_keys(where: str, keys: Iterable[str], known: Iterable[str], *, noun: str = "key") -> None:
+    """Raise ValueError for the first of ``keys`` that is not ``known``; the message names the nearest one.
+
+    Args:
+        where: Their place; empty where :func:`located` says it.
+        keys, known: The keys, and all that there are.
+        noun: Name of a key in the message.
+    """
     known = list(known)
     for key in keys:
         if key not in known:
             raise ValueError(
-                f"{where}: unknown key {key!r}{_suggestion(key, known)}; known keys are {', '.join(known)}"
+                f"{where and f'{where}: '}unknown {noun} {key!r}{_suggestion(key, known)}; "
+                f"known {noun}s are {', '.join(known)}"
             )
 
 

@@ -179,7 +179,7 @@ def test_a_body_is_scaled_then_rotated_then_translated():
     ],
 )
 def test_an_unknown_key_of_any_table_names_the_nearest_known_key(load, text, where, nearest):
-    refused(load, text, where, "unknown key", f"did you mean '{nearest}'?")
+    refused(load, text, f"{where}: unknown {'table' if where == 'the scene' else 'key'} ", f"did you mean '{nearest}'?")
 
 
 @pytest.mark.parametrize("name", ["camera", "light", "body"])

@@ -36,7 +36,7 @@ from warpshadow.pipeline.transfers import Light, one_transfer
 from warpshadow.pipeline.view import View
 from warpshadow.pipeline.view_warnings import warn_of_vertex_receivers, warn_of_view
 from warpshadow.scene.material import GLOSS_ARGUMENTS
-from warpshadow.scene.scene import SCENE_TYPES, BodyLike, PerBody, Scene
+from warpshadow.scene.scene import BodyLike, PerBody, Scene, check_scene
 from warpshadow.scene.visibility import METHODS
 
 RendererType = TypeVar("RendererType", bound="SceneRenderer")
@@ -75,7 +75,7 @@ class SceneRenderer:
         basis: Basis | None = None,
         progress: bool = False,
     ):
-        check.instance("scene", scene, Scene, SCENE_TYPES)
+        check_scene(scene)
         check_basis(basis)
         where, scene = check.device("device", device), scene.with_method()
         check.choice("scene.visibility.method", scene.visibility.method, METHODS)

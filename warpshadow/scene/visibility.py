@@ -148,7 +148,7 @@ class Visibility:
     @classmethod
     def of(cls, settings: Mapping[str, object]) -> Visibility:
         """Make one from settings for any methods, by their names: all are checked, and the method's own are used."""
-        check.known_keys("key", settings, ("method", *METHODS_OF_SETTING))
+        check.known_keys("", settings, ("method", *METHODS_OF_SETTING))
         every = object.__new__(cls)
         vars(every).update(settings)
         every._check_values()

@@ -398,12 +398,13 @@ class TorchRenderer(torch.nn.Module):
         count = len(self.scene.bodies)
         scales = self.scene_poses()[2] if scales is None else scales
         arguments = Arguments(self.device)
-        remedy = "matrices of all bodies; rotation_matrices(…) makes them of axis-angle vectors and quaternions"
+        all_bodies = f"of all {count} bodies, as scene_poses() has them"
+        remedy = f"matrices {all_bodies}; rotation_matrices(…) makes them of axis-angle vectors and quaternions"
         inputs: dict[str, Any] = {
             "poses": [
                 arguments.add("rotations", rotations, wp.mat33, (count,), remedy),
-                arguments.add("translations", translations, wp.vec3, (count,)),
-                arguments.add("scales", scales, wp.float32, (count,)),
+                arguments.add("translations", translations, wp.vec3, (count,), all_bodies),
+                arguments.add("scales", scales, wp.float32, (count,), all_bodies),
             ],
             "pivot": pivot,
         }

@@ -13,7 +13,7 @@ from warpshadow.assets.image import ImageError, read_rgb
 from warpshadow.check import AnyPath
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
-from warpshadow.scene.scene import SCENE_TYPES, Scene
+from warpshadow.scene.scene import Scene, check_scene
 from warpshadow.tuning.renderer import Renderer
 
 _COVERED_SHARE = 0.5  # part of a pixel that bodies cover, above which it is theirs
@@ -49,7 +49,7 @@ def insert(
     Raises:
         ValueError: for a photograph of other proportions than the camera's, and a scene without a catcher.
     """
-    check.instance("scene", scene, Scene, SCENE_TYPES)
+    check_scene(scene)
     pixels = linear_photograph(photograph)
     height, width, _ = pixels.shape
     camera, gain = fitting_camera(scene.camera, width, height), 2.0 ** check.number("exposure", exposure)
