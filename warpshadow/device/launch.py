@@ -14,7 +14,7 @@ from warpshadow.device import warp_internals
 from warpshadow.device.memory import in_huge_pages, require_gradient, reshaped
 from warpshadow.device.parallel import Scratch, launch_adjoint_slices, launch_slices
 from warpshadow.device.tape import record_adjoint, record_kernel
-from warpshadow.device.warp_internals import is_view, scalar_type
+from warpshadow.device.warp_internals import scalar_type, viewed_array
 
 
 def launch(
@@ -108,6 +108,6 @@ def _require_gradient(output: wp.array, kernel: wp.Kernel) -> None:
     is_real = scalar_type(output.dtype) in (wp.float32, wp.float64)
     if output.requires_grad or not is_real:
         return
-    if is_view(output):
+    if viewed_array(output) is not None:
         raise RuntimeError(f"{kernel.key}: got an output that is a view, which has no gradient of its own")
     require_gradient(output)

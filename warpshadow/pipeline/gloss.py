@@ -65,7 +65,7 @@ class GlossyPoints(LitPoints):
             light: As for :meth:`.Method.shading`.
             materials: Of the bodies.
         """
-        item_text = functools.partial(receiver_text, self)
+        item_text = functools.partial(receiver_text, self.in_words)
         roughness, metallic, specular = (self._values(materials, name) for name in GLOSS_ARGUMENTS)
         key = materials.roughness
 

@@ -417,9 +417,10 @@ def _visible_faces(clip_positions: wp.array, faces: wp.array, width: int, height
         layer_count = max(1, min(thread_count() // batch_count, int(layer_bound)))
     corners = empty((batch_count, vertex_count), dtype=wp.vec2i, device=device)
     depths = empty((batch_count, vertex_count), dtype=float, device=device)
-    keys = zeros((batch_count * layer_count, height, width), dtype=wp.int64, device=device)
+    make_scratch = functools.partial(zeros, device=device, outlives_recording=False)
+    keys = make_scratch((batch_count * layer_count, height, width), wp.int64)
     face_ids = empty((batch_count, height, width), dtype=wp.int32, device=device)
-    fault_counts = zeros((batch_count * layer_count, 2), dtype=int, device=device)
+    fault_counts = make_scratch((batch_count * layer_count, 2), wp.int32)
     launch(
         _snap_vertices,
         clip_positions.shape,

@@ -12,7 +12,7 @@ from typing import ParamSpec, TypeVar, overload
 import torch
 import warp as wp
 
-from warpshadow.device.memory import require_gradient
+from warpshadow.device.memory import drop_gradient, require_gradient
 from warpshadow.device.tape import recorded, unrecorded
 from warpshadow.device.threads import one_call
 from warpshadow.device.warp_internals import array_at, item_shape
@@ -187,6 +187,11 @@ class _Playback:
 
     def __init__(self, tape: wp.Tape, arguments: list[wp.array], results: tuple[wp.array, ...]):
         self._tape, self._arguments, self._results, self._is_played = tape, arguments, results, False
+
+    def __del__(self) -> None:
+        """Let go of the gradients: results, which tensors hold, would keep the memory of all."""
+        for result in self._results:
+            drop_gradient(result)
 
     def gradients(self, adjoints: Sequence[torch.Tensor]) -> tuple[torch.Tensor | None, ...]:
         """The gradient to each argument, given the results' gradients; None where it requires none."""

@@ -196,7 +196,8 @@ class StaticBounces:
         return multiply(factors.to_cache_points, after_bounces(*arguments, self_bounces=SELF_BOUNCES))
 
     def _item_text(self, points: LitPoints, senders: Senders) -> Callable[[], str]:
-        return lambda: f"{receiver_text(points)}, {len(senders.areas):,} patches, {self._bounces} bounces"
+        words = points.in_words
+        return lambda: f"{receiver_text(words)}, {len(senders.areas):,} patches, {self._bounces} bounces"
 
     def _factors(self, points: LitPoints, materials: Materials, senders: Senders) -> Node:
         def find(
@@ -269,7 +270,10 @@ class StaticBounces:
         def make() -> Node:
             patch_samples = self.patch_samples(points, materials)
             arguments = points.merged_scene, materials, points.vertices, points.spheres, patch_samples, points.call
-            at_patch_samples = LitPoints(*arguments, normals=points.normals, blocker_kinds=points.blocker_kinds)
+            options = {"normals": points.normals, "blocker_kinds": points.blocker_kinds}
+            at_patch_samples = points.cached(
+                "patch samples under the sky", patch_samples, lambda: LitPoints(*arguments, **options)
+            )
             skies = [self._openness(item) for item in (at_patch_samples, points)]
             return Node(
                 "form factors",
