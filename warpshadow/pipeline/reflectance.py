@@ -202,9 +202,7 @@ class Materials:
 
         return Node("", of_vertices, self._inputs[name])
 
-    def reflectance(
-        self, fragments: Node, pyramids: Node, footprints: Node, items: str
-    ) -> SampleReflectance:
+    def reflectance(self, fragments: Node, pyramids: Node, footprints: Node, items: str) -> SampleReflectance:
         """Nodes of the samples' reflectance by albedo and textures."""
         seen = fragments, self.merged_scene.faces, self.vertex_albedo
         samples = Node("reflectance", sample_albedo, *seen, pyramids, footprints, items=items)

@@ -11,6 +11,7 @@ Coverage has no derivative. Barycentrics are computed from the face that a sampl
 import functools
 from dataclasses import dataclass
 
+import numpy as np
 import warp as wp
 
 from warpshadow import check
@@ -442,12 +443,15 @@ def _visible_faces(clip_positions: wp.array, faces: wp.array, width: int, height
         inputs=[keys.reshape((batch_count, layer_count, height * width)), run],
         outputs=[rows(face_ids)],
     )
-    if not device.is_capturing:
-        bad_vertex_count, bad_face_count = fault_counts.numpy().sum(axis=0).tolist()
+
+    def judge(counts: np.ndarray) -> None:
+        bad_vertex_count, bad_face_count = counts.sum(axis=0).tolist()
         if bad_vertex_count:
             raise ValueError(f"clip_positions: got {bad_vertex_count} with NaN or Inf, expected finite numbers")
         if bad_face_count:
             raise ValueError(
                 f"faces: got {bad_face_count} with an index out of range, expected 0 to {vertex_count - 1}"
             )
+
+    check.values_of(fault_counts, judge)
     return face_ids

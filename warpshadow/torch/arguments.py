@@ -152,5 +152,7 @@ def _check_tensor(
     check.shape(name, tuple(tensor.shape), ("batch", *shape) if tensor.ndim > len(shape) else shape, meaning)
     if tensor.numel() == 0 and 0 not in shape:
         raise ValueError(f"{name}: got shape {tuple(tensor.shape)}, expected at least one value")
-    if not is_capturing(device) and not np.isfinite(float(tensor.detach().sum())):
-        check.finite(name, tensor.detach().cpu().numpy())
+    if device.type == "cuda" and not is_capturing(device):
+        check.finite_arrays({name: as_array(tensor.detach() if tensor.ndim else tensor.detach()[None], wp.float32)})
+    elif not np.isfinite(float(tensor.detach().sum())):
+        check.finite(name, tensor.detach().numpy())
