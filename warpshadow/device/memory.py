@@ -93,7 +93,8 @@ def from_numpy(values: np.ndarray, dtype: type, device: wp.DeviceLike) -> wp.arr
 
 def copied(array: wp.array) -> wp.array:
     """Copy an array without its gradient: ``wp.clone``, but quicker."""
-    if not array.device.is_cpu or not array.is_contiguous or not array.size:
+    device = array.device
+    if not device.is_cpu or device.is_capturing or not array.is_contiguous or not array.size:
         return wp.clone(array, requires_grad=False)
     copy = empty(array.shape, array.dtype, array.device)
     ctypes.memmove(copy.ptr, array.ptr, array.size * wp.types.type_size_in_bytes(array.dtype))
