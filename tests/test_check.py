@@ -3,6 +3,7 @@
 import math
 import re
 import warnings
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -155,6 +156,17 @@ def test_a_fault_is_raised_in_place_of_the_error_that_it_leads_to(device):
     with pytest.raises(RuntimeError, match="nothing fits"), check.of_one_call():
         check.finite_arrays({"points": vectors(device)})
         raise RuntimeError("nothing fits")
+
+
+@pytest.mark.usefixtures("reads")
+def test_a_long_call_does_not_hold_all_its_arrays(device):
+    held = []
+    with check.of_one_call():
+        for _ in range(500):
+            array = vectors(device)
+            held.append(weakref.ref(array))
+            check.finite_arrays({"points": array})
+        assert sum(reference() is not None for reference in held) < 100
 
 
 @pytest.mark.usefixtures("found")

@@ -384,11 +384,31 @@ class _LateChecks(threading.local):
         self.others: list[tuple[wp.array, Callable[[np.ndarray], None]]] = []
         self.faults: dict[str, wp.array] = {}  # by device: zero but while arrays are looked at
 
+    def __enter__(self) -> None:
+        self.depth += 1
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            if self.depth == 1 and (kind is None or issubclass(kind, Exception)):
+                self.run()
+        finally:
+            self.depth -= 1
+            if not self.depth:
+                self.clear()
+
     def clear(self) -> None:
+        """Leave them out."""
         self.arrays, self.others = {}, []
+
+    def run_if_due(self) -> None:
+        """Run them where no call waits for them, or they hold many arrays."""
+        if not self.depth or len(self.arrays) + len(self.others) >= _MAX_LATE:
+            self.run()
 
     def run(self) -> None:
         """Run them in their order."""
+        if not (self.arrays or self.others):
+            return
         arrays, others = list(self.arrays.values()), self.others
         self.clear()
         for alias in dict.fromkeys(array.device.alias for _, array, _ in arrays):
@@ -406,49 +426,34 @@ class _LateChecks(threading.local):
             self.faults[device.alias] = wp.zeros(2 * len(arrays), dtype=wp.int32, device=device)
         faults = self.faults[device.alias]
         for first in range(0, len(arrays), _AT_ONCE):
-            at_once = arrays[first : first + _AT_ONCE]
-            values = [_scalars(array) for _, array, _ in at_once]
-            ranges = [range_ for *_, range_ in at_once] + [(0.0, 0.0)] * (_AT_ONCE - len(at_once))
+            batch = arrays[first : first + _AT_ONCE]
+            values = [_scalars(array) for _, array, _ in batch]
+            ranges = [range_ for *_, range_ in batch] + [(0.0, 0.0)] * (_AT_ONCE - len(batch))
             limits = [_Limits(*side) for side in zip(*ranges, strict=True)]
-            padding: list[None] = [None] * (_AT_ONCE - len(at_once))
+            padding: list[None] = [None] * (_AT_ONCE - len(batch))
             wp.launch(
                 _count_outside,
-                dim=(len(at_once), max(array.size for array in values)),
+                dim=(len(batch), max(array.size for array in values)),
                 inputs=[*values, *padding, *limits, first],
                 outputs=[faults],
                 device=device,
                 record_tape=False,
             )
-        found = np.flatnonzero(faults.numpy()).tolist()
-        if found:
+        faulty_indices = np.flatnonzero(faults.numpy()).tolist()
+        if faulty_indices:
             faults.zero_()
-        return found
+        return faulty_indices
 
 
 _late_checks = _LateChecks()
 
 
-@contextlib.contextmanager
-def of_one_call() -> Iterator[None]:
+def of_one_call() -> contextlib.AbstractContextManager[None]:
     """Check arrays on a GPU when the call ends, so that it waits for the device once.
 
     A call within a call ends with it. A fault is raised in place of the error that it led to.
     """
-    checks = _late_checks
-    checks.depth += 1
-    try:
-        yield
-    except Exception:
-        if checks.depth == 1:
-            checks.run()
-        raise
-    else:
-        if checks.depth == 1 and (checks.arrays or checks.others):
-            checks.run()
-    finally:
-        checks.depth -= 1
-        if not checks.depth:
-            checks.clear()
+    return _late_checks
 
 
 def _is_awaited(device: wp.Device) -> bool:
@@ -457,6 +462,7 @@ def _is_awaited(device: wp.Device) -> bool:
 
 
 _AT_ONCE = 8  # arrays that a launch looks at
+_MAX_LATE = 64  # checks that wait, since they hold their arrays
 
 _Limits = wp.types.vector(length=_AT_ONCE, dtype=wp.float32)
 
@@ -535,8 +541,7 @@ def finite_arrays(
     for name, array in present.items():
         key = array.ptr, array.shape, array.strides, ranges[name]
         _late_checks.arrays.setdefault(key, (name, array, ranges[name]))
-    if not _late_checks.depth:
-        _late_checks.run()
+    _late_checks.run_if_due()
 
 
 def values_of(array: wp.array, judge: Callable[[np.ndarray], None]) -> None:
@@ -550,8 +555,7 @@ def values_of(array: wp.array, judge: Callable[[np.ndarray], None]) -> None:
         judge(array.numpy())
         return
     _late_checks.others.append((array, judge))
-    if not _late_checks.depth:
-        _late_checks.run()
+    _late_checks.run_if_due()
 
 
 def _outside_on_host(arrays: Mapping[str, wp.array], ranges: Mapping[str, tuple[float, float]]) -> list[str]:

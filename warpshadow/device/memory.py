@@ -119,10 +119,10 @@ def require_gradient(array: wp.array) -> None:
 
 def drop_gradient(array: wp.array) -> None:
     """Let go of the gradient of an array, and of the arrays that it is a view of."""
-    viewed: wp.array | None = array
-    while viewed is not None:
-        viewed.requires_grad = False
-        viewed = viewed_array(viewed)
+    owner: wp.array | None = array
+    while owner is not None:
+        owner.requires_grad = False
+        owner = viewed_array(owner)
 
 
 def _memory_of_recording() -> "ZeroedMemory | None":

@@ -158,7 +158,7 @@ class _Same:
 
 
 def _key(inputs: Any) -> Hashable:
-    """What equals that of other inputs if these differ in their tensors alone."""
+    """Key of inputs, which equals the key of others that differ in their tensors alone."""
     if isinstance(inputs, Slot):
         return inputs
     if isinstance(inputs, Geometry):

@@ -7,7 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ParamSpec, TypeAlias, TypeVar, overload
+from typing import ParamSpec, Protocol, TypeAlias, TypeVar, overload
 
 import torch
 import warp as wp
@@ -17,13 +17,29 @@ from warpshadow.device.tape import recorded, unrecorded
 from warpshadow.device.threads import one_call
 from warpshadow.device.warp_internals import array_at, item_shape
 
-if TYPE_CHECKING:
-    from warpshadow.torch.replay import Capture
-
 P = ParamSpec("P")
 R = TypeVar("R")
 
-FindCapture: TypeAlias = Callable[..., "Capture | None"]  # of function, tensors, dtypes, requires_grad, device
+
+class Playback(Protocol):
+    """A call whose gradients can be asked for."""
+
+    def gradients(self, adjoints: Sequence[torch.Tensor]) -> tuple[torch.Tensor | None, ...]:
+        """The gradient to each argument, given the results' gradients; None where it requires none."""
+
+
+class Replayable(Protocol):
+    """A call that has been captured."""
+
+    @property
+    def results_require_grad(self) -> list[bool]:
+        """Whether each result depends on tensors that require a gradient."""
+
+    def replay(self, tensors: Sequence[torch.Tensor]) -> tuple[tuple[torch.Tensor, ...], Playback]:
+        """The results, and the call for its gradients."""
+
+
+FindCapture: TypeAlias = Callable[..., Replayable | None]  # of function, tensors, dtypes, requires_grad, device
 
 
 def uncompiled(function: Callable[P, R]) -> Callable[P, R]:

@@ -270,9 +270,9 @@ class StaticBounces:
         def make() -> Node:
             patch_samples = self.patch_samples(points, materials)
             arguments = points.merged_scene, materials, points.vertices, points.spheres, patch_samples, points.call
-            options = {"normals": points.normals, "blocker_kinds": points.blocker_kinds}
+            lit_points = functools.partial(LitPoints, normals=points.normals, blocker_kinds=points.blocker_kinds)
             at_patch_samples = points.cached(
-                "patch samples under the sky", patch_samples, lambda: LitPoints(*arguments, **options)
+                "patch samples under the sky", patch_samples, lambda: lit_points(*arguments)
             )
             skies = [self._openness(item) for item in (at_patch_samples, points)]
             return Node(
