@@ -37,7 +37,16 @@ class Input:
         self.requires_grad = False
         for item in value if isinstance(value, (tuple, list)) else [value]:
             self.requires_grad |= getattr(item, "requires_grad", False)
-        self.root_inputs, self.differentiated_inputs = {self: None}, {self: None} if self.requires_grad else {}
+
+    @property
+    def root_inputs(self) -> "dict[Input, None]":
+        """Itself. Stored it would be a cycle, and arrays would stay until Python collects garbage."""
+        return {self: None}
+
+    @property
+    def differentiated_inputs(self) -> "dict[Input, None]":
+        """Itself if a gradient to it is asked for."""
+        return {self: None} if self.requires_grad else {}
 
     def value(self, call: "Call | None" = None) -> Any:
         """The value."""

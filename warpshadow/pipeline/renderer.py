@@ -485,7 +485,8 @@ class SceneRenderer:
             hidden = {*decide(view.receivers_node, view.call), view.silhouettes}
         else:
             view = self._views.view(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
-        image = view.preview().image(light, self._given_materials(albedo, textures, gloss))
+        preview = view.preview()  # which the nodes' words ask, so it stays meanwhile
+        image = preview.image(light, self._given_materials(albedo, textures, gloss))
         is_host = self.device.is_cpu or self.clock.waits
         of_receivers = receiver_notes(self._given_scene, self._choices, view.blocker_kinds.bulging)
         notes = [*of_receivers, *bounce_notes(self.scene.bounces)]

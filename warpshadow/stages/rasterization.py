@@ -11,6 +11,7 @@ Coverage has no derivative. Barycentrics are computed from the face that a sampl
 import functools
 from dataclasses import dataclass
 
+import numpy as np
 import warp as wp
 
 from warpshadow import check
@@ -417,9 +418,10 @@ def _visible_faces(clip_positions: wp.array, faces: wp.array, width: int, height
         layer_count = max(1, min(thread_count() // batch_count, int(layer_bound)))
     corners = empty((batch_count, vertex_count), dtype=wp.vec2i, device=device)
     depths = empty((batch_count, vertex_count), dtype=float, device=device)
-    keys = zeros((batch_count * layer_count, height, width), dtype=wp.int64, device=device)
+    make_scratch = functools.partial(zeros, device=device, outlives_recording=False)
+    keys = make_scratch((batch_count * layer_count, height, width), wp.int64)
     face_ids = empty((batch_count, height, width), dtype=wp.int32, device=device)
-    fault_counts = zeros((batch_count * layer_count, 2), dtype=int, device=device)
+    fault_counts = make_scratch((batch_count * layer_count, 2), wp.int32)
     launch(
         _snap_vertices,
         clip_positions.shape,
@@ -441,12 +443,15 @@ def _visible_faces(clip_positions: wp.array, faces: wp.array, width: int, height
         inputs=[keys.reshape((batch_count, layer_count, height * width)), run],
         outputs=[rows(face_ids)],
     )
-    if not device.is_capturing:
-        bad_vertex_count, bad_face_count = fault_counts.numpy().sum(axis=0).tolist()
+
+    def judge(counts: np.ndarray) -> None:
+        bad_vertex_count, bad_face_count = counts.sum(axis=0).tolist()
         if bad_vertex_count:
             raise ValueError(f"clip_positions: got {bad_vertex_count} with NaN or Inf, expected finite numbers")
         if bad_face_count:
             raise ValueError(
                 f"faces: got {bad_face_count} with an index out of range, expected 0 to {vertex_count - 1}"
             )
+
+    check.values_of(fault_counts, judge)
     return face_ids

@@ -384,7 +384,7 @@ def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: 
     """
     sides, side_count = (fragments.face_ids, 1) if fragments.sides is None else (fragments.sides, 2)
     device, face_count = sides.device, len(silhouettes.faces)
-    corners = zeros((side_count, vertex_count), dtype=wp.bool, device=device)
+    corners = zeros((side_count, vertex_count), wp.bool, device, outlives_recording=False)
     run = run_length(device, sides.shape[2])
     launch(
         _mark_visible_corners,

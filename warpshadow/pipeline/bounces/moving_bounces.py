@@ -282,7 +282,7 @@ class MovingBounces:
             lambda: self._patch_samples(make_visibility, visibility_light, proxies, points),
         )
         radiosity = self._radiosity(of_patch_samples, projected_light, proxies, materials)
-        item_text = functools.partial(receiver_text, points)
+        item_text = functools.partial(receiver_text, points.in_words)
         at_points = self._gathering(senders, item_text)
         return BouncedShading(visibility, projected_light, item_text, radiosity, at_points)
 
@@ -301,7 +301,8 @@ class MovingBounces:
 
         make = functools.partial(Node, "patch samples", senders.patch_samples, points.vertices, points.normals)
         patch_samples = points.cached("patch samples", senders, lambda: make(items=_patch_sample_text(senders)))
-        lit_samples = lit_patch_samples(patch_samples, points, points.materials, proxies.nearest_spheres)
+        arguments = patch_samples, points, points.materials, proxies.nearest_spheres
+        lit_samples = points.cached("lit samples", proxies, lambda: lit_patch_samples(*arguments))
         lookups = self_visibility_node(self._method, points, visibility_light)
         lit_samples.cached("self-visibility", id(visibility_light), lambda: lookups)
         visibility = make_visibility(lit_samples, where=OF_PATCH_SAMPLES)

@@ -78,6 +78,7 @@ def path_traced(
             wp.copy(bounced[instance], light)
         return total_light([shading, bounced])
 
+    words = points.in_words
     return Node(
         "bounces",
         trace,
@@ -89,7 +90,7 @@ def path_traced(
         light,
         materials.vertex_albedo,
         colors.pyramids if colors.images else None,
-        items=lambda: f"{receiver_text(points)} × {paths:,} paths of {maximum} bounces",
+        items=lambda: f"{receiver_text(words)} × {paths:,} paths of {maximum} bounces",
         has_adjoint=False,
     )
 

@@ -196,7 +196,8 @@ class StaticBounces:
         return multiply(factors.to_cache_points, after_bounces(*arguments, self_bounces=SELF_BOUNCES))
 
     def _item_text(self, points: LitPoints, senders: Senders) -> Callable[[], str]:
-        return lambda: f"{receiver_text(points)}, {len(senders.areas):,} patches, {self._bounces} bounces"
+        words = points.in_words
+        return lambda: f"{receiver_text(words)}, {len(senders.areas):,} patches, {self._bounces} bounces"
 
     def _factors(self, points: LitPoints, materials: Materials, senders: Senders) -> Node:
         def find(
@@ -268,7 +269,10 @@ class StaticBounces:
 
         def make() -> Node:
             patch_samples = self.patch_samples(points, materials)
-            lit_samples = lit_patch_samples(patch_samples, points, materials)
+            arguments = patch_samples, points, materials
+            lit_samples = points.cached(
+                "patch samples under the sky", patch_samples, lambda: lit_patch_samples(*arguments)
+            )
             skies = [self._openness(item) for item in (lit_samples, points)]
             return Node(
                 "form factors",

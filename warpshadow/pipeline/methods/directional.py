@@ -348,7 +348,7 @@ class Directional(SphereMethod):
     def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input) -> Node:
         """Transmittance towards the samples of lobes, between cells; of known light, to where it comes from in them."""
         cells, projected_light = self._lobe_cells(points, light)
-        item_text = functools.partial(receiver_text, points)
+        item_text = functools.partial(receiver_text, points.in_words)
         arguments = cells, points.receivers_node, directions, projected_light
         return Node("transmittance of lobes", _towards, *arguments, items=item_text)
 

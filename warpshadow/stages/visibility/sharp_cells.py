@@ -16,6 +16,7 @@ import warp as wp
 
 from warpshadow.device.constants import cached_by_values, constant
 from warpshadow.device.launch import differentiable, launch, varies
+from warpshadow.device.memory import copied
 from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK, MIN_WIDTH, brightest_chunk, cell_radius
 from warpshadow.stages.visibility.directional import SOFTNESS
@@ -105,7 +106,6 @@ def _blend_sharp_cells_adjoint(
     # out
     adj_blended: wp.array3d(dtype=wp.float32),
     adj_sharp: wp.array3d(dtype=wp.float32),
-    adj_transmittance: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a receiver: a cell's previous value counts for the rest."""
     batch, receiver = split_row(first_row + wp.tid(), adj_blended.shape[1])
@@ -115,11 +115,6 @@ def _blend_sharp_cells_adjoint(
         adj_cell = adj_blended[batch, receiver, cell]
         adj_sharp[batch, receiver, slot] = adj_sharp[batch, receiver, slot] + shares[i] * adj_cell
         adj_blended[batch, receiver, cell] = (1.0 - shares[i]) * adj_cell
-    if adj_transmittance:
-        for cell in range(adj_blended.shape[2]):
-            adj_transmittance[batch, receiver, cell] = (
-                adj_transmittance[batch, receiver, cell] + adj_blended[batch, receiver, cell]
-            )
 
 
 @cached_by_values
@@ -151,7 +146,10 @@ def blend_sharp_cells(
     row_count = transmittance.shape[0] * transmittance.shape[1]
     pairs, spot_shares, is_partial = _find_pairs(slots, shares, transmittance.device)
     is_copied = is_partial and varies([transmittance])
-    blended = wp.clone(transmittance, requires_grad=False) if is_copied else transmittance
+    blended = transmittance
+    if is_copied:
+        blended = copied(transmittance)
+        blended.grad = transmittance.grad  # which is changed in place, as the values else are
     inputs, cost = [pairs, spot_shares], _CELL_COST * pairs.size
     return differentiable(
         lambda result: launch(
@@ -161,7 +159,7 @@ def blend_sharp_cells(
             _blend_sharp_cells_adjoint,
             row_count,
             inputs=inputs,
-            outputs=[adj_blended, sharp_cells.grad, transmittance.grad if is_copied else None],
+            outputs=[adj_blended, sharp_cells.grad],
             cost=cost,
         ),
         result=blended,
