@@ -29,8 +29,7 @@ from test_end_to_end import (
 )
 
 import warpshadow as ws
-from warpshadow.pipeline.bounces import by_spheres as pipeline_bounces
-from warpshadow.pipeline.bounces import patches, static_bounces
+from warpshadow.pipeline.bounces import moving_bounces, patches, static_bounces
 from warpshadow.pipeline.receivers import groups
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
@@ -323,7 +322,7 @@ def test_light_goes_on_within_a_bowl(monkeypatch):
     )
     expected, found = (ws.render(each)[..., :3].sum(axis=(0, 1)) for each in (paths, scene))
     np.testing.assert_allclose(found, expected, rtol=0.02)
-    monkeypatch.setattr(pipeline_bounces, "SELF_BOUNCES", 0)
+    monkeypatch.setattr(moving_bounces, "SELF_BOUNCES", 0)
     once = ws.render(scene)[..., :3].sum(axis=(0, 1))
     assert once[0] < 0.9 * expected[0]
 
@@ -563,7 +562,7 @@ def test_a_geometry_given_again_is_not_seen_again_where_light_bounces(method, na
     with monkeypatch.context() as patch:
         for function in ("find_visibility", "find_visibility_past_planes", "transfer", "self_lookups"):
             patch.setattr(type(renderer.warp._method), function, refuse)
-        patch.setattr(pipeline_bounces, "find_cell_transmittance", refuse)
+        patch.setattr(moving_bounces, "find_cell_transmittance", refuse)
         patch.setattr(patches, "receivers_on_faces", refuse)
         found = image_and_gradient(renderer, name, 2 * start, geometry)
         explained = renderer.explain(**{name: 2 * start if name == "light" else [2 * start, None]}, geometry=geometry)

@@ -3,6 +3,7 @@
 import math
 import re
 import warnings
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,14 @@ def vectors(device, **spoiled):
     return wp.array(values, dtype=wp.vec3, device=device)
 
 
+@pytest.fixture(params=["by the host", "by the device"])
+def found(request, monkeypatch):
+    """Arrays of a CPU are looked at by NumPy, and as those of a GPU are."""
+    if request.param == "by the device":
+        monkeypatch.setattr(check, "_is_awaited", lambda device: True)
+
+
+@pytest.mark.usefixtures("found")
 def test_finite_arrays_of_any_type_pass(device):
     matrices = wp.zeros((4, 2), dtype=wp.mat33, device=device)
     nothing = wp.zeros((0, 5), dtype=wp.vec3, device=device)
@@ -66,6 +75,7 @@ def test_finite_arrays_of_any_type_pass(device):
     check.finite_arrays({"numbers": numbers})
 
 
+@pytest.mark.usefixtures("found")
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_the_first_array_that_is_not_finite_is_named_with_the_place(value, device):
     arrays = {"points": vectors(device), "normals": vectors(device, _120=value, _111=value), "centers": None}
@@ -75,6 +85,7 @@ def test_the_first_array_that_is_not_finite_is_named_with_the_place(value, devic
         check.finite_arrays(arrays)
 
 
+@pytest.mark.usefixtures("found")
 def test_numbers_out_of_range_are_named_with_the_range(device):
     with pytest.raises(
         ValueError, match=r"^points: got 1 values out of range \(first at index \(0, 2, 1\): -3\), expected -2 to 2$"
@@ -86,17 +97,85 @@ def test_numbers_out_of_range_are_named_with_the_range(device):
         check.finite_arrays({"points": vectors(device), "radii": vectors(device)}, maximum=2.0, nonnegative=["radii"])
 
 
-@pytest.mark.parametrize("find", [check._outside_on_host, check._outside_on_device])
-def test_host_and_device_find_the_same_arrays(find, device):
-    """The host reads arrays of a CPU; the device's kernel runs there as well."""
-    if find is check._outside_on_host and not wp.get_device(device).is_cpu:
-        pytest.skip("arrays of a GPU are never read on the host")
+@pytest.mark.usefixtures("found")
+def test_parts_of_arrays_are_looked_at_alone(device):
     whole = vectors(device, _000=np.nan)
-    arrays = {"nan": whole, "inf": vectors(device, _111=np.inf), "part": whole[1:], "large": vectors(device, _122=5)}
     strided = wp.array(np.arange(12, dtype=np.float32).reshape(3, 4), device=device)[:, 1:3]
-    arrays["strided"] = strided
-    assert find(arrays, dict.fromkeys(arrays, (-4.0, 4.0))) == ["nan", "inf", "large", "strided"]
-    assert find({"strided": strided}, {"strided": (0.0, 10.0)}) == []  # 11 is not in the part
+    check.finite_arrays({"part": whole[1:], "strided": strided}, maximum=10.0)  # 11 is not in the part
+    for name, array in {"whole": whole, "part": vectors(device, _122=5)[1:], "strided": strided}.items():
+        with pytest.raises(ValueError, match=f"^{name}: "):
+            check.finite_arrays({"good": vectors(device), name: array}, maximum=4.0)
+
+
+@pytest.fixture
+def reads(monkeypatch):
+    """Shapes of the arrays that are read, where all are awaited as on a GPU."""
+    shapes, numpy = [], wp.array.numpy
+    monkeypatch.setattr(check, "_is_awaited", lambda device: True)
+    monkeypatch.setattr(wp.array, "numpy", lambda array: (shapes.append(array.shape), numpy(array))[1])
+    return shapes
+
+
+def test_a_call_reads_once_what_a_gpu_found_in_all_arrays(device, reads):
+    arrays = [vectors(device) for _ in range(20)]
+    for _ in range(2):
+        with check.of_one_call():
+            for array in arrays:
+                check.finite_arrays({"points": array, "again": array})
+            with check.of_one_call():
+                check.finite_arrays({"radii": arrays[0]}, maximum=7.0)
+            assert not reads
+        assert len(reads) == 1
+        reads.clear()
+
+
+@pytest.mark.parametrize("number", [0, 7, 8, 19])
+def test_a_call_ends_with_the_first_fault_that_a_gpu_found(number, device, reads):
+    arrays = {f"points {index}": vectors(device) for index in range(20)}
+    spoiled = dict.fromkeys([f"points {number}", "last"], vectors(device, _101=np.nan))
+
+    def call():
+        with check.of_one_call():
+            for name, array in {**arrays, **spoiled}.items():
+                check.finite_arrays({name: array})
+            check.values_of(arrays["points 0"], lambda values: pytest.fail("called after a fault"))
+
+    for _ in range(2):
+        with pytest.raises(ValueError, match=rf"^points {number}: got 1 NaN"):
+            call()
+    spoiled.clear()
+    with check.of_one_call():
+        check.finite_arrays(arrays)
+
+
+@pytest.mark.usefixtures("reads")
+def test_a_fault_is_raised_in_place_of_the_error_that_it_leads_to(device):
+    with pytest.raises(ValueError, match=r"^points: got 1 NaN"), check.of_one_call():
+        check.finite_arrays({"points": vectors(device, _000=np.nan)})
+        raise RuntimeError("nothing fits")
+    with pytest.raises(RuntimeError, match="nothing fits"), check.of_one_call():
+        check.finite_arrays({"points": vectors(device)})
+        raise RuntimeError("nothing fits")
+
+
+@pytest.mark.usefixtures("reads")
+def test_a_long_call_does_not_hold_all_its_arrays(device):
+    held = []
+    with check.of_one_call():
+        for _ in range(500):
+            array = vectors(device)
+            held.append(weakref.ref(array))
+            check.finite_arrays({"points": array})
+        assert sum(reference() is not None for reference in held) < 100
+
+
+@pytest.mark.usefixtures("found")
+def test_values_are_judged_once(device):
+    judged = []
+    check.values_of(vectors(device), lambda values: judged.append(values.shape))
+    with check.of_one_call():
+        check.values_of(vectors(device), lambda values: judged.append(values.shape))
+    assert judged == [(2, 3, 3)] * 2
 
 
 @pytest.mark.parametrize("value", [1, -2.5, np.float32(3), np.int64(4)])

@@ -38,12 +38,61 @@ SCENE = ws.Scene([BALL], SKY, ws.Camera.framing(BALL, size=(8, 8)), ws.Visibilit
         ),
         (lambda: TorchRenderer(SCENE)(vertices=None), r"\(write geometry=renderer.placed\(.*renderer.deformed\("),
         (lambda: ws.Body(BALL.mesh, size=2), r"Body: unknown argument 'size' \(write Body\(…\).on_ground\(size=…\)\)"),
+        (
+            lambda: ws.render(SCENE, samples=16),
+            r"\(write Scene\(…, visibility=Visibility\('ray-traced', samples=…\)\)\)",
+        ),
+        (lambda: ws.Renderer(SCENE, softness=1.0), r"\(write Scene\(…, visibility=Visibility\(…\)\)\)"),
         (lambda: ws.Body(), "Body: missing a required argument: 'mesh'"),
     ],
 )
 def test_arguments_that_do_not_fit_are_told_with_those_that_do(call, message):
     with pytest.raises(TypeError, match=message):
         call()
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("cow.obj", r"got 'cow.obj', expected a Scene; .*; default_scene\('cow.obj'\) makes one of that file"),
+        ("scene.toml", r"; load_scene\('scene.toml'\) makes one of that file"),
+        (BALL, r"got Body, .*; default_scene\(body\) puts it on a ground"),
+        (BALL.mesh, r"; default_scene\(mesh\) puts it"),
+        ([BALL, BALL], r"; Scene\(\[…\], synthetic_sky\(\)\) makes one of bodies"),
+        ([], "got \\[\\], expected a Scene; load_scene\\(path\\) reads one$"),
+        (TorchRenderer(SCENE), r"got TorchRenderer, .*; renderer.scene is its, and renderer\(\) is an image of it"),
+        (ws.Renderer(SCENE), r"got Renderer, .*, and renderer.render\(\) is an image of it"),
+    ],
+    ids=str,
+)
+def test_what_is_no_scene_gets_the_way_to_one(value, message):
+    for function in (ws.render, ws.Renderer, ws.view, TorchRenderer):
+        with pytest.raises(ValueError, match=f"^scene: {'' if message.startswith('got') else 'got .*'}{message}"):
+            function(value)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: ws.Body(BALL.mesh, albedo=0.5), r"albedo: got 0.5, .*; that gray is \(0.5, 0.5, 0.5\)"),
+        (lambda: ws.Body(BALL.mesh, rotation=45), r"rotation: got 45, .* about the vertical \(0, 45, 0\)"),
+        (lambda: ws.Scene([BALL], SKY, visibility="ray-traced"), r"got 'ray-traced', .* Visibility\('ray-traced'\)$"),
+        (lambda: ws.Scene([BALL], SKY, visibility="rays"), r"got 'rays', .* Visibility\('directional'\)$"),
+        (lambda: SCENE.body_numbers("cow", "moving"), r"moving: got 'cow', .* such as \['cow'\]$"),
+    ],
+)
+def test_values_of_another_kind_get_an_example_with_theirs(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_poses_of_some_bodies_get_the_number_of_all():
+    renderer = TorchRenderer(dataclasses.replace(SCENE, bodies=[BALL, BALL]))
+    rotations, translations, scales = renderer.scene_poses()
+    with pytest.raises(ValueError, match=r"rotations: got shape \(1, 3, 3\), .* all 2 bodies, as scene_poses\(\) has"):
+        renderer.placed(rotations[:1], translations, scales)
+    with pytest.raises(ValueError, match=r"translations: got shape \(1, 3\), .* all 2 bodies, as scene_poses\(\) has"):
+        renderer.placed(rotations, translations[:1], scales)
 
 
 def test_cameras_go_to_the_renderer():

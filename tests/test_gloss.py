@@ -118,7 +118,7 @@ def test_a_white_metal_in_a_white_furnace_loses_what_single_scattering_loses(rou
 
 
 @pytest.mark.parametrize("metallic", [0.0, 1.0])
-def test_stills_and_kept_renderers_show_the_same_gloss(metallic):
+def test_stills_and_renderers_show_the_same_gloss(metallic):
     body = dataclasses.replace(BALL, metallic=metallic)
     kept, still = ws.Renderer(scene_of(body, GROUND, POST)).render(), ws.render(scene_of(body, GROUND, POST))
     assert np.linalg.norm(kept - still) < 0.06 * np.linalg.norm(still)
@@ -133,7 +133,7 @@ def test_in_stills_samples_of_different_faces_of_a_body_that_shines_share_no_rec
 
 
 @pytest.mark.parametrize("name", ["roughness", "metallic", "specular"])
-def test_gradients_to_gloss(name):
+def test_gradients_to_gloss_agree_with_differences(name):
     renderer, image = TorchRenderer(scene_of(), progress=False), weights()
 
     def loss(value):
@@ -162,7 +162,7 @@ def texels(height, width, low=0.3):
 
 
 @pytest.mark.parametrize("name", ["roughness", "metallic", "specular"])
-def test_gradients_to_textures_of_gloss(name):
+def test_gradients_to_textures_of_gloss_agree_with_differences(name):
     """Beside a ball of one number; texels are smaller and larger than pixels."""
     renderer, image = TorchRenderer(scene_of(BALL, TILES, POST), progress=False), weights()
     others = {"roughness": texels(64, 64), "metallic": texels(4, 3), "specular": texels(2, 3)}
@@ -244,7 +244,7 @@ def test_a_fit_recovers_a_texture_of_metal():
     np.testing.assert_allclose(fitted.metallic, truth, atol=0.1)  # measured 0.08, where the ball's shadow lies
 
 
-def test_gradients_to_light():
+def test_gradients_to_light_agree_with_differences():
     basis = ws.CellBasis(ws.fibonacci(32))
     scene = scene_of(visibility=ws.Visibility(directions=32))
     renderer, image = TorchRenderer(scene, basis=basis, progress=False), weights()
@@ -258,7 +258,7 @@ def test_gradients_to_light():
     assert gradient == pytest.approx(difference, rel=1e-3)
 
 
-def test_gradients_to_colors():
+def test_gradients_to_colors_agree_with_differences():
     renderer, image = TorchRenderer(scene_of(), progress=False), weights()
     gradient, difference = slopes(
         lambda value: (renderer(albedo={"ball": value}) * image).sum(), torch.tensor([0.8, 0.5, 0.3]), 0.05
@@ -266,7 +266,7 @@ def test_gradients_to_colors():
     np.testing.assert_allclose(gradient, difference, rtol=1e-3)
 
 
-def test_gradients_to_a_pose_of_what_blocks_and_what_shines():
+def test_gradients_to_poses_of_blockers_and_of_bodies_that_shine_agree_with_differences():
     renderer, image = TorchRenderer(dataclasses.replace(scene_of(), camera=NEAR), progress=False), weights()
     rotations, translations, scales = renderer.scene_poses()
 
@@ -279,7 +279,7 @@ def test_gradients_to_a_pose_of_what_blocks_and_what_shines():
     assert np.linalg.norm(gradient - difference) < SMOOTH * np.linalg.norm(difference)
 
 
-def test_gradients_to_the_camera():
+def test_gradients_to_the_camera_agree_with_differences():
     renderer, image = TorchRenderer(dataclasses.replace(scene_of(), camera=NEAR), progress=False), weights()
     R, t, K = renderer.scene_cameras()
 

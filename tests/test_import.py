@@ -71,3 +71,7 @@ def test_an_unknown_public_name_is_an_attribute_error():
 
     with pytest.raises(AttributeError, match="module 'warpshadow' has no attribute 'rendre'"):
         _ = warpshadow.rendre
+
+
+def test_dir_lists_all_public_names_before_they_are_imported():
+    assert not modules_after("import warpshadow; assert {*warpshadow.__all__} <= {*dir(warpshadow)}") & METHODS

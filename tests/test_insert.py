@@ -75,7 +75,7 @@ def test_what_is_brighter_than_white_is_said_with_an_exposure_that_is_not():
         warnings.simplefilter("error")
         ws.insert(dim, photograph, progress=False)
         ws.insert(scene, 4 * photograph, exposure=2, progress=False)  # linear beyond white
-    with pytest.warns(UserWarning, match="^[0-9]+% of what is inserted is brighter than white, as is 0% of") as caught:
+    with pytest.warns(UserWarning, match="^[0-9]+% of the inserted pixels are brighter than white, as is 0%") as caught:
         image = ws.insert(scene, photograph, exposure=2, progress=False)
     covered = ws.Renderer(scene, progress=False).layers().masks[0] > 0.5
     share, stops = re.match(r"(\d+)% .*--exposure (-?[\d.]+)\)", str(caught[0].message)).groups()
@@ -174,7 +174,7 @@ def test_several_catchers_catch_and_shadow_each_other_as_in_the_photograph():
 
 
 def test_shadows_are_caught_pixel_by_pixel():
-    """By a ground that would have its receivers at its vertices in a renderer that is kept."""
+    """By a ground that would have its receivers at its vertices in a renderer."""
     photograph = np.full((36, 48, 3), 0.5, np.float32)
     images = [
         ws.insert(scene_of(bodies=[ball(), ground(receivers=receivers)]), photograph)

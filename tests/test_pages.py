@@ -1,5 +1,6 @@
 """Pages are true: links lead somewhere, names exist, commands start, and snippets run as they stand."""
 
+import ast
 import dataclasses
 import importlib
 import re
@@ -143,14 +144,91 @@ def resolved(path):
     return False
 
 
-ROLES = re.compile(r":(func|class|meth|data|mod|attr):`~?(warpshadow\.[\w.]+)`")
+SOURCES = {file: file.read_text("utf-8") for file in sorted((ROOT / "warpshadow").rglob("*.py"))}
+DEFINED = {name for file in SOURCES for name in (file.stem, file.parent.name)} | {
+    getattr(node, key)
+    for text in SOURCES.values()
+    for node in ast.walk(ast.parse(text))
+    for key in ("name", "id", "attr", "arg")
+    if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.arg) or isinstance(getattr(node, "ctx", None), ast.Store)
+    if hasattr(node, key)
+}
+ROLES = re.compile(r":(func|class|meth|data|mod|attr):`~?([\w.]+)`")
 
 
-@pytest.mark.parametrize("file", sorted((ROOT / "warpshadow").rglob("*.py")), ids=name_of)
-def test_what_docstrings_refer_to_exists(file):
-    for role, path in ROLES.findall(file.read_text("utf-8")):
-        assert resolved(path), path
-        assert (path in sys.modules) == (role == "mod"), path
+@pytest.mark.parametrize("file", SOURCES, ids=name_of)
+def test_names_that_docstrings_refer_to_exist(file):
+    for role, path in ROLES.findall(SOURCES[file]):
+        if path.startswith("warpshadow."):
+            assert resolved(path), path
+            assert (path in sys.modules) == (role == "mod"), path
+        else:
+            assert DEFINED.issuperset(path.strip(".").split(".")), path
+
+
+@each_page_of_today
+def test_methods_and_constants_that_a_page_names_exist(page):
+    texts = code(page)
+    for owner, name in (match.groups() for text in texts if (match := re.match(r"([A-Z]\w*)\.(\w+)(?:$|\()", text))):
+        assert owner not in DEFINED or name in DEFINED, f"{owner}.{name}"
+    for name in (text for text in texts if re.fullmatch(r"(?!WARP_|MALLOC_|G?OMP_)_?[A-Z]+(?:_[A-Z]+)+", text)):
+        assert any(name in text for text in SOURCES.values()), name
+
+
+# ------------------------------------------------------------------------------------------------ figures
+
+
+DEMOS = (ROOT / "demos" / "README.md").read_text("utf-8")
+
+
+def table_rows(heading):
+    """Cells of the tables below a heading of the demos' page, by row; a mark of boldness is left out."""
+    text = re.search(rf"^## {heading}\n(.*?)(?=^## |\Z)", DEMOS, re.DOTALL | re.MULTILINE)[1]
+    return [[cell.strip(" *") for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
+
+
+def numbers(cells):
+    return [float(re.match(r"[\d.]+", cell)[0]) for cell in cells]
+
+
+def row_of(heading, label):
+    return next(numbers(row[1:]) for row in table_rows(heading) if row[0] == label)
+
+
+def summaries(heading, label_count):
+    """The rows of means and worst values of a table of errors, which are those of its columns."""
+    rows = [row for row in table_rows(heading)[2:] if re.match(r"[\d.]+%?$", row[label_count])]
+    *rows, means, worst = [numbers(cell for cell in row[label_count:] if re.match(r"[\d.]+%?$", cell)) for row in rows]
+    for column, mean, highest in zip(zip(*rows, strict=True), means, worst, strict=True):
+        assert mean == pytest.approx(sum(column) / len(column), abs=0.051) and highest == max(column)
+    return len(rows), means, worst
+
+
+def test_figures_of_the_first_page_are_those_of_the_demos_tables():
+    stated = re.sub(r"\]\([^)]*\)|[\[*]", "", (ROOT / "README.md").read_text("utf-8")).replace("\n ", "")
+    count, means, worst = summaries("Accuracy", 2)
+    assert count == 9 and f"off by {means[4]}% on average, {worst[4]}% at worst, on nine meshes" in stated
+    assert f"without shadows by {means[0]}% and {worst[0]}%" in stated
+    count, means, worst = summaries("Scenes of all kinds", 1)
+    assert f"on {count} scenes, by {means[0]}% and {worst[0]}%" in stated
+    image, light, texture, pose = (
+        row_of("Speed", label)[1]
+        for label in (
+            "an image of bodies that have moved, `directional`",
+            "an iteration in torch, forward and backward: light",
+            "… a texture of 256 × 256",
+            "… a pose",
+        )
+    )
+    assert f"moved bodies takes {image:.0f} ms, an iteration of a light or texture fit {texture:.0f} ms" in stated
+    assert f"of a pose {pose:.0f} ms" in stated and light == pytest.approx(texture, rel=0.2)
+    factors = [
+        [float(factor) for row in table_rows("Error against time") for factor in re.findall(cell, "|".join(row))]
+        for cell in (r"\|(\d+) times(?: as long)?\|", r"\|(\d+) times(?: as long|; .*)?$")
+    ]
+    (low, high), (low_bounces, high_bounces) = ((min(each), max(each)) for each in factors)
+    assert f"{low:.0f} to {high:.0f} times as long, with bounces {low_bounces:.0f} to {high_bounces:.0f}" in stated
+    assert f"within {row_of('Gradients', 'by pose, 2 × 2 samples per pixel (default): `directional`')[-1]}%" in stated
 
 
 # ------------------------------------------------------------------------------------------------ commands

@@ -1,17 +1,21 @@
 """Rendering with tensors: the same image, exact gradients, nothing shared by accident, nothing kept too long."""
 
 import dataclasses
+import gc
 import os
 import resource
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 import warpshadow as ws
+from warpshadow.device import memory
 from warpshadow.torch import TorchRenderer, clip_matrices_from_opengl, rotation_matrices
 
 METHODS = ("directional", "log-sh", "none", "ray-traced")
@@ -236,6 +240,26 @@ def test_backward_twice_gives_the_same(renderer):
     second = torch.autograd.grad(loss, leaves)
     for before, after, untouched in zip(first, second, kept, strict=True):
         assert torch.equal(before, after) and torch.equal(before, untouched)
+
+
+def test_an_image_that_is_kept_holds_no_memory_of_gradients(renderer, monkeypatch):
+    blocks, take = [], memory.ZeroedMemory.take
+
+    def noted(self, *arguments):
+        array = take(self, *arguments)
+        blocks.append(weakref.ref(self._block))
+        return array
+
+    monkeypatch.setattr(memory.ZeroedMemory, "take", noted)
+    light = random(renderer.basis.size, 3)
+    image = renderer(light)
+    image.sum().backward()
+    kept = image.detach()
+    assert blocks and blocks[0]() is not None
+    del image
+    gc.collect()
+    assert all(block() is None for block in blocks)
+    torch.testing.assert_close(kept, renderer(light.detach()))
 
 
 def test_gradients_of_two_images_in_any_order_do_not_mix(renderer):
@@ -532,6 +556,37 @@ def test_nine_free_numbers_descend_to_a_rotation(renderer):
 
 
 # ---------------------------------------------------------------------------------------------- over time
+
+
+@pytest.mark.parametrize(
+    ("method", "bounces"), [*((method, 0) for method in METHODS), ("directional", 2), ("log-sh", 2), ("ray-traced", 1)]
+)
+def test_the_memory_of_a_call_is_free_without_garbage_collection(method, bounces):
+    """Python's collector knows nothing of how much memory an array holds, least of all on a GPU."""
+    renderer = TorchRenderer(dataclasses.replace(small_scene(method), bounces=bounces))
+    rotations, translations, scales = renderer.scene_poses()
+    has_gradient = method != "ray-traced"
+
+    def iterate() -> None:
+        for requires_grad in {False, has_gradient}:
+            moved = translations.clone().requires_grad_(requires_grad)
+            image = renderer(geometry=renderer.placed(rotations, moved, scales))
+            if requires_grad:
+                image.sum().backward()
+
+    iterate()
+    gc.collect()
+    gc.disable()
+    try:
+        iterate()
+        gc.set_debug(gc.DEBUG_SAVEALL)
+        gc.collect()
+        arrays = [item for item in gc.garbage if type(item) is wp.array]
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        gc.enable()
+    assert not arrays
 
 
 @pytest.mark.slow

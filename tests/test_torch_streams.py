@@ -15,7 +15,7 @@ def test_warps_stream_waits_for_torchs_before_it_frees_what_was_used(captures, m
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: "torch's stream")
     monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", lambda: captures)
     monkeypatch.setattr(wp, "stream_from_torch", lambda stream: SimpleNamespace(device="cpu", of=stream))
-    scope = autograd._current_stream(torch.device("cuda"))
+    scope = autograd.current_stream(torch.device("cuda"))
     assert scope.stream.of == "torch's stream"
     assert scope.sync_enter == scope.sync_exit == (not captures)
 

@@ -115,6 +115,11 @@ def quiet(*, progress: bool = True) -> None:
     _start_quietly()
 
 
+def __dir__() -> list[str]:
+    """The names of the module, imported or not, for completion."""
+    return sorted({*globals(), *__all__})
+
+
 def __getattr__(name: str) -> object:
     if name not in _MODULES:
         raise AttributeError(f"module 'warpshadow' has no attribute {name!r}")

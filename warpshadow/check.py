@@ -10,8 +10,9 @@ import math
 import os
 import re
 import sys
+import threading
 import warnings
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import ParamSpec, TypeGuard, TypeVar
@@ -49,13 +50,20 @@ def choice(name: str, value: object, choices: Iterable[object]) -> None:
     raise ValueError(f"{name}: got {value!r}, expected one of {accepted}{_suggestion(value, choices)}")
 
 
-def known_keys(where: str, keys: Iterable[str], known: Iterable[str]) -> None:
-    """Raise ValueError for the first of ``keys`` that is not ``known``; the message names the nearest one."""
+def known_keys(where: str, keys: Iterable[str], known: Iterable[str], *, noun: str = "key") -> None:
+    """Raise ValueError for the first of ``keys`` that is not ``known``; the message names the nearest one.
+
+    Args:
+        where: Their place; empty where :func:`located` says it.
+        keys, known: The keys, and all that there are.
+        noun: Name of a key in the message.
+    """
     known = list(known)
     for key in keys:
         if key not in known:
             raise ValueError(
-                f"{where}: unknown key {key!r}{_suggestion(key, known)}; known keys are {', '.join(known)}"
+                f"{where and f'{where}: '}unknown {noun} {key!r}{_suggestion(key, known)}; "
+                f"known {noun}s are {', '.join(known)}"
             )
 
 
@@ -374,20 +382,145 @@ def finite(name: str, values: np.ndarray, *, minimum: float = -LARGEST, maximum:
         )
 
 
+class _LateChecks(threading.local):
+    """Checks of a thread's call that wait for the end of the call, on a GPU."""
+
+    def __init__(self) -> None:
+        self.depth = 0  # of calls in each other
+        self.arrays: dict[Hashable, tuple[str, wp.array, tuple[float, float]]] = {}  # their names and ranges
+        self.others: list[tuple[wp.array, Callable[[np.ndarray], None]]] = []
+        self.faults: dict[str, wp.array] = {}  # by device: zero but while arrays are looked at
+
+    def __enter__(self) -> None:
+        self.depth += 1
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            if self.depth == 1 and (kind is None or issubclass(kind, Exception)):
+                self.run()
+        finally:
+            self.depth -= 1
+            if not self.depth:
+                self.clear()
+
+    def clear(self) -> None:
+        """Leave them out."""
+        self.arrays, self.others = {}, []
+
+    def run_if_due(self) -> None:
+        """Run them where no call waits for them, or they hold many arrays."""
+        if not self.depth or len(self.arrays) + len(self.others) >= _MAX_LATE:
+            self.run()
+
+    def run(self) -> None:
+        """Run them in their order."""
+        if not (self.arrays or self.others):
+            return
+        arrays, others = list(self.arrays.values()), self.others
+        self.clear()
+        for alias in dict.fromkeys(array.device.alias for _, array, _ in arrays):
+            of_device = [item for item in arrays if item[1].device.alias == alias]
+            for number in self._outside(of_device):
+                name, array, (minimum, maximum) = of_device[number]
+                finite(name, array.numpy(), minimum=minimum, maximum=maximum)
+        for array, judge in others:
+            judge(array.numpy())
+
+    def _outside(self, arrays: Sequence[tuple[str, wp.array, tuple[float, float]]]) -> list[int]:
+        """Which arrays, of one device, hold a number out of their range: few launches, and one wait."""
+        device = arrays[0][1].device
+        if device.alias not in self.faults or len(self.faults[device.alias]) < len(arrays):
+            self.faults[device.alias] = wp.zeros(2 * len(arrays), dtype=wp.int32, device=device)
+        faults = self.faults[device.alias]
+        for first in range(0, len(arrays), _AT_ONCE):
+            batch = arrays[first : first + _AT_ONCE]
+            values = [_scalars(array) for _, array, _ in batch]
+            ranges = [range_ for *_, range_ in batch] + [(0.0, 0.0)] * (_AT_ONCE - len(batch))
+            limits = [_Limits(*side) for side in zip(*ranges, strict=True)]
+            padding: list[None] = [None] * (_AT_ONCE - len(batch))
+            wp.launch(
+                _count_outside,
+                dim=(len(batch), max(array.size for array in values)),
+                inputs=[*values, *padding, *limits, first],
+                outputs=[faults],
+                device=device,
+                record_tape=False,
+            )
+        faulty_indices = np.flatnonzero(faults.numpy()).tolist()
+        if faulty_indices:
+            faults.zero_()
+        return faulty_indices
+
+
+_late_checks = _LateChecks()
+
+
+def of_one_call() -> contextlib.AbstractContextManager[None]:
+    """Check arrays on a GPU when the call ends, so that it waits for the device once.
+
+    A call within a call ends with it. A fault is raised in place of the error that it led to.
+    """
+    return _late_checks
+
+
+def _is_awaited(device: wp.Device) -> bool:
+    """Whether the host waits where it reads a device's arrays."""
+    return device.is_cuda
+
+
+_AT_ONCE = 8  # arrays that a launch looks at
+_MAX_LATE = 64  # checks that wait, since they hold their arrays
+
+_Limits = wp.types.vector(length=_AT_ONCE, dtype=wp.float32)
+
+
+@wp.func
+def _is_outside(values: wp.array(dtype=wp.float32), item: int, minimum: float, maximum: float) -> bool:
+    result = bool(False)
+    if item < values.shape[0]:
+        result = not (values[item] >= minimum and values[item] <= maximum)  # so NaN, too
+    return result
+
+
 @wp.kernel(enable_backward=False)
 def _count_outside(
     # in
-    values: wp.array(dtype=wp.float32),
-    minimum: float,
-    maximum: float,
-    argument: int,
+    values_0: wp.array(dtype=wp.float32),
+    values_1: wp.array(dtype=wp.float32),
+    values_2: wp.array(dtype=wp.float32),
+    values_3: wp.array(dtype=wp.float32),
+    values_4: wp.array(dtype=wp.float32),
+    values_5: wp.array(dtype=wp.float32),
+    values_6: wp.array(dtype=wp.float32),
+    values_7: wp.array(dtype=wp.float32),
+    minima: _Limits,
+    maxima: _Limits,
+    first: int,
     # out
     faults: wp.array(dtype=wp.int32),
 ):
-    """A thread owns a number."""
-    value = values[wp.tid()]
-    if not (value >= minimum and value <= maximum):  # so NaN, too
-        wp.atomic_add(faults, argument, 1)
+    """A thread owns a number of an array."""
+    argument, item = wp.tid()
+    minimum, maximum = minima[argument], maxima[argument]
+    is_outside = bool(False)
+    if argument == 0:
+        is_outside = _is_outside(values_0, item, minimum, maximum)
+    elif argument == 1:
+        is_outside = _is_outside(values_1, item, minimum, maximum)
+    elif argument == 2:
+        is_outside = _is_outside(values_2, item, minimum, maximum)
+    elif argument == 3:
+        is_outside = _is_outside(values_3, item, minimum, maximum)
+    elif argument == 4:
+        is_outside = _is_outside(values_4, item, minimum, maximum)
+    elif argument == 5:
+        is_outside = _is_outside(values_5, item, minimum, maximum)
+    elif argument == 6:
+        is_outside = _is_outside(values_6, item, minimum, maximum)
+    else:
+        is_outside = _is_outside(values_7, item, minimum, maximum)
+    if is_outside:
+        wp.atomic_add(faults, first + argument, 1)
 
 
 def finite_arrays(
@@ -395,8 +528,8 @@ def finite_arrays(
 ) -> None:
     """Raise ValueError when float32 arrays on a device, of any dtype, hold NaN, Inf or numbers out of range.
 
-    On a GPU, one count for all of them is read back, which waits for the device. While a CUDA graph is captured that
-    cannot be, and nothing is checked.
+    On a GPU that is found when the call ends (:func:`of_one_call`), at once where there is none. While a CUDA graph is
+    captured nothing can be read back, and nothing is checked.
 
     Args:
         arrays: By the names of their arguments; None is passed over.
@@ -408,9 +541,28 @@ def finite_arrays(
     if not devices or any(device.is_capturing for device in devices):
         return
     ranges = {name: (0.0 if name in nonnegative else -maximum, maximum) for name in present}
-    find = _outside_on_host if all(device.is_cpu for device in devices) else _outside_on_device
-    for name in find(present, ranges):
-        finite(name, present[name].numpy(), minimum=ranges[name][0], maximum=maximum)
+    if not any(map(_is_awaited, devices)):
+        for name in _outside_on_host(present, ranges):
+            finite(name, present[name].numpy(), minimum=ranges[name][0], maximum=maximum)
+        return
+    for name, array in present.items():
+        key = array.ptr, array.shape, array.strides, ranges[name]
+        _late_checks.arrays.setdefault(key, (name, array, ranges[name]))
+    _late_checks.run_if_due()
+
+
+def values_of(array: wp.array, judge: Callable[[np.ndarray], None]) -> None:
+    """Let a function look at an array's values and raise an error: on a GPU when the call ends, as finite_arrays does.
+
+    While a CUDA graph is captured it does not.
+    """
+    if array.device.is_capturing:
+        return
+    if not _is_awaited(array.device):
+        judge(array.numpy())
+        return
+    _late_checks.others.append((array, judge))
+    _late_checks.run_if_due()
 
 
 def _outside_on_host(arrays: Mapping[str, wp.array], ranges: Mapping[str, tuple[float, float]]) -> list[str]:
@@ -427,23 +579,6 @@ def _is_within(values: np.ndarray, minimum: float, maximum: float) -> bool:
     if is_small and minimum == -maximum and float(np.vdot(values, values)) < (0.5 * maximum) ** 2:
         return True
     return bool(minimum <= np.minimum.reduce(values, None) and np.maximum.reduce(values, None) <= maximum)
-
-
-def _outside_on_device(arrays: Mapping[str, wp.array], ranges: Mapping[str, tuple[float, float]]) -> list[str]:
-    """Check that arrays are finite by a kernel, with one readback."""
-    device = next(iter(arrays.values())).device
-    faults = wp.zeros(len(arrays), dtype=wp.int32, device=device)
-    for argument, (name, array) in enumerate(arrays.items()):
-        values = _scalars(array)
-        wp.launch(
-            _count_outside,
-            dim=values.shape,
-            inputs=[values, *ranges[name], argument],
-            outputs=[faults],
-            device=device,
-            record_tape=False,
-        )
-    return [name for name, count in zip(arrays, faults.numpy(), strict=True) if count]
 
 
 def _scalars(array: wp.array) -> wp.array:

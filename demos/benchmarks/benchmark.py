@@ -303,7 +303,7 @@ def time_set_up(device: str) -> None:
         "ball": ws.icosphere(1.0, 6),
     }
     print(cpu_text())
-    print("CPU seconds; image: of a kept Renderer, with all that is left of it; again: of another, all cached")
+    print("CPU seconds; image: of a Renderer, with all that is left of it; again: of another, all cached")
     print(f"{'':12}{'vertices':>10}{'spheres':>9}{'fit':>8}{'tracing':>9}{'image':>8}{'again':>8}{'still':>8}")
     for name, mesh in {"": ws.icosphere(1.0, 1), **meshes}.items():  # the first loads kernels
         scene = on_ground(mesh, ws.synthetic_sky(), blockers="auto")

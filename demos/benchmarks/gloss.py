@@ -30,7 +30,7 @@ from warpshadow.torch import TorchRenderer
 
 ROUGHNESS = (0.2, 0.35, 0.6)
 KINDS = {"metal": {"albedo": (0.9, 0.65, 0.35), "metallic": 1.0}, "plastic": {"albedo": (0.15, 0.35, 0.6)}}
-METHODS = ("still", "kept")
+METHODS = ("still", "renderer")
 
 
 def scenes(data: Path | None, size: int, count: int) -> dict[str, ws.Scene]:

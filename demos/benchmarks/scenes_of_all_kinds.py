@@ -1,11 +1,12 @@
-"""How right images are on scenes of all kinds, body by body: stills and kept renderers, direct and bounced light.
+"""How right images are on scenes of all kinds, body by body: stills and renderers, direct and bounced light.
 
     python demos/benchmarks/scenes_of_all_kinds.py [--scenes NAME ...] [--data FOLDER] [--size 256] [--jobs 1]
-        [--settings still-direct kept-direct still-full kept-full] [--mitsuba] [--output FOLDER]
+        [--settings still-direct renderer-direct still-full renderer-full] [--mitsuba] [--output FOLDER]
 
-The scenes are those of demos/kinds.py. A still is ``ws.render``, kept is ``ws.Renderer(scene).render()``. Direct light
-is compared with rays, full light, ``bounces = "all"`` (or as many as ``--bounces`` says), with paths of all bounces,
-both by method "ray-traced". For each scene and setting the demo prints, in percent
+The scenes are those of demos/kinds.py. A still is ``ws.render``, an image of a renderer
+``ws.Renderer(scene).render()``. Direct light is compared with rays, full light, ``bounces = "all"`` (or as many as
+``--bounces`` says), with paths of all bounces, both by method "ray-traced". For each scene and setting the demo prints,
+in percent
 
     error    relative L2 error of color over wholly covered pixels, as in the other demos
     bodies   of each body, how much brighter its pixels are on average: the worst first, as many as --bodies says
@@ -15,14 +16,14 @@ References are rendered twice, the second time with scene and light turned about
 first two figures are against the mean of both, with its noise, half their difference, taken off. They stay in
 OUTPUT/references by a hash of all that they depend on, so that a second run renders ours alone.
 
-Where a still and a kept image of one light are asked for, "still to kept" is their relative L2 difference over pixels
-that are wholly covered.
+Where a still and a renderer's image of one light are asked for, "still to renderer" is their relative L2 difference
+over pixels that are wholly covered.
 
 Also printed: CPU seconds of the first image (* where the cache lacked a fit, self-shadows or form factors of it; the
 very first run also compiles kernels); CPU milliseconds of an image after all bodies moved; the most memory that the
-scene's process had up to each setting. With
-``--mitsuba`` the references are compared with Mitsuba's, and ours with both. A contact sheet for each scene shows
-reference, still and kept, and in red where they are too bright, in blue where too dark. results.json has all figures.
+scene's process had up to each setting. With ``--mitsuba`` the references are compared with Mitsuba's, and ours with
+both. A contact sheet for each scene shows reference, still and renderer, and in red where they are too bright, in blue
+where too dark. results.json has all figures.
 """
 
 import argparse
@@ -48,7 +49,7 @@ from demos.references import Reference, Request
 from warpshadow.assets.cache import KINDS, cached_files
 from warpshadow.scene.scene import Bounces
 
-SETTINGS = ("still-direct", "kept-direct", "still-full", "kept-full")
+SETTINGS = ("still-direct", "renderer-direct", "still-full", "renderer-full")
 ALL_BOUNCES = 16
 FULL_COLOR = 0.5  # difference, over the mean of the image, that is as red or blue as can be
 MOVED_RUNS = 3
@@ -125,7 +126,7 @@ def measure(name: str, options: Options) -> dict[str, Any]:
         kind, light = setting.split("-")
         lit = dataclasses.replace(scene, bounces=options.bounces if light == "full" else 0)
         before = cached_counts()
-        image, figures = (still if kind == "still" else kept)(lit)
+        image, figures = (still if kind == "still" else of_renderer)(lit)
         figures["made"] = {each: count - before[each] for each, count in cached_counts().items()}
         truth = references[light]
         block, place = truth.worst_block(image)
@@ -135,10 +136,10 @@ def measure(name: str, options: Options) -> dict[str, Any]:
             figures["error to Mitsuba"] = checks[light].error(image)
         result["settings"][setting] = figures
         images[setting] = image
-    result["still to kept"] = {
-        light: relative(images[f"kept-{light}"], images[f"still-{light}"], references[light].covered)
+    result["still to renderer"] = {
+        light: relative(images[f"renderer-{light}"], images[f"still-{light}"], references[light].covered)
         for light in options.lights()
-        if {f"still-{light}", f"kept-{light}"} <= set(images)
+        if {f"still-{light}", f"renderer-{light}"} <= set(images)
     }
     draw_sheet(name, images, references, result, options.output / f"{name}.png")
     return result
@@ -151,8 +152,8 @@ def still(scene: ws.Scene) -> tuple[np.ndarray, dict[str, Any]]:
     return image, {"first CPU s": time.process_time() - start, "peak MiB": peak_mebibytes()}
 
 
-def kept(scene: ws.Scene) -> tuple[np.ndarray, dict[str, Any]]:
-    """The picture of a renderer that is kept, and what it and those of moved bodies take."""
+def of_renderer(scene: ws.Scene) -> tuple[np.ndarray, dict[str, Any]]:
+    """The picture of a renderer, and what it and those of moved bodies take."""
     from warpshadow.tuning.timing import whole_image
 
     start = time.process_time()
@@ -307,8 +308,8 @@ def print_scene(name: str, result: dict[str, Any], body_count: int) -> None:
             line += f", to Mitsuba {figures['error to Mitsuba']:.1%}, {figures['brighter than Mitsuba']:+.2%}; "
             line += ", ".join(f"{body} {error:+.1%}" for body, error in bodies)
         print(line)
-    for light, difference in result["still to kept"].items():
-        print(f"{name:20}{light + ' light':14} still to kept {difference:.1%}")
+    for light, difference in result["still to renderer"].items():
+        print(f"{name:20}{light + ' light':14} still to renderer {difference:.1%}")
     sys.stdout.flush()
 
 
@@ -332,11 +333,11 @@ def print_means(results: dict[str, Any], options: Options) -> None:
             f"{setting}: mean error {statistics.mean(errors.values()):.1%}, worst {errors[worst]:.1%} ({worst}); "
             f"worst body {bodies[worst_body][1]:+.1%} ({bodies[worst_body][0]}, {worst_body})"
         )
-    for light in next(iter(results.values()))["still to kept"]:
-        differences = {name: result["still to kept"][light] for name, result in results.items()}
+    for light in next(iter(results.values()))["still to renderer"]:
+        differences = {name: result["still to renderer"][light] for name, result in results.items()}
         worst = max(differences, key=lambda name: differences[name])
         print(
-            f"{light} light, still to kept: mean {statistics.mean(differences.values()):.1%}, "
+            f"{light} light, still to renderer: mean {statistics.mean(differences.values()):.1%}, "
             f"worst {differences[worst]:.1%} ({worst})"
         )
 

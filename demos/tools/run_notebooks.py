@@ -9,8 +9,11 @@ import argparse
 import sys
 from pathlib import Path
 
-import nbformat
-from nbclient import NotebookClient
+try:
+    import nbformat
+    from nbclient import NotebookClient
+except ImportError as error:
+    raise ImportError(f'{error}; in a checkout pip install -e ".[dev]" installs it') from error
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 MAX_SECONDS = 600  # of a cell: the first one of a new machine compiles kernels and fits spheres

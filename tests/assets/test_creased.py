@@ -6,6 +6,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 import warpshadow as ws
 from warpshadow.assets.topology import face_normals, welded
@@ -251,6 +252,30 @@ def test_many_boxes_are_as_sharp_as_one():
     assert heap.rounds_edges and not heap.creased().rounds_edges
     assert joined(ball, *boxes).rounds_edges
     assert not joined(ball, CUBE.transformed(scale=0.1)).rounds_edges  # a button
+
+
+def vase(sides: int, lip: float = 0.004) -> ws.Mesh:
+    """A vase of trimesh, 0.3 high, whose lip is as thick as its wall."""
+    height = np.linspace(0, 1, 8)
+    outside = np.column_stack([0.05 + 0.03 * np.sin(1.2 * np.pi * height), 0.3 * height])
+    inside = (outside - [lip, 0])[::-1]
+    profile = [[[0, 0]], outside, inside[inside[:, 1] > lip], [[0, lip]]]
+    return ws.load_mesh(trimesh.creation.revolve(np.concatenate(profile), sections=sides))
+
+
+@pytest.mark.parametrize("sides", [16, 24, 64])
+def test_the_lip_of_a_vase_is_sharp_however_coarse_its_sides_are(sides, tmp_path):
+    mesh = vase(sides)
+    assert mesh.surface.is_closed and mesh.rounds_edges and not mesh.creased().rounds_edges
+    trimesh.Trimesh(mesh.positions, mesh.faces, process=False).export(tmp_path / "vase.stl")
+    assert not ws.load_mesh(tmp_path / "vase.stl").rounds_edges  # an STL file has no vertices to share at its lip
+
+
+def test_short_rings_of_sharp_edges_are_no_lips():
+    ball = ws.icosphere(1.0, 3)
+    spiked = ball.positions.copy()
+    spiked[::7] *= 1.3
+    assert not ws.Mesh(spiked, ball.faces).rounds_edges
 
 
 def test_round_meshes_and_irregular_ones_are_not_remarked_upon():

@@ -1,7 +1,6 @@
 """Meshes: what files and primitives give, what is refused and how, and the gradient of vertex normals."""
 
 import json
-import re
 import sys
 import warnings
 
@@ -11,7 +10,6 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from warpshadow.assets import obj
 from warpshadow.assets.mesh import Mesh, MeshError
 from warpshadow.assets.mesh_files import load_mesh
 from warpshadow.assets.primitives import icosphere, infinite_ground, plane
@@ -316,37 +314,6 @@ def test_a_ply_file_that_is_cut_off_says_so(tmp_path, encoding, part):
             MeshError, match=r"x.ply: the file is cut off: (its header has no end|got \d+ (lines|bytes))"
         ):
             load_mesh(tmp_path / "x.ply")
-
-
-PLAIN_OBJ = "# a fan\nv 0 0 0\nv 1 0 0\nv 0 1e-1 0\n\nv -1 .5 2\nf 1 2 3\nf 1 3 4\n"
-COLORED_OBJ = "v 0 0 0 1 0 0\nv 1 0 0 0 1 0\nv 0 1 0 0 0 1\nv 1 1 0 1 1 1\nf 1 2 4 3\n"
-TEXTURED_OBJ = (
-    "mtllib a.mtl  # its pictures\no fan\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv -1 0 2\nvt 0 0\nvt 1 0 0\nvn 0 0 1\n"
-    "usemtl dark red\nusemtl  light  red # used\ns off\nf 1/1/1 2/2/1 3/1/1\nusemtl blue\nf 1/2/1 3/1/1 4/2/1 2/1/1\n"
-).replace("vt 0 0\n", "vt 0 0 0\n")
-
-
-@pytest.mark.parametrize(
-    "text",
-    [PLAIN_OBJ, COLORED_OBJ, TEXTURED_OBJ, re.sub("/./", "//", TEXTURED_OBJ), re.sub("/1(?= |\\n)", "", TEXTURED_OBJ)],
-)
-def test_an_obj_of_like_lines_is_read_at_once_as_line_by_line(text):
-    at_once, by_line = obj.read_alike(text), obj.read_by_line(text)
-    assert at_once is not None
-    for name, values in at_once._asdict().items():
-        expected = getattr(by_line, name)
-        assert np.array_equal(values, expected) if isinstance(values, np.ndarray) else values == expected, name
-
-
-@pytest.mark.parametrize(
-    "change",
-    [("f 1 2 3", "f 1 2 -2"), ("f 1 2 3", "f 1 2 3.0"), ("f 1 2 3", "f 1/1 2/1 3"), ("f 1 2 3", "f 1//1 2/1 3/1"),
-     ("v 1 0 0", "v 1 0"), ("v 1 0 0", "v 1 0 0 1 0 0"), ("v 1 0 0", "vt 1"), ("v 1 0 0", "v 1 0 0 # x"),
-     ("# a fan", "l 1 2")],
-)  # fmt: skip
-def test_any_other_obj_is_read_line_by_line(change):
-    assert obj.read_alike(PLAIN_OBJ) is not None
-    assert obj.read_alike(PLAIN_OBJ.replace(*change)) is None
 
 
 def test_uvs_of_vertices_need_no_faces_of_their_own():
@@ -749,25 +716,6 @@ def test_normals_of_a_welded_seam_are_smooth_across_it(tmp_path, device):
     lower, upper = normals_of(mesh, device)[[0, 5]]
     np.testing.assert_allclose(lower, upper * [1, 1, -1], atol=ROUNDING)  # by symmetry, though the diagonals tilt both
     assert lower[0] > 0.9 > np.sqrt(0.5)  # the normal of either quad
-
-
-def test_the_gradient_of_vertex_normals_equals_central_differences(device, verified_tape):
-    random = np.random.default_rng(1)
-    mesh = icosphere(1.0, 1)
-    start = mesh.positions + 0.1 * random.normal(size=mesh.positions.shape)
-    start = start.astype(np.float32).astype(np.float64)
-    weights = random.normal(size=start.shape)
-    positions = wp.array(start[None], dtype=wp.vec3, device=device, requires_grad=True)
-    with wp.Tape() as tape:
-        normals = vertex_normals(positions, wp.array(mesh.faces, dtype=wp.vec3i, device=device))
-    tape.backward(grads={normals: wp.array(weights[None], dtype=wp.vec3, device=device)})
-    expected = np.zeros_like(start)
-    for index in np.ndindex(*start.shape):
-        step = np.zeros_like(start)
-        step[index] = 1e-5
-        change = normals_twin(start + step, mesh.faces) - normals_twin(start - step, mesh.faces)
-        expected[index] = np.sum(weights * change) / 2e-5
-    np.testing.assert_allclose(positions.grad.numpy()[0], expected, rtol=1e-4, atol=1e-4)
 
 
 def test_faces_without_area_give_zero_normals_and_zero_gradients(device, verified_tape):

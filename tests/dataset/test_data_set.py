@@ -265,7 +265,7 @@ def test_a_recipe_is_read(folder):
             "size = [1, 0.5]",
             "[bodies]: size: got [1, 0.5], expected two numbers from 0.01 to 1.5",
         ),
-        ("size = [0.5, 1]", "sizes = [1, 1]", "[bodies]: key: unknown key 'sizes' (did you mean 'size'?)"),
+        ("size = [0.5, 1]", "sizes = [1, 1]", "[bodies]: unknown key 'sizes' (did you mean 'size'?)"),
         ("upright = 1", "upright = 2", "[bodies]: upright: got 2, expected a part of all, from 0 to 1"),
         (
             "albedo = [0.5, 0.6]",

@@ -3,6 +3,7 @@
 import json
 import re
 import runpy
+import sys
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,13 @@ FOUND = {
 each_notebook = pytest.mark.parametrize(
     "path", sorted(run_notebooks.NOTEBOOKS.glob("*.ipynb")), ids=lambda path: path.stem
 )
+
+
+@pytest.mark.parametrize("package", ["nbformat", "nbclient"])
+def test_without_its_packages_it_says_how_to_install_them(package, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ImportError, match=rf'{package}.* pip install -e "\.\[dev\]"'):
+        runpy.run_path(run_notebooks.__file__)
 
 
 @pytest.mark.slow

@@ -158,7 +158,7 @@ def test_four_scenes_are_measured_and_drawn(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(bench, "SCENES", {name: with_quick_spheres(kinds.SCENES[name]) for name in BOUNDS})
     monkeypatch.setattr(bench, "ProcessPoolExecutor", Here)
     monkeypatch.setattr(bench, "MOVED_RUNS", 1)
-    settings = ("still-direct", "kept-full")
+    settings = ("still-direct", "renderer-full")
     options = bench.Options(
         size=SMALL, samples=128, settings=settings, output=tmp_path / "out", references=tmp_path / "references"
     )
@@ -170,12 +170,12 @@ def test_four_scenes_are_measured_and_drawn(tmp_path, monkeypatch, capsys):
         scene = options.scene(name)
         for setting, figures in result["settings"].items():
             assert 0 < figures["error"] < min(BOUNDS[name], figures["block"])
-            assert figures["peak MiB"] > 50 and ("moved CPU ms" in figures) == setting.startswith("kept")
+            assert figures["peak MiB"] > 50 and ("moved CPU ms" in figures) == setting.startswith("renderer")
             assert list(figures["bodies"]) == [body.called for body in scene.bodies]
             assert all(abs(error) < 0.7 for error in figures["bodies"].values() if error is not None)
             assert abs(list(figures["bodies"].values())[-1]) < 0.2
             assert f"{name:20}{setting}" in printed
         sheet = ws.read_image(options.output / f"{name}.png")
         assert sheet.shape[1] > 5 * SMALL and np.ptp(sheet[..., :3]) > 0.9
-    assert sum(error is not None for error in results["letters"]["settings"]["kept-full"]["bodies"].values()) == 5
+    assert sum(error is not None for error in results["letters"]["settings"]["renderer-full"]["bodies"].values()) == 5
     assert bench.missing_references("bowl", options) == []

@@ -1,5 +1,7 @@
 """Memory: new arrays are as Warp makes them, and large ones come in huge pages, where the system has them."""
 
+import contextlib
+import itertools
 import mmap
 from pathlib import Path
 
@@ -9,6 +11,7 @@ import warp as wp
 
 from warpshadow.device import memory
 from warpshadow.device.memory import in_huge_pages, require_gradient
+from warpshadow.device.tape import recorded
 from warpshadow.device.warp_internals import check_strides
 
 SIZE = 2**24
@@ -96,3 +99,37 @@ def test_arrays_beyond_the_reach_of_strides_are_refused(shape, device):
 @pytest.mark.parametrize("shape", [(2, 2**29 - 1), (1, 2**20, 1024), (2**30,), (2**30, 1), (2, 2**29, 0)])
 def test_arrays_whose_items_strides_reach_may_be_larger(shape):
     check_strides(shape, wp.float32)
+
+
+def test_gradients_of_a_recording_are_parts_of_a_block_that_is_zeroed_at_once(device, monkeypatch):
+    sets, zero = [], wp.array.zero_
+    monkeypatch.setattr(wp.array, "zero_", lambda array: (sets.append(array.size), zero(array))[1])
+    shapes = [(3, 7), (1, SIZE // 64), (5,), (2, 400)]  # the first is of no other test
+
+    def gradients():
+        sets.clear()
+        arrays = [memory.empty(shape, wp.vec3, device) for shape in shapes]
+        with recorded():
+            for array in arrays:
+                require_gradient(array)
+        return [array.grad for array in arrays]
+
+    first = gradients()
+    assert len(sets) > 1  # nobody knew how much there would be
+    for gradient in first:
+        gradient.fill_(1.0)
+    second = gradients()
+    assert len(sets) == 1
+    spans = sorted((gradient.ptr, gradient.ptr + gradient.size * 12) for gradient in second)
+    assert all(end <= begin for (_, end), (begin, _) in itertools.pairwise(spans))
+    for gradient, shape in zip(second, shapes, strict=True):
+        assert gradient.shape == shape and not gradient.numpy().any()
+
+
+def test_scratch_memory_is_zero_in_recordings_and_outside(device):
+    for context in (contextlib.nullcontext, recorded):
+        with context():
+            scratch = memory.zeros((4, 5), wp.int64, device, outlives_recording=False)
+            assert scratch.shape == (4, 5) and scratch.dtype is wp.int64 and not scratch.numpy().any()
+            scratch.fill_(3)  # of which others see nothing
+            assert not memory.zeros((4, 5), wp.int64, device, outlives_recording=False).numpy().any()

@@ -1,6 +1,7 @@
 """Progress: one bar for one wait, from a second on; lines in files; and a quiet start."""
 
 import importlib
+import math
 import re
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from warpshadow.device.warp_internals import kernel_modules
 @pytest.fixture
 def no_delay(monkeypatch):
     monkeypatch.setattr(progress, "_DELAY", 0)
+    monkeypatch.setattr(progress, "_reporter", None)  # a new thread, which knows of it
 
 
 @pytest.fixture
@@ -34,7 +36,8 @@ def lines(monkeypatch, capsys):
     monkeypatch.setattr(progress, "_can_be_seen", lambda: False)
     monkeypatch.setattr(progress, "_DELAY", 0.02)
     monkeypatch.setattr(progress, "_LINE_INTERVAL", 0.2)
-    monkeypatch.setattr(progress, "_reporter", progress._Reporter())
+    for name, value in {"_reporter": None, "_line_time": -math.inf, "_end_time": -math.inf}.items():
+        monkeypatch.setattr(progress, name, value)
     return lambda: capsys.readouterr().err.splitlines()
 
 
@@ -171,10 +174,11 @@ def test_a_bar_that_is_not_wanted_is_not_shown(terminal, no_delay):
     assert "counting" not in shown and "sorting" in shown
 
 
-def test_within_a_bar_there_is_no_second_but_its_words(terminal, no_delay):
+def test_within_a_bar_there_is_no_second_but_its_label(terminal, no_delay):
     with progress_bar(3, "fitting", "step", stays=True) as outer:
         with progress_bar(7, "tracing rays", "ray") as inner:
             inner.update(7)
+            time.sleep(0.1)
         outer.update(3)
     shown = terminal.readouterr().err
     assert re.search(r"fitting: .*0/3 .*tracing rays", shown)

@@ -235,9 +235,19 @@ def test_a_hull_has_the_lowest_vertex_of_any_rotation():
 
 
 def test_a_warning_says_by_how_much_a_body_is_turned_onto_its_stable_support():
-    with pytest.warns(UserWarning, match=r"box: its stable support differs from the scene's pose by 0\.2°.*given"):
-        prepared(scene(box((0.2, 0.0, 0.0))), Pose("box", stands_on="table"))
+    with pytest.warns(UserWarning, match=r"box: its stable support differs from the scene's pose by 1\.2°.*given"):
+        prepared(scene(box((1.2, 0.0, 0.0))), Pose("box", stands_on="table"))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         prepared(scene(box((0.0, 30.0, 0.0))), Pose("box", stands_on="table"))
-        prepared(scene(box((0.2, 0.0, 0.0))), Pose("box", stands_on="table", resting="given"))
+        prepared(scene(box((1.2, 0.0, 0.0))), Pose("box", stands_on="table", resting="given"))
+
+
+def test_a_body_that_nearly_stands_keeps_the_rotation_of_the_scene():
+    where = scene(box((0.8, 30.0, 0.0)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        free, setting, values = prepared(where, Pose("box", stands_on="table"))
+    body = moved_body(free, setting, values)
+    np.testing.assert_allclose(body.rotation_matrix(), where.bodies[0].rotation_matrix(), atol=1e-6)
+    assert abs(body.world_points()[:, 1].min()) < 4 * FLOAT32

@@ -267,7 +267,7 @@ def test_several_views_are_several_targets(load, tmp_path):
     ],
 )
 def test_an_unknown_key_of_any_table_names_the_nearest_known_key(refused, text, where, nearest):
-    refused(text, where, "unknown key", f"did you mean '{nearest}'?")
+    refused(text, f"{where}: unknown key", f"did you mean '{nearest}'?")
 
 
 @pytest.mark.parametrize(
@@ -282,6 +282,7 @@ def test_an_unknown_key_of_any_table_names_the_nearest_known_key(refused, text, 
             ["1st [[target]]", "image: missing, expected a file name"],
         ),
         (MINIMAL + "[free.pose]\nbody = 0\n", ["[free.pose]: expected [[free.pose]]"]),
+        (MINIMAL + "pose = true\n", ["[free] pose: got true, expected a table for each body:\n[[free.pose]]\nbody = "]),
         (MINIMAL + "[[free.pose]]\n", ["1st [[free.pose]]", "body: missing, expected the number of a body"]),
         (
             MINIMAL + "[[free.pose]]\nbody = 2\n",

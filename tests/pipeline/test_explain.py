@@ -482,7 +482,7 @@ def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
         return "shading" if "_shade_cells" in key else "transfer"
     if module == "stages.film":
         return "averaging" if "average" in key else "radiance"
-    if module in ("stages.sample_receivers", "stages.quadtree"):
+    if module in ("stages.sample_receivers", "stages.receiver_means", "stages.quadtree"):
         return "receivers"
     same = {f"stages.{name}": name for name in ("receivers", "shading", "sides", "normals")}
     return {"stages.project": "clip positions", "stages.slopes": "radiance", **same}[module]

@@ -9,6 +9,7 @@ import pytest
 import warp as wp
 
 import warpshadow as ws
+from warpshadow import check
 from warpshadow.assets.basis import CellBasis, HarmonicBasis
 from warpshadow.maths import sh
 from warpshadow.maths.directions import fibonacci
@@ -732,3 +733,36 @@ def test_a_plain_tuple_is_a_geometry_whose_rotations_are_not_known(device):
     for wrong in (plain[:2], plain[0], "ball"):
         with pytest.raises(ValueError, match="^geometry: got .*, expected a Geometry, as placed and deformed return"):
             renderer.view(wrong)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1e30])
+@pytest.mark.parametrize("name", ["positions", "centers", "radii", "translations", "clip_matrices", "light", "albedo"])
+@pytest.mark.parametrize("method", ["directional", "log-sh"])
+def test_a_gpu_names_the_argument_at_fault_after_the_call(method, name, value, monkeypatch):
+    """There arrays are looked at when a call ends, until when kernels work on what is at fault."""
+    renderer = SceneRenderer(scene_of(method, ball(), ground(8), camera=FROM_ABOVE, directions=32, order=3))
+    poses = renderer.scene_poses()
+
+    def draw(spoiled: str):
+        def copy_of(name: str, array: wp.array) -> wp.array:
+            values = array.numpy().copy()
+            if name == spoiled:
+                values.flat[0] = value
+            return wp.array(values, dtype=array.dtype, device=renderer.device)
+
+        translations = copy_of("translations", poses.translations)
+        geometry = renderer.placed(dataclasses.replace(poses, translations=translations))
+        arrays = {part: copy_of(part, array) for part, array in geometry.arrays().items()}
+        view = renderer.view(
+            Geometry(**arrays, rotations=geometry.rotations), copy_of("clip_matrices", renderer.clip_matrices)
+        )
+        light = copy_of("light", wp.full((1, renderer.basis.size), wp.vec3(0.5), dtype=wp.vec3))
+        albedo = copy_of("albedo", wp.full((1, 1), wp.vec3(0.5), dtype=wp.vec3))
+        return renderer.draw(light, albedo=[albedo, None], view=view).numpy()
+
+    plain = draw("")
+    monkeypatch.setattr(check, "_is_awaited", lambda device: True)
+    np.testing.assert_array_equal(draw(""), plain)
+    with pytest.raises(ValueError, match=rf"^{name}(\[0\])?: got 1 "):
+        draw(name)
+    np.testing.assert_array_equal(draw(""), plain)

@@ -1,5 +1,7 @@
 """Bodies by name, wherever a number of one is taken."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -34,13 +36,26 @@ def renderer(scene) -> TorchRenderer:
 def test_a_body_is_called_as_its_meshs_file_unless_it_has_a_name(tmp_path):
     ws.icosphere(1.0, 0).write(tmp_path / "bunny.obj")
     path = tmp_path / "bunny.obj"
-    assert ws.Body(path).called == "bunny" and ws.Body(path, name="rabbit").called == "rabbit"
+    assert ws.Body(path).name == "bunny" and ws.Body(path, name="rabbit").name == "rabbit"
+    assert dataclasses.replace(ws.Body(path), scale=2).name == "bunny"
 
 
 @pytest.mark.parametrize("body", [0, np.int64(0), "icosphere"])
 def test_a_number_and_a_name_are_the_same_body(scene, body):
     number = scene.body_number(body)
     assert number == BALL and type(number) is int
+
+
+def test_the_bodies_of_a_scene_are_a_tuple_in_which_names_are_found(scene):
+    assert scene.bodies["icosphere"] is scene.bodies[BALL] is scene.bodies[-2]
+    assert scene.bodies[:1] == (scene.bodies[BALL],) and len(scene.bodies) == 2
+    with pytest.raises(ValueError, match=r"^body: got 'grund', expected one of 'icosphere', 'ground' \(did you mean"):
+        scene.bodies["grund"]
+
+
+def test_copies_of_a_body_may_share_the_name_of_its_mesh(scene):
+    ball = scene.bodies[BALL]
+    scene_of(ball, dataclasses.replace(ball, translation=(2, 0, 0)), dataclasses.replace(ball, mesh=ws.plane(1.0)))
 
 
 @pytest.mark.parametrize("body", [-1, 2, True, 1.0, None, np.float64(0), b"ground", ("ground",)])
@@ -179,7 +194,7 @@ def test_scene_files_name_bodies(tmp_path):
 def test_bodies_of_one_mesh_are_written_without_names_that_would_be_one(tmp_path):
     body = ws.Body(ws.icosphere(0.5, 0), blockers=0)
     again = ws.load_scene(ws.write_scene(scene_of(body, body), tmp_path)[0])
-    assert [body.name for body in again.bodies] == [None, None]
+    assert [body.name for body in again.bodies] == ["body_0", "body_1"]
 
 
 def test_fit_files_name_bodies(tmp_path):

@@ -81,7 +81,7 @@ def test_a_path_that_is_written_reads_back_the_same(tmp_path, loop):
         (("fps = 10", "fps = 0"), "fps: got 0, expected a positive number"),
         (("fps = 10", "speed = 10"), "unknown key 'speed'"),
         (("eye = [0, 2, 4]", ""), r"2nd \[\[keyframe\]\]: eye: missing"),
-        (("up = [0.1, 1, 0]", "down = [0, 0, 0]"), r"2nd \[\[keyframe\]\]: key: unknown key 'down'"),
+        (("up = [0.1, 1, 0]", "down = [0, 0, 0]"), r"2nd \[\[keyframe\]\]: unknown key 'down'"),
         (("time = 4.0", "time = 40000"), "expected at most 100000 frames; times are in seconds"),
         (("[[keyframe]]", "[[key]]"), "the camera path: unknown key 'key'"),
     ],

@@ -285,7 +285,9 @@ def test_a_camera_that_frames_takes_no_place(refused, key, parts):
 
 def test_framing_is_auto_or_left_out(refused):
     refused(FRAMED.replace('"auto"', '"fit"'), "[camera]: framing: got 'fit', expected one of 'auto'")
-    refused(TABLES.replace("eye =", "margin = 0.1\neye ="), "[camera]", "unknown key 'margin'")
+    for key in ("margin = 0.1", "direction = [1, 1, 1]"):
+        message = f'[camera]: {key.split()[0]} goes with framing = "auto", in place of eye and target'
+        refused(TABLES.replace("eye =", f"{key}\neye ="), message)
 
 
 def test_a_body_in_a_file_stands_on_the_ground_where_its_translation_says(load):
@@ -326,7 +328,7 @@ def test_a_body_in_a_file_may_be_creased(load, refused, tmp_path):
     [
         ("on_ground = 1", "on_ground: got 1, expected true or false, or a table such as {size = 2.0}"),
         ("on_ground = {size = 0}", "on_ground: size: got 0, expected a positive number"),
-        ("on_ground = {foot = [0, 0, 0]}", "on_ground: key: unknown key 'foot'; known keys are size"),
+        ("on_ground = {foot = [0, 0, 0]}", "on_ground: unknown key 'foot'; known keys are size"),
         ("scale = 2\non_ground = {size = 1}", "on_ground: size: got it beside the body's scale"),
     ],
 )

@@ -80,5 +80,5 @@ def test_a_sky_of_a_scene_file_is_that_of_python(tmp_path):
     expected = ws.synthetic_sky((0, 1, 0), height=16).scaled(2.0)
     np.testing.assert_array_equal(ws.load_scene(tmp_path / "a.toml").light.radiance, expected.radiance)
     (tmp_path / "a.toml").write_text(text + "sky = {sun = [0, 1, 0]}\n")
-    with pytest.raises(ws.SceneError, match=r"\[light\]: sky: key: unknown key 'sun'"):
+    with pytest.raises(ws.SceneError, match=r"\[light\]: sky: unknown key 'sun'"):
         ws.load_scene(tmp_path / "a.toml")

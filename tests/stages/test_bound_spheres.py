@@ -5,7 +5,6 @@ import pytest
 import torch
 import warp as wp
 from scipy.spatial.transform import Rotation
-from twins import central_differences
 
 import warpshadow as ws
 from warpshadow.stages.bound_spheres import SphereBinding
@@ -63,43 +62,6 @@ def test_spheres_follow_affine_maps_and_bends(device, sphere_count):
         assert np.abs(centers - function(spheres.centers)).max() <= 4 * tolerance, name
         bends = 0.03 if name == "bent" else tolerance
         assert np.abs(radii / (factor * spheres.radii) - 1).max() <= bends, name
-
-
-def test_gradients_are_those_of_a_float64_twin(device, verified_tape):
-    mesh, spheres = rod(4)
-    mesh = ws.icosphere(1.0, 1).transformed(scale=(2.0, 0.3, 0.3))
-    binding, rest = bound(mesh, spheres, device)
-    first, vertices, weights, shares = (array.numpy() for array in vars(binding).values())
-    rng = np.random.default_rng(0)
-    of_centers, of_radii = rng.normal(size=(2, 4, 3)), rng.normal(size=(2, 4))
-    given = [array.numpy().astype(np.float64) for array in rest]
-    given.insert(0, bent(given[0]) + 0.05 * rng.normal(size=(2, *given[0].shape[1:])))
-
-    def twin(positions, rest_positions, rest_centers, rest_radii):
-        total = 0.0
-        for k in range(4):
-            own = slice(first[k], first[k + 1])
-            x, rest_x, w, a = positions[:, vertices[own]], rest_positions[:, vertices[own]], weights[own], shares[own]
-            center = rest_centers[:, k] + np.einsum("v,bvi->bi", w, x - rest_x)
-            spread, rest_spread = (
-                ((each - middle[:, None]) ** 2).sum(axis=2) @ a
-                for each, middle in ((x, center), (rest_x, rest_centers[:, k]))
-            )
-            soft = 1e-6 * rest_radii[:, k] ** 2
-            radius = rest_radii[:, k] * np.sqrt((spread + soft) / (rest_spread + soft))
-            total += (of_centers[:, k] * center).sum() + (of_radii[:, k] * radius).sum()
-        return total
-
-    dtypes = wp.vec3, wp.vec3, wp.vec3, wp.float32
-    arrays = [put(values, dtype, device, requires_grad=True) for values, dtype in zip(given, dtypes, strict=True)]
-    with wp.Tape() as tape:
-        centers, radii = binding.moved(*arrays)
-    tape.backward(grads={centers: put(of_centers, wp.vec3, device), radii: put(of_radii, wp.float32, device)})
-    for number, array in enumerate(arrays):
-        expected = central_differences(
-            lambda values, number=number: twin(*given[:number], values, *given[number + 1 :]), given[number]
-        )
-        assert np.linalg.norm(array.grad.numpy() - expected) < GRADIENT * np.linalg.norm(expected)
 
 
 @pytest.fixture(scope="module")

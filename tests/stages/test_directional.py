@@ -302,3 +302,14 @@ def test_arrays_that_do_not_fit_together_are_refused(device):
 def test_no_receivers_is_no_work(device):
     nobody = np.zeros((0, 3))
     assert transmittance(nobody, nobody, [[0, 0, 0]], [1.0], cells.fibonacci(16), device).shape == (0, 16)
+
+
+def test_only_inputs_that_require_a_gradient_get_one(device):
+    points, normals, centers, radii = twins.random_scene(3, vertex_count=19, sphere_count=7)
+    vectors = [wp.array(values[None], dtype=wp.vec3, device=device) for values in (points, normals, centers)]
+    sizes = wp.array(radii[None], dtype=wp.float32, device=device, requires_grad=True)
+    with wp.Tape() as tape:
+        result = directional.transmittance(*vectors, sizes, cells.fibonacci(32))
+    result.grad.fill_(1.0)
+    tape.backward()
+    assert sizes.grad.numpy().any() and all(array.grad is None for array in vectors)

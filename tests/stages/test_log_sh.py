@@ -396,3 +396,20 @@ def test_arrays_that_do_not_fit_together_are_refused(device):
         log_sh.accumulate(points, normals, zeros(1, 3), radii)
     with pytest.raises(ValueError, match=r"radii: got shape \(2, 2\), expected \[2, 3\]"):
         log_sh.accumulate(points, normals, centers, zeros(2, 2, dtype=wp.float32))
+
+
+def test_a_tape_played_back_twice_gives_the_same_gradient(device):
+    dtypes = wp.vec3, wp.vec3, wp.vec3, wp.float32
+    scene = zip(twins.random_scene(3, vertex_count=19, sphere_count=7), dtypes, strict=True)
+    arrays = [wp.array(values[None], dtype=dtype, device=device, requires_grad=True) for values, dtype in scene]
+    with wp.Tape() as tape:
+        result = exponential.exponentiate(log_sh.accumulate(*arrays, order=4))
+    gradients = []
+    for _ in range(2):
+        result.grad.fill_(1.0)
+        tape.backward()
+        gradients.append([array.grad.numpy().copy() for array in arrays])
+        tape.zero()
+    for first, second in zip(*gradients, strict=True):
+        assert first.any()
+        np.testing.assert_array_equal(first, second)

@@ -63,33 +63,6 @@ def test_a_quads_sphere_covers_what_its_spheres_do_on_average(spread, measured, 
     assert np.std(ratios) < 0.08
 
 
-@pytest.mark.parametrize("name", ["centers", "radii"])
-def test_gradients_of_quads_are_their_derivatives(name, verified_tape, device):
-    centers, radii = random_clusters(2, count=3)
-    rng = np.random.default_rng(3)
-    seeds = [rng.normal(size=shape) for shape in ((3, 3), (3,), (3,))]
-
-    def loss(changed):
-        values = {"centers": centers.astype(float), "radii": radii.astype(float)} | {name: changed}
-        return sum((part * seed).sum() for part, seed in zip(twins.merged_clusters(**values), seeds, strict=True))
-
-    with wp.Tape() as tape:
-        arrays, nodes = merge(centers, radii, device, requires_grad=True)
-    for array, seed in zip(nodes, seeds, strict=True):
-        whole = np.zeros((1, *array.shape[1:], *seed.shape[1:]), np.float32)
-        whole[0, len(whole[0]) - 3 :] = seed
-        array.grad.assign(whole)
-    tape.backward()
-    got = dict(zip(("centers", "radii"), arrays, strict=True))[name].grad.numpy()[0]
-    values = {"centers": centers, "radii": radii}[name].astype(float)
-    expected = np.empty_like(values)
-    for place in np.ndindex(values.shape):
-        step = np.zeros_like(values)
-        step[place] = 1e-6
-        expected[place] = (loss(values + step) - loss(values - step)) / 2e-6
-    np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
-
-
 def many_spheres(seed, count=640):
     """Neighbors side by side, and receivers near and far."""
     rng = np.random.default_rng(seed)
@@ -155,41 +128,6 @@ def test_nothing_jumps_while_spheres_merge(device):
     seen = directional.transmittance(p, None, c, r, fibonacci(64)).numpy()[0]
     assert np.abs(np.diff(seen, axis=0)).max() < 4e-3
     assert np.ptp(seen, axis=0).max() > 0.1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["points", "centers", "radii"])
-def test_gradients_of_transmittance_are_those_of_the_float64_twin_while_spheres_merge(name, verified_tape, device):
-    points, centers, radii = many_spheres(8, count=512)
-    points = points[:20]
-    directions = fibonacci(64)
-    rng = np.random.default_rng(9)
-    seed = rng.normal(size=(len(points), 64))
-    arrays = dict(zip(("points", "centers", "radii"), put(points, centers, radii, device), strict=True))
-    arrays[name].requires_grad = True
-    with wp.Tape() as tape:
-        seen = directional.transmittance(arrays["points"], None, arrays["centers"], arrays["radii"], directions)
-    seen.grad.assign(seed[None].astype(np.float32))
-    tape.backward()
-    wide = {"points": points.astype(float), "centers": centers.astype(float), "radii": radii.astype(float)}
-    # along random directions in the space of all values, for the twin is slow
-    for _ in range(4):
-        along = rng.normal(size=wide[name].shape)
-        ends = [
-            (
-                twins.merging_transmittance(
-                    **(wide | {name: wide[name] + sign * 1e-6 * along}),
-                    directions=directions,
-                    merging=directional.MERGING,
-                )
-                * seed
-            ).sum()
-            for sign in (1, -1)
-        ]
-        expected = (ends[0] - ends[1]) / 2e-6
-        got = (arrays[name].grad.numpy()[0] * along).sum()
-        scale = np.linalg.norm(arrays[name].grad.numpy()) * np.linalg.norm(along) / np.sqrt(along.size)
-        assert abs(got - expected) < 2e-3 * scale
 
 
 @pytest.mark.parametrize("tau", [-0.1, 1.1, np.nan])

@@ -138,7 +138,7 @@ def fetched(image, grid, y, cosine, t, radius, level_of):
     count = np.array([width, height])
     texel = (np.sign(z) * np.log1p(np.abs(z)) - grid.low) / (grid.high - grid.low) * count
     slopes = 1 / (1 + np.abs(z)) * count / (grid.high - grid.low) / grid.spread
-    footprint = max(2 * t * radius * np.sqrt(slopes.prod() / cosine), 1.0)
+    footprint = max(t * radius * np.sqrt(slopes.prod() / cosine), 1.0)
     sizes = [(height, width)]
     while max(sizes[-1]) > 1:
         sizes.append(tuple(max(size // 2, 1) for size in sizes[-1]))
@@ -221,14 +221,15 @@ def share_in_front(omega, disc, side, other):
     return ramp(difference @ (omega + disc * place) / (disc * slope * np.sqrt(h * other_h)))
 
 
-def seen_of(omega, disc, sides, k):
-    """Part of a side that is seen, and its light."""
+def seen_of(omega, disc, sides, k, before):
+    """Part of a side that is seen, and its light, past bodies before all sides that cover (h, μ)."""
     others = [side for j, side in enumerate(sides) if j != k]
     shares = [share_in_front(omega, disc, sides[k], other) for other in others]
     blocked = sum((share * other.coverage for share, other in zip(shares, others, strict=True)), np.zeros(4))
     seen = max(1 - blocked[0], 1e-4)
-    along = omega - disc * blocked[1:] / np.sqrt(seen**2 + blocked[1:] @ blocked[1:])
-    return sides[k].coverage[0] * seen, sides[k].light(along / np.linalg.norm(along), np.sqrt(seen))
+    is_open, moment = max(seen * (1 - before[0]), 1e-4), blocked[1:] + before[1:]
+    along = omega - disc * moment / np.sqrt(is_open**2 + moment @ moment)
+    return sides[k].coverage[0] * seen, sides[k].light(along / np.linalg.norm(along), np.sqrt(is_open))
 
 
 def above_horizon(omega, normal, radius):
@@ -240,7 +241,9 @@ def above_horizon(omega, normal, radius):
     return shifted / np.linalg.norm(shifted), (radius + cosine) / 2
 
 
-def twin_light(points, normals, transmittance, frames, grids, radiosity, directions, skip=None, fronts=None):
+def twin_light(
+    points, normals, transmittance, frames, grids, radiosity, directions, skip=None, fronts=None, coverages=None
+):
     """Of one instance, [receiver, 3]; radiosity is [side, row, column, 3] for each flat."""
     radius, result = cell_radius(len(directions)), np.zeros((len(points), 3))
     for receiver, (point, normal) in enumerate(zip(points, normals, strict=True)):
@@ -251,7 +254,8 @@ def twin_light(points, normals, transmittance, frames, grids, radiosity, directi
             own = None if fronts is None else fronts[receiver]
             seen = (omega, radius) if skip is None else above_horizon(omega, normal, radius)
             sides = met_sides(point, *seen, radius, frames, grids, radiosity, skip, own)
-            seen_parts = [seen_of(*seen, sides, k) for k in range(len(sides))]
+            before = np.zeros(4) if coverages is None else coverages[receiver, q]
+            seen_parts = [seen_of(*seen, sides, k, before) for k in range(len(sides))]
             shares = sum(share for share, _ in seen_parts)
             if shares > 0:
                 sent = sum(share * light for share, light in seen_parts) / shares
@@ -321,6 +325,7 @@ class Setting:
         if batch > 1:
             self.points[1:] += 0.05
             self.vertices[1:] += 0.02
+        self.coverages = None  # of bodies before the flats [receiver, direction, 4]
         self.fronts = None  # of each receiver [receiver, flat], where its height does not decide
         self.device = device
 
@@ -357,8 +362,8 @@ class Setting:
 
     def light(self, skip=None, batch=0):
         at = self.points[batch], self.normals[batch], self.transmittance[batch]
-        given = self.frames(self.vertices[batch]), self.grids, self.radiosity, DIRECTIONS, skip, self.fronts
-        return twin_light(*at, *given)
+        given = self.frames(self.vertices[batch]), self.grids, self.radiosity, DIRECTIONS, skip
+        return twin_light(*at, *given, self.fronts, self.coverages)
 
     def passing(self, skip=None, batch=0):
         at = self.points[batch], self.transmittance[batch]
@@ -502,6 +507,38 @@ def test_what_receivers_see_of_fronts_can_be_given(device, verified_tape):
             setting.fronts = setting.fronts + sign * step
             ends.append((weight * twin(setting)).sum())
         assert (fronts.grad.numpy()[0] * step).sum() == pytest.approx((ends[0] - ends[1]) / 2, rel=2e-3)
+
+
+@pytest.mark.parametrize("names", [("ground",), ("ground", "wall")])
+def test_light_of_flats_is_that_of_the_part_that_bodies_before_them_leave_open(names, device, verified_tape):
+    setting, rng = Setting(device, two_sided=True, names=names), np.random.default_rng(7)
+    shares = rng.uniform(-0.3, 1, size=(7, len(DIRECTIONS))).clip(0)  # a third of the cells are open
+    moments = rng.normal(size=(*shares.shape, 3))
+    moments -= (moments * DIRECTIONS).sum(axis=-1, keepdims=True) * DIRECTIONS
+    moments *= 0.4 * (shares * (1 - shares))[..., None]
+    setting.coverages = np.concatenate([shares[..., None], moments], axis=-1)
+    points, normals, transmittance, vertices, radiosity = variables = setting.arrays()
+    coverages = wp.array(setting.coverages[None], dtype=wp.vec4, device=device, requires_grad=True)
+    with recorded() as tape:
+        frames, planes = setting.planes.frames(vertices), setting.planes
+        light = plane_light(points, normals, transmittance, frames, radiosity, planes, DIRECTIONS, coverages=coverages)
+    np.testing.assert_allclose(light.numpy()[0], setting.light(), atol=FLOAT32)
+    covered, setting.coverages = setting.coverages, None
+    assert np.abs(light.numpy()[0] - setting.light()).max() > 100 * FLOAT32
+    setting.coverages = covered
+
+    weights = rng.uniform(size=(7, 3))
+    tape.backward(grads={light: wp.array(weights[None], dtype=wp.vec3, device=device)})
+    for number in (0, 3, 4):
+        steps = random_steps(setting, number)
+        expected = slopes_of(setting, steps, Setting.light, weights)
+        assert (variables[number].grad.numpy() * steps[number]).sum() == pytest.approx(expected, rel=2e-3), number
+    step, ends = 1e-6 * rng.normal(size=covered.shape) * (covered[..., :1] > 0), []
+    for sign in (1, -1):
+        setting.coverages = covered + sign * step
+        ends.append((weights * setting.light()).sum())
+    expected = (ends[0] - ends[1]) / 2
+    assert (coverages.grad.numpy()[0] * step).sum() == pytest.approx(expected, rel=2e-3)
 
 
 def test_instances_that_share_an_array_add_to_its_gradient(device):

@@ -117,7 +117,7 @@ def test_what_does_not_fit_is_refused(patches, device):
     g = wp.array(projected_areas, dtype=wp.float32, device=device)
     with pytest.raises(ValueError, match=r"projected_areas: got shape \(2, 8, 16\), expected \[2, 9, direction\]"):
         find_proxy_radiance(b, wp.array(projected_areas[:, :8], dtype=wp.float32, device=device), v, areas, *nodes)
-    with pytest.raises(ValueError, match=r"open_weights: got shape \(2, 8\), expected \[2, 9\]"):
+    with pytest.raises(ValueError, match=r"patch_weights: got shape \(2, 8\), expected \[2, 9\]"):
         find_proxy_radiance(b, g, wp.array(weights[:, :8], dtype=wp.vec3, device=device), areas, *nodes)
     with pytest.raises(ValueError, match="areas: got 1 values out of range"):
         find_proxy_radiance(b, g, v, np.r_[areas[:8], -1.0], *nodes)

@@ -478,32 +478,6 @@ def test_the_gradient_of_barycentrics_matches_central_differences_also_across_th
     np.testing.assert_allclose(got / scale, expected / scale, atol=2e-3)
 
 
-def test_the_gradient_of_interpolation_matches_central_differences(device, verified_tape):
-    rng = np.random.default_rng(20)
-    clip, faces = random_triangles(rng, 6)
-    clip_positions, device_faces = on_device(np.stack([clip, clip[::-1]]), faces, device, requires_grad=True)
-    fragments = rasterize(clip_positions, device_faces, 10, 12)
-    ids = fragments.face_ids.numpy()
-    weights = wp.clone(fragments.barycentrics, requires_grad=True)
-    fragments = Fragments(fragments.face_ids, weights)
-    seed = rng.normal(size=(2, 12, 10, 2)).astype(np.float32)
-    attributes = rng.normal(size=(1, 18, 2))
-    device_attributes = wp.array(attributes, dtype=wp.vec2, device=device, requires_grad=True)
-    with wp.Tape() as tape:
-        image = interpolate(fragments, device_faces, device_attributes)
-    tape.backward(grads={image: wp.array(seed, dtype=wp.vec2, device=device)})
-    corners = attributes[0][faces[ids]] * (ids >= 0)[..., None, None]  # [batch, height, width, 3, 2]
-    expected_weights = np.einsum("bhwc,bhwkc->bhwk", seed, corners)
-    np.testing.assert_allclose(weights.grad.numpy(), expected_weights, rtol=1e-4, atol=1e-5)
-
-    def loss(values):
-        interpolated = np.einsum("bhwk,bhwkc->bhwc", weights.numpy(), values[0][faces[ids]])
-        return (interpolated * seed * (ids >= 0)[..., None]).sum()
-
-    expected = central_differences(loss, attributes)
-    np.testing.assert_allclose(device_attributes.grad.numpy(), expected, rtol=1e-4, atol=1e-4)
-
-
 def test_barycentrics_refuse_positions_of_another_batch(device):
     clip, faces = on_device(*random_triangles(np.random.default_rng(22), 3), device)
     face_ids = wp.zeros((2, 4, 4), dtype=wp.int32, device=device)

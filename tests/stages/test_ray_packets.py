@@ -29,18 +29,8 @@ def trace(
 ):
     point, packet = wp.tid()
     toward = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
-    result = find_open(
-        tree.corners,
-        tree.lowers,
-        tree.uppers,
-        tree.leaf_count,
-        points[point],
-        normals[point],
-        toward,
-        wanted[point, packet],
-        -1,
-    )
-    found[point, packet] = result[0]
+    open_rays, _face = find_open(tree, points[point], normals[point], toward, wanted[point, packet], -1)
+    found[point, packet] = open_rays
 
 
 def knot() -> tuple[np.ndarray, np.ndarray]:

@@ -120,7 +120,7 @@ def on_device(planes, tolerances, device, **options):
     )
 
 
-def test_nodes_show_nothing_below_their_tangent_planes(device):
+def test_proxies_show_nothing_below_their_tangent_planes(device):
     values, (planes, tolerances) = scene(3), tangent_planes()
     shares = twins.facing_share(*values[:1], *values[2:4], planes, tolerances)
     assert all(((shares > low) & (shares < high)).mean() > 0.1 for low, high in ((0, 1e-6), (1e-3, 0.999), (0.999, 2)))
@@ -143,7 +143,7 @@ def test_the_adjoint_with_tangent_planes_is_that_of_the_twin(name, device):
     result.grad.assign(weights[None].astype(np.float32))
     tape.backward()
     number = len(NAMES) if name == "planes" else NAMES.index(name)
-    got = (facing.planes if name == "planes" else arrays[number]).grad.numpy()[0]
+    got = (facing.equations if name == "planes" else arrays[number]).grad.numpy()[0]
 
     def loss(*all_):
         return np.sum(weights * twins.sphere_light(*all_[:-1], directions, facing=(all_[-1], tolerances)))
@@ -185,10 +185,10 @@ def test_a_white_sphere_above_a_plane_sends_what_its_form_factor_says(count, err
     patches = rng.normal(size=(1, 40, 3))
     patches /= np.linalg.norm(patches, axis=-1, keepdims=True)
     white = wp.full((1, 40), wp.vec3(0.5, 1.0, 2.0), dtype=wp.vec3, device=device)
-    nodes = patches_of_clusters(np.zeros(40, int), np.zeros(1, int))
+    clusters = patches_of_clusters(np.zeros(40, int), np.zeros(1, int))
     shown = wp.array(np.maximum(-patches @ directions.T, 0), dtype=wp.float32, device=device)
     all_open = wp.full((1, 40), wp.vec3(1.0), dtype=wp.vec3, device=device)
-    table = find_proxy_radiance(white, shown, all_open, np.ones(40), *nodes)
+    table = find_proxy_radiance(white, shown, all_open, np.ones(40), *clusters)
     arrays = put([v[None] for v in (points, normals, center, np.array([radius]))] + [None] * 3, device)[:4]
     passing = transmittance(*arrays, directions)
     got = stage.sphere_light(*arrays, table, passing, None, directions).numpy()[0]

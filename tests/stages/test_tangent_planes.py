@@ -1,4 +1,4 @@
-"""Tangent planes of nodes: whether receivers are above the patches whose light they would see."""
+"""Tangent planes of proxies: whether receivers are above the patches whose light they would see."""
 
 import numpy as np
 import trimesh
@@ -9,11 +9,11 @@ from warpshadow.stages.bounces.tangent_planes import find_tolerances
 
 
 def of_each(patches):
-    """Of nodes of a patch each."""
+    """Of proxies of a patch each."""
     return find_tolerances([patches], np.arange(patches.count + 1), np.arange(patches.count))
 
 
-def test_a_node_of_none_or_of_several_bodies_is_seen_from_everywhere():
+def test_a_proxy_of_none_or_of_several_bodies_is_seen_from_everywhere():
     box = trimesh.creation.box((1, 1, 1))
     patches = find_patches(np.asarray(box.vertices), np.asarray(box.faces), is_two_sided=False)
     found = find_tolerances([patches, patches], np.array([0, 1, 1, 3]), np.array([0, 1, patches.count]))

@@ -300,25 +300,6 @@ def test_every_level_has_the_mean_of_the_image(shape):
     np.testing.assert_allclose([level.mean(axis=(0, 1)) for level in levels], [levels[-1][0, 0]] * len(levels))
 
 
-def test_gradients_of_mip_levels_are_those_of_their_twin(device, verified_tape):
-    """Levels are linear in images, so a difference of any size is exact; the second image serves both instances."""
-    random = np.random.default_rng(0)
-    images = [random.uniform(size=shape).astype(np.float32) for shape in ((2, 13, 6, 3), (1, 8, 4, 3))]
-    variables = [wp.array(image, dtype=wp.vec3, device=device, requires_grad=True) for image in images]
-
-    def twin(*images):
-        rows = [[image[min(i, len(image) - 1)] for image in images] for i in range(2)]
-        return np.stack([np.concatenate([lv.reshape(-1, 3) for im in row for lv in pyramid(im)]) for row in rows])
-
-    weights = random.normal(size=twin(*images).shape)
-    gradients = tape_gradients(lambda *images: mip_pyramids(images).texels, variables, weights)
-    for number, gradient in enumerate(gradients):
-        direction = random.normal(size=gradient.shape)
-        moved = [*images[:number], images[number] + direction, *images[number + 1 :]]
-        expected = np.sum(weights * (twin(*moved) - twin(*images)))
-        assert abs(np.sum(gradient * direction) - expected) < 1e-6 * np.sum(np.abs(gradient * direction))
-
-
 @pytest.mark.parametrize(
     ("images", "message"),
     [
@@ -552,30 +533,6 @@ def test_uvs_of_no_place_are_refused(device):
 
 
 # ---------------------------------------------------------------------------------------------------- gradients
-
-
-@pytest.mark.slow
-def test_gradients_of_reflectance_are_central_differences_of_the_twin(device, verified_tape):
-    """By what reflects, and by where on its texture and how wide a sample is: through the choice of levels, too."""
-    bodies = Bodies(device)
-    random = np.random.default_rng(1)
-    weights = random.normal(size=(2, *bodies.size[::-1], 3))
-    variables = bodies.variables(requires_grad=True)
-    gradients = tape_gradients(bodies.albedo, variables, weights)
-    start = [variable.numpy().astype(np.float64) for variable in variables]
-    for number, gradient in enumerate(gradients):
-        directions = random.normal(size=(3, *gradient.shape))
-        if number == 0:  # depth moves no sample
-            directions[..., 2] = 0
-        got = [np.sum(gradient * direction) for direction in directions]
-        expected = []
-        for direction in directions:
-            sums = []
-            for step in (1e-6, -1e-6):
-                moved = [*start[:number], start[number] + step * direction, *start[number + 1 :]]
-                sums.append(np.sum(weights * bodies.albedo_twin(*moved)))
-            expected.append((sums[0] - sums[1]) / 2e-6)
-        assert relative(np.array(got), np.array(expected)) < GRADIENT, number
 
 
 @pytest.mark.slow

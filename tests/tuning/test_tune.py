@@ -100,6 +100,26 @@ def test_the_most_accurate_setting_within_a_time_is_chosen(instant):
     assert tuning_.error == min(trial.error for trial in tuning_.trials[:3])
 
 
+def test_settings_that_miss_the_error_are_not_timed(few, monkeypatch):
+    timed = []
+
+    def times(scenes, **_):
+        timed.extend(scenes)
+        return [1.0] * len(scenes)
+
+    monkeypatch.setattr(tune, "image_times", times)
+    monkeypatch.setattr(tune, "whole_image_times", lambda scenes, **_: [1.0] * len(scenes))
+    errors = sorted(trial.error for trial in ws.tune(make_scene(), milliseconds=1.0).trials)
+    assert len(timed) == len(errors)  # within a time all are
+    timed.clear()
+    found = ws.tune(make_scene(), error=errors[1])
+    late = {id(trial.scene) for trial in found.trials if trial.milliseconds == np.inf}
+    least = max(errors[1], errors[0] + max(0.1 * errors[0], 0.003))
+    assert {trial.error <= least for trial in found.trials if id(trial.scene) in late} == {False}
+    assert {id(scene) for scene in timed} | late == {id(trial.scene) for trial in found.trials}
+    assert "– not timed" in str(found) and str(found).count("  –\n") >= len(late)
+
+
 def test_where_nothing_reaches_it_the_nearest_is_chosen_and_said_not_to_reach_it(instant):
     by_error, by_time = ws.tune(make_scene(), error=1e-9), ws.tune(make_scene(), milliseconds=0.5)
     assert not by_error.is_reached and not by_time.is_reached
@@ -304,7 +324,7 @@ def test_another_method_stays_as_it_is(method):
     assert resolved(scene) is scene
 
 
-def test_where_none_is_named_it_is_that_of_renderers_that_are_kept():
+def test_where_none_is_named_it_is_that_of_renderers():
     assert resolved(make_scene()).visibility.method == "directional"
 
 

@@ -1,4 +1,4 @@
-"""Time of videos: the set-up of a renderer that is kept, beside stills of all frames."""
+"""Time of videos: the set-up of a renderer, beside stills of all frames."""
 
 from dataclasses import replace
 

@@ -125,7 +125,7 @@ def check_basis(basis: object) -> None:
         raise ValueError(
             f"basis: got {check.described(basis)}, expected HarmonicBasis({order}) for {order} bands of spherical "
             "harmonics, CellBasis(warpshadow.fibonacci(128)) for cells of 128 directions, or None for "
-            "what the method computes in"
+            "the method's own"
         )
 
 

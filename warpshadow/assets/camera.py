@@ -166,8 +166,7 @@ class Camera:
             shown: A mesh, a body, several, or a scene. Flat ones, grounds and walls, count where all are flat.
             direction: From the framed bodies to the camera, shape [3], any length; the default looks down from the
                 front.
-            up: Direction that points up in the image, shape [3], any length.
-            fov_y: Angle between the top and the bottom edge of the image [degrees], between 0 and 180.
+            up, fov_y: As of :meth:`look_at`.
             margin: Fraction of the image that stays free around the framed bodies, 0 or more and below 1; leave some
                 for shadows.
             near: Distance of the near plane [scene units]; by default 1% of the distance to the framed bodies.
@@ -196,7 +195,7 @@ class Camera:
         minimum, maximum = (x - z[:, None] * tangents).max(axis=0), (x + z[:, None] * tangents).min(axis=0)
         depth = ((maximum - minimum) / (2.0 * tangents)).min()
         if not depth < z.min() - 1e-9 * np.ptp(points, axis=0).max():
-            raise ValueError(f"shown: got what is a point or a line along {away.tolist()}, expected a surface")
+            raise ValueError(f"shown: got a point or a line along {away.tolist()}, expected a surface")
         eye = np.array([*(minimum + maximum) / 2, depth])
         near = _NEAR * (z.min() - depth) if near is None else near
         return cls(intrinsics, rotation, -eye - rotation @ center, width, height, near)

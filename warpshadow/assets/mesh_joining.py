@@ -50,7 +50,7 @@ def join_parts(parts: list[MeshPart], name: str) -> JoinedMesh:
         "duplicate faces dropped": np.sum(~is_first),
         "unreferenced vertices": mesh.vertex_count - len(used) - sum(part.welded for part in parts),
     }
-    remarks = [f"{count} {what}" for what, count in counts.items() if count]
+    remarks = [f"{count} {fault}" for fault, count in counts.items() if count]
     remarks += [part.remark for part in parts if part.remark]
     if 0 < len(textured) < len(parts):
         remarks.append(f"uvs dropped because {len(parts) - len(textured)} of {len(parts)} parts have none")

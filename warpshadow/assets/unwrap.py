@@ -9,6 +9,7 @@ import numpy as np
 from warpshadow import check
 from warpshadow.assets.mesh import Mesh, MeshError
 from warpshadow.maths.adjacency import edge_neighbors
+from warpshadow.maths.components import connected_components
 
 
 def unwrap(mesh: Mesh, *, size: int = 1024, padding: int = 4) -> Mesh:
@@ -69,18 +70,14 @@ def _pieces(corners: np.ndarray, neighbors: np.ndarray) -> list[np.ndarray]:
     It cuts nothing where neighbors are all but coplanar, and crashes where these close around a round, finely
     tessellated body. Such a mesh comes in six pieces, by the axis that a face looks along.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     a, b, c = np.moveaxis(corners.astype(np.float64), 1, 0)
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     face, edge = np.nonzero(neighbors >= 0)
     other = neighbors[face, edge]
     is_flat = np.sum(normals[face] * normals[other], axis=1) > _FLAT_COSINE
-    links = coo_array((is_flat[is_flat], (face[is_flat], other[is_flat])), shape=(len(normals), len(normals)))
-    count, part = connected_components(links, directed=False)
-    means = np.zeros((count, 3))
+    part = connected_components(face[is_flat], other[is_flat], len(normals))
+    means = np.zeros((part.max() + 1, 3))
     np.add.at(means, part, normals)
     cosines = np.sum(normals * means[part], axis=1)
     if (cosines >= _SAME_SIDE * np.linalg.norm(means[part], axis=1)).all():

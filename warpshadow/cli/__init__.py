@@ -1,4 +1,4 @@
-"""The command line: render and view scenes, explain images, fit spheres to a mesh, look into a light, compile ahead.
+"""The command line: render, view and tune scenes, fit them, fit spheres to a mesh, look into a light, compile ahead.
 
 Commands are listed by ``--help`` in the order in which their modules are imported.
 """

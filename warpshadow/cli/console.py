@@ -4,15 +4,31 @@ import contextlib
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+import typer.core
 import warp as wp
 
 from warpshadow import __version__, check, quiet
 from warpshadow.assets import files
 
+_ELSEWHERE = {"explain": "in Python, Renderer(scene).explain() lists the stages of an image, and what is cached"}
+"""Remedies for commands that there are not."""
+
+
+class _Commands(typer.core.TyperGroup):
+    """All commands."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the command of a command line."""
+        if args and args[0] in _ELSEWHERE:
+            ctx.fail(f"No such command '{args[0]}': {_ELSEWHERE[args[0]]}.")
+        return super().resolve_command(ctx, args)
+
+
 app = typer.Typer(
+    cls=_Commands,
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -37,7 +53,7 @@ Quiet = Annotated[
     typer.Option(
         "-q",
         "--quiet",
-        help="Print reports, warnings and errors alone: no progress, and not what was written.",
+        help="Print reports, warnings and errors alone: no progress, and no names of files.",
         callback=_start,
     ),
 ]

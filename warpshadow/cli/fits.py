@@ -120,9 +120,12 @@ def fit(
 
 def _fit_many(fit_path: Path | list[Path], output: Path, view: bool, is_quiet: bool, **options: Any) -> None:
     """Run many fits, and list the failed ones."""
+    from warpshadow.inverse.fit_file import check_kind
     from warpshadow.inverse.many import TABLE, find_fits, fit_many
 
     with clear_errors():
+        for file in fit_path if isinstance(fit_path, list) else []:  # before workers start
+            check_kind(file)
         if view:
             raise ValueError("--view: got many fits, expected one, which a page can show")
         try:
@@ -153,7 +156,11 @@ def _resumable(folder: Path) -> Iterator[None]:
         yield
     except KeyboardInterrupt as error:
         is_resumable = has_checkpoint(folder)
-        remark = f"; the same command goes on from {folder / CHECKPOINT}" if is_resumable else " before a checkpoint"
+        remark = (
+            f"; the same command goes on from {folder / CHECKPOINT}"
+            if is_resumable
+            else " before a checkpoint; the same command starts over"
+        )
         remark += f"; {error}" if error.args else ""
         raise interrupted(remark) from error
 
@@ -162,7 +169,7 @@ def _resumable(folder: Path) -> Iterator[None]:
 def dataset(
     recipe: Annotated[Path, typer.Argument(help="Recipe, TOML; warpshadow/dataset/README.md lists its keys.")],
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="Folder for the shards; what was interrupted there goes on.")
+        Path, typer.Option("-o", "--output", help="Folder for the shards; an interrupted run there goes on.")
     ],
     workers: Annotated[
         Optional[int], typer.Option(help="Processes that render; by default one a core, on a GPU one.", min=1)

@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Optional
 
 import typer
+import typer.core
 
+from warpshadow import check
 from warpshadow.assets.camera import DIRECTION
 from warpshadow.cli.console import note
 from warpshadow.scene.scene import Scene
@@ -21,6 +23,26 @@ SceneOrMesh = Annotated[
 ]
 
 OF_MESHES = "Options of a mesh, which scene files have as keys"
+
+
+class MeshCommand(typer.core.TyperCommand):
+    """A command of meshes: the size of a square image may be one number, and of others 640x480."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read the command line."""
+        return super().parse_args(ctx, _with_whole_size(args))
+
+
+def _with_whole_size(args: list[str]) -> list[str]:
+    """The arguments, width and height of the image apart."""
+    if "--size" not in args:
+        return args
+    place = args.index("--size") + 1
+    text, next_argument = [*args[place:], "", ""][:2]
+    width, x, height = text.partition("x")
+    if (width + height).isdecimal() and (x or not next_argument.isdecimal()):
+        return [*args[:place], width, height or width, *args[place + 1 :]]
+    return args
 
 
 def _two_numbers(size: tuple[str, str] | None) -> tuple[str, str] | None:
@@ -43,10 +65,18 @@ class MeshOptions(NamedTuple):
     size: Annotated[
         Optional[tuple[str, str]],
         typer.Option(
-            help="Width and height of the image, in pixels; without it 512 512.",
+            help="Width and height of the image, in pixels, or one number for both; without it 512 512.",
             rich_help_panel=OF_MESHES,
             metavar="WIDTH HEIGHT",
             callback=_two_numbers,
+        ),
+    ] = None
+    albedo: Annotated[
+        Optional[tuple[float, float, float]],
+        typer.Option(
+            help="Reflectance of the mesh, linear, each from 0 to 1, in place of the file's texture and colors.",
+            rich_help_panel=OF_MESHES,
+            metavar="R G B",
         ),
     ] = None
     light: Annotated[
@@ -94,6 +124,7 @@ def with_mesh_options(command: Callable[..., None], *, without: str = "") -> Cal
 _KEYS_OF_SCENES = {
     "up": "[[body]] rotation",
     "size": "[camera] size",
+    "albedo": "[[body]] albedo",
     "light": "[light]",
     "direction": '[camera] direction, beside framing = "auto", or eye and target',
     "light_rotation": "[light] rotation",
@@ -119,7 +150,7 @@ def load(file: Path, options: MeshOptions, is_quiet: bool, **settings: Any) -> S
                 option, key = f"--{name.replace('_', '-')}", _KEYS_OF_SCENES[name]
                 raise ValueError(f"{option}: got {shown_value} with {file}, expected a mesh; scene files have {key}")
         return load_scene(file, **settings)
-    body = Body(file)
+    body = Body(file, albedo=options.albedo)
     up: str | None = options.up
     if up is None:
         guess = guess_up(body.mesh, file.suffix.lower())
@@ -131,6 +162,17 @@ def load(file: Path, options: MeshOptions, is_quiet: bool, **settings: Any) -> S
     rotated_light = turned_light(scene.light, options.light_rotation or 0.0, 1.0)
     bounces = settings.pop("bounces", scene.bounces)
     return replace(scene, light=rotated_light, visibility=Visibility.of(settings), bounces=bounces)
+
+
+def method_of_visibility(text: str) -> str:
+    """A method of visibility; of others the message names the nearest."""
+    from warpshadow.scene.visibility import METHOD_TRAITS
+
+    try:
+        check.choice("method", text, METHOD_TRAITS)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
+    return text
 
 
 def count_of_bounces(text: str) -> Any:

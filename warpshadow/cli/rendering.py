@@ -9,14 +9,21 @@ from typing import Annotated, Any, Literal, Optional
 
 import numpy as np
 import typer
-import typer.core
 import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.picture import SUFFIXES, Picture
 from warpshadow.assets.video import VIDEO_SUFFIXES, check_video, write_video
 from warpshadow.cli.console import Device, Quiet, app, check_output, clear_errors, device_of, note
-from warpshadow.cli.mesh_options import MeshOptions, SceneOrMesh, count_of_bounces, load, with_mesh_options
+from warpshadow.cli.mesh_options import (
+    MeshCommand,
+    MeshOptions,
+    SceneOrMesh,
+    count_of_bounces,
+    load,
+    method_of_visibility,
+    with_mesh_options,
+)
 from warpshadow.scene.scene import Scene
 from warpshadow.scene.visibility import AUTO, METHOD_TRAITS
 
@@ -24,7 +31,7 @@ _PICTURES, _VIDEOS, _METHOD = "Pictures", "Videos", "Method, in place of the sce
 _BACKGROUNDS = ("transparent", "environment")  # beside colors
 
 
-class _Render(typer.core.TyperCommand):
+class _Render(MeshCommand):
     """The command that renders; a picture that is named without its option gets an answer that says it."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -63,7 +70,7 @@ def render(
     ] = None,
     tone: Annotated[
         Literal["clip", "filmic"],
-        typer.Option(help="What becomes of bright color: cut off, or bent.", rich_help_panel=_PICTURES),
+        typer.Option(help="Tone curve of bright color: cut off, or bent.", rich_help_panel=_PICTURES),
     ] = "clip",
     background: Annotated[
         str,
@@ -111,10 +118,12 @@ def render(
         ),
     ] = False,
     method: Annotated[
-        Optional[Literal[tuple(METHOD_TRAITS)]],  # type: ignore[valid-type]
+        Any,
         typer.Option(
             help="How visibility is computed; ray-traced, the reference, is a path tracer where light bounces.",
             rich_help_panel=_METHOD,
+            parser=method_of_visibility,
+            metavar="|".join(METHOD_TRAITS),
         ),
     ] = None,
     samples: Annotated[

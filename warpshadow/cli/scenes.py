@@ -13,14 +13,22 @@ import typer
 from warpshadow.assets.camera import DIRECTION
 from warpshadow.assets.picture import SUFFIXES
 from warpshadow.cli.console import Device, Quiet, app, check_output, clear_errors, device_of, note
-from warpshadow.cli.mesh_options import NO_OPTIONS, MeshOptions, SceneOrMesh, count_of_bounces, load, with_mesh_options
+from warpshadow.cli.mesh_options import (
+    NO_OPTIONS,
+    MeshCommand,
+    MeshOptions,
+    SceneOrMesh,
+    count_of_bounces,
+    load,
+    with_mesh_options,
+)
 from warpshadow.viewer import HOST, PORT, serve
 
 if TYPE_CHECKING:
     from warpshadow.tuning.tune import Tuning
 
 
-@app.command()
+@app.command(cls=MeshCommand)
 @with_mesh_options
 def scene(
     mesh: Annotated[
@@ -43,7 +51,15 @@ def scene(
             note(f"{mesh}: Warp's bunny", is_quiet)
         loaded_scene = load(mesh, mesh_options, is_quiet)
         direction, rotation = mesh_options.direction or DIRECTION, mesh_options.light_rotation or 0.0
-        write_starter(output, mesh, loaded_scene, light=mesh_options.light, direction=direction, rotation=rotation)
+        write_starter(
+            output,
+            mesh,
+            loaded_scene,
+            albedo=mesh_options.albedo,
+            light=mesh_options.light,
+            direction=direction,
+            rotation=rotation,
+        )
         note(f"{output}: warpshadow view {output} shows it", is_quiet)
 
 
@@ -105,7 +121,7 @@ def view(
     os._exit(0)  # exit at once: Python's own exit waits for compiling and painting threads, and unloads all kernels
 
 
-@app.command()
+@app.command(cls=MeshCommand)
 @with_mesh_options
 def tune(
     scene: SceneOrMesh,
@@ -132,14 +148,15 @@ def tune(
     """Measure settings on a scene, and print the cheapest that reach an error, as lines to put into the scene file.
 
     Errors are printed before times are measured. Exit status 1: no setting reaches the error; the message names the
-    nearest one, and what to try next.
+    nearest one, and the next attempt.
     """
     from warpshadow.tuning.tune import describe
     from warpshadow.tuning.tune import tune as tune_scene
 
     with clear_errors():
         if (error is None) == (ms is None):
-            raise ValueError(f"--error, --ms: got {'neither' if error is None else 'both'}, expected one of them")
+            got = "neither" if error is None else "both"
+            raise ValueError(f"--error, --ms: got {got}, expected one of them, such as --error 0.03, which is 3%")
         loaded_scene = load(scene, mesh_options, is_quiet)
         warp_device = device_of(device)
         tuning_result = tune_scene(

@@ -175,7 +175,7 @@ def _table(values: Table, name: str) -> Table:
         toml_tables.check_table(table)
         known_keys = _KEYS[name]
         if known_keys is not None:
-            check.known_keys("key", table, known_keys)
+            check.known_keys("", table, known_keys)
         return table
 
 

@@ -81,7 +81,7 @@ def constant(values: np.ndarray, dtype: type, device: wp.DeviceLike) -> wp.array
         RuntimeError: for new values while a graph is captured: only a replay of the graph would fill the array.
     """
     if wp.get_device(device).is_capturing:
-        raise RuntimeError("a graph is captured that needs new constants: call what it captures once before")
+        raise RuntimeError("a graph is captured that needs new constants: call the function once before its capture")
     array = wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
     use(array)
     return array

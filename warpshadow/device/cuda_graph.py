@@ -67,7 +67,7 @@ class Captured(Generic[Result]):
             self._has_run = True
             return result
         if self._captured is None:
-            self._has_run = False  # unless the capture succeeds: caches may lack what it asked for
+            self._has_run = False  # unless the capture succeeds: caches may lack values that it asked for
             self._captured = self._capture()
             self._has_run = True
         graph, result, _ = self._captured

@@ -14,7 +14,7 @@ from warpshadow.device import warp_internals
 from warpshadow.device.memory import in_huge_pages, require_gradient, reshaped
 from warpshadow.device.parallel import Scratch, launch_adjoint_slices, launch_slices
 from warpshadow.device.tape import record_adjoint, record_kernel
-from warpshadow.device.warp_internals import is_view, scalar_type
+from warpshadow.device.warp_internals import scalar_type, viewed_array
 
 
 def launch(
@@ -45,7 +45,7 @@ def launch(
         shared: Inputs that several rows read, of a kernel that has a cost and Warp's own adjoint: all rows add to their
             gradients. To a place in the gradient of another input only one row may add.
     """
-    device = next(value.device for value in (*outputs, *sums, *inputs) if isinstance(value, wp.array))
+    device = _device_of((*outputs, *sums, *inputs))
     needs_gradient = kernel.options.get("enable_backward") is not False and varies(inputs)
     if needs_gradient:
         for output in outputs:
@@ -92,7 +92,18 @@ def differentiable(
 
 def varies(values: Iterable[Any]) -> bool:
     """Whether one of some values is an array that requires a gradient."""
-    return any(isinstance(value, wp.array) and value.requires_grad for value in values)
+    for value in values:  # noqa: SIM110  (any takes twice as long)
+        if isinstance(value, wp.array) and value.requires_grad:
+            return True
+    return False
+
+
+def _device_of(values: Iterable[Any]) -> wp.Device:
+    """Device of the first array of some values."""
+    for value in values:
+        if isinstance(value, wp.array):
+            return value.device
+    raise ValueError("got no array")
 
 
 def without_gradient(array: wp.array) -> wp.array:
@@ -108,6 +119,6 @@ def _require_gradient(output: wp.array, kernel: wp.Kernel) -> None:
     is_real = scalar_type(output.dtype) in (wp.float32, wp.float64)
     if output.requires_grad or not is_real:
         return
-    if is_view(output):
+    if viewed_array(output) is not None:
         raise RuntimeError(f"{kernel.key}: got an output that is a view, which has no gradient of its own")
     require_gradient(output)

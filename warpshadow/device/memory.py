@@ -1,24 +1,36 @@
 """Memory: new arrays, huge pages for large ones, and views of arrays.
 
-Memory that is new to a process comes in pages of 4 kB, each of which stops the kernel that first writes to it. Of
-receivers × directions there are 100 MB: their pages took a fifth of a forward call on 64 small images, and a quarter of
-one with gradients. Huge pages, of 2 MB, take a fourth of that. Linux gives them on request; other systems are not
-asked.
+Memory that is new to a process comes in pages of 4 kB, each of which stops the kernel that first writes to it: a fifth
+of a call on 64 small images. Huge pages, of 2 MB, take a fourth of that. Linux gives them on request.
 """
 
 import ctypes
 import functools
 import math
 import mmap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
+from typing import ClassVar
 
 import numpy as np
 import warp as wp
 
-from warpshadow.device.warp_internals import contiguous_view, item_shape, new_array, scalar_type, set_gradient
+from warpshadow.device.warp_internals import (
+    check_strides,
+    contiguous_view,
+    current_tape,
+    item_shape,
+    new_array,
+    scalar_type,
+    set_gradient,
+    viewed_array,
+)
 
 _HUGE = 2**21  # bytes of a huge page
 _MIN_BYTES = 2 * _HUGE  # bytes of an array that is worth asking
+
+_ALIGNMENT = 256  # bytes at whose multiples arrays in a block begin, as CUDA's allocations do
+_MAX_SHARED = 2**28  # bytes of a block; larger arrays have memory of their own
+_MAX_SIZES = 256  # kinds of recordings whose sizes are kept
 
 
 @functools.cache
@@ -48,8 +60,18 @@ def empty(shape: int | Sequence[int], dtype: type, device: wp.DeviceLike) -> wp.
     return new_array(shape, dtype, device if isinstance(device, wp.Device) else wp.get_device(device))
 
 
-def zeros(shape: int | Sequence[int], dtype: type, device: wp.DeviceLike) -> wp.array:
-    """Make an array of zeros: ``wp.zeros``, but quicker."""
+def zeros(
+    shape: int | Sequence[int], dtype: type, device: wp.DeviceLike, *, outlives_recording: bool = True
+) -> wp.array:
+    """Make an array of zeros: ``wp.zeros``, but quicker.
+
+    Args:
+        shape, dtype, device: As of ``wp.zeros``.
+        outlives_recording: Whether the array may be needed after the recording, if this thread records. Others are in
+            the recording's memory, as gradients are.
+    """
+    if not outlives_recording and (memory := _memory_of_recording()) is not None:
+        return memory.take((shape,) if isinstance(shape, int) else shape, dtype, wp.get_device(device))
     array = empty(shape, dtype, device)
     array.zero_()
     return array
@@ -69,7 +91,8 @@ def from_numpy(values: np.ndarray, dtype: type, device: wp.DeviceLike) -> wp.arr
 
 def copied(array: wp.array) -> wp.array:
     """Copy an array without its gradient: ``wp.clone``, but quicker."""
-    if not array.device.is_cpu or not array.is_contiguous or not array.size:
+    device = array.device
+    if not device.is_cpu or device.is_capturing or not array.is_contiguous or not array.size:
         return wp.clone(array, requires_grad=False)
     copy = empty(array.shape, array.dtype, array.device)
     ctypes.memmove(copy.ptr, array.ptr, array.size * wp.types.type_size_in_bytes(array.dtype))
@@ -86,11 +109,75 @@ def reshaped(array: wp.array, shape: Sequence[int]) -> wp.array:
 
 
 def require_gradient(array: wp.array) -> None:
-    """Let an array require a gradient, which is zero."""
+    """Let an array require a gradient, which is zero: in the memory of the recording, if this thread records."""
     if not array.requires_grad:
-        gradient = in_huge_pages(empty(array.shape, array.dtype, array.device))
-        gradient.zero_()
-        set_gradient(array, gradient)
+        memory = _memory_of_recording() or ZeroedMemory()
+        set_gradient(array, memory.take(array.shape, array.dtype, array.device))
+
+
+def drop_gradient(array: wp.array) -> None:
+    """Let go of the gradient of an array, and of the arrays that it is a view of."""
+    owner: wp.array | None = array
+    while owner is not None:
+        owner.requires_grad = False
+        owner = viewed_array(owner)
+
+
+def _memory_of_recording() -> "ZeroedMemory | None":
+    """Memory of the recording of this thread; None where there is none, or another's tape."""
+    return getattr(current_tape(), "memory", None)
+
+
+class ZeroedMemory:
+    """Zeros for the gradients of a recording, which are parts of few blocks, each zeroed at once.
+
+    A recording that begins with an array of a shape and dtype is likely to take as much as the last one that did: so
+    much the first block has. A block stays as long as any array in it.
+    """
+
+    _sizes: ClassVar[dict[Hashable, int]] = {}  # bytes that a recording took, by the first array that it asked for
+
+    def __init__(self) -> None:
+        self._block: wp.array | None = None
+        self._used, self._total = 0, 0  # bytes of the block, and of all arrays
+        self._key: Hashable = None
+
+    def take(self, shape: Sequence[int], dtype: type, device: wp.Device) -> wp.array:
+        """Take an array of zeros."""
+        check_strides(shape, dtype)
+        size = -(-math.prod(shape) * wp.types.type_size_in_bytes(dtype) // _ALIGNMENT) * _ALIGNMENT
+        if not size or size > _MAX_SHARED:
+            array = in_huge_pages(empty(shape, dtype, device))
+            array.zero_()
+            return array
+        self._key = self._key or (tuple(shape), dtype, device.alias)
+        block = self._block
+        if block is None or block.device is not device or self._used + size > block.size:
+            expected = self._sizes.get(self._key, 0) - self._total
+            block = self._block = empty(min(_MAX_SHARED, max(size, expected, self._total)), wp.uint8, device)
+            in_huge_pages(block).zero_()
+            self._used = 0
+        array = part(block, self._used, shape, dtype)
+        self._used += size
+        self._total += size
+        return array
+
+    def end(self) -> None:
+        """Note how much was taken."""
+        if self._key is not None:
+            self._sizes.pop(self._key, None)
+            self._sizes[self._key] = self._total
+            if len(self._sizes) > _MAX_SIZES:
+                del self._sizes[next(iter(self._sizes))]
+
+
+def part(block: wp.array, first: int, shape: Sequence[int], dtype: type) -> wp.array:
+    """View a block of bytes, from one on, as an array, which holds it."""
+    view = contiguous_view(block, shape, dtype, first=first)
+    if view is None:
+        view = wp.array(ptr=block.ptr + first, dtype=dtype, shape=tuple(shape), device=block.device)
+        view.viewed = block
+    return view
 
 
 def as_items(array: wp.array, dtype: type, count: int) -> wp.array:

@@ -120,9 +120,9 @@ def run_length(device: wp.Device, width: int) -> int:
 def run_dimensions(device: wp.Device, run_count: int, instances: int) -> tuple[int, int]:
     """Dimensions of a launch over runs of samples of all instances; :func:`find_run` says which run a thread owns.
 
-    On a CPU a slice has all instances of a run, so no other adds to the gradient of what serves them all. On a GPU
-    neighboring threads own neighboring samples. (So it is with receivers and spans of directions in place of instances:
-    the 32 threads of a warp then ask for the same directions at neighboring receivers, and go the same way.)
+    On a CPU a slice has all instances of a run, so no other adds to the gradient of inputs that serve them all. On a
+    GPU neighboring threads own neighboring samples. (So it is with receivers and spans of directions in place of
+    instances: the 32 threads of a warp then ask for the same directions at neighboring receivers, and go the same way.)
     """
     return (instances, run_count) if device.is_cuda else (run_count, instances)
 

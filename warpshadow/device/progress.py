@@ -1,7 +1,8 @@
 """Progress: bars in terminals and notebooks, from a second on; elsewhere a line every ten seconds.
 
-One wait has one bar or line. Work within it, such as the compilation of kernels, is named there, too. Lines tell of a
-call of a renderer that lasts ten seconds by itself: bars of a loop of shorter calls would say nothing.
+One wait has one bar or line. Work within it, such as the compilation of kernels, is named there, too, also of other
+threads. Lines tell of a call of a renderer that lasts ten seconds by itself: bars of a loop of shorter calls would say
+nothing.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import builtins
 import contextlib
 import itertools
+import math
 import os
 import sys
 import threading
@@ -24,7 +26,6 @@ _DELAY = 1.0  # time before a bar shows, and between its states where nothing is
 _LINE_INTERVAL = 10.0  # time between lines [s]
 
 ANNOUNCED_SECONDS = 30.0  # time of work that is announced, with the way around it [s]
-
 
 _bars_show = True  # whether bars and lines may show, in all of the process
 
@@ -87,10 +88,7 @@ class Wait:
     """Work that somebody waits for, and how much of it is done.
 
     Args:
-        label: Label of the work, such as "shading".
-        total: Number of units; None where it is not known.
-        unit: Unit of the count, such as "receiver"; empty where nothing is counted.
-        done: Units that were done before.
+        label, total, unit, done: As of a :func:`progress_bar`.
         patience: Time before lines tell of it, and of work within it [s].
     """
 
@@ -98,7 +96,6 @@ class Wait:
         self.label, self.total, self.unit, self.done, self.patience = label, total, unit, done, patience
         self.remark = ""
         self.bar: Any = None  # tqdm's, where it shows one
-        self.outer_bar: Any = None  # or that in which its words show
         self._before, self._start = done, time.monotonic()
 
     @property
@@ -111,9 +108,6 @@ class Wait:
         self.done += count
         if self.bar is not None:
             self.bar.update(count)
-        elif self.outer_bar is not None and self.age >= _DELAY:
-            self.outer_bar.set_postfix_str(self.label)
-            self.outer_bar = None  # said
 
     def expect(self, left: int) -> None:
         """Let so many more units follow, where these are fewer or more than was thought."""
@@ -146,79 +140,72 @@ class Wait:
         return f"{self.label}: {', '.join(parts)}"
 
 
-class _ThreadState(threading.local):
-    """Work that a thread waits for, the innermost last, and whether it is hidden."""
-
-    def __init__(self) -> None:
-        self.waits: list[Wait] = []
-        self.is_hidden = False
-
-
-_this_thread = _ThreadState()
+_waits: list[Wait] = []  # of all threads, the innermost last
+_lock = threading.RLock()  # guards them, and the bar
+_reporter: threading.Thread | None = None  # while there are any
+_line_time = _end_time = -math.inf  # when the last line was said, and a wait ended
+_is_hidden = False  # whether a call is under way that says nothing
 
 
-class _Reporter:
-    """A thread that prints the progress of all waiting threads."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._waits_of_threads: list[list[Wait]] = []
-        self._thread: threading.Thread | None = None
-        self._reported = self._ended = -_LINE_INTERVAL
-
-    def begin(self, waits: list[Wait]) -> None:
-        """Report the waits of a thread from now on."""
-        with self._lock:
-            current_time = time.monotonic()
-            if not self._waits_of_threads and current_time - self._ended >= _LINE_INTERVAL:
-                self._reported = current_time
-            self._waits_of_threads.append(waits)
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="warpshadow-progress", daemon=True)
-                self._thread.start()
-
-    @contextlib.contextmanager
-    def ending(self, waits: list[Wait]) -> Iterator[None]:
-        """Report nothing while the last wait of a thread ends."""
-        with self._lock:
-            yield
-            if not waits:
-                self._waits_of_threads = [
-                    other_waits for other_waits in self._waits_of_threads if other_waits is not waits
-                ]
-                self._ended = time.monotonic()
-
-    def _run(self) -> None:
-        while True:
-            time.sleep(min(_DELAY, _LINE_INTERVAL) / 2)
-            with self._lock:
-                if not self._waits_of_threads:
-                    self._thread = None
-                    return
-                shown_waits = [[wait for wait in waits if wait.age >= _DELAY] for waits in self._waits_of_threads]
-                if _can_be_seen():
-                    for waits in shown_waits:
-                        _refresh(waits)
-                    continue
-                reported_waits = [waits for waits in shown_waits if waits and waits[0].age >= waits[0].patience]
-                if reported_waits and time.monotonic() - self._reported >= _LINE_INTERVAL:
-                    self._reported = time.monotonic()
-                    for waits in reported_waits:
-                        say("; ".join(wait.line() for wait in waits))
+def _begin_anew() -> None:
+    """Forget all waits: a process that was forked has them, but not the threads."""
+    global _lock, _reporter
+    _lock, _reporter = threading.RLock(), None
+    _waits.clear()
 
 
-def _refresh(waits: list[Wait]) -> None:
-    """Draw the bar of a thread as it is now; bars of notebooks are drawn by their own threads alone."""
-    bar = next((wait.bar for wait in waits if wait.bar is not None), None)
-    if bar is not None and not in_ipython():
-        if waits[-1].outer_bar is bar:
-            bar.set_postfix_str(waits[-1].label, refresh=False)
-        bar.refresh()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_begin_anew)
 
 
-_reporter = _Reporter()
-if hasattr(os, "register_at_fork"):  # a child has its lock, but not its thread
-    os.register_at_fork(after_in_child=_reporter.__init__)  # type: ignore[misc]
+@contextlib.contextmanager
+def _reported(wait: Wait) -> Iterator[None]:
+    """Report a wait while a block runs."""
+    global _reporter, _line_time, _end_time
+    with _lock:
+        if not _waits and time.monotonic() - _end_time >= _LINE_INTERVAL:
+            _line_time = time.monotonic()
+        _waits.append(wait)
+        if _reporter is None:
+            _reporter = threading.Thread(target=_report, name="warpshadow-progress", daemon=True)
+            _reporter.start()
+    try:
+        yield
+    finally:
+        with _lock:
+            _waits.remove(wait)
+            if wait.bar is not None:
+                wait.bar.close()
+            _name_inner_work(refresh=False)
+            _end_time = time.monotonic()
+
+
+def _report() -> None:
+    """Draw the bar, or say lines, until no wait is left."""
+    global _reporter, _line_time
+    while True:
+        time.sleep(min(_DELAY, _LINE_INTERVAL) / 2)
+        with _lock:
+            if not _waits:
+                _reporter = None
+                return
+            if _can_be_seen():
+                _name_inner_work(refresh=True)
+                continue
+            long_waits = [wait for wait in _waits if wait.age >= _DELAY]
+            is_due = time.monotonic() - _line_time >= _LINE_INTERVAL
+            if is_due and long_waits and long_waits[0].age >= long_waits[0].patience:
+                _line_time = time.monotonic()
+                say("; ".join(wait.line() for wait in long_waits))
+
+
+def _name_inner_work(*, refresh: bool) -> None:
+    """Name the innermost wait behind the bar; bars of notebooks are drawn by their own threads alone."""
+    long_waits = [wait for wait in _waits if wait.age >= _DELAY]
+    outer = next((wait for wait in long_waits if wait.bar is not None), None)
+    if outer is not None and not in_ipython():
+        inner = long_waits[-1]
+        outer.bar.set_postfix_str(outer.remark if inner is outer else inner.label, refresh=refresh)
 
 
 @contextlib.contextmanager
@@ -229,22 +216,25 @@ def waiting(label: str, *, shows: bool = True) -> Iterator[None]:
         label: Label of the work, such as "rendering".
         shows: Whether to say anything, of compiled kernels too.
     """
-    if _this_thread.waits or _this_thread.is_hidden:
+    global _is_hidden
+    if _waits or _is_hidden:
         yield
-        return
-    _this_thread.is_hidden = not shows
-    try:
-        with _within(Wait(label, patience=_LINE_INTERVAL), shows=shows):
+    elif shows and _bars_show:
+        with _reported(Wait(label, patience=_LINE_INTERVAL)):
             yield
-    finally:
-        _this_thread.is_hidden = False
+    else:
+        _is_hidden = True
+        try:
+            yield
+        finally:
+            _is_hidden = False
 
 
 @contextlib.contextmanager
 def progress_bar(
     total: int | None, label: str, unit: str, *, done: int = 0, shows: bool = True, stays: bool = False
 ) -> Iterator[Wait]:
-    """Show a bar while a block runs, if that takes longer than a second; within another bar, its words alone.
+    """Show a bar while a block runs, if that takes longer than a second; within another bar, its label alone.
 
     Where stderr is neither a terminal nor a notebook's, a line says every ten seconds how far it is.
 
@@ -259,40 +249,19 @@ def progress_bar(
         On it the block calls ``update(count)``, and ``expect(left)`` where it ends early.
     """
     wait = Wait(label, total, unit, done)
-    shows = shows and _bars_show
-    if shows and _can_be_seen():
-        wait.outer_bar = next((outer.bar for outer in _this_thread.waits if outer.bar is not None), None)
-        if wait.outer_bar is None:
-            with warnings.catch_warnings():  # of a notebook without ipywidgets, whose bars are text then
-                warnings.filterwarnings("ignore", "IProgress not found")
-                from tqdm.auto import tqdm
-
-            only_time = {} if unit else {"bar_format": "{desc} [{elapsed}]"}
-            delay = 0 if stays else _DELAY
-            wait.bar = tqdm(total=total, desc=label, unit=unit, initial=done, delay=delay, leave=stays, **only_time)
-    with _within(wait, shows=shows):
-        yield wait
-
-
-@contextlib.contextmanager
-def _within(wait: Wait, *, shows: bool) -> Iterator[None]:
-    """Report a wait while a block runs."""
     if not (shows and _bars_show):
-        yield
+        yield wait
         return
-    outer_bar = wait.outer_bar
-    _this_thread.waits.append(wait)
-    if len(_this_thread.waits) == 1:
-        _reporter.begin(_this_thread.waits)
-    try:
-        yield
-    finally:
-        with _reporter.ending(_this_thread.waits):
-            _this_thread.waits.pop()
-            if wait.bar is not None:
-                wait.bar.close()
-        if outer_bar is not None:
-            outer_bar.set_postfix_str("", refresh=False)
+    if _can_be_seen() and all(outer.bar is None for outer in _waits):
+        with warnings.catch_warnings():  # of a notebook without ipywidgets, whose bars are text then
+            warnings.filterwarnings("ignore", "IProgress not found")
+            from tqdm.auto import tqdm
+
+        only_time = {} if unit else {"bar_format": "{desc} [{elapsed}]"}
+        delay = 0 if stays else _DELAY
+        wait.bar = tqdm(total=total, desc=label, unit=unit, initial=done, delay=delay, leave=stays, **only_time)
+    with _reported(wait):
+        yield wait
 
 
 _module_numbers = itertools.count(1)
@@ -300,8 +269,7 @@ _module_numbers = itertools.count(1)
 
 def _compiling() -> contextlib.AbstractContextManager:
     """Say that kernels are compiled, and of which module of this process."""
-    label = f"compiling kernels, module {next(_module_numbers)}"
-    return progress_bar(None, label, "", shows=not _this_thread.is_hidden)
+    return progress_bar(None, f"compiling kernels, module {next(_module_numbers)}", "", shows=not _is_hidden)
 
 
 around_compilation(_compiling)

@@ -1,7 +1,7 @@
 """Spare memory: large blocks that arrays are done with, for the next arrays of about their size.
 
-An iteration frees what the next one takes again. The C library gives large blocks back to the system at once, and every
-page of a new one stops the kernel that first writes to it: a fifth of an iteration of a pose.
+An iteration frees memory that the next one takes again. The C library gives large blocks back to the system at once,
+and every page of a new one stops the kernel that first writes to it: a fifth of an iteration of a pose.
 """
 
 import threading
@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 _MIN_BYTES = 2**16  # smaller blocks the C library keeps itself
 _MAX_BYTES = 2**30  # of a block; larger ones are not kept
-_STEPS = 4  # sizes for each power of two: a block is less than a fourth larger than what it was taken for
+_STEPS = 4  # sizes for each power of two: a block is less than a fourth larger than asked for
 
 
 class SpareMemory:

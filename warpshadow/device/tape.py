@@ -12,15 +12,25 @@ from typing import Any
 import warp as wp
 
 from warpshadow.device import warp_internals
+from warpshadow.device.memory import ZeroedMemory
 from warpshadow.device.warp_internals import current_tape, own_tape, verify_access
+
+
+class Recording(wp.Tape):
+    """A tape, and memory for the gradients that are asked for while it records."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.memory = ZeroedMemory()
 
 
 @contextlib.contextmanager
 def recorded() -> Iterator[wp.Tape]:
     """Record this thread's launches on a tape of their own, whatever tape is open around them or in other threads."""
-    tape = wp.Tape()
+    tape = Recording()
     with own_tape(tape):
         yield tape
+    tape.memory.end()
 
 
 @contextlib.contextmanager

@@ -311,9 +311,9 @@ def scalar_type(dtype: type) -> type:
     return getattr(dtype, "_wp_scalar_type_", dtype)
 
 
-def is_view(array: wp.array) -> bool:
-    """Whether an array is a part of another, or another of its shapes."""
-    return getattr(array, "_ref", None) is not None
+def viewed_array(array: wp.array) -> wp.array | None:
+    """The array of which one is a part, or another shape; None where it is neither."""
+    return getattr(array, "_ref", None)
 
 
 def kernel_modules() -> dict[str, wp.Module]:

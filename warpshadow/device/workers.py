@@ -124,8 +124,8 @@ def run_tasks(
                     status = worker.end()
                     if not worker.has_started and status is not None and status >= 0:
                         raise ChildProcessError(
-                            "a worker process cannot start, as it says above; a script that starts some has what it "
-                            'does under if __name__ == "__main__":'
+                            "a worker process cannot start, as it says above; a script that starts some puts its "
+                            'work under if __name__ == "__main__":'
                         ) from None
                     if attempt < attempts:
                         repeated_tasks.append((task, attempt + 1))

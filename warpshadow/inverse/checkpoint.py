@@ -92,7 +92,7 @@ def load(path: AnyPath) -> dict[str, Any] | None:
             return _state(candidate, payload)
         faults.append(f"{candidate}: not a whole checkpoint (truncated or damaged)")
     if faults:
-        raise CheckpointError(f"{'; '.join(faults)}; remove what is damaged to start anew")
+        raise CheckpointError(f"{'; '.join(faults)}; remove the damaged files to start anew")
     return None
 
 

@@ -111,8 +111,8 @@ def _warn_of_unseen(model: Model, images: torch.Tensor) -> None:
 def _warn_of_exposures(model: Model, images: torch.Tensor) -> None:
     for view, stops in exposure_gaps(model, images).items():
         check.warn(
-            f"targets[{view}] is {2**stops:.3g} times as bright as what was found, which is most of the residual, and "
-            "may have led poses and colors astray: set exposure = true in [free], inverse.Exposure(), or the target's "
-            f"exposure = {stops:+.2f} [stops]",
+            f"targets[{view}] is {2**stops:.3g} times as bright as the fitted image, which is most of the residual, "
+            "and may have led poses and colors astray: set exposure = true in [free], inverse.Exposure(), or the "
+            f"target's exposure = {stops:+.2f} [stops]",
             DiagnosticWarning,
         )

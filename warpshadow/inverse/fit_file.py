@@ -73,12 +73,7 @@ class Fit:
     """A fit, ready to run.
 
     Args:
-        problem: The problem to fit.
-        stages: Stages in order.
-        optimizer: Makes an optimizer of a list of tensors and ``lr``.
-        tolerance: A stage has converged when over 25 iterations, or by the last and the next step of a QuasiNewton, its
-            loss falls by less than this part.
-        seed: Seed of the random starts of stages with candidates.
+        problem, stages, optimizer, tolerance, seed: As of :func:`warpshadow.inverse.fit`.
     """
 
     problem: Problem
@@ -105,7 +100,27 @@ def load_fit(path: AnyPath) -> Fit:
     """
     path = Path(path)
     with check.located(str(path), FitFileError):
-        return _fit(toml_tables.read(path, "fit file"), path.parent)
+        table = toml_tables.read(path, "fit file")
+        _check_no_scene(path, table)
+        return _fit(table, path.parent)
+
+
+def check_kind(path: Path) -> None:
+    """Raise FitFileError for a file that is no fit file: one of another suffix, or a scene file."""
+    with check.located(str(path), FitFileError):
+        if path.suffix.lower() != ".toml":
+            raise ValueError(f"got extension {path.suffix!r}, expected a fit file, .toml, which names its images")
+        try:
+            table = toml_tables.read(path, "fit file")
+        except ValueError:  # which the fit says
+            return
+        _check_no_scene(path, table)
+
+
+def _check_no_scene(path: Path, table: Table) -> None:
+    """Raise ValueError for the tables of a scene file."""
+    if "scene" not in table and ("camera" in table or "body" in table):
+        raise ValueError(f'got a scene file, expected a fit file, which names it: scene = "{path.name}"')
 
 
 def _fit(table: Table, folder: Path) -> Fit:
@@ -137,7 +152,7 @@ def _fit(table: Table, folder: Path) -> Fit:
 
 def _target(table: Table, folder: Path) -> Target:
     toml_tables.check_table(table)
-    check.known_keys("key", table, _TARGET_KEYS)
+    check.known_keys("", table, _TARGET_KEYS)
     path = toml_tables.file(table, "image", folder)
     options: Table = {key: table[key] for key in _PHOTOGRAPH_KEYS if key in table}
     if is_curve_file(options.get("encoding")):
@@ -186,7 +201,7 @@ def _check_framing(path: Path, problem: Problem) -> None:
 def _free(table: Table, scene: Scene) -> list[Free]:
     with check.located("[free]"):
         toml_tables.check_table(table)
-        check.known_keys("key", table, (*_FREE_OF_SCENE, *_FREE_OF_BODIES))
+        check.known_keys("", table, (*_FREE_OF_SCENE, *_FREE_OF_BODIES))
     free: list[Free] = []
     for key, kind in _FREE_OF_SCENE.items():
         entry = table.get(key, False)
@@ -199,6 +214,9 @@ def _free(table: Table, scene: Scene) -> list[Free]:
                 settings = {"order": None} | settings  # in place of the default
             free.append(toml_tables.make(kind, settings))
     for key, kind in _FREE_OF_BODIES.items():
+        if isinstance(table.get(key), bool):
+            lines = f'[[free.{key}]]\nbody = "{scene.bodies[0].name}"'
+            raise ValueError(f"[free] {key}: got {str(table[key]).lower()}, expected a table for each body:\n{lines}")
         for where, value in toml_tables.numbered({key: []} | table, key, "free."):
             with check.located(where):
                 free.append(toml_tables.make(kind, value).numbered(scene))
@@ -230,7 +248,7 @@ def _optimizer(table: Table) -> Callable[..., torch.optim.Optimizer]:
     name = table.get("name", "adam")
     check.choice("name", name, _OPTIMIZERS)
     kind, checks = _OPTIMIZERS[name]
-    check.known_keys("key", table, ("name", *checks))
+    check.known_keys("", table, ("name", *checks))
     options = {key: checks[key](key, value) for key, value in table.items() if key != "name"}
     if name == "adam" and not options:
         return short_adam

@@ -23,7 +23,7 @@ from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.target import Target
 from warpshadow.inverse.world import FittedScene, Setting
 from warpshadow.scene.blockers import blocking_planes, scene_blockers
-from warpshadow.scene.scene import SCENE_TYPES, Scene, change_bodies
+from warpshadow.scene.scene import Scene, change_bodies, check_scene
 from warpshadow.scene.visibility import METHODS, SPHERE_METHODS, Visibility
 from warpshadow.tuning.tune import resolved
 
@@ -59,7 +59,7 @@ class Problem:
         still: Visibility | None = _RAYS,
     ):
         vars(self).update(scene=scene, targets=targets, free=free, loss=loss, still=still)
-        check.instance("scene", self.scene, Scene, SCENE_TYPES)
+        check_scene(self.scene)
         check.instance("loss", self.loss, Loss, "a Loss, such as Loss('huber')")
         rays = "a Visibility, such as Visibility('ray-traced'), or None for the scene's"
         check.instance("still", self.still, (Visibility, type(None)), rays)
@@ -73,7 +73,7 @@ class Problem:
         for number, target in enumerate(self.targets):
             check.instance(f"targets[{number}]", target, Target, "a Target, as Target(image) makes it, or an image")
         for number, item in enumerate(self.free):
-            check.instance(f"free[{number}]", item, Free, "what is free, such as Pose(0) or Light()")
+            check.instance(f"free[{number}]", item, Free, "a free parameter, such as Pose(0) or Light()")
         object.__setattr__(self, "free", with_planes_last(tuple(self._numbered())))
         shapes = {target.image.shape for target in self.targets}
         if len(shapes) > 1:

@@ -125,10 +125,9 @@ def check_stages(stages: Sequence[Stage], problem: Problem) -> None:
 def pose_stages(problem: Problem) -> tuple[Stage, ...]:
     """Find a pose from 10° to 40° and a quarter of the body away.
 
-    A descent from there ends in a wrong pose about once in eight times, and its loss tells: on a bunny and a machine
-    part right ones end at 1% to 4% of the loss of poses turned by 30°, wrong ones at a third and more. If the first
-    does not stand out so, on images of some 32 pixels, others start turned by 30° fourteen ways, until one does.
-    Soft shadows have fewer wrong poses; under a sun firm ones lead nearer, past bumps of its shadow's edge.
+    A descent from there ends in a wrong pose about once in eight times, and its loss tells: right ones end at 1% to 4%
+    of the loss of poses turned by 30°, wrong ones at a third and more. If the first does not stand out so, others start
+    turned by 30° fourteen ways, until one does. Soft shadows have fewer wrong poses; under a sun firm ones lead nearer.
     """
     small_scale, middle_scale, large_scale = (_scale(problem, size) for size in (32, 64, 512))
     soft, firm = _soft(problem, 1.0), _soft(problem, 0.5)
@@ -144,8 +143,7 @@ def pose_stages(problem: Problem) -> tuple[Stage, ...]:
 def deformation_stages(problem: Problem) -> tuple[Stage, ...]:
     """Find the shape of a body that is bent, from coarse images with soft shadows to fine ones.
 
-    The last stage goes on as long as the loss falls: on six bends of three meshes (five under a bare sun) 40 iterations
-    end at a mean MDE of 2.4%, 150 at 2.2%. With 0.4 of the regularization they end farther off.
+    The last stage goes on as long as the loss falls: 40 iterations end at a mean MDE of 2.4%, 150 at 2.2%.
     """
     middle_scale, large_scale = (_scale(problem, size) for size in (64, 128))
     return (

@@ -7,27 +7,15 @@ import numpy as np
 from warpshadow.maths.adjacency import edge_neighbors
 from warpshadow.maths.components import connected_components
 from warpshadow.maths.outline import cut_outline, find_outline
-from warpshadow.maths.plane import is_flat
+from warpshadow.maths.plane import is_flat, principal_axes
 
 TOLERANCES = (0.02, 0.03)
-"""Thickness and mean gap of a panel at most, over the size of the mesh: the second where the first takes too many.
-
-The tent of demos/kinds.py has 6 panels, and its image by pixel is 3.1% off; with 0.01 it has 16, and the image is 2.9%
-off, in 1.5 times the time. With spheres it was 10.2% off. With 0.04 light comes through between the panels of half a
-shell.
-"""
+"""Thickness and mean gap of a panel at most, over the size of the mesh: the second where the first takes too many. With
+0.04 light comes through between the panels of half a shell."""
 
 FLAT = 1e-3  # the same for flat panels, which shade nothing that lies on the mesh
-
-MAX_PANELS = 64
-"""Panels of a mesh at most: beyond, spheres are faster.
-
-With a panel for each of the 162 leaves of the tree of demos/kinds.py its image takes 2.4 times as long, and is 5.3% off
-in place of 5.6%. An umbrella of eight arched fields has 48.
-"""
-
-_CREASE = 0.94
-"""Cosine of the angle between neighboring triangles, 20°, beyond which there is a crease between them."""
+MAX_PANELS = 64  # of a mesh: beyond, spheres are faster. An umbrella of eight arched fields has 48
+_CREASE = 0.94  # cosine of the angle between neighboring triangles, 20°, beyond which there is a crease between them
 
 
 def find_panels(points: np.ndarray, triangles: np.ndarray, tolerance: float, maximum: int) -> list[np.ndarray] | None:
@@ -90,21 +78,15 @@ def _flat_polygons(points: np.ndarray, region: np.ndarray, maximum: int) -> list
     used_vertices, faces = np.unique(region, return_inverse=True)
     if not is_flat(points[used_vertices]):
         return None
-    flat = points[used_vertices] @ _principal_axes(points[used_vertices])[:2].T
+    flat = points[used_vertices] @ principal_axes(points[used_vertices])[:2].T
     polygons = cut_outline(flat, find_outline(flat, faces.reshape(region.shape)), maximum)
     return None if polygons is None else [used_vertices[polygon] for polygon in polygons]
-
-
-def _principal_axes(local_points: np.ndarray) -> np.ndarray:
-    """Unit vectors along which places spread, the longest first, shape [3, 3]."""
-    centered_points = local_points - local_points.mean(axis=0)
-    return np.linalg.eigh(centered_points.T @ centered_points)[1].T[::-1]
 
 
 def _cuts(points: np.ndarray, region: np.ndarray) -> list[list[np.ndarray]]:
     """Halves of a region, across each of its principal axes."""
     centroids = points[region].mean(axis=1)
-    permutations = np.argsort(centroids @ _principal_axes(centroids).T, axis=0, kind="stable")
+    permutations = np.argsort(centroids @ principal_axes(centroids).T, axis=0, kind="stable")
     return [[region[half] for half in np.array_split(column, 2)] for column in permutations.T]
 
 
@@ -112,7 +94,7 @@ def _deviation(points: np.ndarray, region: np.ndarray) -> float:
     """Deviation of a region from a panel: its thickness, or the mean width by which a convex outline is larger."""
     from scipy.spatial import ConvexHull
 
-    local_points = points[region] @ _principal_axes(points[np.unique(region)]).T
+    local_points = points[region] @ principal_axes(points[np.unique(region)]).T
     flat = local_points[..., :2]
     outline = ConvexHull(flat.reshape(-1, 2))
     u, v = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
@@ -139,7 +121,7 @@ def _outline(points: np.ndarray, region: np.ndarray, tolerance: float) -> np.nda
     from scipy.spatial import ConvexHull
 
     used_vertices = np.unique(region)
-    flat = points[used_vertices] @ _principal_axes(points[used_vertices])[:2].T
+    flat = points[used_vertices] @ principal_axes(points[used_vertices])[:2].T
     rim = ConvexHull(flat).vertices
     rim_ends = np.array([flat[rim, 0].argmin(), flat[rim, 0].argmax()])  # of the rim, in order
     while True:

@@ -18,16 +18,16 @@ def plane_normal(corners: np.ndarray) -> np.ndarray | None:
         return None
     normal = normal / np.linalg.norm(normal)
     points = corners.reshape(-1, 3)
-    return normal if np.ptp(points @ normal) < _FLATNESS * np.ptp(points @ _axes(points)[0]) else None
+    return normal if np.ptp(points @ normal) < _FLATNESS * np.ptp(points @ principal_axes(points)[0]) else None
 
 
 def is_flat(points: np.ndarray) -> bool:
     """Whether points of float64, shape [point, 3], lie in one plane."""
-    axes = _axes(points)
+    axes = principal_axes(points)
     return bool(np.ptp(points @ axes[2]) < _FLATNESS * np.ptp(points @ axes[0]))
 
 
-def _axes(points: np.ndarray) -> np.ndarray:
+def principal_axes(points: np.ndarray) -> np.ndarray:
     """Unit vectors along which points extend most, second most and least, shape [3, 3]."""
     away = points - points.mean(axis=0)
     return np.linalg.eigh(away.T @ away)[1].T[::-1]

@@ -140,7 +140,7 @@ def _decision(node: Node, call: Call, reason: Decision) -> Decision:
 
 
 def _reason_to_run(inputs: Iterable[AnyInput], reason: Decision, otherwise: str = "") -> Decision:
-    """Whether a stage of some inputs runs, given why it is asked for: what changed before it, if anything did."""
+    """Whether a stage of some inputs runs, given why it is asked for: the input that changed, if one did."""
     if not reason:
         return reason
     root_inputs = dict.fromkeys(root for item in inputs for root in item.root_inputs)

@@ -68,7 +68,7 @@ class GlossyPoints(LitPoints):
             materials: Of the bodies.
             bounced: Node of the view's shading without direct light of emitters.
         """
-        item_text = functools.partial(receiver_text, self)
+        item_text = functools.partial(receiver_text, self.in_words)
         roughness, metallic, specular = (self._values(materials, name) for name in GLOSS_ARGUMENTS)
         key = materials.roughness
 
@@ -100,7 +100,7 @@ class GlossyPoints(LitPoints):
         of_vertices, textures = materials.of_vertices(name), materials.textures_of[name]
         if not textures.images:
             return Node("", self._interpolate, self.receivers_node, of_vertices)
-        arguments = self._fragments, self._clip_positions, textures.pyramids, str
+        arguments = self._fragments, self._clip_positions, textures.pyramids, ""
         cached_name = f"footprints in textures of {textures.sizes}"
         footprints = self.cached(cached_name, None, functools.partial(textures.footprints, *arguments))
         samples = Node("", self._sample, self._fragments, of_vertices, textures.pyramids, footprints)

@@ -184,7 +184,7 @@ class Method:
         """Shading of points in free light, which is converted where the transfer vectors are not."""
         transfers = self.cached_transfers(points)
         matrix = self.native_from_basis if transfers.requires_grad else None
-        items = functools.partial(receiver_text, points)
+        items = functools.partial(receiver_text, points.in_words)
         return Node("shading", functools.partial(shade_free, matrix=matrix), transfers, light, items=items)
 
     @functools.cached_property

@@ -37,7 +37,16 @@ class Input:
         self.requires_grad = False
         for item in value if isinstance(value, (tuple, list)) else [value]:
             self.requires_grad |= getattr(item, "requires_grad", False)
-        self.root_inputs, self.differentiated_inputs = {self: None}, {self: None} if self.requires_grad else {}
+
+    @property
+    def root_inputs(self) -> "dict[Input, None]":
+        """Itself. Stored it would be a cycle, and arrays would stay until Python collects garbage."""
+        return {self: None}
+
+    @property
+    def differentiated_inputs(self) -> "dict[Input, None]":
+        """Itself if a gradient to it is asked for."""
+        return {self: None} if self.requires_grad else {}
 
     def value(self, call: "Call | None" = None) -> Any:
         """The value."""
@@ -57,7 +66,7 @@ class Input:
 
         On a CPU values are compared. On a GPU, which would have to wait for that, an array is the same if it has the
         same ``origin``, the tensor whose memory it is, and the same ``version``, which counts the writes to that.
-        While a graph is captured none is: replays read what is written to it later.
+        While a graph is captured none is: replays read values that are written to it later.
         """
         result = cls(name, value)
         if result.requires_grad:
@@ -108,7 +117,7 @@ class NodeStage(NamedTuple):
         items: On how many items it is computed, in words.
         idle: Why there is nothing to do, in words.
         has_adjoint: Whether gradients take it more than to hand them on.
-        inputs: What it depends on, where that is less than its node does.
+        inputs: Its inputs, where they are fewer than its node's.
 
     Items and idle may be functions that make the words.
     """

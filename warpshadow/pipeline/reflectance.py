@@ -65,20 +65,21 @@ class BodyTextures:
 
     def pyramids_to(self, coarsest: Callable[[], int | None]) -> Node:
         """Node of the mip levels of the textures down to the coarsest that is wanted, None for all."""
+        images = self.images
 
         def why_flat() -> str:
-            is_flat = len(self.images) == 1 and coarsest() == 0
+            is_flat = len(images) == 1 and coarsest() == 0
             return "no sample takes a coarser level of the only texture" if is_flat else ""
 
         return Node(
             "mip pyramids",
-            lambda _: mip_pyramids([*map(as_colors, self.images)], coarsest=coarsest()),
+            lambda _: mip_pyramids([*map(as_colors, images)], coarsest=coarsest()),
             self._source,
-            items=lambda: f"{sum(image.size for image in self.images):,} texels",
+            items=lambda: f"{sum(image.size for image in images):,} texels",
             idle=why_flat,
         )
 
-    def footprints(self, fragments: Node, clip_positions: Node, pyramids: Node, items: Callable[[], str]) -> Node:
+    def footprints(self, fragments: Node, clip_positions: Node, pyramids: Node, items: str) -> Node:
         """Node of the samples' footprints in the textures."""
         merged_scene = self._merged_scene
         maps = merged_scene.uvs, merged_scene.uv_faces, self.texture_of_face
@@ -214,15 +215,13 @@ class Materials:
 
         return Node("", of_vertices, self._inputs[name])
 
-    def reflectance(
-        self, fragments: Node, pyramids: Node, footprints: Node, items: Callable[[], str]
-    ) -> SampleReflectance:
+    def reflectance(self, fragments: Node, pyramids: Node, footprints: Node, items: str) -> SampleReflectance:
         """Nodes of the samples' reflectance by albedo and textures."""
         seen = fragments, self.merged_scene.faces, self.vertex_albedo
         samples = Node("reflectance", sample_albedo, *seen, pyramids, footprints, items=items)
         return SampleReflectance(samples, self.vertex_albedo, pyramids, footprints)
 
-    def untextured_reflectance(self, fragments: Node, items: Callable[[], str]) -> SampleReflectance:
+    def untextured_reflectance(self, fragments: Node, items: str) -> SampleReflectance:
         """The same where no body has a texture."""
         none = [Node(name, None, idle="no body has a texture") for name in ("mip pyramids", "footprints")]
         seen = fragments, self.merged_scene.faces, self.vertex_albedo

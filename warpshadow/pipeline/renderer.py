@@ -36,7 +36,7 @@ from warpshadow.pipeline.transfers import Light, one_transfer
 from warpshadow.pipeline.view import View
 from warpshadow.pipeline.view_warnings import warn_of_vertex_receivers, warn_of_view
 from warpshadow.scene.material import GLOSS_ARGUMENTS
-from warpshadow.scene.scene import SCENE_TYPES, BodyLike, PerBody, Scene
+from warpshadow.scene.scene import BodyLike, PerBody, Scene, check_scene
 from warpshadow.scene.visibility import METHODS
 
 RendererType = TypeVar("RendererType", bound="SceneRenderer")
@@ -75,7 +75,7 @@ class SceneRenderer:
         basis: Basis | None = None,
         progress: bool = False,
     ):
-        check.instance("scene", scene, Scene, SCENE_TYPES)
+        check_scene(scene)
         check_basis(basis)
         where, scene = check.device("device", device), scene.with_method()
         check.choice("scene.visibility.method", scene.visibility.method, METHODS)
@@ -180,7 +180,7 @@ class SceneRenderer:
         return view
 
     def _warn_of_nothing(self, view: View) -> None:
-        """Say once why an image shows nothing, and of the scene itself what is likely to be wrong."""
+        """Say once why an image shows nothing, and the likely mistakes in the scene itself."""
         is_of_scene, device = self._views.is_of_scene(view), self.device
         if not self._has_warned and (is_readable(device) or (is_of_scene and not device.is_capturing)):
             self._has_warned = warn_of_view(view, self.cameras if is_of_scene else None)
@@ -494,7 +494,8 @@ class SceneRenderer:
             hidden = {*decide(view.receivers_node, view.call), view.silhouettes}
         else:
             view = self._views.view(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
-        image = view.preview().image(light, self._given_materials(albedo, textures, gloss, emission))
+        preview = view.preview()  # which the nodes' words ask, so it stays meanwhile
+        image = preview.image(light, self._given_materials(albedo, textures, gloss, emission))
         is_host = self.device.is_cpu or self.clock.waits
         of_receivers = receiver_notes(self._given_scene, self._choices, view.blocker_kinds.bulging)
         notes = [*of_receivers, *bounce_notes(self.scene.bounces)]

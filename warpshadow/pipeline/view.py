@@ -9,6 +9,7 @@ import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
+from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.method import Method
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached, identity
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
@@ -74,13 +75,13 @@ class View(LitPoints):
     ):
         self.dependencies = vertices, spheres, cameras, static_bodies, blocker_kinds
         self.method = method
-        self._separate_bodies = method.separate_bodies(blocker_kinds)
         self._samples_receive = method.samples_receive(blocker_kinds)
         self.cameras = cameras
         self._camera, self._supersampling, self._pose_count = camera, method.merged_scene.scene.supersampling, counts[0]
         self._size = self._supersampling * camera.width, self._supersampling * camera.height
         self._sample_count = counts[1] * self._size[0] * self._size[1]
-        normals, receivers = self._wire(method, vertices, spheres, cameras, static_bodies)
+        self._samples = f"{self._sample_count:,} samples"
+        normals, receivers = self._wire(method, *self.dependencies)
         super().__init__(
             method.merged_scene,
             materials,
@@ -95,10 +96,17 @@ class View(LitPoints):
         )
 
     def _wire(
-        self, method: Method, vertices: Input, spheres: Input, cameras: Input, static_bodies: "StaticBodies | None"
+        self,
+        method: Method,
+        vertices: Input,
+        spheres: Input,
+        cameras: Input,
+        static_bodies: "StaticBodies | None",
+        blocker_kinds: BlockerKinds,
     ) -> tuple[Node, Node]:
         """From the vertices to their normals and to the receivers."""
-        merged_scene, samples, corners = method.merged_scene, self._samples, self._vertices
+        merged_scene, samples = method.merged_scene, self._samples
+        corners = functools.partial(View._vertices, self.in_words)
         faces, two_sided = merged_scene.faces, merged_scene.two_sided_faces
         if static_bodies is None or cameras.requires_grad:
             clip = Node("clip positions", to_clip, vertices, cameras, items=corners)
@@ -123,81 +131,14 @@ class View(LitPoints):
             normals = Node("normals", static_bodies.with_moving_normals, vertices, static_bodies.normals, items=corners)
         # receivers at vertices move with these alone; receivers at samples move with the samples' fragments, too
         seen = sides if self._samples_receive.any() else detached(sides)
-        item_text = functools.partial(receiver_text, self)
+        item_text = functools.partial(receiver_text, self.in_words)
         arguments = [vertices, normals, seen, detached(silhouettes)]
         if method.is_adaptive.any():
             arguments.append(detached(spheres))
-        receivers = Node("receivers", self._receive, *arguments, items=item_text)
+        receive = functools.partial(_receive, method, blocker_kinds, static_bodies, self._supersampling)
+        receivers = Node("receivers", receive, *arguments, items=item_text)
         self.clip_positions, self.fragments_node, self.silhouettes = clip, sides, silhouettes
         return normals, receivers
-
-    def _receive(
-        self,
-        positions: wp.array,
-        normals: wp.array,
-        fragments: Fragments,
-        silhouettes: Silhouettes,
-        spheres: tuple[wp.array, wp.array] | None = None,
-    ) -> Receivers:
-        """Receivers at the vertices that are seen, or at all where that cannot be read without waiting."""
-        merged_scene, method, quadtree = self.merged_scene, self.method, None
-        has_backs = fragments.sides is not None
-        keeps_vertex, wants_samples = method.can_receive(self.blocker_kinds)[: 1 + has_backs], self._samples_receive
-        on_static_body = None if self.static_bodies is None else self.static_bodies.has_vertex
-        separate_bodies = self._separate_bodies
-        bodies = None if separate_bodies is None else separate_bodies[merged_scene.body_of_vertex]
-        if is_readable(merged_scene.device):
-            by_rows = method.is_adaptive & self._has_cached_shadows
-            if by_rows.any():
-                keeps_vertex = keeps_vertex | by_rows[merged_scene.body_of_vertex]
-                wants_samples = wants_samples & ~by_rows
-            keeps_vertex = keeps_vertex & seen_vertices(fragments, silhouettes, keeps_vertex.shape[1])
-            numbering = number_receivers(
-                merged_scene.faces, keeps_vertex, on_static_body, merged_scene.vertex_order, bodies
-            )
-            if spheres is not None and (is_adaptive := method.is_adaptive & wants_samples).any():
-                from warpshadow.pipeline.by_spheres import SphereMethod
-                from warpshadow.pipeline.receivers.adaptive import find_squares
-
-                assert isinstance(method, SphereMethod)
-                place = functools.partial(method.blockers, self.blocker_kinds)
-                seen = positions, normals, fragments, spheres
-                quadtree = find_squares(place, method.sharp_share, *seen, is_adaptive, self._supersampling)
-        else:
-            numbering = method.numbering(self.blocker_kinds, has_backs, self.static_bodies)
-        bodies = None if separate_bodies is None else separate_bodies[merged_scene.body_of_face]
-        arguments = (
-            positions,
-            normals,
-            merged_scene.faces,
-            fragments,
-            numbering,
-            wants_samples[merged_scene.body_of_face],
-        )
-        smooth_pieces, supersampling = None, self._supersampling
-        if method.shares_directions:
-            if supersampling > MAX_SHARED:
-                supersampling = 1  # each sample is a receiver
-            else:
-                smooth_pieces = merged_scene.smooth_pieces
-        return find_receivers(
-            *arguments,
-            bodies=bodies,
-            supersampling=supersampling,
-            quadtree=quadtree,
-            rises=method.lights_samples,
-            smooth_pieces=smooth_pieces,
-        )
-
-    @functools.cached_property
-    def _has_cached_shadows(self) -> np.ndarray:
-        """Static bodies on which shadows of others are cached at vertices, bool of shape [body]."""
-        static_bodies, count = self.static_bodies, len(self.merged_scene.scene.bodies)
-        result = np.zeros(count, bool)
-        if static_bodies is not None:
-            casting = [body for body in static_bodies.bodies if self.merged_scene.scene.bodies[body].casts_shadow]
-            result[[body for body in static_bodies.bodies if set(casting) - {body}]] = True
-        return result
 
     def shading(self, light: Light | None, materials: Materials | None = None) -> Node:
         """Light on the receivers: :meth:`.Method.shading`."""
@@ -387,9 +328,6 @@ class View(LitPoints):
         samples = self._sample_count * self._samples_receive.any()
         return "up to ", int(self._pose_count * (can_receive.sum() - static) + samples), static
 
-    def _samples(self) -> str:
-        return f"{self._sample_count:,} samples"
-
     def _vertices(self) -> str:
         count, static = int(self.merged_scene.first_vertex[-1]), 0
         if self.static_bodies is not None:
@@ -450,3 +388,73 @@ def _white_shading(receivers: Receivers) -> wp.array:
     """Light of 1 on all receivers, vec3 of shape [1, receiver]."""
     count = len(receivers.on_static) + receivers.points.shape[1]
     return wp.full((1, count), wp.vec3(1.0), dtype=wp.vec3, device=receivers.points.device)
+
+
+def _receive(
+    method: Method,
+    blocker_kinds: BlockerKinds,
+    static_bodies: "StaticBodies | None",
+    supersampling: int,
+    positions: wp.array,
+    normals: wp.array,
+    fragments: Fragments,
+    silhouettes: Silhouettes,
+    spheres: tuple[wp.array, wp.array] | None = None,
+) -> Receivers:
+    """Receivers at the vertices that are seen, or at all where that cannot be read without waiting."""
+    merged_scene, quadtree, has_backs = method.merged_scene, None, fragments.sides is not None
+    keeps_vertex = method.can_receive(blocker_kinds)[: 1 + has_backs]
+    wants_samples, separate_bodies = method.samples_receive(blocker_kinds), method.separate_bodies(blocker_kinds)
+    on_static_body = None if static_bodies is None else static_bodies.has_vertex
+    bodies = None if separate_bodies is None else separate_bodies[merged_scene.body_of_vertex]
+    if is_readable(merged_scene.device):
+        by_rows = method.is_adaptive & _has_cached_shadows(merged_scene, static_bodies)
+        if by_rows.any():
+            keeps_vertex = keeps_vertex | by_rows[merged_scene.body_of_vertex]
+            wants_samples = wants_samples & ~by_rows
+        keeps_vertex = keeps_vertex & seen_vertices(fragments, silhouettes, keeps_vertex.shape[1])
+        numbering = number_receivers(
+            merged_scene.faces, keeps_vertex, on_static_body, merged_scene.vertex_order, bodies
+        )
+        if spheres is not None and (is_adaptive := method.is_adaptive & wants_samples).any():
+            from warpshadow.pipeline.receivers.adaptive import find_squares
+            from warpshadow.pipeline.sphere_method import SphereMethod
+
+            assert isinstance(method, SphereMethod)
+            place = functools.partial(method.blockers, blocker_kinds)
+            seen = positions, normals, fragments, spheres
+            quadtree = find_squares(place, method.sharp_share, *seen, is_adaptive, supersampling)
+    else:
+        numbering = method.numbering(blocker_kinds, has_backs, static_bodies)
+    bodies = None if separate_bodies is None else separate_bodies[merged_scene.body_of_face]
+    arguments = (
+        positions,
+        normals,
+        merged_scene.faces,
+        fragments,
+        numbering,
+        wants_samples[merged_scene.body_of_face],
+    )
+    smooth_pieces = None
+    if method.shares_directions:
+        if supersampling > MAX_SHARED:
+            supersampling = 1  # each sample is a receiver
+        else:
+            smooth_pieces = merged_scene.smooth_pieces
+    return find_receivers(
+        *arguments,
+        bodies=bodies,
+        supersampling=supersampling,
+        quadtree=quadtree,
+        rises=method.lights_samples,
+        smooth_pieces=smooth_pieces,
+    )
+
+
+def _has_cached_shadows(merged_scene: MergedScene, static_bodies: "StaticBodies | None") -> np.ndarray:
+    """Static bodies on which shadows of others are cached at vertices, bool of shape [body]."""
+    result = np.zeros(len(merged_scene.scene.bodies), bool)
+    if static_bodies is not None:
+        casting = [body for body in static_bodies.bodies if merged_scene.scene.bodies[body].casts_shadow]
+        result[[body for body in static_bodies.bodies if set(casting) - {body}]] = True
+    return result

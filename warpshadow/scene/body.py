@@ -77,8 +77,7 @@ class Body:
             bodies by pixel, and under a sun all.
         self_shadows: How it casts shadows on itself, "traced", by "rays" or by its "spheres", as for
             :class:`Visibility`; None for the scene's setting.
-        name: Its name for lookups; None for that of its mesh, so of the mesh's file. :attr:`called` is the one that
-            counts.
+        name: Its name for lookups, by default that of its mesh, so of the mesh's file: ``scene.bodies["cow"]``.
         shadow_catcher: Whether it models a surface in the photograph: :func:`warpshadow.insert` does not draw it, and
             has it darken the photograph, or with bounces tint it, by the ratio of the light that it receives with the
             other bodies to the light without them. In the image of :func:`warpshadow.render` its shadow is coverage
@@ -106,7 +105,7 @@ class Body:
     translation: np.ndarray
     scale: float
     receivers: str
-    name: str | None
+    name: str
     self_shadows: str | None
     shadow_catcher: bool
     roughness: np.ndarray | None
@@ -166,6 +165,7 @@ class Body:
             check.choice("self_shadows", self.self_shadows, SELF_SHADOWS)
         if self.name is not None and not (isinstance(self.name, str) and self.name):
             raise ValueError(f"name: got {check.described(self.name)}, expected a name, or None for the mesh's")
+        object.__setattr__(self, "name", self.name or self.mesh.name)
 
     def __repr__(self) -> str:
         count = len(self.blockers) if isinstance(self.blockers, Spheres) else self.blockers
@@ -175,8 +175,13 @@ class Body:
 
     @property
     def called(self) -> str:
-        """Its name, or else its mesh's."""
-        return self.name or self.mesh.name
+        """Its name."""
+        return self.name
+
+    @property
+    def has_own_name(self) -> bool:
+        """Whether its name is another than its mesh's."""
+        return self.name != self.mesh.name
 
     @property
     def casts_shadow(self) -> bool:
@@ -240,6 +245,8 @@ class Body:
         if isinstance(self.albedo, str):
             raise ValueError(f"albedo: got {self.albedo!r}, expected {expected}{_css_color_hint(self.albedo)}")
         albedo = check.numbers("albedo", self.albedo, expected=expected)
+        if albedo.ndim == 0:
+            raise ValueError(f"albedo: got {albedo:g}, expected {expected}; that gray is {(float(albedo),) * 3}")
         if albedo.shape not in ((3,), (count, 3)):
             raise ValueError(f"albedo: got shape {albedo.shape}, expected [3] or [{count}, 3] (one for each vertex)")
         check.reflectance("albedo", albedo)

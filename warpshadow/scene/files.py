@@ -26,7 +26,7 @@ from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
 from warpshadow.scene.body import COLORS_SUFFIX, LIKELY_MISTAKES, VALUES_SUFFIX, Body
 from warpshadow.scene.material import GLOSS_ARGUMENTS
-from warpshadow.scene.scene import SCENE_TYPES, Bounces, Scene, check_bounces, check_supersampling
+from warpshadow.scene.scene import Bounces, Scene, check_bounces, check_scene, check_supersampling
 from warpshadow.scene.toml_tables import Table
 from warpshadow.scene.visibility import METHODS_OF_SETTING, Visibility
 from warpshadow.spheres import Spheres
@@ -100,6 +100,9 @@ def _scene(scene: Table, folder: Path, bounces: Bounces | None, settings: Table)
         placed = dict(scene["camera"])
         supersampling = placed.pop("supersampling", Scene.supersampling)
         check_supersampling(supersampling)
+        unframed_key = next((key for key in _FRAMING_KEYS if key in placed and "framing" not in placed), None)
+        if unframed_key is not None:
+            raise ValueError(f'{unframed_key} goes with framing = "auto", in place of eye and target')
         camera = _framing(placed, bodies) if "framing" in placed else parse_camera(placed)
     with check.located("[visibility]"):
         value = scene.get("visibility", {})
@@ -128,14 +131,14 @@ def _check_keys(name: str, table: Table, known: Iterable[str] = (), *, noun: str
         if key not in known and others and name not in others:
             raise ValueError(f"got {key}, expected it in {' or '.join(others)}")
         if key not in known and LIKELY_MISTAKES.get(key) in known:
-            raise ValueError(f"{noun}: unknown key {key!r} (did you mean {LIKELY_MISTAKES[key]!r}?)")
-    check.known_keys(noun, table, known)
+            raise ValueError(f"unknown {noun} {key!r} (did you mean {LIKELY_MISTAKES[key]!r}?)")
+    check.known_keys("", table, known, noun=noun)
 
 
 def parse_camera(table: Table) -> Camera:
     """A camera from its table: eye and target, or intrinsics and world-to-camera [R | t]."""
     toml_tables.check_table(table)
-    check.known_keys("key", table, _CAMERA_KEYS)
+    check.known_keys("", table, _CAMERA_KEYS)
     if not any(key in table for key in ("eye", "target", *_PINHOLE_KEYS)):
         raise ValueError('eye: missing, expected eye and target, or framing = "auto", or intrinsics and the rest')
     if not any(key in table for key in _PINHOLE_KEYS):
@@ -222,7 +225,7 @@ def _body(table: Table, folder: Path) -> Body:
         return body.on_ground(body.translation) if on_ground else body
     check.instance("on_ground", on_ground, Mapping, "true or false, or a table such as {size = 2.0}")
     with check.located("on_ground"):
-        check.known_keys("key", on_ground, ("size",))
+        check.known_keys("", on_ground, ("size",))
         if "size" in on_ground and "scale" in table:
             raise ValueError("size: got it beside the body's scale, expected one of them")
         return body.on_ground(body.translation, **on_ground)
@@ -243,7 +246,7 @@ def write_scene(scene: Scene, folder: AnyPath, *, stems: Sequence[str] | None = 
     Returns:
         The files.
     """
-    check.instance("scene", scene, Scene, SCENE_TYPES)
+    check_scene(scene)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
@@ -252,7 +255,7 @@ def write_scene(scene: Scene, folder: AnyPath, *, stems: Sequence[str] | None = 
     stems = [f"body_{number}" for number in range(len(names))] if stems is None else stems
     for body, stem in zip(scene.bodies, stems, strict=True):
         table, files = _write_body(body, folder / stem)
-        if body.name is not None or names.count(body.called) == 1:
+        if body.has_own_name or names.count(body.name) == 1:
             table["name"] = body.called
         bodies.append(table)
         written += files

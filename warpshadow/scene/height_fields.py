@@ -1,8 +1,7 @@
 """Land: height fields, which are open meshes, whose rim is closed behind them, so that a solid stands in for them.
 
 Spheres in a sheet bulge out of both sides. Where nobody sees one side, they may lie behind it, as deep as they like.
-The image of the land of demos/kinds.py, 128², kept, direct light, is 4.0% off, with spheres in the sheet 6.5%, and with
-panels, of which it takes 37, 8.5%.
+The image of the land of demos/kinds.py is 4.0% off, with spheres in the sheet 6.5%, with panels 8.5%.
 """
 
 from __future__ import annotations
@@ -19,10 +18,8 @@ from warpshadow.scene.body import Body, into_own_space
 from warpshadow.stages.ray_tracing import trace_visibility_on_host
 
 DEPTH = 1 / 16
-"""How far the solid reaches beyond the mesh, over the longest side of its bounds.
-
-The deeper it is, the fewer and larger are the spheres that fill it, and the coarser is its front: that land is 6.1% off
-with 1/4, and 4.2% with 1/32."""
+"""How far the solid reaches beyond the mesh, over the longest side of its bounds: that land is 6.1% off with 1/4, of
+fewer and larger spheres, and 4.2% with 1/32."""
 
 _POINTS = 1024  # of meshes, from which rays tell which bodies lie before the field, and which behind
 

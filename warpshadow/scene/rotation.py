@@ -17,6 +17,8 @@ def rotation_vector(value: npt.ArrayLike) -> np.ndarray:
     """
     meaning = "an axis-angle vector in degrees, or a rotation matrix [3, 3]"
     matrix = check.numbers("rotation", value, expected=f"3 finite numbers: {meaning}", dtype=np.float64)
+    if matrix.ndim == 0:
+        raise ValueError(f"rotation: got {matrix:g}, expected {meaning}: about the vertical (0, {matrix:g}, 0)")
     if matrix.shape != (3, 3):
         return check.array("rotation", value, (3,), meaning)
     from scipy.spatial.transform import Rotation

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -15,16 +16,16 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.harmonic_light import KnownLight, as_light
 from warpshadow.assets.image import ImageError
 from warpshadow.assets.light import LIGHT, EnvironmentMap, check_coefficients
+from warpshadow.assets.mesh import Mesh
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.scene.body import Body
-from warpshadow.scene.visibility import BOUNCE_METHODS, GLOSS_METHODS, Visibility
+from warpshadow.scene.visibility import BOUNCE_METHODS, DEFAULT_METHOD, GLOSS_METHODS, METHODS, Visibility
 
 MAX_BOUNCES = 16
 
 Bounces = int | Literal["all"]  # how often light bounces
 
-SCENE_TYPES = "a Scene; load_scene(path) reads one"  # the types of scenes that functions accept, for messages
 BodyLike = int | str  # a body of a scene: its number, from 0, or its name
 
 Item = TypeVar("Item")
@@ -35,6 +36,22 @@ PerBody = Sequence[Item | None] | Mapping[int, Item | None] | Mapping[str, Item 
 _DEFAULT_VISIBILITY = Visibility()
 
 _SEVERAL_CAMERAS = "several go to Renderer(scene, cameras=[…]), or in a torch loop to TorchRenderer(scene, cameras=[…])"
+
+
+def check_scene(value: object) -> None:
+    """Raise ValueError unless it is a scene; the message says how to make one of the value."""
+    remedy, own_scene = "", getattr(value, "scene", None)
+    items = value if isinstance(value, (list, tuple)) else [value]
+    if check.is_path(value):
+        is_scene_file = Path(value).suffix.lower() == ".toml"
+        remedy = f"; {'load' if is_scene_file else 'default'}_scene({str(value)!r}) makes one of that file"
+    elif isinstance(value, (Body, Mesh)):
+        remedy = f"; default_scene({type(value).__name__.lower()}) puts it on a ground under a sky"
+    elif items and all(isinstance(item, Body) for item in items):
+        remedy = "; Scene([…], synthetic_sky()) makes one of bodies"
+    elif isinstance(own_scene, Scene) and not isinstance(value, type):
+        remedy = f"; renderer.scene is its, and renderer{'' if callable(value) else '.render'}() is an image of it"
+    check.instance("scene", value, Scene, f"a Scene; load_scene(path) reads one{remedy}")
 
 
 def check_supersampling(count: object) -> None:
@@ -71,6 +88,37 @@ def _argument_role(value: object, name: str) -> str:
     return next((role for kind, role in roles.items() if isinstance(value, kind)), name)
 
 
+class Bodies(tuple[Body, ...]):
+    """The bodies of a scene, by their numbers, from 0, or names."""
+
+    def __getitem__(self, key: Any) -> Any:
+        """A body by its number or name, or several by a slice."""
+        return super().__getitem__(self.number(key) if isinstance(key, str) else key)
+
+    def number(self, body: BodyLike, argument: str = "body") -> int:
+        """Number of a body, from 0, given that or its name.
+
+        Args:
+            body: The number or the name.
+            argument: Its name in messages.
+        Raises:
+            ValueError: for a body that there is not, and for a name that two bodies have from their meshes.
+        """
+        if not isinstance(body, str):
+            by_name = f", or its name, such as {self[-1].name!r}"
+            check.index(argument, body, len(self), "body", by_name)
+            return int(body)
+        names = [item.name for item in self]
+        check.choice(argument, body, names)
+        if names.count(body) > 1:
+            numbers = [number for number, name in enumerate(names) if name == body]
+            raise ValueError(
+                f"{argument}: got {body!r}, as bodies {numbers} are called, expected a number, or "
+                'a name of its own for each: Body(…, name="…")'
+            )
+        return names.index(body)
+
+
 @check.frozen
 @dataclass(frozen=True, eq=False, init=False)
 class Scene:
@@ -80,7 +128,8 @@ class Scene:
     white ground under light of 1 from everywhere is 1. Pictures have their own exposure, :class:`warpshadow.Picture`.
 
     Args:
-        bodies: One or more bodies; they cast shadows on each other and on themselves.
+        bodies: One or more bodies; they cast shadows on each other and on themselves. ``scene.bodies`` finds them by
+            name, too: ``scene.bodies["cow"]``.
         light: Environment map, or SH coefficients [order², 3] as of a :class:`warpshadow.HarmonicBasis`, or the path of
             a map, relative to the current folder. Coefficients in cells become a map by ``basis.to_map``.
         camera: The camera; None for one that shows all bodies, :meth:`Camera.framing`.
@@ -115,18 +164,20 @@ class Scene:
     ):
         _check_order({"bodies": bodies, "light": light, "camera": camera, "visibility": visibility})
         check.instance("bodies", bodies, Iterable, "a list of one or more: [Body(mesh)]")
-        vars(self).update(bodies=tuple(bodies), light=light, camera=camera)
+        vars(self).update(bodies=Bodies(bodies), light=light, camera=camera)
         vars(self).update(visibility=visibility, supersampling=supersampling, bounces=bounces)
         if not self.bodies:
             raise ValueError("bodies: got none, expected one or more")
         for number, body in enumerate(self.bodies):
             check.instance(f"bodies[{number}]", body, Body, "a Body, as Body(mesh) makes it of a mesh")
-            if body.name is not None and body.name in [other.name for other in self.bodies[:number]]:
+            own_names = [other.name for other in self.bodies[:number] if other.has_own_name]
+            if body.has_own_name and body.name in own_names:
                 raise ValueError(f"bodies[{number}]: name: got {body.name!r}, as another has, expected one of its own")
         if camera is None:
             object.__setattr__(self, "camera", Camera.framing(self.bodies))
         check.instance("camera", self.camera, Camera, f"a Camera; {_SEVERAL_CAMERAS}")
-        check.instance("visibility", self.visibility, Visibility, "a Visibility, such as Visibility('directional')")
+        method = self.visibility if str(self.visibility) in METHODS else DEFAULT_METHOD
+        check.instance("visibility", self.visibility, Visibility, f"a Visibility, such as Visibility({method!r})")
         value: Any = self.light
         if check.is_path(value):
             path = check.file("light", value)
@@ -172,7 +223,7 @@ class Scene:
         return as_light(self.light)
 
     def with_method(self) -> Scene:
-        """The scene as renderers that are kept have it: "directional" where no method is named."""
+        """The scene as renderers have it: "directional" where no method is named."""
         return self if self.visibility.method else replace(self, visibility=self.visibility.with_method())
 
     def background(self) -> np.ndarray:
@@ -185,33 +236,16 @@ class Scene:
         return samples.mean(axis=(1, 3)).astype(np.float32)
 
     def body_number(self, body: BodyLike, argument: str = "body") -> int:
-        """Number of a body, from 0, given that or its name.
-
-        Args:
-            body: The number or the name.
-            argument: Its name in messages.
-        Raises:
-            ValueError: for a body that there is not, and for a name that two bodies have from their meshes.
-        """
-        if not isinstance(body, str):
-            by_name = f", or its name, such as {self.bodies[-1].called!r}"
-            check.index(argument, body, len(self.bodies), "body", by_name)
-            return int(body)
-        names = [item.called for item in self.bodies]
-        check.choice(argument, body, names)
-        if names.count(body) > 1:
-            numbers = [number for number, name in enumerate(names) if name == body]
-            raise ValueError(
-                f"{argument}: got {body!r}, as bodies {numbers} are called, expected a number, or "
-                'a name of its own for each: Body(…, name="…")'
-            )
-        return names.index(body)
+        """Number of a body, from 0, given that or its name: :meth:`Bodies.number`."""
+        return Bodies(self.bodies).number(body, argument)
 
     def body_numbers(self, bodies: Iterable[BodyLike], argument: str = "bodies") -> tuple[int, ...]:
         """Numbers of some bodies, given numbers or names."""
         if not isinstance(bodies, Iterable) or isinstance(bodies, str):
-            got = check.described(bodies)
-            raise ValueError(f"{argument}: got {got}, expected a list of bodies, by numbers or names, such as [0]")
+            got, example = check.described(bodies), [bodies] if isinstance(bodies, str) else [0]
+            raise ValueError(
+                f"{argument}: got {got}, expected a list of bodies, by numbers or names, such as {example}"
+            )
         return tuple(self.body_number(body, argument) for body in bodies)
 
     @property
@@ -242,7 +276,7 @@ class Scene:
         if not isinstance(value, Sequence) or isinstance(value, str):
             raise ValueError(
                 f"{argument}: got {check.described(value)}, expected a list of {count} items, one for each body, None "
-                "for what the scene has; or some by their bodies, such as {0: …}"
+                "for the scene's own; or some by their bodies, such as {0: …}"
             )
         if len(value) != count:
             raise ValueError(f"{argument}: got {len(value)} items, expected {count}, one for each body")

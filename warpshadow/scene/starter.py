@@ -47,6 +47,7 @@ def write_starter(
     mesh: Path,
     scene: Scene,
     *,
+    albedo: Sequence[float] | None = None,
     light: Path | None = None,
     direction: Sequence[float] = DIRECTION,
     rotation: float = 0.0,
@@ -57,6 +58,7 @@ def write_starter(
         path: The scene file.
         mesh: File of the mesh.
         scene: Its :func:`warpshadow.default_scene`.
+        albedo: Reflectance of the mesh, if not that of its file.
         light: File of the environment map that lights it, if not the sky.
         direction: From the mesh's middle to the camera.
         rotation: Angle by which the light is turned [degrees about +y].
@@ -67,6 +69,8 @@ def write_starter(
     options = []
     if body.rotation.any():
         options.append(f"rotation = {body.rotation.tolist()}  # axis-angle vector, degrees: z is up")
+    if albedo is not None:
+        options.append(f"albedo = {[float(number) for number in albedo]}")
     if body.mesh.origins is not None:
         options.append(f"creased = {CREASE:g}                 # edges stay sharp where faces bend by more degrees")
     lines = _SCENE.format(
@@ -83,7 +87,10 @@ def write_starter(
         albedo=[round(float(value), 4) for value in ground.albedo],
     )
     if path.exists() and path.read_text(encoding="utf-8") != lines:
-        raise FileExistsError(f"{path}: got a file that is there and may have been edited, expected none; remove it")
+        raise FileExistsError(
+            f"{path}: got a file that is there and may have been edited, expected none; remove "
+            "it, or write another, -o other.toml"
+        )
     with files.atomic_write(path) as unfinished:
         unfinished.write_text(lines, encoding="utf-8")
 

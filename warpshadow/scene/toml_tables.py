@@ -61,7 +61,7 @@ def make(kind: Callable[..., T], table: Table) -> T:
     """
     check_table(table)
     arguments = inspect.signature(kind).parameters
-    check.known_keys("key", table, arguments)
+    check.known_keys("", table, arguments)
     missing = {key: check.NOTHING for key, argument in arguments.items() if argument.default is argument.empty}
     return kind(**missing | table)
 

@@ -14,7 +14,7 @@ from warpshadow.stages.visibility.exponential import THRESHOLDS
 from warpshadow.stages.visibility.merging import MERGING, check_merging
 from warpshadow.stages.visibility.zonal_logs import LOGS
 
-DEFAULT_METHOD = "directional"  # method of renderers that are kept, where none is named
+DEFAULT_METHOD = "directional"  # method of renderers, where none is named
 AUTO = "auto"
 
 
@@ -57,9 +57,7 @@ SELF_SHADOWS = ("traced", "rays", "spheres")
 SAMPLINGS = ("independent", "shared")
 
 SHARED_DIRECTIONS = 512
-"""Directions that receivers share unless ``samples`` says how many, as in stills. Of 24 scenes of demos/kinds.py (128²,
-direct light) stills have a mean error of 1.5%, at worst 2.6%, in a cage. With 256 edges of dim shadows show as streaks.
-"""
+"""Directions that receivers share unless ``samples`` says how many: with 256 edges of dim shadows show as streaks."""
 
 _INDEPENDENT_RAYS = 1024  # rays unless ``samples`` says how many, where each receiver has its own
 
@@ -72,9 +70,9 @@ class Visibility:
     Args:
         method: "directional" transmittance of spheres, "log-sh" of spheres, "none" (no shadows), or "ray-traced"
             visibility of the meshes, the reference. "auto" leaves the choice to
-            :func:`warpshadow.tuning.tune.resolved`. None, where nothing is named: "directional" for renderers that are
-            kept, fits and data sets, and for stills, as by :func:`warpshadow.render`, rays that all receivers share,
-            which need neither spheres nor tables. A setting that "directional" alone reads names it.
+            :func:`warpshadow.tuning.tune.resolved`. None, where nothing is named: "directional" for renderers, fits and
+            data sets, and for stills, as by :func:`warpshadow.render`, rays that all receivers share, which need
+            neither spheres nor tables. A setting that "directional" alone reads names it.
         directions: Number of direction cells of "directional", a multiple of 16.
         softness: κ of "directional": half-width of a shadow's soft edge in cell radii.
         merging: τ: half-angle under which four neighboring spheres of 512 or more are seen as one, in radii of a cell
@@ -118,8 +116,8 @@ class Visibility:
                 readers = " or ".join(map(repr, METHODS_OF_SETTING[name]))
                 raise ValueError(
                     f"{name}: got {getattr(self, name)!r}, which {reader!r} does not read, expected the default, "
-                    f"{getattr(Visibility, name)!r}, or method = {readers}; visibility.by({reader!r}) leaves behind "
-                    "what a method does not read"
+                    f"{getattr(Visibility, name)!r}, or method = {readers}; visibility.by({reader!r}) leaves such "
+                    "settings out"
                 )
         if self.method is None and set(changed) & _DIRECTIONAL_SETTINGS:
             object.__setattr__(self, "method", DEFAULT_METHOD)
@@ -150,7 +148,7 @@ class Visibility:
     @classmethod
     def of(cls, settings: Mapping[str, object]) -> Visibility:
         """Make one from settings for any methods, by their names: all are checked, and the method's own are used."""
-        check.known_keys("key", settings, ("method", *METHODS_OF_SETTING))
+        check.known_keys("", settings, ("method", *METHODS_OF_SETTING))
         every = object.__new__(cls)
         vars(every).update(settings)
         every._check_values()
@@ -158,7 +156,7 @@ class Visibility:
         return cls(every.method, **{name: getattr(every, name) for name in METHOD_TRAITS[reader].settings})
 
     def with_method(self) -> Visibility:
-        """The same by "directional" where no method is named, as renderers that are kept have it."""
+        """The same by "directional" where no method is named, as renderers have it."""
         return self if self.method else self.by(DEFAULT_METHOD)
 
     def by(self, method: str) -> Visibility:

@@ -34,31 +34,16 @@ from warpshadow.spheres.sphere_set import Spheres
 ALGORITHM_VERSION = 11
 """Part of the key of cached fits: raise it whenever a fit would come out differently."""
 
-COVER_STEPS = 200
-"""Steps of stage 1 where it is all there is."""
-
-STEPS = 320
-"""Steps of stage 2. After 200 and after 2000 the errors of 64 spheres on a bunny are 4.1 and 4.0% on it, 1.8 and 2.3%
-on a ground."""
+COVER_STEPS = 200  # of stage 1 where it is all there is
+STEPS = 320  # of stage 2: 2000 are no better on a bunny
 
 RECEIVERS = 8192  # receivers that stage 2 draws from
 MANY = 64  # spheres from which on one expects the shadow of the mesh. A flat body, which rarely needs any, has so many
 
-BAD_SHADOW = 0.18
-"""Error of a shadow above which it is ragged. With 64 spheres a chair, a fence and a table with thin legs have 0.21 to
-0.27; a ring and rocks, whose shadows are small but whole, 0.16; man, monkey, cow, teapot and bunny 0.02 to 0.07."""
-
-MIN_GROUND_ERROR = 0.01
-"""Error of a ground below which ragged shadows are not visible: of a slab that lies on it, 0.004. Chair, fence and
-table have 0.02 to 0.05."""
-
-BAD_AIR = 0.45
-"""Error of the light around a body above which its cavities are dark: of half a shell that is filled, 0.51; as it is
-fitted with 64 spheres, 0.32, and a room open in front 0.36."""
-
-BAD_SURFACE = 0.25
-"""Error of the light on both sides of a mesh above which light comes through it: with 1024 spheres, of an umbrella 0.33
-and of a colander 0.36, below which bodies have up to 1.9 times their light; of a bowl 0.20, a funnel 0.15."""
+BAD_SHADOW = 0.18  # error of a shadow above which it is ragged: a fence has 0.21, rocks, whose shadow is whole, 0.16
+MIN_GROUND_ERROR = 0.01  # of a ground, below which ragged shadows are not visible: of a slab that lies on it, 0.004
+BAD_AIR = 0.45  # error of the light around a body above which its cavities are dark: of a filled half shell 0.51
+BAD_SURFACE = 0.25  # of the light on both sides, above which some comes through: a colander has 0.36, a bowl 0.20
 
 _warned: weakref.WeakSet[Mesh] = weakref.WeakSet()
 
@@ -176,10 +161,7 @@ def is_fitted(mesh: Mesh, count: int | str, *, device: wp.DeviceLike = "cpu") ->
 
 
 def fit_seconds(count: int | str) -> float:
-    """Estimate the time of a fit on one thread [s].
-
-    Measured on a bunny and a Zen 4: 2.1 s for 64 spheres, 4.9 for 256, 14.5 for 1024; "auto", which takes 256, 8.4.
-    """
+    """Estimate the time of a fit on one thread [s], by that of a bunny on a Zen 4."""
     return 8.4 if isinstance(count, str) else 1.3 + 0.013 * count
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -49,31 +49,35 @@ _FRAME_ROWS = 12  # numbers that say where a receiver is: its point, and the row
 
 
 @functools.cache
+def _make_frame_axis(lanes: int) -> wp.Function:
+    """Make the kernel function of a row (step 1) or a column (step 3) of the frames of a block of receivers."""
+    Vectors = vectors_type(lanes)
+
+    @wp.func(inline=True)
+    def frame_axis(frame_rows: wp.array2d(dtype=Any), block: int, first: int, step: int):
+        return Vectors(frame_rows[first, block], frame_rows[first + step, block], frame_rows[first + 2 * step, block])
+
+    return frame_axis
+
+
+@functools.cache
 def _make_view_sphere(lanes: int) -> wp.Function:
     """Make the kernel function of a sphere as a block of receivers sees it, in their frames."""
     Lane, Vectors, SphereView = lane_type(lanes), vectors_type(lanes), sphere_view_type(lanes)
-    cone_of = make_cone(lanes)
+    cone_of, frame_axis, fn = make_cone(lanes), _make_frame_axis(lanes), make_lane_functions(lanes)
+    dot, offset_from = fn.dot, fn.offset
 
     @wp.func(inline=True)
     def view_sphere(frame_rows: wp.array2d(dtype=Lane), block: int, ball: wp.vec4):
-        x = Lane(ball[0]) - frame_rows[0, block]
-        y = Lane(ball[1]) - frame_rows[1, block]
-        z = Lane(ball[2]) - frame_rows[2, block]
-        offset = Vectors(
-            wp.cw_mul(frame_rows[3, block], x)
-            + wp.cw_mul(frame_rows[4, block], y)
-            + wp.cw_mul(frame_rows[5, block], z),
-            wp.cw_mul(frame_rows[6, block], x)
-            + wp.cw_mul(frame_rows[7, block], y)
-            + wp.cw_mul(frame_rows[8, block], z),
-            wp.cw_mul(frame_rows[9, block], x)
-            + wp.cw_mul(frame_rows[10, block], y)
-            + wp.cw_mul(frame_rows[11, block], z),
-        )
+        offset = offset_from(wp.vec3(ball[0], ball[1], ball[2]), frame_axis(frame_rows, block, 0, 1))
         sphere_view = SphereView()
-        sphere_view.offset = offset
+        sphere_view.offset = Vectors(
+            dot(frame_axis(frame_rows, block, 3, 1), offset),
+            dot(frame_axis(frame_rows, block, 6, 1), offset),
+            dot(frame_axis(frame_rows, block, 9, 1), offset),
+        )
         sphere_view.curvature = 1.0 / ball[3]
-        sphere_view.cone = cone_of(offset, sphere_view.curvature)
+        sphere_view.cone = cone_of(sphere_view.offset, sphere_view.curvature)
         sphere_view.share = Lane(1.0)
         return sphere_view
 
@@ -129,8 +133,8 @@ def _make_project(lanes: int) -> wp.Kernel:
 def _make_project_adjoint(lanes: int) -> wp.Kernel:
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
     view_sphere, sphere_adjoint = _make_view_sphere(lanes), make_sphere_adjoint(lanes)
-    fn = make_lane_functions(lanes)
-    sqrt, total = fn.sqrt, fn.total
+    fn, frame_axis = make_lane_functions(lanes), _make_frame_axis(lanes)
+    dot, sqrt, total = fn.dot, fn.sqrt, fn.total
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def project_adjoint(
@@ -175,21 +179,9 @@ def _make_project_adjoint(lanes: int) -> wp.Kernel:
             sphere_view, sine, low, cos_width, sin_width, slope, adj_opacity, sum_, sum_t, Vectors(x, y, z)
         )
         adj_balls[block, sphere] = wp.vec4(
-            total(
-                wp.cw_mul(frame_rows[3, block], adj_offset.x)
-                + wp.cw_mul(frame_rows[6, block], adj_offset.y)
-                + wp.cw_mul(frame_rows[9, block], adj_offset.z)
-            ),
-            total(
-                wp.cw_mul(frame_rows[4, block], adj_offset.x)
-                + wp.cw_mul(frame_rows[7, block], adj_offset.y)
-                + wp.cw_mul(frame_rows[10, block], adj_offset.z)
-            ),
-            total(
-                wp.cw_mul(frame_rows[5, block], adj_offset.x)
-                + wp.cw_mul(frame_rows[8, block], adj_offset.y)
-                + wp.cw_mul(frame_rows[11, block], adj_offset.z)
-            ),
+            total(dot(frame_axis(frame_rows, block, 3, 3), adj_offset)),
+            total(dot(frame_axis(frame_rows, block, 4, 3), adj_offset)),
+            total(dot(frame_axis(frame_rows, block, 5, 3), adj_offset)),
             total(adj_radius),
         )
 

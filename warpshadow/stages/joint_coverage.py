@@ -1,22 +1,20 @@
-"""Joint coverage: the share of a cell of directions that several blockers leave open.
+"""Joint coverage: the share of a cell of directions that several blockers leave open, and where.
 
-Of each blocker the share of the cell that it covers is known, h, and its first moment μ
-(:mod:`warpshadow.stages.cell_coverage`), but not which part both of two blockers cover. They are beside each other, as
-a roof and the wall under it; in no relation, as things far apart; or one in front of the other, as a car on a ground:
+Of each blocker the share h that it covers is known, and its first moment μ (:mod:`warpshadow.stages.cell_coverage`),
+but not the part that two of them cover both. If they are independent of each other; beside each other, as a roof and
+the wall under it; or behind each other, as a car on a ground,
 
     Π (1 − h)        max(0, 1 − Σ h)        1 − max h
 
-is open if they are independent, beside each other, or behind each other. Moments tell: those of blockers beside each
-other point away from each other, and those of blockers behind each other in the same direction. With ν(h) the moment of
-a half-plane that covers h, which is the longest that there is,
+is open. Moments tell: of blockers beside each other they point away from each other, of blockers behind each other in
+the same direction. With ν(h) the moment of a half-plane that covers h, which is the longest that there is,
 
     k = Σ_{i≠j} μ_i·μ_j / Σ_{i≠j} ν(h_i) ν(h_j)
     T = (1 − |k|) Π (1 − h) + |k| (max(0, 1 − Σ h) where k < 0, else 1 − max h)
 
 Together they cover h = 1 − T, with the moment μ = T′ Σ μ, T′ = (1 − T) / Σ h.
 
-In a barn of planks under an even sky, blockers as independent ones made the light 23% too strong, since a quarter of
-each cell in which two walls meet stayed open; by T it is 2% too strong.
+In a barn of planks under an even sky light was 23% too strong by independent blockers; by T it is 2% too strong.
 """
 
 import warp as wp

@@ -131,7 +131,7 @@ def vertex_normals(positions: wp.array, faces: wp.array) -> wp.array:
     """
     check.finite_arrays({"positions": positions})
     device, shape = positions.device, positions.shape
-    sums = zeros(shape, dtype=wp.vec3d, device=device)
+    sums = zeros(shape, dtype=wp.vec3d, device=device, outlives_recording=False)
     face_dim, vertex_dim = (shape[0], faces.shape[0]), shape
 
     def forward(normals: wp.array) -> None:

@@ -89,8 +89,8 @@ class Poses:
         translations: Offsets [scene units], vec3 of shape [batch, body].
         scales: Factors, float32 of shape [batch, body].
     Raises:
-        ValueError: where the shapes differ, and for matrices that are no rotations. (Reading them waits for a GPU.
-            While a CUDA graph is captured that cannot be, and nothing is checked.)
+        ValueError: where the shapes differ, and for matrices that are no rotations. (Not while a CUDA graph
+            is captured, when they cannot be read.)
     """
 
     rotations: wp.array
@@ -101,8 +101,7 @@ class Poses:
         """Validate."""
         check.shape("translations", self.translations.shape, self.rotations.shape)
         check.shape("scales", self.scales.shape, self.rotations.shape)
-        if not self.rotations.device.is_capturing:
-            check_orthonormal(self.rotations.numpy().astype(np.float64))
+        check.values_of(self.rotations, lambda values: check_orthonormal(values.astype(np.float64)))
 
     def about(self, pivots: wp.array) -> "Poses":
         """The poses x → s R (x − pivot) + t, if these have t: it is where the pivot goes.

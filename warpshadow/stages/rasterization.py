@@ -11,6 +11,7 @@ Coverage has no derivative. Barycentrics are computed from the face that a sampl
 import functools
 from dataclasses import dataclass
 
+import numpy as np
 import warp as wp
 
 from warpshadow import check
@@ -191,10 +192,10 @@ def _trim(columns: wp.vec2i, step: wp.int64, value: wp.int64):
 
 
 @wp.func
-def _unclipped_plane(
+def _unclipped_depth(
     a: wp.vec2i, b: wp.vec2i, c: wp.vec2i, area: wp.int64, depth_a: float, depth_b: float, depth_c: float
 ):
-    """Depth of a face as a linear function of sample indices: plane0 column + plane1 row + plane2."""
+    """Depth of a face as a linear function of sample indices: p[0] column + p[1] row + p[2]."""
     scale = wp.float64(_ONE) / wp.float64(area)
     depth_step_ab = wp.float64(depth_b - depth_a) * scale
     depth_step_ac = wp.float64(depth_c - depth_a) * scale
@@ -206,13 +207,13 @@ def _unclipped_plane(
 
 
 @wp.func
-def _clipped_plane(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, z: wp.vec3d):
-    """`_unclipped_plane` for a face with vertices behind the eye or far away."""
+def _clipped_depth(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, z: wp.vec3d):
+    """`_unclipped_depth` for a face with vertices behind the eye or far away."""
     cross_ab = wp.cross(a, b)
-    plane = (z[0] * wp.cross(b, c) + z[1] * wp.cross(c, a) + z[2] * cross_ab) / wp.dot(cross_ab, c)
+    p = (z[0] * wp.cross(b, c) + z[1] * wp.cross(c, a) + z[2] * cross_ab) / wp.dot(cross_ab, c)
     half = wp.float64(_HALF)
     one = wp.float64(_ONE)
-    return wp.vec3d(plane[0] * one, plane[1] * one, plane[2] + (plane[0] + plane[1]) * half)
+    return wp.vec3d(p[0] * one, p[1] * one, p[2] + (p[0] + p[1]) * half)
 
 
 @wp.func
@@ -287,7 +288,7 @@ def _rasterize_faces(
     edge_a = _edge(b, c)
     edge_b = _edge(c, a)
     edge_c = _edge(a, b)
-    plane = wp.vec3d()
+    depth_plane = wp.vec3d()
     min_depth_bits = 0
     max_depth_bits = int(_DEPTH_ONE + 1)
     sign = wp.int64(1)
@@ -308,7 +309,7 @@ def _rasterize_faces(
         edge_b = _clipped_edge(fixed_c, fixed_a, c, a)
         edge_c = _clipped_edge(fixed_a, fixed_b, a, b)
         z = wp.vec3d(wp.float64(clip_a[2]), wp.float64(clip_b[2]), wp.float64(clip_c[2]))
-        plane = _clipped_plane(fixed_a, fixed_b, fixed_c, z)
+        depth_plane = _clipped_depth(fixed_a, fixed_b, fixed_c, z)
     else:
         area = edge_c[0] * wp.int64(c[0]) + edge_c[1] * wp.int64(c[1]) + edge_c[2]
         if area == wp.int64(0):
@@ -317,7 +318,7 @@ def _rasterize_faces(
         depth_a = depths[instance, vertex_a]
         depth_b = depths[instance, vertex_b]
         depth_c = depths[instance, vertex_c]
-        plane = _unclipped_plane(a, b, c, area, depth_a, depth_b, depth_c)
+        depth_plane = _unclipped_depth(a, b, c, area, depth_a, depth_b, depth_c)
         # Rounding must not carry the depth of a sliver beyond that of its vertices.
         min_depth_bits = wp.cast(wp.min(depth_a, wp.min(depth_b, depth_c)), wp.int32)
         max_depth_bits = wp.cast(wp.max(depth_a, wp.max(depth_b, depth_c)), wp.int32)
@@ -342,10 +343,10 @@ def _rasterize_faces(
         inside_a += edge_a[0] * x
         inside_b += edge_b[0] * x
         inside_c += edge_c[0] * x
-        depth_of_row = plane[1] * wp.float64(row) + plane[2]
+        depth_of_row = depth_plane[1] * wp.float64(row) + depth_plane[2]
         while column <= columns[1]:
             if (inside_a | inside_b | inside_c) >= wp.int64(0):
-                depth = float(plane[0] * wp.float64(column) + depth_of_row)
+                depth = float(depth_plane[0] * wp.float64(column) + depth_of_row)
                 bits = wp.clamp(wp.cast(depth, wp.int32), min_depth_bits, max_depth_bits)
                 if bits > 0 and bits <= _DEPTH_ONE:
                     key = (wp.int64(bits) << wp.int64(32)) | face_bits
@@ -417,9 +418,10 @@ def _visible_faces(clip_positions: wp.array, faces: wp.array, width: int, height
         layer_count = max(1, min(thread_count() // batch_count, int(layer_bound)))
     corners = empty((batch_count, vertex_count), dtype=wp.vec2i, device=device)
     depths = empty((batch_count, vertex_count), dtype=float, device=device)
-    keys = zeros((batch_count * layer_count, height, width), dtype=wp.int64, device=device)
+    make_scratch = functools.partial(zeros, device=device, outlives_recording=False)
+    keys = make_scratch((batch_count * layer_count, height, width), wp.int64)
     face_ids = empty((batch_count, height, width), dtype=wp.int32, device=device)
-    fault_counts = zeros((batch_count * layer_count, 2), dtype=int, device=device)
+    fault_counts = make_scratch((batch_count * layer_count, 2), wp.int32)
     launch(
         _snap_vertices,
         clip_positions.shape,
@@ -441,12 +443,15 @@ def _visible_faces(clip_positions: wp.array, faces: wp.array, width: int, height
         inputs=[keys.reshape((batch_count, layer_count, height * width)), run],
         outputs=[rows(face_ids)],
     )
-    if not device.is_capturing:
-        bad_vertex_count, bad_face_count = fault_counts.numpy().sum(axis=0).tolist()
+
+    def judge(counts: np.ndarray) -> None:
+        bad_vertex_count, bad_face_count = counts.sum(axis=0).tolist()
         if bad_vertex_count:
             raise ValueError(f"clip_positions: got {bad_vertex_count} with NaN or Inf, expected finite numbers")
         if bad_face_count:
             raise ValueError(
                 f"faces: got {bad_face_count} with an index out of range, expected 0 to {vertex_count - 1}"
             )
+
+    check.values_of(fault_counts, judge)
     return face_ids

@@ -202,7 +202,7 @@ def make_find_open() -> wp.Function:
         found |= open[lane] > 0.0f ? 1u << lane : 0u;
     return wp::vec_t<2, int>((int)found, last_face);
     """)
-    def find_open(  # type: ignore[empty-body]
+    def find_open_rays(  # type: ignore[empty-body]
         corners: wp.array2d(dtype=wp.vec3),
         lowers: wp.array(dtype=wp.vec3),
         uppers: wp.array(dtype=wp.vec3),
@@ -213,10 +213,17 @@ def make_find_open() -> wp.Function:
         facing_rays: wp.int32,
         last_face: int,
     ) -> wp.vec2i:
+        """`find_open`, with the fields of the tree; its results are a vector."""
+        ...
+
+    @wp.func
+    def find_open(
+        tree: FaceTree, point: wp.vec3, normal: wp.vec3, ray_directions: Vectors, facing_rays: int, last_face: int
+    ):
         """Find which rays of a packet meet no face.
 
         Args:
-            corners, lowers, uppers, leaf_count: The faces, a :class:`FaceTree`.
+            tree: The faces.
             point, normal: The receiver; none of these rays goes below its horizon.
             ray_directions: Directions of the rays.
             facing_rays: Bits of the rays to trace, which are above the horizon.
@@ -224,6 +231,19 @@ def make_find_open() -> wp.Function:
         Returns:
             Bits of the rays that escape; and a face that blocked some, or ``last_face``.
         """
-        ...
+        open_and_face = wp.vec2i(0, last_face)
+        if facing_rays != 0:
+            open_and_face = find_open_rays(
+                tree.corners,
+                tree.lowers,
+                tree.uppers,
+                tree.leaf_count,
+                point,
+                normal,
+                ray_directions,
+                facing_rays,
+                last_face,
+            )
+        return open_and_face[0], open_and_face[1]
 
     return find_open

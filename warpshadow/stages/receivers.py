@@ -18,7 +18,8 @@ from warpshadow.device.parallel import run_length
 from warpshadow.stages.interpolation import interpolate_at
 from warpshadow.stages.quadtree import Quadtree
 from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.sample_receivers import Span, VisibleSurface, find_sample_receivers, spans_of
+from warpshadow.stages.receiver_means import VisibleSurface
+from warpshadow.stages.sample_receivers import Span, find_sample_receivers, spans_of
 from warpshadow.stages.sides import split_side, split_sides
 from warpshadow.stages.silhouettes.find import Silhouettes
 
@@ -383,7 +384,7 @@ def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: 
     """
     sides, side_count = (fragments.face_ids, 1) if fragments.sides is None else (fragments.sides, 2)
     device, face_count = sides.device, len(silhouettes.faces)
-    corners = zeros((side_count, vertex_count), dtype=wp.bool, device=device)
+    corners = zeros((side_count, vertex_count), wp.bool, device, outlives_recording=False)
     run = run_length(device, sides.shape[2])
     launch(
         _mark_visible_corners,

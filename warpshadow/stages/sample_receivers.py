@@ -1,10 +1,9 @@
 """Sample receivers: points that samples see, at which light is evaluated for them.
 
-Samples of a pixel that see the same side share one, at the mean of their points: with four samples a pixel that is 1.1
-to 1.5 receivers a pixel, where faces have 400 to 10 pixels. In stills samples of different faces share one, too, if
-these belong to one smooth piece and the surface is even: shared by two slats of a bench, it lay in the gap or in the
-leg behind, and was black. (Stills of the cage of demos/kinds.py, 128², were 3.5% off, and are 2.5%.) In squares of a
-quadtree there is one at each corner, and samples interpolate in triangles of these.
+Samples of a pixel that see the same side share one, at the mean of their points: of four samples, 1.1 to 1.5 receivers
+a pixel. In stills samples of different faces share one, too, if these belong to one smooth piece and the surface is
+even: shared by two slats of a bench, it would lie in the gap. In squares of a quadtree there is one at each corner, and
+samples interpolate in triangles of these.
 """
 
 import itertools
@@ -15,11 +14,12 @@ import warp as wp
 
 from warpshadow.device.batch import rows
 from warpshadow.device.constants import cached_by_values, constant
-from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, from_numpy
 from warpshadow.device.parallel import run_length, split_row
 from warpshadow.stages.quadtree import Quadtree, sample_at
 from warpshadow.stages.rasterization import Fragments
+from warpshadow.stages.receiver_means import VisibleSurface, mean_fragments, sample_of_pixel
 
 TILE = 16  # pixels of a side of the tiles whose receivers follow each other
 
@@ -43,16 +43,6 @@ def spans_of(bodies: np.ndarray) -> tuple[Span, ...]:
     changes = np.flatnonzero(np.diff(bodies)) + 1
     bounds = [0, *changes.tolist(), len(bodies)] if len(bodies) else []
     return tuple(Span(int(bodies[first]), first, end) for first, end in itertools.pairwise(bounds))
-
-
-class VisibleSurface(NamedTuple):
-    """The points that samples see."""
-
-    points: wp.array  # [view, sample] vec3
-    normals: wp.array  # [view, sample] vec3
-    positions: wp.array  # [vertex] vec3
-    faces: wp.array  # [face] vec3i
-    pieces: wp.array  # [face] int32, the smooth piece that each is of
 
 
 class SampleReceivers(NamedTuple):
@@ -154,7 +144,7 @@ def _find_owner_samples(
                     owner_sample = sample
                     weight = wp.vec3(1.0, 0.0, 0.0)
                     for k in range(i * supersampling + j):
-                        other = corner + k // supersampling * width + k % supersampling
+                        other = sample_of_pixel(corner, k, width, supersampling)
                         if owner_sample == sample and sides[view, other] == side:
                             owner_sample = owner_samples[view, other]
                         # (kernels evaluate both sides of "and")
@@ -213,141 +203,6 @@ def _number_fragments(
             if receiver_numbers:
                 number = receiver_numbers[view, sample]
             samples[view, number] = sample
-
-
-@wp.func
-def _shares_receiver(
-    owner_samples: wp.array(dtype=wp.int32), sides: wp.array(dtype=wp.int32), is_corner: bool, sample: int, other: int
-):
-    """Whether two samples average their barycentrics: on one face, and not at the corner of a square."""
-    return other == sample or (owner_samples[other] == sample and sides[other] == sides[sample] and not is_corner)
-
-
-@wp.func
-def _nearest_on_edge(start: wp.vec3, end: wp.vec3, point: wp.vec3):
-    """Position on an edge, 0 to 1, of the point that is nearest to a given point."""
-    edge_vector = end - start
-    return wp.clamp(wp.dot(point - start, edge_vector) / wp.max(wp.length_sq(edge_vector), 1.0e-37), 0.0, 1.0)
-
-
-@wp.func
-def _nearest_on_face(point: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """Barycentrics of the point on a face that is nearest to a point."""
-    doubled_normal = wp.cross(b - a, c - a)
-    squared_length = wp.max(wp.length_sq(doubled_normal), 1.0e-37)
-    v = wp.dot(wp.cross(a - c, point - c), doubled_normal) / squared_length
-    w = wp.dot(wp.cross(b - a, point - a), doubled_normal) / squared_length
-    weights = wp.vec3(1.0 - v - w, v, w)
-    if wp.min(weights) < 0.0:
-        min_distance = float(wp.inf)
-        corners = wp.matrix_from_rows(a, b, c)
-        for k in range(3):
-            start = corners[k]
-            end = corners[(k + 1) % 3]
-            edge_share = _nearest_on_edge(start, end, point)
-            distance = wp.length_sq(start + edge_share * (end - start) - point)
-            if distance < min_distance:
-                min_distance = distance
-                weights = wp.vec3()
-                weights[k] = 1.0 - edge_share
-                weights[(k + 1) % 3] = edge_share
-    return weights
-
-
-@wp.kernel(enable_backward=False)
-def _find_means(
-    # in
-    points: wp.array2d(dtype=wp.vec3),
-    positions: wp.array(dtype=wp.vec3),
-    faces: wp.array(dtype=wp.vec3i),
-    sides: wp.array2d(dtype=wp.int32),
-    barycentrics: wp.array2d(dtype=wp.vec3),
-    owner_samples: wp.array2d(dtype=wp.int32),
-    is_corner: wp.array2d(dtype=wp.bool),
-    samples: wp.array2d(dtype=wp.int32),
-    width: int,
-    supersampling: int,
-    # out
-    fragment_sides: wp.array2d(dtype=wp.int32),
-    means: wp.array2d(dtype=wp.vec3),
-    counts: wp.array2d(dtype=wp.int32),
-):
-    """A thread owns a receiver, whose owner ``samples`` has, −1 for none."""
-    view, receiver = wp.tid()
-    sample = samples[view, receiver]
-    side = int(-1)
-    mean = wp.vec3(1.0, 0.0, 0.0)
-    count = int(0)
-    if sample >= 0:
-        side = sides[view, sample]
-        is_at_corner = bool(False)
-        if is_corner:
-            is_at_corner = is_corner[view, sample]
-        barycentric_sum = wp.vec3()
-        corner = (sample // width // supersampling * width + sample % width // supersampling) * supersampling
-        for i in range(supersampling * supersampling):
-            other = corner + i // supersampling * width + i % supersampling
-            if _shares_receiver(owner_samples[view], sides[view], is_at_corner, sample, other):
-                barycentric_sum += barycentrics[view, other]
-                count += 1
-        mean = barycentric_sum / float(count)
-        if points:
-            # the mean point of all faces that share, or the point nearest to it on one of them
-            mean_point = wp.vec3()
-            shared_count = int(0)
-            for i in range(supersampling * supersampling):
-                other = corner + i // supersampling * width + i % supersampling
-                if owner_samples[view, other] == sample:
-                    mean_point += points[view, other]
-                    shared_count += 1
-            if shared_count > count:
-                mean_point = mean_point / float(shared_count)
-                min_distance = float(wp.inf)
-                for i in range(supersampling * supersampling):
-                    other = corner + i // supersampling * width + i % supersampling
-                    if owner_samples[view, other] == sample:
-                        face = faces[sides[view, other] % faces.shape[0]]
-                        a = positions[face[0]]
-                        b = positions[face[1]]
-                        c = positions[face[2]]
-                        weights = _nearest_on_face(mean_point, a, b, c)
-                        distance = wp.length_sq(weights[0] * a + weights[1] * b + weights[2] * c - mean_point)
-                        if distance < min_distance:
-                            min_distance = distance
-                            side = sides[view, other]
-                            mean = weights
-    fragment_sides[view, receiver] = side
-    means[view, receiver] = mean
-    counts[view, receiver] = count
-
-
-@wp.kernel(enable_backward=False)
-def _find_means_adjoint(
-    # in
-    sides: wp.array2d(dtype=wp.int32),
-    owner_samples: wp.array2d(dtype=wp.int32),
-    is_corner: wp.array2d(dtype=wp.bool),
-    samples: wp.array2d(dtype=wp.int32),
-    counts: wp.array2d(dtype=wp.int32),
-    width: int,
-    supersampling: int,
-    adj_means: wp.array2d(dtype=wp.vec3),
-    # out
-    adj_barycentrics: wp.array2d(dtype=wp.vec3),
-):
-    """A thread owns a receiver: each of n samples that share it gets an n-th of its gradient."""
-    view, receiver = wp.tid()
-    sample = samples[view, receiver]
-    if sample >= 0:
-        is_at_corner = bool(False)
-        if is_corner:
-            is_at_corner = is_corner[view, sample]
-        adj = adj_means[view, receiver] / float(counts[view, receiver])
-        corner = (sample // width // supersampling * width + sample % width // supersampling) * supersampling
-        for i in range(supersampling * supersampling):
-            other = corner + i // supersampling * width + i % supersampling
-            if _shares_receiver(owner_samples[view], sides[view], is_at_corner, sample, other):
-                wp.atomic_add(adj_barycentrics, view, other, adj)
 
 
 def find_sample_receivers(
@@ -413,9 +268,8 @@ def find_sample_receivers(
         ranks = body_ranks[sides.numpy().ravel()[owner_indices] % len(bodies)]
         if quadtree is not None:
             # in tiles: light is found fastest where neighbors follow each other
-            tiles = owner_indices // width // (TILE * supersampling) * width + owner_indices % width // (
-                TILE * supersampling
-            )
+            tile = TILE * supersampling
+            tiles = owner_indices // width // tile * width + owner_indices % width // tile
             permutation = np.argsort(tiles, kind="stable")
             owner_indices, ranks = owner_indices[permutation], ranks[permutation]
         owner_numbers, ends = _number_by_body(owner_indices // sample_count, ranks, view_count, len(body_ids))
@@ -433,23 +287,10 @@ def find_sample_receivers(
         inputs=[sides, owner_samples, is_owner, receiver_numbers, ranks_on_device, side_count, run],
         outputs=[receiver_sides, samples],
     )
-    fragment_sides, counts = (empty(samples.shape, dtype=wp.int32, device=device) for _ in range(2))
-    surface_arrays = (surface.points, surface.positions, surface.faces) if surface else (None, None, None)
-    inputs = [*surface_arrays, sides, barycentrics, owner_samples, is_corner, samples, width, supersampling]
-    means = differentiable(
-        lambda means: launch(_find_means, samples.shape, inputs=inputs, outputs=[fragment_sides, means, counts]),
-        lambda adj_means: launch(
-            _find_means_adjoint,
-            samples.shape,
-            inputs=[sides, owner_samples, is_corner, samples, counts, width, supersampling, adj_means],
-            outputs=[barycentrics.grad],
-        ),
-        result=empty(samples.shape, dtype=wp.vec3, device=device),
-        variables=[barycentrics],
-    )
+    sample_fragments = mean_fragments(surface, fragments, owner_samples, is_corner, samples, supersampling)
     return SampleReceivers(
         Fragments(receiver_sides.reshape(shape), weights.reshape(shape)),
-        Fragments(fragment_sides, means),
+        sample_fragments,
         triangles,
         tuple(
             Span(body_id, first, end)

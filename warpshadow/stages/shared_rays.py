@@ -140,20 +140,8 @@ def _make_trace() -> wp.Kernel:
                             shares = interpolate(a, b, c, d, weights[receiver])
                             irradiance += sum_open(rays, wp.cw_mul(shares, cosine), color)
                             rays = 0
-                if rays != 0:
-                    open_and_face = find_open(
-                        tree.corners,
-                        tree.lowers,
-                        tree.uppers,
-                        tree.leaf_count,
-                        point,
-                        normal,
-                        ray_directions,
-                        rays,
-                        last_face,
-                    )
-                    open_rays = open_rays | open_and_face[0]
-                    last_face = open_and_face[1]
+                traced_rays, last_face = find_open(tree, point, normal, ray_directions, rays, last_face)
+                open_rays = open_rays | traced_rays
                 irradiance += sum_open(open_rays, cosine, color)
                 if ray_light.shape[0] > 0:
                     for lane in range(PACKET):

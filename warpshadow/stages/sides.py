@@ -121,8 +121,8 @@ def find_sides(
     """
     device = positions.device
     view_count, height, width = fragments.face_ids.shape
-    shows_back = zeros((view_count, faces.shape[0]), dtype=wp.bool, device=device)
-    has_back = zeros(2, dtype=wp.bool, device=device)
+    shows_back = zeros((view_count, faces.shape[0]), wp.bool, device, outlives_recording=False)
+    has_back = zeros(2, wp.bool, device, outlives_recording=False)
     run = run_length(device, _FACE_RUN)
     launch(
         _find_backs,

@@ -42,21 +42,7 @@ def _make_trace_cosines() -> wp.Kernel:
             ray_directions = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
             cosine = dot_direction(normal, ray_directions)
             facing_rays = bits_above(cosine, 0.0)
-            open_rays = int(0)
-            if facing_rays != 0:
-                open_and_face = find_open(
-                    tree.corners,
-                    tree.lowers,
-                    tree.uppers,
-                    tree.leaf_count,
-                    point,
-                    normal,
-                    ray_directions,
-                    facing_rays,
-                    last_face,
-                )
-                open_rays = open_and_face[0]
-                last_face = open_and_face[1]
+            open_rays, last_face = find_open(tree, point, normal, ray_directions, facing_rays, last_face)
             for lane in range(PACKET):
                 is_open = ((open_rays & facing_rays) >> lane) & 1
                 cosines[receiver, PACKET * packet + lane] = wp.where(is_open == 1, cosine[lane], 0.0)

@@ -1,6 +1,7 @@
 """Arguments: check tensors, and pass them as Warp arrays."""
 
-from collections.abc import Callable, Collection, Sequence
+import functools
+from collections.abc import Callable, Collection, Hashable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +14,9 @@ from warpshadow.device.batch import common_batch
 from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.geometry import GEOMETRY_DTYPES, PLACED, Geometry, as_geometry
 from warpshadow.torch.autograd import apply, as_array, check_float32, is_capturing
+from warpshadow.torch.replay import Replays
+
+_REUSED = ("geometry.", "clip_matrices")  # tensors about which a renderer caches results while they stay the same
 
 
 class Slot(NamedTuple):
@@ -86,13 +90,22 @@ class Arguments:
         return _filled(inputs, arrays)
 
     def apply(
-        self, function: Callable[[dict[str, Any]], Any], inputs: dict[str, Any], *, affine: Collection[str] = ()
+        self,
+        function: Callable[[dict[str, Any]], Any],
+        inputs: dict[str, Any],
+        *,
+        affine: Collection[str] = (),
+        replays: Replays | None = None,
     ) -> Any:
-        """Apply a function of inputs, as :func:`~warpshadow.torch.apply` does.
+        """Apply a function of inputs, as :func:`~warpshadow.torch.apply` does, or replay it if there are replays.
 
         Results lose a batch dimension that no tensor had.
         """
         self._common_batch()
+        find_capture = None
+        if replays is not None:
+            reused = [number for number, name in enumerate(self.names) if name.startswith(_REUSED)]
+            find_capture = functools.partial(replays.find, _key(inputs), reused)
         results = apply(
             lambda *arrays: function(_filled(inputs, arrays)),
             *self.tensors,
@@ -100,6 +113,7 @@ class Arguments:
             device=self.device,
             names=self.names,
             affine=affine,
+            find_capture=find_capture,
         )
         if self._has_batch:
             return results
@@ -130,6 +144,30 @@ class Arguments:
         return common_batch({"cameras": self._cameras, **dict(zip(self.names, self.tensors, strict=True))})
 
 
+class _Same:
+    """A value that equals itself alone."""
+
+    def __init__(self, value: object):
+        self._value = value
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self._value is other._value
+
+    def __hash__(self) -> int:
+        return id(self._value)
+
+
+def _key(inputs: Any) -> Hashable:
+    """Key of inputs, which equals the key of others that differ in their tensors alone."""
+    if isinstance(inputs, Slot):
+        return inputs
+    if isinstance(inputs, Geometry):
+        return *inputs.arrays().values(), inputs.rotations, inputs.moving, inputs.deformed
+    if isinstance(inputs, dict):
+        return tuple((name, _key(item)) for name, item in inputs.items())
+    return tuple(map(_key, inputs)) if isinstance(inputs, list) else _Same(inputs)
+
+
 def _filled(inputs: Any, arrays: Sequence[wp.array]) -> Any:
     if isinstance(inputs, Slot):
         return arrays[inputs.number]
@@ -152,5 +190,7 @@ def _check_tensor(
     check.shape(name, tuple(tensor.shape), ("batch", *shape) if tensor.ndim > len(shape) else shape, meaning)
     if tensor.numel() == 0 and 0 not in shape:
         raise ValueError(f"{name}: got shape {tuple(tensor.shape)}, expected at least one value")
-    if not is_capturing(device) and not np.isfinite(float(tensor.detach().sum())):
-        check.finite(name, tensor.detach().cpu().numpy())
+    if device.type == "cuda" and not is_capturing(device):
+        check.finite_arrays({name: as_array(tensor.detach() if tensor.ndim else tensor.detach()[None], wp.float32)})
+    elif not np.isfinite(float(tensor.detach().sum())):
+        check.finite(name, tensor.detach().numpy())

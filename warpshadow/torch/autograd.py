@@ -7,18 +7,39 @@ import sys
 import threading
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import ParamSpec, TypeVar, overload
+from typing import ParamSpec, Protocol, TypeAlias, TypeVar, overload
 
 import torch
 import warp as wp
 
-from warpshadow.device.memory import require_gradient
+from warpshadow.device.memory import drop_gradient, require_gradient
 from warpshadow.device.tape import recorded, unrecorded
 from warpshadow.device.threads import one_call
 from warpshadow.device.warp_internals import array_at, item_shape
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+
+class Playback(Protocol):
+    """A call whose gradients can be asked for."""
+
+    def gradients(self, adjoints: Sequence[torch.Tensor]) -> tuple[torch.Tensor | None, ...]:
+        """The gradient to each argument, given the results' gradients; None where it requires none."""
+
+
+class Replayable(Protocol):
+    """A call that has been captured."""
+
+    @property
+    def results_require_grad(self) -> list[bool]:
+        """Whether each result depends on tensors that require a gradient."""
+
+    def replay(self, tensors: Sequence[torch.Tensor]) -> tuple[tuple[torch.Tensor, ...], Playback]:
+        """The results, and the call for its gradients."""
+
+
+FindCapture: TypeAlias = Callable[..., Replayable | None]  # of function, tensors, dtypes, requires_grad, device
 
 
 def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
@@ -46,6 +67,7 @@ def apply(
     device: torch.device | None = None,
     names: Sequence[str] | None = None,
     affine: Collection[str] = (),
+    find_capture: FindCapture | None = None,
 ) -> tuple[torch.Tensor, ...]: ...
 
 
@@ -57,6 +79,7 @@ def apply(
     device: torch.device | None = None,
     names: Sequence[str] | None = None,
     affine: Collection[str] = (),
+    find_capture: FindCapture | None = None,
 ) -> torch.Tensor: ...
 
 
@@ -68,6 +91,7 @@ def apply(
     device: torch.device | None = None,
     names: Sequence[str] | None = None,
     affine: Collection[str] = (),
+    find_capture: FindCapture | None = None,
 ) -> torch.Tensor | tuple[torch.Tensor, ...]:
     """Apply a differentiable function of Warp arrays to tensors.
 
@@ -80,6 +104,7 @@ def apply(
         device: Where the function runs, by default the tensors' own; launched on torch's current stream there.
         names: Names of the tensors in messages, by default ``tensors[0]`` and so on.
         affine: Names of tensors in each of which alone the function is affine.
+        find_capture: Finds the graphs that compute the call instead, if there are any (:mod:`.replay`).
     Returns:
         The array as a tensor, or a tuple of tensors for a tuple of arrays.
     Raises:
@@ -93,7 +118,7 @@ def apply(
     if torch.get_num_threads() > 1:
         _let_waiting_threads_sleep()
     requires_grad = tuple(tensor.requires_grad and torch.is_grad_enabled() for tensor in tensors)
-    call = _Call(function, tuple(dtypes), device or tensors[0].device, tuple(names), frozenset(affine))
+    call = _Call(function, tuple(dtypes), device or tensors[0].device, tuple(names), frozenset(affine), find_capture)
     results = _WarpFunction.apply(call, requires_grad, *tensors)
     return results if len(results) > 1 else results[0]
 
@@ -127,13 +152,13 @@ def _let_waiting_threads_sleep() -> None:
 
 def as_array(tensor: torch.Tensor, dtype: type) -> wp.array:
     """A tensor as an array that requires no gradient, of the same memory if that is contiguous."""
-    array = _of_memory(tensor.detach().contiguous(), dtype)
+    array = array_of(tensor.detach().contiguous(), dtype)
     if not tensor.is_inference():  # by it a renderer on a GPU knows which arrays have not been written to
         array.origin, array.version = tensor if tensor._base is None else tensor._base, tensor._version
     return array
 
 
-def _of_memory(tensor: torch.Tensor, dtype: type) -> wp.array:
+def array_of(tensor: torch.Tensor, dtype: type) -> wp.array:
     """A contiguous tensor as an array of the same memory, as ``wp.from_torch`` makes one."""
     shape, item = tuple(tensor.shape), item_shape(dtype)
     leading_shape = shape[: len(shape) - len(item)]
@@ -153,6 +178,7 @@ class _Call:
     device: torch.device
     names: tuple[str, ...]
     affine: frozenset[str]
+    find_capture: FindCapture | None
 
     def moved(self, tensors: Sequence[torch.Tensor], directions: Sequence[torch.Tensor | None]) -> list[torch.Tensor]:
         """Change of the results as tensors move in directions: Σ f(…, direction, …) − f(…, 0, …), exact if affine.
@@ -188,16 +214,21 @@ class _Playback:
     def __init__(self, tape: wp.Tape, arguments: list[wp.array], results: tuple[wp.array, ...]):
         self._tape, self._arguments, self._results, self._is_played = tape, arguments, results, False
 
+    def __del__(self) -> None:
+        """Let go of the gradients: results, which tensors hold, would keep the memory of all."""
+        for result in self._results:
+            drop_gradient(result)
+
     def gradients(self, adjoints: Sequence[torch.Tensor]) -> tuple[torch.Tensor | None, ...]:
         """The gradient to each argument, given the results' gradients; None where it requires none."""
-        with one_call, _current_stream(adjoints[0].device), unrecorded():
+        with one_call, current_stream(adjoints[0].device), unrecorded():
             if self._is_played:  # before, gradients are zero
                 self._tape.zero()
             self._is_played = True
             # copies, since memory shared with torch is reused behind the tape's back
             for result, adjoint in zip(self._results, adjoints, strict=True):
                 if result.requires_grad:
-                    wp.copy(result.grad, _of_memory(adjoint.detach().contiguous(), result.dtype))
+                    wp.copy(result.grad, array_of(adjoint.detach().contiguous(), result.dtype))
             self._tape.backward()
             return tuple(
                 wp.to_torch(argument.grad, requires_grad=False).clone() if argument.requires_grad else None
@@ -210,9 +241,17 @@ class _WarpFunction(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, call: _Call, requires_grad: tuple[bool, ...], *tensors: torch.Tensor):
+        with one_call:
+            call_arguments = call.function, tensors, call.dtypes, requires_grad, call.device
+            if call.find_capture is not None and (capture := call.find_capture(*call_arguments)) is not None:
+                ctx.save_for_backward(*tensors)
+                outputs, ctx.playback = capture.replay(tensors)
+                ctx.call, varies = call, capture.results_require_grad
+                ctx.mark_non_differentiable(*(output for output, does in zip(outputs, varies, strict=True) if not does))
+                return outputs
         arguments = [as_array(*pair) for pair in zip(tensors, call.dtypes, strict=True)]
         # streams are the device's, as Warp has it, not a thread's
-        with one_call, _current_stream(call.device), recorded() if any(requires_grad) else unrecorded() as tape:
+        with one_call, current_stream(call.device), recorded() if any(requires_grad) else unrecorded() as tape:
             for argument, needs_gradient in zip(arguments, requires_grad, strict=True):
                 if needs_gradient:
                     require_gradient(argument)  # here, so that a graph that is captured zeroes the gradient
@@ -263,7 +302,7 @@ class _WarpAdjoint(torch.autograd.Function):
         return None, None, None, *gradients
 
 
-def _current_stream(device: torch.device) -> wp.ScopedStream:
+def current_stream(device: torch.device) -> wp.ScopedStream:
     """Launch on torch's current stream, which while it is captured must not wait for streams that are not.
 
     Else Warp's stream waits for it at the end: there Warp frees memory that has no reference left.

@@ -25,6 +25,7 @@ from warpshadow.stages.poses import Poses
 from warpshadow.stages.project import compose_clip_matrices
 from warpshadow.torch.arguments import Arguments, Slot
 from warpshadow.torch.autograd import uncompiled
+from warpshadow.torch.replay import Replays
 from warpshadow.tuning.renderer import Renderer
 
 P = ParamSpec("P")
@@ -89,7 +90,10 @@ class TorchRenderer(torch.nn.Module):
         device: Device of the tensors and the kernels.
         basis: Basis of free light: ``HarmonicBasis(order)`` or ``CellBasis(directions)``; None for the native basis of
             the scene's method.
+        graphs: Whether calls that come again with tensors of the same shapes are captured as CUDA graphs and replayed
+            on a GPU (:mod:`warpshadow.torch.replay`).
     Attributes:
+        replays: The captured calls; ``replays.reason`` says why the last call was not replayed.
         warp: The :class:`warpshadow.Renderer` of Warp's arrays that it calls; most users need it not.
 
     Functions under ``torch.compile`` may call it: it and the functions of this package run as they are, between parts
@@ -110,8 +114,10 @@ class TorchRenderer(torch.nn.Module):
         device: str | torch.device = "cpu",
         basis: Basis | None = None,
         progress: bool = True,
+        graphs: bool = True,
     ):
         super().__init__()
+        self.replays = Replays(is_on=check.flag("graphs", graphs))
         self.warp = Renderer(scene, cameras=cameras, device=str(device), basis=basis, progress=progress)
 
     @property
@@ -224,7 +230,7 @@ class TorchRenderer(torch.nn.Module):
             "textures": not self.scene.bounces,
         }
         affine = [name for name in arguments.names if is_affine.get(name.partition("[")[0])]
-        return arguments.apply(draw, inputs, affine=affine)
+        return arguments.apply(draw, inputs, affine=affine, replays=self.replays)
 
     @uncompiled
     @one_at_a_time
@@ -407,12 +413,13 @@ class TorchRenderer(torch.nn.Module):
         count = len(self.scene.bodies)
         scales = self.scene_poses()[2] if scales is None else scales
         arguments = Arguments(self.device)
-        remedy = "matrices of all bodies; rotation_matrices(…) makes them of axis-angle vectors and quaternions"
+        all_bodies = f"of all {count} bodies, as scene_poses() has them"
+        remedy = f"matrices {all_bodies}; rotation_matrices(…) makes them of axis-angle vectors and quaternions"
         inputs: dict[str, Any] = {
             "poses": [
                 arguments.add("rotations", rotations, wp.mat33, (count,), remedy),
-                arguments.add("translations", translations, wp.vec3, (count,)),
-                arguments.add("scales", scales, wp.float32, (count,)),
+                arguments.add("translations", translations, wp.vec3, (count,), all_bodies),
+                arguments.add("scales", scales, wp.float32, (count,), all_bodies),
             ],
             "pivot": pivot,
         }

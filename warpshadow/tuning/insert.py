@@ -13,7 +13,7 @@ from warpshadow.assets.image import ImageError, read_rgb
 from warpshadow.check import AnyPath
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
-from warpshadow.scene.scene import SCENE_TYPES, Scene
+from warpshadow.scene.scene import Scene, check_scene
 from warpshadow.tuning.renderer import Renderer
 
 _COVERED_SHARE = 0.5  # part of a pixel that bodies cover, above which it is theirs
@@ -49,7 +49,7 @@ def insert(
     Raises:
         ValueError: for a photograph of other proportions than the camera's, and a scene without a catcher.
     """
-    check.instance("scene", scene, Scene, SCENE_TYPES)
+    check_scene(scene)
     pixels = linear_photograph(photograph)
     height, width, _ = pixels.shape
     camera, gain = fitting_camera(scene.camera, width, height), 2.0 ** check.number("exposure", exposure)
@@ -80,8 +80,8 @@ def _overexposure(image: np.ndarray, photograph: np.ndarray, coverage: np.ndarra
         return None
     stops = math.floor(10 * (exposure - math.log2(np.percentile(bright_values, 99)))) / 10
     return (
-        f"{share:.0%} of what is inserted is brighter than white, as is {usual:.0%} of the photograph; with exposure = "
-        f"{stops:.1f} (--exposure {stops:.1f}) 1% is, or scale the light by {2 ** (stops - exposure):.2g}"
+        f"{share:.0%} of the inserted pixels are brighter than white, as is {usual:.0%} of the photograph; with "
+        f"exposure = {stops:.1f} (--exposure {stops:.1f}) 1% is, or scale the light by {2 ** (stops - exposure):.2g}"
     )
 
 

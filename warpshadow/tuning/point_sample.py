@@ -76,7 +76,7 @@ class PointSample:
         self._scene = scene
         self._chosen = [body.receivers for body in stage.scene.bodies]
         if not self.reference.any():
-            raise ValueError("light: none falls on what the camera sees, so nothing can be compared")
+            raise ValueError("light: none falls on the surfaces that the camera sees, so nothing can be compared")
 
     @functools.cached_property
     def reference(self) -> np.ndarray:

@@ -10,8 +10,17 @@ from warpshadow.assets.basis import Basis, check_basis
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline import renderer
 from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
-from warpshadow.scene.scene import SCENE_TYPES, Scene
+from warpshadow.scene.scene import Scene, check_scene
+from warpshadow.scene.visibility import METHODS_OF_SETTING
 from warpshadow.tuning import tune
+
+_IN_SCENES = {
+    **dict.fromkeys(METHODS_OF_SETTING, "Scene(…, visibility=Visibility(…))"),
+    "samples": "Scene(…, visibility=Visibility('ray-traced', samples=…))",
+    "method": "Scene(…, visibility=Visibility(method))",
+    "bounces": "Scene(…, bounces=…)",
+}
+"""Remedies for keywords that a scene has."""
 
 
 class Renderer(renderer.SceneRenderer):
@@ -24,7 +33,11 @@ class Renderer(renderer.SceneRenderer):
         cameras, device, basis, progress: As there.
     """
 
-    @check.keywords(camera="cameras=[camera], or Scene(…, camera=…)", size="Scene(…, camera=Camera.framing(…, size=…))")
+    @check.keywords(
+        camera="cameras=[camera], or Scene(…, camera=…)",
+        size="Scene(…, camera=Camera.framing(…, size=…))",
+        **_IN_SCENES,
+    )
     def __init__(
         self,
         scene: Scene,
@@ -34,15 +47,14 @@ class Renderer(renderer.SceneRenderer):
         basis: Basis | None = None,
         progress: bool = True,
     ):
-        check.instance("scene", scene, Scene, SCENE_TYPES)
+        check_scene(scene)
         check_basis(basis)
         scene = tune.resolved(scene, device=check.device("device", device), progress=progress)
         super().__init__(scene, cameras=cameras, device=device, basis=basis, progress=progress)
 
 
 @check.keywords(
-    bounces="Scene(…, bounces=…)",
-    method="Scene(…, visibility=Visibility(method))",
+    **_IN_SCENES,
     **dict.fromkeys(("camera", "size"), "Scene(…, camera=Camera.framing(bodies, size=…))"),
     light="Renderer(scene).render(light)",
 )
@@ -58,12 +70,12 @@ def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = True
 
     By "directional" flat bodies, such as grounds, are shaded by pixel unless they say otherwise, so that shadows have
     smooth edges there; under a sun so are all, and their pixels find by rays where they lie in their own body's shadow.
-    A renderer that is kept has vertices, which take less time, where faces are small: its own :meth:`Renderer.render`
+    A renderer has vertices, which take less time, where faces are small: its own :meth:`Renderer.render`
     is the image to compare with its others. With ``Body(…, receivers="pixel")`` and ``Visibility(self_shadows="rays")``
     both are the same.
 
     Returns:
         Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4]; the background is 0.
     """
-    check.instance("scene", scene, Scene, SCENE_TYPES)
+    check_scene(scene)
     return Renderer(for_picture(scene), device=device, progress=progress).render()

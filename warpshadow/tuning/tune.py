@@ -7,6 +7,7 @@ Errors are measured in shading at points that the camera sees, against rays thro
 
 import contextlib
 import itertools
+import math
 import os
 import sys
 import warnings
@@ -23,7 +24,7 @@ from warpshadow.device.progress import progress_bar
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.scene import toml_tables
 from warpshadow.scene.blockers import fitted_counts, fitted_meshes
-from warpshadow.scene.scene import SCENE_TYPES, Bounces, Scene, change_bodies, check_bounces
+from warpshadow.scene.scene import Bounces, Scene, change_bodies, check_bounces, check_scene
 from warpshadow.scene.visibility import AUTO, METHOD_TRAITS, SPHERE_METHODS, Visibility
 from warpshadow.spheres import Spheres, fit_spheres, is_fitted
 from warpshadow.stages.visibility.zonal_logs import LOGS
@@ -54,7 +55,7 @@ class Trial(NamedTuple):
     error: float
     """‖B − B_mesh‖ / ‖B_mesh‖ over points that the camera sees, B the shading."""
     milliseconds: float
-    """Time of an image."""
+    """Time of an image; Inf where it is not measured, since the error is too large anyway."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,11 +105,13 @@ class Tuning:
         )
         sample_text *= not any(trial.scene.bounces for trial in self.trials)
         mark = "chosen" if self.is_reached else "nearest"
+        is_all_timed = all(math.isfinite(trial.milliseconds) for trial in self.trials)
+        untimed_text = "" if is_all_timed else "    – not timed: less accurate than is asked for"
         return (
             "error: of the shading at points of the image, relative, against rays\n"
             f"image: time of a warm one of {camera.width} × {camera.height}, {samples} × {samples} samples a pixel, "
             f"after all bodies have moved{sample_text}\n"
-            f"{self.table()}\n* no other is both faster and more accurate    > {mark}"
+            f"{self.table()}\n* no other is both faster and more accurate    > {mark}{untimed_text}"
         )
 
     def table(self) -> str:
@@ -118,7 +121,8 @@ class Tuning:
         lines = [f"  {_HEAD}{'error':>8}{'image':>12}"]
         for number, (scene, error, milliseconds) in enumerate(self.trials):
             mark = (">" if scene is self.scene else " ") + ("*" if number in front else " ")
-            lines.append(f"{mark}{_columns(scene, fitted)}{error:8.2%}{milliseconds:9.2f} ms")
+            time_text = f"{milliseconds:9.2f} ms" if math.isfinite(milliseconds) else f"{'–':>12}"
+            lines.append(f"{mark}{_columns(scene, fitted)}{error:8.2%}{time_text}")
         return "\n".join(lines)
 
     def toml(self) -> str:
@@ -214,13 +218,14 @@ def tune(
             number is, and others where fits are cached already.
         progress: Show progress, and all errors before anything is timed.
     Returns:
-        The choice, and all trials. If no setting reaches the target, it is the nearest.
+        The choice, and all trials. If no setting reaches the target, it is the nearest. Settings that miss an error are
+        not timed.
     Raises:
         ValueError: where the camera sees nothing.
     Warns:
         Where the machine is busy already: its load average is above its number of cores.
     """
-    check.instance("scene", scene, Scene, SCENE_TYPES)
+    check_scene(scene)
     device = check.device("device", device)
     arguments = {"error": error, "milliseconds": milliseconds}
     requested = next((value for value in arguments.values() if value is not None), None)
@@ -253,10 +258,18 @@ def tune(
                 bar.update()
         if progress:  # timing takes as long again, and may be interrupted
             print(_error_table(settings, errors, fitted_counts(scene)), file=sys.stderr)
-        times = image_times(settings, device=device, progress=progress)
+        limit = max(error, _nearest_limit(errors)) if error is not None else math.inf
+        timed_numbers = [number for number, item in enumerate(errors) if item <= limit]
+        timed_settings = [settings[number] for number in timed_numbers]
+        times = image_times(timed_settings, device=device, progress=progress)
         if not any(item.bounces for item in scenes_with_bounces):
-            _time_front(settings, errors, times, device=device, progress=progress)
-    trials = sorted(map(Trial, settings, errors, times), key=lambda trial: trial.milliseconds)
+            timed_errors = [errors[number] for number in timed_numbers]
+            _time_front(timed_settings, timed_errors, times, device=device, progress=progress)
+    milliseconds_of = dict(zip(timed_numbers, times, strict=True))
+    trials = [
+        Trial(*pair, milliseconds_of.get(k, math.inf)) for k, pair in enumerate(zip(settings, errors, strict=True))
+    ]
+    trials.sort(key=lambda trial: (trial.milliseconds, trial.error))
     if milliseconds is None:
         accurate_trials = [trial for trial in trials if trial.error <= requested]
         chosen = _cheapest(accurate_trials) if accurate_trials else _nearest(trials)
@@ -299,9 +312,14 @@ def _cheapest(trials: Sequence[Trial]) -> Trial:
 
 def _nearest(trials: Sequence[Trial]) -> Trial:
     """The most accurate trial, or the fastest of trials that are about as accurate."""
-    minimum = min(trial.error for trial in trials)
-    maximum = minimum + max(EQUAL_TIME_SHARE * minimum, ERROR_STEP)
+    maximum = _nearest_limit([trial.error for trial in trials])
     return min((trial for trial in trials if trial.error <= maximum), key=lambda trial: trial.milliseconds)
+
+
+def _nearest_limit(errors: Sequence[float]) -> float:
+    """Error up to which trials are about as accurate as the best."""
+    minimum = min(errors)
+    return minimum + max(EQUAL_TIME_SHARE * minimum, ERROR_STEP)
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:

@@ -1,4 +1,4 @@
-"""Time of a video, before it is rendered: with a renderer that is kept, and so set up first, or as stills."""
+"""Time of a video, before it is rendered: with a renderer, which is set up first, or as stills."""
 
 from __future__ import annotations
 

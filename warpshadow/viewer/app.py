@@ -39,8 +39,7 @@ class ViewerApp:
 
     Args:
         scene: The scene; "auto" is replaced by a choice.
-        host: Address to serve at; others than this machine's own let everybody in who can reach it.
-        port: Port, or the next that is free.
+        host, port: As of a :class:`.Server`.
         path: The scene's file, which is saved with the changes in it; None where it has none.
     Attributes:
         painter: Paints pictures.

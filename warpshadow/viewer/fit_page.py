@@ -24,8 +24,7 @@ class FitPage:
     """A page that shows a fit, until it is closed; all browsers share it.
 
     Args:
-        host: Address to serve at; others than this machine's own let everybody in who can reach it.
-        port: Port, or the next that is free.
+        host, port: As of a :class:`.Server`.
     Attributes:
         url: Where it is.
     """

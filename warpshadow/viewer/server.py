@@ -126,5 +126,5 @@ def check_address(host: object, port: object) -> None:
         raise ValueError(f"host: got {host!r} ({cause}), expected {expected}") from cause
     if host not in OWN_NAMES:
         check.warn(
-            f"host: got {host!r}: everybody who can reach this address sees the scene and can change what is shown"
+            f"host: got {host!r}: everybody who can reach this address sees the scene and can change the picture"
         )

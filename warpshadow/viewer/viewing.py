@@ -13,7 +13,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.progress import in_ipython
-from warpshadow.scene.scene import SCENE_TYPES, Scene
+from warpshadow.scene.scene import Scene, check_scene
 
 HOST, PORT = "127.0.0.1", 8080  # where pages are by default: for this machine alone
 
@@ -111,7 +111,7 @@ def view(
     Raises:
         ImportError: without viser.
     """
-    check.instance("scene", scene, Scene, SCENE_TYPES)
+    check_scene(scene)
     viewer = serve(scene, host=host, port=port, device=device, progress=progress)
     viewer.open(browser)
     return viewer

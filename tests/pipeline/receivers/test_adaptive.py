@@ -91,7 +91,7 @@ def test_several_cameras_and_poses_are_as_alone():
 def _groups(renderer: SceneRenderer) -> list:
     view = renderer.view()
     blockers = renderer._method.blockers(view.blocker_kinds, view.vertices.value(), view.spheres.value())
-    return find_groups(view, view.receivers, blockers, {}, None, None)
+    return find_groups(view.static_bodies, view.nearest_spheres, view.receivers, blockers, {}, None, None)
 
 
 def test_where_shadows_are_kept_at_vertices_they_stay_there():

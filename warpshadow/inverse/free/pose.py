@@ -16,6 +16,7 @@ from warpshadow.inverse import constraints
 from warpshadow.inverse.constraints import PoseConstraint
 from warpshadow.inverse.free.base import PRIOR, FreeOfBody, Values
 from warpshadow.inverse.world import FittedScene, Setting, World
+from warpshadow.scene.body import Body
 from warpshadow.scene.scene import BodyLike, Scene
 from warpshadow.torch import rotation_matrices
 
@@ -25,7 +26,7 @@ _TURNS = np.array(
 )
 
 
-_SEEN_TURN = 0.05  # degrees that a warning names
+_MAX_TILT = 1.0  # degrees from the nearest stable support up to which a body stands as the scene has it
 
 
 @dataclass(frozen=True)
@@ -39,8 +40,9 @@ class Pose(FreeOfBody):
         spread: Angle by which candidates are turned [radians]: about each axis, either way, then about the eight
             directions between, then about any; a pose with one axis about that, farther and farther.
         stands_on: A flat body, its number or name, that the body touches from above; three degrees of freedom stay.
-        resting: How it stands: "stable", turned onto the support of its convex hull that needs the least turn; "given",
-            as the scene has it; "free", any way, so that five degrees of freedom stay. Its height always follows.
+        resting: How it stands: "stable", turned onto the support of its convex hull that needs the least turn, if by
+            more than 1°; "given", as the scene has it; "free", any way, so that five degrees of freedom stay. Its
+            height always follows.
         upright: Whether it turns about the world's y alone.
         axis: Direction about which alone it turns, shape [3].
         fixed: Coordinates of its middle that stay: "x", "y", "z". Beside ``stands_on`` the others must be able to move
@@ -138,22 +140,10 @@ class Pose(FreeOfBody):
         if self.resting != "free":
             turns = plane.normal[None]
         if self.resting == "stable":
-            rotation = constraints.stable_rotation(body.mesh, rotation, plane.normal)
-            self._warn_of_turn(rotation @ body.rotation_matrix().T, body.called)
+            rotation = _stable_rotation(body, plane)
         shifts = constraints.remaining([plane.normal, *fixed_axes])
         onto = constraints.onto_plane(plane.normal, self.fixed)
         return PoseConstraint(turns, shifts, rotation, plane, onto, constraints.hull_points(body.mesh))
-
-    def _warn_of_turn(self, turn: np.ndarray, name: str) -> None:
-        """Say that a body is turned onto its stable support, and how it is kept from that."""
-        from scipy.spatial.transform import Rotation
-
-        angle = np.degrees(Rotation.from_matrix(turn).magnitude())
-        if angle > _SEEN_TURN:
-            check.warn(
-                f"{name}: its stable support differs from the scene's pose by {angle:.2g}°, by which it is turned; "
-                'resting = "given" keeps it'
-            )
 
     def start(self, setting: Setting) -> Values:
         """Pose of the body."""
@@ -244,3 +234,19 @@ def _rotation_vector(matrix: torch.Tensor) -> torch.Tensor:
     length = (sine.square().sum() + 1e-20).sqrt()
     angle = torch.atan2(length, (matrix.trace() - 1) / 2)
     return sine * (angle / length)
+
+
+def _stable_rotation(body: Body, plane: constraints.PlaneConstraint) -> np.ndarray:
+    """The rotation in which a body rests on a plane: its own if that nearly is one, else a warning says the turn."""
+    from scipy.spatial.transform import Rotation
+
+    start = body.rotation_matrix()
+    rotation = constraints.stable_rotation(body.mesh, start, plane.normal)
+    angle = np.degrees(Rotation.from_matrix(rotation @ start.T).magnitude())
+    if angle <= _MAX_TILT:
+        return start
+    check.warn(
+        f"{body.name}: its stable support differs from the scene's pose by {angle:.2g}°, by which it is turned; "
+        'resting = "given" keeps it'
+    )
+    return rotation

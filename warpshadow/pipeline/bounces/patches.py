@@ -14,6 +14,7 @@ from warpshadow.maths.plane import plane_normal
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Node
 from warpshadow.pipeline.planes import ScenePlanes
+from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.albedo import mean_over_texels, mean_over_vertices
 from warpshadow.stages.bounces.patches import MAX_PATCHES, SAMPLES_PER_PATCH, Patches, find_patches, find_plane_patches
@@ -229,3 +230,13 @@ class Senders:
 
 def _joined(parts: list[np.ndarray], dtype: type) -> np.ndarray:
     return np.concatenate(parts).astype(dtype) if parts else np.empty(0, dtype)
+
+
+def lit_patch_samples(
+    patch_samples: Node, points: LitPoints, materials: Materials, nearest_spheres: np.ndarray | None = None
+) -> LitPoints:
+    """Make lit points of patch samples, among the same bodies as other points."""
+    arguments = points.merged_scene, materials, points.vertices, points.spheres, patch_samples, points.call
+    return LitPoints(
+        *arguments, normals=points.normals, blocker_kinds=points.blocker_kinds, nearest_spheres=nearest_spheres
+    )

@@ -82,6 +82,7 @@ def path_traced(
             wp.copy(bounced[instance], light)
         return total_light([shading, bounced])
 
+    words = points.in_words
     return Node(
         "bounces",
         trace,
@@ -94,7 +95,7 @@ def path_traced(
         materials.vertex_albedo,
         colors.pyramids if colors.images else None,
         materials.of_vertices("emission") if materials.emission else None,
-        items=lambda: f"{receiver_text(points)} × {paths:,} paths of {maximum} bounces",
+        items=lambda: f"{receiver_text(words)} × {paths:,} paths of {maximum} bounces",
         has_adjoint=False,
     )
 

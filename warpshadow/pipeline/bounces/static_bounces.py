@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
+from warpshadow.pipeline.bounces.patches import ScenePatches, Senders, lit_patch_samples
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
@@ -196,7 +196,8 @@ class StaticBounces:
         return multiply(factors.to_cache_points, after_bounces(*arguments, self_bounces=SELF_BOUNCES))
 
     def _item_text(self, points: LitPoints, senders: Senders) -> Callable[[], str]:
-        return lambda: f"{receiver_text(points)}, {len(senders.areas):,} patches, {self._bounces} bounces"
+        words = points.in_words
+        return lambda: f"{receiver_text(words)}, {len(senders.areas):,} patches, {self._bounces} bounces"
 
     def _factors(self, points: LitPoints, materials: Materials, senders: Senders) -> Node:
         def find(
@@ -268,9 +269,11 @@ class StaticBounces:
 
         def make() -> Node:
             patch_samples = self.patch_samples(points, materials)
-            arguments = points.merged_scene, materials, points.vertices, points.spheres, patch_samples, points.call
-            at_patch_samples = LitPoints(*arguments, normals=points.normals, blocker_kinds=points.blocker_kinds)
-            skies = [self._openness(item) for item in (at_patch_samples, points)]
+            arguments = patch_samples, points, materials
+            lit_samples = points.cached(
+                "patch samples under the sky", patch_samples, lambda: lit_patch_samples(*arguments)
+            )
+            skies = [self._openness(item) for item in (lit_samples, points)]
             return Node(
                 "form factors",
                 find,

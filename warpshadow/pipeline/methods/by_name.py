@@ -25,7 +25,7 @@ def make_method(merged_scene: MergedScene, basis: Basis | None, *, progress: boo
     module = importlib.import_module(f"{__package__}.{name.replace('-', '_')}")
     method = module.METHOD(merged_scene, basis, progress=progress)
     if scene.bounces and name in SPHERE_METHODS:
-        from warpshadow.pipeline.bounces.by_spheres import SphereBounces
+        from warpshadow.pipeline.bounces.sphere_bounces import SphereBounces
 
         method.bounces = SphereBounces(method)
     return method  # type: ignore[no-any-return]

@@ -15,13 +15,13 @@ from warpshadow.device.constants import constant
 from warpshadow.device.memory import empty
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
-from warpshadow.pipeline.by_spheres import PortionedShading, SphereMethod
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.pipeline.receivers.groups import CellCoverages, Group, GroupVisibility
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.self_visibility import SelfVisibilityLookup
+from warpshadow.pipeline.sphere_method import PortionedShading, SphereMethod
 from warpshadow.pipeline.transfers import LARGEST_COEFFICIENT, change_basis, joined
 from warpshadow.scene.blockers import blocking_planes
 from warpshadow.stages.cached_cells import CachedRows, cell_transfer, shade_cached_cells
@@ -355,7 +355,7 @@ class Directional(SphereMethod):
     def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input) -> Node:
         """Transmittance towards the samples of lobes, between cells; of known light, to where it comes from in them."""
         cells, projected_light = self._lobe_cells(points, light)
-        item_text = functools.partial(receiver_text, points)
+        item_text = functools.partial(receiver_text, points.in_words)
         arguments = cells, points.receivers_node, directions, projected_light
         return Node("transmittance of lobes", _towards, *arguments, items=item_text)
 

@@ -143,7 +143,7 @@ class Rays(Method):
 
     def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input) -> Node:
         """Transmittance towards the samples of lobes: rays, each of its own."""
-        item_text = functools.partial(receiver_text, points)
+        item_text = functools.partial(receiver_text, points.in_words)
         return Node(
             "transmittance of lobes",
             _trace_lobes,
@@ -168,12 +168,13 @@ class Rays(Method):
 
     def transfers(self, points: LitPoints) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""
+        words = points.in_words
         node = Node(
             "transfer",
             self._transfer,
             self._meshes(points),
             points.receivers_node,
-            items=lambda: f"{receiver_text(points)} × {self.basis.size} coefficients",
+            items=lambda: f"{receiver_text(words)} × {self.basis.size} coefficients",
         )
         if node.requires_grad:
             node.function = _refuse
@@ -187,7 +188,7 @@ class Rays(Method):
             meshes,
             points.receivers_node,
             light,
-            items=lambda: receiver_text(points),
+            items=functools.partial(receiver_text, points.in_words),
             stages=(NodeStage("transfer", idle="rays shade known light at once"),),
         )
 
@@ -199,7 +200,7 @@ class Rays(Method):
 
     def _trees_around(self, points: LitPoints, name: str = "") -> Node:
         """Node of the trees of all vertices around points."""
-        items = functools.partial(receiver_text, points)
+        items = functools.partial(receiver_text, points.in_words)
         return points.cached("trees", points.vertices, lambda: Node(name, self._trees, points.vertices, items=items))
 
     def _trees(self, positions: wp.array) -> list[FaceTree]:
@@ -210,12 +211,13 @@ class Rays(Method):
 
     def _meshes(self, points: LitPoints) -> Node:
         """Node of the meshes that rays meet."""
+        words = points.in_words
         return Node(
             "visibility",
             self._casting_meshes,
             points.vertices,
             detached(points.receivers_node),
-            items=lambda: f"{receiver_text(points)} by rays",
+            items=lambda: f"{receiver_text(words)} by rays",
             idle="" if self.merged_scene.casting else "no body has blockers",
             caches=False,
             stages=(NodeStage("static shadows", idle="rays treat all receivers alike"),),

@@ -1,1 +1,1 @@
-"""Receivers: where light is evaluated, which of them go together, and what is cached of those that do not move."""
+"""Receivers: where light is evaluated, which of them go together, and results that are cached for static ones."""

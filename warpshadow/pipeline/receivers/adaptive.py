@@ -32,7 +32,7 @@ def find_squares(
     """Find the squares of images in which the samples of some bodies interpolate.
 
     Args:
-        place_blockers: Places what blocks light, given the vertices, and the spheres.
+        place_blockers: Places blockers, given the vertices, and the spheres.
         sharp_share: Finds the share of the unblocked light of a group that comes from the cells with the sharpest
             shadows, shape [batch, receiver]; None where no shadow is sharp.
         positions, normals: Of the vertices, vec3 of shape [batch, vertex]; no gradient passes.

@@ -59,7 +59,7 @@ and cylinders of 100 pixels each the worst one was 33% too dark at vertices, and
 UNEVEN = 0.06
 """Error of light that is interpolated between vertices, relative L2, from which a body is shaded by pixel.
 
-Images of scenes of demos/kinds.py, kept, 128², direct light, at vertices and by pixel, and CPU time of a moved one:
+Renderers' images of demos/kinds.py, 128², direct light, at vertices and by pixel, and CPU time of a moved one:
 
     body, and its error foretold       at vertices       by pixel
     stone in the pile, 25%             2.9%, 127 ms      1.8%, 146 ms
@@ -154,11 +154,11 @@ def with_receivers(scene: Scene, choices: Sequence[ReceiverChoice]) -> Scene:
 
 
 def for_picture(scene: Scene) -> Scene:
-    """The scene, for a picture that is made once: by rays, where it names neither a method nor what these replace.
+    """The scene, for a still: by rays, where it names neither a method nor settings that rays leave unused.
 
     All receivers share their directions, as many as ``samples`` says, 512 by default: of 24 scenes of demos/kinds.py
     (128², direct light) such pictures have a mean error of 1.5%, at worst 2.6%. They need no spheres and no tables,
-    whose making a picture would wait for, and the picture does not depend on what the cache holds. Bodies with spheres
+    whose making a picture would wait for, and the picture does not depend on the cache. Bodies with spheres
     or ``self_shadows`` of their own name "directional", which has them.
 
     By other methods flat bodies that leave their receivers open are shaded by pixel, unless spheres bulge out of them.

@@ -14,7 +14,8 @@ from warpshadow.device.launch import varies
 from warpshadow.pipeline.convex import GroupConvexParts, SceneConvexParts
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.planes import GroupPlanes, ScenePlanes
-from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints
+from warpshadow.pipeline.receivers.lit_points import BlockerKinds
+from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.self_visibility import SelfVisibility, SelfVisibilityLobes, SelfVisibilityLookup
 from warpshadow.stages.cached_cells import CachedRows
 from warpshadow.stages.convex.prepared import PlacedParts
@@ -182,7 +183,8 @@ def _blocking(
 
 
 def find_groups(
-    points: LitPoints,
+    static_bodies: StaticBodies | None,
+    nearest_spheres: np.ndarray | None,
     receivers: Receivers,
     blockers: Blockers,
     self_lookups: dict[int, Any] | None,
@@ -192,15 +194,14 @@ def find_groups(
     """Put receivers into groups.
 
     Args:
-        points: Of which they are the receivers.
+        static_bodies, nearest_spheres: As of the :class:`LitPoints` that they are.
         receivers: All of them.
         blockers: Their surroundings.
         self_lookups: Self-visibility of receivers, by body; None without any.
         cached_rows: Cached transmittance past static bodies, for receivers on them.
         static_normals: Normals of all vertices of static bodies; None where any may move.
     """
-    groups = list(_groups_that_move(receivers, blockers, self_lookups or {}, points.nearest_spheres))
-    static_bodies = points.static_bodies
+    groups = list(_groups_that_move(receivers, blockers, self_lookups or {}, nearest_spheres))
     if static_bodies is None or not len(receivers.on_static):
         return groups
     assert static_normals is not None

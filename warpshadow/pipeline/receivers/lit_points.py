@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import weakref
 from collections.abc import Callable, Hashable
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -96,6 +97,14 @@ class LitPoints:
             for name, (key, value) in self._cached.items()
         }
         return points
+
+    @property
+    def in_words(self: Points) -> Points:
+        """The points for functions that put a node of theirs into words.
+
+        These must not hold the points, which hold the node: arrays would stay until Python collects garbage.
+        """
+        return weakref.proxy(self)
 
     @property
     def receivers(self) -> Receivers:

@@ -1,14 +1,11 @@
-"""Overlays: flat bodies right before other bodies, as a cloth on a table, whose light these send in place of their own.
-
-Spheres and convex parts block a cell before flat bodies do: receivers before a cloth see, in cells that the table
-blocks, the covered patches of the table, which are dark. So such a patch p sends the mean radiosity of the texels
-before it, as long as it is near them:
+"""Overlays: planes right before other bodies, as a cloth on a table, whose light these send in place of their own.
 
     B′_p = B_p + c_p (Σ_t k_pt B_t − B_p),  c_p = S(3 − 2 |x_p − Σ_t k_pt x_t| / d_p)
 
-x_p is the center of its proxy, and d_p, at least its radius, its distance from these texels in the scene as given;
-S is the smoothstep from 0 at −1 to 1 at 1. Without it, pieces on a board of chess, a plane over a slab, lost 5 to 10%
-of their light.
+of a patch p that is covered by texels t of a plane with weights k: x_p is the center of its proxy, and d_p, at least
+its radius, its distance from these texels in the scene as given; S is the smoothstep from 0 at −1 to 1 at 1. So it
+sends their mean radiosity as long as it is near them. Otherwise receivers before a cloth would see the dark patches
+that it covers: spheres and convex parts block a cell before planes do.
 """
 
 import numpy as np

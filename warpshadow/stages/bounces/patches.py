@@ -1,8 +1,12 @@
-"""Patches: parts of a body's surface that send light as one, and the points at which they are lit.
+"""Patches: the parts of a body's surface that send light as one, and the patch samples at which they are lit.
 
-Most bodies are cut into pieces of about one size, and k-means of position and normal makes patches of them. A body that
-lies in a plane has a grid instead, finer near the other bodies, whose shadows it shows. All is found once, in the
-body's own frame and at rest; patches move with the body.
+Faces are cut at their longest edges into pieces of about one size, and patches are clusters of pieces by position and
+normal (k-means): 256 at most, of 8 pieces or more. A body that lies in a plane has a grid of texels instead, which are
+small near the other bodies, whose shadows it shows (:mod:`warpshadow.stages.planes.grid`). A patch has up to four patch
+samples, with weights by area. Pieces inside another part of the body belong to no patch.
+
+All is found once, in the body's own frame and at rest; patches move with the body. The patches of an open surface's
+backs follow those of its fronts.
 """
 
 from __future__ import annotations
@@ -80,7 +84,7 @@ class Patches:
         centers: Mean position, float32 of shape [patch, 3].
         normals: Mean normal, of unit length, float32 of shape [patch, 3].
         spreads: Largest angle of its surface to the mean normal [radians], float32 of shape [patch].
-        sagittas: How far its surface lies below the plane of its center and normal, at most, float32 of shape [patch].
+        sagittas: How far its surface lies below its tangent plane, at most, float32 of shape [patch].
         patch_samples: Where they are lit.
         pieces: Their pieces.
         patch_of_pieces: Patch of each piece's front and back, int32 of shape [2, piece]; −1 for sides that send

@@ -1,37 +1,37 @@
-"""Plane hits: the sides of planes that a cell of a receiver meets, and how they hide each other.
+"""Plane hits: the sides of planes that a cell of a receiver meets, how they hide each other, and their radiosity.
 
-Of each side k its coverage h_k is known, the centroid y_k = μ_k / h_k of what it covers, in radii ρ from the middle of
-the cell, and the inverse of its distance along a direction ω, which is g_k·ω, g_k = N_k / d_k. Sides are taken to
-cover parts of a cell that do not depend on each other. So k and j share a part around ω + ρ (y_k + y_j). In a share
+Of side k the cell's coverage h_k is known (:mod:`warpshadow.stages.cell_coverage`), the centroid y_k = μ_k / h_k of the
+covered part, in radii ρ from the middle of the cell, and the vector g_k = N_k / d_k, by which the side is 1 / (g_k·ω)
+away along a direction ω. Of the part that k and j share, which is taken to be around ω + ρ (y_k + y_j), side j is in
+front in a share
 
     S_kj = S((g_j − g_k)·(ω + ρ (y_k + y_j)) / ρ √(h_k h_j (|P(g_j − g_k)|² + 10⁻⁶ (|g_k|² + |g_j|²))))
 
-of it j is in front, where P projects to the plane that touches the sphere of directions and S is the smoothstep from 0
-at −1 to 1 at 1: it cuts a disc as large as the shared part by the line in which both planes meet. Nearer sides leave
-open, and block with a moment,
+where P projects to the plane that touches the sphere of directions and S is the smoothstep from 0 at −1 to 1 at 1: it
+cuts a disc as large as the shared part by the line in which both sides meet. Nearer sides leave open, and block with a
+moment,
 
     o_k = 1 − Σ_j S_kj h_j,  m_k = Σ_j S_kj μ_j
 
-So of a side the share h_k o_k is seen, and its centroid is that of what others leave open,
+So of a side the share h_k o_k is seen, around ω + ρ z_k, away from all that blocks it, over a footprint √o as wide:
 
-    z_k = −m_k / √(o_k² + |m_k|²)
+    z_k = −m / √(o² + |m|²),  o = o_k (1 − h₀),  m = m_k + μ₀
 
-away from where it is without them; the root holds it in the cell. Its radiosity is looked up along ω + ρ z_k, over a
-footprint √o_k as wide.
+There its radiosity is looked up; the root holds it in the cell. The coverage (h₀, μ₀) is that by convex parts before
+all planes (:mod:`warpshadow.stages.convex.coverage`), which the transmittance takes off.
 
-A mean over all of a side in a cell has parts that nearer ones hide. Behind the front wall of a garage, which is open up
-to one half of its height, lies ground in the sun. With sides looked up along ω and ordered by their distances there,
-light of planes on receivers in the garage was 6.5% off (relative L2) and 4.5% too strong, and by this 2.6% and 1.4%; by
-S alone 3.5%.
+A mean over all of a side in a cell has parts that nearer ones hide, as the sunlit ground behind a garage's front wall:
+in a garage light of planes was 6.5% off by sides ordered by distance, 2.6% by this, and 3.5% by S alone. Without h₀
+the light of the ground on the roof of a barn, with the sun outside, was 1.4 to 1.6 times too strong.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-from warpshadow.stages.cell_coverage import ViewedEdge, coverage_adjoint
+from warpshadow.device.parallel import Scratch
+from warpshadow.stages.cell_coverage import coverage_adjoint
 from warpshadow.stages.planes.cells import (
-    LocalReceiver,
     PlaneArrays,
     fetch,
     fetch_adjoint,
@@ -40,16 +40,15 @@ from warpshadow.stages.planes.cells import (
     scatter,
     smoothstep_slope,
 )
-from warpshadow.stages.planes.prepared import PlaneGrid
+from warpshadow.stages.planes.prepared import PlaneBlockers
 from warpshadow.stages.planes.sides import (
-    SIDE_ROWS,
+    PlaneReceiver,
     PlaneSide,
     VisibleCell,
     footprint_on_side,
     footprint_on_side_adjoint,
     inverse_distance_on_side,
     inverse_distance_on_side_adjoint,
-    load_local_receiver,
     load_side,
     outline_coverage_on_side,
 )
@@ -58,10 +57,6 @@ _MIN_WEIGHT_SUM = wp.constant(1.0e-30)  # the least Σ h o
 _MIN_OPEN = wp.constant(1.0e-4)  # the least o: of more than two sides each may hide another
 _TIE = wp.constant(1.0e-6)  # planes whose distances differ by some thousandth of them are neither before the other
 _MIN_WIDTH = wp.constant(1.0e-30)  # least denominator of S's argument
-
-
-HIT_ROWS = SIDE_ROWS + 10
-"""Rows of scratch for each plane: `SIDE_ROWS`, and five for the hit of a cell on each of two sides."""
 
 
 @wp.struct
@@ -77,80 +72,44 @@ class PlaneHit:
     blocked_moment: wp.vec3  # m
 
 
-@wp.func
-def load_hit(store: wp.array(dtype=wp.vec3), first_hit: int, side_index: int):
-    """Load the hit on side ``side_index``; without coverage, all else in it is old. ``first_hit`` is side 0's row."""
-    row = first_hit + 5 * side_index
-    hit = PlaneHit()
-    hit.coverage = store[row][0]
-    hit.mesh_share = store[row][1]
-    hit.open_share = store[row][2]
-    hit.radiosity = store[row + 1]
-    hit.centroid = store[row + 2]
-    hit.inverse_distance = store[row + 3]
-    hit.blocked_moment = store[row + 4]
-    return hit
+def hit_scratch(planes: PlaneBlockers) -> Scratch:
+    """Scratch memory of a receiver: the hit of a cell on each side."""
+    return Scratch((2 * planes.count,), PlaneHit)
 
 
 @wp.func
-def clear_hit(store: wp.array(dtype=wp.vec3), first_hit: int, side_index: int):
-    """Take its coverage away."""
-    store[first_hit + 5 * side_index] = wp.vec3()
+def is_hit(hits: wp.array(dtype=PlaneHit), i: int):
+    """Whether side i covers a part of the cell; if not, all else in its hit is old."""
+    return hits[i].coverage > 0.0
 
 
 @wp.func
-def is_hit(store: wp.array(dtype=wp.vec3), first_hit: int, side_index: int):
-    """Whether side ``side_index`` covers a part of the cell."""
-    return store[first_hit + 5 * side_index][0] > 0.0
-
-
-@wp.func
-def store_hit(store: wp.array(dtype=wp.vec3), first_hit: int, side_index: int, hit: PlaneHit):
-    """Overwrite it."""
-    row = first_hit + 5 * side_index
-    store[row] = wp.vec3(hit.coverage, hit.mesh_share, hit.open_share)
-    store[row + 1] = hit.radiosity
-    store[row + 2] = hit.centroid
-    store[row + 3] = hit.inverse_distance
-    store[row + 4] = hit.blocked_moment
-
-
-@wp.func
-def _add_to_open_part(
-    store: wp.array(dtype=wp.vec3), first_hit: int, side_index: int, open_share: float, blocked_moment: wp.vec3
-):
+def _add_to_open_part(hits: wp.array(dtype=PlaneHit), i: int, open_share: float, blocked_moment: wp.vec3):
     """Add to the open share and the blocked moment of a hit; or of its adjoint."""
-    row = first_hit + 5 * side_index
-    store[row] = store[row] + wp.vec3(0.0, 0.0, open_share)
-    store[row + 4] = store[row + 4] + blocked_moment
+    hits[i].open_share = hits[i].open_share + open_share
+    hits[i].blocked_moment = hits[i].blocked_moment + blocked_moment
 
 
 @wp.func
 def _add_to_hit(
-    adj_store: wp.array(dtype=wp.vec3),
-    first_hit: int,
-    side_index: int,
-    coverage: float,
-    centroid: wp.vec3,
-    inverse_distance: wp.vec3,
+    adj_hits: wp.array(dtype=PlaneHit), i: int, coverage: float, centroid: wp.vec3, inverse_distance: wp.vec3
 ):
     """Add to the adjoint of a hit."""
-    row = first_hit + 5 * side_index
-    adj_store[row] = adj_store[row] + wp.vec3(coverage, 0.0, 0.0)
-    adj_store[row + 2] = adj_store[row + 2] + centroid
-    adj_store[row + 3] = adj_store[row + 3] + inverse_distance
+    adj_hits[i].coverage = adj_hits[i].coverage + coverage
+    adj_hits[i].centroid = adj_hits[i].centroid + centroid
+    adj_hits[i].inverse_distance = adj_hits[i].inverse_distance + inverse_distance
 
 
 @wp.func
-def first_level_of_side(grid: PlaneGrid, is_back: bool):
+def _first_level(side: PlaneSide):
     """First mip level of a side. A one-sided plane reuses its front levels for occupancy."""
-    return grid.first_level + wp.where(is_back and grid.sides == 2, grid.level_count, 0)
+    return side.grid.first_level + wp.where(side.is_back and side.grid.sides == 2, side.grid.level_count, 0)
 
 
 @wp.func
-def _is_sender(grid: PlaneGrid, side: PlaneSide):
+def _is_sender(side: PlaneSide):
     """Whether a side has patches."""
-    return grid.sides == 2 or not side.is_back
+    return side.grid.sides == 2 or not side.is_back
 
 
 @wp.struct
@@ -185,28 +144,23 @@ def _find_overlap(cell: VisibleCell, hit: PlaneHit, other: PlaneHit):
 
 
 @wp.func
-def _block_each_other(cell: VisibleCell, k: int, j: int, first_hit: int, store: wp.array(dtype=wp.vec3)):
+def _block_each_other(cell: VisibleCell, k: int, j: int, hits: wp.array(dtype=PlaneHit)):
     """Take from each of two hits what the other blocks of it."""
-    hit, other = load_hit(store, first_hit, k), load_hit(store, first_hit, j)
+    hit, other = hits[k], hits[j]
     share_in_front = wp.smoothstep(-1.0, 1.0, _find_overlap(cell, hit, other).relative)
     by_other = share_in_front * other.coverage
     by_hit = (1.0 - share_in_front) * hit.coverage
-    _add_to_open_part(store, first_hit, k, -by_other, by_other * other.centroid)
-    _add_to_open_part(store, first_hit, j, -by_hit, by_hit * hit.centroid)
+    _add_to_open_part(hits, k, -by_other, by_other * other.centroid)
+    _add_to_open_part(hits, j, -by_hit, by_hit * hit.centroid)
 
 
 @wp.func
 def _block_each_other_adjoint(
-    cell: VisibleCell,
-    k: int,
-    j: int,
-    first_hit: int,
-    store: wp.array(dtype=wp.vec3),
-    adj_store: wp.array(dtype=wp.vec3),
+    cell: VisibleCell, k: int, j: int, hits: wp.array(dtype=PlaneHit), adj_hits: wp.array(dtype=PlaneHit)
 ):
     """Add to the gradients of two hits."""
-    hit, other = load_hit(store, first_hit, k), load_hit(store, first_hit, j)
-    adj_hit, adj_other = load_hit(adj_store, first_hit, k), load_hit(adj_store, first_hit, j)
+    hit, other = hits[k], hits[j]
+    adj_hit, adj_other = adj_hits[k], adj_hits[j]
     overlap = _find_overlap(cell, hit, other)
     share_in_front = wp.smoothstep(-1.0, 1.0, overlap.relative)
     share_behind = 1.0 - share_in_front
@@ -231,16 +185,14 @@ def _block_each_other_adjoint(
         + adj_squares * overlap.difference
     )
     _add_to_hit(
-        adj_store,
-        first_hit,
+        adj_hits,
         k,
         share_behind * adj_by_hit + 0.5 * adj_log / hit.coverage,
         (share_behind * hit.coverage) * adj_other.blocked_moment + adj_shared_centroid,
         (_TIE * adj_squares) * hit.inverse_distance - adj_difference,
     )
     _add_to_hit(
-        adj_store,
-        first_hit,
+        adj_hits,
         j,
         share_in_front * adj_by_other + 0.5 * adj_log / other.coverage,
         (share_in_front * other.coverage) * adj_hit.blocked_moment + adj_shared_centroid,
@@ -249,28 +201,36 @@ def _block_each_other_adjoint(
 
 
 @wp.func
-def _unnormalized_direction(cell: VisibleCell, hit: PlaneHit):
-    """Direction ω + ρ z of what others leave open of a side, not of unit length; and the length of (o, m)."""
-    length = wp.sqrt(hit.open_share * hit.open_share + wp.length_sq(hit.blocked_moment))
-    return cell.direction - (cell.radius / length) * hit.blocked_moment, length
+def _open_part(hit: PlaneHit, before: wp.vec4):
+    """Share o of a side that neither nearer sides nor bodies before all planes block, and the moment m of these."""
+    share = wp.max(hit.open_share * (1.0 - before[0]), _MIN_OPEN)
+    return share, hit.blocked_moment + wp.vec3(before[1], before[2], before[3])
 
 
 @wp.func
-def _visible_footprint(
-    planes: PlaneArrays,
-    grid: PlaneGrid,
-    side: PlaneSide,
-    local_receiver: LocalReceiver,
-    cell: VisibleCell,
-    hit: PlaneHit,
-):
-    """Direction and footprint of what others leave open of a side."""
+def _is_wholly_open(hit: PlaneHit, before: wp.vec4):
+    return hit.open_share >= 1.0 and before[0] <= 0.0
+
+
+@wp.func
+def _unnormalized_direction(cell: VisibleCell, open_share: float, blocked_moment: wp.vec3):
+    """Direction ω + ρ z of what is open of a side, not of unit length; and the length of (o, m)."""
+    length = wp.sqrt(open_share * open_share + wp.length_sq(blocked_moment))
+    return cell.direction - (cell.radius / length) * blocked_moment, length
+
+
+@wp.func
+def _visible_footprint(planes: PlaneArrays, side: PlaneSide, cell: VisibleCell, hit: PlaneHit, before: wp.vec4):
+    """Direction and footprint of what is open of a side."""
     direction = cell.direction
-    if hit.open_share < 1.0:
-        visible_direction, _ = _unnormalized_direction(cell, hit)
+    extent = float(1.0)
+    if not _is_wholly_open(hit, before):
+        open_share, blocked_moment = _open_part(hit, before)
+        visible_direction, _ = _unnormalized_direction(cell, open_share, blocked_moment)
         direction = wp.normalize(visible_direction)
-    footprint = footprint_on_side(planes, grid, side, local_receiver, direction)
-    footprint.extent = wp.sqrt(hit.open_share)
+        extent = wp.sqrt(open_share)
+    footprint = footprint_on_side(planes, side, direction)
+    footprint.extent = extent
     return direction, footprint
 
 
@@ -280,40 +240,42 @@ def find_side_hits(
     cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
     weight: float,
-    side_count: int,
-    store: wp.array(dtype=wp.vec3),
-    edges: wp.array(dtype=ViewedEdge),
+    before: wp.vec4,
+    receiver: PlaneReceiver,
+    hits: wp.array(dtype=PlaneHit),
 ):
-    """Store which plane sides this cell hits; return how many. A share of 0 hits nothing."""
+    """Store which plane sides this cell hits, past bodies before all planes that cover (h₀, μ₀); return how many.
+
+    A weight of 0 hits nothing.
+    """
     hit_count = int(0)
     if weight <= 0.0:
         return hit_count
-    first_hit = SIDE_ROWS * planes.grids.shape[0]
-    for side_index in range(side_count):
-        side = load_side(planes, side_index, store)
-        grid = planes.grids[side.f]
-        local_receiver = load_local_receiver(store, side.f)
-        outline = outline_coverage_on_side(planes, grid, side, local_receiver, cell, edges)
-        clear_hit(store, first_hit, side_index)
+    for i in range(receiver.side_count):
+        side = load_side(planes, receiver, i)
+        outline = outline_coverage_on_side(planes, side, cell, receiver.edges)
+        hits[i].coverage = float(0.0)
         if outline[0] > 0.0:
             hit = PlaneHit()
             hit.mesh_share = 1.0
             hit.open_share = 1.0
-            if _is_sender(grid, side) or is_covered_by_texels(grid):
-                first_level = first_level_of_side(grid, side.is_back)
-                footprint = footprint_on_side(planes, grid, side, local_receiver, cell.direction)
-                mip = find_mip_footprint(grid, planes, footprint)
-                if is_covered_by_texels(grid):
+            if _is_sender(side) or is_covered_by_texels(side.grid):
+                first_level = _first_level(side)
+                mip = find_mip_footprint(side.grid, planes, footprint_on_side(planes, side, cell.direction))
+                if is_covered_by_texels(side.grid):
                     hit.mesh_share = fetch(planes.covered, planes, first_level, mip)[0]
-                if _is_sender(grid, side):
+                if _is_sender(side):
+                    if before[0] > 0.0:
+                        _, footprint = _visible_footprint(planes, side, cell, hit, before)
+                        mip = find_mip_footprint(side.grid, planes, footprint)
                     hit.radiosity = fetch(texels, planes, first_level, mip)
             hit.coverage = outline[0] * hit.mesh_share
             hit.centroid = wp.vec3(outline[1], outline[2], outline[3]) / outline[0]
-            hit.inverse_distance = inverse_distance_on_side(grid, side, local_receiver)
-            store_hit(store, first_hit, side_index, hit)
+            hit.inverse_distance = inverse_distance_on_side(side)
+            hits[i] = hit
             hit_count += 1
     if hit_count > 1:
-        _find_visible_parts(planes, cell, texels, side_count, store)
+        _find_visible_parts(planes, cell, texels, before, receiver, hits)
     return hit_count
 
 
@@ -322,27 +284,23 @@ def _find_visible_parts(
     planes: PlaneArrays,
     cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
-    side_count: int,
-    store: wp.array(dtype=wp.vec3),
+    before: wp.vec4,
+    receiver: PlaneReceiver,
+    hits: wp.array(dtype=PlaneHit),
 ):
     """Find what nearer sides leave open of each hit, and the radiosity of that."""
-    first_hit = SIDE_ROWS * planes.grids.shape[0]
-    for k in range(1, side_count):
+    for k in range(1, receiver.side_count):
         for j in range(k):
-            if is_hit(store, first_hit, k) and is_hit(store, first_hit, j):
-                _block_each_other(cell, k, j, first_hit, store)
-    for side_index in range(side_count):
-        hit = load_hit(store, first_hit, side_index)
-        if hit.coverage > 0.0 and hit.open_share < 1.0:
-            hit.open_share = wp.max(hit.open_share, _MIN_OPEN)
-            side = load_side(planes, side_index, store)
-            grid = planes.grids[side.f]
-            if _is_sender(grid, side):
-                local_receiver = load_local_receiver(store, side.f)
-                _, footprint = _visible_footprint(planes, grid, side, local_receiver, cell, hit)
-                mip = find_mip_footprint(grid, planes, footprint)
-                hit.radiosity = fetch(texels, planes, first_level_of_side(grid, side.is_back), mip)
-            store_hit(store, first_hit, side_index, hit)
+            if is_hit(hits, k) and is_hit(hits, j):
+                _block_each_other(cell, k, j, hits)
+    for i in range(receiver.side_count):
+        if is_hit(hits, i) and hits[i].open_share < 1.0:
+            hits[i].open_share = wp.max(hits[i].open_share, _MIN_OPEN)
+            side = load_side(planes, receiver, i)
+            if _is_sender(side):
+                _, footprint = _visible_footprint(planes, side, cell, hits[i], before)
+                mip = find_mip_footprint(side.grid, planes, footprint)
+                hits[i].radiosity = fetch(texels, planes, _first_level(side), mip)
 
 
 @wp.func
@@ -350,27 +308,33 @@ def find_side_hits_adjoint(
     planes: PlaneArrays,
     cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
+    before: wp.vec4,
     hit_count: int,
-    side_count: int,
-    store: wp.array(dtype=wp.vec3),
-    edges: wp.array(dtype=ViewedEdge),
-    adj_store: wp.array(dtype=wp.vec3),
+    receiver: PlaneReceiver,
+    hits: wp.array(dtype=PlaneHit),
+    adj_hits: wp.array(dtype=PlaneHit),
     instance: int,
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
-    """Add to the gradients of a receiver relative to each plane, of viewed edges, and of an instance's texels."""
-    first_hit = SIDE_ROWS * planes.grids.shape[0]
-    for side_index in range(side_count):
-        if is_hit(store, first_hit, side_index):
-            _visible_radiosity_adjoint(planes, cell, texels, side_index, store, adj_store, instance, adj_texels)
+    """Add to gradients of local receivers, viewed edges, and an instance's texels; return that of ``before``."""
+    adj_before = wp.vec4()
+    for i in range(receiver.side_count):
+        if is_hit(hits, i):
+            side = load_side(planes, receiver, i)
+            if _is_sender(side):
+                adj_before += _visible_radiosity_adjoint(
+                    planes, cell, texels, before, side, receiver, hits, adj_hits, instance, adj_texels
+                )
     if hit_count > 1:
-        for k in range(1, side_count):
+        for k in range(1, receiver.side_count):
             for j in range(k):
-                if is_hit(store, first_hit, k) and is_hit(store, first_hit, j):
-                    _block_each_other_adjoint(cell, k, j, first_hit, store, adj_store)
-    for side_index in range(side_count):
-        if is_hit(store, first_hit, side_index):
-            _outline_hit_adjoint(planes, cell, side_index, hit_count == 1, store, edges, adj_store)
+                if is_hit(hits, k) and is_hit(hits, j):
+                    _block_each_other_adjoint(cell, k, j, hits, adj_hits)
+    for i in range(receiver.side_count):
+        if is_hit(hits, i):
+            side = load_side(planes, receiver, i)
+            _outline_hit_adjoint(planes, cell, side, hit_count == 1, receiver, hits[i], adj_hits[i])
+    return adj_before
 
 
 @wp.func
@@ -378,86 +342,80 @@ def _visible_radiosity_adjoint(
     planes: PlaneArrays,
     cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
-    side_index: int,
-    store: wp.array(dtype=wp.vec3),
-    adj_store: wp.array(dtype=wp.vec3),
+    before: wp.vec4,
+    side: PlaneSide,
+    receiver: PlaneReceiver,
+    hits: wp.array(dtype=PlaneHit),
+    adj_hits: wp.array(dtype=PlaneHit),
     instance: int,
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
-    """Add to the gradients of a receiver relative to a plane, of what others leave open of it, and of its texels."""
-    side = load_side(planes, side_index, store)
-    grid = planes.grids[side.f]
-    first_hit = SIDE_ROWS * planes.grids.shape[0]
-    hit, adj_hit = load_hit(store, first_hit, side_index), load_hit(adj_store, first_hit, side_index)
-    if _is_sender(grid, side):
-        first_level = first_level_of_side(grid, side.is_back)
-        local_receiver = load_local_receiver(store, side.f)
-        direction, footprint = _visible_footprint(planes, grid, side, local_receiver, cell, hit)
-        mip = find_mip_footprint(grid, planes, footprint)
-        adj_mip = fetch_adjoint(texels, grid, planes, first_level, footprint, mip, adj_hit.radiosity)
-        if adj_texels:
-            scatter(adj_texels[instance], planes, first_level, mip, adj_hit.radiosity)
-        adj_direction = footprint_on_side_adjoint(
-            planes, grid, side, local_receiver, direction, footprint, adj_mip, adj_store
+    """Add to the gradients of a local receiver, of a side's open part, and of its texels; return that of ``before``."""
+    adj_before = wp.vec4()
+    hit, adj_radiosity = hits[side.index], adj_hits[side.index].radiosity
+    direction, footprint = _visible_footprint(planes, side, cell, hit, before)
+    mip = find_mip_footprint(side.grid, planes, footprint)
+    adj_mip = fetch_adjoint(texels, side.grid, planes, _first_level(side), footprint, mip, adj_radiosity)
+    if adj_texels:
+        scatter(adj_texels[instance], planes, _first_level(side), mip, adj_radiosity)
+    adj_direction = footprint_on_side_adjoint(planes, side, direction, footprint, adj_mip, receiver.sides)
+    if not _is_wholly_open(hit, before):
+        open_share, blocked_moment = _open_part(hit, before)
+        visible_direction, length = _unnormalized_direction(cell, open_share, blocked_moment)
+        adj_centroid = (cell.radius / wp.length(visible_direction)) * (
+            adj_direction - wp.dot(adj_direction, direction) * direction
         )
-        if hit.open_share < 1.0:
-            visible_direction, length = _unnormalized_direction(cell, hit)
-            adj_centroid = (cell.radius / wp.length(visible_direction)) * (
-                adj_direction - wp.dot(adj_direction, direction) * direction
-            )
-            adj_length = wp.dot(adj_centroid, hit.blocked_moment) / (length * length)
-            adj_open = 0.5 * adj_mip[2] / hit.open_share + adj_length * hit.open_share / length
-            adj_moment = (adj_length * hit.blocked_moment - adj_centroid) / length
-            _add_to_open_part(adj_store, first_hit, side_index, adj_open, adj_moment)
+        adj_length = wp.dot(adj_centroid, blocked_moment) / (length * length)
+        adj_open = float(0.0)
+        if open_share > _MIN_OPEN:
+            adj_open = 0.5 * adj_mip[2] / open_share + adj_length * open_share / length
+        adj_moment = (adj_length * blocked_moment - adj_centroid) / length
+        adj_before = wp.vec4(-adj_open * hit.open_share, adj_moment[0], adj_moment[1], adj_moment[2])
+        _add_to_open_part(adj_hits, side.index, adj_open * (1.0 - before[0]), adj_moment)
+    return adj_before
 
 
 @wp.func
 def _outline_hit_adjoint(
     planes: PlaneArrays,
     cell: VisibleCell,
-    side_index: int,
+    side: PlaneSide,
     is_alone: bool,
-    store: wp.array(dtype=wp.vec3),
-    edges: wp.array(dtype=ViewedEdge),
-    adj_store: wp.array(dtype=wp.vec3),
+    receiver: PlaneReceiver,
+    hit: PlaneHit,
+    adj_hit: PlaneHit,
 ):
-    """Add to the gradients of a receiver relative to a plane, and of viewed edges."""
-    side = load_side(planes, side_index, store)
-    grid = planes.grids[side.f]
-    first_hit = SIDE_ROWS * planes.grids.shape[0]
-    hit, adj_hit = load_hit(store, first_hit, side_index), load_hit(adj_store, first_hit, side_index)
-    local_receiver = load_local_receiver(store, side.f)
+    """Add to the gradients of a local receiver, of the side's weight, and of viewed edges."""
+    grid = side.grid
     outline_share = hit.coverage / hit.mesh_share
     if is_covered_by_texels(grid):
-        footprint = footprint_on_side(planes, grid, side, local_receiver, cell.direction)
+        footprint = footprint_on_side(planes, side, cell.direction)
         mip = find_mip_footprint(grid, planes, footprint)
-        first_level = first_level_of_side(grid, side.is_back)
         adj_covered = wp.vec3(adj_hit.coverage * outline_share, 0.0, 0.0)
-        adj_mip = fetch_adjoint(planes.covered, grid, planes, first_level, footprint, mip, adj_covered)
-        footprint_on_side_adjoint(planes, grid, side, local_receiver, cell.direction, footprint, adj_mip, adj_store)
+        adj_mip = fetch_adjoint(planes.covered, grid, planes, _first_level(side), footprint, mip, adj_covered)
+        footprint_on_side_adjoint(planes, side, cell.direction, footprint, adj_mip, receiver.sides)
     adj_share = adj_hit.coverage * hit.mesh_share
     adj_outline = wp.vec4(adj_share * side.weight, 0.0, 0.0, 0.0)
     if not is_alone:
-        inverse_distance_on_side_adjoint(
-            grid, side, local_receiver, hit.inverse_distance, adj_hit.inverse_distance, adj_store
-        )
+        inverse_distance_on_side_adjoint(side, hit.inverse_distance, adj_hit.inverse_distance, receiver.sides)
         adj_moment = (side.weight / outline_share) * adj_hit.centroid
         adj_outline = adj_outline + wp.vec4(
             -wp.dot(adj_moment, hit.centroid), adj_moment[0], adj_moment[1], adj_moment[2]
         )
-    coverage_adjoint(edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, adj_outline)
-    adj_store[side.row] = adj_store[side.row] + wp.vec3(0.0, 0.0, adj_share * outline_share / side.weight)
+    coverage_adjoint(receiver.edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, adj_outline)
+    adj_weight = adj_share * outline_share / side.weight
+    receiver.sides[side.index].adj_weight = receiver.sides[side.index].adj_weight + adj_weight
 
 
 @wp.func
-def mean_radiosity(first_hit: int, side_count: int, store: wp.array(dtype=wp.vec3)):
+def mean_radiosity(side_count: int, hits: wp.array(dtype=PlaneHit)):
     """Find the mean radiosity of the sides that a cell hits, by its weights h o; also their sum, and the coverages'."""
     radiosity_sum = wp.vec3()
     weight_sum = float(0.0)
     total_coverage = float(0.0)
-    for side_index in range(side_count):
-        if is_hit(store, first_hit, side_index):
-            hit = load_hit(store, first_hit, side_index)
+    for i in range(side_count):
+        if is_hit(hits, i):
+            hit = hits[i]
             radiosity_sum += (hit.coverage * hit.open_share) * hit.radiosity
             weight_sum += hit.coverage * hit.open_share
             total_coverage += hit.coverage

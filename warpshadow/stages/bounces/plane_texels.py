@@ -1,16 +1,11 @@
 """Texels of planes: the mean radiosity of their patches in mip levels, without patches that other bodies bury.
 
-Under a box that stands on a ground patches of the ground are not seen, but between them and the patches beside the box
-radiosity is interpolated. So in each texel the mean counts patches by whether they are open, and texels beside it a
-little [normalized convolution: Knutsson and Westin 1993]:
+    B = Σ_p k_p v_p B_p / Σ_p k_p v_p                  [normalized convolution: Knutsson and Westin 1993]
 
-    B = Σ_p k_p v_p B_p / Σ_p k_p v_p
-
-with v the weight of a patch by its openness (:mod:`.openness`), and k its share of the mesh in the texel, or 0.002
-of that in a texel beside it. A texel of buried patches alone has the light of those beside it, others hardly any of it.
-
-Without it the foot of a thick wall in the sun was 10% too dark with all bounces, and 35% too bright with the sun behind
-it; so it is 4% too dark, and 10% too bright.
+with v the weight of a patch (:mod:`.patch_weights`), and k its share of the mesh in the texel, or 0.002 of that in a
+texel beside it. So a texel of buried patches alone, as under a box, has the light of those beside it, and others hardly
+any of that. Otherwise their darkness would be interpolated to the patches around the box: the foot of a thick wall in
+the sun was 2.5% too dark.
 """
 
 import warp as wp
@@ -40,21 +35,21 @@ def _divide(
     texels[batch, texel] = mean_radiosity
 
 
-def find_texels(radiosity: wp.array, open_weights: wp.array, planes: PlaneBlockers) -> wp.array:
+def find_texels(radiosity: wp.array, patch_weights: wp.array, planes: PlaneBlockers) -> wp.array:
     """Find the radiosity of texels in all mip levels of planes.
 
     Args:
         radiosity: Of the patches of all bodies, vec3 of shape [batch, patch].
-        open_weights: v of each patch, in three equal channels, vec3 of shape [batch, patch]. Either batch may be 1.
+        patch_weights: v of each patch, in three equal channels, vec3 of shape [batch, patch]. Either batch may be 1.
         planes: The planes.
     Returns:
         vec3 of shape [batch, texel].
-    Differentiable: radiosity, open_weights.
+    Differentiable: radiosity, patch_weights.
     """
     assert planes.texels_of_patches is not None
-    weighted_radiosity = reflect(open_weights, radiosity)
+    weighted_radiosity = reflect(patch_weights, radiosity)
     radiosity_sums, weight_sums = (
-        multiply(planes.texels_of_patches, values) for values in (weighted_radiosity, open_weights)
+        multiply(planes.texels_of_patches, values) for values in (weighted_radiosity, patch_weights)
     )
     texels = empty(radiosity_sums.shape, dtype=wp.vec3, device=radiosity.device)
     launch(_divide, radiosity_sums.shape, inputs=[radiosity_sums, weight_sums], outputs=[texels])

@@ -1,17 +1,17 @@
-"""Proxies: the spheres that receivers see in place of the patches of bodies that are not flat.
+"""Proxies: the spheres that send the light of patches of bodies that are not flat.
 
-A patch of area A has a sphere of radius ρ = √(A/2), whose center is ρ/2 below it: as wide as the diagonal of a square
-patch, so that neighbors overlap, bulging out of the body by ρ/2. As bodies grow, so does it, by the radius of the
-sphere that blocks light beside it. Of a sheet, whose other side has patches of its own, centers are ρ/4 above: a
-receiver is nearer to visible patches than to the patches behind them. If they were below, too, the sunlit outside of
-a tent shone through: its image with all bounces is 6.8% off so, 3.9% with centers in the sheet, and 3.6% with these.
-So it is with walls and boards that are thinner than their proxies: with a thickness h ≤ 2ρ centers are 3h/8 − ρ/4
-below. With ρ/2 the proxies of both sides change places, and a sunlit wall glows on its inside. What touches a body is
-within proxies of several of its sides, and sees by ``tangent_planes.py`` those that it is above.
+A patch of area A has a proxy of radius ρ = √(A/2), as wide as the diagonal of a square patch, so that neighbors
+overlap. As the body grows, so does it, in the ratio of the nearest sphere that blocks light. Its center is at a depth
+below the patch,
 
-If the spheres that block light stood in for the patches around them, the foot of a ball would be lit by the ball's
-whole side, where it sees the little below, which is dark: at 0.2, 0.4 and 0.6 radii from the contact of a ball with a
-ground by 6.0, 1.7 and 1.3 times the light of paths; with a sphere for each patch it is 1.36, 0.96 and 0.94 times.
+    (3/4 min(h / 2ρ, 1) − 1/4) ρ
+
+where the body is h thick: ρ/2 below if it is thicker than the proxy, so that the proxy bulges out by ρ/2, and ρ/4 above
+if it is a sheet, whose other side has patches of its own. So a receiver is nearer to visible patches than to the
+patches behind them, whose light would shine through a tent or a thin wall. A receiver that touches a body is within
+proxies of several of its sides, and sees those whose tangent planes it is above (:mod:`.tangent_planes`).
+
+One proxy for each patch, not each blocking sphere: the foot of a ball on a ground sees the dark part below the ball.
 """
 
 import numpy as np
@@ -81,12 +81,12 @@ def place_proxies(
     radius_ratios: np.ndarray,
     depths: np.ndarray,
 ) -> tuple[wp.array, wp.array]:
-    """Place the spheres that stand in for patches.
+    """Place the proxies of patches.
 
     Args:
         points, normals: Means of the patches, vec3 of shape [batch, patch].
         blocker_radii: Radii of the spheres that block light [scene units], float32 of shape [batch, sphere].
-        blocker_indices: One of them beside each patch, −1 for patches that nothing stands in for, shape [patch].
+        blocker_indices: One of them beside each patch, −1 for patches without a proxy, shape [patch].
         radius_ratios: Radius of each proxy in radii of that sphere, shape [patch].
         depths: How far below its patch the center of each is, in radii of the proxy, shape [patch].
     Returns:

@@ -1,21 +1,14 @@
-"""Radiance of proxies: the light of a body's patches, as the spheres in their place send it.
-
-Each patch p has a sphere of its own; several share one only where spheres are merged. Towards a receiver that sees the
-sphere in direction ω, its patches send
+"""Radiance of proxies: the light that the patches of each send towards cells of directions.
 
     E_j(ω) = Σ_p A_p (v_p g_p + ε) B_p / Σ_p A_p (v_p g_p + ε),  ε = 0.0001
 
-the mean of their radiosities B by the area that they show: g_p is that of a unit (:mod:`.projected_areas`), and v_p
-makes patches count that other bodies do not bury (:mod:`.openness`). Patches
-that face away count for ε of their area: where none shows itself the mean is still one, so it is smooth, and nothing is
-divided by zero. The sunlit top of a slab is brighter than its bottom by more than a hundred times: by ε = 0.01 it shone
-through, and the floor of a car park below was 19% too bright.
+is the mean of the radiosities B of proxy j's patches, of which a cluster has several, by the area that they show in
+direction ω: g_p of a unit (:mod:`.projected_areas`), counted by v_p, since other bodies may bury them
+(:mod:`.patch_weights`). Patches that face away count for ε of their area: where none shows itself the mean is still
+one, smooth and not divided by zero. ε is small since a sunlit top is some hundred times brighter than the bottom.
 
-Through a cell a receiver sees a mean over the spheres in it (:mod:`warpshadow.stages.bounces.sphere_light`).
-There, too, patches should count by the area that they show: the spheres on the far side of a body show none. So
-numerator and denominator stay apart, both over Σ_p A_p. By g_p = max(−n_p·ω, 0), on a ground around a bunny of 64
-spheres that is in the sky and the sun the light that the bunny sends is 14% off by either, of a sun alone 33%, where
-equal weights give 37%; of a white bunny 8% and without bias, where equal weights lose 6% of the light.
+Through a cell a receiver sees a mean over the proxies in it (:mod:`.sphere_light`), which count by the area that they
+show, too. So numerator and denominator stay apart, both over Σ_p A_p.
 """
 
 import numpy as np
@@ -37,15 +30,15 @@ _BLACK_SPHERE_WEIGHT = 0.25
 def patches_of_clusters(
     spheres: np.ndarray, nearest: np.ndarray, *, merging: float = MERGING
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Patches of spheres and then, where spheres merge, of the clusters' spheres, which have the patches of all four.
+    """Patches of proxies and then, where proxies merge, of their clusters, which have the patches of all four.
 
     Args:
-        spheres: Sphere of each patch, −1 for none, shape [patch].
-        nearest: Patch nearest to each sphere, which a sphere that has none takes; −1 if its body is black, as the
-            sphere then is. Shape [sphere].
+        spheres: Proxy of each patch, −1 for none, shape [patch].
+        nearest: Patch nearest to each proxy, which a proxy that has none takes; −1 if its body is black, as the
+            proxy then is. Shape [proxy].
         merging: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
     Returns:
-        Where the patches of each node begin, and the end, int32 of shape [node + 1]; and these patches, int32.
+        Where the patches of each proxy begin, and the end, int32 of shape [proxy + 1]; and these patches, int32.
     """
     permutation = np.argsort(spheres, kind="stable")
     patch_bounds = np.searchsorted(spheres[permutation], np.arange(len(nearest) + 1))
@@ -65,7 +58,7 @@ def _tabulate(
     # in
     radiosity: wp.array2d(dtype=wp.vec3),
     projected_areas: wp.array3d(dtype=wp.float32),
-    open_weights: wp.array2d(dtype=wp.vec3),
+    patch_weights: wp.array2d(dtype=wp.vec3),
     starts: wp.array(dtype=wp.int32),
     patch_indices: wp.array(dtype=wp.int32),
     shares: wp.array(dtype=wp.float32),
@@ -73,51 +66,51 @@ def _tabulate(
     # out
     proxy_radiance: wp.array3d(dtype=wp.vec4),
 ):
-    """A thread owns a node and a direction; shares are A / Σ A, and so sums are linear, as Warp's adjoint needs it."""
-    batch, node, direction = wp.tid()
+    """A thread owns a proxy and a direction; shares are A / Σ A, and so sums are linear, as Warp's adjoint needs it."""
+    batch, proxy, direction = wp.tid()
     patch_radiosity = radiosity[instance_in(batch, radiosity.shape[0])]
     patch_projected_areas = projected_areas[instance_in(batch, projected_areas.shape[0])]
-    patch_weights = open_weights[instance_in(batch, open_weights.shape[0])]
+    weights = patch_weights[instance_in(batch, patch_weights.shape[0])]
     light = wp.vec3()
-    weight_sum = float(black_sphere_weights[node])
-    for k in range(starts[node], starts[node + 1]):
+    weight_sum = float(black_sphere_weights[proxy])
+    for k in range(starts[proxy], starts[proxy + 1]):
         patch = patch_indices[k]
-        patch_weight = shares[k] * (patch_weights[patch][0] * patch_projected_areas[patch, direction] + _AVERTED_WEIGHT)
+        patch_weight = shares[k] * (weights[patch][0] * patch_projected_areas[patch, direction] + _AVERTED_WEIGHT)
         light += patch_weight * patch_radiosity[patch]
         weight_sum += patch_weight
-    proxy_radiance[batch, node, direction] = wp.vec4(light[0], light[1], light[2], weight_sum)
+    proxy_radiance[batch, proxy, direction] = wp.vec4(light[0], light[1], light[2], weight_sum)
 
 
 def find_proxy_radiance(
     radiosity: wp.array,
     projected_areas: wp.array,
-    open_weights: wp.array,
+    patch_weights: wp.array,
     areas: np.ndarray,
     starts: np.ndarray,
     patch_indices: np.ndarray,
 ) -> wp.array:
-    """Light that spheres send towards cells of directions, for :func:`.sphere_light.sphere_light`.
+    """Light that proxies send towards cells of directions, for :func:`.sphere_light.sphere_light`.
 
-    It costs nodes × directions × patches of a node, for any number of receivers.
+    It costs proxies × directions × patches of a proxy, for any number of receivers.
 
     Args:
         radiosity: Of patches: white under a radiance of 1 has 1, vec3 of shape [batch, patch].
         projected_areas: g of each patch towards each cell, float32 of shape [batch, patch, direction], from
             :func:`.projected_areas.find_projected_areas`.
-        open_weights: v of each patch, in three equal channels, vec3 of shape [batch, patch], from
-            :func:`.openness.open_shares`.
+        patch_weights: v of each patch, in three equal channels, vec3 of shape [batch, patch], from
+            :func:`.patch_weights.find_patch_weights`.
         areas: Of patches [scene units²], not negative, float32 of shape [patch].
-        starts, patch_indices: Patches of each node, from :func:`patches_of_clusters`.
+        starts, patch_indices: Patches of each proxy, from :func:`patches_of_clusters`.
     Returns:
-        Σ A (v g + ε) B / Σ A and Σ A (v g + ε) / Σ A, vec4 of shape [batch, node, direction].
-    Differentiable: radiosity, projected_areas, open_weights.
+        Σ A (v g + ε) B / Σ A and Σ A (v g + ε) / Σ A, vec4 of shape [batch, proxy, direction].
+    Differentiable: radiosity, projected_areas, patch_weights.
     """
-    arrays = {"radiosity": radiosity, "projected_areas": projected_areas, "open_weights": open_weights}
+    arrays = {"radiosity": radiosity, "projected_areas": projected_areas, "patch_weights": patch_weights}
     batch_count = common_batch(arrays)
     patch_count = len(areas)
     check.shape("radiosity", radiosity.shape, (radiosity.shape[0], patch_count))
     check.shape("projected_areas", projected_areas.shape, (projected_areas.shape[0], patch_count, "direction"))
-    check.shape("open_weights", open_weights.shape, (open_weights.shape[0], patch_count))
+    check.shape("patch_weights", patch_weights.shape, (patch_weights.shape[0], patch_count))
     check.finite("areas", np.asarray(areas), minimum=0.0)
     if starts[0] != 0 or (np.diff(starts) < 0).any() or starts[-1] != len(patch_indices):
         raise ValueError(f"starts: got {np.asarray(starts)!r}, expected 0 to the {len(patch_indices)} indices, rising")
@@ -126,12 +119,12 @@ def find_proxy_radiance(
             f"patch_indices: got {min(patch_indices)} to {max(patch_indices)}, expected patches, 0 to {patch_count - 1}"
         )
     device = radiosity.device
-    nodes = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-    area_sums = np.bincount(nodes, areas[patch_indices], len(starts) - 1)
-    shares = areas[patch_indices] / np.where(area_sums > 0, area_sums, 1)[nodes]
+    proxies = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    area_sums = np.bincount(proxies, areas[patch_indices], len(starts) - 1)
+    shares = areas[patch_indices] / np.where(area_sums > 0, area_sums, 1)[proxies]
     int_tables = [constant(np.asarray(values, np.int32), wp.int32, device) for values in (starts, patch_indices)]
     float_tables = [shares, np.where(area_sums > 0, 0.0, _BLACK_SPHERE_WEIGHT)]
-    node_arrays = [*int_tables, *(constant(values.astype(np.float32), wp.float32, device) for values in float_tables)]
+    proxy_arrays = [*int_tables, *(constant(values.astype(np.float32), wp.float32, device) for values in float_tables)]
     proxy_radiance = empty((batch_count, len(starts) - 1, projected_areas.shape[2]), dtype=wp.vec4, device=device)
-    launch(_tabulate, proxy_radiance.shape, inputs=[*arrays.values(), *node_arrays], outputs=[proxy_radiance])
+    launch(_tabulate, proxy_radiance.shape, inputs=[*arrays.values(), *proxy_arrays], outputs=[proxy_radiance])
     return proxy_radiance

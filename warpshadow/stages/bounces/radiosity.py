@@ -53,7 +53,7 @@ def patch_radiosity(albedo: wp.array, light: wp.array, mean: SparseMatrix, share
             patch sample].
         mean: The weights w, from :func:`mean_over_patch_samples`.
         shares: f, how much each patch sample counts, vec3 of shape [batch, patch sample], from
-            :func:`.openness.open_shares`; None for 1.
+            :func:`.patch_weights.find_patch_weights`; None for 1.
     Returns:
         vec3 of shape [batch, patch]; any batch may be 1, and then serves every instance.
     Differentiable: albedo, light, shares.

@@ -1,21 +1,17 @@
-"""Light from spheres: bodies that block a receiver's cells send light in place of the light they block.
-
-The spheres that block cell q in part are blended without sorting [McGuire and Bavoil 2013, weighted blended
-order-independent transparency], each by its share a_jq of the blocked light, and by nearness:
+"""Light from spheres: the light that proxies send to receivers through the cells that they block.
 
     I = 4/Q Σ_q max(n·ω_q, 0) (F_q − T_q) R_q
-    R_q = Σ_j w_j a_jq L_jq / Σ_j w_j a_jq S_jq,   w_j = f_j / (d_j² + (r_j/4)²)²
+    R_q = Σ_j w_j a_jq L_jq / Σ_j w_j a_jq S_jq
 
-T_q is the transmittance past the spheres, F_q that without them, so the light is all that a cell lacks; a_jq are the
-very shares of the transmittance, T_q = F_q Π_j (1 − a_jq); L and S are the light and the area that patches of a sphere
-show (:mod:`warpshadow.stages.bounces.proxy_radiance`); d is the distance to a sphere's center, r its radius, and f
-whether the receiver is above the patches (:mod:`warpshadow.stages.bounces.tangent_planes`). R is smooth in everything,
-stays within the radiosities of the patches, and does not depend on the scene's units. With the root of w a white ball
-behind a black one sent a tenth of its light past it, and patches behind a contact outshone it.
+R is the mean radiosity of the proxies j that block cell q in part, blended without sorting [McGuire and Bavoil 2013,
+weighted blended order-independent transparency]. T_q is the transmittance past them, F_q that without them, so the
+light is all that a cell lacks. a_jq are the shares of the transmittance, T_q = F_q Π_j (1 − a_jq), w the weights of
+:mod:`.proxy_weights`, L and S the light and the area that proxies show (:mod:`.proxy_radiance`). R is smooth in
+everything, stays within the radiosities of the patches, and does not depend on the scene's units.
 
 The traversal is that of the transmittance, with other visits. The adjoint needs both sums of R of the cells in which
-something is blocked; the forward launch stores them: 16 bytes a receiver and cell, touched only in bundles of cells
-that are blocked in part (a fifth of them on a ground around a body). N bounces store N times that.
+light is blocked; the forward launch stores them: 16 bytes a receiver and cell, touched only in bundles of cells that
+are blocked in part. N bounces store N times that.
 """
 
 import functools
@@ -39,11 +35,12 @@ from warpshadow.device.launch import differentiable, launch, varies
 from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_slot
 from warpshadow.maths.directions import BUNDLE, cell_radius
-from warpshadow.stages.bounces.tangent_planes import TangentPlanes, make_facing
+from warpshadow.stages.bounces.proxy_weights import WeightInputs, make_weight_functions
+from warpshadow.stages.bounces.tangent_planes import TangentPlanes
 from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres
 from warpshadow.stages.visibility.culling import DirectionCells, make_cap_functions, make_cells, make_cull
 from warpshadow.stages.visibility.directional import PAIR_COST, SOFTNESS
-from warpshadow.stages.visibility.falloff import make_falloff, make_sphere_adjoint
+from warpshadow.stages.visibility.falloff import make_cap_adjoint, make_falloff
 from warpshadow.stages.visibility.merging import MERGING, NODES_PER_CLUSTER, Gradients, merged_count
 from warpshadow.stages.visibility.traversal import (
     ClusterTree,
@@ -55,11 +52,6 @@ from warpshadow.stages.visibility.traversal import (
     receiver_lanes_type,
     sphere_view_type,
 )
-
-_CORE = 0.25  # radii within which a sphere's weight hardly grows any more
-
-_NEAREST2 = 1.0e-12
-"""The least d² + (r/4)², in squares of the radius of the largest run of spheres: so √w is at most 1e12."""
 
 _MIN_DENOMINATOR = 1.0e-30
 """The least denominator of R: spheres that block so little of a cell that they have less leave T at F."""
@@ -82,12 +74,9 @@ def _task_type(lanes: int) -> Any:
         sums: wp.array(dtype=Lane)  # [direction · sum] of R
         adj_cells: wp.array(dtype=Lane)  # [direction] the adjoint of the light · R
         adj_light: Vectors
-        proxy_radiance: wp.array2d(dtype=wp.vec4)  # [node, direction]
+        proxy_radiance: wp.array2d(dtype=wp.vec4)  # [proxy, direction]
         adj_radiance: wp.array2d(dtype=wp.vec4)
-        planes: wp.array(dtype=wp.vec4)  # [node] tangent planes; none where nodes are seen from everywhere
-        adj_planes: wp.array(dtype=wp.vec4)
-        tolerances: wp.array(dtype=wp.vec2)
-        inverse_size: float  # 1/radius of the largest run of spheres
+        weights: WeightInputs
 
     return LightTask
 
@@ -99,7 +88,7 @@ class LightInputs:
     traversed: TraversalInputs
     cells: DirectionCells
     proxy_radiance: wp.array3d(dtype=wp.vec4)
-    planes: wp.array2d(dtype=wp.vec4)
+    equations: wp.array2d(dtype=wp.vec4)  # of tangent planes, [batch, proxy]
     tolerances: wp.array(dtype=wp.vec2)
     transmittance: wp.array3d(dtype=wp.float32)
     transmittance_others: wp.array3d(dtype=wp.float32)
@@ -139,13 +128,13 @@ def _make_load_task(lanes: int) -> wp.Function:
         task.adj_cells = scratch[slot, 1]
         task.sums = sums[wp.where(inputs.stores_sums, item, slot)]
         task.proxy_radiance = inputs.proxy_radiance[instance_in(batch, inputs.proxy_radiance.shape[0])]
-        if inputs.planes:
-            task.planes = inputs.planes[instance_in(batch, inputs.planes.shape[0])]
-            task.tolerances = inputs.tolerances
+        if inputs.equations:
+            task.weights.equations = inputs.equations[instance_in(batch, inputs.equations.shape[0])]
+            task.weights.tolerances = inputs.tolerances
         largest_radius = float(TINY_RADIUS)
         for run in range(spheres.run_bounds.shape[1]):
             largest_radius = wp.max(largest_radius, spheres.run_bounds[batch, run][3])
-        task.inverse_size = 1.0 / largest_radius
+        task.weights.inverse_size = 1.0 / largest_radius
         for bundle in range(task.ends.shape[0]):
             task.ends[bundle] = 0
             direction_bundle = task.first_bundle + bundle
@@ -176,38 +165,13 @@ def _make_load_task(lanes: int) -> wp.Function:
 
 
 @functools.cache
-def _make_weight(lanes: int) -> wp.Function:
-    """Make the kernel function of a node's nearness √(w/f), in units of the largest run of spheres, and weight w."""
-    Lane, SphereView, LightTask = lane_type(lanes), sphere_view_type(lanes), _task_type(lanes)
-    fn = make_lane_functions(lanes)
-    dot, scale, find_facing_share = fn.dot, fn.scale, make_facing(lanes).share
-    CORE = wp.constant(_CORE)
-    NEAREST2 = wp.constant(_NEAREST2)
-
-    @wp.func(inline=True)
-    def find_weight(sphere_view: SphereView, task: LightTask):
-        offset, curvature = sphere_view.offset, sphere_view.curvature
-        scaled_offset = scale(Lane(task.inverse_size), offset)
-        core_radius = CORE * task.inverse_size / curvature
-        nearness = wp.cw_div(
-            Lane(1.0), wp.max(dot(scaled_offset, scaled_offset) + Lane(core_radius * core_radius), Lane(NEAREST2))
-        )
-        weight = wp.cw_mul(nearness, nearness)
-        if task.planes:
-            node = sphere_view.node
-            weight = wp.cw_mul(weight, find_facing_share(offset, curvature, task.planes[node], task.tolerances[node]))
-        return nearness, weight
-
-    return find_weight
-
-
-@functools.cache
 def _make_light(lanes: int) -> wp.Kernel:
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
     ReceiverLanes, SphereView, LightTask = receiver_lanes_type(lanes), sphere_view_type(lanes), _task_type(lanes)
     fn = make_lane_functions(lanes)
     sqrt, is_any_above, dot_direction, add_vectors = fn.sqrt, fn.is_any_above, fn.dot_direction, fn.add_vectors
-    load_task, find_weight, falloff = _make_load_task(lanes), _make_weight(lanes), make_falloff(lanes)
+    load_task, falloff = _make_load_task(lanes), make_falloff(lanes)
+    find_weight = make_weight_functions(lanes).weight
     widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(True, lanes)
     SUMS = wp.constant(_SUMS)
     MIN_DENOMINATOR = wp.constant(_MIN_DENOMINATOR)
@@ -220,7 +184,7 @@ def _make_light(lanes: int) -> wp.Kernel:
         cap = widen_cone(cone.axis, cone.cosine, sine, cells)
         if is_above_horizon(cap, receivers.normals):
             slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
-            _nearness, weight = find_weight(sphere_view, task)
+            weight = find_weight(sphere_view.offset, sphere_view.curvature, sphere_view.node, task.weights)
             opacity = wp.cw_mul(opacity, weight)
             for k in range(count):
                 bundle = task.reached_bundles[1, k]
@@ -230,10 +194,10 @@ def _make_light(lanes: int) -> wp.Kernel:
                         t, step = soft_edge(cells.directions[direction_bundle * BUNDLE + i], cap, slope)
                         if is_any_above(t, 0.0):
                             share = wp.cw_mul(opacity, step)
-                            node_radiance = task.proxy_radiance[sphere_view.node, direction_bundle * BUNDLE + i]
+                            radiance = task.proxy_radiance[sphere_view.node, direction_bundle * BUNDLE + i]
                             slot = (bundle * BUNDLE + i) * SUMS
                             for c in range(SUMS):
-                                task.sums[slot + c] = task.sums[slot + c] + node_radiance[c] * share
+                                task.sums[slot + c] = task.sums[slot + c] + radiance[c] * share
 
     traverse = make_traversal(make_cull(True, LightTask, lanes), visit, LightTask, False, lanes)
 
@@ -280,111 +244,50 @@ def _make_light(lanes: int) -> wp.Kernel:
 @functools.cache
 def _make_light_adjoint(lanes: int) -> wp.Kernel:
     Lane, Vectors, LightTask = lane_type(lanes), vectors_type(lanes), _task_type(lanes)
-    ReceiverLanes, SphereView, SphereAdjoint = lane_structs(lanes)
+    ReceiverLanes, SphereView, _SphereAdjoint = lane_structs(lanes)
     fn = make_lane_functions(lanes)
-    sqrt, is_any_above, dot_direction, dot, scale = fn.sqrt, fn.is_any_above, fn.dot_direction, fn.dot, fn.scale
-    add, load, total, add_vectors = fn.add, fn.load, fn.total, fn.add_vectors
-    load_task, find_weight = _make_load_task(lanes), _make_weight(lanes)
-    falloff, sphere_adjoint = make_falloff(lanes), make_sphere_adjoint(lanes)
-    widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(True, lanes)
+    dot_direction, dot, total, add = fn.dot_direction, fn.dot, fn.total, fn.add
+    load, add_vectors = fn.load, fn.add_vectors
+    load_task, weight_functions = _make_load_task(lanes), make_weight_functions(lanes)
+    find_weight_of_proxy, weight_adjoint = weight_functions.weight, weight_functions.adjoint
     SUMS = wp.constant(_SUMS)
-    facing_adjoint = make_facing(lanes).adjoint
     MIN_DENOMINATOR = wp.constant(_MIN_DENOMINATOR)
-    CORE2 = wp.constant(_CORE**2)
+
+    @wp.func(inline=True)
+    def find_weight(sphere_view: SphereView, task: LightTask):
+        return find_weight_of_proxy(sphere_view.offset, sphere_view.curvature, sphere_view.node, task.weights)
+
+    @wp.func(inline=True)
+    def share_adjoint(sphere_view: SphereView, weight: Lane, share: Lane, slot: int, direction: int, task: LightTask):
+        """With f = 4/Q max(n·ω, 0) (F − T) / Σ w a S:  ā = w f (Ī·L − S Ī·R),  L̄ = f w a Ī,  S̄ = −f w a Ī·R."""
+        weighted_blocked = wp.cw_mul(weight, task.blocked[slot])
+        adj_cell = task.adj_cells[slot]
+        radiance = task.proxy_radiance[sphere_view.node, direction]
+        light = dot_direction(wp.vec3(radiance[0], radiance[1], radiance[2]), task.adj_light)
+        if task.adj_radiance:
+            weighted_share = wp.cw_mul(weighted_blocked, share)
+            adj_radiance_of_proxy = wp.vec4(
+                total(wp.cw_mul(weighted_share, task.adj_light.x)),
+                total(wp.cw_mul(weighted_share, task.adj_light.y)),
+                total(wp.cw_mul(weighted_share, task.adj_light.z)),
+                -total(wp.cw_mul(weighted_share, adj_cell)),
+            )
+            # summed over a warp first it took 1.4 times as long on an H200
+            wp.atomic_add(task.adj_radiance, sphere_view.node, direction, adj_radiance_of_proxy)
+        return wp.cw_mul(weighted_blocked, light - radiance[3] * adj_cell)
+
+    cap_adjoint = make_cap_adjoint(True, find_weight, share_adjoint, True, LightTask, lanes)
 
     @wp.func(inline=True)
     def visit(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: LightTask):
-        """The adjoint of the sphere's cone and weight.
-
-        With f = 4/Q max(n·ω, 0) (F − T) / Σ w a S, and v = f (Ī·L − S Ī·R), the gradient of w a: ā = w v,  w̄ = Σ
-        a v,  L̄ = f w a Ī,  S̄ = −f w a Ī·R and with y = d / size:  w̄ → d̄ = −4 w̄ w √w y / size,  r̄ = −4 w̄ w √w r /
-        (4 size)²;  ā as for the transmittance.
-        """
-        adj_sphere = SphereAdjoint()
-        cone = sphere_view.cone
-        cells = task.cells
-        sine = sqrt(cone.sine2)
-        cap = widen_cone(cone.axis, cone.cosine, sine, cells)
-        if is_above_horizon(cap, receivers.normals):
-            slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
-            nearness, weight = find_weight(sphere_view, task)
-            is_any_blocked = bool(False)
-            sum_adj_t = Lane(0.0)
-            sum_t = Lane(0.0)
-            sum_x = Lane(0.0)
-            sum_y = Lane(0.0)
-            sum_z = Lane(0.0)
-            adj_opacity = Lane(0.0)
-            for k in range(count):
-                bundle = task.reached_bundles[1, k]
-                direction_bundle = task.first_bundle + bundle
-                if reaches_bundle(cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle]):
-                    for i in range(BUNDLE):
-                        omega = cells.directions[direction_bundle * BUNDLE + i]
-                        t, step = soft_edge(omega, cap, slope)
-                        if is_any_above(t, 0.0):
-                            is_any_blocked = True
-                            weighted_blocked = wp.cw_mul(weight, task.blocked[bundle * BUNDLE + i])
-                            adj_cell = task.adj_cells[bundle * BUNDLE + i]
-                            node_radiance = task.proxy_radiance[sphere_view.node, direction_bundle * BUNDLE + i]
-                            light = dot_direction(
-                                wp.vec3(node_radiance[0], node_radiance[1], node_radiance[2]), task.adj_light
-                            )
-                            adj_blocked = wp.cw_mul(weighted_blocked, light - node_radiance[3] * adj_cell)
-                            adj_opacity += wp.cw_mul(adj_blocked, step)
-                            step_slope = wp.cw_mul(t, Lane(1.0) - t)
-                            adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_blocked, opacity), step_slope)
-                            sum_adj_t += adj_t
-                            sum_t += wp.cw_mul(adj_t, t)
-                            sum_x += omega[0] * adj_t
-                            sum_y += omega[1] * adj_t
-                            sum_z += omega[2] * adj_t
-                            if task.adj_radiance:
-                                share = wp.cw_mul(weighted_blocked, wp.cw_mul(opacity, step))
-                                adj_node_radiance = wp.vec4(
-                                    total(wp.cw_mul(share, task.adj_light.x)),
-                                    total(wp.cw_mul(share, task.adj_light.y)),
-                                    total(wp.cw_mul(share, task.adj_light.z)),
-                                    -total(wp.cw_mul(share, adj_cell)),
-                                )
-                                # summed over a warp first it took 1.4 times as long on an H200
-                                direction = direction_bundle * BUNDLE + i
-                                wp.atomic_add(task.adj_radiance, sphere_view.node, direction, adj_node_radiance)
-            if is_any_blocked:
-                sum_omega = Vectors(sum_x, sum_y, sum_z)
-                adj_offset, adj_radius, adj_weight = sphere_adjoint(
-                    sphere_view,
-                    sine,
-                    cap.cosine,
-                    cells.cos_width,
-                    cells.sin_width,
-                    slope,
-                    adj_opacity,
-                    sum_adj_t,
-                    sum_t,
-                    sum_omega,
-                )
-                weighted_adjoint = wp.cw_mul(adj_opacity, opacity)  # w̄ w = Σ a v w = Ā A
-                adj_nearness = (-4.0 * task.inverse_size) * wp.cw_mul(weighted_adjoint, nearness)
-                adj_sphere.is_any = True
-                adj_sphere.weight = adj_weight
-                adj_sphere.offset = add(
-                    adj_offset, scale(adj_nearness, scale(Lane(task.inverse_size), sphere_view.offset))
-                )
-                adj_sphere.radius = adj_radius + (CORE2 * task.inverse_size / sphere_view.curvature) * adj_nearness
-                if task.planes:
-                    node = sphere_view.node
-                    adj_facing_offset, adj_facing_radius, adj_plane = facing_adjoint(
-                        sphere_view.offset,
-                        sphere_view.curvature,
-                        task.planes[node],
-                        task.tolerances[node],
-                        weighted_adjoint,
-                    )
-                    adj_sphere.offset = add(adj_sphere.offset, adj_facing_offset)
-                    adj_sphere.radius += adj_facing_radius
-                    if task.adj_planes and not adj_plane == wp.vec4():  # noqa: SIM201 (vectors have no !=)
-                        wp.atomic_add(task.adj_planes, node, adj_plane)
+        """Of the cone, and of the weight w, whose w̄ w is Σ ā a."""
+        adj_sphere, relative_adjoint = cap_adjoint(receivers, sphere_view, count, task)
+        if adj_sphere.is_any:
+            adj_offset, adj_radius = weight_adjoint(
+                sphere_view.offset, sphere_view.curvature, sphere_view.node, relative_adjoint, task.weights
+            )
+            adj_sphere.offset = add(adj_sphere.offset, adj_offset)
+            adj_sphere.radius += adj_radius
         return adj_sphere
 
     traverse = make_traversal(make_cull(True, LightTask, lanes), visit, LightTask, True, lanes)
@@ -408,7 +311,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         adj_transmittance_others: wp.array3d(dtype=wp.float32),
         # sums
         adj_radiance: wp.array3d(dtype=wp.vec4),
-        adj_planes: wp.array2d(dtype=wp.vec4),
+        adj_equations: wp.array2d(dtype=wp.vec4),
         adj_centers: wp.array2d(dtype=wp.vec3),
         adj_radii: wp.array2d(dtype=wp.float32),
         adj_extents: wp.array2d(dtype=wp.float32),
@@ -423,8 +326,8 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         task.adj_light = load(adj_light[batch], block)
         if adj_radiance:
             task.adj_radiance = adj_radiance[instance_in(batch, inputs.proxy_radiance.shape[0])]
-        if adj_planes:
-            task.adj_planes = adj_planes[instance_in(batch, adj_planes.shape[0])]
+        if adj_equations:
+            task.weights.adj_equations = adj_equations[instance_in(batch, adj_equations.shape[0])]
         adj_normal = Vectors()
         for bundle in range(task.ends.shape[0]):
             if task.ends[bundle] > 0:
@@ -481,44 +384,43 @@ def sphere_light(
     clusters: ClusterTree | None = None,
     tangent_planes: TangentPlanes | None = None,
 ) -> wp.array:
-    """Light that spheres send to receivers, through the cells that they block.
+    """Light that proxies send to receivers, through the cells that they block.
 
     Args:
         points, normals, centers, radii: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
-        proxy_radiance: Light and area that spheres, and the clusters that they merge into, show towards cells, vec4 of
-            shape [batch, node, direction], from :func:`.proxy_radiance.find_proxy_radiance`. A batch of 1 serves every
-            instance.
+        proxy_radiance: Light and area that proxies, clusters included, show towards cells, vec4 of shape [batch, proxy,
+            direction], from :func:`.proxy_radiance.find_proxy_radiance`. A batch of 1 serves every instance.
         transmittance: T past these spheres and all else that F is past, float32 of shape [batch, receiver, direction],
             made with the same directions, softness, merging and skip.
         transmittance_others: F, the factor of T without these spheres, of the same shape; a batch of 1 serves every
             instance. None for 1.
         directions: Unit vectors ω, NumPy of shape [direction, 3], from :func:`warpshadow.fibonacci`.
         softness, merging, skip, clusters: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
-        tangent_planes: Of the nodes, which show nothing below them. A batch of 1 serves every instance. None for nodes
-            that are seen from everywhere.
+        tangent_planes: Of the proxies, which show nothing below them. A batch of 1 serves every instance. None for
+            proxies that are seen from everywhere.
     Returns:
         Light that a white receiver reflects of it, vec3 of shape [batch, receiver]: 1 where all patches are white and
         radiant by 1.
     Raises:
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii of receivers and spheres, as the transmittance.
-    Differentiable: points, normals, centers, radii, proxy_radiance, transmittance, transmittance_others, planes of the
-    tangent planes. (The derivative in T is the one at a fixed blend of spheres.) Not: directions, softness, merging,
-    skip, clusters, tolerances.
+    Differentiable: points, normals, centers, radii, proxy_radiance, transmittance, transmittance_others, equations of
+    the tangent planes. (The derivative in T is the one at a fixed blend of proxies.) Not: directions, softness,
+    merging, skip, clusters, tolerances.
     """
     cells = make_cells(directions, softness, points.device)
     check_spheres(points, normals, centers, radii)
-    planes, tolerances = (None, None) if tangent_planes is None else tangent_planes
+    equations, tolerances = (None, None) if tangent_planes is None else tangent_planes
     common_batch(
         {
             "points": points,
             "proxy_radiance": proxy_radiance,
             "transmittance_others": transmittance_others,
-            "tangent_planes": planes,
+            "tangent_planes": equations,
         }
     )
     batch_count, vertex_count = points.shape
-    node_count = radii.shape[1] + merged_count(radii.shape[1], merging)
-    check.shape("proxy_radiance", proxy_radiance.shape, (proxy_radiance.shape[0], node_count, len(directions)))
+    proxy_count = radii.shape[1] + merged_count(radii.shape[1], merging)
+    check.shape("proxy_radiance", proxy_radiance.shape, (proxy_radiance.shape[0], proxy_count, len(directions)))
     check.shape("transmittance", transmittance.shape, (*points.shape, len(directions)))
     if transmittance_others is not None:
         check.shape(
@@ -526,17 +428,17 @@ def sphere_light(
             transmittance_others.shape,
             (transmittance_others.shape[0], vertex_count, len(directions)),
         )
-    if planes is not None:
-        check.shape("tangent_planes", planes.shape, (planes.shape[0], node_count))
+    if equations is not None:
+        check.shape("tangent_planes", equations.shape, (equations.shape[0], proxy_count))
     device = points.device
     lanes = lane_count(device)
     spans = span_count(device, len(directions))
     span_direction_count = len(directions) // spans
     cell = cell_radius(len(directions))
-    nodes, traversed = make_inputs(points, normals, centers, radii, merging, cell, skip, clusters)
+    proxies, traversed = make_inputs(points, normals, centers, radii, merging, cell, skip, clusters)
     row_count = batch_count * block_count(vertex_count, lanes)
     launch_dim = run_dimensions(device, row_count, spans)
-    variables = [points, normals, *nodes, proxy_radiance, transmittance, transmittance_others, planes]
+    variables = [points, normals, *proxies, proxy_radiance, transmittance, transmittance_others, equations]
     stores_sums = varies(variables)
     scratch = [
         Scratch((2, span_direction_count), lane_type(lanes)),
@@ -551,8 +453,8 @@ def sphere_light(
         transmittance,
         transmittance_others,
     )
-    if planes is not None:
-        inputs.planes, inputs.tolerances = planes, tolerances
+    if equations is not None:
+        inputs.equations, inputs.tolerances = equations, tolerances
     inputs.factor, inputs.span_count, inputs.stores_sums = 4 / len(directions), spans, stores_sums
     cost = PAIR_COST * lanes * radii.shape[1] * span_direction_count
     is_shared = transmittance_others is not None and len(transmittance_others) < batch_count
@@ -569,8 +471,8 @@ def sphere_light(
             sums=[
                 *(adj_transmittance_others if is_shared else []),
                 proxy_radiance.grad,
-                None if planes is None else planes.grad,
-                *(array.grad for array in nodes),
+                None if equations is None else equations.grad,
+                *(array.grad for array in proxies),
             ],
         )
 

@@ -46,6 +46,21 @@ _BOUND_MARGIN = 1.001
 """Bounds are so much larger, for rounding."""
 
 
+@wp.struct
+class PartInputs:
+    """Receivers, and the parts around them."""
+
+    points: wp.array2d(dtype=wp.vec3)
+    horizon_normals: wp.array2d(dtype=wp.vec3)  # none where there is no horizon
+    corners: wp.array2d(dtype=wp.vec3)
+    face_planes: wp.array2d(dtype=wp.vec4)
+    bounds: wp.array2d(dtype=wp.vec4)
+    parts: ConvexArrays
+    cells: DirectionCells
+    radius: float  # of cells
+    skip: int  # the body that the receivers are part of, -1 for none
+
+
 @functools.cache
 def _task_type(lanes: int) -> Any:
     """Struct of a block of receivers, and memory for its cells."""
@@ -54,6 +69,11 @@ def _task_type(lanes: int) -> Any:
 
     @wp.struct
     class PartsTask:
+        batch: int
+        block: int
+        slot: int  # of scratch memory
+        instance: int  # of the parts
+        bounds: wp.array(dtype=wp.vec4)  # [part]
         points: Vectors
         normals: Vectors
         lift: Lane  # 1 where there is no horizon, else 0
@@ -98,39 +118,46 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
     Coverages, SumsOfBlockers = coverage_type(lanes), sums_type(lanes)
     fn, silhouettes, joint = make_lane_functions(lanes), make_silhouette_functions(lanes), make_joint_functions(lanes)
     is_any_above, dot, dot_direction, offset, scale = fn.is_any_above, fn.dot, fn.dot_direction, fn.offset, fn.scale
-    load, sqrt, add, is_positive = fn.load, fn.sqrt, fn.add, fn.is_positive
+    find_block, load, sqrt, add, is_positive = fn.find_block, fn.load, fn.sqrt, fn.add, fn.is_positive
     find, find_coverage = silhouettes.find, silhouettes.find_coverage
     no_blockers, with_blocker = joint.no_blockers, joint.with_blocker
     MARGIN = wp.constant(_BOUND_MARGIN)
 
     @wp.func
     def begin(
-        points: wp.array2d(dtype=wp.vec3),
-        horizon_normals: wp.array2d(dtype=wp.vec3),
-        batch: int,
-        block: int,
-        coverage: wp.array(dtype=Coverages),
-        covered: wp.array(dtype=wp.int32),
-        sums: wp.array(dtype=SumsOfBlockers),
-        chord_sums: wp.array(dtype=Lane),
-        edge_scratch: wp.array(dtype=Lane),
-        adj_edge_scratch: wp.array(dtype=Lane),
-        numbers: wp.array2d(dtype=wp.int32),
+        row: int,
+        worker: int,
+        inputs: PartInputs,
+        coverage: wp.array2d(dtype=Coverages),
+        covered: wp.array2d(dtype=wp.int32),
+        sums: wp.array2d(dtype=SumsOfBlockers),
+        chord_sums: wp.array2d(dtype=Lane),
+        edges: wp.array2d(dtype=Lane),
+        numbers: wp.array3d(dtype=wp.int32),
     ):
         """Load a block of receivers; nothing is covered yet."""
+        batch, block = find_block(row, inputs.points.shape[1])
+        slot, instance = scratch_slot(worker, row), instance_in(batch, inputs.corners.shape[0])
         task = PartsTask()
-        task.points = load(points[batch], block)
-        if horizon_normals:
-            task.normals = load(horizon_normals[batch], block)
+        task.batch = batch
+        task.block = block
+        task.slot = slot
+        task.instance = instance
+        task.bounds = inputs.bounds[instance]
+        task.points = load(inputs.points[batch], block)
+        if inputs.horizon_normals:
+            task.normals = load(inputs.horizon_normals[batch], block)
         task.lift = Lane(1.0) - is_positive(dot(task.normals, task.normals))
-        task.coverage = coverage
-        task.covered = covered
-        task.sums = sums
-        task.silhouette.facing = numbers[0]
-        task.silhouette.numbers = numbers[1]
-        task.silhouette.edges = edge_scratch
-        task.silhouette.adj_edges = adj_edge_scratch
-        task.silhouette.sums = chord_sums
+        task.coverage = coverage[slot]
+        task.covered = covered[slot]
+        task.sums = sums[slot]
+        task.silhouette.points = task.points
+        task.silhouette.corners = inputs.corners[instance]
+        task.silhouette.face_planes = inputs.face_planes[instance]
+        task.silhouette.facing = numbers[slot, 0]
+        task.silhouette.numbers = numbers[slot, 1]
+        task.silhouette.edges = edges[slot]
+        task.silhouette.sums = chord_sums[slot]
         for q in range(task.coverage.shape[0]):
             task.coverage[q] = Coverages()
             task.sums[q] = no_blockers()
@@ -169,22 +196,14 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         return wp.min(dot_direction(direction, bound.axis) - bound.cosine, is_above)
 
     @wp.func
-    def cover(
-        corners: wp.array(dtype=wp.vec3),
-        planes: wp.array(dtype=wp.vec4),
-        bounds: wp.array(dtype=wp.vec4),
-        parts: ConvexArrays,
-        body: int,
-        cells: DirectionCells,
-        radius: float,
-        task: PartsTask,
-    ):
+    def cover(inputs: PartInputs, body: int, task: PartsTask):
         """Coverage by a body of cells that no other body covers wholly; returns how many it covers, and lists them."""
+        parts, cells, radius = inputs.parts, inputs.cells, inputs.radius
         covered_count = int(0)
         silhouette = task.silhouette
         enough = wp.where(parts.signs[parts.first_part[body + 1] - 1] < 0.0, 1.0e30, 1.0)  # seams take off
         for part in range(parts.first_part[body], parts.first_part[body + 1]):
-            bound = find_bound(task, bounds[part], radius)
+            bound = find_bound(task, task.bounds[part], radius)
             sign = parts.signs[part]
             if is_any_above(bound.rise, 0.0):
                 is_found = bool(False)
@@ -199,11 +218,11 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
                             effect = wp.min(find_reach(task, bound, direction), room)
                             if is_any_above(effect, 0.0):
                                 if not is_found:
-                                    count, is_solid = find(task.points, corners, planes, parts, part, silhouette)
+                                    count, is_solid = find(parts, part, silhouette)
                                     silhouette.count = count
                                     silhouette.is_solid = is_solid
                                     is_found = True
-                                by_part = find_coverage(task.points, corners, parts, silhouette, direction, radius)
+                                by_part = find_coverage(parts, silhouette, direction, radius)
                                 is_affected = is_positive(effect)
                                 if is_any_above(wp.cw_mul(is_affected, by_part.share), 0.0):
                                     if not is_any_above(before, 0.0):
@@ -217,20 +236,11 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         return covered_count
 
     @wp.func
-    def cover_all(
-        corners: wp.array(dtype=wp.vec3),
-        planes: wp.array(dtype=wp.vec4),
-        bounds: wp.array(dtype=wp.vec4),
-        parts: ConvexArrays,
-        skip: int,
-        cells: DirectionCells,
-        radius: float,
-        task: PartsTask,
-    ):
+    def cover_all(inputs: PartInputs, task: PartsTask):
         """Store sums over all bodies for each cell."""
-        for body in range(parts.first_part.shape[0] - 1):
-            if body != skip and parts.blocks[body] == 1:
-                covered_count = cover(corners, planes, bounds, parts, body, cells, radius, task)
+        for body in range(inputs.parts.first_part.shape[0] - 1):
+            if body != inputs.skip and inputs.parts.blocks[body] == 1:
+                covered_count = cover(inputs, body, task)
                 for k in range(covered_count):
                     q = task.covered[k]
                     task.sums[q] = with_blocker(task.sums[q], task.coverage[q])
@@ -243,7 +253,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
 def _make_cover(lanes: int) -> wp.Kernel:
     Lane, Coverages, SumsOfBlockers = lane_type(lanes), coverage_type(lanes), sums_type(lanes)
     fn, functions, joint = make_lane_functions(lanes), _make_part_functions(lanes), make_joint_functions(lanes)
-    find_block, is_any_above, begin, cover_all = fn.find_block, fn.is_any_above, functions.begin, functions.cover_all
+    is_any_above, begin, cover_all = fn.is_any_above, functions.begin, functions.cover_all
     joint_coverage, store_columns = joint.joint_coverage, joint.store_columns
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
@@ -251,47 +261,25 @@ def _make_cover(lanes: int) -> wp.Kernel:
         first_row: int,
         worker: int,
         # in
-        points: wp.array2d(dtype=wp.vec3),
-        horizon_normals: wp.array2d(dtype=wp.vec3),
-        corners: wp.array2d(dtype=wp.vec3),
-        planes: wp.array2d(dtype=wp.vec4),
-        bounds: wp.array2d(dtype=wp.vec4),
-        parts: ConvexArrays,
-        cells: DirectionCells,
-        radius: float,
-        skip: int,
+        inputs: PartInputs,
         # scratch
         coverage: wp.array2d(dtype=Coverages),
         covered: wp.array2d(dtype=wp.int32),
         sums: wp.array2d(dtype=SumsOfBlockers),
         chord_sums: wp.array2d(dtype=Lane),
-        edge_scratch: wp.array2d(dtype=Lane),
+        edges: wp.array2d(dtype=Lane),
         numbers: wp.array3d(dtype=wp.int32),
         # out
         result: wp.array3d(dtype=wp.vec4),
     ):
         """A thread owns a block of receivers."""
         row = first_row + wp.tid()
-        batch, block = find_block(row, points.shape[1])
-        slot, instance = scratch_slot(worker, row), instance_in(batch, corners.shape[0])
-        task = begin(
-            points,
-            horizon_normals,
-            batch,
-            block,
-            coverage[slot],
-            covered[slot],
-            sums[slot],
-            chord_sums[slot],
-            edge_scratch[slot],
-            edge_scratch[slot],
-            numbers[slot],
-        )
-        cover_all(corners[instance], planes[instance], bounds[instance], parts, skip, cells, radius, task)
+        task = begin(row, worker, inputs, coverage, covered, sums, chord_sums, edges, numbers)
+        cover_all(inputs, task)
         for q in range(task.coverage.shape[0]):
             if is_any_above(task.sums[q].total, 0.0):
                 task.coverage[q] = joint_coverage(task.sums[q])
-        store_columns(task.coverage, block, result[batch])
+        store_columns(task.coverage, task.block, result[task.batch])
 
     return cover_cells
 
@@ -301,7 +289,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
     Coverages, SumsOfBlockers = coverage_type(lanes), sums_type(lanes)
     fn, functions, joint = make_lane_functions(lanes), _make_part_functions(lanes), make_joint_functions(lanes)
-    find_block, is_any_above, is_positive, scale = fn.find_block, fn.is_any_above, fn.is_positive, fn.scale
+    is_any_above, is_positive, scale = fn.is_any_above, fn.is_positive, fn.scale
     add, add_vectors = fn.add, fn.add_vectors
     joint_coverage_adjoint, blocker_adjoint = joint.joint_coverage_adjoint, joint.blocker_adjoint
     load_columns = joint.load_columns
@@ -322,25 +310,17 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
         first_row: int,
         worker: int,
         # in
-        points: wp.array2d(dtype=wp.vec3),
-        horizon_normals: wp.array2d(dtype=wp.vec3),
-        corners: wp.array2d(dtype=wp.vec3),
-        planes: wp.array2d(dtype=wp.vec4),
-        bounds: wp.array2d(dtype=wp.vec4),
-        parts: ConvexArrays,
-        cells: DirectionCells,
-        radius: float,
-        skip: int,
+        inputs: PartInputs,
         adj_result: wp.array3d(dtype=wp.vec4),
         # scratch
         coverage: wp.array2d(dtype=Coverages),
         covered: wp.array2d(dtype=wp.int32),
         sums: wp.array2d(dtype=SumsOfBlockers),
         chord_sums: wp.array2d(dtype=Lane),
-        edge_scratch: wp.array2d(dtype=Lane),
+        edges: wp.array2d(dtype=Lane),
         numbers: wp.array3d(dtype=wp.int32),
         adj_sums: wp.array2d(dtype=SumsOfBlockers),
-        adj_edge_scratch: wp.array2d(dtype=Lane),
+        adj_edges: wp.array2d(dtype=Lane),
         # out
         adj_points: wp.array2d(dtype=wp.vec3),
         # sums
@@ -348,57 +328,41 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
     ):
         """A thread owns a block of receivers; cells that are covered wholly have no gradient."""
         row = first_row + wp.tid()
-        batch, block = find_block(row, points.shape[1])
-        slot, instance = scratch_slot(worker, row), instance_in(batch, corners.shape[0])
-        task = begin(
-            points,
-            horizon_normals,
-            batch,
-            block,
-            coverage[slot],
-            covered[slot],
-            sums[slot],
-            chord_sums[slot],
-            edge_scratch[slot],
-            adj_edge_scratch[slot],
-            numbers[slot],
-        )
-        cover_all(corners[instance], planes[instance], bounds[instance], parts, skip, cells, radius, task)
-        load_columns(adj_result[batch], block, task.coverage)
+        task = begin(row, worker, inputs, coverage, covered, sums, chord_sums, edges, numbers)
+        task.silhouette.adj_edges = adj_edges[task.slot]
+        parts, radius = inputs.parts, inputs.radius
+        cover_all(inputs, task)
+        load_columns(adj_result[task.batch], task.block, task.coverage)
         for q in range(task.coverage.shape[0]):
-            adj_sums[slot, q] = SumsOfBlockers()
+            adj_sums[task.slot, q] = SumsOfBlockers()
             if is_any_above(task.sums[q].total, 0.0):
-                adj_sums[slot, q] = joint_coverage_adjoint(task.sums[q], task.coverage[q])
+                adj_sums[task.slot, q] = joint_coverage_adjoint(task.sums[q], task.coverage[q])
             task.coverage[q] = Coverages()
         silhouette = task.silhouette
         adj_point = Vectors()
         for body in range(parts.first_part.shape[0] - 1):
             covered_count = int(0)
-            if body != skip and parts.blocks[body] == 1:
-                covered_count = cover(
-                    corners[instance], planes[instance], bounds[instance], parts, body, cells, radius, task
-                )
+            if body != inputs.skip and parts.blocks[body] == 1:
+                covered_count = cover(inputs, body, task)
             affected_count = int(0)
             for k in range(covered_count):
                 q = task.covered[k]
-                adj_coverage = blocker_adjoint(task.sums[q], adj_sums[slot, q], task.coverage[q])
+                adj_coverage = blocker_adjoint(task.sums[q], adj_sums[task.slot, q], task.coverage[q])
                 task.coverage[q] = adj_coverage
                 if is_any(adj_coverage):
                     task.covered[affected_count] = q
                     affected_count += 1
             if affected_count > 0:
                 for part in range(parts.first_part[body], parts.first_part[body + 1]):
-                    bound = find_bound(task, bounds[instance, part], radius)
+                    bound = find_bound(task, task.bounds[part], radius)
                     is_found = bool(False)
                     for k in range(affected_count):
                         q = task.covered[k]
-                        direction = cells.directions[q]
+                        direction = inputs.cells.directions[q]
                         reach = find_reach(task, bound, direction)
                         if is_any_above(reach, 0.0):
                             if not is_found:
-                                count, is_solid = find(
-                                    task.points, corners[instance], planes[instance], parts, part, silhouette
-                                )
+                                count, is_solid = find(parts, part, silhouette)
                                 silhouette.count = count
                                 silhouette.is_solid = is_solid
                                 is_found = True
@@ -408,18 +372,13 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
                             adj = Coverages(
                                 wp.cw_mul(factor, task.coverage[q].share), scale(factor, task.coverage[q].moment)
                             )
-                            coverage_adjoint(task.points, corners[instance], parts, silhouette, direction, radius, adj)
+                            coverage_adjoint(parts, silhouette, direction, radius, adj)
                     if is_found:
-                        adj_point = add(
-                            adj_point,
-                            silhouette_adjoint(
-                                task.points, corners[instance], parts, silhouette, instance, adj_corners
-                            ),
-                        )
+                        adj_point = add(adj_point, silhouette_adjoint(parts, silhouette, task.instance, adj_corners))
                 for k in range(affected_count):
                     task.coverage[task.covered[k]] = Coverages()
         if adj_points:
-            add_vectors(adj_point, block, adj_points[batch])
+            add_vectors(adj_point, task.block, adj_points[task.batch])
 
     return cover_cells_adjoint
 
@@ -455,9 +414,13 @@ def part_coverage(
     if skip is not None:
         check.choice("skip", skip, range(blockers.body_count))
     points = expand(points, common_batch({"points": points, "corners": placed.corners}))
-    radius_of_cells = cell_radius(len(directions)) if radius is None else radius
-    cells = make_cells(directions, SOFTNESS, points.device)
-    inputs = [points, horizon_normals, *placed, blockers.arrays, cells, radius_of_cells, -1 if skip is None else skip]
+    inputs = PartInputs()
+    inputs.points, inputs.parts, inputs.cells = points, blockers.arrays, make_cells(directions, SOFTNESS, points.device)
+    if horizon_normals is not None:
+        inputs.horizon_normals = horizon_normals
+    inputs.corners, inputs.face_planes, inputs.bounds = placed
+    inputs.radius = cell_radius(len(directions)) if radius is None else radius
+    inputs.skip = -1 if skip is None else skip
     lanes = lane_count(points.device)
     Lane, sums, edge_count = lane_type(lanes), sums_type(lanes), blockers.edge_count
     by_cell = (len(directions),)
@@ -471,11 +434,11 @@ def part_coverage(
     rows = points.shape[0] * block_count(points.shape[1], lanes)
     cost = _PART_COST * lanes * placed.bounds.shape[1]
     return differentiable(
-        lambda result: launch(_make_cover(lanes), rows, inputs=inputs, outputs=[result], scratch=scratch, cost=cost),
+        lambda result: launch(_make_cover(lanes), rows, inputs=[inputs], outputs=[result], scratch=scratch, cost=cost),
         lambda adj_result: launch(
             _make_cover_adjoint(lanes),
             rows,
-            inputs=[*inputs, adj_result],
+            inputs=[inputs, adj_result],
             outputs=[points.grad],
             sums=[placed.corners.grad],
             scratch=[*scratch, *adj_scratch],

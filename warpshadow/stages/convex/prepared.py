@@ -97,17 +97,17 @@ class ConvexBlockers:
         check.shape("positions", positions.shape, ("batch", self.corners_of_vertices.shape[1]))
         corners = multiply(self.corners_of_vertices, positions)
         count, device, arrays = corners.shape[0], corners.device, self.arrays
-        planes = wp.empty((count, arrays.faces.size), dtype=wp.vec4, device=device)
+        face_planes = wp.empty((count, arrays.faces.size), dtype=wp.vec4, device=device)
         bounds = wp.empty((count, arrays.first_face.size - 1), dtype=wp.vec4, device=device)
-        launch(_bound_parts, bounds.shape, inputs=[without_gradient(corners), arrays], outputs=[planes, bounds])
-        return PlacedParts(corners, planes, bounds)
+        launch(_bound_parts, bounds.shape, inputs=[without_gradient(corners), arrays], outputs=[face_planes, bounds])
+        return PlacedParts(corners, face_planes, bounds)
 
 
 class PlacedParts(NamedTuple):
     """Convex parts in the world."""
 
     corners: wp.array  # vec3 of shape [batch, corner]
-    planes: wp.array  # of faces: outward normals N, and N·x of their points, vec4 of shape [batch, face]
+    face_planes: wp.array  # of faces: outward normals N, and N·x of their points, vec4 of shape [batch, face]
     bounds: wp.array  # of parts: center and radius of a sphere around each, vec4 of shape [batch, part]
 
 
@@ -117,7 +117,7 @@ def _bound_parts(
     corners: wp.array2d(dtype=wp.vec3),
     parts: ConvexArrays,
     # out
-    planes: wp.array2d(dtype=wp.vec4),
+    face_planes: wp.array2d(dtype=wp.vec4),
     bounds: wp.array2d(dtype=wp.vec4),
 ):
     """A thread owns a part of an instance."""
@@ -136,7 +136,7 @@ def _bound_parts(
         normal = wp.normalize(
             wp.cross(corners[batch, parts.faces[face][1]] - a, corners[batch, parts.faces[face][2]] - a)
         )
-        planes[batch, face] = wp.vec4(normal[0], normal[1], normal[2], wp.dot(normal, a))
+        face_planes[batch, face] = wp.vec4(normal[0], normal[1], normal[2], wp.dot(normal, a))
 
 
 def _starts(counts: Sequence[int]) -> np.ndarray:

@@ -91,11 +91,14 @@ _DIRECTION = "const float dx = direction.c[0], dy = direction.c[1], dz = directi
 
 @functools.cache
 def silhouette_type(lanes: int) -> Any:
-    """Struct of a part's silhouette, and memory for it."""
-    Lane = lane_type(lanes)
+    """Struct of a part's silhouette for a block of receivers, and memory for it."""
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
 
     @wp.struct
     class Silhouette:
+        points: Vectors  # of the receivers
+        corners: wp.array(dtype=wp.vec3)  # [corner] of all parts
+        face_planes: wp.array(dtype=wp.vec4)  # [face]
         facing: wp.array(dtype=wp.int32)  # [face] which receivers it faces, a bit for each
         numbers: wp.array(dtype=wp.int32)  # [edge]
         edges: wp.array(dtype=Lane)  # [EDGE_LANES · edge]
@@ -305,21 +308,16 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
         return dot_direction(direction, normal) + silhouette.edges[row + 4]
 
     @wp.func
-    def find(
-        points: Vectors,
-        corners: wp.array(dtype=wp.vec3),
-        planes: wp.array(dtype=wp.vec4),
-        parts: ConvexArrays,
-        part: int,
-        silhouette: Silhouette,
-    ):
+    def find(parts: ConvexArrays, part: int, silhouette: Silhouette):
         """Store a part's silhouette; returns how many edges it has, and where it is solid: see the struct."""
         first_face = parts.first_face[part]
         face_count = parts.first_face[part + 1] - first_face
         outside = int(0)
         for face in range(face_count):
-            plane = planes[first_face + face]
-            height = dot_direction(wp.vec3(plane[0], plane[1], plane[2]), points) - Lane(plane[3])
+            face_plane = silhouette.face_planes[first_face + face]
+            height = dot_direction(wp.vec3(face_plane[0], face_plane[1], face_plane[2]), silhouette.points) - Lane(
+                face_plane[3]
+            )
             bits = bits_above(height, 0.0)
             silhouette.facing[face] = bits
             outside = outside | bits
@@ -330,7 +328,8 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
             left = silhouette.facing[edge[2]]
             right = silhouette.facing[edge[3]]
             if left != right:
-                store_edge(points, corners[edge[0]], corners[edge[1]], left, right, STRIDE * count, silhouette.edges)
+                a, b = silhouette.corners[edge[0]], silhouette.corners[edge[1]]
+                store_edge(silhouette.points, a, b, left, right, STRIDE * count, silhouette.edges)
                 silhouette.numbers[count] = e
                 sign = silhouette.edges[STRIDE * count + 3]
                 edge_counts += wp.cw_mul(sign, sign)
@@ -343,14 +342,7 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
         return count, is_solid
 
     @wp.func
-    def find_coverage(
-        points: Vectors,
-        corners: wp.array(dtype=wp.vec3),
-        parts: ConvexArrays,
-        silhouette: Silhouette,
-        direction: wp.vec3,
-        radius: float,
-    ):
+    def find_coverage(parts: ConvexArrays, silhouette: Silhouette, direction: wp.vec3, radius: float):
         """Coverage of a cell by a silhouette."""
         nearest = Lane(radius)
         for k in range(silhouette.count):
@@ -365,20 +357,15 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
                 cosine = edge_cosine(silhouette, k, direction)
                 if is_any_above(-wp.max(cosine, -cosine), -radius):
                     edge = parts.edges[silhouette.numbers[k]]
-                    a, b = corners[edge[0]], corners[edge[1]]
-                    add_chord(points, a, b, cosine, direction, radius, STRIDE * k, silhouette.edges, silhouette.sums)
+                    a, b = silhouette.corners[edge[0]], silhouette.corners[edge[1]]
+                    edges, sums = silhouette.edges, silhouette.sums
+                    add_chord(silhouette.points, a, b, cosine, direction, radius, STRIDE * k, edges, sums)
         share = finish_sums(nearest, silhouette.is_solid, silhouette.sums, radius)
         return Coverages(share, Vectors(silhouette.sums[4], silhouette.sums[5], silhouette.sums[6]))
 
     @wp.func
     def coverage_adjoint(
-        points: Vectors,
-        corners: wp.array(dtype=wp.vec3),
-        parts: ConvexArrays,
-        silhouette: Silhouette,
-        direction: wp.vec3,
-        radius: float,
-        adj: Coverages,
+        parts: ConvexArrays, silhouette: Silhouette, direction: wp.vec3, radius: float, adj: Coverages
     ):
         """Add to the gradients of the edges' normals."""
         solid = Coverages(wp.cw_mul(silhouette.is_solid, adj.share), scale(silhouette.is_solid, adj.moment))
@@ -386,28 +373,22 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
             cosine = edge_cosine(silhouette, k, direction)
             if is_any_above(-wp.max(cosine, -cosine), -radius):
                 edge = parts.edges[silhouette.numbers[k]]
-                a, b = corners[edge[0]], corners[edge[1]]
+                a, b = silhouette.corners[edge[0]], silhouette.corners[edge[1]]
+                points, edges, adj_edges = silhouette.points, silhouette.edges, silhouette.adj_edges
                 row, adj_row = STRIDE * k, ADJOINT_STRIDE * k
-                edges, adj_edges = silhouette.edges, silhouette.adj_edges
                 add_chord_adjoint(points, a, b, cosine, direction, radius, solid, row, edges, adj_row, adj_edges)
 
     @wp.func
     def silhouette_adjoint(
-        points: Vectors,
-        corners: wp.array(dtype=wp.vec3),
-        parts: ConvexArrays,
-        silhouette: Silhouette,
-        instance: int,
-        adj_corners: wp.array2d(dtype=wp.vec3),
+        parts: ConvexArrays, silhouette: Silhouette, instance: int, adj_corners: wp.array2d(dtype=wp.vec3)
     ):
         """Add to the gradients of corners; returns those of the receivers."""
         adj_points = Vectors()
         for k in range(silhouette.count):
             edge = parts.edges[silhouette.numbers[k]]
             row = ADJOINT_STRIDE * k
-            ends_adjoint(
-                points, corners[edge[0]], corners[edge[1]], STRIDE * k, silhouette.edges, row, silhouette.adj_edges
-            )
+            a, b = silhouette.corners[edge[0]], silhouette.corners[edge[1]]
+            ends_adjoint(silhouette.points, a, b, STRIDE * k, silhouette.edges, row, silhouette.adj_edges)
             for end in range(2):
                 x = silhouette.adj_edges[row + 3 * end]
                 y = silhouette.adj_edges[row + 3 * end + 1]

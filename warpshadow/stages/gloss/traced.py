@@ -44,23 +44,9 @@ def _make_trace() -> wp.Kernel:
                 z[lane] = direction[2]
             ray_directions = Vectors(x, y, z)
             facing_rays = bits_above(dot_direction(normal, ray_directions), 0.0)
-            is_open = int(0)
-            if facing_rays != 0:
-                open_and_face = find_open(
-                    tree.corners,
-                    tree.lowers,
-                    tree.uppers,
-                    tree.leaf_count,
-                    point,
-                    normal,
-                    ray_directions,
-                    facing_rays,
-                    last_face,
-                )
-                is_open = open_and_face[0]
-                last_face = open_and_face[1]
+            open_rays, last_face = find_open(tree, point, normal, ray_directions, facing_rays, last_face)
             for lane in range(PACKET):
-                transmittance[receiver, packet * PACKET + lane] = float((is_open >> lane) % 2)
+                transmittance[receiver, packet * PACKET + lane] = float((open_rays >> lane) % 2)
 
     return trace_lobes
 

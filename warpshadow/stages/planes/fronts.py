@@ -1,36 +1,28 @@
-"""Fronts: which side of a plane receivers are on.
+"""Fronts: which side of a plane receivers are on, from 1 in front of it to 0 behind it.
 
-Where bodies touch, as two walls at their seam or a box and the ground that it stands on, points lie in the plane of
-another body, or within float32 of it. They are on the side on which their own body lies. Of a receiver at height h and
-of normal n, on a body that reaches from height l to height u over a plane with normal N,
+Where bodies touch, points lie in the plane of another body, or within float32 of it; they are on the side on which
+their own body lies. With h the height of a receiver, n its normal, N the plane's, and l to u the heights of its body,
 
     front = S(b + (1 − b²) n·N + 2 h / m),  b = (u + l) / max(u − l, m), from −1 to 1
 
-S is the smoothstep from 0 at −1 to 1 at 1, and m the margin of the plane, a thousandth of a texel. So
+S is the smoothstep from 0 at −1 to 1 at 1, and m the margin of the plane, a thousandth of a texel. So a body wholly in
+front of the plane (b = 1) or behind it (b = −1) has all its receivers there; one that the plane cuts has them where
+their heights are; and in the same plane (b = 0, h = 0) normals decide. The height term has no gradient: over so short a
+way as the margin it would be hundreds of times that of receivers beside it.
 
-- a body wholly in front of the plane (b = 1) has all its receivers in front, one wholly behind it (b = −1) all behind;
-- a body that the plane cuts has its receivers where their heights are;
-- of a body in the same plane (b = 0, h = 0) the normals decide.
-
-The height term has no gradient. Over so short a way as the margin it would be steep: a row of vertices of a wall in the
-plane of a ground had 280 times the gradient of the rows beside it.
-
-Where two or three planes meet, a receiver on the seam must see each of them as one before it does: at its own place it
-is at the border of both, and half of each would cover nothing. So receivers within 2 k of planes are lit where they are
-lifted to, off all of them, k = 5 m:
+Receivers within 2 k of planes, k = 5 m, are lit where they are lifted to, off all of them: on a seam of planes half of
+each would cover nothing.
 
     x + Σ_f (2 front_f − 1) k (1 − (h_f / 2 k)²)² N_f
 
-A body that has sunk into a ground a little has patch samples on its surface below. A point there gets the light of the
-ground's back: the light of the sky there. But receivers do not see the patch samples, they see spheres. So a patch
-sample is on the side of a plane on which the blocker nearest to its patch is:
+A patch sample is on the side on which the blocker nearest to its patch is, with c the height of that sphere's center
+and r its radius:
 
     front = S(1.25 (h + c) / r)
 
-c is the height of that sphere's center, and r its radius. A sphere that touches a plane from above has all its patch
-samples in front, and one that touches it from below, behind; 1.25 leaves room for spheres that bulge out of their mesh.
-So the light at a patch sample changes over the depth of a sphere. With a margin of a tenth of a texel it jumped: the
-gradient of a ball that touches a ground held for steps of 1/5000 of its radius.
+So a sphere that touches a plane from above has all its patch samples in front, also where the body has sunk into the
+ground a little, since receivers see its proxies. 1.25 leaves room for spheres that bulge out of their mesh. The light
+of a patch sample so changes over the depth of a sphere, not of a margin.
 """
 
 from __future__ import annotations
@@ -66,11 +58,11 @@ class NearestBlockers(NamedTuple):
 
 
 @wp.func
-def _height(point: wp.vec3, frames: wp.array2d(dtype=wp.vec3), instance: int, f: int):
+def _height(point: wp.vec3, frames: wp.array2d(dtype=wp.vec3), instance: int, plane: int):
     """Height of a point over a plane that has an area [units of the body]."""
-    axis_u = frames[instance, 3 * f + 1]
-    plane_normal = wp.normalize(wp.cross(axis_u, frames[instance, 3 * f + 2]))
-    return wp.dot(point - frames[instance, 3 * f], plane_normal) / wp.length(axis_u)
+    axis_u = frames[instance, 3 * plane + 1]
+    plane_normal = wp.normalize(wp.cross(axis_u, frames[instance, 3 * plane + 2]))
+    return wp.dot(point - frames[instance, 3 * plane], plane_normal) / wp.length(axis_u)
 
 
 @wp.func
@@ -93,9 +85,9 @@ def _find_extremes(
     extremes: wp.array2d(dtype=wp.vec2i),
 ):
     """A thread owns an instance and a plane."""
-    batch, f = wp.tid()
+    batch, plane = wp.tid()
     frame_batch = instance_in(batch, frames.shape[0])
-    plane_normal = wp.cross(frames[frame_batch, 3 * f + 1], frames[frame_batch, 3 * f + 2])
+    plane_normal = wp.cross(frames[frame_batch, 3 * plane + 1], frames[frame_batch, 3 * plane + 2])
     lowest_corner, highest_corner = int(0), int(0)
     corner_batch = instance_in(batch, corners.shape[0])
     first_corner = corners[corner_batch, 0]
@@ -106,7 +98,7 @@ def _find_extremes(
             lowest_corner, minimum = corner, height
         if height > maximum:
             highest_corner, maximum = corner, height
-    extremes[batch, f] = wp.vec2i(lowest_corner, highest_corner)
+    extremes[batch, plane] = wp.vec2i(lowest_corner, highest_corner)
 
 
 @wp.kernel
@@ -120,15 +112,17 @@ def _find_body_sides(
     body_sides: wp.array2d(dtype=wp.float32),
 ):
     """A thread owns an instance and a plane."""
-    batch, f = wp.tid()
+    batch, plane = wp.tid()
     frame_batch = instance_in(batch, frames.shape[0])
     side_of_body = float(0.0)
-    if wp.length_sq(frames[frame_batch, 3 * f + 1]) > 0.0:
+    if wp.length_sq(frames[frame_batch, 3 * plane + 1]) > 0.0:
         corner_batch = instance_in(batch, corners.shape[0])
-        min_height = _height(corners[corner_batch, extremes[batch, f][0]], frames, frame_batch, f)
-        max_height = _height(corners[corner_batch, extremes[batch, f][1]], frames, frame_batch, f)
-        side_of_body = wp.clamp((max_height + min_height) / wp.max(max_height - min_height, grids[f].margin), -1.0, 1.0)
-    body_sides[batch, f] = side_of_body
+        min_height = _height(corners[corner_batch, extremes[batch, plane][0]], frames, frame_batch, plane)
+        max_height = _height(corners[corner_batch, extremes[batch, plane][1]], frames, frame_batch, plane)
+        side_of_body = wp.clamp(
+            (max_height + min_height) / wp.max(max_height - min_height, grids[plane].margin), -1.0, 1.0
+        )
+    body_sides[batch, plane] = side_of_body
 
 
 @wp.kernel
@@ -146,12 +140,12 @@ def _find_fronts(
     fronts: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a point of an instance and a plane."""
-    batch, receiver, f = wp.tid()
+    batch, receiver, plane = wp.tid()
     frame_batch = instance_in(batch, frames.shape[0])
-    axis_u = frames[frame_batch, 3 * f + 1]
+    axis_u = frames[frame_batch, 3 * plane + 1]
     front = float(0.0)
     if wp.length_sq(axis_u) > 0.0:
-        height = _height(points[instance_in(batch, points.shape[0]), receiver], frames, frame_batch, f)
+        height = _height(points[instance_in(batch, points.shape[0]), receiver], frames, frame_batch, plane)
         blocker_index = int(-1)
         if blocker_indices:
             blocker_index = blocker_indices[receiver]
@@ -160,28 +154,28 @@ def _find_fronts(
             radius = radii[instance_in(batch, radii.shape[0]), blocker_index] / wp.length(axis_u)
         if radius > _MIN_BLOCKER_RADIUS:
             center_height = _height(
-                centers[instance_in(batch, centers.shape[0]), blocker_index], frames, frame_batch, f
+                centers[instance_in(batch, centers.shape[0]), blocker_index], frames, frame_batch, plane
             )
             if _FRONT_RADIUS_RATIO * wp.abs(height + center_height) < radius:
                 front = wp.smoothstep(-1.0, 1.0, _FRONT_RADIUS_RATIO * (height + center_height) / radius)
             else:
                 front = wp.where(height + center_height > 0.0, 1.0, 0.0)
-        elif wp.abs(height) < 2.0 * grids[f].margin:
+        elif wp.abs(height) < 2.0 * grids[plane].margin:
             side_of_body = float(1.0)
             if body_sides:
-                side_of_body = body_sides[instance_in(batch, body_sides.shape[0]), f]
-            plane_normal = wp.normalize(wp.cross(axis_u, frames[frame_batch, 3 * f + 2]))
+                side_of_body = body_sides[instance_in(batch, body_sides.shape[0]), plane]
+            plane_normal = wp.normalize(wp.cross(axis_u, frames[frame_batch, 3 * plane + 2]))
             facing_cosine = wp.dot(normals[instance_in(batch, normals.shape[0]), receiver], plane_normal)
             front = wp.smoothstep(
                 -1.0,
                 1.0,
                 side_of_body
                 + (1.0 - side_of_body * side_of_body) * facing_cosine
-                + _over_margin(height, grids[f].margin),
+                + _over_margin(height, grids[plane].margin),
             )
         else:
             front = wp.where(height > 0.0, 1.0, 0.0)
-    fronts[batch, receiver, f] = front
+    fronts[batch, receiver, plane] = front
 
 
 def find_fronts(
@@ -247,16 +241,22 @@ def _lift_points(
     frame_batch = instance_in(batch, frames.shape[0])
     point = points[instance_in(batch, points.shape[0]), receiver]
     lifted_point = point
-    for f in range(grids.shape[0]):
-        axis_u = frames[frame_batch, 3 * f + 1]
-        if f != skip and wp.length_sq(axis_u) > 0.0:
-            height = _height(point, frames, frame_batch, f) / (2.0 * _LIFT_IN_MARGINS * grids[f].margin)
+    for plane in range(grids.shape[0]):
+        axis_u = frames[frame_batch, 3 * plane + 1]
+        if plane != skip and wp.length_sq(axis_u) > 0.0:
+            height = _height(point, frames, frame_batch, plane) / (2.0 * _LIFT_IN_MARGINS * grids[plane].margin)
             if wp.abs(height) < 1.0:
                 nearness = 1.0 - height * height
-                plane_normal = wp.normalize(wp.cross(axis_u, frames[frame_batch, 3 * f + 2]))
-                side = 2.0 * fronts[batch, receiver, f] - 1.0
+                plane_normal = wp.normalize(wp.cross(axis_u, frames[frame_batch, 3 * plane + 2]))
+                side = 2.0 * fronts[batch, receiver, plane] - 1.0
                 lifted_point += (
-                    side * nearness * nearness * _LIFT_IN_MARGINS * grids[f].margin * wp.length(axis_u) * plane_normal
+                    side
+                    * nearness
+                    * nearness
+                    * _LIFT_IN_MARGINS
+                    * grids[plane].margin
+                    * wp.length(axis_u)
+                    * plane_normal
                 )
     lifted[batch, receiver] = lifted_point
 

@@ -1,4 +1,9 @@
-"""Sides of planes that a receiver sees, with their outlines, and the part of a cell that each covers."""
+"""Sides of planes that a receiver sees, with their outlines, and the part of a cell that each covers.
+
+A thread that owns a receiver stores the sides that it sees, with its position relative to them and their outlines
+(:func:`prepare_receiver`), and looks at each side cell by cell. An adjoint collects gradients beside all these, which
+:func:`prepare_receiver_adjoint` carries to the points, the fronts and the frames of the planes.
+"""
 
 import warp as wp
 
@@ -9,110 +14,162 @@ from warpshadow.stages.planes.cells import (
     LocalReceiver,
     PlaneArrays,
     PlaneFootprint,
-    direction_on_side,
     find_footprint,
     find_footprint_adjoint,
     find_local_receiver,
     find_local_receiver_adjoint,
     front_of,
     front_of_adjoint,
-    position_on_side,
-    side_adjoint,
 )
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 
-# Rows of a receiver's scratch, each a vec3; scratch of gradients has the same rows. Of n planes,
-#     5 f            has the receiver's position in the axes of plane f (:class:`.cells.LocalReceiver`);
-#     5 f + 1, 2, 3  have the plane's axes u and v, of unit length, and its normal;
-#     5 f + 4        has the scale of its body;
-#     5 n + i        has side i of the sides that the receiver sees, at most 2 n: the number of its plane, 1 for a back
-#                    or 0 for a front, and the part of the side that the receiver sees.
-_RECEIVER_ROWS = wp.constant(5)
-SIDE_ROWS = wp.constant(7)
-"""Rows of scratch for each plane: five, and one for each of its two sides."""
+_SIDES = wp.constant(2)  # a plane's front and its back
 
-# Views of an outline: the front's and the back's.
-_VIEWS = wp.constant(2)
+# ---------------------------------------------------------------------------------------------------- memory
 
 
-def receiver_scratch(planes: PlaneBlockers, rows: int = SIDE_ROWS) -> list[Scratch]:
-    """Scratch of a receiver: ``rows`` vec3 for each plane, and viewed edges."""
-    return [Scratch((rows * planes.count,), wp.vec3), Scratch((_VIEWS * planes.edges.size,), ViewedEdge)]
+@wp.struct
+class PlaneInputs:
+    """Receivers, and the planes around them."""
+
+    points: wp.array2d(dtype=wp.vec3)
+    frames: wp.array2d(dtype=wp.vec3)
+    fronts: wp.array3d(dtype=wp.float32)  # none where heights decide
+    planes: PlaneArrays
+
+
+def plane_inputs(points: wp.array, frames: wp.array, fronts: wp.array | None, planes: PlaneArrays) -> PlaneInputs:
+    """Put receivers together with the planes around them, for kernels."""
+    inputs = PlaneInputs()
+    inputs.points, inputs.frames, inputs.planes = points, frames, planes
+    if fronts is not None:
+        inputs.fronts = fronts
+    return inputs
+
+
+@wp.struct
+class StoredSide:
+    """A side that a receiver sees, as it is stored, with its gradients."""
+
+    plane: int  # its number
+    is_back: wp.bool
+    weight: float  # part of the side that is there
+    local_receiver: LocalReceiver
+    adj_weight: float
+    adj_local_receiver: LocalReceiver
+
+
+@wp.struct
+class PlaneReceiver:
+    """A receiver, and what its thread stores of the planes around it."""
+
+    batch: int
+    index: int  # of the receiver
+    slot: int  # of scratch memory
+    side_count: int
+    sides: wp.array(dtype=StoredSide)  # the sides that it sees, ``side_count`` of them
+    edges: wp.array(dtype=ViewedEdge)  # of each plane's front, and of its back
+
+
+def receiver_scratch(planes: PlaneBlockers) -> list[Scratch]:
+    """Scratch memory of a receiver: sides and edges, with their gradients."""
+    return [Scratch((_SIDES * planes.count,), StoredSide), Scratch((_SIDES * planes.edges.size,), ViewedEdge)]
 
 
 @wp.struct
 class PlaneSide:
-    """A side of a plane, as it is stored for a receiver."""
+    """A side of a plane, as a receiver sees it."""
 
-    row: int  # of scratch
-    f: int  # number of the plane
+    index: int  # among the sides that the receiver sees
+    plane: int  # its number
     is_back: wp.bool
     weight: float  # part of the side that is there
     first_edge: int  # of its viewed edges
+    grid: PlaneGrid
+    local_receiver: LocalReceiver
 
 
 @wp.func
-def load_side(planes: PlaneArrays, i: int, store: wp.array(dtype=wp.vec3)):
-    """Load side i of the sides that a receiver sees."""
+def load_side(planes: PlaneArrays, receiver: PlaneReceiver, index: int):
+    """Load one of the sides that a receiver sees."""
     side = PlaneSide()
-    side.row = _RECEIVER_ROWS * planes.grids.shape[0] + i
-    stored_side = store[side.row]
-    side.f = int(stored_side[0])
-    side.is_back = stored_side[1] > 0.0
-    side.weight = stored_side[2]
-    grid = planes.grids[side.f]
-    side.first_edge = _VIEWS * grid.first_edge + wp.where(side.is_back, grid.edge_count, 0)
+    side.index = index
+    side.plane = receiver.sides[index].plane
+    side.is_back = receiver.sides[index].is_back
+    side.weight = receiver.sides[index].weight
+    side.grid = planes.grids[side.plane]
+    side.first_edge = _SIDES * side.grid.first_edge + wp.where(side.is_back, side.grid.edge_count, 0)
+    side.local_receiver = receiver.sides[index].local_receiver
     return side
 
 
-@wp.func
-def load_local_receiver(store: wp.array(dtype=wp.vec3), f: int):
-    """Load a receiver in the axes of a plane."""
-    local_receiver = LocalReceiver()
-    row = _RECEIVER_ROWS * f
-    local_receiver.position = store[row]
-    local_receiver.axis_u = store[row + 1]
-    local_receiver.axis_v = store[row + 2]
-    local_receiver.normal = store[row + 3]
-    local_receiver.scale = store[row + 4][0]
-    return local_receiver
+# ---------------------------------------------------------------------------------------------------- positions
 
 
 @wp.func
-def store_local_receiver(store: wp.array(dtype=wp.vec3), f: int, local_receiver: LocalReceiver):
-    """Overwrite it."""
-    row = _RECEIVER_ROWS * f
-    store[row] = local_receiver.position
-    store[row + 1] = local_receiver.axis_u
-    store[row + 2] = local_receiver.axis_v
-    store[row + 3] = local_receiver.normal
-    store[row + 4] = wp.vec3(local_receiver.scale, 0.0, 0.0)
-
-
-@wp.func
-def _side_normal(local_receiver: LocalReceiver, side: PlaneSide):
+def _side_normal(side: PlaneSide):
     """Normal of a plane away from a side."""
-    return wp.where(side.is_back, 1.0, -1.0) * local_receiver.normal
+    return wp.where(side.is_back, 1.0, -1.0) * side.local_receiver.normal
 
 
 @wp.func
-def _view_outline(
-    planes: PlaneArrays,
-    grid: PlaneGrid,
+def _position_on_side(side: PlaneSide):
+    """Position of a receiver above a side: at least a margin high, and its own height from two margins on."""
+    position, margin = side.local_receiver.position, side.grid.margin
+    height = wp.where(side.is_back, -position[2], position[2])
+    front_ramp = wp.clamp(height / margin, 0.0, 2.0)
+    return wp.vec3(
+        position[0],
+        position[1],
+        margin * (1.0 + 0.25 * front_ramp * front_ramp) + wp.max(height - 2.0 * margin, 0.0),
+    )
+
+
+@wp.func
+def _direction_on_side(side: PlaneSide, direction: wp.vec3):
+    """Direction along the axes of a plane, and its cosine with a side."""
+    along_normal = wp.dot(direction, side.local_receiver.normal)
+    return wp.vec3(
+        wp.dot(direction, side.local_receiver.axis_u),
+        wp.dot(direction, side.local_receiver.axis_v),
+        wp.where(side.is_back, along_normal, -along_normal),
+    )
+
+
+@wp.func
+def _side_adjoint(
     side: PlaneSide,
-    local_receiver: LocalReceiver,
-    edges: wp.array(dtype=ViewedEdge),
+    direction: wp.vec3,
+    adj_position: wp.vec3,
+    adj_direction: wp.vec3,
+    adj_local_receiver: LocalReceiver,
 ):
+    """Add the gradients of :func:`_position_on_side` and :func:`_direction_on_side` to that of the local receiver."""
+    sign = wp.where(side.is_back, -1.0, 1.0)
+    height_slope = wp.clamp(0.5 * sign * side.local_receiver.position[2] / side.grid.margin, 0.0, 1.0)
+    result = LocalReceiver()
+    result.position = adj_local_receiver.position + wp.vec3(
+        adj_position[0], adj_position[1], sign * height_slope * adj_position[2]
+    )
+    result.axis_u = adj_local_receiver.axis_u + adj_direction[0] * direction
+    result.axis_v = adj_local_receiver.axis_v + adj_direction[1] * direction
+    result.normal = adj_local_receiver.normal - (sign * adj_direction[2]) * direction
+    result.scale = adj_local_receiver.scale
+    return result
+
+
+# ---------------------------------------------------------------------------------------------------- outlines
+
+
+@wp.func
+def _view_outline(planes: PlaneArrays, side: PlaneSide, edges: wp.array(dtype=ViewedEdge)):
     """Store the outline of a plane as a receiver over one side sees it; n = ±(a − x) × (b − a) / |b − a|.
 
     Edges run so that the mesh is to their left as the receiver sees it: the front's from b to a.
     """
-    position = position_on_side(grid, local_receiver, side.is_back)
-    foot = (
-        position[2] * _side_normal(local_receiver, side)
-        - position[0] * local_receiver.axis_u
-        - position[1] * local_receiver.axis_v
-    )
+    local_receiver, grid = side.local_receiver, side.grid
+    position = _position_on_side(side)
+    foot = position[2] * _side_normal(side) - position[0] * local_receiver.axis_u - position[1] * local_receiver.axis_v
     for e in range(grid.edge_count):
         edge_ends = planes.edges[grid.first_edge + e]
         axis = planes.edge_axes[grid.first_edge + e]
@@ -126,15 +183,11 @@ def _view_outline(
 
 @wp.func
 def _view_outline_adjoint(
-    planes: PlaneArrays,
-    grid: PlaneGrid,
-    side: PlaneSide,
-    local_receiver: LocalReceiver,
-    edges: wp.array(dtype=ViewedEdge),
-    adj_local_receiver: LocalReceiver,
+    planes: PlaneArrays, side: PlaneSide, edges: wp.array(dtype=ViewedEdge), adj_local_receiver: LocalReceiver
 ):
-    """Add to the gradient of the receiver relative to the plane."""
-    position = position_on_side(grid, local_receiver, side.is_back)
+    """Add to the gradient of the local receiver."""
+    local_receiver, grid = side.local_receiver, side.grid
+    position = _position_on_side(side)
     sign = wp.where(side.is_back, 1.0, -1.0)
     adj_foot = wp.vec3()
     for e in range(grid.edge_count):
@@ -157,98 +210,91 @@ def _view_outline_adjoint(
         -wp.dot(adj_foot, local_receiver.axis_v),
         sign * wp.dot(adj_foot, local_receiver.normal),
     )
-    return side_adjoint(grid, local_receiver, side.is_back, wp.vec3(), adj_position, wp.vec3(), adj_local_receiver)
+    return _side_adjoint(side, wp.vec3(), adj_position, wp.vec3(), adj_local_receiver)
+
+
+# ---------------------------------------------------------------------------------------------------- receivers
 
 
 @wp.func
-def _add_side(
+def _with_side(
     planes: PlaneArrays,
-    f: int,
-    is_back: float,
+    plane: int,
+    is_back: bool,
     weight: float,
-    side_count: int,
     local_receiver: LocalReceiver,
-    store: wp.array(dtype=wp.vec3),
-    edges: wp.array(dtype=ViewedEdge),
+    receiver: PlaneReceiver,
 ):
     """Store a side with its outline if some of it is there; returns how many sides are stored."""
     if weight <= 0.0:
-        return side_count
-    store[_RECEIVER_ROWS * planes.grids.shape[0] + side_count] = wp.vec3(float(f), is_back, weight)
-    _view_outline(planes, planes.grids[f], load_side(planes, side_count, store), local_receiver, edges)
-    return side_count + 1
+        return receiver.side_count
+    side = StoredSide()
+    side.plane = plane
+    side.is_back = is_back
+    side.weight = weight
+    side.local_receiver = local_receiver
+    receiver.sides[receiver.side_count] = side
+    _view_outline(planes, load_side(planes, receiver, receiver.side_count), receiver.edges)
+    return receiver.side_count + 1
 
 
 @wp.func
 def prepare_receiver(
     row: int,
     worker: int,
-    points: wp.array2d(dtype=wp.vec3),
-    frames: wp.array2d(dtype=wp.vec3),
-    fronts: wp.array3d(dtype=wp.float32),
-    planes: PlaneArrays,
-    scratch: wp.array2d(dtype=wp.vec3),
-    viewed_edges: wp.array2d(dtype=ViewedEdge),
+    inputs: PlaneInputs,
+    sides: wp.array2d(dtype=StoredSide),
+    edges: wp.array2d(dtype=ViewedEdge),
 ):
-    """Store a receiver's position relative to each plane, and the sides that it may hit.
-
-    Returns its instance and number, its place in scratch memory, and how many sides are stored.
-    """
-    batch, receiver = split_row(row, points.shape[1])
-    scratch_row = scratch_slot(worker, row)
-    store, edges = scratch[scratch_row], viewed_edges[scratch_row]
-    frame_batch = instance_in(batch, frames.shape[0])
-    side_count = int(0)
-    for f in range(planes.grids.shape[0]):
-        local_receiver = find_local_receiver(points[batch, receiver], frames[frame_batch], f)
-        store_local_receiver(store, f, local_receiver)
-        if f != planes.skip and wp.length_sq(local_receiver.normal) > 0.0:
-            # below the plane the front fades, and the back takes over
-            front = front_of(fronts, planes.grids[f], local_receiver.position[2], batch, receiver, f)
-            side_count = _add_side(planes, f, 0.0, front, side_count, local_receiver, store, edges)
-            side_count = _add_side(planes, f, 1.0, 1.0 - front, side_count, local_receiver, store, edges)
-    return batch, receiver, scratch_row, side_count
+    """Store the sides of planes that a receiver may hit, and where it is relative to them, in scratch memory."""
+    receiver = PlaneReceiver()
+    batch, index = split_row(row, inputs.points.shape[1])
+    receiver.batch = batch
+    receiver.index = index
+    receiver.slot = scratch_slot(worker, row)
+    receiver.sides = sides[receiver.slot]
+    receiver.edges = edges[receiver.slot]
+    planes = inputs.planes
+    frame_batch = instance_in(batch, inputs.frames.shape[0])
+    for plane in range(planes.grids.shape[0]):
+        if plane != planes.skip:
+            local_receiver = find_local_receiver(inputs.points[batch, index], inputs.frames[frame_batch], plane)
+            if wp.length_sq(local_receiver.normal) > 0.0:
+                # below the plane the front fades, and the back takes over
+                front = front_of(inputs.fronts, planes.grids[plane], local_receiver.position[2], batch, index, plane)
+                receiver.side_count = _with_side(planes, plane, False, front, local_receiver, receiver)
+                receiver.side_count = _with_side(planes, plane, True, 1.0 - front, local_receiver, receiver)
+    return receiver
 
 
 @wp.func
 def prepare_receiver_adjoint(
-    batch: int,
-    receiver: int,
-    side_count: int,
-    points: wp.array2d(dtype=wp.vec3),
-    frames: wp.array2d(dtype=wp.vec3),
-    fronts: wp.array3d(dtype=wp.float32),
-    planes: PlaneArrays,
-    store: wp.array(dtype=wp.vec3),
-    edges: wp.array(dtype=ViewedEdge),
-    adj_store: wp.array(dtype=wp.vec3),
+    receiver: PlaneReceiver,
+    inputs: PlaneInputs,
     adj_points: wp.array2d(dtype=wp.vec3),
     adj_fronts: wp.array3d(dtype=wp.float32),
     adj_frames: wp.array2d(dtype=wp.vec3),
 ):
     """Add to the gradients of points, fronts and frames."""
-    for i in range(side_count):
-        side = load_side(planes, i, store)
-        grid = planes.grids[side.f]
-        local_receiver = load_local_receiver(store, side.f)
-        adj_receiver = _view_outline_adjoint(
-            planes, grid, side, local_receiver, edges, load_local_receiver(adj_store, side.f)
-        )
-        adj_front = wp.where(side.is_back, -1.0, 1.0) * adj_store[side.row][2]
-        adj_height = front_of_adjoint(
-            fronts, grid, local_receiver.position[2], adj_front, batch, receiver, side.f, adj_fronts
-        )
-        adj_receiver.position = adj_receiver.position + wp.vec3(0.0, 0.0, adj_height)
-        store_local_receiver(adj_store, side.f, adj_receiver)
-    frame_batch = instance_in(batch, frames.shape[0])
+    batch, index = receiver.batch, receiver.index
+    frame_batch = instance_in(batch, inputs.frames.shape[0])
+    point, frames = inputs.points[batch, index], inputs.frames[frame_batch]
     adj_point = wp.vec3()
-    for f in range(planes.grids.shape[0]):
-        local_receiver, adj_receiver = load_local_receiver(store, f), load_local_receiver(adj_store, f)
+    for i in range(receiver.side_count):
+        side = load_side(inputs.planes, receiver, i)
+        adj_local = _view_outline_adjoint(inputs.planes, side, receiver.edges, receiver.sides[i].adj_local_receiver)
+        adj_front = wp.where(side.is_back, -1.0, 1.0) * receiver.sides[i].adj_weight
+        height = side.local_receiver.position[2]
+        adj_height = front_of_adjoint(inputs.fronts, side.grid, height, adj_front, batch, index, side.plane, adj_fronts)
+        adj_local.position = adj_local.position + wp.vec3(0.0, 0.0, adj_height)
         adj_point += find_local_receiver_adjoint(
-            points[batch, receiver], frames[frame_batch], f, local_receiver, adj_receiver, frame_batch, adj_frames
+            point, frames, side.plane, side.local_receiver, adj_local, frame_batch, adj_frames
         )
     if adj_points:
-        adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
+        adj_points[batch, index] = adj_points[batch, index] + adj_point
+
+
+# ---------------------------------------------------------------------------------------------------- cells
 
 
 @wp.struct
@@ -276,106 +322,80 @@ def visible_cell(planes: PlaneArrays, normal: wp.vec3, direction: wp.vec3):
 
 
 @wp.func
-def footprint_on_side(
-    planes: PlaneArrays, grid: PlaneGrid, side: PlaneSide, local_receiver: LocalReceiver, direction: wp.vec3
-):
+def footprint_on_side(planes: PlaneArrays, side: PlaneSide, direction: wp.vec3):
     """Find the footprint of a cell on a side."""
-    return find_footprint(
-        planes,
-        position_on_side(grid, local_receiver, side.is_back),
-        direction_on_side(local_receiver, side.is_back, direction),
-    )
+    return find_footprint(planes, _position_on_side(side), _direction_on_side(side, direction))
 
 
 @wp.func
 def footprint_on_side_adjoint(
     planes: PlaneArrays,
-    grid: PlaneGrid,
     side: PlaneSide,
-    local_receiver: LocalReceiver,
     direction: wp.vec3,
     footprint: PlaneFootprint,
     adj_mip: wp.vec3,
-    adj_store: wp.array(dtype=wp.vec3),
+    sides: wp.array(dtype=StoredSide),
 ):
-    """Add to the gradients of the receiver relative to the plane, given those of :func:`.cells.fetch`.
-
-    Returns the gradient of the direction.
-    """
+    """Add to those of the local receiver the gradients of :func:`.cells.fetch`; returns that of the direction."""
     adj_cosine = -0.5 * footprint.per_cosine * adj_mip[2]  # texels are as wide as t / √c′
     adj_distance = float(0.0)
     if adj_mip[2] != 0.0:
         adj_distance = adj_mip[2] / footprint.distance
-    local_direction, adj_center = (
-        direction_on_side(local_receiver, side.is_back, direction),
+    adj_position, adj_direction = find_footprint_adjoint(
+        planes,
+        _direction_on_side(side, direction),
+        footprint,
+        adj_distance,
+        adj_cosine,
         wp.vec2(adj_mip[0], adj_mip[1]),
     )
-    adj_position, adj_direction = find_footprint_adjoint(
-        planes, local_direction, footprint, adj_distance, adj_cosine, adj_center
-    )
-    adj_local_receiver = load_local_receiver(adj_store, side.f)
-    store_local_receiver(
-        adj_store,
-        side.f,
-        side_adjoint(grid, local_receiver, side.is_back, direction, adj_position, adj_direction, adj_local_receiver),
+    sides[side.index].adj_local_receiver = _side_adjoint(
+        side, direction, adj_position, adj_direction, sides[side.index].adj_local_receiver
     )
     return (
-        adj_direction[0] * local_receiver.axis_u
-        + adj_direction[1] * local_receiver.axis_v
-        + adj_direction[2] * _side_normal(local_receiver, side)
+        adj_direction[0] * side.local_receiver.axis_u
+        + adj_direction[1] * side.local_receiver.axis_v
+        + adj_direction[2] * _side_normal(side)
     )
 
 
 @wp.func
-def inverse_distance_on_side(grid: PlaneGrid, side: PlaneSide, local_receiver: LocalReceiver):
+def inverse_distance_on_side(side: PlaneSide):
     """Vector g of a side: along a direction ω its plane is 1/(g·ω) away [scene units]."""
-    height = local_receiver.scale * position_on_side(grid, local_receiver, side.is_back)[2]
-    return _side_normal(local_receiver, side) / height
+    return _side_normal(side) / (side.local_receiver.scale * _position_on_side(side)[2])
 
 
 @wp.func
 def inverse_distance_on_side_adjoint(
-    grid: PlaneGrid,
     side: PlaneSide,
-    local_receiver: LocalReceiver,
     inverse_distance: wp.vec3,
     adj_inverse_distance: wp.vec3,
-    adj_store: wp.array(dtype=wp.vec3),
+    sides: wp.array(dtype=StoredSide),
 ):
-    """Add to the gradients of the receiver relative to the plane."""
-    height = position_on_side(grid, local_receiver, side.is_back)[2]
+    """Add to the gradients of the local receiver."""
+    height = _position_on_side(side)[2]
     adj_log = -wp.dot(adj_inverse_distance, inverse_distance)  # of the height in scene units
-    adj_receiver = side_adjoint(
-        grid,
-        local_receiver,
-        side.is_back,
-        wp.vec3(),
-        wp.vec3(0.0, 0.0, adj_log / height),
-        wp.vec3(),
-        load_local_receiver(adj_store, side.f),
-    )
+    adj_position = wp.vec3(0.0, 0.0, adj_log / height)
+    adj_local_receiver = _side_adjoint(side, wp.vec3(), adj_position, wp.vec3(), sides[side.index].adj_local_receiver)
     sign = wp.where(side.is_back, 1.0, -1.0)
-    adj_receiver.normal = adj_receiver.normal + (sign / (local_receiver.scale * height)) * adj_inverse_distance
-    adj_receiver.scale = adj_receiver.scale + adj_log / local_receiver.scale
-    store_local_receiver(adj_store, side.f, adj_receiver)
+    adj_local_receiver.normal = (
+        adj_local_receiver.normal + (sign / (side.local_receiver.scale * height)) * adj_inverse_distance
+    )
+    adj_local_receiver.scale = adj_local_receiver.scale + adj_log / side.local_receiver.scale
+    sides[side.index].adj_local_receiver = adj_local_receiver
 
 
 @wp.func
 def outline_coverage_on_side(
-    planes: PlaneArrays,
-    grid: PlaneGrid,
-    side: PlaneSide,
-    local_receiver: LocalReceiver,
-    cell: VisibleCell,
-    edges: wp.array(dtype=ViewedEdge),
+    planes: PlaneArrays, side: PlaneSide, cell: VisibleCell, edges: wp.array(dtype=ViewedEdge)
 ):
     """Coverage (h, μ) of a cell by the outline of a plane, as much of it as is seen of the side."""
-    side_normal = _side_normal(local_receiver, side)
+    side_normal = _side_normal(side)
     if wp.dot(side_normal, cell.direction) <= -planes.radius:
         return wp.vec4()
-    first_edge_index, count = side.first_edge, grid.edge_count
-    if grid.is_convex == 1:
-        return side.weight * convex_coverage(edges, first_edge_index, count, cell.direction, cell.radius)
+    first, count = side.first_edge, side.grid.edge_count
+    if side.grid.is_convex == 1:
+        return side.weight * convex_coverage(edges, first, count, cell.direction, cell.radius)
     return side.weight * outline_coverage(
-        edges, first_edge_index, count, side_normal, local_receiver.axis_u, cell.direction, cell.radius
+        edges, first, count, side_normal, side.local_receiver.axis_u, cell.direction, cell.radius
     )

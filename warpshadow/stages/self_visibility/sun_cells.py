@@ -115,24 +115,14 @@ def _make_trace() -> wp.Kernel:
                     dot_direction(axes[2], world_directions),
                 )
                 cosine = dot_direction(normal, ray_directions)
-                facing_rays = bits_above(cosine, 0.0)
-                open_and_face = find_open(
-                    tree.corners,
-                    tree.lowers,
-                    tree.uppers,
-                    tree.leaf_count,
-                    point,
-                    normal,
-                    ray_directions,
-                    facing_rays,
-                    last_face,
+                open_rays, last_face = find_open(
+                    tree, point, normal, ray_directions, bits_above(cosine, 0.0), last_face
                 )
-                last_face = open_and_face[1]
                 cosine_sum = float(0.0)
                 open_cosine_sum = float(0.0)
                 for lane in range(PACKET):
                     cosine_sum += wp.max(cosine[lane], 0.0)
-                    if (open_and_face[0] >> lane) % 2 == 1:
+                    if (open_rays >> lane) % 2 == 1:
                         open_cosine_sum += cosine[lane]
                 transmittance[batch, receiver, slot] = wp.where(cosine_sum > 0.0, open_cosine_sum / cosine_sum, 1.0)
 

@@ -118,6 +118,7 @@ def _make_trace() -> wp.Kernel:
     ):
         """A thread owns a row, whose bits are zero before."""
         row = first_row + wp.tid()
+        point = points[row]
         normal = normals[row]
         last_face = int(-1)
         for packet in range(directions.shape[0]):
@@ -130,21 +131,9 @@ def _make_trace() -> wp.Kernel:
                 ray_directions.x -= normal[0] * cosine
                 ray_directions.y -= normal[1] * cosine
                 ray_directions.z -= normal[2] * cosine
-                point = points[row]
-                open_and_face = find_open(
-                    tree.corners,
-                    tree.lowers,
-                    tree.uppers,
-                    tree.leaf_count,
-                    point,
-                    normal,
-                    ray_directions,
-                    facing_rays,
-                    last_face,
-                )
-                last_face = open_and_face[1]
+                open_rays, last_face = find_open(tree, point, normal, ray_directions, facing_rays, last_face)
                 word = PACKET * packet // 32
-                bits[row, word] = bits[row, word] | (wp.uint32(open_and_face[0]) << wp.uint32(PACKET * packet % 32))
+                bits[row, word] = bits[row, word] | (wp.uint32(open_rays) << wp.uint32(PACKET * packet % 32))
         for packet in range(directions.shape[0]):
             ray_directions = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
             cosine = dot_direction(normal, ray_directions)

@@ -109,7 +109,8 @@ def find_edge_colors(
     Not differentiable.
     """
     fragments, shape = silhouettes.fragments, silhouettes.flat_shape(image)
-    edge_colors = zeros((shape[0], *silhouettes.edges.shape), dtype=wp.vec4, device=image.device)
+    color_shape = shape[0], *silhouettes.edges.shape
+    edge_colors = zeros(color_shape, dtype=wp.vec4, device=image.device, outlives_recording=False)
     launch(
         _find_edge_colors,
         edge_colors.shape[:2],

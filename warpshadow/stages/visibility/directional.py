@@ -23,7 +23,6 @@ from warpshadow.device.lanes import (
     make_lane_functions,
     module_options,
     span_count,
-    vectors_type,
 )
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
@@ -31,7 +30,7 @@ from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratc
 from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.visibility.cones import check_spheres
 from warpshadow.stages.visibility.culling import DirectionCells, cap_type, make_cap_functions, make_cells, make_cull
-from warpshadow.stages.visibility.falloff import make_falloff, make_sphere_adjoint
+from warpshadow.stages.visibility.falloff import make_cap_adjoint, make_falloff
 from warpshadow.stages.visibility.merging import MERGING, NODES_PER_CLUSTER, Gradients
 from warpshadow.stages.visibility.traversal import (
     ClusterTree,
@@ -181,75 +180,29 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
 
 @functools.cache
 def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
-    Lane, Vectors, TransmittanceTask = lane_type(lanes), vectors_type(lanes), _task_type(lanes)
-    ReceiverLanes, SphereView, SphereAdjoint = lane_structs(lanes)
+    Lane, TransmittanceTask = lane_type(lanes), _task_type(lanes)
+    ReceiverLanes, SphereView, _SphereAdjoint = lane_structs(lanes)
     fn = make_lane_functions(lanes)
-    load_products, sqrt, add_vectors = fn.load_products, fn.sqrt, fn.add_vectors
-    load_task, falloff, sphere_adjoint = (
-        _make_load_task(has_horizon, lanes),
-        make_falloff(lanes),
-        make_sphere_adjoint(lanes),
-    )
-    widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(has_horizon, lanes)
+    load_products, add_vectors = fn.load_products, fn.add_vectors
+    load_task = _make_load_task(has_horizon, lanes)
+
+    @wp.func(inline=True)
+    def find_weight(sphere_view: SphereView, task: TransmittanceTask):
+        """None counts more than another."""
+        return Lane(1.0)
+
+    @wp.func(inline=True)
+    def share_adjoint(
+        sphere_view: SphereView, weight: Lane, share: Lane, slot: int, direction: int, task: TransmittanceTask
+    ):
+        """ā_i = −T̄ T / (1 − a_i)."""
+        return -wp.cw_div(task.transmittances[slot], wp.max(Lane(1.0) - share, Lane(1.0e-7)))
+
+    cap_adjoint = make_cap_adjoint(has_horizon, find_weight, share_adjoint, False, TransmittanceTask, lanes)
 
     @wp.func(inline=True)
     def visit(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: TransmittanceTask):
-        """The adjoint of the sphere's cone.
-
-        With a the share of a cell that it blocks, ā_i = −T̄ T / (1 − a_i).
-        """
-        adj_sphere = SphereAdjoint()
-        cone = sphere_view.cone
-        cells = task.cells
-        sine = sqrt(cone.sine2)
-        cap = widen_cone(cone.axis, cone.cosine, sine, cells)
-        if is_above_horizon(cap, receivers.normals):
-            slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
-            is_any_blocked = bool(False)
-            sum_adj_t = Lane(0.0)
-            sum_t = Lane(0.0)
-            sum_x = Lane(0.0)
-            sum_y = Lane(0.0)
-            sum_z = Lane(0.0)
-            adj_opacity = Lane(0.0)
-            for k in range(count):
-                bundle = task.reached_bundles[1, k]
-                direction_bundle = task.first_bundle + bundle
-                if task.ends[bundle] > sphere_view.traversal_index and reaches_bundle(
-                    cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle]
-                ):
-                    is_any_blocked = True
-                    for i in range(BUNDLE):
-                        omega = cells.directions[direction_bundle * BUNDLE + i]
-                        t, step = soft_edge(omega, cap, slope)
-                        transmitted = wp.max(Lane(1.0) - wp.cw_mul(opacity, step), Lane(1.0e-7))
-                        adj_blocked = -wp.cw_div(task.transmittances[bundle * BUNDLE + i], transmitted)
-                        adj_opacity += wp.cw_mul(adj_blocked, step)
-                        step_slope = wp.cw_mul(t, Lane(1.0) - t)
-                        adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_blocked, opacity), step_slope)
-                        sum_adj_t += adj_t
-                        sum_t += wp.cw_mul(adj_t, t)
-                        sum_x += omega[0] * adj_t
-                        sum_y += omega[1] * adj_t
-                        sum_z += omega[2] * adj_t
-            if is_any_blocked:
-                sum_omega = Vectors(sum_x, sum_y, sum_z)
-                adj_offset, adj_radius, adj_weight = sphere_adjoint(
-                    sphere_view,
-                    sine,
-                    cap.cosine,
-                    cells.cos_width,
-                    cells.sin_width,
-                    slope,
-                    adj_opacity,
-                    sum_adj_t,
-                    sum_t,
-                    sum_omega,
-                )
-                adj_sphere.is_any = True
-                adj_sphere.offset = adj_offset
-                adj_sphere.radius = adj_radius
-                adj_sphere.weight = adj_weight
+        adj_sphere, _relative_adjoint = cap_adjoint(receivers, sphere_view, count, task)
         return adj_sphere
 
     traverse = make_traversal(make_cull(has_horizon, TransmittanceTask, lanes), visit, TransmittanceTask, True, lanes)

@@ -429,13 +429,16 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
         result=empty(log_sh.shape, dtype=wp.float32, device=device),
         variables=[log_sh],
     )
-    if not device.is_capturing:
-        held_count, broken_count = faults.numpy().tolist()
+
+    def judge(counts: np.ndarray) -> None:
+        held_count, broken_count = counts.tolist()
         if broken_count:
-            check.finite_arrays({"log_sh": log_sh})
+            check.finite("log_sh", log_sh.numpy())
         if held_count:
             check.warn(
                 f"log-SH visibility of {held_count} of {batch_count * vertex_count} receivers is held back from rising "
                 "above 1, since many spheres overlap; fewer spheres, or directional transmittance, are accurate"
             )
+
+    check.values_of(faults, judge)
     return visibility

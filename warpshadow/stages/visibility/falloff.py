@@ -5,8 +5,10 @@ import functools
 import warp as wp
 
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
+from warpshadow.maths.directions import BUNDLE
 from warpshadow.stages.visibility.cones import cone_type, make_cone_adjoint
-from warpshadow.stages.visibility.traversal import sphere_view_type
+from warpshadow.stages.visibility.culling import make_cap_functions
+from warpshadow.stages.visibility.traversal import lane_structs, sphere_view_type
 
 
 @functools.cache
@@ -115,3 +117,98 @@ def make_sphere_adjoint(lanes: int) -> wp.Function:
         return adj_offset, adj_radius, adj_weight
 
     return sphere_adjoint
+
+
+@functools.cache
+def make_cap_adjoint(
+    has_horizon: bool, find_weight: wp.Function, share_adjoint: wp.Function, is_costly: bool, Task: type, lanes: int
+) -> wp.Function:
+    """Make the kernel function of the adjoint of all cells that a sphere blocks in part, for the traversal's visits.
+
+    Args:
+        has_horizon: Whether receivers have normals.
+        find_weight: (sphere_view, task) → a weight of the sphere for each receiver.
+        share_adjoint: (sphere_view, weight, share, slot, direction, task) → ā of a cell of which the sphere blocks the
+            share a = A step(t). Slot is the number of the cell among the thread's, direction that among all.
+        is_costly: Whether that costs more than the test for cells of which the sphere blocks nothing.
+        Task: Struct as for :func:`.culling.make_cull`.
+        lanes: Receivers of a block.
+
+    Returns:
+        The function (receivers, sphere_view, count, task) → SphereAdjoint, and Σ ā a.
+    """
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
+    ReceiverLanes, SphereView, SphereAdjoint = lane_structs(lanes)
+    fn = make_lane_functions(lanes)
+    sqrt, is_any_above = fn.sqrt, fn.is_any_above
+    falloff, sphere_adjoint = make_falloff(lanes), make_sphere_adjoint(lanes)
+    widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(has_horizon, lanes)
+
+    @wp.func(inline=True)
+    def is_looked_at(t: Lane):
+        is_reached = bool(True)
+        if wp.static(is_costly):
+            is_reached = is_any_above(t, 0.0)
+        return is_reached
+
+    @wp.func(inline=True)
+    def cap_adjoint(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: Task):
+        adj_sphere = SphereAdjoint()
+        cone = sphere_view.cone
+        cells = task.cells
+        sine = sqrt(cone.sine2)
+        cap = widen_cone(cone.axis, cone.cosine, sine, cells)
+        relative_adjoint = Lane(0.0)
+        if is_above_horizon(cap, receivers.normals):
+            slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
+            weight = find_weight(sphere_view, task)
+            is_any_blocked = bool(False)
+            sum_adj_t = Lane(0.0)
+            sum_t = Lane(0.0)
+            sum_x = Lane(0.0)
+            sum_y = Lane(0.0)
+            sum_z = Lane(0.0)
+            adj_opacity = Lane(0.0)
+            for k in range(count):
+                bundle = task.reached_bundles[1, k]
+                direction_bundle = task.first_bundle + bundle
+                if task.ends[bundle] > sphere_view.traversal_index and reaches_bundle(
+                    cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle]
+                ):
+                    for i in range(BUNDLE):
+                        direction = direction_bundle * BUNDLE + i
+                        omega = cells.directions[direction]
+                        t, step = soft_edge(omega, cap, slope)
+                        if is_looked_at(t):
+                            is_any_blocked = True
+                            share = wp.cw_mul(opacity, step)
+                            adj_share = share_adjoint(sphere_view, weight, share, bundle * BUNDLE + i, direction, task)
+                            adj_opacity += wp.cw_mul(adj_share, step)
+                            step_slope = wp.cw_mul(t, Lane(1.0) - t)
+                            adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_share, opacity), step_slope)
+                            sum_adj_t += adj_t
+                            sum_t += wp.cw_mul(adj_t, t)
+                            sum_x += omega[0] * adj_t
+                            sum_y += omega[1] * adj_t
+                            sum_z += omega[2] * adj_t
+            if is_any_blocked:
+                adj_offset, adj_radius, adj_weight = sphere_adjoint(
+                    sphere_view,
+                    sine,
+                    cap.cosine,
+                    cells.cos_width,
+                    cells.sin_width,
+                    slope,
+                    adj_opacity,
+                    sum_adj_t,
+                    sum_t,
+                    Vectors(sum_x, sum_y, sum_z),
+                )
+                adj_sphere.is_any = True
+                adj_sphere.offset = adj_offset
+                adj_sphere.radius = adj_radius
+                adj_sphere.weight = adj_weight
+                relative_adjoint = wp.cw_mul(adj_opacity, opacity)
+        return adj_sphere, relative_adjoint
+
+    return cap_adjoint

@@ -1,14 +1,12 @@
-"""Sharp cells: cells whose light comes from a spot much smaller than they are, as a sun's.
-
-Where nothing is known of the light in a cell, the soft edge of a shadow, w = κρ, is as wide as cells ask for. A spot of
-half-angle s has a penumbra of ±s. So a sharp cell gets the edge of cells of radius ρ = 2.4 s: at κ = 0.35 it is ±0.84
-s, a smoothstep about as steep as that penumbra. κ scales it as it does all edges. The transmittance T′ of sharp cells
-is found by itself, and blended with that by wide edges, T, by the share σ of the cell's light that is the spot's:
+"""Sharp cells: transmittance of cells whose light comes from a spot much smaller than they are, as a sun's.
 
     T ← T + σ (T′ − T)
 
-Around a sun the sky is bright: 7% of the light of its cell. By σ = 1 the spot of a sun on the floor of a closed room
-was 4% too bright, and a ball above it, which sees that sky and not the sun, 15% too dark.
+with T the transmittance by edges as wide as cells ask for, w = κρ, T′ that by the edge of cells of radius 2.4 s, s the
+half-angle of the spot, and σ the share of the cell's light that is the spot's. A spot has a penumbra of ±s; at κ = 0.35
+the edge is ±0.84 s, a smoothstep about as steep. κ scales it as it does all edges.
+
+By σ = 1 a ball in a room that sees the sky around the sun and not the sun was 15% too dark.
 """
 
 from typing import NamedTuple
@@ -18,6 +16,7 @@ import warp as wp
 
 from warpshadow.device.constants import cached_by_values, constant
 from warpshadow.device.launch import differentiable, launch, varies
+from warpshadow.device.memory import copied
 from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK, MIN_WIDTH, brightest_chunk, cell_radius
 from warpshadow.stages.visibility.directional import SOFTNESS
@@ -107,7 +106,6 @@ def _blend_sharp_cells_adjoint(
     # out
     adj_blended: wp.array3d(dtype=wp.float32),
     adj_sharp: wp.array3d(dtype=wp.float32),
-    adj_transmittance: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a receiver: a cell's previous value counts for the rest."""
     batch, receiver = split_row(first_row + wp.tid(), adj_blended.shape[1])
@@ -117,11 +115,6 @@ def _blend_sharp_cells_adjoint(
         adj_cell = adj_blended[batch, receiver, cell]
         adj_sharp[batch, receiver, slot] = adj_sharp[batch, receiver, slot] + shares[i] * adj_cell
         adj_blended[batch, receiver, cell] = (1.0 - shares[i]) * adj_cell
-    if adj_transmittance:
-        for cell in range(adj_blended.shape[2]):
-            adj_transmittance[batch, receiver, cell] = (
-                adj_transmittance[batch, receiver, cell] + adj_blended[batch, receiver, cell]
-            )
 
 
 @cached_by_values
@@ -153,7 +146,10 @@ def blend_sharp_cells(
     row_count = transmittance.shape[0] * transmittance.shape[1]
     pairs, spot_shares, is_partial = _find_pairs(slots, shares, transmittance.device)
     is_copied = is_partial and varies([transmittance])
-    blended = wp.clone(transmittance, requires_grad=False) if is_copied else transmittance
+    blended = transmittance
+    if is_copied:
+        blended = copied(transmittance)
+        blended.grad = transmittance.grad  # which is changed in place, as the values else are
     inputs, cost = [pairs, spot_shares], _CELL_COST * pairs.size
     return differentiable(
         lambda result: launch(
@@ -163,7 +159,7 @@ def blend_sharp_cells(
             _blend_sharp_cells_adjoint,
             row_count,
             inputs=inputs,
-            outputs=[adj_blended, sharp_cells.grad, transmittance.grad if is_copied else None],
+            outputs=[adj_blended, sharp_cells.grad],
             cost=cost,
         ),
         result=blended,

@@ -1,22 +1,14 @@
-"""Openness: how much each patch sample counts in its patch, and each patch among others, by how open they are.
+"""Weights of patch samples in their patches, and of patches among others, by how open they are.
 
-Where bodies touch or stick in each other, patch samples of a patch may lie inside another body, and those of a book's
-side between other books. These are dark, and few see them. So a patch sample s of patch p counts by how open it is,
+    f_s = o_s / Σ_r w_pr o_r,  o_s = ⟨T⟩_s + ε,  ⟨T⟩ = 4/Q Σ_q max(n·ω_q, 0) T_q
+    v_p = r_p⁸ / (r_p⁸ + 0.06⁸),  r_p = Σ_s w_ps (⟨T⟩_s + ε) / Σ_s w_ps (⟨T_self⟩_s + ε)
 
-    o_s = ⟨T⟩ + ε,  ⟨T⟩ = 4/Q Σ_q max(n·ω_q, 0) T_q
-    f_s = o_s / Σ_r w_pr o_r
+with s a patch sample of patch p, T the transmittance past all bodies but planes, T_self that past its own body, and w
+the weights of patch samples by area. The light of a patch is Σ_s w_ps f_s L_s: samples that lie inside another body, or
+between books on a shelf, are dark, and few see them. By v, patches that other bodies bury wholly count hardly at all
+beside others, in a texel of a plane or among the proxies that a receiver sees through a cell.
 
-with T the transmittance past all bodies but planes, and w the weights of patch samples in their patch: the light of a
-patch is Σ_s w_ps f_s L_s. Seen from outside, parts of a patch count just by how open they are.
-
-A patch that other bodies bury wholly counts hardly at all beside others, in a texel of a plane or among the proxies
-that a receiver sees through a cell, by the share of the openness past its own body that other bodies leave:
-
-    v_p = r⁴ / (r⁴ + 0.1⁴),  r_p = Σ_s w_ps (⟨T⟩_s + ε) / Σ_s w_ps (⟨T_self⟩_s + ε)
-
-Without f, in a pile of bodies that stick in each other direct light on the patches of a ball was 19% too dark, and in
-a shelf full of books that on the shelf 14%; with ⟨T⟩ / ⟨T_self⟩ for ⟨T⟩ a row of books is 2% darker. Without v among
-proxies five bricks that stick in each other send the ground around them 11% too little light, with it 0.3% too much.
+Without f a pile of bodies that stick in each other was 19% too dark, without v the ground around it 11%.
 """
 
 from __future__ import annotations
@@ -33,26 +25,26 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
-_MIN_OPENNESS = wp.constant(0.01)  # ε, by which patch samples count of a patch that is buried wholly
-_BURIED_RATIO = wp.constant(0.1)  # r of a patch that counts half
+_MIN_OPEN = wp.constant(0.01)  # ε, by which patch samples count of a patch that is buried wholly
+_BURIED_RATIO = wp.constant(0.06)  # r of a patch that counts half
 
 
 @wp.kernel
-def _sum_openness(
+def _average_transmittance(
     # in
     normals: wp.array2d(dtype=wp.vec3),
     transmittance_self: wp.array3d(dtype=wp.float32),
     transmittance_spheres: wp.array3d(dtype=wp.float32),
     directions: wp.array(dtype=wp.vec3),
     # out
-    openness: wp.array2d(dtype=wp.vec3),
+    mean_transmittance: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a patch sample of an instance: ⟨T⟩ and ⟨T_self⟩, linear in both as Warp's adjoint needs it."""
     batch, patch_sample = wp.tid()
     normal = normals[instance_in(batch, normals.shape[0]), patch_sample]
     sphere_batch = instance_in(batch, transmittance_spheres.shape[0])
     factor = 4.0 / float(directions.shape[0])
-    openness_sums = wp.vec3(_MIN_OPENNESS, _MIN_OPENNESS, 0.0)
+    sums = wp.vec3(_MIN_OPEN, _MIN_OPEN, 0.0)
     for q in range(directions.shape[0]):
         cosine = factor * wp.max(wp.dot(normal, directions[q]), 0.0)
         sample_transmittance_self = float(1.0)
@@ -60,16 +52,14 @@ def _sum_openness(
             sample_transmittance_self = transmittance_self[
                 instance_in(batch, transmittance_self.shape[0]), patch_sample, q
             ]
-        openness_sums += cosine * wp.vec3(
-            transmittance_spheres[sphere_batch, patch_sample, q], sample_transmittance_self, 0.0
-        )
-    openness[batch, patch_sample] = openness_sums
+        sums += cosine * wp.vec3(transmittance_spheres[sphere_batch, patch_sample, q], sample_transmittance_self, 0.0)
+    mean_transmittance[batch, patch_sample] = sums
 
 
-def find_openness(
+def find_mean_transmittance(
     normals: wp.array, transmittance_self: wp.array | None, transmittance_spheres: wp.array, directions: np.ndarray
 ) -> wp.array:
-    """Find the openness of patch samples' hemispheres past all bodies, and past their own.
+    """Find the mean transmittance of the hemispheres of patch samples, past all bodies and past their own.
 
     Args:
         normals: Of the patch samples, vec3 of shape [batch, patch sample].
@@ -88,16 +78,16 @@ def find_openness(
         arrays["transmittance_self"] = transmittance_self
     batch_count, device = common_batch(arrays), normals.device
     cell_directions = constant(np.asarray(directions, np.float32), wp.vec3, device)
-    openness = empty((batch_count, normals.shape[1]), dtype=wp.vec3, device=device)
+    mean_transmittance = empty((batch_count, normals.shape[1]), dtype=wp.vec3, device=device)
     inputs = [normals, transmittance_self, transmittance_spheres, cell_directions]
-    launch(_sum_openness, openness.shape, inputs=inputs, outputs=[openness])
-    return openness
+    launch(_average_transmittance, mean_transmittance.shape, inputs=inputs, outputs=[mean_transmittance])
+    return mean_transmittance
 
 
 @wp.kernel
 def _find_shares(
     # in
-    openness: wp.array2d(dtype=wp.vec3),
+    mean_transmittance: wp.array2d(dtype=wp.vec3),
     means: wp.array2d(dtype=wp.vec3),
     patch_of_sample: wp.array(dtype=wp.int32),
     # out
@@ -106,7 +96,7 @@ def _find_shares(
     """A thread owns a patch sample of an instance: f, in three channels."""
     batch, patch_sample = wp.tid()
     shares[batch, patch_sample] = wp.vec3(
-        openness[batch, patch_sample][0] / means[batch, patch_of_sample[patch_sample]][0]
+        mean_transmittance[batch, patch_sample][0] / means[batch, patch_of_sample[patch_sample]][0]
     )
 
 
@@ -123,32 +113,35 @@ def _find_weights(
     weight = float(0.0)
     if mean[1] > 0.0:
         ratio = mean[0] / (_BURIED_RATIO * mean[1])
-        power = ratio * ratio * ratio * ratio
+        square = ratio * ratio
+        fourth = square * square
+        power = fourth * fourth
         weight = power / (power + 1.0)
     weights[batch, patch] = wp.vec3(weight)
 
 
-class Openness(NamedTuple):
-    """Weights of patch samples and patches by their openness, in three equal channels."""
+class PatchWeights(NamedTuple):
+    """Weights of patch samples and patches, in three equal channels."""
 
     shares: wp.array  # f, of patch samples in their patches, vec3 of shape [batch, patch sample]
     weights: wp.array  # v, of patches among others, vec3 of shape [batch, patch]
 
 
-def open_shares(openness: wp.array, mean: SparseMatrix, patch_of_sample: np.ndarray) -> Openness:
+def find_patch_weights(mean_transmittance: wp.array, mean: SparseMatrix, patch_of_sample: np.ndarray) -> PatchWeights:
     """Find the weights of patch samples in their patches, 1 on average, and of patches among others.
 
     Args:
-        openness: Of the patch samples, from :func:`find_openness`, vec3 of shape [batch, patch sample].
+        mean_transmittance: Of the patch samples, from :func:`find_mean_transmittance`, vec3 of shape [batch, patch
+            sample].
         mean: The weights w, [patch, patch sample], from :func:`.radiosity.mean_over_patch_samples`.
         patch_of_sample: The patch of each patch sample, shape [patch sample].
-    Differentiable: openness.
+    Differentiable: mean_transmittance.
     """
-    check.shape("patch_of_sample", patch_of_sample.shape, (openness.shape[1],))
-    patch_indices = constant(np.asarray(patch_of_sample, np.int32), wp.int32, openness.device)
-    means = multiply(mean, openness)
-    shares = empty(openness.shape, dtype=wp.vec3, device=openness.device)
-    weights = empty(means.shape, dtype=wp.vec3, device=openness.device)
-    launch(_find_shares, shares.shape, inputs=[openness, means, patch_indices], outputs=[shares])
+    check.shape("patch_of_sample", patch_of_sample.shape, (mean_transmittance.shape[1],))
+    patch_indices = constant(np.asarray(patch_of_sample, np.int32), wp.int32, mean_transmittance.device)
+    means = multiply(mean, mean_transmittance)
+    shares = empty(mean_transmittance.shape, dtype=wp.vec3, device=mean_transmittance.device)
+    weights = empty(means.shape, dtype=wp.vec3, device=mean_transmittance.device)
+    launch(_find_shares, shares.shape, inputs=[mean_transmittance, means, patch_indices], outputs=[shares])
     launch(_find_weights, weights.shape, inputs=[means], outputs=[weights])
-    return Openness(shares, weights)
+    return PatchWeights(shares, weights)

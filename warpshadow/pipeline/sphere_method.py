@@ -176,12 +176,13 @@ class SphereMethod(Method):
         """Direct light of emitters on points, by the same blockers."""
         from warpshadow.pipeline.emitters import find_emitted_light
 
-        samples = self.emitters.samples
+        samples, words = self.emitters.samples, points.in_words
+        bodies_and_spheres = points.static_bodies, points.nearest_spheres
 
         def find(
             receivers: Receivers, blockers: Blockers, self_lookups: dict[int, Any] | None, *placed: Any
         ) -> wp.array:
-            groups = find_groups(points, receivers, blockers, self_lookups, None, None)
+            groups = find_groups(*bodies_and_spheres, receivers, blockers, self_lookups, None, None)
             return find_emitted_light(samples, groups, blockers, *placed)
 
         def lookups() -> Node:
@@ -197,7 +198,7 @@ class SphereMethod(Method):
             points.cached("self-visibility towards emitters", None, lookups),
             self.emitters.placed(points),
             self.emitters.radiance(materials),
-            items=lambda: f"{receiver_text(points)} × {samples.first[-1]} samples",
+            items=lambda: f"{receiver_text(words)} × {samples.first[-1]} samples",
         )
 
     def known_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
@@ -271,9 +272,10 @@ class PortionedShading(Node):
         is_shaded: bool = True,
         stages: tuple[NodeStage, ...] = (),
     ):
-        self.method, self._points = method, points
+        self.method, self._bodies_and_spheres = method, (points.static_bodies, points.nearest_spheres)
         self._finish, self._progress = finish, method.progress and light is not None
-        receivers, item_text = points.receivers_node, functools.partial(receiver_text, points)
+        receivers, words = points.receivers_node, points.in_words
+        item_text = functools.partial(receiver_text, words)
         self_visibility = self_visibility_node(method, points, projected_light)
         shadows = _static_shadows(method, points, light)
         planes = points.blocker_kinds.planes
@@ -281,12 +283,12 @@ class PortionedShading(Node):
         self._is_shaded = light is not None and is_shaded
         self._is_transferred = not (self._is_shaded and method.shades_transmittance)
         self._visibility = NodeStage(
-            f"visibility{where}", lambda: _pairs(method, points), lambda: _why_unblocked(method, points)
+            f"visibility{where}", lambda: _pairs(method, words), lambda: _why_unblocked(method, words)
         )
         self._planes = NodeStage(
             f"planes{where}",
             lambda: f"{item_text()} × {len(planes)} flat {'body' if len(planes) == 1 else 'bodies'}",
-            "" if planes else "spheres stand in for what casts shadows",
+            "" if planes else "spheres stand in for the bodies that cast shadows",
         )
         self._transfer = NodeStage(
             f"transfer{where}",
@@ -316,7 +318,7 @@ class PortionedShading(Node):
     def portions(self, call: Call) -> Iterator[Any]:
         """Find it for one portion after another."""
         receivers, blockers, projected_light, *cached = self.values(call)
-        groups = find_groups(self._points, receivers, blockers, *cached)
+        groups = find_groups(*self._bodies_and_spheres, receivers, blockers, *cached)
         total = len(receivers.on_static) + receivers.points.shape[1]
         with progress_bar(total, "shading", "receiver", shows=self._progress) as bar:
             for group in groups:
@@ -407,10 +409,10 @@ def self_visibility_node(method: SphereMethod, points: LitPoints, projected_ligh
 
 
 def _self_visibility(method: SphereMethod, points: LitPoints, projected_light: Any) -> Node:
-    bodies, rotations = points.blocker_kinds.traced, points.blocker_kinds.rotations
+    bodies, rotations, words = points.blocker_kinds.traced, points.blocker_kinds.rotations, points.in_words
     curved_bodies = [body for body in bodies if not method.merged_scene.is_flat[body]]
     if not curved_bodies or rotations is None:
-        return Node("self-shadows", None, idle=lambda: _why_no_self_visibility(method, points))
+        return Node("self-shadows", None, idle=lambda: _why_no_self_visibility(method, words))
 
     def state() -> str:
         missing = method.self_visibility.missing(bodies)
@@ -431,7 +433,7 @@ def _why_no_self_visibility(method: SphereMethod, points: LitPoints) -> str:
 
 def _static_shadows(method: SphereMethod, points: LitPoints, light: Input | None) -> Node:
     """Node of cached transmittance past static bodies; its value is None if there are none."""
-    static_bodies = points.static_bodies
+    static_bodies, words = points.static_bodies, points.in_words
     if static_bodies is None or not static_bodies.spheres[1].shape[1]:
         bouncing = bool(method.merged_scene.scene.bounces)
         why = "light bounces: nothing of static bodies is cached" if bouncing else "no static body has blockers"
@@ -439,7 +441,7 @@ def _static_shadows(method: SphereMethod, points: LitPoints, light: Input | None
     rows = method.cached_rows(static_bodies, light, points.blocker_kinds)
 
     def missing() -> int:
-        receivers = points.receivers_node.value_if_known(points.call)
+        receivers = words.receivers_node.value_if_known(words.call)
         return rows.missing(None if receivers is None else receivers.on_static)
 
     return Node(

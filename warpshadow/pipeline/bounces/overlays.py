@@ -1,4 +1,4 @@
-"""Covered patches: those that lie right behind a flat body, which other bodies see, as a table's below its cloth."""
+"""Overlays of a scene: the patches right behind a plane, as a table's below its cloth, and its texels before them."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import pytest
 import warp as wp
 from test_projected_areas import DIRECTIONS, compare
 
-from warpshadow.stages.bounces.openness import find_openness, open_shares
+from warpshadow.stages.bounces.patch_weights import find_mean_transmittance, find_patch_weights
 from warpshadow.stages.bounces.radiosity import mean_over_patch_samples, patch_radiosity
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
@@ -22,19 +22,19 @@ def sums(normals, *transmittances):
 
 
 def twin_shares(normals, past_self, past_all):
-    (openness,) = sums(normals, past_all)
-    return np.repeat((openness / np.bincount(PATCHES, WEIGHTS * openness)[PATCHES])[:, None], 3, axis=1)
+    (means,) = sums(normals, past_all)
+    return np.repeat((means / np.bincount(PATCHES, WEIGHTS * means)[PATCHES])[:, None], 3, axis=1)
 
 
 def twin_weights(normals, past_self, past_all):
     of_self, of_all = (np.bincount(PATCHES, WEIGHTS * each) for each in sums(normals, past_self, past_all))
     ratio = np.divide(of_all, of_self, out=np.zeros(3), where=of_self > 0)
-    return np.repeat((ratio**4 / (ratio**4 + 0.1**4))[:, None], 3, axis=1)
+    return np.repeat((ratio**8 / (ratio**8 + 0.06**8))[:, None], 3, axis=1)
 
 
 def find(normals, past_self, past_all, device):
     mean = mean_over_patch_samples(PATCHES, WEIGHTS, 3, device=device)
-    return open_shares(find_openness(normals, past_self, past_all, DIRECTIONS), mean, PATCHES)
+    return find_patch_weights(find_mean_transmittance(normals, past_self, past_all, DIRECTIONS), mean, PATCHES)
 
 
 def shares(normals, past_self, past_all, device):
@@ -47,7 +47,7 @@ def test_shares_of_patch_samples_and_weights_of_patches_are_those_of_the_twin(na
     normals = rng.normal(size=(5, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     past_self = rng.random((5, 32))
-    values = [normals, past_self, 0.3 * past_self * rng.random((5, 32))]
+    values = [normals, past_self, 0.12 * past_self * rng.random((5, 32))]
     compare(
         lambda *arrays: getattr(find(*arrays, device), name), twin, values, (wp.vec3, wp.float32, wp.float32), device
     )
@@ -78,4 +78,4 @@ def test_what_does_not_fit_is_refused(device):
     normals = wp.zeros((1, 5), dtype=wp.vec3, device=device)
     passing = wp.zeros((1, 5, 8), dtype=wp.float32, device=device)
     with pytest.raises(ValueError, match=r"transmittance_spheres: got shape \(1, 5, 8\), expected \[batch, 5, 32\]"):
-        find_openness(normals, None, passing, DIRECTIONS)
+        find_mean_transmittance(normals, None, passing, DIRECTIONS)

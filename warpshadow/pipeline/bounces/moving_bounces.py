@@ -1,12 +1,12 @@
-"""Light that bounces between bodies, by the spheres that stand in for them.
+"""Bounces where geometry may move: patches reflect light in each call, by the proxies of their bodies.
 
-Patches of bodies have a radiosity B, reflected from direct light S and bounced light I:
+Patches have a radiosity B, reflected from direct light S and bounced light I:
 
-    B = a (S + I),   I = G[B],
+    B = a (S + I),   I = G[B]
 
-and G is applied as often as light bounces: first at the patch samples, points where patches are lit, at last at the
-receivers of the image. G has three parts, each a stage of its own: light from a body's own patches, light from plane
-bodies, and light from bodies represented by spheres. A blocked part of a cell sends light of one of the three.
+G is applied as often as light bounces: first at the patch samples, points where patches are lit, at last at the
+receivers of the image. It has three parts, each a stage of its own: light from a body's own patches, from plane bodies,
+and from the proxies of other bodies. A blocked part of a cell sends light of one of the three.
 
 Between patches of one body the first part is a small matrix that does not change. After the last bounce between bodies,
 light within each body bounces ``SELF_BOUNCES`` times more, since hollow bodies keep it long.
@@ -18,36 +18,28 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import cut
-from warpshadow.pipeline.bounces.gathering import (
-    ALL_FLAT,
-    CellTransmittance,
-    Gathering,
-    OutgoingRadiance,
-    ProjectedPatches,
-    Proxies,
-    find_cell_transmittance,
-)
-from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
+from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance, find_cell_transmittance
+from warpshadow.pipeline.bounces.gathering import ALL_FLAT, Gathering, OutgoingRadiance
+from warpshadow.pipeline.bounces.patches import ScenePatches, Senders, lit_patch_samples
+from warpshadow.pipeline.bounces.proxies import ProjectedPatches, Proxies
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
-from warpshadow.pipeline.bounces.static_bounces import StaticBounces
-from warpshadow.pipeline.by_spheres import PortionedShading, SphereMethod, self_visibility_node
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage
 from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
+from warpshadow.pipeline.sphere_method import PortionedShading, SphereMethod, self_visibility_node
 from warpshadow.pipeline.transfers import joined
 from warpshadow.scene.scene import Bounces
-from warpshadow.stages.bounces.openness import Openness, find_openness, open_shares
+from warpshadow.stages.bounces.patch_weights import PatchWeights, find_mean_transmittance, find_patch_weights
 from warpshadow.stages.bounces.radiosity import patch_radiosity
 from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.receivers import Receivers
 
-_OF_PATCH_SAMPLES = " of patch samples"  # put after the names of stages
+OF_PATCH_SAMPLES = " of patch samples"  # suffix of the names of stages
 
 
 def _patch_sample_text(senders: Senders) -> str:
@@ -123,10 +115,10 @@ class PortionedDirectLight(Node):
         return PortionDirectLight(direct, portion.group, portion.cells)
 
 
-def _openness(senders: Senders, visibility: list[PortionVisibility]) -> Openness:
-    """How open patch samples and patches are."""
-    portions = [find_openness(portion.group.normals, *portion.cells) for portion in visibility]
-    return open_shares(joined(portions), senders.mean, senders.patch_of_sample)
+def _patch_weights(senders: Senders, visibility: list[PortionVisibility]) -> PatchWeights:
+    """Weights of patch samples and patches by how open they are."""
+    portions = [find_mean_transmittance(portion.group.normals, *portion.cells[:3]) for portion in visibility]
+    return find_patch_weights(joined(portions), senders.mean, senders.patch_of_sample)
 
 
 def _add_emitted(lit: list[PortionDirectLight], emitted: wp.array) -> list[PortionDirectLight]:
@@ -146,7 +138,7 @@ class PatchSampleNodes(NamedTuple):
     visibility: PortionedVisibility  # of the patch samples, for any light
     frames: Node  # of flat bodies
     projected_patches: Node  # patches as receivers see them
-    openness: Node  # how open patch samples are, and their patches
+    weights: Node  # of patch samples and patches, by how open they are
 
 
 class Radiosity(Node):
@@ -162,7 +154,7 @@ class Radiosity(Node):
         albedo: Node,
         patch_samples: PatchSampleNodes,
     ):
-        _, _, frames, projected_patches, openness = patch_samples
+        _, _, frames, projected_patches, weights = patch_samples
         self._count, self._proxies, self._self_form_factors, self._gathering = (
             count,
             proxies,
@@ -175,11 +167,11 @@ class Radiosity(Node):
         self._reflection = NodeStage("radiosity", item_text)
         self._self_reflection = NodeStage("self light of patches", item_text, idle)
         stages = self._reflection, self._self_reflection, *gathering.stages
-        super().__init__("", None, lit, albedo, projected_patches, frames, openness, stages=stages)
+        super().__init__("", None, lit, albedo, projected_patches, frames, weights, stages=stages)
 
     def compute(self, call: Call) -> OutgoingRadiance:
         """Reflect direct light, then light that has bounced once, and so on; more often between patches of one body."""
-        lit, albedo, projected_patches, frames, openness = self.values(call)
+        lit, albedo, projected_patches, frames, weights = self.values(call)
         senders, count = self._proxies.senders, self._count
         between = (
             None
@@ -188,7 +180,7 @@ class Radiosity(Node):
         )
 
         def sent(radiosity: wp.array) -> OutgoingRadiance:
-            return OutgoingRadiance(self._proxies, radiosity, projected_patches, frames, openness.weights)
+            return OutgoingRadiance(self._proxies, radiosity, projected_patches, frames, weights.weights)
 
         def radiosity_by_others(radiosity: wp.array | None) -> wp.array:
             """Radiosity of patches by light from the sky and from other bodies."""
@@ -198,7 +190,7 @@ class Radiosity(Node):
                 outgoing = sent(radiosity)
                 portions = [self._light(call, portion, outgoing) for portion in lit]
             with self.timed(call, self._reflection):
-                return patch_radiosity(albedo, joined(portions), senders.mean, openness.shares)
+                return patch_radiosity(albedo, joined(portions), senders.mean, weights.shares)
 
         def add_radiosity_by_self(by_others: wp.array, radiosity: wp.array | None) -> wp.array:
             if between is None or radiosity is None:
@@ -253,39 +245,20 @@ class BouncedShading(PortionedDirectLight):
         return total_light([portion.direct, *bounced])
 
 
-class SphereBounces:
-    """How light bounces in a scene in which spheres stand in for bodies.
+class MovingBounces:
+    """How light bounces between bodies that may move.
 
     Args:
         method: How light is blocked.
+        patches: Of the scene.
     """
 
-    def __init__(self, method: SphereMethod):
-        self._method, self._count = method, method.merged_scene.scene.bounces
-        self._patches = ScenePatches(method.merged_scene)
-        self._self_form_factors = SelfFormFactors(method.self_visibility, self._patches, progress=method.progress)
+    def __init__(self, method: SphereMethod, patches: ScenePatches):
+        self._method, self._count, self._patches = method, method.merged_scene.scene.bounces, patches
+        self._self_form_factors = SelfFormFactors(method.self_visibility, patches, progress=method.progress)
         self._proxies: dict[Senders, Proxies] = {}
 
-    def bounced_shading(self, points: LitPoints, projected_light: Node, light: Input, materials: Materials) -> Node:
-        """Node of the shading of points, direct and bounced, vec3 of shape [batch, receiver].
-
-        If colors vary, the visibility of points is cached; otherwise their shading is.
-
-        Args:
-            points: The receivers.
-            projected_light: The light projected for the method.
-            light: The light, known.
-            materials: Reflectance of the bodies.
-        """
-        return self._shading(points, projected_light, projected_light, light, materials, is_free=False)
-
-    def bounced_free_shading(
-        self, points: LitPoints, projected_light: Node, light: Input, materials: Materials
-    ) -> Node:
-        """The same in free light; the points' visibility, which holds for any light, is cached."""
-        return self._shading(points, projected_light, self._method.free_projection, light, materials, is_free=True)
-
-    def _shading(
+    def shading(
         self,
         points: LitPoints,
         projected_light: Node,
@@ -295,7 +268,16 @@ class SphereBounces:
         *,
         is_free: bool,
     ) -> Node:
-        """Shading of points, given the projected light and the inputs of their visibility."""
+        """Node of the shading of points, direct and bounced, vec3 of shape [batch, receiver].
+
+        Args:
+            points: The receivers.
+            projected_light: The light projected for the method.
+            visibility_light: That by which their visibility is found: the basis of free light.
+            light: The light.
+            materials: Reflectance of the bodies.
+            is_free: Whether the light is free.
+        """
         method, senders = self._method, self._patches.senders(materials)
         if not senders.bodies:
             idle = NodeStage("bounces", idle="every body is black")
@@ -312,7 +294,7 @@ class SphereBounces:
             lambda: self._patch_samples(make_visibility, visibility_light, proxies, points),
         )
         radiosity = self._radiosity(of_patch_samples, projected_light, proxies, materials)
-        item_text = functools.partial(receiver_text, points)
+        item_text = functools.partial(receiver_text, points.in_words)
         at_points = self._gathering(senders, item_text)
         return BouncedShading(visibility, projected_light, item_text, radiosity, at_points)
 
@@ -331,14 +313,15 @@ class SphereBounces:
 
         make = functools.partial(Node, "patch samples", senders.patch_samples, points.vertices, points.normals)
         patch_samples = points.cached("patch samples", senders, lambda: make(items=_patch_sample_text(senders)))
-        lit_samples = self._at(patch_samples, points, points.materials, proxies.nearest_spheres)
+        arguments = patch_samples, points, points.materials, proxies.nearest_spheres
+        lit_samples = points.cached("lit samples", proxies, lambda: lit_patch_samples(*arguments))
         lookups = self_visibility_node(self._method, points, visibility_light)
         lit_samples.cached("self-visibility", id(visibility_light), lambda: lookups)
-        visibility = make_visibility(lit_samples, where=_OF_PATCH_SAMPLES)
+        visibility = make_visibility(lit_samples, where=OF_PATCH_SAMPLES)
         frames = Node("", planes.all.frames if planes else lambda _: None, points.vertices)
         projected_patches = Node("", project, patch_samples, visibility, spheres, frames)
-        openness = Node("", functools.partial(_openness, senders), visibility)
-        return PatchSampleNodes(lit_samples, visibility, frames, projected_patches, openness)
+        weights = Node("", functools.partial(_patch_weights, senders), visibility)
+        return PatchSampleNodes(lit_samples, visibility, frames, projected_patches, weights)
 
     def _radiosity(
         self, patch_samples: PatchSampleNodes, projected_light: Node, proxies: Proxies, materials: Materials
@@ -346,61 +329,15 @@ class SphereBounces:
         """Radiosity of the patches, given the light at their patch samples."""
         senders, why_not = proxies.senders, "light bounces once" if self._count == 1 else ""
         lit: Node = PortionedDirectLight(
-            patch_samples.visibility, projected_light, _patch_sample_text(senders), _OF_PATCH_SAMPLES
+            patch_samples.visibility, projected_light, _patch_sample_text(senders), OF_PATCH_SAMPLES
         )
         if materials.emission:
             lit = Node("", _add_emitted, lit, self._method.light_of_emitters(patch_samples.points, materials))
         albedo = self._patches.albedo(materials, senders.bodies)
         among_senders = self._gathering(
-            senders, _patch_sample_text(senders), _OF_PATCH_SAMPLES, why_not, only_others=True
+            senders, _patch_sample_text(senders), OF_PATCH_SAMPLES, why_not, only_others=True
         )
         return Radiosity(self._count, proxies, self._self_form_factors, among_senders, lit, albedo, patch_samples)
 
     def _gathering(self, senders: Senders, *arguments: Any, **options: Any) -> Gathering:
         return Gathering(self._method.visibility, senders, self._self_form_factors, *arguments, **options)
-
-    def cached_bounced_shading(
-        self, points: LitPoints, projected_light: Any, light: Input, materials: Materials
-    ) -> Node:
-        """The same for static points: visibility of receivers and patch samples is cached, as are form factors."""
-        patch_samples, at_patch_samples = self._cached_patch_samples(points, materials)
-        direct = points.cached(
-            "direct", light, lambda: PortionedShading(self._method, points, projected_light, light, joined)
-        )
-        make = functools.partial(
-            PortionedShading, self._method, at_patch_samples, projected_light, light, joined, where=_OF_PATCH_SAMPLES
-        )
-        by_map = points.cached("direct at patch samples", (light, patch_samples), make)
-        lit = self._method.with_emitters(by_map, at_patch_samples, materials)
-        return self._static_bounces.add_bounces(direct, lit, points, materials)
-
-    def cached_bounced_free_shading(self, direct: Node, points: LitPoints, light: Input, materials: Materials) -> Node:
-        """The same in free light, given a node of the direct shading of the receivers."""
-        patch_samples, at_patch_samples = self._cached_patch_samples(points, materials)
-        transfers = points.cached(
-            "transfer", patch_samples, lambda: self._method.transfers(at_patch_samples, _OF_PATCH_SAMPLES)
-        )
-        if materials.emission:
-            lit = self._method.light_of_emitters(at_patch_samples, materials)
-            direct = self._static_bounces.add_bounces(direct, lit, points, materials)
-        return self._static_bounces.add_free_bounces(direct, transfers, light, points, materials)
-
-    def _cached_patch_samples(self, points: LitPoints, materials: Materials) -> tuple[Node, LitPoints]:
-        """Node of the static patch samples, and the same patch samples as lit points."""
-        patch_samples = self._static_bounces.patch_samples(points, materials)
-        return patch_samples, points.cached(
-            "lit patch samples", patch_samples, lambda: self._at(patch_samples, points, materials)
-        )
-
-    @functools.cached_property
-    def _static_bounces(self) -> StaticBounces:
-        return StaticBounces(self._patches, self._count, self._method.openness, progress=self._method.progress)
-
-    def _at(
-        self, patch_samples: Node, points: LitPoints, materials: Materials, nearest_spheres: np.ndarray | None = None
-    ) -> LitPoints:
-        """Make lit points of patch samples, among the same bodies as other points."""
-        arguments = self._method.merged_scene, materials, points.vertices, points.spheres, patch_samples, points.call
-        return LitPoints(
-            *arguments, normals=points.normals, blocker_kinds=points.blocker_kinds, nearest_spheres=nearest_spheres
-        )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import warpshadow as ws
-from warpshadow.pipeline.bounces.covered import find_overlays
+from warpshadow.pipeline.bounces.overlays import find_overlays
 from warpshadow.pipeline.bounces.patches import ScenePatches
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.reflectance import Materials

@@ -1,0 +1,176 @@
+"""Calls that a renderer replays as graphs: images and gradients of plain calls. Captures are of the CPU's."""
+
+import copy
+import dataclasses
+
+import pytest
+import torch
+import warp as wp
+
+import warpshadow as ws
+from warpshadow.device import cuda_graph
+from warpshadow.pipeline import view as view_module
+from warpshadow.torch import TorchRenderer
+from warpshadow.torch.replay import Capture
+
+SPHERES = ws.Spheres([(0.2, 0, 0), (-0.2, 0.1, 0), (0, 0.2, 0.2)], [0.3, 0.25, 0.2])
+# The same kernels on the same numbers; on a CPU plain calls run in slices, whose sums have another order.
+SAME = {"rtol": 1e-5, "atol": 1e-6}
+
+
+@pytest.fixture(autouse=True)
+def on_a_gpu(monkeypatch):
+    """Capture on a CPU, too, and have all vertices as receivers."""
+    monkeypatch.setattr(cuda_graph, "is_captured", lambda device: True)
+    monkeypatch.setattr(view_module, "is_readable", lambda device: False)
+    monkeypatch.setattr(Capture, "_seconds_of", lambda capture, run: (run(), 0.0)[1])
+
+
+@pytest.fixture
+def make_renderer():
+    """Of a ball with known spheres on a ground, 24 × 24 pixels."""
+
+    def make(**options) -> TorchRenderer:
+        ball = ws.Body(ws.icosphere(0.5, 2), blockers=SPHERES, translation=(0, 0.5, 0), receivers="vertex")
+        ground = ws.Body(ws.plane(4, 8), receivers="vertex")
+        camera = ws.Camera.look_at((0, 2, 3), (0, 0.3, 0), size=(24, 24))
+        scene = ws.Scene((ball, ground), ws.synthetic_sky(height=32), camera, ws.Visibility(directions=32))
+        bounces = options.pop("bounces", 0)
+        return TorchRenderer(dataclasses.replace(scene, bounces=bounces), **options)
+
+    return make
+
+
+def moved(renderer: TorchRenderer, shift: float) -> tuple[torch.Tensor, ...]:
+    """Poses in which the ball is moved, with a gradient to translations."""
+    rotations, translations, scales = renderer.scene_poses()
+    translations[0, 0] += shift
+    return rotations, translations.requires_grad_(), scales
+
+
+def image_and_gradients(renderer: TorchRenderer, shift: float, *, light: torch.Tensor | None = None):
+    poses = moved(renderer, shift)
+    image = renderer(light, geometry=renderer.placed(*poses))
+    variables = [poses[1]] if light is None else [poses[1], light]
+    return [image.detach(), *torch.autograd.grad(image.square().sum(), variables)]
+
+
+@pytest.mark.parametrize("bounces", [0, 2])
+@pytest.mark.parametrize("has_light", [False, True])
+def test_replays_have_the_images_and_gradients_of_plain_calls(bounces, has_light, make_renderer):
+    renderer, plain = make_renderer(bounces=bounces), make_renderer(bounces=bounces, graphs=False)
+    for call, shift in enumerate((0.0, 0.1, -0.1, 0.05, 0.2)):
+        light = None
+        if has_light:
+            generator = torch.Generator().manual_seed(call)
+            light = torch.rand(renderer.basis.size, 3, generator=generator).requires_grad_()
+        found = image_and_gradients(renderer, shift, light=light)
+        assert bool(renderer.replays.reason) == (call < 2)
+        for one, other in zip(found, image_and_gradients(plain, shift, light=light), strict=True):
+            torch.testing.assert_close(one, other, **SAME)
+            assert one.abs().max() > 0
+    assert plain.replays.reason == "graphs = False"
+
+
+def test_images_stay_and_gradients_are_of_their_own_call(make_renderer):
+    renderer = make_renderer()
+    shifts = (0.1, -0.1, 0.2)
+    for shift in shifts:
+        image_and_gradients(renderer, shift)
+    assert not renderer.replays.reason
+    alone = [image_and_gradients(renderer, shift) for shift in shifts]
+    poses = [moved(renderer, shift) for shift in shifts]
+    images = [renderer(geometry=renderer.placed(*each)) for each in poses]
+    for order in ((0, 1, 2), (2, 0, 1)):
+        for number in order:
+            loss = images[number].square().sum()
+            (gradient,) = torch.autograd.grad(loss, poses[number][1], retain_graph=True)
+            assert torch.equal(images[number], alone[number][0])
+            torch.testing.assert_close(gradient, alone[number][1], **SAME)
+
+
+def test_other_shapes_and_other_variables_have_graphs_of_their_own(make_renderer):
+    renderer = make_renderer()
+    light = torch.rand(renderer.basis.size, 3)
+    for _ in range(3):
+        renderer(light)
+    assert not renderer.replays.reason
+    renderer(light.expand(2, -1, -1))
+    assert renderer.replays.reason
+    renderer(light.clone().requires_grad_())
+    assert renderer.replays.reason
+    renderer(light)
+    assert not renderer.replays.reason
+    known = ws.synthetic_sky(height=16)
+    renderer(known)
+    assert renderer.replays.reason
+    with torch.no_grad():  # which is as if no gradient were asked for
+        torch.testing.assert_close(renderer(light.clone().requires_grad_()), renderer(light))
+        assert not renderer.replays.reason
+
+
+def test_light_that_is_linear_can_be_differentiated_again(make_renderer):
+    renderer = make_renderer()
+    light = torch.rand(renderer.basis.size, 3).requires_grad_()
+
+    def product():
+        (gradient,) = torch.autograd.grad(renderer(light).square().sum(), light, create_graph=True)
+        return torch.autograd.grad(gradient.square().sum(), light)[0]
+
+    plain = product()
+    for _ in range(4):
+        torch.testing.assert_close(product(), plain, rtol=1e-4, atol=1e-4)
+
+
+def test_geometry_without_a_gradient_that_stays_is_not_computed_again(make_renderer):
+    renderer = make_renderer()
+    geometry = renderer.placed(*(pose.detach() for pose in moved(renderer, 0.1)))
+    for _ in range(5):
+        renderer(torch.rand(renderer.basis.size, 3).requires_grad_(), geometry=geometry)
+    assert "same as before" in renderer.replays.reason
+
+
+def test_calls_that_cannot_be_captured_stay_plain_and_say_why(make_renderer, monkeypatch):
+    renderer, plain = make_renderer(), make_renderer(graphs=False)
+    draw, tries = renderer.warp.draw, []
+
+    def reading(*arguments, **options):
+        tries.append(renderer.warp.device.is_capturing)
+        if tries[-1]:
+            raise RuntimeError("nothing is read while a graph is captured")
+        return draw(*arguments, **options)
+
+    monkeypatch.setattr(renderer.warp, "draw", reading)
+    for shift in (0.1, 0.2, 0.3, 0.1, 0.2, 0.3, 0.1, 0.2):
+        found, expected = image_and_gradients(renderer, shift), image_and_gradients(plain, shift)
+        torch.testing.assert_close(found, expected, **SAME)
+    assert not renderer.warp.device.is_capturing
+    assert sum(tries) == 2
+    assert "it cannot be captured: nothing is read" in renderer.replays.reason
+
+
+def test_calls_whose_graph_takes_longer_stay_plain(make_renderer, monkeypatch):
+    renderer, seconds, runs = make_renderer(), [1e-3, 3e-3, 2e-3], []
+    monkeypatch.setattr(Capture, "_seconds_of", lambda capture, run: (runs.append(run()), seconds[len(runs) - 1])[1])
+    for shift in (0.1, 0.2, 0.3, 0.1, 0.2):
+        image_and_gradients(renderer, shift)
+    assert len(runs) == 3
+    assert renderer.replays.reason == "its graph takes 2.0 ms, a plain call 1.0 ms"
+
+
+def test_copies_capture_anew(make_renderer):
+    renderer = make_renderer()
+    for shift in (0.1, 0.2, 0.3):
+        image_and_gradients(renderer, shift)
+    other = copy.deepcopy(renderer)
+    torch.testing.assert_close(image_and_gradients(other, 0.1), image_and_gradients(renderer, 0.1), **SAME)
+    assert other.replays.reason and not renderer.replays.reason
+
+
+def test_on_a_cpu_calls_are_plain(make_renderer, monkeypatch):
+    monkeypatch.undo()
+    renderer = make_renderer()
+    for _ in range(4):
+        renderer(torch.rand(renderer.basis.size, 3))
+    assert renderer.replays.reason == "calls are captured on a GPU alone"
+    assert not wp.get_device("cpu").is_capturing

@@ -1,0 +1,243 @@
+"""Replays: calls that come again with tensors of the same shapes are captured as CUDA graphs, forward and backward.
+
+On a GPU Python takes longer to launch the kernels of a call than they run. So a :class:`TorchRenderer` captures a call
+of a kind that has come twice, and replays it from then on: it copies the tensors to where the graph reads them,
+launches the graph, and copies the results. A kind has shapes, tensors that require a gradient, and arguments that are
+no tensors. Tensors are checked as ever; what is computed from them is not, as in all graphs
+(:mod:`warpshadow.device.cuda_graph`).
+
+Calls are plain where nothing would be won, or cannot be captured: on a CPU, while torch captures, where geometry or
+cameras without a gradient are the same as before, so that results about them are cached, and where the function reads
+back, and where a graph takes longer. :attr:`Replays.reason` says which it was.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Hashable, Sequence
+from typing import Any
+
+import torch
+import warp as wp
+
+from warpshadow.device import cuda_graph
+from warpshadow.device.constants import collected
+from warpshadow.device.memory import require_gradient
+from warpshadow.device.tape import recorded, unrecorded
+from warpshadow.torch.autograd import array_of, as_array, current_stream, is_capturing
+
+_PLAIN_CALLS = 2  # of a kind before it is captured: the first compiles kernels and fills caches, as may the second
+_MAX_FAILURES = 2  # after which calls of a kind stay plain
+_MAX_KINDS = 8  # captured at a time: each holds the memory of its call
+
+
+class Replays:
+    """The captured calls of a renderer.
+
+    Args:
+        is_on: Whether calls are captured at all.
+    Attributes:
+        reason: Why the last call was plain; empty if it was replayed.
+    """
+
+    def __init__(self, *, is_on: bool = True):
+        self.is_on = is_on
+        self.reason = "nothing was called yet"
+        self._kinds: dict[Hashable, _Kind] = {}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies begin anew."""
+        return _make_replays, (self.is_on,)
+
+    def find(
+        self,
+        key: Hashable,
+        reused: Collection[int],
+        function: Callable[..., Any],
+        tensors: Sequence[torch.Tensor],
+        dtypes: Sequence[type],
+        requires_grad: Sequence[bool],
+        device: torch.device,
+    ) -> Capture | None:
+        """Find or make the capture of a call; None if it is to be plain.
+
+        Args:
+            key: Arguments of the call but the tensors.
+            reused: Indices of tensors about which results are cached while they stay the same.
+            function, tensors, dtypes, requires_grad, device: The call, as of :func:`~warpshadow.torch.apply`.
+        """
+        capture, self.reason = None, self._why_plain(device)
+        if not self.reason:
+            shapes = tuple((tuple(tensor.shape), needs) for tensor, needs in zip(tensors, requires_grad, strict=True))
+            kind_key = str(device), key, shapes
+            kind = self._kinds.pop(kind_key, None) or _Kind()
+            self._kinds[kind_key] = kind  # the last that was used
+            while len(self._kinds) > _MAX_KINDS:
+                del self._kinds[next(iter(self._kinds))]
+            static = [tensors[number] for number in reused if not requires_grad[number]]
+            capture, self.reason = kind.find(function, tensors, dtypes, requires_grad, device, static)
+        return capture
+
+    def _why_plain(self, device: torch.device) -> str:
+        if not self.is_on:
+            return "graphs = False"
+        if not cuda_graph.is_captured(wp.device_from_torch(device)):
+            return "calls are captured on a GPU alone"
+        return "torch captures the call" if is_capturing(device) else ""
+
+
+def _make_replays(is_on: bool) -> Replays:
+    return Replays(is_on=is_on)
+
+
+class _Kind:
+    """Calls that a graph can stand for."""
+
+    def __init__(self) -> None:
+        self._plain_calls = self._failures = 0
+        self._capture: Capture | None = None
+        self._failure = ""
+        self._marks: list[tuple[int, int]] | None = None  # of static tensors, at the last call
+
+    def find(
+        self,
+        function: Callable[..., Any],
+        tensors: Sequence[torch.Tensor],
+        dtypes: Sequence[type],
+        requires_grad: Sequence[bool],
+        device: torch.device,
+        static: Sequence[torch.Tensor],
+    ) -> tuple[Capture | None, str]:
+        """The capture, or why there is none."""
+        before, self._marks = self._marks, [(tensor.data_ptr(), tensor._version) for tensor in static]
+        if static and self._marks == before:
+            return None, "geometry or cameras are the same as before: results about them are cached"
+        if self._failures == _MAX_FAILURES:
+            return None, self._failure
+        self._plain_calls += self._capture is None
+        if self._capture is None and self._plain_calls <= _PLAIN_CALLS:
+            return None, "calls of this kind have not come often enough"
+        if self._capture is None:
+            try:
+                capture = Capture(function, tensors, dtypes, requires_grad, device)
+            except (RuntimeError, MemoryError) as error:  # such as for a constant that is missing: plain calls make it
+                self._plain_calls, self._failures = 0, self._failures + 1
+                self._failure = f"it cannot be captured: {error}"
+                return None, self._failure
+            if capture.seconds > capture.plain_seconds:  # of a large image, of which it cannot leave out what is unseen
+                milliseconds = [f"{1e3 * seconds:.1f} ms" for seconds in (capture.seconds, capture.plain_seconds)]
+                self._failures = _MAX_FAILURES
+                self._failure = f"its graph takes {milliseconds[0]}, a plain call {milliseconds[1]}"
+                return None, self._failure
+            self._capture = capture
+        return self._capture, ""
+
+
+class Capture:
+    """A call as graphs: one forward, and one backward if a tensor requires a gradient.
+
+    Args:
+        function, tensors, dtypes, requires_grad, device: As of :func:`~warpshadow.torch.apply`.
+    Raises:
+        RuntimeError: where the function cannot be captured.
+        MemoryError: likewise.
+    Attributes:
+        seconds, plain_seconds: How long it takes forward as a graph, and as a plain call.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        tensors: Sequence[torch.Tensor],
+        dtypes: Sequence[type],
+        requires_grad: Sequence[bool],
+        device: torch.device,
+    ):
+        self._device = device
+        self._inputs = [tensor.detach().clone(memory_format=torch.contiguous_format) for tensor in tensors]
+        self._arguments = [as_array(*pair) for pair in zip(self._inputs, dtypes, strict=True)]
+        self._state = 0  # counts replays; gradients are of the last
+        self._backward: wp.Graph | None = None
+        where = wp.device_from_torch(device)
+        if where.is_cuda and not wp.is_mempool_enabled(where):
+            raise RuntimeError(f"{where} has no memory pool (wp.set_mempool_enabled)")
+        with current_stream(device), unrecorded():
+            self.plain_seconds = self._seconds_of(lambda: function(*self._arguments))
+        with collected() as self._cached_values:
+            with wp.ScopedCapture(device=where) as capture, recorded() if any(requires_grad) else unrecorded() as tape:
+                for argument, needs_gradient in zip(self._arguments, requires_grad, strict=True):
+                    if needs_gradient:
+                        require_gradient(argument)  # by the graph, which zeroes it
+                results = function(*self._arguments)
+            self._forward, self._tape = capture.graph, tape
+            self._results = results if isinstance(results, tuple) else (results,)
+            if tape is not None:
+                self._adjoints = [
+                    torch.zeros_like(wp.to_torch(result, requires_grad=False)) for result in self._results
+                ]
+                sources = [
+                    array_of(adjoint, result.dtype)
+                    for adjoint, result in zip(self._adjoints, self._results, strict=True)
+                ]
+                with wp.ScopedCapture(device=where) as capture, unrecorded():
+                    for result, source in zip(self._results, sources, strict=True):
+                        if result.requires_grad:
+                            wp.copy(result.grad, source)
+                    tape.backward()
+                self._backward = capture.graph
+        with current_stream(device):
+            self.seconds = min(self._seconds_of(lambda: wp.capture_launch(self._forward)) for _ in range(2))
+
+    def _seconds_of(self, run: Callable[[], object]) -> float:
+        """How long a call takes on the device."""
+        wp.synchronize_device(wp.device_from_torch(self._device))
+        start = time.perf_counter()
+        run()
+        wp.synchronize_device(wp.device_from_torch(self._device))
+        return time.perf_counter() - start
+
+    @property
+    def results_require_grad(self) -> list[bool]:
+        """Whether each result depends on tensors that require a gradient."""
+        return [result.requires_grad for result in self._results]
+
+    def replay(self, tensors: Sequence[torch.Tensor]) -> tuple[tuple[torch.Tensor, ...], ReplayedCall]:
+        """Replay it forward: the results, and the call for its gradients."""
+        self._launch_forward(tensors)
+        with current_stream(self._device):
+            results = tuple(wp.to_torch(result, requires_grad=False).clone() for result in self._results)
+        return results, ReplayedCall(self, tensors, self._state)
+
+    def _launch_forward(self, tensors: Sequence[torch.Tensor]) -> None:
+        for static, tensor in zip(self._inputs, tensors, strict=True):
+            static.copy_(tensor.detach())
+        self._state += 1
+        with current_stream(self._device):
+            wp.capture_launch(self._forward)
+
+    def gradients(
+        self, tensors: Sequence[torch.Tensor], state: int, adjoints: Sequence[torch.Tensor]
+    ) -> tuple[torch.Tensor | None, ...]:
+        """The gradient to each tensor; the call is replayed once more if another has been since, or its gradients."""
+        if state != self._state:
+            self._launch_forward(tensors)
+        self._state += 1  # the memory of this state holds its gradients now
+        for static, adjoint in zip(self._adjoints, adjoints, strict=True):
+            static.copy_(adjoint.detach())
+        with current_stream(self._device):
+            wp.capture_launch(self._backward)
+            return tuple(
+                wp.to_torch(argument.grad, requires_grad=False).clone() if argument.requires_grad else None
+                for argument in self._arguments
+            )
+
+
+class ReplayedCall:
+    """A replayed call, to be played back as often as asked."""
+
+    def __init__(self, capture: Capture, tensors: Sequence[torch.Tensor], state: int):
+        self._capture, self._tensors, self._state = capture, [tensor.detach() for tensor in tensors], state
+
+    def gradients(self, adjoints: Sequence[torch.Tensor]) -> tuple[torch.Tensor | None, ...]:
+        """The gradient to each argument, given the results' gradients; None where it requires none."""
+        return self._capture.gradients(self._tensors, self._state, adjoints)
