@@ -1,4 +1,4 @@
-"""Bodies that emit, as a whole: images by kept renderers, stills and paths, and gradients of images."""
+"""Bodies that emit, as a whole: images by renderers, stills and paths, and gradients of images."""
 
 import dataclasses
 import subprocess
@@ -18,7 +18,7 @@ SMOOTH = 5e-3
 KEPT = 0.06
 # Mean of bounced light of stills against paths, which draw points of the lamp's surface. Measured 0.1%.
 BOUNCED = 0.02
-# The same of kept renderers. Measured 5.5 and 6%; 3.3 and 3.9% of the light of the sky, which is wider.
+# The same of renderers. Measured 5.5 and 6%; 3.3 and 3.9% of the light of the sky, which is wider.
 KEPT_BOUNCED = 0.08
 
 DARK = ws.EnvironmentMap.constant(0.0)

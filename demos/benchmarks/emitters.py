@@ -4,7 +4,7 @@
         [--samples 4096] [--picture emitters.png]
 
 Errors are of all pixels but those that show a lamp, relative L2, noise of the reference taken off; "edges" are errors
-without the pixels where the reference jumps, beside shadows' edges and outlines. CPU time is of a kept renderer's
+without the pixels where the reference jumps, beside shadows' edges and outlines. CPU time is of a renderer's
 image of moved bodies, and of that with its gradient.
 """
 
@@ -159,7 +159,7 @@ def main() -> None:
     options = parser.parse_args()
     ws.quiet()
     torch.manual_seed(0)
-    heads = ("bounces", 8), ("kept", 8), ("no edges", 10), ("light", 8), ("still", 8), ("light", 8), ("image", 9)
+    heads = ("bounces", 8), ("renderer", 10), ("no edges", 10), ("light", 8), ("still", 8), ("light", 8), ("image", 9)
     print(f"{'scene':12}" + "".join(f"{head:>{width}}" for head, width in (*heads, ("+ grad", 9))))
     rows, strips = [], []
     for name in options.scenes:
@@ -176,13 +176,13 @@ def main() -> None:
             times = [seconds(scene, has_gradient=has_gradient) for has_gradient in (False, True)]
             rows.append(errors)
             print(
-                f"{name:12}{text:>8}{errors[0]:8.1%}{errors[1]:10.1%}{light[0]:+8.1%}{errors[2]:8.1%}{light[1]:+8.1%}"
+                f"{name:12}{text:>8}{errors[0]:10.1%}{errors[1]:10.1%}{light[0]:+8.1%}{errors[2]:8.1%}{light[1]:+8.1%}"
                 f"{times[0]:7.2f} s{times[1]:7.2f} s",
                 flush=True,
             )
             strips.append(np.concatenate([kept, still, reference.mean], axis=1)[..., :3])
     means = np.mean(rows, axis=0)
-    print(f"{'mean':20}{means[0]:8.1%}{means[1]:10.1%}{'':8}{means[2]:8.1%}")
+    print(f"{'mean':20}{means[0]:10.1%}{means[1]:10.1%}{'':8}{means[2]:8.1%}")
     if options.picture:
         scaled = [strip * 0.6 / np.percentile(strip, 95) for strip in strips]
         ws.write_image(options.picture, np.clip(np.concatenate(scaled), 0, 1))
