@@ -40,7 +40,7 @@ class Replays:
         reason: Why the last call was plain; empty if it was replayed.
     """
 
-    def __init__(self, *, is_on: bool = True):
+    def __init__(self, *, is_on: bool = False):
         self.is_on = is_on
         self.reason = "nothing was called yet"
         self._kinds: dict[Hashable, _Kind] = {}
