@@ -36,6 +36,7 @@ def make_renderer():
         camera = ws.Camera.look_at((0, 2, 3), (0, 0.3, 0), size=(24, 24))
         scene = ws.Scene((ball, ground), ws.synthetic_sky(height=32), camera, ws.Visibility(directions=32))
         bounces = options.pop("bounces", 0)
+        options.setdefault("graphs", True)
         return TorchRenderer(dataclasses.replace(scene, bounces=bounces), **options)
 
     return make

@@ -13,7 +13,7 @@ import warp as wp
 from warpshadow import __version__, check, quiet
 from warpshadow.assets import files
 
-_ELSEWHERE = {"explain": "in Python, Renderer(scene).explain() lists the stages of an image, and what is cached"}
+_ELSEWHERE = {"explain": "in Python, Renderer(scene).explain() lists the stages of an image, and which are cached"}
 """Remedies for commands that there are not."""
 
 

@@ -91,7 +91,7 @@ class TorchRenderer(torch.nn.Module):
         basis: Basis of free light: ``HarmonicBasis(order)`` or ``CellBasis(directions)``; None for the native basis of
             the scene's method.
         graphs: Whether calls that come again with tensors of the same shapes are captured as CUDA graphs and replayed
-            on a GPU (:mod:`warpshadow.torch.replay`).
+            on a GPU (:mod:`warpshadow.torch.replay`): tested with captures of a CPU alone so far.
     Attributes:
         replays: The captured calls; ``replays.reason`` says why the last call was not replayed.
         warp: The :class:`warpshadow.Renderer` of Warp's arrays that it calls; most users need it not.
@@ -114,7 +114,7 @@ class TorchRenderer(torch.nn.Module):
         device: str | torch.device = "cpu",
         basis: Basis | None = None,
         progress: bool = True,
-        graphs: bool = True,
+        graphs: bool = False,
     ):
         super().__init__()
         self.replays = Replays(is_on=check.flag("graphs", graphs))

@@ -3,7 +3,7 @@
 On a GPU Python takes longer to launch the kernels of a call than they run. So a :class:`TorchRenderer` captures a call
 of a kind that has come twice, and replays it from then on: it copies the tensors to where the graph reads them,
 launches the graph, and copies the results. A kind has shapes, tensors that require a gradient, and arguments that are
-no tensors. Tensors are checked as ever; what is computed from them is not, as in all graphs
+no tensors. Tensors are checked as ever; results in between are not, as in all graphs
 (:mod:`warpshadow.device.cuda_graph`).
 
 Calls are plain where nothing would be won, or cannot be captured: on a CPU, while torch captures, where geometry or
@@ -40,7 +40,7 @@ class Replays:
         reason: Why the last call was plain; empty if it was replayed.
     """
 
-    def __init__(self, *, is_on: bool = True):
+    def __init__(self, *, is_on: bool = False):
         self.is_on = is_on
         self.reason = "nothing was called yet"
         self._kinds: dict[Hashable, _Kind] = {}

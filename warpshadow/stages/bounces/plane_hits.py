@@ -145,7 +145,7 @@ def _find_overlap(cell: VisibleCell, hit: PlaneHit, other: PlaneHit):
 
 @wp.func
 def _block_each_other(cell: VisibleCell, k: int, j: int, hits: wp.array(dtype=PlaneHit)):
-    """Take from each of two hits what the other blocks of it."""
+    """Take from each of two hits the part that the other blocks."""
     hit, other = hits[k], hits[j]
     share_in_front = wp.smoothstep(-1.0, 1.0, _find_overlap(cell, hit, other).relative)
     by_other = share_in_front * other.coverage
@@ -214,14 +214,14 @@ def _is_wholly_open(hit: PlaneHit, before: wp.vec4):
 
 @wp.func
 def _unnormalized_direction(cell: VisibleCell, open_share: float, blocked_moment: wp.vec3):
-    """Direction ω + ρ z of what is open of a side, not of unit length; and the length of (o, m)."""
+    """Direction ω + ρ z of the open part of a side, not of unit length; and the length of (o, m)."""
     length = wp.sqrt(open_share * open_share + wp.length_sq(blocked_moment))
     return cell.direction - (cell.radius / length) * blocked_moment, length
 
 
 @wp.func
 def _visible_footprint(planes: PlaneArrays, side: PlaneSide, cell: VisibleCell, hit: PlaneHit, before: wp.vec4):
-    """Direction and footprint of what is open of a side."""
+    """Direction and footprint of the open part of a side."""
     direction = cell.direction
     extent = float(1.0)
     if not _is_wholly_open(hit, before):
@@ -288,7 +288,7 @@ def _find_visible_parts(
     receiver: PlaneReceiver,
     hits: wp.array(dtype=PlaneHit),
 ):
-    """Find what nearer sides leave open of each hit, and the radiosity of that."""
+    """Find the part of each hit that nearer sides leave open, and its radiosity."""
     for k in range(1, receiver.side_count):
         for j in range(k):
             if is_hit(hits, k) and is_hit(hits, j):

@@ -61,7 +61,7 @@ class StoredSide:
 
 @wp.struct
 class PlaneReceiver:
-    """A receiver, and what its thread stores of the planes around it."""
+    """A receiver, and the scratch memory of its thread for the planes around it."""
 
     batch: int
     index: int  # of the receiver
