@@ -110,4 +110,4 @@ def test_only_tests_that_take_a_device_run_and_those_not_reached_are_counted(tmp
     monkeypatch.setenv("PYTEST_ADDOPTS", "tests/stages/test_film.py tests/maths/test_directions.py")  # of all tests
     tests = gpu_report.run_tests("cpu", 0, tmp_path)
     assert tests["passed"] + len(tests["failed"]) + tests["skipped"] == 1  # the first one ends the time
-    assert 10 < tests["not reached"] < 30  # those of films; directions take no device
+    assert 5 < tests["not reached"] < 30  # those of films; directions take no device

@@ -265,16 +265,13 @@ def find_side_hits(
                 if is_covered_by_texels(side.grid):
                     hit.mesh_share = fetch(planes.covered, planes, first_level, mip)[0]
                 if _is_sender(side):
-                    if before[0] > 0.0:
-                        _, footprint = _visible_footprint(planes, side, cell, hit, before)
-                        mip = find_mip_footprint(side.grid, planes, footprint)
                     hit.radiosity = fetch(texels, planes, first_level, mip)
             hit.coverage = outline[0] * hit.mesh_share
             hit.centroid = wp.vec3(outline[1], outline[2], outline[3]) / outline[0]
             hit.inverse_distance = inverse_distance_on_side(side)
             hits[i] = hit
             hit_count += 1
-    if hit_count > 1:
+    if hit_count > 1 or (hit_count > 0 and before[0] > 0.0):
         _find_visible_parts(planes, cell, texels, before, receiver, hits)
     return hit_count
 
@@ -288,13 +285,13 @@ def _find_visible_parts(
     receiver: PlaneReceiver,
     hits: wp.array(dtype=PlaneHit),
 ):
-    """Find the part of each hit that nearer sides leave open, and its radiosity."""
+    """Find the part of each hit that all before it leaves open, and its radiosity."""
     for k in range(1, receiver.side_count):
         for j in range(k):
             if is_hit(hits, k) and is_hit(hits, j):
                 _block_each_other(cell, k, j, hits)
     for i in range(receiver.side_count):
-        if is_hit(hits, i) and hits[i].open_share < 1.0:
+        if is_hit(hits, i) and not _is_wholly_open(hits[i], before):
             hits[i].open_share = wp.max(hits[i].open_share, _MIN_OPEN)
             side = load_side(planes, receiver, i)
             if _is_sender(side):
