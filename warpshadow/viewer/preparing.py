@@ -10,6 +10,7 @@ import _thread
 import contextlib
 import os
 import pickle
+import signal
 import subprocess
 import sys
 import threading
@@ -99,6 +100,7 @@ class Preparation:
 def prepare() -> None:
     """Prepare the scene that comes on stdin; the end of stdin interrupts that."""
     warnings.simplefilter("ignore")  # the viewer warns of the same
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # processes in the background of a shell ignore it
     start_quietly()
     scene, device = pickle.load(sys.stdin.buffer)
     sys.unraisablehook = _interrupt_again
