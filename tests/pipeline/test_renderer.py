@@ -9,8 +9,8 @@ import pytest
 import warp as wp
 
 import warpshadow as ws
-from warpshadow import check
 from warpshadow.assets.basis import CellBasis, HarmonicBasis
+from warpshadow.device import array_checks
 from warpshadow.maths import sh
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.geometry import Geometry
@@ -761,7 +761,7 @@ def test_a_gpu_names_the_argument_at_fault_after_the_call(method, name, value, m
         return renderer.draw(light, albedo=[albedo, None], view=view).numpy()
 
     plain = draw("")
-    monkeypatch.setattr(check, "_is_awaited", lambda device: True)
+    monkeypatch.setattr(array_checks, "_is_awaited", lambda device: True)
     np.testing.assert_array_equal(draw(""), plain)
     with pytest.raises(ValueError, match=rf"^{name}(\[0\])?: got 1 "):
         draw(name)

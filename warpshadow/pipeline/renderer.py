@@ -15,6 +15,7 @@ from warpshadow import check
 from warpshadow.assets.basis import Basis, check_basis
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.light import EnvironmentMap
+from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.progress import waiting
 from warpshadow.device.tape import unrecorded
@@ -383,7 +384,7 @@ class SceneRenderer:
             )
         if photograph is not None:
             check.shape("photograph", photograph.shape, ("batch", *self._size))
-            check.finite_arrays({"photograph": photograph})
+            finite_arrays({"photograph": photograph})
         catchers, materials, alone = (
             self._catchers_alone,
             self._given_materials(albedo, textures, gloss, emission),

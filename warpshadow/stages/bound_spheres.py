@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warpshadow import check
+from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
@@ -152,7 +152,7 @@ class SphereBinding:
         Differentiable: all.
         """
         arguments = {"positions": positions, "rest": rest_positions, "centers": rest_centers, "radii": rest_radii}
-        check.finite_arrays(arguments)
+        finite_arrays(arguments)
         shape, device = (common_batch(arguments), len(self.item_starts) - 1), positions.device
         binding = [self.item_starts, self.vertices]
         centers = empty(shape, dtype=wp.vec3, device=device)

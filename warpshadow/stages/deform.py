@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
+from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
 from warpshadow.device.threads import one_at_a_time
@@ -166,7 +167,7 @@ class DeformationGraph:
     def centers(self, translations: wp.array) -> wp.array:
         """Displaced positions of the nodes: vec3 of shape [batch, node]. Differentiable: translations."""
         check.shape("translations", translations.shape, ("batch", self.node_positions.shape[0]))
-        check.finite_arrays({"translations": translations})
+        finite_arrays({"translations": translations})
         moved_centers = wp.empty_like(translations, requires_grad=False)
         launch(_move_nodes, moved_centers.shape, inputs=[self.node_positions, translations], outputs=[moved_centers])
         return moved_centers
@@ -190,13 +191,13 @@ class DeformationGraph:
         Differentiable: matrices.
         """
         check.shape("matrices", matrices.shape, ("batch", self.node_positions.shape[0]))
-        check.finite_arrays({"matrices": matrices})
+        finite_arrays({"matrices": matrices})
         return _sum_energy("matrices", _sum_shear, matrices.shape, [matrices])
 
     def _check(self, matrices: wp.array, translations: wp.array) -> None:
         check.shape("matrices", matrices.shape, ("batch", self.node_positions.shape[0]))
         check.shape("translations", translations.shape, matrices.shape)
-        check.finite_arrays({"matrices": matrices, "translations": translations})
+        finite_arrays({"matrices": matrices, "translations": translations})
 
 
 def _sum_energy(names: str, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list[wp.array]) -> wp.array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from warpshadow import check
+from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty, zeros
 
@@ -129,7 +129,7 @@ def vertex_normals(positions: wp.array, faces: wp.array) -> wp.array:
         ValueError: for NaN, Inf and positions beyond 1e18.
     Differentiable: positions (with a zero gradient where the normal is zero). Not: faces.
     """
-    check.finite_arrays({"positions": positions})
+    finite_arrays({"positions": positions})
     device, shape = positions.device, positions.shape
     sums = zeros(shape, dtype=wp.vec3d, device=device, outlives_recording=False)
     face_dim, vertex_dim = (shape[0], faces.shape[0]), shape

@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
+from warpshadow.device.array_checks import finite_arrays, values_of
 from warpshadow.device.batch import common_batch, expand, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
@@ -101,7 +102,7 @@ class Poses:
         """Validate."""
         check.shape("translations", self.translations.shape, self.rotations.shape)
         check.shape("scales", self.scales.shape, self.rotations.shape)
-        check.values_of(self.rotations, lambda values: check_orthonormal(values.astype(np.float64)))
+        values_of(self.rotations, lambda values: check_orthonormal(values.astype(np.float64)))
 
     def about(self, pivots: wp.array) -> "Poses":
         """The poses x → s R (x − pivot) + t, if these have t: it is where the pivot goes.
@@ -120,7 +121,7 @@ class Poses:
         batch_count = common_batch({"pivot": pivots, "scales": self.scales})
         check.shape("pivot", pivots.shape, ("batch", self.scales.shape[1]))
         arrays = {"rotations": self.rotations, "translations": self.translations, "scales": self.scales}
-        check.finite_arrays(arrays | {"pivot": pivots})
+        finite_arrays(arrays | {"pivot": pivots})
         moved_translations = empty((batch_count, pivots.shape[1]), dtype=wp.vec3, device=pivots.device)
         launch(
             _move_pivots,
@@ -163,5 +164,5 @@ class Poses:
         """Shape of the moving arrays."""
         check.shape("rest", rest.shape, ("batch", bodies.shape[0]))
         arrays = {"rest": rest, "rotations": self.rotations, "translations": self.translations, "scales": self.scales}
-        check.finite_arrays(arrays, nonnegative=["scales"])
+        finite_arrays(arrays, nonnegative=["scales"])
         return common_batch({"rest": rest, "scales": self.scales}), bodies.shape[0]

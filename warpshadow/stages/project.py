@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
+from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
@@ -58,7 +59,7 @@ def compose_clip_matrices(
     """
     width, height = check.image_size(size)
     variables = {"intrinsics": intrinsics, "rotations": rotations, "translations": translations}
-    check.finite_arrays(variables)
+    finite_arrays(variables)
     to_ndc = wp.mat33(2.0 / width, 0.0, -1.0, 0.0, 2.0 / height, -1.0, 0.0, 0.0, 1.0)
     clip_matrices = empty(common_batch(variables), dtype=wp.mat44, device=intrinsics.device)
     inputs = [*variables.values(), to_ndc, check.positive("near", near)]
@@ -95,7 +96,7 @@ def to_clip(positions: wp.array, clip_matrices: wp.array) -> wp.array:
         Clip positions, vec4, shape [batch, vertex].
     Differentiable: positions, clip_matrices.
     """
-    check.finite_arrays({"clip_matrices": clip_matrices})
+    finite_arrays({"clip_matrices": clip_matrices})
     batch_count = common_batch({"positions": positions, "clip_matrices": clip_matrices})
     clip_positions = empty((batch_count, positions.shape[1]), dtype=wp.vec4, device=positions.device)
     launch(_to_clip, clip_positions.shape, inputs=[positions, clip_matrices], outputs=[clip_positions])
@@ -109,7 +110,7 @@ def check_clip_space(clip_matrices: wp.array) -> None:
     """
     if clip_matrices.device.is_capturing:
         return
-    check.finite_arrays({"clip_matrices": clip_matrices})
+    finite_arrays({"clip_matrices": clip_matrices})
     matrices = clip_matrices.numpy()
     depth_row_slopes, depth_slopes = (np.linalg.norm(matrices[:, row, :3], axis=1) for row in (2, 3))
     other_indices = np.flatnonzero(

@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
+from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.threads import one_at_a_time
@@ -119,7 +120,7 @@ def _check_rotations(parameters: wp.array) -> None:
     """Raise ValueError for parameters that no rotation has."""
     if parameters.device.is_capturing:
         return
-    check.finite_arrays({"parameters": parameters})
+    finite_arrays({"parameters": parameters})
     if parameters.dtype is wp.vec3:
         if parameters.device.is_cpu:
             _warn_of_degrees(parameters.numpy())

@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
+from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.lanes import Chunk, as_chunks, use_vector_registers
@@ -188,7 +189,7 @@ def shade(transfer: wp.array, light: wp.array, *, maximum: float = check.LARGEST
     Differentiable: transfer, light. Exact, both being linear.
     """
     check.shape("light", light.shape, ("batch", transfer.shape[2]))
-    check.finite_arrays({"light": light}, maximum=maximum)
+    finite_arrays({"light": light}, maximum=maximum)
     for name, array in (("transfer", transfer), ("light", light)):
         if not array.is_contiguous:
             raise ValueError(f"{name}: got a strided array, expected a contiguous one")
@@ -300,7 +301,7 @@ def shade_cells(
     """
     cells, device = cell_inputs(transmittance, normals, directions), normals.device
     check.shape("light", light.shape, ("batch", len(directions)))
-    check.finite_arrays({"light": light}, maximum=maximum)
+    finite_arrays({"light": light}, maximum=maximum)
     use_vector_registers(__name__, device)
     shading = empty(normals.shape, dtype=wp.vec3, device=device)
     cost = _RECEIVER_COST + _COEFFICIENT_COST * len(directions)

@@ -10,6 +10,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.assets.camera import Camera
+from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.batch import common_batch
 from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.geometry import GEOMETRY_DTYPES, PLACED, Geometry, as_geometry
@@ -191,6 +192,6 @@ def _check_tensor(
     if tensor.numel() == 0 and 0 not in shape:
         raise ValueError(f"{name}: got shape {tuple(tensor.shape)}, expected at least one value")
     if device.type == "cuda" and not is_capturing(device):
-        check.finite_arrays({name: as_array(tensor.detach() if tensor.ndim else tensor.detach()[None], wp.float32)})
+        finite_arrays({name: as_array(tensor.detach() if tensor.ndim else tensor.detach()[None], wp.float32)})
     elif not np.isfinite(float(tensor.detach().sum())):
         check.finite(name, tensor.detach().numpy())

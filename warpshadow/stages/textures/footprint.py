@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from warpshadow import check
+from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
@@ -216,7 +217,7 @@ def find_footprints(
     """
     check.shape("uv_faces", uv_faces.shape, faces.shape)
     check.shape("texture_of_face", texture_of_face.shape, faces.shape)
-    check.finite_arrays({"uvs": uvs})
+    finite_arrays({"uvs": uvs})
     batch_count = common_batch({"fragments": fragments.barycentrics, "clip_positions": clip_positions, "uvs": uvs})
     _, height, width = fragments.face_ids.shape
     count, shape = batch_count * height * width, (batch_count, height, width)

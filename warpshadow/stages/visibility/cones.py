@@ -16,6 +16,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
+from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 
 BLEND = 0.01  # the exact formula ends at D = (1 + BLEND) r
@@ -38,7 +39,7 @@ def check_spheres(points: wp.array, normals: wp.array | None, centers: wp.array,
     check.shape("centers", centers.shape, (points.shape[0], "sphere"))
     check.shape("radii", radii.shape, centers.shape)
     arrays = {"points": points, "normals": normals, "centers": centers, "radii": radii}
-    check.finite_arrays(arrays, nonnegative=["radii"])
+    finite_arrays(arrays, nonnegative=["radii"])
 
 
 @functools.cache

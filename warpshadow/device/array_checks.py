@@ -1,0 +1,220 @@
+"""Checks of arrays on a device: NaN, Inf and numbers out of range, found on a GPU when a call ends.
+
+On a CPU arrays are looked at where they are checked. On a GPU that would stop the host each time: arrays of a call wait
+for its end, and few launches look at all of them. While a CUDA graph is captured nothing can be read back, and nothing
+is checked.
+"""
+
+import contextlib
+import threading
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+
+_AT_ONCE = 8  # arrays that a launch looks at
+_MAX_LATE = 64  # checks that wait, since they hold their arrays
+_SMALL = 10_000  # numbers up to which BLAS sums on one thread
+
+_Limits = wp.types.vector(length=_AT_ONCE, dtype=wp.float32)
+
+
+@wp.func
+def _is_outside(values: wp.array(dtype=wp.float32), item: int, minimum: float, maximum: float) -> bool:
+    result = bool(False)
+    if item < values.shape[0]:
+        result = not (values[item] >= minimum and values[item] <= maximum)  # so NaN, too
+    return result
+
+
+@wp.kernel(enable_backward=False)
+def _count_outside(
+    # in
+    values_0: wp.array(dtype=wp.float32),
+    values_1: wp.array(dtype=wp.float32),
+    values_2: wp.array(dtype=wp.float32),
+    values_3: wp.array(dtype=wp.float32),
+    values_4: wp.array(dtype=wp.float32),
+    values_5: wp.array(dtype=wp.float32),
+    values_6: wp.array(dtype=wp.float32),
+    values_7: wp.array(dtype=wp.float32),
+    minima: _Limits,
+    maxima: _Limits,
+    first: int,
+    # out
+    faults: wp.array(dtype=wp.int32),
+):
+    """A thread owns a number of an array."""
+    argument, item = wp.tid()
+    minimum, maximum = minima[argument], maxima[argument]
+    is_outside = bool(False)
+    if argument == 0:
+        is_outside = _is_outside(values_0, item, minimum, maximum)
+    elif argument == 1:
+        is_outside = _is_outside(values_1, item, minimum, maximum)
+    elif argument == 2:
+        is_outside = _is_outside(values_2, item, minimum, maximum)
+    elif argument == 3:
+        is_outside = _is_outside(values_3, item, minimum, maximum)
+    elif argument == 4:
+        is_outside = _is_outside(values_4, item, minimum, maximum)
+    elif argument == 5:
+        is_outside = _is_outside(values_5, item, minimum, maximum)
+    elif argument == 6:
+        is_outside = _is_outside(values_6, item, minimum, maximum)
+    else:
+        is_outside = _is_outside(values_7, item, minimum, maximum)
+    if is_outside:
+        wp.atomic_add(faults, first + argument, 1)
+
+
+class _LateChecks(threading.local):
+    """Checks of a thread's call that wait for the end of the call, on a GPU."""
+
+    def __init__(self) -> None:
+        self.depth = 0  # of calls in each other
+        self.arrays: dict[Hashable, tuple[str, wp.array, tuple[float, float]]] = {}  # their names and ranges
+        self.others: list[tuple[wp.array, Callable[[np.ndarray], None]]] = []
+        self.faults: dict[str, wp.array] = {}  # by device: zero but while arrays are looked at
+
+    def __enter__(self) -> None:
+        self.depth += 1
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            if self.depth == 1 and (kind is None or issubclass(kind, Exception)):
+                self.run()
+        finally:
+            self.depth -= 1
+            if not self.depth:
+                self.clear()
+
+    def clear(self) -> None:
+        """Leave them out."""
+        self.arrays, self.others = {}, []
+
+    def run_if_due(self) -> None:
+        """Run them where no call waits for them, or they hold many arrays."""
+        if not self.depth or len(self.arrays) + len(self.others) >= _MAX_LATE:
+            self.run()
+
+    def run(self) -> None:
+        """Run them in their order."""
+        if not (self.arrays or self.others):
+            return
+        arrays, others = list(self.arrays.values()), self.others
+        self.clear()
+        for alias in dict.fromkeys(array.device.alias for _, array, _ in arrays):
+            of_device = [item for item in arrays if item[1].device.alias == alias]
+            for number in self._outside(of_device):
+                name, array, (minimum, maximum) = of_device[number]
+                check.finite(name, array.numpy(), minimum=minimum, maximum=maximum)
+        for array, judge in others:
+            judge(array.numpy())
+
+    def _outside(self, arrays: Sequence[tuple[str, wp.array, tuple[float, float]]]) -> list[int]:
+        """Which arrays, of one device, hold a number out of their range: few launches, and one wait."""
+        device = arrays[0][1].device
+        if device.alias not in self.faults or len(self.faults[device.alias]) < len(arrays):
+            self.faults[device.alias] = wp.zeros(2 * len(arrays), dtype=wp.int32, device=device)
+        faults = self.faults[device.alias]
+        for first in range(0, len(arrays), _AT_ONCE):
+            batch = arrays[first : first + _AT_ONCE]
+            values = [_scalars(array) for _, array, _ in batch]
+            ranges = [range_ for *_, range_ in batch] + [(0.0, 0.0)] * (_AT_ONCE - len(batch))
+            limits = [_Limits(*side) for side in zip(*ranges, strict=True)]
+            padding: list[None] = [None] * (_AT_ONCE - len(batch))
+            wp.launch(
+                _count_outside,
+                dim=(len(batch), max(array.size for array in values)),
+                inputs=[*values, *padding, *limits, first],
+                outputs=[faults],
+                device=device,
+                record_tape=False,
+            )
+        faulty_indices = np.flatnonzero(faults.numpy()).tolist()
+        if faulty_indices:
+            faults.zero_()
+        return faulty_indices
+
+
+_late_checks = _LateChecks()
+
+
+def of_one_call() -> contextlib.AbstractContextManager[None]:
+    """Check arrays on a GPU when the call ends, so that it waits for the device once.
+
+    A call within a call ends with it. A fault is raised in place of the error that it led to.
+    """
+    return _late_checks
+
+
+def _is_awaited(device: wp.Device) -> bool:
+    """Whether the host waits where it reads a device's arrays."""
+    return device.is_cuda
+
+
+def finite_arrays(
+    arrays: Mapping[str, wp.array | None], *, maximum: float = check.LARGEST, nonnegative: Collection[str] = ()
+) -> None:
+    """Raise ValueError when float32 arrays on a device, of any dtype, hold NaN, Inf or numbers out of range.
+
+    On a GPU that is found when the call ends (:func:`of_one_call`), at once where there is none. While a CUDA graph is
+    captured nothing can be read back, and nothing is checked.
+
+    Args:
+        arrays: By the names of their arguments; None is passed over.
+        maximum: Largest magnitude that is accepted.
+        nonnegative: Names of the arrays that must hold nothing below 0.
+    """
+    present = {name: array for name, array in arrays.items() if array is not None and array.size}
+    devices = [array.device for array in present.values()]
+    if not devices or any(device.is_capturing for device in devices):
+        return
+    ranges = {name: (0.0 if name in nonnegative else -maximum, maximum) for name in present}
+    if not any(map(_is_awaited, devices)):
+        for name in _outside_on_host(present, ranges):
+            check.finite(name, present[name].numpy(), minimum=ranges[name][0], maximum=maximum)
+        return
+    for name, array in present.items():
+        key = array.ptr, array.shape, array.strides, ranges[name]
+        _late_checks.arrays.setdefault(key, (name, array, ranges[name]))
+    _late_checks.run_if_due()
+
+
+def values_of(array: wp.array, judge: Callable[[np.ndarray], None]) -> None:
+    """Let a function look at an array's values and raise an error: on a GPU when the call ends, as finite_arrays does.
+
+    While a CUDA graph is captured it does not.
+    """
+    if array.device.is_capturing:
+        return
+    if not _is_awaited(array.device):
+        judge(array.numpy())
+        return
+    _late_checks.others.append((array, judge))
+    _late_checks.run_if_due()
+
+
+def _outside_on_host(arrays: Mapping[str, wp.array], ranges: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Names of the arrays that hold a number out of their range, by NumPy."""
+    return [name for name, array in arrays.items() if not _is_within(np.asarray(array), *ranges[name])]
+
+
+def _is_within(values: np.ndarray, minimum: float, maximum: float) -> bool:
+    """Whether no number is NaN or out of a range; of most small arrays the sum of squares tells, which is quicker."""
+    is_small = values.size <= _SMALL and values.flags.c_contiguous
+    if is_small and minimum == -maximum and float(np.vdot(values, values)) < (0.5 * maximum) ** 2:
+        return True
+    return bool(minimum <= np.minimum.reduce(values, None) and np.maximum.reduce(values, None) <= maximum)
+
+
+def _scalars(array: wp.array) -> wp.array:
+    """View an array of vectors or matrices as one of numbers."""
+    array = array.contiguous()
+    count = array.size * wp.types.type_size(array.dtype)
+    values = wp.array(ptr=array.ptr, dtype=wp.float32, shape=count, device=array.device)
+    values.viewed = array  # the memory stays while the view does
+    return values
