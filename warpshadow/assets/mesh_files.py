@@ -205,7 +205,8 @@ def _read_trimesh(path: Path) -> list[MeshPart]:
     tree = gltf_tree(path) if path.suffix.lower() in (".gltf", ".glb") else {}
     loaded_scene = trimesh.load_scene(path, process=False, maintain_order=True, fix_texture=False)
     parts = _trimesh_parts(loaded_scene, of_file=True, factors=base_color_factors(tree))
-    parts = [stronger(part, emissive_strengths(tree)) for part in parts]
+    strengths = emissive_strengths(tree)
+    parts = [stronger(part, strengths) for part in parts]
     if path.suffix.lower() == ".stl":
         if not any(len(part.faces) for part in parts):
             raise MeshError(f"faces: got none, expected at least one triangle{_stl_fault(path.read_bytes())}")

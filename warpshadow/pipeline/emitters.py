@@ -19,7 +19,6 @@ from warpshadow.pipeline.node import Node
 from warpshadow.pipeline.receivers.groups import Blockers, Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.reflectance import Materials
-from warpshadow.pipeline.self_visibility import SelfVisibilityLookup
 from warpshadow.pipeline.transfers import joined
 from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.emitters.convex import find_log_transmittance_of_parts
@@ -35,7 +34,6 @@ from warpshadow.stages.emitters.samples import (
 from warpshadow.stages.emitters.spheres import find_log_transmittance
 from warpshadow.stages.gloss.transmittance import transmittance_of_directions
 from warpshadow.stages.receivers import Receivers
-from warpshadow.stages.self_visibility.gather import gather_self_transmittance
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
 EMITTER_CELLS = fibonacci(512)
@@ -95,8 +93,7 @@ class SceneEmitters:
         ) -> wp.array:
             lit = receivers.points, receivers.normals, placed_samples, radiance
             pairs = zip(self.samples.spans(), transmittance, strict=True)
-            lights = [sum_light(*lit, span, transmittance=item) for span, item in pairs]
-            return functools.reduce(lambda first, second: total_light([first, second]), lights)
+            return total_light([sum_light(*lit, span, transmittance=item) for span, item in pairs])
 
         return Node(name, light, receivers, placed, radiance, transmittance)
 
@@ -130,7 +127,7 @@ def _light_of(
     total = wp.zeros(points.shape, dtype=wp.vec3, device=points.device)
     if not points.size:
         return total
-    cells = _self_transmittance(group)
+    cells = None if group.self_lookup is None else group.self_transmittance()
     sphere_bodies = blockers.sphere_blockers(blockers.bodies)
     spheres = merged_scene.spheres_of(sphere_bodies, blockers.spheres)
     traced_body = group.body if group.body in blockers.blocker_kinds.traced else None
@@ -152,15 +149,6 @@ def _light_of(
         )
         total = total_light([total, light])
     return total
-
-
-def _self_transmittance(group: Group) -> wp.array | None:
-    """Transmittance of the receivers' own body in even cells, [batch, receiver, cell]; None where that is 1."""
-    if group.self_lookup is None:
-        return None
-    assert group.probe_weights is not None and isinstance(group.self_lookup, SelfVisibilityLookup)
-    rows, lookup, kernels, _ = group.self_lookup
-    return gather_self_transmittance(group.normals, group.probe_weights, lookup, kernels, rows)
 
 
 def _log_of_planes(

@@ -138,7 +138,7 @@ class Method:
         if not materials.emission:
             return direct
         emitted = self.light_of_emitters(points, materials)
-        return points.cached("direct with emitters", (direct, emitted), lambda: Node("", _sum, direct, emitted))
+        return points.cached("direct with emitters", (direct, emitted), lambda: Node("", add_light, direct, emitted))
 
     def light_of_emitters(self, points: LitPoints, materials: Materials) -> Node:
         """Direct light of emitters on points, vec3 of shape [batch, receiver], cached for the last emission."""
@@ -240,7 +240,8 @@ class Method:
         return None
 
 
-def _sum(*summands: wp.array) -> wp.array:
+def add_light(*summands: wp.array) -> wp.array:
+    """Add light of several kinds. Differentiable: summands."""
     from warpshadow.stages.bounces.total import total_light
 
     return total_light(summands)

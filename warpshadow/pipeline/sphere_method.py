@@ -38,6 +38,8 @@ class SphereMethod(Method):
         sees_cells: Whether visibility is transmittance in cells: those towards ``directions`` of projected light.
         shades_transmittance: Whether known light is shaded without transfer vectors, by :meth:`shade_transmittance`.
         bounces: The ``SphereBounces`` by which light bounces; None where it does not.
+        emitter_projection: Even light in the cells in which self-visibility towards emitters is looked up; None where
+            nothing is.
     """
 
     free_projection: Any
@@ -47,11 +49,7 @@ class SphereMethod(Method):
     sees_cells = False
     shades_transmittance = False
     bounces: Any = None
-
-    @functools.cached_property
-    def emitter_projection(self) -> Any:
-        """Even light in the cells in which self-visibility towards emitters is looked up; None where nothing is."""
-        return None
+    emitter_projection: Any = None
 
     @functools.cached_property
     def plane_blockers(self) -> tuple[int, ...]:
@@ -426,7 +424,7 @@ def _why_no_self_visibility(method: SphereMethod, points: LitPoints) -> str:
     """Why no body's shadow on itself is looked up."""
     if not method.traces_self_visibility:
         return "the method takes those of spheres"
-    names = [body.called for body in method.merged_scene.scene.bodies]
+    names = [body.name for body in method.merged_scene.scene.bodies]
     whys = {name: why for name, why in zip(names, points.blocker_kinds.why_spheres, strict=False) if why}
     return "; ".join(f"{name}: {why}" for name, why in whys.items()) or "bodies are flat"
 

@@ -117,7 +117,15 @@ class PortionedDirectLight(Node):
 
 def _patch_weights(senders: Senders, visibility: list[PortionVisibility]) -> PatchWeights:
     """Weights of patch samples and patches by how open they are."""
-    portions = [find_mean_transmittance(portion.group.normals, *portion.cells[:3]) for portion in visibility]
+    portions = [
+        find_mean_transmittance(
+            portion.group.normals,
+            portion.cells.transmittance_self,
+            portion.cells.transmittance_spheres,
+            portion.cells.directions,
+        )
+        for portion in visibility
+    ]
     return find_patch_weights(joined(portions), senders.mean, senders.patch_of_sample)
 
 

@@ -33,7 +33,7 @@ from warpshadow.stages.planes.coverage import plane_coverage
 from warpshadow.stages.planes.partial_cells import SAMPLES, coverage_of_light
 from warpshadow.stages.ray_tracing import trace_cells
 from warpshadow.stages.receivers import Receivers
-from warpshadow.stages.self_visibility.gather import gather_self_transmittance, multiply_transmittances
+from warpshadow.stages.self_visibility.gather import multiply_transmittances
 from warpshadow.stages.self_visibility.sun_cells import SunCells, find_sun_cells, trace_sun_cells
 from warpshadow.stages.shading import shade, shade_cells
 from warpshadow.stages.sides import split_sides
@@ -262,8 +262,7 @@ class Directional(SphereMethod):
         if group.self_lookup is None or not group.points.size:
             return None
         assert group.probe_weights is not None and isinstance(group.self_lookup, SelfVisibilityLookup)
-        rows, lookup, kernels, rays = group.self_lookup
-        transmittance_self = gather_self_transmittance(group.normals, group.probe_weights, lookup, kernels, rows)
+        transmittance_self, rays = group.self_transmittance(), group.self_lookup.rays
         if rays is None or projected_light.sun is None:
             return transmittance_self
         if transmittance_self.requires_grad:

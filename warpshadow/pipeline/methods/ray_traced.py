@@ -11,7 +11,7 @@ from warpshadow.assets.basis import Basis, HarmonicBasis
 from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.device.batch import common_batch
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.method import Method
+from warpshadow.pipeline.method import Method, add_light
 from warpshadow.pipeline.node import Input, Node, NodeStage, detached
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
@@ -70,7 +70,7 @@ class Rays(Method):
             at_patch_samples = points.cached(
                 "emitters at patch samples",
                 (at_patch_samples, materials.emission),
-                lambda: Node("", _sum, at_patch_samples, emitted),
+                lambda: Node("", add_light, at_patch_samples, emitted),
             )
         return self._bounces.add_bounces(direct, at_patch_samples, points, materials)
 
@@ -96,7 +96,7 @@ class Rays(Method):
 
     def _light_of_emitters_at(self, points: LitPoints, receivers: Node, materials: Materials, name: str = "") -> Node:
         """The same on other receivers among the same bodies. Differentiable: emission."""
-        placed, items = self.emitters.placed(points), functools.partial(receiver_text, points)
+        placed, items = self.emitters.placed(points), functools.partial(receiver_text, points.in_words)
 
         def traced() -> Node:
             arguments = points.vertices, receivers, placed
@@ -299,12 +299,6 @@ def _openness(trees: list[FaceTree], receivers: Receivers) -> wp.array:
         arguments = trees[min(instance, len(trees) - 1)], points[instance], normals[instance], samples
         wp.copy(result[instance], trace_shared(*arguments))
     return result
-
-
-def _sum(first: wp.array, second: wp.array) -> wp.array:
-    from warpshadow.stages.bounces.total import total_light
-
-    return total_light([first, second])
 
 
 def _checked_points(points: wp.array) -> wp.array:

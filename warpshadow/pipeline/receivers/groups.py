@@ -22,6 +22,7 @@ from warpshadow.stages.convex.prepared import PlacedParts
 from warpshadow.stages.planes.fronts import NearestBlockers, find_fronts, lifted_points
 from warpshadow.stages.planes.prepared import PlaneBlockers
 from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.self_visibility.gather import gather_self_transmittance
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 
@@ -56,6 +57,12 @@ class Group(NamedTuple):
     def is_before_planes(self) -> bool:
         """Whether planes block light of its receivers."""
         return self.planes is not None and bool(self.points.size and self.planes.blocking)
+
+    def self_transmittance(self) -> wp.array:
+        """Transmittance past the receivers' own body, looked up in cells: float32 of shape [batch, receiver, cell]."""
+        assert self.probe_weights is not None and isinstance(self.self_lookup, SelfVisibilityLookup)
+        rows, lookup, kernels, _rays = self.self_lookup
+        return gather_self_transmittance(self.normals, self.probe_weights, lookup, kernels, rows)
 
     def lifted_points_and_fronts(
         self, frames: wp.array, planes: PlaneBlockers, skip: int | None

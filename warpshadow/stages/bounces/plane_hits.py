@@ -264,7 +264,7 @@ def find_side_hits(
                 mip = find_mip_footprint(side.grid, planes, footprint_on_side(planes, side, cell.direction))
                 if is_covered_by_texels(side.grid):
                     hit.mesh_share = fetch(planes.covered, planes, first_level, mip)[0]
-                if _is_sender(side):
+                if _is_sender(side) and before[0] <= 0.0:  # else it is that of the part beside
                     hit.radiosity = fetch(texels, planes, first_level, mip)
             hit.coverage = outline[0] * hit.mesh_share
             hit.centroid = wp.vec3(outline[1], outline[2], outline[3]) / outline[0]

@@ -30,12 +30,14 @@ def _add_light(
 
 
 def total_light(summands: Sequence[wp.array]) -> wp.array:
-    """Add up to four summands of light, vec3 of shape [batch, receiver]; a batch of 1 serves every instance.
+    """Add summands of light, vec3 of shape [batch, receiver], four in a launch; a batch of 1 serves every instance.
 
     Differentiable: summands.
     """
     if len(summands) == 1:
         return summands[0]
+    if len(summands) > 4:
+        return total_light([total_light(summands[:4]), *summands[4:]])
     count = common_batch({f"summand {number}": summand for number, summand in enumerate(summands)})
     total = empty((count, summands[0].shape[1]), dtype=wp.vec3, device=summands[0].device)
     launch(_add_light, total.shape, inputs=[*summands, *[None] * (4 - len(summands))], outputs=[total])

@@ -26,6 +26,15 @@ wp.set_module_options({"max_unroll": 1})
 
 
 @wp.func
+def _gap_to_edge(edge: wp.vec4, u: float, v: float):
+    """The way from the nearest point of an edge to a point."""
+    x = edge[2] - edge[0]
+    y = edge[3] - edge[1]
+    position = wp.clamp(((u - edge[0]) * x + (v - edge[1]) * y) / wp.max(x * x + y * y, 1.0e-30), 0.0, 1.0)
+    return wp.vec2(u - edge[0] - position * x, v - edge[1] - position * y)
+
+
+@wp.func
 def _nearest_edge(edges: wp.array(dtype=wp.vec4), first_edge: int, edge_count: int, u: float, v: float):
     """The edge of an outline that is nearest to a point, counted from 1; negative where the point is outside."""
     nearest_edge = int(0)
@@ -33,16 +42,11 @@ def _nearest_edge(edges: wp.array(dtype=wp.vec4), first_edge: int, edge_count: i
     crossings = int(0)
     for e in range(edge_count):
         edge = edges[first_edge + e]
-        x = edge[2] - edge[0]
-        y = edge[3] - edge[1]
-        position = wp.clamp(((u - edge[0]) * x + (v - edge[1]) * y) / wp.max(x * x + y * y, 1.0e-30), 0.0, 1.0)
-        gap_u = u - edge[0] - position * x
-        gap_v = v - edge[1] - position * y
-        distance2 = gap_u * gap_u + gap_v * gap_v
+        distance2 = wp.length_sq(_gap_to_edge(edge, u, v))
         if distance2 < min_distance2:
             min_distance2 = distance2
             nearest_edge = e + 1
-        if (edge[1] > v) != (edge[3] > v) and u < edge[0] + (v - edge[1]) / y * x:
+        if (edge[1] > v) != (edge[3] > v) and u < edge[0] + (v - edge[1]) / (edge[3] - edge[1]) * (edge[2] - edge[0]):
             crossings += 1
     return wp.where(crossings % 2 == 1, nearest_edge, -nearest_edge)
 
@@ -80,10 +84,7 @@ def _covered_share(
         v = wp.dot(hit, axis_v) / (scale * scale)
         number = _nearest_edge(edges, grid.first_edge, grid.edge_count, u, v)
         edge = edges[grid.first_edge + wp.abs(number) - 1]
-        x = edge[2] - edge[0]
-        y = edge[3] - edge[1]
-        along_edge = wp.clamp(((u - edge[0]) * x + (v - edge[1]) * y) / wp.max(x * x + y * y, 1.0e-30), 0.0, 1.0)
-        gap = wp.vec2(u - edge[0] - along_edge * x, v - edge[1] - along_edge * y)
+        gap = _gap_to_edge(edge, u, v)
         outward = wp.normalize(gap)
         slope = (outward[0] * wp.dot(beam, axis_u) + outward[1] * wp.dot(beam, axis_v)) / (scale * rise)
         width = wp.max(disc_radius * position, _MIN_WIDTH * distance) * wp.sqrt(1.0 + slope * slope)
@@ -116,16 +117,18 @@ def _block_by_planes(
     normal = normals[instance_in(batch, normals.shape[0]), receiver]
     sample_batch = instance_in(batch, sample_points.shape[0])
     frame_batch = instance_in(batch, frames.shape[0])
-    for f in range(grids.shape[0]):
-        axis_u = frames[frame_batch, 3 * f + 1]
-        if f != skipped[0] and f != skipped[1] and grids[f].blocks == 1 and wp.length_sq(axis_u) > 0.0:
-            origin = frames[frame_batch, 3 * f]
-            axis_v = frames[frame_batch, 3 * f + 2]
+    for plane in range(grids.shape[0]):
+        grid = grids[plane]
+        axis_u = frames[frame_batch, 3 * plane + 1]
+        is_skipped = plane == skipped[0] or plane == skipped[1]
+        if not is_skipped and grid.blocks == 1 and wp.length_sq(axis_u) > 0.0:
+            origin = frames[frame_batch, 3 * plane]
+            axis_v = frames[frame_batch, 3 * plane + 2]
             for i in range(log_transmittances.shape[2]):
                 area = sample_areas[sample_batch, first_sample + i]
                 beam = sample_points[sample_batch, first_sample + i] - point
                 if is_lit(beam, area, normal, is_two_sided):
-                    share = _covered_share(grids[f], edges, origin, axis_u, axis_v, point, beam, sample_radius(area))
+                    share = _covered_share(grid, edges, origin, axis_u, axis_v, point, beam, sample_radius(area))
                     if share > 0.0:
                         wp.atomic_add(log_transmittances, batch, receiver, i, log_transmittance(share))
 
