@@ -144,7 +144,15 @@ _waits: list[Wait] = []  # of all threads, the innermost last
 _lock = threading.RLock()  # guards them, and the bar
 _reporter: threading.Thread | None = None  # while there are any
 _line_time = _end_time = -math.inf  # when the last line was said, and a wait ended
-_is_hidden = False  # whether a call is under way that says nothing
+
+
+class _ThreadState(threading.local):
+    """Whether a thread is within a call that says nothing."""
+
+    is_hidden = False
+
+
+_this_thread = _ThreadState()
 
 
 def _begin_anew() -> None:
@@ -216,18 +224,17 @@ def waiting(label: str, *, shows: bool = True) -> Iterator[None]:
         label: Label of the work, such as "rendering".
         shows: Whether to say anything, of compiled kernels too.
     """
-    global _is_hidden
-    if _waits or _is_hidden:
+    if _waits or _this_thread.is_hidden:
         yield
     elif shows and _bars_show:
         with _reported(Wait(label, patience=_LINE_INTERVAL)):
             yield
     else:
-        _is_hidden = True
+        _this_thread.is_hidden = True
         try:
             yield
         finally:
-            _is_hidden = False
+            _this_thread.is_hidden = False
 
 
 @contextlib.contextmanager
@@ -269,7 +276,9 @@ _module_numbers = itertools.count(1)
 
 def _compiling() -> contextlib.AbstractContextManager:
     """Say that kernels are compiled, and of which module of this process."""
-    return progress_bar(None, f"compiling kernels, module {next(_module_numbers)}", "", shows=not _is_hidden)
+    return progress_bar(
+        None, f"compiling kernels, module {next(_module_numbers)}", "", shows=not _this_thread.is_hidden
+    )
 
 
 around_compilation(_compiling)

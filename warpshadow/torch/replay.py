@@ -1,9 +1,9 @@
 """Replays: calls that come again with tensors of the same shapes are captured as CUDA graphs, forward and backward.
 
-On a GPU Python takes longer to launch the kernels of a call than they run. So a :class:`TorchRenderer` captures a call
-of a kind that has come twice, and replays it from then on: it copies the tensors to where the graph reads them,
-launches the graph, and copies the results. A kind has shapes, tensors that require a gradient, and arguments that are
-no tensors. Tensors are checked as ever; results in between are not, as in all graphs
+On a GPU Python takes longer to launch the kernels of a call than they run. So a :class:`TorchRenderer` with
+``graphs=True`` captures a call of a kind that has come twice, and replays it from then on: it copies the tensors to
+where the graph reads them, launches the graph, and copies the results. A kind has shapes, tensors that require a
+gradient, and arguments that are no tensors. Tensors are checked as ever; results in between are not, as in all graphs
 (:mod:`warpshadow.device.cuda_graph`).
 
 Calls are plain where nothing would be won, or cannot be captured: on a CPU, while torch captures, where geometry or
@@ -13,6 +13,7 @@ back, and where a graph takes longer. :attr:`Replays.reason` says which it was.
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Collection, Hashable, Sequence
 from typing import Any
@@ -40,14 +41,14 @@ class Replays:
         reason: Why the last call was plain; empty if it was replayed.
     """
 
-    def __init__(self, *, is_on: bool = False):
+    def __init__(self, *, is_on: bool):
         self.is_on = is_on
         self.reason = "nothing was called yet"
         self._kinds: dict[Hashable, _Kind] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies begin anew."""
-        return _make_replays, (self.is_on,)
+        return functools.partial(Replays, is_on=self.is_on), ()
 
     def find(
         self,
@@ -84,10 +85,6 @@ class Replays:
         if not cuda_graph.is_captured(wp.device_from_torch(device)):
             return "calls are captured on a GPU alone"
         return "torch captures the call" if is_capturing(device) else ""
-
-
-def _make_replays(is_on: bool) -> Replays:
-    return Replays(is_on=is_on)
 
 
 class _Kind:
