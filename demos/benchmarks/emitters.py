@@ -83,7 +83,7 @@ def tube(size: int) -> ws.Scene:
         standing(joined("column", rod((0, 0, 0), (0, 1, 0), 0.3, 32)), RED, (-0.5, 0, -0.3), 1.4, name="column"),
         standing(shipped_mesh("bear"), GRAY, (0.5, 0, 0.1), 1.0, rotation=(0, -30, 0)),
     ]
-    walls = [part for part in room() if part.called in ("floor", "left wall", "back wall")]
+    walls = [part for part in room() if part.name in ("floor", "left wall", "back wall")]
     upright = lamp(joined("tube", rod((0, 0, 0), (0, 1.2, 0), 0.04, 16)), (1.3, 0.5, 0.9), 40)
     return seen([*bodies, *walls, upright], DARK, size, (2.4, 2.2, 4.2), (0, 0.8, 0), fov_y=34)
 

@@ -103,7 +103,7 @@ def measure(name: str, options: Options) -> dict[str, Any]:
     ws.quiet(progress=False)
     warnings.simplefilter("ignore")  # of coarse meshes and thin bodies: how wrong they are, is measured here
     scene = options.scene(name)
-    names = [body.called for body in scene.bodies]
+    names = [body.name for body in scene.bodies]
     references = {light: options.request(name, light, "rays").reference() for light in options.lights()}
     checks = {}
     if options.mitsuba:

@@ -70,7 +70,7 @@ class DataSet:
         self._read_mesh = functools.partial(_read_body, **arguments)
         self.hashes: dict[str, dict[str, str]] = {}
         if recipe.meshes is None:
-            self.hashes["meshes"] = {body.called: body.mesh.content_hash for body in primitives()}
+            self.hashes["meshes"] = {body.name: body.mesh.content_hash for body in primitives()}
             self._primitives = [_fitted(body, self.device) if fits else body for body in primitives()]
         else:
             self.hashes["meshes"] = _hashes(
@@ -117,7 +117,7 @@ class DataSet:
         recipe, stock = self.recipe, self.stocks[split]
         bodies: Sequence[Body]
         if recipe.meshes is None:
-            bodies = [body for body in self._primitives if body.called in stock.meshes]
+            bodies = [body for body in self._primitives if body.name in stock.meshes]
         else:
             bodies = _LazyFiles(recipe.meshes, stock.meshes, lambda path: self._read_mesh(path).body)
         maps = None if recipe.maps is None else _LazyFiles(recipe.maps, stock.maps or (), _read_map)

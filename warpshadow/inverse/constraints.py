@@ -120,7 +120,7 @@ def plane_below(ground: Body, above: np.ndarray, argument: str = "stands_on") ->
     points = mesh.positions.astype(np.float64)
     normal = plane_normal(points[mesh.faces])
     if normal is None:
-        raise ValueError(f"{argument}: got {ground.called!r}, which is not flat; expected a plane, such as the ground")
+        raise ValueError(f"{argument}: got {ground.name!r}, which is not flat; expected a plane, such as the ground")
     offset = float(np.median(points @ normal))
     sign = 1.0 if normal @ above >= offset else -1.0
     return PlaneConstraint(sign * normal, sign * offset)

@@ -182,7 +182,7 @@ def _check_framing(path: Path, problem: Problem) -> None:
     is_framed = "framing" in toml_tables.read(path, "scene file")["camera"]
     if not (is_framed and moving and any(target.camera is None for target in problem.targets)):
         return
-    names = dict.fromkeys(problem.scene.bodies[item.number].called for item in moving)
+    names = dict.fromkeys(problem.scene.bodies[item.number].name for item in moving)
     camera, points = problem.scene.camera, framed_points(problem.scene)
     forward = camera.rotation[2]
     center = (points.min(axis=0) + points.max(axis=0)) / 2

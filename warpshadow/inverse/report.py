@@ -149,7 +149,7 @@ _OTHER_FILES = ("light", "target", "before", "after", "loss", "preview", "parame
 
 def _stems(scene: Scene) -> list[str]:
     """Names of the bodies' files: the bodies' own, or body_0 and so on where other files have them."""
-    names = [body.called for body in scene.bodies]
+    names = [body.name for body in scene.bodies]
     lower = [name.lower() for name in names]
     return [
         name
@@ -175,7 +175,7 @@ def found_values(result: Result) -> list[str]:
                 and values.size <= 3
             ):
                 rounded_text = ", ".join(f"{value:.4g}" for value in values.ravel())
-                lines.append(f"{after.called}: {name} ({rounded_text}){unit}")
+                lines.append(f"{after.name}: {name} ({rounded_text}){unit}")
     if scene.light is not start.light:
         radiance = scene.known_light.radiance
         x, y, z = EnvironmentMap(np.maximum(radiance, 0)).directions().reshape(-1, 3)[radiance.sum(axis=2).argmax()]

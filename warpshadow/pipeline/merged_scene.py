@@ -419,7 +419,7 @@ class MergedScene:
         """Raise ValueError for other vertices of a flat body where light bounces by spheres."""
         if self.scene.visibility.method in SPHERE_METHODS:
             raise ValueError(
-                f"positions: got some for body {number} ({self.scene.bodies[number].called!r}), which is flat; "
+                f"positions: got some for body {number} ({self.scene.bodies[number].name!r}), which is flat; "
                 f"expected None where light bounces (scene.bounces is {self.scene.bounces}), since a flat body "
                 'reflects and blocks as a part of a plane; set bounces = 0, or take method "ray-traced"'
             )

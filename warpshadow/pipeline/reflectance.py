@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
+from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
 from warpshadow.device.cuda_graph import is_readable
@@ -177,23 +178,21 @@ class Materials:
         body, where = self.merged_scene.scene.bodies[number], f"{name}[{number}]"
         if name in GLOSS_ARGUMENTS and not body.is_glossy:
             expected = "one for bodies that have roughness in the scene"
-            raise ValueError(f"{where}: got some for {body.called!r}, expected {expected}")
+            raise ValueError(f"{where}: got some for {body.name!r}, expected {expected}")
         if name == "emission" and body.emission is None:
-            raise ValueError(
-                f"{where}: got some for {body.called!r}, expected one for bodies that have it in the scene"
-            )
+            raise ValueError(f"{where}: got some for {body.name!r}, expected one for bodies that have it in the scene")
         if name == "textures" or (name in GLOSS_ARGUMENTS and array.ndim == 3):
             check.shape(where, array.shape, ("batch", "height", "width"))
             if body.mesh.uvs is None:
                 raise ValueError(
-                    f"{where}: got an image, but the mesh of {body.called!r} has no uvs; expected None, or a body of "
+                    f"{where}: got an image, but the mesh of {body.name!r} has no uvs; expected None, or a body of "
                     "warpshadow.unwrap(mesh)"
                 )
             if not array.is_contiguous:
                 raise ValueError(f"{where}: got a strided array, expected a contiguous one")
         else:
             check.shape(where, array.shape, ("batch", 1 if array.shape[1:] == (1,) else body.mesh.vertex_count))
-        check.finite_arrays({where: array})
+        finite_arrays({where: array})
         if name in ("albedo", "textures"):
             self._warn_of_growth(where, array)
 

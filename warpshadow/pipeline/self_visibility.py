@@ -316,7 +316,7 @@ class SelfVisibility:
         probes, faces = self.probes(body), mesh.surface.faces
         count = ray_count(self._row_count(body))
         if count < RAYS:
-            called = self._merged_scene.scene.bodies[body].called
+            called = self._merged_scene.scene.bodies[body].name
             check.warn(
                 f"body {body} ({called!r}): {len(probes.positions):,} points have {count} rays each for the body's "
                 f"shadow on itself, in place of {RAYS}, which would take too much memory"

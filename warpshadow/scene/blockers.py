@@ -116,7 +116,7 @@ def free_shape_remark(scene: Scene, number: int) -> str:
     body = scene.bodies[number]
     if scene.visibility.with_method().method not in SPHERE_METHODS or not body.casts_shadow:
         return ""
-    called = f"body {number} ({body.called!r})"
+    called = f"body {number} ({body.name!r})"
     if _ground_spheres(scene)[number] is not None:
         return (
             f"{called} is flat, and one sphere behind it blocks light in its place, whatever its shape becomes; "

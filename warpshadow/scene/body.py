@@ -171,11 +171,11 @@ class Body:
         count = len(self.blockers) if isinstance(self.blockers, Spheres) else self.blockers
         texture = "" if self.texture is None else f", texture {self.texture.shape[1]} × {self.texture.shape[0]}"
         mesh = f"{self.mesh.vertex_count} vertices, {self.mesh.face_count} faces"
-        return f"Body({self.called!r}, {mesh}, {count} spheres{texture})"
+        return f"Body({self.name!r}, {mesh}, {count} spheres{texture})"
 
     @property
     def called(self) -> str:
-        """Its name."""
+        """Its ``name``, by a former word."""
         return self.name
 
     @property
@@ -367,7 +367,7 @@ class Body:
             scale = check.positive("size", size) / extent
         else:
             raise ValueError(
-                f"size: got {size:g} for a mesh ({self.called!r}) whose vertices coincide, expected one that has a size"
+                f"size: got {size:g} for a mesh ({self.name!r}) whose vertices coincide, expected one that has a size"
             )
         points = self.mesh.world_points().astype(np.float64) @ self.rotation_matrix().T
         bottom = self.rotation_matrix() @ (low + high) / 2

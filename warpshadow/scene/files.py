@@ -251,12 +251,12 @@ def write_scene(scene: Scene, folder: AnyPath, *, stems: Sequence[str] | None = 
     folder.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     bodies = []
-    names = [body.called for body in scene.bodies]
+    names = [body.name for body in scene.bodies]
     stems = [f"body_{number}" for number in range(len(names))] if stems is None else stems
     for body, stem in zip(scene.bodies, stems, strict=True):
         table, files = _write_body(body, folder / stem)
         if body.has_own_name or names.count(body.name) == 1:
-            table["name"] = body.called
+            table["name"] = body.name
         bodies.append(table)
         written += files
     if isinstance(scene.light, EnvironmentMap):

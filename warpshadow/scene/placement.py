@@ -53,8 +53,8 @@ def misplacements(scene: Scene) -> list[str]:
         broadest = max(below, key=lambda other: boxes[other].breadth)
         if box.breadth > _CEILING_RATIO * boxes[broadest].breadth:
             remarks.append(
-                f"body {number} ({body.called!r}) is {box.breadth:.3g} broad, and body {broadest} "
-                f"({scene.bodies[broadest].called!r}) below it {boxes[broadest].breadth:.3g}; on_ground(size=…) makes "
+                f"body {number} ({body.name!r}) is {box.breadth:.3g} broad, and body {broadest} "
+                f"({scene.bodies[broadest].name!r}) below it {boxes[broadest].breadth:.3g}; on_ground(size=…) makes "
                 "it smaller"
             )
             continue
@@ -63,8 +63,8 @@ def misplacements(scene: Scene) -> list[str]:
         others = [other for k, other in enumerate(boxes) if k != number and box.is_over(other)]
         gap = min((box.low[1] - other.high[1] for other in others if other.low[1] <= box.low[1]), default=-np.inf)
         depth = boxes[ground].low[1] - box.low[1]
-        where = f"body {number} ({body.called!r}), which is {size:.3g} large,"
-        which = f"body {ground} ({scene.bodies[ground].called!r}); on_ground() stands it there"
+        where = f"body {number} ({body.name!r}), which is {size:.3g} large,"
+        which = f"body {ground} ({scene.bodies[ground].name!r}); on_ground() stands it there"
         if gap > size:
             remarks.append(f"{where} floats {gap:.3g} above {which}")
         elif depth > size:
@@ -84,7 +84,7 @@ def enclosures(scene: Scene, cameras: Iterable[Camera]) -> list[str]:
             if (low < eye).all() and (eye < high).all() and _winding_number(body.mesh, eye) > 0.5:
                 place = ", ".join(f"{coordinate:.3g}" for coordinate in camera.eye)
                 return [
-                    f"camera: its eye ({place}) is inside body {number} ({body.called!r}), which is "
+                    f"camera: its eye ({place}) is inside body {number} ({body.name!r}), which is "
                     f"{body.scale * (high - low).max():.3g} large; Camera.framing(scene) sees it from outside"
                 ]
     return []

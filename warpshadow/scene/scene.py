@@ -195,13 +195,13 @@ class Scene:
         glossy = next((body for body in self.bodies if body.is_glossy), None)
         if glossy is not None and self.visibility.method not in (*GLOSS_METHODS, None):
             raise ValueError(
-                f"roughness: got some for body {glossy.called!r}, which {self.visibility.method!r} does not show, "
+                f"roughness: got some for body {glossy.name!r}, which {self.visibility.method!r} does not show, "
                 f"expected None, or method = one of {', '.join(map(repr, GLOSS_METHODS))}"
             )
         emitter = next((body for body in self.bodies if body.is_emitter), None)
         if emitter is not None and self.visibility.method not in (*GLOSS_METHODS, None):
             raise ValueError(
-                f"emission: got some for body {emitter.called!r}, whose light {self.visibility.method!r} lacks, "
+                f"emission: got some for body {emitter.name!r}, whose light {self.visibility.method!r} lacks, "
                 f"expected None, or method = one of {', '.join(map(repr, GLOSS_METHODS))}"
             )
         if self.bounces and self.visibility.method not in (*BOUNCE_METHODS, None):

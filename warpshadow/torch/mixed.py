@@ -50,7 +50,7 @@ class MixedRenderer(torch.nn.Module):
         scenes = [self._renderer(number).scene for number in range(len(self.renderers))]
         self._body_count = max(len(scene.bodies) for scene in scenes)
         self._vertex_counts: list[dict[BodyLike, int]] = [
-            {key: body.mesh.vertex_count for number, body in enumerate(scene.bodies) for key in (number, body.called)}
+            {key: body.mesh.vertex_count for number, body in enumerate(scene.bodies) for key in (number, body.name)}
             for scene in scenes
         ]
         self._maximum_vertices: dict[BodyLike, int] = {}  # of items with a number or a name

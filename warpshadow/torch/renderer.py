@@ -163,7 +163,7 @@ class TorchRenderer(torch.nn.Module):
 
     def get_extra_state(self) -> torch.Tensor:
         """Meaning of tensors beside it, for ``state_dict``: JSON as bytes, since some formats hold tensors alone."""
-        bodies = [[body.called, body.mesh.vertex_count] for body in self.scene.bodies]
+        bodies = [[body.name, body.mesh.vertex_count] for body in self.scene.bodies]
         meaning = {"basis": type(self.basis).__name__, "coefficients": self.basis.size, "bodies": bodies}
         return torch.tensor(list(json.dumps(meaning).encode()), dtype=torch.uint8)
 

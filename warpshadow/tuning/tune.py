@@ -136,7 +136,7 @@ class Tuning:
             pairs = {key: (getattr(before, key), getattr(after, key)) for key in ("blockers", "receivers")}
             changes = {key: new for key, (old, new) in pairs.items() if new != old}
             if changes:
-                blocks.append(toml_tables.block(f"[[body]]  # body {number} ({before.called!r})", changes))
+                blocks.append(toml_tables.block(f"[[body]]  # body {number} ({before.name!r})", changes))
         return "\n".join(blocks)
 
 

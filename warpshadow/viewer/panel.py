@@ -104,7 +104,7 @@ class Panel:
 
     def _add_bodies(self) -> None:
         gui = self._server.gui
-        self._names = [f"{number}: {body.called}" for number, body in enumerate(self._scene.bodies)]
+        self._names = [f"{number}: {body.name}" for number, body in enumerate(self._scene.bodies)]
         with gui.add_folder("Bodies"):
             dragged_input = gui.add_dropdown("Drag", (_NOTHING, *self._names))
             self._balls = balls = gui.add_checkbox("Show spheres", False)

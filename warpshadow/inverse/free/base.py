@@ -105,7 +105,7 @@ class FreeOfBody(Free):
 
     def called(self, fitted: FittedScene) -> str:
         """The name of its body, or its number if the name is not unique."""
-        names = [body.called for body in fitted.scene.bodies]
+        names = [body.name for body in fitted.scene.bodies]
         body_name = names[self.number]
         return body_name if names.count(body_name) == 1 else f"body_{self.number}"
 

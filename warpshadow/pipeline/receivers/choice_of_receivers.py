@@ -212,7 +212,7 @@ def receiver_notes(scene: Scene, choices: Sequence[ReceiverChoice], bulging: Col
             where, why = _WHERE[choice.receivers], _reason(choice)
             if number in bulging:
                 where, why = _WHERE["vertex"], "spheres block its light, and bulge out of it between vertices"
-            notes.append(f"Body {number} ({body.called!r}) has receivers at {where}: {why}.")
+            notes.append(f"Body {number} ({body.name!r}) has receivers at {where}: {why}.")
     return notes
 
 
@@ -227,7 +227,7 @@ def warn_of_coarse_faces(bodies: Sequence[Body], sizes: Sequence[FaceSize]) -> N
     for number, (body, size) in enumerate(zip(bodies, sizes, strict=True)):
         if body.receivers == "vertex" and size.exceeds(COARSE_FACE):
             check.warn(
-                f"body {number} ({body.called!r}): {size}, and light is evaluated at their corners alone; "
+                f"body {number} ({body.name!r}): {size}, and light is evaluated at their corners alone; "
                 'receivers = "auto" or "pixel" evaluates it at every pixel'
             )
 
