@@ -97,18 +97,26 @@ def room(depth: float = 3.0) -> list[ws.Body]:
 # -------------------------------------------------------------------------------- furniture and rooms
 
 
-def table(sources: Sources, size: int) -> ws.Scene:
-    top = 1.03
-    bodies = [
+TABLE_TOP = 1.03  # height of the round table
+
+
+def laid_table() -> list[ws.Body]:
+    """A round table with things on it, and a box below."""
+    top = TABLE_TOP
+    return [
         body(shapes.round_table(), WOOD),
         standing(shipped_mesh("bunny"), WHITE, (-0.4, top, -0.35), 0.7),
         standing(ws.icosphere(1.0, 4), RED, (0.35, top, 0.45), 0.4, name="ball"),
         standing(joined("cone", cone(0.2, 0.6)), GREEN, (0.55, top, -0.4), 0.6),
         standing(joined("ring", turned(ring(0.25, 0.08), 90, X)), BLUE, (-0.45, top, 0.45), 0.6),
         standing(joined("box", box((1, 1, 1))), GOLD, (0.0, 0, 0.3), 0.45, rotation=(0, 30, 0), name="box below"),
-        standing(joined("column", rod((0, 0, 0), (0, 1, 0), 0.3, 32)), GRAY, (0.05, top, 0.0), 0.35, name="can"),
     ]
-    return seen([*bodies, ground()], ws.synthetic_sky(HIGH_SUN), size)
+
+
+def table(sources: Sources, size: int) -> ws.Scene:
+    column = joined("column", rod((0, 0, 0), (0, 1, 0), 0.3, 32))
+    can = standing(column, GRAY, (0.05, TABLE_TOP, 0.0), 0.35, name="can")
+    return seen([*laid_table(), can, ground()], ws.synthetic_sky(HIGH_SUN), size)
 
 
 def open_room(sources: Sources, size: int) -> ws.Scene:

@@ -19,11 +19,10 @@ import torch
 
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
-from demos import shapes
-from demos.kinds import BLUE, GOLD, GRAY, GREEN, RED, WHITE, WOOD, body, ground, room, seen, standing
+from demos.kinds import BLUE, GOLD, GRAY, RED, WHITE, body, ground, laid_table, room, seen, standing
 from demos.references import Reference, Request
 from demos.scenes import shipped_mesh
-from demos.shapes import box, cone, joined, ring, rod, turned
+from demos.shapes import box, joined, rod
 from warpshadow.torch import TorchRenderer
 
 DARK = ws.EnvironmentMap.constant(0.0)
@@ -45,16 +44,7 @@ def small_lamp(size: int) -> ws.Scene:
 
 def table(size: int) -> ws.Scene:
     """A table with things on it under a round lamp, and a box and the floor below it."""
-    top = 1.03
-    bodies = [
-        body(shapes.round_table(), WOOD),
-        standing(shipped_mesh("bunny"), WHITE, (-0.4, top, -0.35), 0.7),
-        standing(ws.icosphere(1.0, 4), RED, (0.35, top, 0.45), 0.4, name="ball"),
-        standing(joined("cone", cone(0.2, 0.6)), GREEN, (0.55, top, -0.4), 0.6),
-        standing(joined("ring", turned(ring(0.25, 0.08), 90, (1, 0, 0))), BLUE, (-0.45, top, 0.45), 0.6),
-        standing(joined("box", box((1, 1, 1))), GOLD, (0.0, 0, 0.3), 0.45, rotation=(0, 30, 0), name="box below"),
-    ]
-    return seen([*bodies, ground(), lamp(ws.icosphere(0.15, 3), (0.4, 2.6, 0.3), 40)], DARK, size)
+    return seen([*laid_table(), ground(), lamp(ws.icosphere(0.15, 3), (0.4, 2.6, 0.3), 40)], DARK, size)
 
 
 def ball_room(size: int) -> ws.Scene:
