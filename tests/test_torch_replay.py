@@ -175,3 +175,17 @@ def test_on_a_cpu_calls_are_plain(make_renderer, monkeypatch):
         renderer(torch.rand(renderer.basis.size, 3))
     assert renderer.replays.reason == "calls are captured on a GPU alone"
     assert not wp.get_device("cpu").is_capturing
+
+
+def test_no_other_tensor_can_lie_where_the_last_ones_do(make_renderer):
+    """They are known by their addresses."""
+    renderer = make_renderer()
+    for call in range(4):
+        geometry = renderer.placed(*(pose.detach() for pose in moved(renderer, 0.1 * call)))
+        renderer(torch.rand(renderer.basis.size, 3).requires_grad_(), geometry=geometry)
+    assert not renderer.replays.reason
+    shapes = {tensor.data_ptr(): tensor.shape for tensor in vars(geometry).values() if isinstance(tensor, torch.Tensor)}
+    assert shapes
+    del geometry
+    others = [torch.empty(shape) for shape in shapes.values() for _ in range(20)]
+    assert shapes.keys().isdisjoint(other.data_ptr() for other in others)

@@ -94,7 +94,8 @@ class _Kind:
         self._plain_calls = self._failures = 0
         self._capture: Capture | None = None
         self._failure = ""
-        self._marks: list[tuple[int, int]] | None = None  # of static tensors, at the last call
+        self._static: list[torch.Tensor] = []  # of the last call: held, so that no other lies where they did
+        self._versions: list[tuple[int, int]] | None = None  # of these
 
     def find(
         self,
@@ -106,8 +107,9 @@ class _Kind:
         static: Sequence[torch.Tensor],
     ) -> tuple[Capture | None, str]:
         """The capture, or why there is none."""
-        before, self._marks = self._marks, [(tensor.data_ptr(), tensor._version) for tensor in static]
-        if static and self._marks == before:
+        before, self._versions = self._versions, [(tensor.data_ptr(), tensor._version) for tensor in static]
+        self._static = [tensor.detach() for tensor in static]
+        if static and self._versions == before:
             return None, "geometry or cameras are the same as before: results about them are cached"
         if self._failures == _MAX_FAILURES:
             return None, self._failure
