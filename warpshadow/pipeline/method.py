@@ -90,7 +90,7 @@ class Method:
         bodies = range(len(self.merged_scene.scene.bodies))
         if self.merged_scene.scene.bounces or self.has_emitters:
             return np.array(bodies)
-        separate = {*blocker_kinds.traced, *blocker_kinds.planes, *np.flatnonzero(self.merged_scene.is_glossy).tolist()}
+        separate = {*blocker_kinds.separate, *np.flatnonzero(self.merged_scene.is_glossy).tolist()}
         return np.array([body if body in separate else -1 for body in bodies]) if separate else None
 
     def numbering(
@@ -101,7 +101,7 @@ class Method:
         Those on static bodies are the same in both, as results about them are cached.
         """
         moving = None if static_bodies is None else static_bodies.moving
-        key = blocker_kinds.traced, blocker_kinds.planes, blocker_kinds.bulging, moving
+        key = frozenset(blocker_kinds.separate), blocker_kinds.bulging, moving
         if key not in self._numberings:
             faces, can_receive, separate_bodies = (
                 self.merged_scene.faces,

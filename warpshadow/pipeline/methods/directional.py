@@ -230,9 +230,9 @@ class Directional(SphereMethod):
         """Bodies of the scene that block light as planes."""
         return blocking_planes(self.merged_scene.scene)
 
-    def convex_blockers(self, traced: tuple[int, ...]) -> tuple[int, ...]:
+    def convex_blockers(self, rigid: tuple[int, ...]) -> tuple[int, ...]:
         """Bodies that consist of convex parts."""
-        return tuple(body for body in traced if body in self.parts.parts)
+        return tuple(body for body in rigid if body in self.parts.parts)
 
     def find_visibility_past_planes(
         self, group: Group, visibility: GroupVisibility, projected_light: ProjectedCells
@@ -258,11 +258,12 @@ class Directional(SphereMethod):
         return visibility._replace(transmittance_total=total, transmittance_spheres=visibility.transmittance_total)
 
     def _transmittance_self(self, group: Group, projected_light: ProjectedCells) -> wp.array | None:
-        """Transmittance past the body of the receivers: looked up, and of a sun by rays where these are asked for."""
-        if group.self_lookup is None or not group.points.size:
-            return None
-        assert group.probe_weights is not None and isinstance(group.self_lookup, SelfVisibilityLookup)
-        transmittance_self, rays = group.self_transmittance(), group.self_lookup.rays
+        """Transmittance past the body of the receivers: by its parts, or looked up, and by rays where asked."""
+        if group.has_own_coverage:
+            own = self._coverages(group.own_coverage, projected_light)
+            return self._past_coverages(None, own, None, projected_light)
+        transmittance_self = group.looked_up_transmittance()
+        rays = None if transmittance_self is None else group.self_lookup.rays
         if rays is None or projected_light.sun is None:
             return transmittance_self
         if transmittance_self.requires_grad:
