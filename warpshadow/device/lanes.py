@@ -365,19 +365,29 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
         scratch: wp.array(dtype=Lane),
         first: int,
     ):
-        """scratch[first + k] = rows[the block's vertices, begin + k] for ``count`` columns; ``past`` the last vertex."""
+        """scratch[first + k] = rows[the block's vertices, begin + k] for ``count`` columns; ``past`` the last."""
         ...
 
     @wp.func_native(_on_columns("item *= number", lanes))
     def multiply_by_columns(
-        rows: wp.array2d(dtype=wp.float32), begin: int, count: int, block: int, scratch: wp.array(dtype=Lane), first: int
+        rows: wp.array2d(dtype=wp.float32),
+        begin: int,
+        count: int,
+        block: int,
+        scratch: wp.array(dtype=Lane),
+        first: int,
     ):
         """scratch[first + k] *= rows[the block's vertices, begin + k] for ``count`` columns."""
         ...
 
     @wp.func_native(_on_columns("number = item", lanes))
     def store_columns(
-        scratch: wp.array(dtype=Lane), first: int, rows: wp.array2d(dtype=wp.float32), begin: int, count: int, block: int
+        scratch: wp.array(dtype=Lane),
+        first: int,
+        rows: wp.array2d(dtype=wp.float32),
+        begin: int,
+        count: int,
+        block: int,
     ):
         """rows[the block's vertices, begin + k] = scratch[first + k] for ``count`` columns."""
         ...

@@ -13,7 +13,7 @@ import warp as wp
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty, from_numpy, reshaped, zeros
+from warpshadow.device.memory import empty, from_numpy, zeros
 from warpshadow.device.parallel import run_length
 from warpshadow.stages.interpolation import interpolate_at
 from warpshadow.stages.quadtree import Quadtree

@@ -72,7 +72,10 @@ def _tabulate(
     # out
     proxy_radiance: wp.array3d(dtype=wp.vec4),
 ):
-    """A thread owns a run of directions of a proxy; shares are A / Σ A, and so sums are linear, as Warp's adjoint needs it."""
+    """A thread owns a run of directions of a proxy.
+
+    Shares are A / Σ A, so that sums are linear, as Warp's adjoint needs it.
+    """
     i, run = wp.tid()
     batch, proxy = split_row(first_row + i, proxy_radiance.shape[1])
     radiosity_batch = instance_in(batch, radiosity.shape[0])

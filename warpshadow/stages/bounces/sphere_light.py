@@ -196,8 +196,11 @@ def _make_light(lanes: int) -> wp.Kernel:
                             share = wp.cw_mul(opacity, step)
                             radiance = task.proxy_radiance[sphere_view.node, direction_bundle * BUNDLE + i]
                             slot = (bundle * BUNDLE + i) * SUMS
-                            for c in range(SUMS):
-                                task.sums[slot + c] = task.sums[slot + c] + radiance[c] * share
+                            # (a loop is not unrolled, and reads the radiance from memory)
+                            task.sums[slot] = task.sums[slot] + radiance[0] * share
+                            task.sums[slot + 1] = task.sums[slot + 1] + radiance[1] * share
+                            task.sums[slot + 2] = task.sums[slot + 2] + radiance[2] * share
+                            task.sums[slot + 3] = task.sums[slot + 3] + radiance[3] * share
 
     traverse = make_traversal(make_cull(True, LightTask, lanes), visit, LightTask, False, lanes)
 
