@@ -266,8 +266,8 @@ def find_receivers(
     elif vertices is None:
         return Receivers(positions, normals, faces, of_vertices, receiver_fragments)
     receiver_faces = empty(count + len(triangles), dtype=wp.vec3i, device=device)
-    arguments = faces, of_vertices, positions.shape[1], side_count, receiver_count
-    launch(_find_faces, count, inputs=arguments, outputs=[receiver_faces])
+    inputs = [faces, of_vertices, positions.shape[1], side_count, receiver_count]
+    launch(_find_faces, count, inputs=inputs, outputs=[receiver_faces])
     if len(triangles):
         wp.copy(receiver_faces[count:], from_numpy(receiver_count + triangles, dtype=wp.vec3i, device=device))
     vertices = of_vertices if vertices is None else vertices

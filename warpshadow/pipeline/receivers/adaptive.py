@@ -62,8 +62,8 @@ def find_squares(
             known = [portion for portion in portions if portion is not None]
             if known:
                 shares[np.arange(len(sides))[:, None], numbers[columns]] = np.concatenate(known, axis=1)
-    shares = shares[:, :-1].reshape(len(sides), len(row), len(column))
-    return find_quadtree(sides, keys, shares, supersampling)
+    shares_of_grid = shares[:, :-1].reshape(len(sides), len(row), len(column))
+    return find_quadtree(sides, keys, shares_of_grid, supersampling)
 
 
 @functools.lru_cache(maxsize=16)
