@@ -347,9 +347,10 @@ class Directional(SphereMethod):
         lit = shade_cells(transmittance, normals, directions, light, maximum=LARGEST_COEFFICIENT).numpy()[..., 0]
         receiver_normals, towards = normals.numpy(), self.free_projection.directions
         plane_normals = receiver_normals[:, :1]  # points of a plane have this normal or its opposite
-        # [batch, 1]
-        whole = [4 / len(power) * np.maximum(sign * plane_normals @ towards.T, 0) @ power for sign in (1, -1)]
-        unblocked = np.where((receiver_normals * plane_normals).sum(axis=2) > 0, *whole)
+        facing = plane_normals @ towards.T  # [batch, 1, cell]
+        whole = [4 / len(power) * np.maximum(cosines, 0) @ power for cosines in (facing, -facing)]
+        is_front = (receiver_normals @ plane_normals.transpose(0, 2, 1))[..., 0] > 0
+        unblocked = np.where(is_front, *whole)
         return np.divide(lit, unblocked, out=np.zeros_like(lit), where=unblocked > 0)
 
     def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input) -> Node:
