@@ -262,8 +262,11 @@ class Directional(SphereMethod):
         if group.has_own_coverage:
             own = self._coverages(group.own_coverage, projected_light)
             return self._past_coverages(None, own, None, projected_light)
-        transmittance_self = group.looked_up_transmittance()
-        rays = None if transmittance_self is None else group.self_lookup.rays
+        transmittance_self, lookup = group.looked_up_transmittance(), group.self_lookup
+        if transmittance_self is None:
+            return None
+        assert group.probe_weights is not None and isinstance(lookup, SelfVisibilityLookup)
+        rays = lookup.rays
         if rays is None or projected_light.sun is None:
             return transmittance_self
         if transmittance_self.requires_grad:

@@ -229,7 +229,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
 
     @wp.func
     def cover(inputs: PartInputs, piece: int, task: PartsTask):
-        """Coverage by a piece of cells that no other piece covers wholly; returns how many it covers, and lists them."""
+        """Coverage by a piece of cells that no other covers wholly; returns how many it covers, and lists them."""
         parts, cells, radius = inputs.parts, inputs.cells, inputs.radius
         covered_count = int(0)
         silhouette = task.silhouette
