@@ -244,8 +244,18 @@ def _sum_of_halves(lanes: int) -> str:
 def _on_columns(statement: str, lanes: int) -> str:
     """C++ that runs a statement on each ``number`` of rows of a block's vertices and its ``item`` of scratch memory.
 
-    Plain Warp finds the address of each number anew, and loads or stores a whole vector for it.
+    Plain Warp finds the address of each number anew, and loads or stores a whole vector for it. For one lane that
+    takes fewer registers than addresses that are kept.
     """
+    if lanes == 1:
+        return f"""
+        const int vertex_count = block < rows.shape[0] ? 1 : 0;
+        for (int k = 0; k < vertex_count * count; ++k) {{
+            wp::float32& number = wp::index(rows, block, begin + k);
+            wp::float32& item = wp::index(scratch, first + k).c[0];
+            {statement};
+        }}
+        """
     return f"""
     const int first_vertex = block * {lanes};
     const int vertex_count = rows.shape[0] - first_vertex < {lanes} ? rows.shape[0] - first_vertex : {lanes};
@@ -353,7 +363,7 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
         + f"""
     for (int lane = vertex_count; lane < {lanes}; ++lane)
         for (int k = 0; k < count; ++k)
-            wp::index(scratch, first + k).c[lane] = past;
+            wp::index(scratch, first + k).c[lane] = outside;
     """
     )
     def load_columns(
@@ -361,11 +371,11 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
         begin: int,
         count: int,
         block: int,
-        past: float,
+        outside: float,
         scratch: wp.array(dtype=Lane),
         first: int,
     ):
-        """scratch[first + k] = rows[the block's vertices, begin + k] for ``count`` columns; ``past`` the last."""
+        """scratch[first + k] = rows[the block's vertices, begin + k] for ``count`` columns; past them ``outside``."""
         ...
 
     @wp.func_native(_on_columns("item *= number", lanes))

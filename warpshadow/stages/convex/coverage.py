@@ -189,21 +189,21 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
     @wp.func
     def find_rise(parts: ConvexArrays, part: int, task: PartsTask):
         """How far a part rises above tangent planes; not above 0 for receivers that lie on it."""
-        least = ON_SURFACE * task.bounds[part][3]
+        margin = ON_SURFACE * task.bounds[part][3]
         above = Lane(-1.0e30)
         is_on = Lane(0.0)
         for face in range(parts.first_face[part], parts.first_face[part + 1]):
             face_plane = task.silhouette.face_planes[face]
             normal = wp.vec3(face_plane[0], face_plane[1], face_plane[2])
             height = dot_direction(normal, task.points) - Lane(face_plane[3])
-            is_near = is_positive(Lane(least) - wp.max(height, -height))
+            is_near = is_positive(Lane(margin) - wp.max(height, -height))
             above = wp.max(above, height)
             is_on = wp.max(is_on, wp.cw_mul(is_near, is_positive(dot_direction(normal, task.normals))))
-        is_on = wp.cw_mul(is_on, is_positive(Lane(least) - above))
+        is_on = wp.cw_mul(is_on, is_positive(Lane(margin) - above))
         rise = Lane(0.0)
         for corner in range(parts.first_corner[part], parts.first_corner[part + 1]):
             rise = wp.max(rise, dot(task.normals, offset(task.silhouette.corners[corner], task.points)))
-        return wp.cw_mul(rise - Lane(least), Lane(1.0) - is_on)
+        return wp.cw_mul(rise - Lane(margin), Lane(1.0) - is_on)
 
     @wp.func
     def find_bound(inputs: PartInputs, part: int, task: PartsTask):
