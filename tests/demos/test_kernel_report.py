@@ -74,8 +74,8 @@ BUDGETS = {
     "_make_transmit_adjoint True": {"": Budget(112)},
     "_make_light": {"": Budget(120)},
     "_make_light_adjoint": {"": Budget(168)},
+    "_make_accumulate 8 True": {"": Budget(96)},
     # the stack is that of vectors of eight bands, which loops index
-    "_make_accumulate 8 True": {"": Budget(80)},
     "_make_accumulate_adjoint 8 True": {"": Budget(128, 2 * 4 * 8)},
     "_make_gather": {"": Budget(72)},
     "_make_gather_adjoint": {"": Budget(80)},
