@@ -14,7 +14,7 @@ import warp as wp
 
 from warpshadow.device.batch import concatenate, cut, rows
 from warpshadow.device.constants import constant
-from warpshadow.pipeline.method import Method
+from warpshadow.pipeline.method import LightInput, Method
 from warpshadow.pipeline.node import Input, Node, detached
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
@@ -125,7 +125,7 @@ class GlossyPoints(LitPoints):
         """Numbers of the view's samples: of textures and, on bodies without one, of vertices."""
         return as_scalars(sample_albedo(fragments, self.merged_scene.faces, as_colors(values), textures, footprints))
 
-    def _prefiltered(self, light: Input) -> Node:
+    def _prefiltered(self, light: LightInput) -> Node:
         """Node of the texels of light, vec3 of shape [batch, texel]."""
         if light.is_free:
             return Node("prefiltering", self._blurred, light, items=lambda: f"{self.method.basis.size} coefficients")

@@ -198,14 +198,14 @@ class Method:
 
     def _shell_input(self, points: LitPoints, light: Light | None, shell: wp.array | None) -> Input | None:
         """The shell of light that is not the scene's, the same while its values are; None for the scene's."""
-        if isinstance(light, EnvironmentMap) and light.shell is not None and shell is None:
+        if isinstance(light, EnvironmentMap) and light.radius is not None and shell is None:
             shell = shell_array(light.radius, light.center, self.merged_scene.device)
         if shell is None:
             return None
         if self.shell is None:
             raise ValueError(
-                "light: got some with a radius for a scene whose light is infinitely far away, expected none; the light "
-                "of the scene has to have one: EnvironmentMap(…, radius=…)"
+                "light: got some with a radius for a scene whose light is infinitely far away, expected none; the "
+                "scene's light has to have one: EnvironmentMap(…, radius=…)"
             )
         check_shell(shell)
         points.last_shell = Input.renewed("shell", shell, points.last_shell)

@@ -331,7 +331,9 @@ class SceneRenderer:
         Differentiable: light, albedo, textures, gloss, emission, shell, view.
         """
         view = self._checked(view)
-        return view.image(_from_shell(light, shell), self._given_materials(albedo, textures, gloss, emission)).value(self._views.call(view))
+        return view.image(_from_shell(light, shell), self._given_materials(albedo, textures, gloss, emission)).value(
+            self._views.call(view)
+        )
 
     @check.keywords(**dict.fromkeys(("camera", "cameras"), "renderer.with_cameras([camera]).render()"))
     def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import warp as wp
@@ -26,9 +26,9 @@ class ShellLight(NamedTuple):
     shell: wp.array
 
 
-Light = EnvironmentMap | np.ndarray | wp.array | ShellLight
-"""A map, SH coefficients [order², 3], or free coefficients in the renderer's basis, vec3 [batch, coefficient]; or one of
-these from a shell that a call gives."""
+Light: TypeAlias = EnvironmentMap | np.ndarray | wp.array | ShellLight
+"""A map, SH coefficients [order², 3], or free coefficients in the renderer's basis, vec3 [batch, coefficient]; or one
+of these from a shell that a call gives."""
 
 LARGEST_COEFFICIENT = 1e3 * check.LARGEST
 """Light is larger in another basis than it was given in: 64 harmonics add up in a direction."""

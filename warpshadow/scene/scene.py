@@ -136,8 +136,9 @@ class Bodies(tuple[Body, ...]):
 class Scene:
     """Bodies, their light and a camera, in a right-handed world with y up, in units of length of your choice.
 
-    Light is linear RGB radiance from infinitely far away, or from a sphere around all bodies. An image is its color times reflectance, without exposure:
-    white ground under light of 1 from everywhere is 1. Pictures have their own exposure, :class:`warpshadow.Picture`.
+    Light is linear RGB radiance from infinitely far away, or from a sphere around all bodies. An image is its color
+    times reflectance, without exposure: white ground under light of 1 from everywhere is 1. Pictures have their own
+    exposure, :class:`warpshadow.Picture`.
 
     Args:
         bodies: One or more bodies; they cast shadows on each other and on themselves. ``scene.bodies`` finds them by

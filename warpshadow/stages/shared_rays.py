@@ -23,13 +23,13 @@ from warpshadow.device.constants import constant
 from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, vectors_type
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
+from warpshadow.stages.beam_packets import make_beams
 from warpshadow.stages.light_samples import LightSamples
 from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open, packets_of
 from warpshadow.stages.ray_tracing import progress_slices
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sample_receivers import MAX_SHARED_SLOPE, MIN_SHARED_COSINE
 from warpshadow.stages.shell.beams import FAR
-from warpshadow.stages.shell.packets import make_beams
 
 _PACKET_COST = 2000.0  # nanoseconds that a packet takes
 _PILOT_RECEIVERS = 256  # receivers that stand for all, where directions are chosen
@@ -310,9 +310,7 @@ class _Tracing:
 
     _corners: tuple[wp.array | None, ...] = (None, None, None, None)
 
-    def __init__(
-        self, tree: FaceTree, points: wp.array, normals: wp.array, samples: LightSamples, shell: np.ndarray
-    ):
+    def __init__(self, tree: FaceTree, points: wp.array, normals: wp.array, samples: LightSamples, shell: np.ndarray):
         device = points.device
         packets = packets_of(samples.directions[0])
         directions = constant(packets, lane_type(PACKET), device)

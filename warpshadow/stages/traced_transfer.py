@@ -10,10 +10,10 @@ from warpshadow.device.lanes import lane_type, make_lane_functions, module_optio
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.directions import CHUNK, fibonacci
+from warpshadow.stages.beam_packets import make_beams
 from warpshadow.stages.ray_packets import PACKET, FaceTree, build_face_tree, make_find_open, packets_of
 from warpshadow.stages.ray_tracing import progress_slices
 from warpshadow.stages.shell.beams import FAR
-from warpshadow.stages.shell.packets import make_beams
 
 _RAY_COST = 60.0  # nanoseconds that a ray takes
 
@@ -92,6 +92,8 @@ def trace_transfer(
         shape = receivers.stop - receivers.start, len(directions)
         cosines = empty(shape, dtype=wp.float32, device=points.device)
         inputs = [tree, points[receivers], normals[receivers], packets, wp.vec4(*shell)]
-        launch(_make_trace_cosines(bool(shell[3])), shape[0], inputs=inputs, outputs=[cosines], cost=_RAY_COST * shape[1])
+        launch(
+            _make_trace_cosines(bool(shell[3])), shape[0], inputs=inputs, outputs=[cosines], cost=_RAY_COST * shape[1]
+        )
         transfer[receivers] = cosines.numpy() @ values
     return wp.array(transfer, device=points.device)

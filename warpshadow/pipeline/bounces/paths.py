@@ -67,7 +67,9 @@ def path_traced(
     ) -> wp.array:
         texels = None if textures is None else textures.texels
         shells = FAR[None] if shell is None else shell.numpy()
-        count = common_batch({"shell": shells, "geometry": shading, "albedo": vertex_albedo, "textures": texels, "emission": emission})
+        count = common_batch(
+            {"shell": shells, "geometry": shading, "albedo": vertex_albedo, "textures": texels, "emission": emission}
+        )
         drawn = sample_map(known_light.radiance, _LIGHT_SAMPLES, seed=1)
         bounced = empty((count, *shading.shape[1:]), dtype=wp.vec3, device=shading.device)
 

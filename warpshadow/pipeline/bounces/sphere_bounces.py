@@ -27,7 +27,9 @@ class SphereBounces:
         self._method, self._patches = method, ScenePatches(method.merged_scene)
         self._moving_bounces = MovingBounces(method, self._patches)
 
-    def bounced_shading(self, points: LitPoints, projected_light: Node, light: LightInput, materials: Materials) -> Node:
+    def bounced_shading(
+        self, points: LitPoints, projected_light: Node, light: LightInput, materials: Materials
+    ) -> Node:
         """Node of the shading of points, direct and bounced, vec3 of shape [batch, receiver].
 
         If colors vary, the visibility of points is cached; otherwise their shading is.
@@ -68,7 +70,9 @@ class SphereBounces:
         lit = self._method.with_emitters(by_map, at_patch_samples, materials)
         return self._static_bounces.add_bounces(direct, lit, points, materials)
 
-    def cached_bounced_free_shading(self, direct: Node, points: LitPoints, light: LightInput, materials: Materials) -> Node:
+    def cached_bounced_free_shading(
+        self, direct: Node, points: LitPoints, light: LightInput, materials: Materials
+    ) -> Node:
         """The same in free light, given a node of the direct shading of the receivers."""
         patch_samples, at_patch_samples = self._cached_patch_samples(points, materials)
         transfers = points.cached(

@@ -16,7 +16,7 @@ from warpshadow.pipeline.shell import PATCHES, ShellPatches, project_on_shell
 _NO_CELLS = np.empty((0, 3))
 
 
-class ProjectedPatches(NamedTuple):
+class ProjectedShell(NamedTuple):
     """Light of a shell."""
 
     patches: ShellPatches
@@ -37,11 +37,11 @@ class NoShadows(LogSH):
 
     def project_light(self, light: KnownLight, shell: wp.array | None = None) -> Any:
         """The bands that the light has, or its patches."""
-        return super().project_light(light) if shell is None else ProjectedPatches(*project_on_shell(light, shell))
+        return super().project_light(light) if shell is None else ProjectedShell(*project_on_shell(light, shell))
 
-    def project_free_light(self, shell: wp.array) -> ProjectedPatches:
+    def project_free_light(self, shell: wp.array) -> ProjectedShell:
         """The basis of free light of a shell. Differentiable: shell."""
-        return ProjectedPatches(ShellPatches(shell))
+        return ProjectedShell(ShellPatches(shell))
 
     def coefficient_count(self, light: Input | None) -> int:
         """Number of coefficients that take part."""
@@ -49,7 +49,7 @@ class NoShadows(LogSH):
 
     def transfer(self, visibility: GroupVisibility, group: Group, projected_light: Any) -> wp.array:
         """Transfer vectors, float32 of shape [batch, receiver, coefficient]."""
-        if not isinstance(projected_light, ProjectedPatches):
+        if not isinstance(projected_light, ProjectedShell):
             return super().transfer(visibility, group, projected_light)
         return projected_light.patches.transfer(group.points, group.normals, None, _NO_CELLS)
 

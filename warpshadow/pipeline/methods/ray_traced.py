@@ -267,7 +267,9 @@ class Rays(Method):
             lit_points = tree, points[instance], normals[instance]
             options = {"shell": shells[min(instance, len(shells) - 1)]}
             # a ratio image has the same directions with the bodies and without
-            pilots = None if self.merged_scene.scene.catchers else functools.partial(find_shares, *lit_points, **options)
+            pilots = (
+                None if self.merged_scene.scene.catchers else functools.partial(find_shares, *lit_points, **options)
+            )
             samples = cut_map(light.radiance, count, pilots)
             corners = None
             if receivers.fragments.face_ids.ndim == 3:  # of an image

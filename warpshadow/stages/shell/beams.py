@@ -56,14 +56,14 @@ def _find_exits(
     # out
     exits: wp.array3d(dtype=wp.vec3),
 ):
-    """A thread owns a ray: the root of |x + t ω − c| = R that lies ahead."""
+    """A thread owns a ray: the root of |x + t ω − c| = R in front of it."""
     batch, receiver, i = wp.tid()
     own_shell = shell[instance_in(batch, shell.shape[0])]
     offset = points[instance_in(batch, points.shape[0]), receiver] - center_of(own_shell)
     direction = directions[instance_in(batch, directions.shape[0]), receiver, i]
-    along = wp.dot(offset, direction)
-    square = along * along - wp.dot(offset, offset) + own_shell[3] * own_shell[3]
-    exits[batch, receiver, i] = wp.normalize(offset + (wp.sqrt(wp.max(square, 0.0)) - along) * direction)
+    projection = wp.dot(offset, direction)
+    square = projection * projection - wp.dot(offset, offset) + own_shell[3] * own_shell[3]
+    exits[batch, receiver, i] = wp.normalize(offset + (wp.sqrt(wp.max(square, 0.0)) - projection) * direction)
 
 
 def exits_from_shell(points: wp.array, directions: wp.array, shell: wp.array) -> wp.array:
@@ -90,9 +90,9 @@ def exits_on_host(points: np.ndarray, directions: np.ndarray, shell: np.ndarray)
         shell: Center and radius, shape [4].
     """
     offset = points - shell[:3]
-    along = (offset * directions).sum(axis=-1, keepdims=True)
-    square = along**2 - (offset**2).sum(axis=-1, keepdims=True) + shell[3] ** 2
-    exits = offset + (np.sqrt(np.maximum(square, 0)) - along) * directions
+    projection = (offset * directions).sum(axis=-1, keepdims=True)
+    square = projection**2 - (offset**2).sum(axis=-1, keepdims=True) + shell[3] ** 2
+    exits = offset + (np.sqrt(np.maximum(square, 0)) - projection) * directions
     return exits / np.linalg.norm(exits, axis=-1, keepdims=True)
 
 

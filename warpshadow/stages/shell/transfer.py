@@ -1,6 +1,7 @@
 """Transfer vectors to light from a shell: a sum over patches of it, with transmittance from the receivers' cells.
 
-    E(x) = Σ_k L_k T(ω_k) g_k,   g_k = A max(n·b_k, 0) max(d_k·b_k, 0) / (|b_k|² √(π² |b_k|⁴ + A²)),   b_k = c + R d_k − x
+    E(x) = Σ_k L_k T(ω_k) g_k,   g_k = A max(n·b_k, 0) max(d_k·b_k, 0) / (|b_k|² √(π² |b_k|⁴ + A²)),
+    b_k = c + R d_k − x
 
 d_k is the direction from the center c to patch k, A = 4π R² / K the area of each of the K patches, ω_k = b_k / |b_k|.
 E is over π. The root is π |b|² but for receivers closer to the shell than patches are to each other, as in
@@ -192,14 +193,12 @@ def _find_transfer_adjoint(
             product = adj * mean * factor
             square = wp.pi * wp.pi * distance2 * distance2
             adj_normal += product / wp.dot(normal, beam) * beam
-            adj_beam += product / wp.dot(normal, beam) * normal + product / wp.dot(
-                patch_direction, beam
-            ) * patch_direction
+            adj_beam += (
+                product / wp.dot(normal, beam) * normal + product / wp.dot(patch_direction, beam) * patch_direction
+            )
             adj_beam -= 2.0 * product / distance2 * (1.0 + square / (square + area * area)) * beam
             adj_center += adj_beam
-            adj_radius += (
-                wp.dot(patch_direction, adj_beam) + 2.0 * product / radius * square / (square + area * area)
-            )
+            adj_radius += wp.dot(patch_direction, adj_beam) + 2.0 * product / radius * square / (square + area * area)
     if adj_points:
         adj_points[batch, receiver] = adj_points[batch, receiver] - adj_center
     if adj_normals:

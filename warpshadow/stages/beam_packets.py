@@ -1,4 +1,4 @@
-"""Beams to the shell for packets of rays, as :mod:`.beams` has them for one."""
+"""Beams to the shell for packets of rays, as :mod:`warpshadow.stages.shell.beams` has them for one."""
 
 import functools
 
