@@ -69,7 +69,7 @@ class Method:
         self._can_receive: dict[tuple[int, ...], np.ndarray] = {}  # by the bodies out of which spheres bulge
         self.has_emitters = bool(merged_scene.is_emitter.any())
         shell = merged_scene.scene.shell
-        self.shell = None if shell is None else shell_array(shell[3], shell[:3], merged_scene.device)
+        self.shell = None if shell is None else shell_array(shell, merged_scene.device)
 
     def blocker_kinds(self, geometry: Geometry | None, rotations: Input | None) -> BlockerKinds:
         """Choose the kind of blocker that each body of a geometry is; the scene's geometry by default.
@@ -198,8 +198,8 @@ class Method:
 
     def _shell_input(self, points: LitPoints, light: Light | None, shell: wp.array | None) -> Input | None:
         """The shell of light that is not the scene's, the same while its values are; None for the scene's."""
-        if isinstance(light, EnvironmentMap) and light.radius is not None and shell is None:
-            shell = shell_array(light.radius, light.center, self.merged_scene.device)
+        if isinstance(light, EnvironmentMap) and light.shell is not None and shell is None:
+            shell = shell_array(light.shell, self.merged_scene.device)
         if shell is None:
             return None
         if self.shell is None:

@@ -96,9 +96,9 @@ def exits_on_host(points: np.ndarray, directions: np.ndarray, shell: np.ndarray)
     return exits / np.linalg.norm(exits, axis=-1, keepdims=True)
 
 
-def shell_array(radius: float, center: np.ndarray, device: wp.DeviceLike) -> wp.array:
-    """A shell as kernels take it, vec4 of shape [1]."""
-    return constant(np.array([[*center, radius]], np.float32), wp.vec4, device)
+def shell_array(shell: np.ndarray, device: wp.DeviceLike) -> wp.array:
+    """A shell, its center and radius [4], as kernels take it, vec4 of shape [1]."""
+    return constant(shell[None], wp.vec4, device)
 
 
 def check_shell(shell: wp.array) -> None:

@@ -56,6 +56,23 @@ def _form_factor(beam: wp.vec3, normal: wp.vec3, patch_direction: wp.vec3, area:
     return area * wp.dot(normal, beam) * wp.dot(patch_direction, beam) / denominator
 
 
+@wp.func
+def _sum_cells(
+    lookup: CellLookup, transmittance: wp.array(dtype=wp.float32), normal: wp.vec3, direction: wp.vec3, texel: int
+):
+    """The sums of k min(T, H) and of k H over the cells near a direction."""
+    through = float(0.0)
+    whole = float(0.0)
+    for i in range(lookup.neighbors.shape[1]):
+        cell = lookup.neighbors[texel, i]
+        kernel = wp.max(wp.dot(direction, lookup.cells[cell]) - lookup.reach_cosine, 0.0)
+        weight = kernel * kernel + _NEGLIGIBLE
+        above = wp.smoothstep(-1.0, 1.0, lookup.per_radius * wp.dot(normal, lookup.cells[cell])) + _NEGLIGIBLE
+        through += weight * wp.min(transmittance[cell], above)
+        whole += weight * above
+    return through, whole
+
+
 @wp.kernel(enable_backward=False)
 def _find_transfer(
     first_row: int,
@@ -85,18 +102,8 @@ def _find_transfer(
             value = _form_factor(beam, normal, patch_direction, area)
             if transmittance:
                 direction = wp.normalize(beam)
-                texel = texel_of(direction)
-                through = float(0.0)
-                whole = float(0.0)
-                for i in range(lookup.neighbors.shape[1]):
-                    cell = lookup.neighbors[texel, i]
-                    kernel = wp.max(wp.dot(direction, lookup.cells[cell]) - lookup.reach_cosine, 0.0)
-                    weight = kernel * kernel + _NEGLIGIBLE
-                    above = (
-                        wp.smoothstep(-1.0, 1.0, lookup.per_radius * wp.dot(normal, lookup.cells[cell])) + _NEGLIGIBLE
-                    )
-                    through += weight * wp.min(transmittance[batch, receiver, cell], above)
-                    whole += weight * above
+                cells = transmittance[batch, receiver]
+                through, whole = _sum_cells(lookup, cells, normal, direction, texel_of(direction))
                 value *= through / whole
         transfer[batch, receiver, k] = value
 
@@ -153,17 +160,7 @@ def _find_transfer_adjoint(
                 distance = wp.sqrt(distance2)
                 direction = beam / distance
                 texel = texel_of(direction)
-                through = float(0.0)
-                whole = float(0.0)
-                for i in range(lookup.neighbors.shape[1]):
-                    cell = lookup.neighbors[texel, i]
-                    kernel = wp.max(wp.dot(direction, lookup.cells[cell]) - lookup.reach_cosine, 0.0)
-                    weight = kernel * kernel + _NEGLIGIBLE
-                    above = (
-                        wp.smoothstep(-1.0, 1.0, lookup.per_radius * wp.dot(normal, lookup.cells[cell])) + _NEGLIGIBLE
-                    )
-                    through += weight * wp.min(transmittance[batch, receiver, cell], above)
-                    whole += weight * above
+                through, whole = _sum_cells(lookup, transmittance[batch, receiver], normal, direction, texel)
                 mean = through / whole
                 adj_through = factor * adj / whole
                 adj_whole = -adj_through * mean
