@@ -74,12 +74,12 @@ class SceneEmitters:
         of_vertices = csr_matrix((of_vertices.data, vertices[of_vertices.indices], of_vertices.indptr), shape)
         is_emitting = np.isin(merged_scene.body_of_face, bodies)
         first_faces = np.cumsum([0, *(item.faces.shape[1] for item in weights[:-1])])
-        shifted = [item.surface_points.faces + first for item, first in zip(weights, first_faces, strict=True)]
+        surface_faces = [item.surface_points.faces + first for item, first in zip(weights, first_faces, strict=True)]
         surface_weights = np.concatenate([item.surface_points.weights for item in weights])
         return EmitterSamples(
             SparseMatrix.from_matrix(of_vertices, device=merged_scene.device),
             SparseMatrix.from_matrix(block_diag([item.faces for item in weights]), device=merged_scene.device),
-            SurfacePoints(np.concatenate(shifted), surface_weights),
+            SurfacePoints(np.concatenate(surface_faces), surface_weights),
             wp.array(merged_scene.faces.numpy()[is_emitting], dtype=wp.vec3i, device=merged_scene.device),
             tuple(bodies),
             tuple(merged_scene.is_two_sided[bodies].tolist()),

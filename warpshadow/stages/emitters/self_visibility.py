@@ -1,14 +1,14 @@
-"""Self-visibility of emitters: what of a lamp its own surface hides, such as the far side of a shade.
+"""Self-visibility of emitters: the part of a lamp that its own surface hides, such as the far side of a shade.
 
-Rays from points of each sample, traced once in the body's own frame, tell for cells q of directions ω_q what share s_q
-of the sample is open to infinity, and how far the surface is that hides the rest, D_q. A receiver at the distance d in
+Rays from points of each sample, traced once in the body's own frame, find for cells q of directions ω_q the share s_q
+of the sample that is open to infinity, and the distance D_q of the surface that hides the rest. A receiver at the distance d in
 the direction ω sees
 
     T = Σ_q k_q (s_q + (1 − s_q) S(D_q, d)) / Σ_q k_q,   k_q = max(ω·ω_q − cos 2.2ρ, 0)² + ε,
 
 S falling from 1 to 0 around d = D_q: receivers within a lamp are nearer than its far side. The frame is the rotation R
 that takes the samples y⁰_k at rest nearest to the placed ones, that of Σ_k y_k y⁰_kᵀ, and so is the scale of D_q.
-A convex body hides nothing of what faces a receiver, and has no table.
+A convex body hides nothing that faces a receiver, and has no table.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ CELLS = fibonacci(512)
 _COST = 60.0  # nanoseconds that a sample takes
 _NEGLIGIBLE = 1.0e-7
 _LIFT = 1.0e-4  # height above the surface at which rays start [sizes of the body]
-_LEAST_HIDDEN = 1.0e-3  # mean hidden share of a body below which it has no table: rounding at edges of convex bodies
+_MIN_HIDDEN = 1.0e-3  # mean hidden share of a body below which it has no table: rounding at edges of convex bodies
 
 _EDGE = 0.1  # half-width of the fall of S [D_q]
 _OWN_REACH = 1.25  # middle of that fall for receivers on the lamp itself, which are at D_q
@@ -47,12 +47,12 @@ class EmitterSelfVisibility(NamedTuple):
 
     Args:
         rest_points: Samples at rest around their middle y⁰, of squares that sum up to 1; vec3 of shape [sample].
-        open_shares: s, float32 of shape [sample, cell].
+        far_transmittance: s, float32 of shape [sample, cell].
         distances: D [lengths of rest_points], float32 of shape [sample, cell].
     """
 
     rest_points: wp.array
-    open_shares: wp.array
+    far_transmittance: wp.array
     distances: wp.array
 
 
@@ -68,7 +68,7 @@ def _trace_samples(
     is_two_sided: int,
     lift: float,
     # out
-    open_shares: wp.array2d(dtype=wp.float32),
+    far_transmittance: wp.array2d(dtype=wp.float32),
     distances: wp.array2d(dtype=wp.float32),
 ):
     """A thread owns a sample. Cells below the horizon of all its points have the rays of their mirror images."""
@@ -99,10 +99,10 @@ def _trace_samples(
                 else:
                     open_weight += cosine
         if hidden_weight > 0.0:
-            open_shares[sample, c] = open_weight / (open_weight + hidden_weight)
+            far_transmittance[sample, c] = open_weight / (open_weight + hidden_weight)
             distances[sample, c] = total_distance / hidden_weight
         else:
-            open_shares[sample, c] = 1.0
+            far_transmittance[sample, c] = 1.0
             distances[sample, c] = 1.0
 
 
@@ -136,18 +136,20 @@ def find_self_visibility(
     vertices = from_numpy(corners.reshape(-1, 3), dtype=wp.vec3, device=device)
     mesh = wp.Mesh(vertices, wp.array(np.arange(len(vertices)), dtype=wp.int32, device=device))
     shape = len(points), len(CELLS)
-    open_shares, distances = (empty(shape, dtype=wp.float32, device=device) for _ in range(2))
+    far_transmittance, distances = (empty(shape, dtype=wp.float32, device=device) for _ in range(2))
     arrays = [from_numpy(item, dtype=wp.vec3, device=device) for item in (points, normals)]
     launch(
         _trace_samples,
         len(points),
         inputs=[mesh.id, *arrays, constant(CELLS, wp.vec3, device), int(is_two_sided), _LIFT],
-        outputs=[open_shares, distances],
+        outputs=[far_transmittance, distances],
         cost=200.0 * len(CELLS) * points.shape[1],
     )
-    if 1 - open_shares.numpy().mean() < _LEAST_HIDDEN:
+    if 1 - far_transmittance.numpy().mean() < _MIN_HIDDEN:
         return None
-    return EmitterSelfVisibility(from_numpy(rest_points / size, dtype=wp.vec3, device=device), open_shares, distances)
+    return EmitterSelfVisibility(
+        from_numpy(rest_points / size, dtype=wp.vec3, device=device), far_transmittance, distances
+    )
 
 
 @wp.kernel
@@ -178,7 +180,7 @@ def _look_up(
     first_sample: int,
     moments: wp.array2d(dtype=wp.mat33),
     rotations: wp.array2d(dtype=wp.mat33),
-    open_shares: wp.array2d(dtype=wp.float32),
+    far_transmittance: wp.array2d(dtype=wp.float32),
     distances: wp.array2d(dtype=wp.float32),
     cells: wp.array(dtype=wp.vec3),
     neighbors: wp.array2d(dtype=wp.int32),
@@ -203,7 +205,7 @@ def _look_up(
             cell = neighbors[texel, k]
             kernel_weight = wp.max(wp.dot(direction, cells[cell]) - reach_cosine, 0.0)
             weight = kernel_weight * kernel_weight + _NEGLIGIBLE
-            share = open_shares[i, cell]
+            share = far_transmittance[i, cell]
             middle = reach * distances[i, cell]
             nearness = 1.0 - wp.smoothstep((1.0 - _EDGE) * middle, (1.0 + _EDGE) * middle, distance)
             weighted_sum += weight * wp.vec2(share + (1.0 - share) * nearness, 1.0)
@@ -252,7 +254,7 @@ def look_up_self_visibility(
     )
     count = common_batch({"points": points, "emitters": sample_points})
     weighted_sums = empty((count, points.shape[1], span.size), dtype=wp.vec2, device=device)
-    table = self_visibility.open_shares, self_visibility.distances
+    table = self_visibility.far_transmittance, self_visibility.distances
     cells = constant(CELLS, wp.vec3, device), cell_neighbors(CELLS, device)
     launch(
         _look_up,
