@@ -1,8 +1,8 @@
 """Self-visibility of emitters: the part of a lamp that its own surface hides, such as the far side of a shade.
 
 Rays from points of each sample, traced once in the body's own frame, find for cells q of directions ω_q the share s_q
-of the sample that is open to infinity, and the distance D_q of the surface that hides the rest. A receiver at the distance d in
-the direction ω sees
+of the sample that is open to infinity, and the distance D_q of the surface that hides the rest. A receiver at the
+distance d in the direction ω sees
 
     T = Σ_q k_q (s_q + (1 − s_q) S(D_q, d)) / Σ_q k_q,   k_q = max(ω·ω_q − cos 2.2ρ, 0)² + ε,
 
