@@ -17,6 +17,7 @@ from warpshadow.inverse.free.plane import Plane
 from warpshadow.inverse.free.pose import Pose
 from warpshadow.inverse.free.reflectance import Albedo, Texture
 from warpshadow.inverse.free.shape import Deformation, Radii
+from warpshadow.inverse.free.shell import Shell
 from warpshadow.inverse.free.views import CameraPose, Exposure, OutlineOffset
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.many import Ending, find_fits, fit_many
@@ -56,6 +57,7 @@ __all__ = [
     "Radii",
     "Result",
     "Roughness",
+    "Shell",
     "Stage",
     "Target",
     "Texture",
