@@ -53,6 +53,11 @@ class Light(Free):
         for name in ("nonnegativity", "smoothness"):
             check.nonnegative(name, getattr(self, name))
 
+    @property
+    def is_light(self) -> bool:
+        """Images are linear in it."""
+        return True
+
     @functools.cached_property
     def basis(self) -> Basis:
         """The basis of the light."""
