@@ -16,11 +16,13 @@ from warpshadow.device.memory import empty
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.method import LightInput
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.pipeline.receivers.groups import CellCoverages, Group, GroupVisibility
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.self_visibility import SelfVisibilityLookup
+from warpshadow.pipeline.shell import PATCHES, ShellPatches, project_on_shell
 from warpshadow.pipeline.sphere_method import PortionedShading, SphereMethod
 from warpshadow.pipeline.transfers import LARGEST_COEFFICIENT, change_basis, joined
 from warpshadow.scene.blockers import blocking_planes
@@ -64,6 +66,7 @@ class ProjectedCells(NamedTuple):
     spot_shares: np.ndarray | None = None  # share of the light of sharp cells that their spot has [direction]
     samples: np.ndarray | None = None  # directions drawn from known light in its cells, and even ones [direction, 8, 3]
     sun: SunCells | None = None  # the brightest cells, where bodies want rays to them
+    patches: ShellPatches | None = None  # that send the light, whose coefficients are theirs; None where it is far
 
     @property
     def facing(self) -> np.ndarray:
@@ -90,11 +93,21 @@ class Directional(SphereMethod):
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
         self._directions = fibonacci(merged_scene.scene.visibility.directions)
-        super().__init__(merged_scene, CellBasis(self._directions), basis, progress=progress)
-        self.free_projection = ProjectedCells(self._directions)
+        is_near = merged_scene.scene.shell is not None
+        native_basis = PATCHES if is_near else CellBasis(self._directions)
+        super().__init__(merged_scene, native_basis, basis, progress=progress)
+        self.free_projection = ProjectedCells(
+            self._directions, patches=None if self.shell is None else ShellPatches(self.shell)
+        )
 
-    def project_light(self, light: KnownLight) -> ProjectedCells:
-        """Cells that look to where their light comes from: a sun is rarely in the middle of one."""
+    def project_light(self, light: KnownLight, shell: wp.array | None = None) -> ProjectedCells:
+        """Cells that look to where their light comes from: a sun is rarely in the middle of one.
+
+        From a shell light comes to each receiver from other directions: cells are even.
+        """
+        if shell is not None:
+            patches, radiance = project_on_shell(light, shell)
+            return self.free_projection._replace(patches=patches, coefficients=radiance)
         cells = light.cells(self._directions)
         if cells.spots is None or cells.half_angles is None:
             return ProjectedCells(cells.directions, self._on_device(cells.radiance), cells.directions)
@@ -135,9 +148,13 @@ class Directional(SphereMethod):
     def _on_device(self, coefficients: np.ndarray) -> wp.array:
         return constant(coefficients[None], wp.vec3, self.merged_scene.device)
 
+    def project_free_light(self, shell: wp.array) -> ProjectedCells:
+        """The basis of free light of another shell than the scene's. Differentiable: shell."""
+        return self.free_projection._replace(patches=ShellPatches(shell))
+
     def coefficient_count(self, light: Input | None) -> int:
         """Number of coefficients that take part: all."""
-        return len(self._directions)
+        return self.native_basis.size
 
     def self_lookups(
         self, bodies: tuple[int, ...], rotations: wp.array, projected_light: ProjectedCells
@@ -230,9 +247,9 @@ class Directional(SphereMethod):
         """Bodies of the scene that block light as planes."""
         return blocking_planes(self.merged_scene.scene)
 
-    def convex_blockers(self, traced: tuple[int, ...]) -> tuple[int, ...]:
+    def convex_blockers(self, rigid: tuple[int, ...]) -> tuple[int, ...]:
         """Bodies that consist of convex parts."""
-        return tuple(body for body in traced if body in self.parts.parts)
+        return tuple(body for body in rigid if body in self.parts.parts)
 
     def find_visibility_past_planes(
         self, group: Group, visibility: GroupVisibility, projected_light: ProjectedCells
@@ -258,11 +275,15 @@ class Directional(SphereMethod):
         return visibility._replace(transmittance_total=total, transmittance_spheres=visibility.transmittance_total)
 
     def _transmittance_self(self, group: Group, projected_light: ProjectedCells) -> wp.array | None:
-        """Transmittance past the body of the receivers: looked up, and of a sun by rays where these are asked for."""
-        if group.self_lookup is None or not group.points.size:
+        """Transmittance past the body of the receivers: by its parts, or looked up, and by rays where asked."""
+        if group.has_own_coverage:
+            own = self._coverages(group.own_coverage, projected_light)
+            return self._past_coverages(None, own, None, projected_light)
+        transmittance_self, lookup = group.looked_up_transmittance(), group.self_lookup
+        if transmittance_self is None:
             return None
-        assert group.probe_weights is not None and isinstance(group.self_lookup, SelfVisibilityLookup)
-        transmittance_self, rays = group.self_transmittance(), group.self_lookup.rays
+        assert group.probe_weights is not None and isinstance(lookup, SelfVisibilityLookup)
+        rays = lookup.rays
         if rays is None or projected_light.sun is None:
             return transmittance_self
         if transmittance_self.requires_grad:
@@ -277,6 +298,9 @@ class Directional(SphereMethod):
     def transfer(self, visibility: GroupVisibility, group: Group, projected_light: ProjectedCells) -> wp.array:
         """Transfer vectors; the transmittance as it is where cached cells hold known light."""
         assert visibility.transmittance_total is not None
+        if projected_light.patches is not None:
+            arguments = group.points, group.normals, visibility.transmittance_total, projected_light.directions
+            return projected_light.patches.transfer(*arguments)
         if group.cached_rows is None:
             return directional_transfer(visibility.transmittance_total, group.normals, projected_light.facing)
         if _has_light(group.cached_rows):
@@ -293,7 +317,7 @@ class Directional(SphereMethod):
         self, visibility: GroupVisibility, group: Group, projected_light: ProjectedCells
     ) -> wp.array:
         """Shading of a group in known light."""
-        if group.cached_rows is not None:
+        if group.cached_rows is not None or projected_light.patches is not None:
             return self.shade_transfer(self.transfer(visibility, group, projected_light), group, projected_light)
         assert visibility.transmittance_total is not None and projected_light.coefficients is not None
         cells = projected_light.facing, projected_light.coefficients
@@ -346,12 +370,13 @@ class Directional(SphereMethod):
         lit = shade_cells(transmittance, normals, directions, light, maximum=LARGEST_COEFFICIENT).numpy()[..., 0]
         receiver_normals, towards = normals.numpy(), self.free_projection.directions
         plane_normals = receiver_normals[:, :1]  # points of a plane have this normal or its opposite
-        # [batch, 1]
-        whole = [4 / len(power) * np.maximum(sign * plane_normals @ towards.T, 0) @ power for sign in (1, -1)]
-        unblocked = np.where((receiver_normals * plane_normals).sum(axis=2) > 0, *whole)
+        facing = plane_normals @ towards.T  # [batch, 1, cell]
+        whole = [4 / len(power) * np.maximum(cosines, 0) @ power for cosines in (facing, -facing)]
+        is_front = (receiver_normals @ plane_normals.transpose(0, 2, 1))[..., 0] > 0
+        unblocked = np.where(is_front, *whole)
         return np.divide(lit, unblocked, out=np.zeros_like(lit), where=unblocked > 0)
 
-    def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input) -> Node:
+    def lobe_transmittance(self, points: LitPoints, directions: Node, light: LightInput) -> Node:
         """Transmittance towards the samples of lobes, between cells; of known light, to where it comes from in them."""
         cells, projected_light = self._lobe_cells(points, light)
         item_text = functools.partial(receiver_text, points.in_words)
@@ -359,7 +384,7 @@ class Directional(SphereMethod):
         return Node("transmittance of lobes", _towards, *arguments, items=item_text)
 
     def blocked_radiance(
-        self, points: LitPoints, diffuse: Node, light: Input, view: LitPoints, choose: Callable[[Node], Node]
+        self, points: LitPoints, diffuse: Node, light: LightInput, view: LitPoints, choose: Callable[[Node], Node]
     ) -> Node:
         """Mean radiance of the blockers of points, by their light with bounces and without."""
         cells, projected_light = self._lobe_cells(points, light)
@@ -377,24 +402,30 @@ class Directional(SphereMethod):
         if not diffuse.size:
             return diffuse
         count = len(projected_light.directions)
-        transfer = directional_transfer(_joined_cells(cells, count), receivers.normals, projected_light.facing)
+        transmittance = _joined_cells(cells, count)
+        of_cells = transfer = directional_transfer(transmittance, receivers.normals, projected_light.facing)
+        if projected_light.patches is not None:
+            arguments = receivers.points, receivers.normals, transmittance, projected_light.directions
+            transfer = projected_light.patches.transfer(*arguments)
         light = projected_light.coefficients if free is None else change_basis(free, self.native_from_basis)
         assert light is not None
         even = wp.full((1, count), wp.vec3(1.0), dtype=wp.vec3, device=diffuse.device)
-        direct, openness = shade(transfer, light, maximum=LARGEST_COEFFICIENT), shade(transfer, even)
+        direct, openness = shade(transfer, light, maximum=LARGEST_COEFFICIENT), shade(of_cells, even)
         return blocked_radiance(diffuse, direct, openness)
 
-    def _lobe_cells(self, points: LitPoints, light: Input) -> tuple[Node, Any]:
+    def _lobe_cells(self, points: LitPoints, light: LightInput) -> tuple[Node, Any]:
         """Node of the transmittance of cells, in portions, and the projected light that says which."""
-        make = functools.partial(self.projected, light)
-        projected_light = self.free_projection if light.is_free else points.cached("projected", light, make)
+        if light.is_free:
+            projected_light = self.free_projection_of(points, light)
+        else:
+            projected_light = points.cached("projected", light, functools.partial(self.projected, light))
 
         def in_cells() -> Node:
             return PortionedCellTransmittance(
                 self, points, projected_light, None, list, where=" of gloss", is_shaded=False
             )
 
-        return points.cached("cells", None if light.is_free else light, in_cells), projected_light
+        return points.cached("cells", light.shell if light.is_free else light, in_cells), projected_light
 
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """Rows of the light of each cell that static bodies let through.

@@ -26,11 +26,17 @@ class BlockerKinds(NamedTuple):
     """Which bodies block light as planes, convex parts or by traced self-visibility; spheres block the rest."""
 
     traced: tuple[int, ...] = ()  # bodies that block their own light as rays found, not by their spheres
-    rotations: Input | None = None  # of all bodies, mat33 of shape [batch, body]; None where none is traced
-    why_spheres: tuple[str, ...] = ()  # of each body, why it blocks its own light by spheres; empty for the traced
+    rotations: Input | None = None  # of all bodies, mat33 of shape [batch, body]; None where they are not known
+    why_spheres: tuple[str, ...] = ()  # of each body, why it blocks its own light by spheres; empty for others
     planes: tuple[int, ...] = ()  # bodies that block all light as the planes in which they lie
-    convex: tuple[int, ...] = ()  # traced ones that block the light of others by the convex parts that they consist of
+    convex: tuple[int, ...] = ()  # bodies that block the light of others by the convex parts that they consist of
+    solids: tuple[int, ...] = ()  # those that block their own by them, too; others are traced
     bulging: tuple[int, ...] = ()  # bodies out of which spheres bulge: they receive at vertices, for any choice
+
+    @property
+    def separate(self) -> set[int]:
+        """Bodies whose receivers form a group each."""
+        return {*self.traced, *self.solids, *self.planes}
 
 
 ONLY_SPHERES = BlockerKinds()  # all bodies block by their spheres
@@ -73,7 +79,8 @@ class LitPoints:
         self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
         self.call, self.static_bodies = call, static_bodies
         self.normals = Node("", vertex_normals, vertices, merged_scene.faces) if normals is None else normals
-        self.last_light: Input | None = None  # that was known, but for the scene's
+        self.last_light: Any = None  # that was known, but for the scene's: a ``LightInput``
+        self.last_shell: Input | None = None  # of light, but for the scene's
         self._cached: dict[str, tuple[Hashable, Any]] = {}
 
     def cached(self, name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:
@@ -86,7 +93,7 @@ class LitPoints:
         """Other receivers, of which nothing is cached, among the same blockers, any of which may move."""
         points = copy.copy(self)
         points.receivers_node, points.static_bodies, points.is_scene_view = receivers, None, False
-        points._cached, points.last_light = {}, None
+        points._cached, points.last_light, points.last_shell = {}, None, None
         return points
 
     def preview(self: Points) -> Points:

@@ -6,8 +6,6 @@ over the cells near l, ρ their radius and s the smoothstep from 0 at −1 to 1 
 receiver's horizon. Of a ball, T_q is H_q: it blocks nothing above its horizon.
 """
 
-import functools
-
 import numpy as np
 import warp as wp
 
@@ -17,49 +15,13 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import cell_radius
-
-KERNEL_RADIUS = 2.2  # distance of a cell from which it no longer counts, in cell radii
-
-_TABLE_ROWS = 32  # rows of the table of cells near directions, and its columns: an octahedron
+from warpshadow.stages.cell_neighbors import KERNEL_RADIUS, cell_neighbors, texel_of
 
 _COST = 60.0  # nanoseconds that a sample takes
 
 _NEGLIGIBLE = 1.0e-7
 
 wp.set_module_options({"max_unroll": 1})
-
-
-@functools.lru_cache(maxsize=8)
-def _neighbors(directions: bytes) -> np.ndarray:
-    """Cells near each texel of an octahedron, the nearest first, int32 of shape [texel, cell]."""
-    from scipy.spatial import cKDTree
-
-    cells = np.frombuffer(directions).reshape(-1, 3)
-    row_centers = (np.arange(_TABLE_ROWS) + 0.5) / _TABLE_ROWS * 2 - 1
-    x, z = np.meshgrid(row_centers, row_centers)
-    y = 1 - np.abs(x) - np.abs(z)
-    lower_part = np.maximum(-y, 0)
-    texels = np.stack([x - np.sign(x) * lower_part, y, z - np.sign(z) * lower_part], axis=-1).reshape(-1, 3)
-    texels /= np.linalg.norm(texels, axis=1, keepdims=True)
-    search_radius = 2 * np.sin(min(KERNEL_RADIUS * cell_radius(len(cells)) + 2.2 / _TABLE_ROWS, np.pi) / 2)
-    tree = cKDTree(cells)
-    count = max(len(neighbor_cells) for neighbor_cells in tree.query_ball_point(texels, search_radius))
-    return tree.query(texels, min(max(count, 3), len(cells)))[1].astype(np.int32)
-
-
-@wp.func
-def _texel(direction: wp.vec3):
-    """Texel of the octahedron that a direction is in."""
-    size = wp.abs(direction[0]) + wp.abs(direction[1]) + wp.abs(direction[2])
-    x = direction[0] / size
-    z = direction[2] / size
-    if direction[1] < 0.0:
-        folded_direction = wp.sign(x) * (1.0 - wp.abs(z))
-        z = wp.sign(z) * (1.0 - wp.abs(x))
-        x = folded_direction
-    column = wp.clamp(int((x + 1.0) * 0.5 * float(_TABLE_ROWS)), 0, _TABLE_ROWS - 1)
-    row = wp.clamp(int((z + 1.0) * 0.5 * float(_TABLE_ROWS)), 0, _TABLE_ROWS - 1)
-    return row * _TABLE_ROWS + column
 
 
 @wp.kernel
@@ -84,7 +46,7 @@ def _sum_near(
     row = transmittance[instance_in(batch, transmittance.shape[0])]
     for i in range(weighted_sums.shape[2]):
         direction = directions[direction_batch, receiver, i]
-        texel = _texel(direction)
+        texel = texel_of(direction)
         weighted_sum = wp.vec2()
         for k in range(neighbors.shape[1]):
             cell = neighbors[texel, k]
@@ -126,11 +88,10 @@ def transmittance_of_directions(
     check.shape("transmittance", transmittance.shape, ("batch", directions.shape[1], len(cells)))
     arrays = {"transmittance": transmittance, "directions": directions, "normals": normals}
     count, device = common_batch(arrays), directions.device
-    neighbor_cells = _neighbors(np.ascontiguousarray(cells, np.float64).tobytes())
     radius = float(cell_radius(len(cells)))
     cos_radius = float(np.cos(KERNEL_RADIUS * radius))
     weighted_sums = wp.empty((count, *directions.shape[1:]), dtype=wp.vec2, device=device)
-    cell_directions, neighbors = constant(cells, wp.vec3, device), constant(neighbor_cells, wp.int32, device)
+    cell_directions, neighbors = constant(cells, wp.vec3, device), cell_neighbors(cells, device)
     launch(
         _sum_near,
         count * directions.shape[1],
