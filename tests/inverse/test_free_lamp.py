@@ -177,3 +177,5 @@ def test_bodies_that_do_not_emit_are_no_lamps(photograph):
         problem(photograph, Lamp("body"))
     with pytest.raises(ValueError, match="a scene of lamps alone"):
         problem(photograph, Lamp("lamp"), start=scene(LAMP))
+    with pytest.raises(ValueError, match=r"got Lamp\(2\) and Pose\(2\)"):
+        problem(photograph, CELLS, Lamp("lamp"), Pose("lamp"))

@@ -31,7 +31,7 @@ class Stage:
         supersampling: Samples a pixel across and down; by default the scene's.
         candidates: How many descents take part. They go on from the best of the stage before; missing ones start
             scattered around the best. The least loss tells them apart.
-        standout: A candidate has found it, and no others are tried from then on, if its loss is below this part of
+        standout: A candidate has found it, and no others are turned from then on, if its loss is below this part of
             that of each of six values scattered around it. 0: all are tried.
         tolerance: In place of the fit's.
         compares: "all", or "outlines" alone, for which nothing is shaded.

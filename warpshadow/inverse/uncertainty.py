@@ -352,11 +352,11 @@ def _few_number_entries(problem: Problem, values: Mapping[str, Values]) -> list[
 
     Light is projected out: that of a map, and beside it that of lamps, whose emission is then left out here.
     """
-    solved = {free.name for free in problem.free if free.is_light} if problem.basis is not None else set()
+    light_names = {free.name for free in problem.free if free.is_light and problem.basis is not None}
     return [
         (name, key, number)
         for name, parts in values.items()
         for key, tensor in parts.items()
-        if name not in solved and tensor.numel() <= MAX_UNCERTAIN_NUMBERS
+        if name not in light_names and tensor.numel() <= MAX_UNCERTAIN_NUMBERS
         for number in range(tensor.numel())
     ]

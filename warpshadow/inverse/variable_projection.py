@@ -56,8 +56,8 @@ class ProjectedModel(Model):
 
     def emitted(self, values: Mapping[str, Values]) -> torch.Tensor | float:
         """Images by emitters that are not solved for, [view, height, width, 3]; 0 where no body emits."""
-        solved = {lamp.number for lamp in self.lamps}
-        if not any(body.is_emitter and n not in solved for n, body in enumerate(self.setting.scene.bodies)):
+        lamp_numbers = {lamp.number for lamp in self.lamps}
+        if not any(body.is_emitter and n not in lamp_numbers for n, body in enumerate(self.setting.scene.bodies)):
             return 0.0
         return self._lit(self.world(values), self._darkness)[0]
 

@@ -60,7 +60,7 @@ class Lamp(FreeOfBody):
             middle = self._middle(setting)
             offset = setting.scene.bodies[self.number].to_world(setting.middle(self.number)) - middle
             distance = float(np.linalg.norm(offset))
-            return middle, (offset / distance if distance > 0 else constraints.UP), distance
+            return middle, (offset / distance if distance > 0 else np.array(constraints.UP)), distance
 
         return setting.cached(self, find)
 
