@@ -12,6 +12,7 @@ from warpshadow.inverse.found_light import FoundLight
 from warpshadow.inverse.free.base import Free
 from warpshadow.inverse.free.emission import Emission
 from warpshadow.inverse.free.gloss import Metallic, Roughness
+from warpshadow.inverse.free.lamp import Lamp
 from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.free.plane import Plane
 from warpshadow.inverse.free.pose import Pose
@@ -45,6 +46,7 @@ __all__ = [
     "FitWarning",
     "FoundLight",
     "Free",
+    "Lamp",
     "Light",
     "Loss",
     "Metallic",

@@ -20,6 +20,7 @@ from warpshadow.inverse.encoding import is_curve_file
 from warpshadow.inverse.free.base import Free
 from warpshadow.inverse.free.emission import Emission
 from warpshadow.inverse.free.gloss import Metallic, Roughness
+from warpshadow.inverse.free.lamp import Lamp
 from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.free.plane import Plane
 from warpshadow.inverse.free.pose import Pose
@@ -44,7 +45,7 @@ _PHOTOGRAPH_KEYS = ("encoding", "exposure", "white_balance", "saturation", "dist
 _TARGET_KEYS = ("image", "mask", "camera", "outlines", *_PHOTOGRAPH_KEYS)
 _FREE_OF_SCENE: dict[str, type[Free]] = {kind.key: kind for kind in (Light, Shell, Exposure, CameraPose, OutlineOffset)}
 _FREE_OF_BODIES: dict[str, type[Free]] = {
-    kind.key: kind for kind in (Albedo, Texture, Roughness, Metallic, Emission, Pose, Plane, Deformation, Radii)
+    kind.key: kind for kind in (Albedo, Texture, Roughness, Metallic, Emission, Lamp, Pose, Plane, Deformation, Radii)
 }
 
 

@@ -62,6 +62,11 @@ class Light(Free):
                 f"order: got {self.order} for light that has a radius, expected cells: Light(None, directions=512)"
             )
 
+    @property
+    def is_light(self) -> bool:
+        """Images are linear in it."""
+        return True
+
     @functools.cached_property
     def basis(self) -> Basis:
         """The basis of the light."""
