@@ -428,7 +428,7 @@ def self_visibility_node(method: SphereMethod, points: LitPoints, projected_ligh
 
 
 def _self_visibility(method: SphereMethod, points: LitPoints, projected_light: Any) -> Node:
-    bodies, rotations, words = points.blocker_kinds.traced, points.blocker_kinds.rotations, points.in_words
+    bodies, rotations, words = points.blocker_kinds.self_traced, points.blocker_kinds.rotations, points.in_words
     curved_bodies = [body for body in bodies if not method.merged_scene.is_flat[body]]
     if not curved_bodies or rotations is None:
         return Node("self-shadows", None, idle=lambda: _why_no_self_visibility(method, words))
