@@ -94,10 +94,8 @@ class SphereMethod(Method):
     def _can_bulge(self) -> list[bool]:
         """Whether each body is thin, so that its spheres bulge out of it, and its receivers were chosen, not asked for.
 
-        They are at vertices where its spheres block its own light. By pixel and at vertices, in 64² pixels, gradients
-        to free vertices are off by 80 and 9% on an arched cloth, 162 and 15% on a table of five boxes, 40 and 19% on a
-        wall of four; and these bodies are 39 and 23%, 7 and 1%, 6 and 1% too dark. Images of others are nearer to rays
-        by pixel.
+        They are at vertices where its spheres block its own light: pipeline/README.md has figures. Images of others
+        are nearer to rays by pixel.
         """
         return [
             is_chosen and body.casts_shadow and not body.is_glossy and body.is_thin
