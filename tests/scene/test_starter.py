@@ -67,7 +67,7 @@ def test_without_a_mesh_there_is_a_bunny(tmp_path, monkeypatch):
     pytest.importorskip("pxr")
     monkeypatch.chdir(tmp_path)
     assert CliRunner().invoke(app, ["scene"]).exit_code == 0
-    assert [body.called for body in ws.load_scene("scene.toml").bodies] == ["bunny", "infinite_ground"]
+    assert [body.name for body in ws.load_scene("scene.toml").bodies] == ["bunny", "infinite_ground"]
     assert write_bunny(Path()) == Path("bunny.obj")  # again
     ws.icosphere(0.5, 1).write("bunny.obj")
     with pytest.raises(FileExistsError, match="bunny.obj: got another file than Warp's bunny"):
