@@ -8,11 +8,12 @@ its surface has its radiance beside the light that it reflects.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import warp as wp
 
+from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Node
@@ -28,8 +29,15 @@ from warpshadow.stages.emitters.samples import (
     EmitterSamples,
     EmitterSpan,
     PlacedSamples,
+    SampleWeights,
+    SurfacePoints,
     find_sample_weights,
     place_samples,
+)
+from warpshadow.stages.emitters.self_visibility import (
+    EmitterSelfVisibility,
+    find_self_visibility,
+    look_up_self_visibility,
 )
 from warpshadow.stages.emitters.spheres import find_log_transmittance
 from warpshadow.stages.gloss.transmittance import transmittance_of_directions
@@ -59,24 +67,50 @@ class SceneEmitters:
 
         merged_scene = self._merged_scene
         bodies = np.flatnonzero(merged_scene.is_emitter).tolist()
-        weights = []
-        for body in bodies:
-            mesh, is_open = merged_scene.scene.bodies[body].mesh, bool(merged_scene.is_two_sided[body])
-            surface = mesh.positions, mesh.surface.faces
-            weights.append(find_sample_weights(*surface, is_two_sided=is_open, device=merged_scene.device))
+        weights = self._sample_weights
         of_vertices = block_diag([item.vertices for item in weights], format="csr")
         vertices = np.flatnonzero(np.isin(merged_scene.body_of_vertex, bodies))
         shape = of_vertices.shape[0], int(merged_scene.first_vertex[-1])
         of_vertices = csr_matrix((of_vertices.data, vertices[of_vertices.indices], of_vertices.indptr), shape)
         is_emitting = np.isin(merged_scene.body_of_face, bodies)
+        first_faces = np.cumsum([0, *(item.faces.shape[1] for item in weights[:-1])])
+        surface_faces = [item.surface_points.faces + first for item, first in zip(weights, first_faces, strict=True)]
+        surface_weights = np.concatenate([item.surface_points.weights for item in weights])
         return EmitterSamples(
             SparseMatrix.from_matrix(of_vertices, device=merged_scene.device),
             SparseMatrix.from_matrix(block_diag([item.faces for item in weights]), device=merged_scene.device),
+            SurfacePoints(np.concatenate(surface_faces), surface_weights),
             wp.array(merged_scene.faces.numpy()[is_emitting], dtype=wp.vec3i, device=merged_scene.device),
             tuple(bodies),
             tuple(merged_scene.is_two_sided[bodies].tolist()),
             np.cumsum([0, *(item.vertices.shape[0] for item in weights)]),
         )
+
+    @functools.cached_property
+    def _sample_weights(self) -> list[SampleWeights]:
+        scene, result = self._merged_scene, []
+        for body in np.flatnonzero(scene.is_emitter):
+            surface, is_open = scene.scene.bodies[body].mesh.surface, bool(scene.is_two_sided[body])
+            positions = scene.scene.bodies[body].mesh.positions
+            result.append(find_sample_weights(positions, surface.faces, is_two_sided=is_open, device=scene.device))
+        return result
+
+    @functools.cached_property
+    def self_visibility(self) -> list[EmitterSelfVisibility | None]:
+        """Self-visibility of each emitter; None of one that hides nothing of itself."""
+        pairs = zip(self.samples.bodies, self._sample_weights, strict=True)
+        return [self._find_self_visibility(body, weights) for body, weights in pairs]
+
+    def _find_self_visibility(self, body: int, weights: SampleWeights) -> EmitterSelfVisibility | None:
+        merged_scene = self._merged_scene
+        mesh, is_open = merged_scene.scene.bodies[body].mesh, bool(merged_scene.is_two_sided[body])
+        is_convex = len(mesh.convex_parts) == 1 and not is_open
+        if merged_scene.is_flat[body] or is_convex or body not in merged_scene.casting:
+            return None
+        samples = weights.vertices @ mesh.positions.astype(np.float64), weights.surface_points
+        surface, device = (mesh.positions, mesh.surface.faces), merged_scene.device
+        with unrecorded():
+            return find_self_visibility(*surface, *samples, is_two_sided=is_open, device=device)
 
     def placed(self, points: LitPoints) -> Node:
         """Node of the samples among the bodies around points."""
@@ -101,6 +135,7 @@ class SceneEmitters:
 
 def find_emitted_light(
     emitters: EmitterSamples,
+    self_visibility: Sequence[EmitterSelfVisibility | None],
     groups: Iterable[Group],
     blockers: Blockers,
     placed_samples: PlacedSamples,
@@ -110,6 +145,7 @@ def find_emitted_light(
 
     Args:
         emitters: Their samples.
+        self_visibility: Of each; None of one that hides nothing of itself.
         groups: The receivers, with the self-visibility of their bodies in EMITTER_CELLS.
         blockers: All of them.
         placed_samples: Where the samples are.
@@ -117,13 +153,20 @@ def find_emitted_light(
     Differentiable: blockers, receivers of the groups, placed_samples, radiance.
     """
     portions = (portion for group in groups for portion in group.portions())
-    return joined([_light_of(emitters, portion, blockers, placed_samples, radiance) for portion in portions])
+    return joined(
+        [_light_of(emitters, self_visibility, portion, blockers, placed_samples, radiance) for portion in portions]
+    )
 
 
 def _light_of(
-    emitters: EmitterSamples, group: Group, blockers: Blockers, placed_samples: PlacedSamples, radiance: wp.array
+    emitters: EmitterSamples,
+    self_visibility: Sequence[EmitterSelfVisibility | None],
+    group: Group,
+    blockers: Blockers,
+    placed_samples: PlacedSamples,
+    radiance: wp.array,
 ) -> wp.array:
-    """Light of all emitters but the group's own body on a portion of the receivers."""
+    """Light of all emitters on a portion of the receivers; that of their own body where it is not convex."""
     merged_scene, points, normals = blockers.merged_scene, group.points, group.normals
     total = wp.zeros(points.shape, dtype=wp.vec3, device=points.device)
     if not points.size:
@@ -137,12 +180,13 @@ def _light_of(
     spheres = merged_scene.spheres_of(sphere_bodies, blockers.spheres)
     traced_body = group.body if group.body in blockers.blocker_kinds.traced else None
     own_spheres = merged_scene.spheres_among(sphere_bodies, traced_body)
-    for body, span in zip(emitters.bodies, emitters.spans(), strict=True):
-        if body == group.body:
+    for body, span, hidden_by_itself in zip(emitters.bodies, emitters.spans(), self_visibility, strict=True):
+        is_own = body == group.body
+        if is_own and hidden_by_itself is None:
             continue
         skipped = own_spheres, merged_scene.spheres_among(sphere_bodies, body)
         transmittance_self = None
-        if cells is not None:
+        if cells is not None and not is_own:
             towards = directions_to_samples(points, placed_samples, span)
             transmittance_self = transmittance_of_directions(cells, normals, towards, EMITTER_CELLS)
         light = sum_light(
@@ -151,6 +195,9 @@ def _light_of(
             log_of_planes=_log_of_planes(group, blockers, placed_samples, span, body),
             log_of_parts=_log_of_parts(group, blockers, placed_samples, span, body),
             transmittance=transmittance_self,
+            transmittance_of_emitter=None
+            if hidden_by_itself is None
+            else look_up_self_visibility(points, placed_samples, span, hidden_by_itself, is_own=is_own),
         )
         total = total_light([total, light])
     return total

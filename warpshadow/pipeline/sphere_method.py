@@ -196,14 +196,14 @@ class SphereMethod(Method):
         """Direct light of emitters on points, by the same blockers."""
         from warpshadow.pipeline.emitters import find_emitted_light
 
-        samples, words = self.emitters.samples, points.in_words
+        emitters, words = (self.emitters.samples, self.emitters.self_visibility), points.in_words
         bodies_and_spheres = points.static_bodies, points.nearest_spheres
 
         def find(
             receivers: Receivers, blockers: Blockers, self_lookups: dict[int, Any] | None, *placed: Any
         ) -> wp.array:
             groups = find_groups(*bodies_and_spheres, receivers, blockers, self_lookups, None, None)
-            return find_emitted_light(samples, groups, blockers, *placed)
+            return find_emitted_light(*emitters, groups, blockers, *placed)
 
         def lookups() -> Node:
             if self.emitter_projection is None:
@@ -218,7 +218,7 @@ class SphereMethod(Method):
             points.cached("self-visibility towards emitters", None, lookups),
             self.emitters.placed(points),
             self.emitters.radiance(materials),
-            items=lambda: f"{receiver_text(words)} × {samples.first[-1]} samples",
+            items=lambda: f"{receiver_text(words)} × {emitters[0].first[-1]} samples",
         )
 
     def known_shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:

@@ -65,6 +65,8 @@ def path_traced(
         textures: Textures | None,
         emission: wp.array | None,
     ) -> wp.array:
+        if not receivers.points.size:
+            return shading
         texels = None if textures is None else textures.texels
         shells = FAR[None] if shell is None else shell.numpy()
         count = common_batch(

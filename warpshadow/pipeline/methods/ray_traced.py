@@ -117,14 +117,14 @@ class Rays(Method):
         points, normals, samples = _checked_points(receivers.points), receivers.normals, self.emitters.samples
         count, result = common_batch({"points": points, "geometry": positions}), []
         rays = max(1, (self.visibility.ray_count if self.shares_directions else self._sample_count) // (4 * SAMPLES))
-        for body, span in zip(samples.bodies, samples.spans(), strict=True):
-            others = [number for number in self.merged_scene.casting if number != body]
+        meshes = [self.merged_scene.casting_mesh(positions[instance]) for instance in range(len(positions))]
+        for span in samples.spans():
             traced = wp.empty((count, points.shape[1], span.size), dtype=wp.float32, device=points.device)
             for instance in range(count if points.size else 0):
                 position_number, point_number = min(instance, len(positions) - 1), min(instance, len(points) - 1)
                 rows = trace_transmittance(
-                    self.merged_scene.casting_mesh(positions[position_number], others),
-                    *(points[point_number], normals[point_number]),
+                    *(meshes[position_number], points[point_number], normals[point_number]),
+                    *(samples, positions[position_number]),
                     *(placed_samples.points[position_number], placed_samples.areas[position_number]),
                     span,
                     rays=rays,
