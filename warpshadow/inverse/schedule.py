@@ -161,7 +161,7 @@ def photograph_stages(problem: Problem) -> tuple[Stage, ...]:
     A light that is fitted at a wrong pose confirms it. So the light is solved for at each pose, and of five poses along
     the flat direction that with the least loss goes on.
     """
-    side = {size: _scale(problem, size) for size in (32, 64, 96, 160)}
+    side = {size: _scale(problem, size) for size in (32, 64, 160)}
     stages: list[Stage] = []
     has_outlines = all(target.outlines for target in problem.targets)
     if has_outlines:
@@ -179,7 +179,7 @@ def photograph_stages(problem: Problem) -> tuple[Stage, ...]:
     scatter = "flat" if has_outlines else "turned"
     return (
         *stages,
-        Stage(12, 0.03, side[96], candidates=5, scatter=scatter, tolerance=0.01, **solved_settings),
+        Stage(12, 0.03, side[64], candidates=5, scatter=scatter, tolerance=0.01, **solved_settings),
         Stage(20, 0.01, side[160], tolerance=1e-3, **solved_settings),
     )
 

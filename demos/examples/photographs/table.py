@@ -36,14 +36,21 @@ FOOT = np.array([0, 0.5, 0])  # from which directions towards the light are meas
 
 
 def problem(
-    case: Case, seed: int, *, grown: int = 0, shadows: bool = True, table: str = "known", light: str = "lamp"
+    case: Case,
+    seed: int,
+    *,
+    grown: int = 0,
+    shadows: bool = True,
+    table: str = "known",
+    light: str = "lamp",
+    stands: bool = True,
 ) -> inverse.Problem:
     """A start 15° and 10% away, of which color, light and pose are unknown; its table may be wrong, or free, too."""
     truth = case.truth()
     start = displaced(truth.bodies[0], np.random.default_rng(seed), degrees=(15, 15), part=(0.1, 0.1))
     scene = changed(truth, 0, albedo=(0.5, 0.5, 0.5), **placement(start))
     scene = dataclasses.replace(scene, visibility=ws.Visibility(directions=64) if shadows else ws.Visibility("none"))
-    pose = inverse.Pose(BODY, stands_on=TABLE, spread=0.3)
+    pose = inverse.Pose(BODY, stands_on=TABLE if stands else None, spread=0.3)
     free = [pose, inverse.Albedo(BODY), LIGHT, inverse.OutlineOffset()]
     if table != "known":
         scene = changed(scene, 1, rotation=(2.0, 0.0, -1.0), translation=(0.0, -0.1, 0.0))
@@ -148,7 +155,8 @@ if __name__ == "__main__":
     tables = "known, or 5% of a body too low and tilted by 2.2°: taken as it is, or free with priors"
     parser.add_argument("--table", choices=("known", "wrong", "free"), default="known", help=tables)
     parser.add_argument("--light", choices=("lamp", "map"), default="lamp", help="a lamp and a map, or a map alone")
+    parser.add_argument("--no-plane", action="store_true", help="nobody knows that the body stands on the table")
     arguments = parser.parse_args()
     masks = [0, 1, -1] if arguments.masks else [0]
     known = {"shadows": not arguments.no_shadows, "table": arguments.table, "light": arguments.light}
-    main(arguments.names, arguments.starts, masks, **known)
+    main(arguments.names, arguments.starts, masks, **known, stands=not arguments.no_plane)
