@@ -97,11 +97,12 @@ def takes(record: Callable[P, Inputs_co]) -> _Taking[P, Inputs_co]:
     Args:
         record: A dataclass such as :class:`ImageInputs`, of some type of arrays.
     """
-    kind = typing.get_origin(record) or record
+    kind: Any = typing.get_origin(record) or record
     types = _field_types(record)
     fields = [field.replace(annotation=types[name]) for name, field in inspect.signature(kind).parameters.items()]
-    documentation = inspect.getdoc(ImageInputs).partition("Args:\n")[2]  # type: ignore[union-attr]
-    entries = textwrap.indent(documentation, 8 * " ").rstrip()
+    classes = [base for base in reversed(kind.__mro__) if dataclasses.is_dataclass(base)]
+    documentation = "\n".join((inspect.getdoc(base) or "").partition("Args:\n")[2] for base in classes)
+    entries = textwrap.indent(documentation, 8 * " ")
 
     def decorate(method: Callable[..., Any]) -> Callable[..., Any]:
         *others, _ = inspect.signature(method).parameters.values()

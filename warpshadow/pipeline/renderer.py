@@ -45,7 +45,12 @@ RendererType = TypeVar("RendererType", bound="SceneRenderer")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ViewArrays(ImageArrays):
-    """All that an image takes, or its view in place of geometry and cameras."""
+    """All that an image takes, and its view, which may be made before.
+
+    Args:
+        view: From ``view``, in place of geometry and cameras; by default the scene's own. Where it is given, only the
+            stages after it are explained.
+    """
 
     view: View | None = None
 
@@ -307,7 +312,6 @@ class SceneRenderer:
 
         Args:
             inputs: All that an image takes.
-            view: From :meth:`view`, in place of geometry and cameras; by default the scene's own.
         Returns:
             Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]; the background is 0.
         Differentiable: all.
@@ -444,7 +448,6 @@ class SceneRenderer:
 
         Args:
             inputs: All that an image takes.
-            view: As for :meth:`draw`: then only the stages after it are explained.
         Returns:
             The stages, which print as a table: whether each runs and on how many items, how long it took last, and why
             it does or does not run; then the same of the adjoints. Nothing is computed.
