@@ -222,6 +222,17 @@ class LaneFunctions(NamedTuple):
     total: wp.Function
 
 
+def _total_code(lanes: int) -> str:
+    """C++ for the sum of a vector's items, the first half plus the second, and so on, each time all at once."""
+    lines, name = [], "value.c"
+    for half in (8, 4, 2, 1):
+        if half < lanes:
+            lines.append(f"float sums_{half}[{half}];")
+            lines.append(f"for (int i = 0; i < {half}; ++i) sums_{half}[i] = {name}[i] + {name}[i + {half}];")
+            name = f"sums_{half}"
+    return "\n".join([*lines, f"return {name}[0];"])
+
+
 @functools.cache
 def make_lane_functions(lanes: int) -> LaneFunctions:
     """Make the kernel functions for a number of lanes."""
@@ -244,15 +255,7 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
     """)
     def bits_above(value: Lane, limit: float) -> int: ...  # type: ignore[empty-body]
 
-    @wp.func_native(f"""
-    float part[{lanes}];
-    for (int lane = 0; lane < {lanes}; ++lane)
-        part[lane] = value.c[lane];
-    for (int half = {lanes} / 2; half > 0; half /= 2)
-        for (int lane = 0; lane < half; ++lane)
-            part[lane] += part[lane + half];
-    return part[0];
-    """)
+    @wp.func_native(_total_code(lanes))
     def total(value: Lane) -> float: ...  # type: ignore[empty-body]
 
     @wp.func(inline=True)
