@@ -75,9 +75,9 @@ def whole_launches(function: Callable[[], object], runs: int) -> dict[tuple[str,
         launch = bound_kernel(kernel, *arguments, **options)
         label = kernel.key.split("__locals__")[-1] + (", adjoint" if options.get("gradients") else "")
 
-        def run(dim: object, *first: object) -> None:
+        def run(dim: object, *first: object, **options: object) -> None:
             start = time.thread_time()
-            launch(dim, *first)
+            launch(dim, *first, **options)
             if not first:
                 key = label, numbers[label]
                 numbers[label] += 1

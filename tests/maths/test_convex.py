@@ -189,7 +189,7 @@ def test_prisms_that_are_none_have_no_parts():
     assert parts_of(twisted) is None
     assert parts_of(wall_of([*sieve, "#" * 21], 1.0)) is None  # 50 windows
     parts = parts_of(together(wall_of(rows, 1.0), box(middle=(9, 0, 0))))
-    assert [part.is_seam for part in parts] == [False] * 5 + [True] * 4
+    assert [(part.piece, part.is_seam) for part in parts] == [(0, False)] * 4 + [(0, True)] * 4 + [(1, False)]
 
 
 def roof(ridge, top, slope):

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+import trimesh
 import warp as wp
 
 import warpshadow as ws
@@ -63,6 +64,16 @@ def pierced() -> ws.Mesh:
     ball, spindle = ws.icosphere(0.7, 3), ws.icosphere(1.0, 2)
     points = np.concatenate([ball.positions, spindle.positions * (1.6, 0.4, 0.4)])
     return ws.Mesh(points, np.concatenate([ball.faces, spindle.faces + len(ball.positions)]))
+
+
+def solids() -> ws.Mesh:
+    """A wall on a slab, each a box."""
+    boxes = [
+        trimesh.creation.box(size).apply_translation(at)
+        for size, at in (((2, 0.2, 1.6), (0, -0.3, 0)), ((0.3, 1.4, 1.2), (0.4, 0.4, 0)))
+    ]
+    whole = trimesh.util.concatenate([box.subdivide().subdivide() for box in boxes])
+    return ws.Mesh(whole.vertices, whole.faces).creased()
 
 
 def turned(renderer: SceneRenderer, angles, requires_grad=False) -> Poses:
@@ -139,13 +150,20 @@ def test_images_in_harmonics_are_nearer_to_rays_than_with_spheres(order):
     assert errors[0] < 0.75 * errors[1]
 
 
-@pytest.mark.parametrize("method", ["directional", "log-sh"])
+@pytest.mark.parametrize(
+    ("method", "mesh"),
+    [("directional", None), ("log-sh", None), ("directional", solids())],
+    ids=["directional", "log-sh", "solids"],
+)
 @pytest.mark.parametrize("receivers", ["vertex", "pixel"])
-def test_gradients_to_rotations_are_central_differences(receivers, method, device):
-    """Of weighted shading, through vertices, normals, places in faces, and lookups or turned lobes."""
+def test_gradients_to_rotations_are_central_differences(receivers, method, mesh, device):
+    """Of weighted shading, through vertices, normals, places in faces, and lookups, turned lobes or parts."""
     other = ws.Body(ws.icosphere(0.6, 2), blockers=ws.Spheres([[0, 0, 0]], [0.6]), translation=(-1.4, 0.3, 0))
     bodies = (other,) if method == "log-sh" else ()
-    renderer = SceneRenderer(scene_of(receivers, method=method, order=4, bodies=bodies), device=device)
+    scene = scene_of(receivers, method=method, order=4, bodies=bodies)
+    if mesh is not None:
+        scene = dataclasses.replace(scene, bodies=(dataclasses.replace(scene.bodies[0], mesh=mesh, blockers="auto"),))
+    renderer = SceneRenderer(scene, device=device)
     rng = np.random.default_rng(3)
 
     def shading_of(poses):
@@ -155,7 +173,7 @@ def test_gradients_to_rotations_are_central_differences(receivers, method, devic
         poses = turned(renderer, (0, 0, 0), True)
         shading = shading_of(poses)
     middle = shading.numpy().astype(float)
-    weights = rng.normal(size=middle.shape)
+    weights = rng.normal(1, size=middle.shape)
 
     def differences(axis):
         ends = [shading_of(turned(renderer, sign * STEP * axis)).numpy().astype(float) for sign in (1, -1)]

@@ -144,6 +144,59 @@ def test_prisms_of_a_body_cover_their_seam_once(device):
             assert share == pytest.approx(met, abs=RAYS)
 
 
+def test_pieces_of_a_body_are_blockers_of_their_own(device):
+    """From the second point one of them stands before another, which covers no more."""
+    starts, parts = np.cumsum([0, *map(len, VERTICES)]), []
+    for number, mesh in enumerate(MESHES):
+        (part,) = find_convex_parts(mesh.vertices, mesh.faces)
+        parts.append(part._replace(corners=part.corners + starts[number], piece=number))
+    some = ConvexBlockers.from_bodies([ConvexBody(parts, 0)], int(starts[-1]), device=device)
+    placed = some.placed(wp.array(np.concatenate(VERTICES)[None], dtype=wp.vec3, device=device))
+    points = np.array([[0.4, 0.2, -0.9], [0.5, 3.0, 0.3]])
+    got = part_coverage(wp.array(points[None], dtype=wp.vec3, device=device), placed, some, DIRECTIONS).numpy()[0]
+    for point, found in zip(points, got, strict=True):
+        expected = twin(point, DIRECTIONS, cell_radius(32), [[0], [1], [2]])
+        np.testing.assert_allclose(found[:, 0], expected[:, 0], rtol=0, atol=RAYS)
+
+
+SLAB, POST = trimesh.creation.box((2, 0.2, 1)), trimesh.creation.box((0.3, 1, 0.4))
+POST.apply_translation([0.5, 0.55, 0])  # its foot is 5 cm within the slab
+TILTED = np.array([0.25, 1, -0.2]) / np.linalg.norm([0.25, 1, -0.2])
+
+
+@pytest.mark.parametrize(
+    ("point", "normal", "blocking"),
+    [
+        ((-0.3, 0.1, 0.2), (0, 1, 0), [1]),
+        ((-0.3, 0.1, 0.2), TILTED, [1]),  # of smooth normals
+        ((-1, 0.1, 0.5), TILTED, [1]),  # a corner
+        ((0.35, 0.5, 0.1), (-1, 0, 0), [0]),
+        ((0.5, 1.05, 0), (0, 1, 0), []),
+        ((0.5, -0.1, 0), (0, -1, 0), []),
+        ((0.5, 0.08, 0), (1, 0, 0), [0, 1]),  # within both
+        ((0.6, 0.1, 0), (0, 1, 0), [1]),  # on the slab, within the post
+    ],
+)
+@pytest.mark.parametrize("shift", [0.0, 300.0])
+def test_parts_block_no_light_of_receivers_that_lie_on_them(point, normal, blocking, shift, device):
+    parts, meshes = [], [SLAB, POST]
+    for number, mesh in enumerate(meshes):
+        (part,) = find_convex_parts(mesh.vertices, mesh.faces)
+        parts.append(part._replace(corners=part.corners + 8 * number, piece=number))
+    some = ConvexBlockers.from_bodies([ConvexBody(parts, 0)], 16, device=device)
+    vertices = np.concatenate([mesh.vertices for mesh in meshes]) + shift
+    placed = some.placed(wp.array(vertices[None], dtype=wp.vec3, device=device))
+    at, facing = (wp.array(np.array([[v]]), dtype=wp.vec3, device=device) for v in (np.add(point, shift), normal))
+    got = part_coverage(at, placed, some, DIRECTIONS, horizon_normals=facing, on_surface=True).numpy()[0, 0, :, 0]
+    is_above = DIRECTIONS @ normal > 0
+    radius = cell_radius(32)
+    bodies = [[number] for number in blocking]
+    solids = [mesh.vertices for mesh in meshes]
+    expected = twin(np.array(point, float), DIRECTIONS, radius, bodies, vertices=solids)[:, 0] if bodies else 0 * got
+    np.testing.assert_allclose(got[is_above], expected[is_above], rtol=0, atol=RAYS + 1e-4 * shift)
+    np.testing.assert_array_equal(got[~is_above], 0)
+
+
 def test_narrow_cells_and_a_receivers_own_body_are_left_to_it(device):
     # beside corners, where silhouettes are
     toward = np.concatenate([VERTICES[0], VERTICES[1]])[:16] - POINTS[0] + 0.004

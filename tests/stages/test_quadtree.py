@@ -39,7 +39,7 @@ def shares_of(fragments, supersampling, value):
 
 def receivers_in(positions, faces, fragments, quadtree, supersampling):
     wants = KEYS >= 0
-    numbering = number_receivers(faces, np.repeat([[False, True]], [4, 3], axis=1))
+    numbering = number_receivers(np.repeat([[False, True]], [4, 3], axis=1), device=faces.device)
     normals = vertex_normals(positions, faces)
     return find_receivers(
         positions, normals, faces, fragments, numbering, wants, supersampling=supersampling, quadtree=quadtree

@@ -37,7 +37,7 @@ def two_triangles(device, cameras: int, requires_grad=False):
 def receivers_of(positions, faces, matrices, wants_samples, supersampling=1):
     fragments = rasterize(to_clip(positions, matrices), faces, 12, 12)
     wants = np.array(wants_samples)
-    numbering = number_receivers(faces, np.repeat(~wants, 3)[None])
+    numbering = number_receivers(np.repeat(~wants, 3)[None], device=faces.device)
     found = find_receivers(
         positions, vertex_normals(positions, faces), faces, fragments, numbering, wants, supersampling=supersampling
     )
@@ -105,7 +105,7 @@ def slats(device, *, bend: float = 0.0):
 
 def shared_receivers(positions, faces, fragments, pieces):
     wants, normals = np.ones(4, bool), vertex_normals(positions, faces)
-    numbering = number_receivers(faces, np.zeros((1, 8), bool))
+    numbering = number_receivers(np.zeros((1, 8), bool), device=faces.device)
     pieces = wp.array(pieces, dtype=wp.int32, device=faces.device)
     arguments = positions, normals, faces, fragments, numbering, wants
     found = find_receivers(*arguments, supersampling=2, smooth_pieces=pieces)
@@ -151,7 +151,7 @@ def test_while_a_graph_is_captured_every_sample_has_room_for_a_receiver(device):
     fragments = rasterize(to_clip(positions, matrices), faces, 12, 12)
     normals = vertex_normals(positions, faces)
     wants = np.array([True, False])
-    numbering = number_receivers(faces, np.repeat(~wants, 3)[None])
+    numbering = number_receivers(np.repeat(~wants, 3)[None], device=faces.device)
     with wp.ScopedCapture(device=device) as capture:
         found = find_receivers(positions, normals, faces, fragments, numbering, wants, supersampling=2)
     wp.capture_launch(capture.graph)
@@ -175,7 +175,7 @@ def test_views_of_one_geometry_share_the_vertices_that_any_of_them_sees(device):
     positions, faces, matrices = two_triangles(device, 3)
     normals = vertex_normals(positions, faces)
     fragments = rasterize(to_clip(positions, matrices), faces, 12, 12)
-    numbering = number_receivers(faces, np.array([[False, False, False, True, True, True]]))
+    numbering = number_receivers(np.array([[False, False, False, True, True, True]]), device=faces.device)
     found = find_receivers(positions, normals, faces, fragments, numbering, np.zeros(2, bool))
     np.testing.assert_array_equal(found.points.numpy(), positions.numpy()[:, 3:])
     np.testing.assert_array_equal(found.normals.numpy(), normals.numpy()[:, 3:])
@@ -236,7 +236,7 @@ def test_receivers_of_bodies_that_are_told_apart_follow_each_other(device, wants
     normals, wants = vertex_normals(positions, faces), np.array(wants_samples)
     fragments = rasterize(to_clip(positions, matrices), faces, 12, 12)
     bodies = np.array([1, -1])
-    numbering = number_receivers(faces, np.repeat(~wants, 3)[None], bodies=np.repeat(bodies, 3))
+    numbering = number_receivers(np.repeat(~wants, 3)[None], bodies=np.repeat(bodies, 3), device=faces.device)
     found = find_receivers(positions, normals, faces, fragments, numbering, wants, bodies)
     got = interpolate(found.fragments, found.faces, found.points).numpy()
     assert np.abs(got - interpolate(fragments, faces, positions).numpy()).max() < FLOAT32
@@ -267,7 +267,7 @@ def seen_points(device, mesh, matrix, *, rises, turned=False):
     normals = vertex_normals(positions, faces)
     fragments = rasterize(to_clip(positions, wp.array([matrix], dtype=wp.mat44, device=device)), faces, 24, 24)
     wants = np.ones(len(mesh.faces), bool)
-    numbering = number_receivers(faces, np.zeros((1, len(mesh.positions)), bool))
+    numbering = number_receivers(np.zeros((1, len(mesh.positions)), bool), device=faces.device)
     return find_receivers(positions, normals, faces, fragments, numbering, wants, rises=rises).points.numpy()[0]
 
 

@@ -1,13 +1,14 @@
 """Batches: every array of a stage has a leading dimension of instances, and a length of 1 serves them all."""
 
 import functools
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import warp as wp
 
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.device.launch import launch
+from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty, reshaped
 from warpshadow.device.warp_internals import contiguous_view
 
@@ -66,11 +67,25 @@ def concatenate(parts: Sequence[wp.array], counts: Sequence[int], *, instances: 
     if instances is None:
         instances = common_batch({f"part {number}": part for number, part in enumerate(parts)})
     joined = empty((instances, sum(counts)), dtype=parts[0].dtype, device=parts[0].device)
-    first = 0
-    for part, count in zip(parts, counts, strict=True):
-        launch(_make_copy(part.dtype), (instances, count), inputs=[part, first], outputs=[joined])
-        first += count
-    return joined
+    places = [(end - count, end) for end, count in zip(itertools.accumulate(counts), counts, strict=True)]
+    if not is_readable(joined.device):
+        for part, (first, end) in zip(parts, places, strict=True):
+            launch(_make_copy(part.dtype), (instances, end - first), inputs=[part, first], outputs=[joined])
+        return joined
+
+    def copy(joined: wp.array) -> None:
+        """By NumPy, ten times as fast as the kernel."""
+        for part, (first, end) in zip(parts, places, strict=True):
+            joined.numpy()[:, first:end] = part.numpy()
+
+    def add(adj_joined: wp.array) -> None:
+        for part, (first, end) in zip(parts, places, strict=True):
+            if part.requires_grad:
+                gradient, values = part.grad.numpy(), adj_joined.numpy()[:, first:end]
+                summed_axes = tuple(axis for axis in range(2) if gradient.shape[axis] < values.shape[axis])
+                gradient += values.sum(axis=summed_axes, keepdims=True) if summed_axes else values
+
+    return differentiable(copy, add, joined, parts)
 
 
 def cut(array: wp.array, first: int, end: int) -> wp.array:

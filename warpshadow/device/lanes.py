@@ -211,26 +211,65 @@ class LaneFunctions(NamedTuple):
     subtract: wp.Function
     find_block: wp.Function
     load: wp.Function
-    load_products: wp.Function
+    load_columns: wp.Function
+    multiply_by_columns: wp.Function
+    store_columns: wp.Function
+    add_columns: wp.Function
     add_vectors: wp.Function
     load_rows: wp.Function
     add_rows: wp.Function
     store_rows: wp.Function
-    store_columns: wp.Function
     sqrt: wp.Function
     smoothstep: wp.Function
     total: wp.Function
 
 
-def _total_code(lanes: int) -> str:
-    """C++ for the sum of a vector's items, the first half plus the second, and so on, each time all at once."""
-    lines, name = [], "value.c"
-    for half in (8, 4, 2, 1):
-        if half < lanes:
-            lines.append(f"float sums_{half}[{half}];")
-            lines.append(f"for (int i = 0; i < {half}; ++i) sums_{half}[i] = {name}[i] + {name}[i + {half}];")
-            name = f"sums_{half}"
-    return "\n".join([*lines, f"return {name}[0];"])
+def _sum_of_halves(lanes: int) -> str:
+    """C++ that adds up a vector. A loop over halves goes through memory: half the time of some adjoints."""
+    if lanes == 1:
+        return "return value.c[0];"
+    half = lanes // 2
+    lines = [
+        f"typedef float Numbers __attribute__((ext_vector_type({lanes})));",
+        "Numbers numbers;",
+        "__builtin_memcpy(&numbers, value.c, sizeof numbers);",
+        f"const auto part_{half} = numbers.lo + numbers.hi;",
+    ]
+    while half > 1:
+        half //= 2
+        lines.append(f"const auto part_{half} = part_{2 * half}.lo + part_{2 * half}.hi;")
+    return "\n".join([*lines, "return part_1;"])
+
+
+def _on_columns(statement: str, lanes: int) -> str:
+    """C++ that runs a statement on each ``number`` of rows of a block's vertices and its ``item`` of scratch memory.
+
+    Plain Warp finds the address of each number anew, and loads or stores a whole vector for it. For one lane that
+    takes fewer registers than addresses that are kept.
+    """
+    if lanes == 1:
+        return f"""
+        const int vertex_count = block < rows.shape[0] ? 1 : 0;
+        for (int k = 0; k < vertex_count * count; ++k) {{
+            wp::float32& number = wp::index(rows, block, begin + k);
+            wp::float32& item = wp::index(scratch, first + k).c[0];
+            {statement};
+        }}
+        """
+    return f"""
+    const int first_vertex = block * {lanes};
+    const int vertex_count = rows.shape[0] - first_vertex < {lanes} ? rows.shape[0] - first_vertex : {lanes};
+    const int column_step = rows.strides[1] / (int)sizeof(wp::float32);
+    for (int lane = 0; lane < vertex_count; ++lane) {{
+        wp::float32* row = &wp::index(rows, first_vertex + lane, begin);
+        wp::float32* lane_items = &wp::index(scratch, first).c[lane];
+        for (int k = 0; k < count; ++k) {{
+            wp::float32& number = row[k * column_step];
+            wp::float32& item = lane_items[k * {lanes}];
+            {statement};
+        }}
+    }}
+    """
 
 
 @functools.cache
@@ -255,7 +294,7 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
     """)
     def bits_above(value: Lane, limit: float) -> int: ...  # type: ignore[empty-body]
 
-    @wp.func_native(_total_code(lanes))
+    @wp.func_native(_sum_of_halves(lanes))
     def total(value: Lane) -> float: ...  # type: ignore[empty-body]
 
     @wp.func(inline=True)
@@ -314,63 +353,82 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
         return Vectors(x, y, z)
 
     @wp.func
-    def load_products(
-        a: wp.array2d(dtype=wp.float32),
-        b: wp.array2d(dtype=wp.float32),
-        begin: int,
-        count: int,
-        block: int,
-        scratch: wp.array(dtype=Lane),
-    ):
-        """scratch[k] = a b of the block's vertices in the column ``begin`` + k, 0 past the last vertex."""
-        for k in range(count):
-            value = Lane()
-            for lane in range(wp.min(lanes, a.shape[0] - block * lanes)):
-                vertex = block * lanes + lane
-                value[lane] = a[vertex, begin + k] * b[vertex, begin + k]
-            scratch[k] = value
-
-    @wp.func
     def add_vectors(a: Vectors, block: int, values: wp.array(dtype=wp.vec3)):
         """Add to a block's vectors."""
         for lane in range(wp.min(lanes, values.shape[0] - block * lanes)):
             wp.atomic_add(values, block * lanes + lane, wp.vec3(a.x[lane], a.y[lane], a.z[lane]))
 
+    @wp.func_native(
+        _on_columns("item = number", lanes)
+        + f"""
+    for (int lane = vertex_count; lane < {lanes}; ++lane)
+        for (int k = 0; k < count; ++k)
+            wp::index(scratch, first + k).c[lane] = outside;
+    """
+    )
+    def load_columns(
+        rows: wp.array2d(dtype=wp.float32),
+        begin: int,
+        count: int,
+        block: int,
+        outside: float,
+        scratch: wp.array(dtype=Lane),
+        first: int,
+    ):
+        """scratch[first + k] = rows[the block's vertices, begin + k] for ``count`` columns; past them ``outside``."""
+        ...
+
+    @wp.func_native(_on_columns("item *= number", lanes))
+    def multiply_by_columns(
+        rows: wp.array2d(dtype=wp.float32),
+        begin: int,
+        count: int,
+        block: int,
+        scratch: wp.array(dtype=Lane),
+        first: int,
+    ):
+        """scratch[first + k] *= rows[the block's vertices, begin + k] for ``count`` columns."""
+        ...
+
+    @wp.func_native(_on_columns("number = item", lanes))
+    def store_columns(
+        scratch: wp.array(dtype=Lane),
+        first: int,
+        rows: wp.array2d(dtype=wp.float32),
+        begin: int,
+        count: int,
+        block: int,
+    ):
+        """rows[the block's vertices, begin + k] = scratch[first + k] for ``count`` columns."""
+        ...
+
+    @wp.func_native(_on_columns("wp::atomic_add(&number, factor * item)", lanes))
+    def add_columns(
+        factor: float,
+        scratch: wp.array(dtype=Lane),
+        first: int,
+        rows: wp.array2d(dtype=wp.float32),
+        begin: int,
+        count: int,
+        block: int,
+    ):
+        """rows[the block's vertices, begin + k] += factor · scratch[first + k] for ``count`` columns."""
+        ...
+
     @wp.func
     def load_rows(rows: wp.array2d(dtype=wp.float32), block: int, scratch: wp.array(dtype=Lane)):
         """scratch[k] = rows[the block's vertices, k], 0 past the last vertex."""
-        for k in range(rows.shape[1]):
-            value = Lane()
-            for lane in range(wp.min(lanes, rows.shape[0] - block * lanes)):
-                value[lane] = rows[block * lanes + lane, k]
-            scratch[k] = value
+        load_columns(rows, 0, rows.shape[1], block, 0.0, scratch, 0)
 
     @wp.func
     def add_rows(scratch: wp.array(dtype=Lane), block: int, rows: wp.array2d(dtype=wp.float32)):
         """rows[the block's vertices, k] += scratch[k]."""
-        for lane in range(wp.min(lanes, rows.shape[0] - block * lanes)):
-            vertex = block * lanes + lane
-            for k in range(rows.shape[1]):
-                rows[vertex, k] = rows[vertex, k] + scratch[k][lane]
-
-    # Plain Warp loads a whole vector for each of its numbers.
-    @wp.func_native(f"""
-    const int first = block * {lanes};
-    const int past = first + {lanes} < rows.shape[0] ? first + {lanes} : rows.shape[0];
-    for (int vertex = first; vertex < past; ++vertex)
-        for (int k = 0; k < count; ++k)
-            wp::index(rows, vertex, begin + k) = wp::index(scratch, k).c[vertex - first];
-    """)
-    def store_columns(
-        scratch: wp.array(dtype=Lane), begin: int, count: int, block: int, rows: wp.array2d(dtype=wp.float32)
-    ):
-        """rows[the block's vertices, begin + k] = scratch[k] for ``count`` columns."""
-        ...
+        add_columns(1.0, scratch, 0, rows, 0, rows.shape[1], block)
 
     @wp.func
     def store_rows(scratch: wp.array(dtype=Lane), block: int, rows: wp.array2d(dtype=wp.float32)):
         """rows[the block's vertices, k] = scratch[k]."""
-        store_columns(scratch, 0, rows.shape[1], block, rows)
+        store_columns(scratch, 0, rows, 0, rows.shape[1], block)
 
     @wp.func
     def sqrt(value: Lane):

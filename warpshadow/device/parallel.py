@@ -218,37 +218,35 @@ def _launch_slices(
         )
     is_divisible = device.is_cpu and not device.is_capturing
     slice_count = min(dim[0], maximum, int(math.prod(dim) * cost / min_work)) if is_divisible else 1
-    launch = functools.partial(warp_internals.bound_kernel, kernel, device=device)
     if not summed_arguments and slice_count > workers:
         slice_count -= slice_count % workers  # as many for each thread
     if slice_count <= 1 or (not summed_arguments and workers == 1):
-        launch(arguments, gradients=gradients)(dim)
+        warp_internals.bound_kernel(kernel, arguments, device, gradients=gradients)(dim)
         return
     slice_sums = {
         argument_index: zeros((slice_count, *array.shape), array.dtype, device=device)
         for argument_index, array in summed_arguments.items()
     }
     kernel.module.load(device, 1)  # compiled here, not by each thread
-    launches = [] if slice_sums else [launch(arguments, gradients=gradients)] * slice_count
-    for number in range(len(launches), slice_count):
-        values, adjoints = list(arguments), None if gradients is None else list(gradients)
-        for argument_index, parts in slice_sums.items():
-            if adjoints is None:
-                values[argument_index] = parts[number]
-            else:
-                values[argument_index], adjoints[argument_index] = (
-                    _with_gradient(values[argument_index], parts[number]),
-                    parts[number],
-                )
-        launches.append(launch(values, gradients=adjoints))
+    for argument_index, parts in slice_sums.items():
+        if gradients is None:
+            arguments[argument_index] = parts[0]
+        else:
+            arguments[argument_index] = _with_gradient(arguments[argument_index], parts[0])
+            gradients[argument_index] = parts[0]
+    launch = warp_internals.bound_kernel(kernel, arguments, device, gradients=gradients)
     starts = [dim[0] * k // slice_count for k in range(slice_count + 1)]
 
     def run(number: int, worker: int) -> None:
-        launches[number]((starts[number + 1] - starts[number], *dim[1:]), starts[number], worker)
+        offsets = {argument_index: number * parts.strides[0] for argument_index, parts in slice_sums.items()}
+        launch((starts[number + 1] - starts[number], *dim[1:]), starts[number], worker, offsets=offsets)
 
     _share(run, slice_count, workers)
     for argument_index, parts in slice_sums.items():
-        summed_arguments[argument_index].numpy()[...] += parts.numpy().sum(axis=0)
+        total, *others = parts.numpy()
+        for other in others:
+            total += other
+        summed_arguments[argument_index].numpy()[...] += total
 
 
 def _with_gradient(array: wp.array, gradient: wp.array) -> wp.array:

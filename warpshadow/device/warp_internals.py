@@ -10,7 +10,7 @@ import functools
 import inspect
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import warp as wp
@@ -158,7 +158,8 @@ def bound_kernel(
 ) -> Callable[..., None]:
     """Make the function that launches a kernel with arguments off the tape, or its adjoint where gradients are given.
 
-    It takes the dimensions of a launch, and then values in place of the first arguments, if they are others each time.
+    It takes the dimensions of a launch; then values in place of the first arguments, if they are others each time; and
+    ``offsets``, bytes by which other arrays begin later, by argument index. Of an adjoint these are their gradients.
 
     On a CPU arguments go straight to the compiled function: ``wp.launch`` takes ten times as long to look at them as
     small kernels run. Warp itself launches unusual calls, such as with an argument of a wrong type, and reports the
@@ -168,28 +169,49 @@ def bound_kernel(
     is_plain = wp._src.context.runtime._apic_capture is None and not wp.config.print_launches
     if signature is not None and is_plain and (fields := _fields(signature, arguments, gradients)) is not None:
         (values, *others), (_, _, _, loaded_hooks), names = fields, signature, signature[0]._fields_
-        adjoints = [ctypes.byref(other) for other in others]
 
-        def run_plainly(dim: Sequence[int], *first: Any, holds: Any = (arguments, gradients)) -> None:
-            copied_values = values
+        def run_plainly(
+            dim: Sequence[int], *first: Any, offsets: Mapping[int, int] = {}, holds: Any = (arguments, gradients)
+        ) -> None:
+            copied_values, adjoints = values, others
             if first:
                 copied_values = type(values).from_buffer_copy(values)
                 for (name, _), value in zip(names, first, strict=False):
                     setattr(copied_values, name, value)
+            if offsets:
+                adjoints = [type(other).from_buffer_copy(other) for other in others]
+                for argument_index, offset in offsets.items():
+                    name = names[argument_index][0]
+                    if adjoints:
+                        getattr(copied_values, name).grad += offset
+                    getattr(adjoints[0] if adjoints else copied_values, name).data += offset
             if 0 not in dim:
                 hooks, bounds = _cpu_hooks(kernel, loaded_hooks, device), _cpu_bounds(tuple(dim), kernel.adj.kernel_dim)
-                (hooks.backward if adjoints else hooks.forward)(bounds, ctypes.byref(copied_values), *adjoints)
+                structs = map(ctypes.byref, (copied_values, *adjoints))
+                (hooks.backward if adjoints else hooks.forward)(bounds, *structs)
 
         return run_plainly
 
-    def run_by_warp(dim: Sequence[int], *first: Any) -> None:
+    def run_by_warp(dim: Sequence[int], *first: Any, offsets: Mapping[int, int] = {}) -> None:
         options: dict[str, Any] = {"block_dim": BLOCK_DIM} if device.is_cuda else {}
-        if gradients is not None:
-            options |= {"adj_inputs": gradients, "adjoint": True}
-        inputs = [*first, *arguments[len(first) :]]
+        inputs, adjoints = list(arguments), None if gradients is None else list(gradients)
+        for argument_index, offset in offsets.items():
+            moved = _moved((inputs if adjoints is None else adjoints)[argument_index], offset)
+            if adjoints is None:
+                inputs[argument_index] = moved
+            else:
+                inputs[argument_index], adjoints[argument_index] = _moved(inputs[argument_index], 0, moved), moved
+        if adjoints is not None:
+            options |= {"adj_inputs": adjoints, "adjoint": True}
+        inputs[: len(first)] = first
         wp.launch(kernel, dim=dim, inputs=inputs, device=device, record_tape=False, **options)
 
     return run_by_warp
+
+
+def _moved(array: wp.array, offset: int, gradient: wp.array | None = None) -> wp.array:
+    """View memory of the shape of a contiguous array that begins some bytes after it."""
+    return wp.array(ptr=array.ptr + offset, dtype=array.dtype, shape=array.shape, device=array.device, grad=gradient)
 
 
 def _fields(signature: tuple, arguments: Sequence[Any], gradients: Sequence[Any] | None) -> list[Any] | None:

@@ -41,6 +41,13 @@ class ConvexPart(NamedTuple):
     """Ends of each edge, indices of corners, and the faces to its left and right, [edge, 4]."""
     is_seam: bool = False
     """Whether it is the face that two prisms share: seen at a slant both cover it, so it is to be taken off."""
+    piece: int = 0
+    """Number of the piece of the mesh, from 0. Parts of one piece are beside each other. All panels are of one."""
+
+
+def is_panel(part: ConvexPart) -> bool:
+    """Whether a part is a panel of a sheet, which encloses nothing."""
+    return len(part.faces) == 2 and not part.is_seam
 
 
 def find_convex_parts(
@@ -56,7 +63,8 @@ def find_convex_parts(
 
     Returns:
         The parts, which may touch and overlap: for each closed piece of the mesh a solid, or the prisms into which it
-        is cut if it is one, with holes or without; panels for each open one. The seams of prisms come last. None where
+        is cut if it is one, with holes or without; panels for each open one. They come by pieces, and in each the seams
+        of prisms come last. None where
         a closed piece is hollow or curved otherwise, where a part has more than 64 faces, or where there are more than
         32 prisms of a piece, or 64 panels.
     """
@@ -65,7 +73,7 @@ def find_convex_parts(
     triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
     if not len(triangles):
         return None
-    points, solids, sheets = positions.astype(np.float64)[first], [], []
+    points, pieces, sheets = positions.astype(np.float64)[first], [], []
     piece = _pieces(triangles)
     for number in range(piece.max() + 1):
         piece_triangles = triangles[piece == number]
@@ -76,12 +84,17 @@ def find_convex_parts(
         prisms = _prisms(points, piece_triangles) if solid is None else [solid]
         if prisms is None:
             return None
-        solids += prisms
+        pieces.append(prisms)
     panels = _find_panels(points, sheets, tolerances)
     if panels is None:
         return None
-    parts = sorted([*solids, *map(_panel, panels)], key=lambda part: part.is_seam)
-    return [part._replace(corners=first[part.corners]) for part in parts]
+    if panels:
+        pieces.append([_panel(panel) for panel in panels])
+    return [
+        part._replace(corners=first[part.corners], piece=number)
+        for number, parts in enumerate(pieces)
+        for part in parts
+    ]
 
 
 def _find_panels(points: np.ndarray, sheets: list[np.ndarray], tolerances: Sequence[float]) -> list[np.ndarray] | None:

@@ -1,7 +1,8 @@
 """Convex blockers of a scene: bodies that consist of convex parts, such as boxes, rods and panels of cloth.
 
 Spheres bulge out of flat sides and thin boards, and light comes between them. Instead, the share of a cell of
-directions that each part covers is computed. On themselves such bodies cast shadows found by rays.
+directions that each part covers is computed. The parts of solids block their own light, too; panels are chords of bent
+cloth, in which its receivers do not lie, so sheets cast shadows on themselves found by rays.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import warp as wp
 
 from warpshadow.maths.convex import ConvexPart
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.scene.blockers import blocking_parts
+from warpshadow.scene.blockers import blocking_parts, solid_bodies
 from warpshadow.stages.convex.coverage import part_coverage
 from warpshadow.stages.convex.prepared import ConvexBlockers, ConvexBody, PlacedParts
 
@@ -25,6 +26,7 @@ class GroupConvexParts(NamedTuple):
     blockers: ConvexBlockers
     placed: PlacedParts
     skip: int | None = None  # index, among the bodies of blockers, of the body that the receivers are part of
+    on_surface: bool = False  # whether receivers lie on the parts, which are those of one body
 
     def coverage(
         self, points: wp.array, horizon_normals: wp.array | None, directions: np.ndarray, radius: float | None = None
@@ -38,6 +40,7 @@ class GroupConvexParts(NamedTuple):
             radius=radius,
             horizon_normals=horizon_normals,
             skip=self.skip,
+            on_surface=self.on_surface,
         )
 
 
@@ -58,6 +61,11 @@ class SceneConvexParts:
         is_flat = self._merged_scene.is_flat
         parts = blocking_parts(self._merged_scene.scene)
         return {number: parts[number] for number in parts if not is_flat[number]}
+
+    @functools.cached_property
+    def solids(self) -> frozenset[int]:
+        """Bodies whose parts block their own light, too."""
+        return solid_bodies(self._merged_scene.scene)
 
     def blockers(self, bodies: tuple[int, ...], blocking_bodies: tuple[int, ...]) -> ConvexBlockers:
         """Convex blockers of some of these bodies; ``blocking_bodies`` cast shadows."""

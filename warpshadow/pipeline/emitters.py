@@ -33,6 +33,7 @@ from warpshadow.stages.emitters.samples import (
 )
 from warpshadow.stages.emitters.spheres import find_log_transmittance
 from warpshadow.stages.gloss.transmittance import transmittance_of_directions
+from warpshadow.stages.joint_coverage import transmittance_past
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
@@ -127,7 +128,11 @@ def _light_of(
     total = wp.zeros(points.shape, dtype=wp.vec3, device=points.device)
     if not points.size:
         return total
-    cells = None if group.self_lookup is None else group.self_transmittance()
+    cells = (
+        transmittance_past(None, group.own_coverage(EMITTER_CELLS))
+        if group.has_own_coverage
+        else group.looked_up_transmittance()
+    )
     sphere_bodies = blockers.sphere_blockers(blockers.bodies)
     spheres = merged_scene.spheres_of(sphere_bodies, blockers.spheres)
     traced_body = group.body if group.body in blockers.blocker_kinds.traced else None

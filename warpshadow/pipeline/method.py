@@ -90,7 +90,7 @@ class Method:
         bodies = range(len(self.merged_scene.scene.bodies))
         if self.merged_scene.scene.bounces or self.has_emitters:
             return np.array(bodies)
-        separate = {*blocker_kinds.traced, *blocker_kinds.planes, *np.flatnonzero(self.merged_scene.is_glossy).tolist()}
+        separate = {*blocker_kinds.separate, *np.flatnonzero(self.merged_scene.is_glossy).tolist()}
         return np.array([body if body in separate else -1 for body in bodies]) if separate else None
 
     def numbering(
@@ -101,20 +101,17 @@ class Method:
         Those on static bodies are the same in both, as results about them are cached.
         """
         moving = None if static_bodies is None else static_bodies.moving
-        key = blocker_kinds.traced, blocker_kinds.planes, blocker_kinds.bulging, moving
+        key = frozenset(blocker_kinds.separate), blocker_kinds.bulging, moving
         if key not in self._numberings:
-            faces, can_receive, separate_bodies = (
-                self.merged_scene.faces,
-                self.can_receive(blocker_kinds),
-                self.separate_bodies(blocker_kinds),
-            )
+            device = self.merged_scene.device
+            can_receive, separate_bodies = self.can_receive(blocker_kinds), self.separate_bodies(blocker_kinds)
             bodies = None if separate_bodies is None else separate_bodies[self.merged_scene.body_of_vertex]
             is_static = None if static_bodies is None else static_bodies.has_vertex
             fronts = can_receive[:1]
             if is_static is not None and (can_receive[1] & is_static).any():
                 fronts = np.stack([can_receive[0], can_receive[1] & is_static])
             sides = fronts, can_receive
-            self._numberings[key] = [number_receivers(faces, item, is_static, bodies=bodies) for item in sides]
+            self._numberings[key] = [number_receivers(item, is_static, bodies=bodies, device=device) for item in sides]
         return self._numberings[key][has_backs]
 
     def shading(self, points: LitPoints, light: Light | None, materials: Materials | None = None) -> Node:

@@ -83,9 +83,12 @@ class SphereMethod(Method):
             return ONLY_SPHERES._replace(planes=planes)
         count = len(self.merged_scene.scene.bodies)
         why = tuple(self.self_visibility.why_spheres(body, geometry) for body in range(count))
-        traced = tuple(body for body, reason in enumerate(why) if not reason)
+        rigid = tuple(body for body, reason in enumerate(why) if not reason)
+        convex = self.convex_blockers(rigid)
+        solids = tuple(body for body in convex if body in self.parts.solids)
+        traced = tuple(body for body in rigid if body not in solids)
         bulging = tuple(body for body, reason in enumerate(why) if reason and self._can_bulge[body])
-        return BlockerKinds(traced, rotations, why, planes, self.convex_blockers(traced), bulging)
+        return BlockerKinds(traced, rotations, why, planes, convex, solids, bulging)
 
     @functools.cached_property
     def _can_bulge(self) -> list[bool]:
@@ -103,8 +106,8 @@ class SphereMethod(Method):
             )
         ]
 
-    def convex_blockers(self, traced: tuple[int, ...]) -> tuple[int, ...]:
-        """Choose the bodies with traced self-visibility that block other bodies' light as convex parts."""
+    def convex_blockers(self, rigid: tuple[int, ...]) -> tuple[int, ...]:
+        """Choose the bodies, of some whose shape is known, that block other bodies' light as convex parts."""
         return ()
 
     def blockers(
@@ -426,6 +429,7 @@ def _why_no_self_visibility(method: SphereMethod, points: LitPoints) -> str:
         return "the method takes those of spheres"
     names = [body.name for body in method.merged_scene.scene.bodies]
     whys = {name: why for name, why in zip(names, points.blocker_kinds.why_spheres, strict=False) if why}
+    whys |= {names[body]: "its convex parts block its own light" for body in points.blocker_kinds.solids}
     return "; ".join(f"{name}: {why}" for name, why in whys.items()) or "bodies are flat"
 
 

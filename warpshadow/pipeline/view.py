@@ -414,7 +414,7 @@ def _receive(
             wants_samples = wants_samples & ~by_rows
         keeps_vertex = keeps_vertex & seen_vertices(fragments, silhouettes, keeps_vertex.shape[1])
         numbering = number_receivers(
-            merged_scene.faces, keeps_vertex, on_static_body, merged_scene.vertex_order, bodies
+            keeps_vertex, on_static_body, merged_scene.vertex_order, bodies, device=merged_scene.device
         )
         if spheres is not None and (is_adaptive := method.is_adaptive & wants_samples).any():
             from warpshadow.pipeline.receivers.adaptive import find_squares

@@ -7,7 +7,7 @@ import warp as wp
 
 from warpshadow.assets.mesh import Mesh
 from warpshadow.device.progress import ANNOUNCED_SECONDS, announce
-from warpshadow.maths.convex import ConvexPart
+from warpshadow.maths.convex import ConvexPart, is_panel
 from warpshadow.maths.plane import plane_normal
 from warpshadow.maths.solid_angle import solid_angles
 from warpshadow.scene.body import Body, into_own_space
@@ -73,6 +73,19 @@ def blocking_parts(scene: Scene) -> dict[int, list[ConvexPart]]:
             mesh = body.mesh
             result[number] = mesh.convex_parts if _solid_behind(scene, number) is None else mesh.flat_parts
     return {number: parts for number, parts in result.items() if parts}
+
+
+def solid_bodies(scene: Scene) -> frozenset[int]:
+    """Find the bodies whose convex parts block their own light, too: those that consist of solids alone.
+
+    Panels are chords of bent sheets, in which receivers do not lie; and rays to a sun may be asked for.
+    """
+    visibility = scene.visibility.with_method()
+    return frozenset(
+        number
+        for number, parts in blocking_parts(scene).items()
+        if scene.bodies[number].self_shadows_in(visibility) == "traced" and not any(map(is_panel, parts))
+    )
 
 
 def fitted_counts(scene: Scene) -> dict[int, int | str]:

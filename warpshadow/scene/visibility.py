@@ -78,7 +78,8 @@ class Visibility:
         merging: τ: half-angle under which four neighboring spheres of 512 or more are seen as one, in radii of a cell
             ("directional") or of a cell for each coefficient ("log-sh"); 0 for never.
         self_shadows: How a body casts shadows on itself: from its mesh, "traced" once by rays wherever its shape is not
-            free, or from its "spheres". "rays" are as "traced", but under "directional" pixels send rays to the
+            free, or from its "spheres". Under "directional" nothing is traced of a body of convex solids: they block
+            its own light as they do others'. "rays" are as "traced", but under "directional" pixels send rays to the
             brightest cells in every image: a sun's edge has no teeth, and rotations and cameras have no gradient.
             Pictures that are made once have that under a sun. Bodies may say otherwise.
         order: Number of SH bands, 2 to 8: of "log-sh", of the light that "none" shades with, and of free light by

@@ -11,6 +11,7 @@ tolerance. Samples within it that see another side, or whose pixel is in no acce
 (As squares of one pixel they blurred the edges of the sun: the ground of a barn was 26% off, and is 12%.)
 """
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -50,6 +51,7 @@ def probe_spacing(size: tuple[int, int], supersampling: int) -> int:
     return 1 if size[0] * size[1] <= _FINE_PIXELS * supersampling**2 else 2
 
 
+@functools.lru_cache(maxsize=16)
 def probe_grid(size: tuple[int, int], supersampling: int) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns of the samples that are probes; the last may stand there several times.
 
@@ -234,5 +236,4 @@ def find_quadtree(
 def keys_of(sides: wp.array, keys: np.ndarray, supersampling: int) -> np.ndarray:
     """The keys of the sides that probes see, −1 for none, int of shape [view, row, column]."""
     row, column = probe_grid(sides.shape[1:], supersampling)
-    view_sides = sides.numpy()[:, row[:, None], column]
-    return np.where(view_sides < 0, -1, keys[view_sides]) if len(keys) else np.full(view_sides.shape, -1)
+    return np.append(keys, np.int32(-1))[sides.numpy()[:, row[:, None], column]]  # side −1 has the last

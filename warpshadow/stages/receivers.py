@@ -121,20 +121,26 @@ def _gather_points(
 
 
 @wp.kernel(enable_backward=False)
-def _add_faces(
+def _find_faces(
     # in
     faces: wp.array(dtype=wp.vec3i),
+    of_vertices: wp.array(dtype=wp.int32),
+    vertex_count: int,
+    side_count: int,
     receiver_count: int,
     # out
     receiver_faces: wp.array(dtype=wp.vec3i),
 ):
-    """A thread owns a face: of the mesh, or of a sample receiver."""
+    """A thread owns a face: a side of one of the mesh, or of a sample receiver."""
     face = wp.tid()  # the array may have room for triangles after these
-    receiver = receiver_count + face - faces.shape[0]
-    corners = wp.vec3i(receiver, receiver, receiver)
-    if receiver < receiver_count:
-        corners = faces[face]
-    receiver_faces[face] = corners
+    receiver = receiver_count + face - side_count
+    result = wp.vec3i(receiver, receiver, receiver)
+    if face < side_count:
+        side = face / faces.shape[0]
+        corners = faces[face - side * faces.shape[0]]
+        for k in range(3):
+            result[k] = of_vertices[side * vertex_count + corners[k]]
+    receiver_faces[face] = result
 
 
 class Numbering(NamedTuple):
@@ -143,7 +149,6 @@ class Numbering(NamedTuple):
     # [receiver − on static] int32, receivers not on static bodies; None for all vertices as they are
     vertices: wp.array | None
     on_static: np.ndarray  # [on static], the receivers on static bodies, which come first
-    faces: wp.array  # [face or side] vec3i
     of_vertices: wp.array  # [vertex, and their backs] int32, -1 for none
     spans: tuple[Span, ...] = ()  # of receivers not on static bodies, where bodies are told apart
 
@@ -159,27 +164,28 @@ class Numbering(NamedTuple):
 
 
 def number_receivers(
-    faces: wp.array,
     keeps_vertex: np.ndarray,
     is_static: np.ndarray | None = None,
     sequence: np.ndarray | None = None,
     bodies: np.ndarray | None = None,
+    *,
+    device: wp.DeviceLike,
 ) -> Numbering:
     """Choose the vertices that are receivers.
 
     Args:
-        faces: Vertex indices, vec3i of shape [face].
         keeps_vertex: Which are, bool of shape [1, vertex], or [2, vertex] with their backs: see :func:`seen_vertices`.
         is_static: Vertices of static bodies, bool of shape [vertex]; None if there are none.
         sequence: All vertices in the sequence in which they become receivers, shape [vertex]: light is found fastest
             where neighbors follow each other. None for the mesh's.
         bodies: Body of each vertex, −1 for vertices that need not be told apart, shape [vertex]: receivers of a body
             then follow each other. None where all share their blockers.
+        device: Where they are.
     """
-    device, (side_count, vertex_count) = faces.device, keeps_vertex.shape
+    side_count, vertex_count = keeps_vertex.shape
     if side_count == 1 and keeps_vertex.all() and is_static is None and sequence is None and bodies is None:
         of_vertices = constant(np.arange(vertex_count), wp.int32, device)
-        return Numbering(None, np.empty(0, int), faces, of_vertices)
+        return Numbering(None, np.empty(0, int), of_vertices)
     is_static = np.zeros(vertex_count, bool) if is_static is None else is_static
     sequence = np.arange(vertex_count) if sequence is None else sequence
     side_offsets = vertex_count * np.arange(side_count)
@@ -191,11 +197,9 @@ def number_receivers(
     on_static, vertices = sequence[is_static_receiver[sequence]], sequence[is_moving_receiver[sequence]]
     of_vertices = np.full(keeps_vertex.size, -1, np.int32)
     of_vertices[np.concatenate([on_static, vertices])] = np.arange(len(on_static) + len(vertices))
-    corners = of_vertices[faces.numpy() + side_offsets[:, None, None]].reshape(-1, 3)
     return Numbering(
         from_numpy(vertices, dtype=wp.int32, device=device),
         on_static,
-        from_numpy(corners, dtype=wp.vec3i, device=device),
         from_numpy(of_vertices, dtype=wp.int32, device=device),
         () if bodies is None else spans_of(bodies[vertices]),
     )
@@ -237,13 +241,14 @@ def find_receivers(
     Differentiable: positions, normals, barycentrics of the fragments.
     """
     device = positions.device
-    vertices, on_static, receiver_faces, of_vertices, spans = numbering
+    vertices, on_static, of_vertices, spans = numbering
     sides = fragments.face_ids if fragments.sides is None else fragments.sides
     receiver_fragments = fragments if fragments.sides is None else Fragments(sides, fragments.barycentrics)
-    batch_count, sample_fragments = len(positions), None
+    batch_count, sample_fragments, triangles = len(positions), None, np.empty((0, 3), np.int32)
+    side_count, receiver_count = of_vertices.size // positions.shape[1] * len(faces), numbering.receiver_count
+    count = side_count
     if wants_samples.any():
         batch_count = common_batch({"positions": positions, "fragments": sides})
-        side_count, receiver_count = len(receiver_faces), numbering.receiver_count
         body_keys = np.zeros(len(faces), int) if bodies is None else bodies
         surface = None
         if smooth_pieces is not None and len(positions) == 1:
@@ -256,17 +261,15 @@ def find_receivers(
         spans += tuple(
             Span(body, moving_count + first, moving_count + end) for body, first, end in sample_receivers.spans
         )
-        count = side_count + sample_fragments.face_ids.shape[1]
-        all_faces = empty(count + len(sample_receivers.triangles), dtype=wp.vec3i, device=device)
-        launch(_add_faces, count, inputs=[receiver_faces, receiver_count], outputs=[all_faces])
-        if len(sample_receivers.triangles):
-            wp.copy(
-                all_faces[count:],
-                from_numpy(receiver_count + sample_receivers.triangles, dtype=wp.vec3i, device=device),
-            )
-        receiver_faces = all_faces
+        count += sample_fragments.face_ids.shape[1]
+        triangles = sample_receivers.triangles
     elif vertices is None:
-        return Receivers(positions, normals, receiver_faces, of_vertices, receiver_fragments)
+        return Receivers(positions, normals, faces, of_vertices, receiver_fragments)
+    receiver_faces = empty(count + len(triangles), dtype=wp.vec3i, device=device)
+    inputs = [faces, of_vertices, positions.shape[1], side_count, receiver_count]
+    launch(_find_faces, count, inputs=inputs, outputs=[receiver_faces])
+    if len(triangles):
+        wp.copy(receiver_faces[count:], from_numpy(receiver_count + triangles, dtype=wp.vec3i, device=device))
     vertices = of_vertices if vertices is None else vertices
     points = _gather_receiver_points(batch_count, positions, normals, faces, vertices, sample_fragments, rises=rises)
     receivers = Receivers(*points, receiver_faces, of_vertices, receiver_fragments, on_static)

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.batch import accumulate, common_batch, expand
+from warpshadow.device.batch import accumulate, common_batch, expand, instance_in
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
@@ -77,6 +77,8 @@ def _multiply(
     columns: wp.array(dtype=wp.int32),
     weights: wp.array(dtype=wp.float32),
     factor_batches: wp.array2d(dtype=wp.vec3),
+    column_scales: wp.array2d(dtype=wp.vec3),
+    row_scales: wp.array2d(dtype=wp.vec3),
     addend: wp.array2d(dtype=wp.vec3),
     run: int,
     # out
@@ -88,47 +90,82 @@ def _multiply(
     factors = factor_batches[batch]
     for row in range(thread * run, wp.min((thread + 1) * run, row_count)):
         product = wp.vec3()
-        if addend:
+        if addend and not row_scales:
             product = addend[batch, row]
         for entry in range(row_starts[row], row_starts[row + 1]):
-            product += weights[entry] * factors[columns[entry]]
+            factor = factors[columns[entry]]
+            if column_scales:
+                factor = wp.cw_mul(column_scales[instance_in(batch, column_scales.shape[0]), columns[entry]], factor)
+            product += weights[entry] * factor
+        if row_scales:
+            product = wp.cw_mul(row_scales[instance_in(batch, row_scales.shape[0]), row], product)
+            if addend:
+                product += addend[batch, row]
         products[batch, row] = product
 
 
-def multiply(matrix: SparseMatrix, values: wp.array, *, addend: wp.array | None = None) -> wp.array:
-    """Multiply a sparse matrix with colors.
+def multiply(
+    matrix: SparseMatrix,
+    values: wp.array,
+    *,
+    addend: wp.array | None = None,
+    row_scales: wp.array | None = None,
+    column_scales: wp.array | None = None,
+) -> wp.array:
+    """Multiply a sparse matrix M with colors v: c + r ∘ M (s ∘ v).
 
     Args:
         matrix: Of shape [row, column].
-        values: vec3 of shape [batch, column].
-        addend: Added to the product, vec3 of shape [batch, row].
-            Either batch may be 1 and then serves every instance of the other.
+        values: v, vec3 of shape [batch, column].
+        addend: c, vec3 of shape [batch, row]; None for 0.
+        row_scales: r, vec3 of shape [batch, row]; None for 1.
+        column_scales: s, vec3 of shape [batch, column]; None for 1.
+            Any batch may be 1 and then serves every instance of the others.
     Returns:
         vec3 of shape [batch, row].
-    Differentiable: values, addend. Exact, being linear. Not: the matrix.
+    Differentiable: values, addend, scales. Exact, being linear in each. Not: the matrix.
     """
-    check.shape("values", values.shape, ("batch", matrix.shape[1]))
-    if addend is not None:
-        check.shape("addend", addend.shape, ("batch", matrix.shape[0]))
-        count = common_batch({"values": values, "addend": addend})
-        values, addend = expand(values, count), expand(addend, count)
+    row_count, column_count = matrix.shape
+    arrays = {"values": values, "addend": addend, "row_scales": row_scales, "column_scales": column_scales}
+    for (name, array), length in zip(arrays.items(), (column_count, row_count, row_count, column_count), strict=True):
+        if array is not None:
+            check.shape(name, array.shape, ("batch", length))
+    count = common_batch(arrays)
+    values, addend = expand(values, count), None if addend is None else expand(addend, count)
+    row_scales, column_scales = (
+        expand(scales, count) if scales is not None and scales.requires_grad else scales
+        for scales in (row_scales, column_scales)
+    )
 
-    def multiply_entries(entries: Entries, factors: wp.array, addend: wp.array | None, products: wp.array) -> None:
+    def multiply_entries(
+        entries: Entries,
+        factors: wp.array,
+        column_scales: wp.array | None,
+        row_scales: wp.array | None,
+        addend: wp.array | None,
+        products: wp.array,
+    ) -> None:
         batch_count, row_count = products.shape
         run = 1 if products.device.is_cuda else _RUN
         cost = run * (_ENTRY_COST * entries.columns.size / max(row_count, 1) + _ROW_COST)
-        inputs = [*entries, factors, addend, run]
+        inputs = [*entries, factors, column_scales, row_scales, addend, run]
         launch(_multiply, batch_count * -(-row_count // run), inputs=inputs, outputs=[products], cost=cost)
 
     def adjoint(adj_products: wp.array) -> None:
+        transposed = matrix.columns, adj_products, row_scales
         if values.requires_grad:
-            multiply_entries(matrix.columns, adj_products, values.grad, values.grad)
+            multiply_entries(*transposed, column_scales, values.grad, values.grad)
+        if column_scales is not None and column_scales.requires_grad:
+            multiply_entries(*transposed, values, column_scales.grad, column_scales.grad)
+        if row_scales is not None and row_scales.requires_grad:
+            grad = row_scales.grad
+            multiply_entries(matrix.rows, values, column_scales, adj_products, grad, grad)
         if addend is not None and addend.requires_grad:
             accumulate(adj_products, addend.grad)
 
     return differentiable(
-        lambda products: multiply_entries(matrix.rows, values, addend, products),
+        lambda products: multiply_entries(matrix.rows, values, column_scales, row_scales, addend, products),
         adjoint,
-        result=empty((values.shape[0], matrix.shape[0]), dtype=wp.vec3, device=values.device),
-        variables=[values, addend],
+        result=empty((count, row_count), dtype=wp.vec3, device=values.device),
+        variables=[values, addend, row_scales, column_scales],
     )

@@ -55,8 +55,9 @@ def find_cell_transmittance(
     else:
         directions, transmittance_self = HARMONIC_GATHER_CELLS, None
         transmittance_spheres = _transmittance(method, group, nonplanar_bodies(merged_scene), spheres, directions)
-    if transmittance_self is None and group.body is not None and not merged_scene.is_flat[group.body]:
-        transmittance_self = _transmittance(method, group, [group.body], spheres, directions)
+    body = group.body
+    if transmittance_self is None and body is not None and group.own_parts is None and not merged_scene.is_flat[body]:
+        transmittance_self = _transmittance(method, group, [body], spheres, directions)
     if transmittance_spheres is None:
         transmittance_spheres = wp.full(
             (*group.points.shape, len(directions)), 1.0, wp.float32, device=group.points.device

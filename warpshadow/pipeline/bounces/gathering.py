@@ -68,7 +68,7 @@ class OutgoingRadiance:
         if proxies.overlays is not None:
             radiosity = overlaid_radiosity(radiosity, cut(patches.centers, 0, radiosity.shape[1]), *proxies.overlays)
         return find_proxy_radiance(
-            radiosity, patches.areas, self.patch_weights, self.senders.areas, *proxies.patches_of_clusters
+            radiosity, patches.areas, self.patch_weights, self.senders.areas, *proxies.seen_patches
         )
 
     @functools.cached_property

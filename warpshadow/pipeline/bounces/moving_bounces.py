@@ -204,8 +204,7 @@ class Radiosity(Node):
             if between is None or radiosity is None:
                 return by_others
             with self.timed(call, self._self_reflection):
-                by_self = patch_radiosity(albedo, radiosity, between)
-            return total_light([by_others, by_self])
+                return patch_radiosity(albedo, radiosity, between, addend=by_others)
 
         self_bounces = 0 if between is None else SELF_BOUNCES
         return sent(

@@ -39,7 +39,7 @@ class SenderPlanes(NamedTuple):
 class ProjectedPatches(NamedTuple):
     """Patches of bodies that are not flat, as their proxy spheres send them."""
 
-    areas: wp.array  # part of its area that each shows towards each cell, [batch, patch, cell]
+    areas: wp.array  # part of its area that each shows towards each cell, [batch, patch, cell]; 0 on flat bodies
     centers: wp.array  # of the spheres, vec3 of shape [batch, patch + sphere of dark bodies]
     radii: wp.array  # likewise, 0 for patches of flat bodies
     clusters: ClusterTree
@@ -108,6 +108,25 @@ class Proxies:
         count = int(self.merged_scene.sphere_counts[self.black_bodies].sum())
         numbers = np.arange(len(self.senders.areas))
         return patches_of_clusters(numbers, np.full(len(numbers) + count, -1), merging=self.merging)
+
+    @functools.cached_property
+    def seen_patches(self) -> tuple[np.ndarray, np.ndarray]:
+        """The same without the proxies and clusters of flat bodies, which no receiver sees: these have none."""
+        starts, patches = self.patches_of_clusters
+        proxies = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+        is_flat = self.merged_scene.is_flat[self.senders.body_of_patch[patches]]
+        is_seen = np.bincount(proxies, ~is_flat, minlength=len(starts) - 1)[proxies] > 0
+        counts = np.bincount(proxies[is_seen], minlength=len(starts) - 1)
+        return np.cumsum([0, *counts]).astype(np.int32), patches[is_seen]
+
+    @functools.cached_property
+    def _mean_of_seen(self) -> SparseMatrix:
+        """The matrix of means over patch samples, empty for patches that no proxy shows."""
+        from scipy.sparse import diags
+
+        is_seen = np.isin(np.arange(len(self.senders.areas)), self.seen_patches[1])
+        matrix = diags(is_seen.astype(np.float32)) @ self.senders.mean.to_scipy()
+        return SparseMatrix.from_matrix(matrix, device=self.merged_scene.device)
 
     @functools.cached_property
     def _blockers(self) -> tuple[np.ndarray, np.ndarray]:
@@ -183,7 +202,7 @@ class Proxies:
             others = self.merged_scene.spheres_of(self.black_bodies, spheres)
             counts = [len(senders.areas), others[1].shape[1]]
             placed = tuple(concatenate(pair, counts) for pair in zip(placed, others, strict=True))
-        areas = find_projected_areas(normals, transmittance, senders.mean, directions)
+        areas = find_projected_areas(normals, transmittance, self._mean_of_seen, directions)
         clusters = find_clusters(*placed, self.merging)
         proxies = clusters.nodes.centers, *self.patches_of_clusters, self._tolerances
         tangent_planes = find_tangent_planes(mean_points, mean_normals, *proxies)

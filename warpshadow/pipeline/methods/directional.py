@@ -230,9 +230,9 @@ class Directional(SphereMethod):
         """Bodies of the scene that block light as planes."""
         return blocking_planes(self.merged_scene.scene)
 
-    def convex_blockers(self, traced: tuple[int, ...]) -> tuple[int, ...]:
+    def convex_blockers(self, rigid: tuple[int, ...]) -> tuple[int, ...]:
         """Bodies that consist of convex parts."""
-        return tuple(body for body in traced if body in self.parts.parts)
+        return tuple(body for body in rigid if body in self.parts.parts)
 
     def find_visibility_past_planes(
         self, group: Group, visibility: GroupVisibility, projected_light: ProjectedCells
@@ -258,11 +258,15 @@ class Directional(SphereMethod):
         return visibility._replace(transmittance_total=total, transmittance_spheres=visibility.transmittance_total)
 
     def _transmittance_self(self, group: Group, projected_light: ProjectedCells) -> wp.array | None:
-        """Transmittance past the body of the receivers: looked up, and of a sun by rays where these are asked for."""
-        if group.self_lookup is None or not group.points.size:
+        """Transmittance past the body of the receivers: by its parts, or looked up, and by rays where asked."""
+        if group.has_own_coverage:
+            own = self._coverages(group.own_coverage, projected_light)
+            return self._past_coverages(None, own, None, projected_light)
+        transmittance_self, lookup = group.looked_up_transmittance(), group.self_lookup
+        if transmittance_self is None:
             return None
-        assert group.probe_weights is not None and isinstance(group.self_lookup, SelfVisibilityLookup)
-        transmittance_self, rays = group.self_transmittance(), group.self_lookup.rays
+        assert group.probe_weights is not None and isinstance(lookup, SelfVisibilityLookup)
+        rays = lookup.rays
         if rays is None or projected_light.sun is None:
             return transmittance_self
         if transmittance_self.requires_grad:
@@ -346,9 +350,10 @@ class Directional(SphereMethod):
         lit = shade_cells(transmittance, normals, directions, light, maximum=LARGEST_COEFFICIENT).numpy()[..., 0]
         receiver_normals, towards = normals.numpy(), self.free_projection.directions
         plane_normals = receiver_normals[:, :1]  # points of a plane have this normal or its opposite
-        # [batch, 1]
-        whole = [4 / len(power) * np.maximum(sign * plane_normals @ towards.T, 0) @ power for sign in (1, -1)]
-        unblocked = np.where((receiver_normals * plane_normals).sum(axis=2) > 0, *whole)
+        facing = plane_normals @ towards.T  # [batch, 1, cell]
+        whole = [4 / len(power) * np.maximum(cosines, 0) @ power for cosines in (facing, -facing)]
+        is_front = (receiver_normals @ plane_normals.transpose(0, 2, 1))[..., 0] > 0
+        unblocked = np.where(is_front, *whole)
         return np.divide(lit, unblocked, out=np.zeros_like(lit), where=unblocked > 0)
 
     def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input) -> Node:

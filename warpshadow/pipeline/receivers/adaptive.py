@@ -13,7 +13,7 @@ import warp as wp
 from warpshadow.device.launch import without_gradient
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.receivers.groups import Blockers, Group
-from warpshadow.stages.quadtree import Quadtree, find_quadtree, keys_of, probe_grid
+from warpshadow.stages.quadtree import Quadtree, find_quadtree, probe_grid
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import points_of_fragments
 from warpshadow.stages.sample_receivers import fragments_of_samples
@@ -45,47 +45,57 @@ def find_squares(
         blockers = place_blockers(positions, (centers, radii))
     merged_scene = blockers.merged_scene
     sides = fragments.face_ids if fragments.sides is None else fragments.sides
-    keys = _keys(is_adaptive.tobytes(), merged_scene.first_face.tobytes())
+    keys, bodies = _keys(is_adaptive.tobytes(), merged_scene.first_face.tobytes())
     row, column = probe_grid(sides.shape[1:], supersampling)
-    permutation = _by_tiles(len(row), len(column))
-    probes = (row[:, None] * sides.shape[2] + column).ravel()[permutation]
-    probe_keys = keys_of(sides, keys, supersampling).reshape(len(sides), -1)[:, permutation]
-    body_of_probe = np.where(probe_keys < 0, -1, probe_keys % len(is_adaptive))
-    shares = np.zeros(probe_keys.shape, np.float32)
+    numbers, probes = _by_tiles(sides.shape[1:], supersampling)
+    body_of_probe = bodies[sides.numpy().reshape(len(sides), -1)[:, probes[:-1]]]
+    shares = np.zeros((len(sides), len(probes)), np.float32)  # the last is of no probe
     with unrecorded():
         for body in np.flatnonzero(is_adaptive).tolist():
             columns = _ragged(body_of_probe == body)
             if not columns.shape[1]:
                 continue
-            samples = np.where(columns < 0, -1, probes[columns])
-            seen = fragments_of_samples(fragments, samples)
+            seen = fragments_of_samples(fragments, probes[columns])
             points_and_normals = points_of_fragments(positions, normals, merged_scene.faces, seen)
             group = blockers.around_plane(*points_and_normals, body)
             portions = [sharp_share(portion) for portion in group.portions()]
             known = [portion for portion in portions if portion is not None]
             if known:
-                view, item = np.nonzero(columns >= 0)
-                shares[view, permutation[columns[view, item]]] = np.concatenate(known, axis=1)[view, item]
-    return find_quadtree(sides, keys, shares.reshape(len(shares), len(row), len(column)), supersampling)
+                shares[np.arange(len(sides))[:, None], numbers[columns]] = np.concatenate(known, axis=1)
+    shares_of_grid = shares[:, :-1].reshape(len(sides), len(row), len(column))
+    return find_quadtree(sides, keys, shares_of_grid, supersampling)
 
 
 @functools.lru_cache(maxsize=16)
-def _keys(is_adaptive: bytes, first_face: bytes) -> np.ndarray:
-    """Body of each face side, fronts first and then backs; −1 for bodies that are not adaptive."""
+def _keys(is_adaptive: bytes, first_face: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """A number of each face side by body, fronts first and then backs, and its body; −1 where that is not adaptive.
+
+    The last body, −1, is that of side −1.
+    """
     adaptive, starts = np.frombuffer(is_adaptive, bool), np.frombuffer(first_face, int)
     bodies = np.repeat(np.where(adaptive, np.arange(len(adaptive), dtype=np.int32), -1), np.diff(starts))
-    return np.concatenate([bodies, np.where(bodies < 0, -1, len(adaptive) + bodies)]).astype(np.int32)
+    keys = np.concatenate([bodies, np.where(bodies < 0, -1, len(adaptive) + bodies)])
+    return keys.astype(np.int32), np.concatenate([bodies, bodies, [-1]])
 
 
 @functools.lru_cache(maxsize=16)
-def _by_tiles(height: int, width: int) -> np.ndarray:
-    """Order the probes of a grid by 4 × 4 tiles, so that neighbors are shaded one after another."""
-    row, column = np.divmod(np.arange(height * width), width)
-    return np.lexsort((column // 4, row // 4))
+def _by_tiles(size: tuple[int, int], supersampling: int) -> tuple[np.ndarray, np.ndarray]:
+    """Order the probes of a grid by 4 × 4 tiles, so that neighbors are shaded one after another.
+
+    Returns:
+        The number of each in the grid, and that of its sample; in the end, for −1, the number after the last, and −1.
+    """
+    rows, columns = probe_grid(size, supersampling)
+    row, column = np.divmod(np.arange(len(rows) * len(columns)), len(columns))
+    permutation = np.lexsort((column // 4, row // 4))
+    samples = (rows[:, None] * size[1] + columns).ravel()[permutation]
+    return np.append(permutation, len(permutation)), np.append(samples, -1)
 
 
 def _ragged(chosen: np.ndarray) -> np.ndarray:
     """List the chosen columns of each row, padded with −1, shape [row, longest row]."""
+    if len(chosen) == 1:
+        return np.flatnonzero(chosen)[None]
     row, column = np.nonzero(chosen)
     counts = np.bincount(row, minlength=len(chosen))
     columns = np.full((len(chosen), counts.max(initial=0)), -1)

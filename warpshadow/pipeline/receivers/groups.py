@@ -48,6 +48,7 @@ class Group(NamedTuple):
     self_lookup: SelfVisibilityLookup | SelfVisibilityLobes | None = None
     planes: GroupPlanes | None = None  # bodies that block as planes; None without any
     convex_parts_around: GroupConvexParts | None = None  # bodies that block as convex parts; None without any
+    own_parts: GroupConvexParts | None = None  # of that body, where it is a solid
     nearest_blockers: NearestBlockers | None = None  # None where receivers are not patch samples
     corners: wp.array | None = None  # of the body, vec3 of shape [batch, corner]; None where it is not known
     skip: tuple[int, int] = (0, 0)  # spheres that do not block: the first, and the one after the last
@@ -58,8 +59,20 @@ class Group(NamedTuple):
         """Whether planes block light of its receivers."""
         return self.planes is not None and bool(self.points.size and self.planes.blocking)
 
-    def self_transmittance(self) -> wp.array:
-        """Transmittance past the receivers' own body, looked up in cells: float32 of shape [batch, receiver, cell]."""
+    @property
+    def has_own_coverage(self) -> bool:
+        """Whether convex parts of the receivers' own body block its light: one alone does not."""
+        return self.own_parts is not None and self.own_parts.blockers.has_several_blocking and bool(self.points.size)
+
+    def own_coverage(self, directions: np.ndarray, radius: float | None = None) -> wp.array:
+        """Coverage of cells by them."""
+        assert self.own_parts is not None
+        return self.own_parts.coverage(self.points, self.normals, directions, radius)
+
+    def looked_up_transmittance(self) -> wp.array | None:
+        """Transmittance past the receivers' own body, looked up, [batch, receiver, cell]; None without rows."""
+        if self.self_lookup is None or not self.points.size:
+            return None
         assert self.probe_weights is not None and isinstance(self.self_lookup, SelfVisibilityLookup)
         rows, lookup, kernels, _rays = self.self_lookup
         return gather_self_transmittance(self.normals, self.probe_weights, lookup, kernels, rows)
@@ -79,7 +92,8 @@ class Group(NamedTuple):
         self_lookup, planes, clusters = self.self_lookup, self.planes, self.clusters
         rotation_data = None if self_lookup is None else self_lookup.turned
         frames = None if planes is None else planes.frames
-        part_corners = None if self.convex_parts_around is None else self.convex_parts_around.placed.corners
+        parts = self.convex_parts_around or self.own_parts
+        part_corners = None if parts is None else parts.placed.corners
         arguments = points, normals, centers, radii = self[:4]
         if radii.shape[1] or any(array is not None for array in (rotation_data, frames, part_corners)):
             arrays = {
@@ -175,6 +189,13 @@ class Blockers(NamedTuple):
             return None
         return GroupConvexParts(self.parts.blockers(bodies, chosen), self.placed, skip)
 
+    def own_parts(self, body: int) -> GroupConvexParts | None:
+        """The convex parts of a body, where they block its own light."""
+        bodies = self.blocker_kinds.convex
+        if self.placed is None or body not in self.blocker_kinds.solids:
+            return None
+        return GroupConvexParts(self.parts.blockers(bodies, (body,)), self.placed, on_surface=True)
+
     def around_plane(self, points: wp.array, normals: wp.array, body: int) -> Group:
         """The group of points of a flat body."""
         planes, parts = self.planes_around(body), self.convex_parts_around()
@@ -247,6 +268,7 @@ def _groups_that_move(
             clusters = clusters or find_clusters(*spheres, blockers.merging)
             group = group._replace(skip=skip, clusters=clusters)
         if span.body >= 0:
+            group = group._replace(own_parts=blockers.own_parts(span.body))
             weights = blockers.self_visibility.probe_weights(receivers, span)
             group = group._replace(body=span.body, probe_weights=weights, self_lookup=self_lookups.get(span.body))
             if corners is not None:

@@ -26,11 +26,17 @@ class BlockerKinds(NamedTuple):
     """Which bodies block light as planes, convex parts or by traced self-visibility; spheres block the rest."""
 
     traced: tuple[int, ...] = ()  # bodies that block their own light as rays found, not by their spheres
-    rotations: Input | None = None  # of all bodies, mat33 of shape [batch, body]; None where none is traced
-    why_spheres: tuple[str, ...] = ()  # of each body, why it blocks its own light by spheres; empty for the traced
+    rotations: Input | None = None  # of all bodies, mat33 of shape [batch, body]; None where they are not known
+    why_spheres: tuple[str, ...] = ()  # of each body, why it blocks its own light by spheres; empty for others
     planes: tuple[int, ...] = ()  # bodies that block all light as the planes in which they lie
-    convex: tuple[int, ...] = ()  # traced ones that block the light of others by the convex parts that they consist of
+    convex: tuple[int, ...] = ()  # bodies that block the light of others by the convex parts that they consist of
+    solids: tuple[int, ...] = ()  # those that block their own by them, too; others are traced
     bulging: tuple[int, ...] = ()  # bodies out of which spheres bulge: they receive at vertices, for any choice
+
+    @property
+    def separate(self) -> set[int]:
+        """Bodies whose receivers form a group each."""
+        return {*self.traced, *self.solids, *self.planes}
 
 
 ONLY_SPHERES = BlockerKinds()  # all bodies block by their spheres

@@ -19,18 +19,22 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.batch import common_batch, expand, expand_rows
 from warpshadow.device.constants import constant
-from warpshadow.device.launch import launch
+from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
+from warpshadow.device.parallel import split_row
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
+_CELL_COST = 2.5  # time of a cell of a patch sample [ns]
 _MIN_OPEN = wp.constant(0.01)  # ε, by which patch samples count of a patch that is buried wholly
 _BURIED_RATIO = wp.constant(0.06)  # r of a patch that counts half
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def _average_transmittance(
+    first_row: int,
+    worker: int,
     # in
     normals: wp.array2d(dtype=wp.vec3),
     transmittance_self: wp.array3d(dtype=wp.float32),
@@ -39,21 +43,60 @@ def _average_transmittance(
     # out
     mean_transmittance: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a patch sample of an instance: ⟨T⟩ and ⟨T_self⟩, linear in both as Warp's adjoint needs it."""
-    batch, patch_sample = wp.tid()
-    normal = normals[instance_in(batch, normals.shape[0]), patch_sample]
-    sphere_batch = instance_in(batch, transmittance_spheres.shape[0])
+    """A thread owns a patch sample of an instance: ⟨T⟩ and ⟨T_self⟩."""
+    batch, patch_sample = split_row(first_row + wp.tid(), normals.shape[1])
+    normal = normals[batch, patch_sample]
     factor = 4.0 / float(directions.shape[0])
     sums = wp.vec3(_MIN_OPEN, _MIN_OPEN, 0.0)
     for q in range(directions.shape[0]):
         cosine = factor * wp.max(wp.dot(normal, directions[q]), 0.0)
         sample_transmittance_self = float(1.0)
         if transmittance_self:
-            sample_transmittance_self = transmittance_self[
-                instance_in(batch, transmittance_self.shape[0]), patch_sample, q
-            ]
-        sums += cosine * wp.vec3(transmittance_spheres[sphere_batch, patch_sample, q], sample_transmittance_self, 0.0)
+            sample_transmittance_self = transmittance_self[batch, patch_sample, q]
+        sums += cosine * wp.vec3(transmittance_spheres[batch, patch_sample, q], sample_transmittance_self, 0.0)
     mean_transmittance[batch, patch_sample] = sums
+
+
+@wp.kernel(enable_backward=False)
+def _average_transmittance_adjoint(
+    first_row: int,
+    worker: int,
+    # in
+    normals: wp.array2d(dtype=wp.vec3),
+    transmittance_self: wp.array3d(dtype=wp.float32),
+    transmittance_spheres: wp.array3d(dtype=wp.float32),
+    directions: wp.array(dtype=wp.vec3),
+    adj_mean_transmittance: wp.array2d(dtype=wp.vec3),
+    # out
+    adj_normals: wp.array2d(dtype=wp.vec3),
+    adj_transmittance_self: wp.array3d(dtype=wp.float32),
+    adj_transmittance_spheres: wp.array3d(dtype=wp.float32),
+):
+    """A thread owns a patch sample of an instance."""
+    batch, patch_sample = split_row(first_row + wp.tid(), normals.shape[1])
+    normal = normals[batch, patch_sample]
+    adj_mean = (4.0 / float(directions.shape[0])) * adj_mean_transmittance[batch, patch_sample]
+    adj_normal = wp.vec3()
+    for q in range(directions.shape[0]):
+        direction = directions[q]
+        cosine = wp.dot(normal, direction)
+        if cosine > 0.0:
+            adj_cosine = adj_mean[0] * transmittance_spheres[batch, patch_sample, q]
+            if transmittance_self:
+                adj_cosine += adj_mean[1] * transmittance_self[batch, patch_sample, q]
+            else:
+                adj_cosine += adj_mean[1]
+            adj_normal += adj_cosine * direction
+            if adj_transmittance_spheres:
+                adj_transmittance_spheres[batch, patch_sample, q] = (
+                    adj_transmittance_spheres[batch, patch_sample, q] + adj_mean[0] * cosine
+                )
+            if adj_transmittance_self:
+                adj_transmittance_self[batch, patch_sample, q] = (
+                    adj_transmittance_self[batch, patch_sample, q] + adj_mean[1] * cosine
+                )
+    if adj_normals:
+        adj_normals[batch, patch_sample] = adj_normals[batch, patch_sample] + adj_normal
 
 
 def find_mean_transmittance(
@@ -77,11 +120,24 @@ def find_mean_transmittance(
         check.shape("transmittance_self", transmittance_self.shape, shape)
         arrays["transmittance_self"] = transmittance_self
     batch_count, device = common_batch(arrays), normals.device
-    cell_directions = constant(np.asarray(directions, np.float32), wp.vec3, device)
-    mean_transmittance = empty((batch_count, normals.shape[1]), dtype=wp.vec3, device=device)
-    inputs = [normals, transmittance_self, transmittance_spheres, cell_directions]
-    launch(_average_transmittance, mean_transmittance.shape, inputs=inputs, outputs=[mean_transmittance])
-    return mean_transmittance
+    normals, transmittance_spheres = expand(normals, batch_count), expand_rows(transmittance_spheres, batch_count)
+    if transmittance_self is not None:
+        transmittance_self = expand_rows(transmittance_self, batch_count)
+    variables = [normals, transmittance_self, transmittance_spheres]
+    inputs = [*variables, constant(np.asarray(directions, np.float32), wp.vec3, device)]
+    cost = _CELL_COST * len(directions)
+    return differentiable(
+        lambda mean: launch(_average_transmittance, normals.size, inputs=inputs, outputs=[mean], cost=cost),
+        lambda adj_mean: launch(
+            _average_transmittance_adjoint,
+            normals.size,
+            inputs=[*inputs, adj_mean],
+            outputs=[None if array is None else array.grad for array in variables],
+            cost=cost,
+        ),
+        result=empty(normals.shape, dtype=wp.vec3, device=device),
+        variables=variables,
+    )
 
 
 @wp.kernel

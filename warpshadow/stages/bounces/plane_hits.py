@@ -32,7 +32,9 @@ import warp as wp
 from warpshadow.device.parallel import Scratch
 from warpshadow.stages.cell_coverage import coverage_adjoint
 from warpshadow.stages.planes.cells import (
+    MipFootprint,
     PlaneArrays,
+    PlaneFootprint,
     fetch,
     fetch_adjoint,
     find_mip_footprint,
@@ -49,6 +51,7 @@ from warpshadow.stages.planes.sides import (
     footprint_on_side_adjoint,
     inverse_distance_on_side,
     inverse_distance_on_side_adjoint,
+    is_towards_side,
     load_side,
     outline_coverage_on_side,
 )
@@ -61,7 +64,7 @@ _MIN_WIDTH = wp.constant(1.0e-30)  # least denominator of S's argument
 
 @wp.struct
 class PlaneHit:
-    """The hit of a cell on a side of a plane; or its adjoint, which has no mesh share."""
+    """The hit of a cell on a side of a plane; or its adjoint, which has neither mesh share nor lookup."""
 
     coverage: float  # h
     mesh_share: float  # of the outline's coverage, by texels
@@ -70,6 +73,8 @@ class PlaneHit:
     centroid: wp.vec3  # y, of the coverage [radii of the cell]
     inverse_distance: wp.vec3  # g
     blocked_moment: wp.vec3  # m
+    footprint: PlaneFootprint  # of the lookup of the radiosity
+    mip: MipFootprint
 
 
 def hit_scratch(planes: PlaneBlockers) -> Scratch:
@@ -220,18 +225,22 @@ def _unnormalized_direction(cell: VisibleCell, open_share: float, blocked_moment
 
 
 @wp.func
+def _visible_direction(cell: VisibleCell, hit: PlaneHit, before: wp.vec4):
+    """Direction of the open part of a side."""
+    if _is_wholly_open(hit, before):
+        return cell.direction
+    open_share, blocked_moment = _open_part(hit, before)
+    visible_direction, _ = _unnormalized_direction(cell, open_share, blocked_moment)
+    return wp.normalize(visible_direction)
+
+
+@wp.func
 def _visible_footprint(planes: PlaneArrays, side: PlaneSide, cell: VisibleCell, hit: PlaneHit, before: wp.vec4):
-    """Direction and footprint of the open part of a side."""
-    direction = cell.direction
-    extent = float(1.0)
-    if not _is_wholly_open(hit, before):
-        open_share, blocked_moment = _open_part(hit, before)
-        visible_direction, _ = _unnormalized_direction(cell, open_share, blocked_moment)
-        direction = wp.normalize(visible_direction)
-        extent = wp.sqrt(open_share)
-    footprint = footprint_on_side(planes, side, direction)
-    footprint.extent = extent
-    return direction, footprint
+    """Footprint of the open part of a side that is not wholly open."""
+    footprint = footprint_on_side(planes, side, _visible_direction(cell, hit, before))
+    open_share, _ = _open_part(hit, before)
+    footprint.extent = wp.sqrt(open_share)
+    return footprint
 
 
 @wp.func
@@ -252,20 +261,24 @@ def find_side_hits(
     if weight <= 0.0:
         return hit_count
     for i in range(receiver.side_count):
-        side = load_side(planes, receiver, i)
-        outline = outline_coverage_on_side(planes, side, cell, receiver.edges)
         hits[i].coverage = float(0.0)
+        outline = wp.vec4()
+        side = PlaneSide()
+        if is_towards_side(planes, receiver, i, cell):  # most cells end here, so before all of the side is loaded
+            side = load_side(planes, receiver, i)
+            outline = outline_coverage_on_side(planes, side, cell, receiver.edges)
         if outline[0] > 0.0:
             hit = PlaneHit()
             hit.mesh_share = 1.0
             hit.open_share = 1.0
             if _is_sender(side) or is_covered_by_texels(side.grid):
                 first_level = _first_level(side)
-                mip = find_mip_footprint(side.grid, planes, footprint_on_side(planes, side, cell.direction))
+                hit.footprint = footprint_on_side(planes, side, cell.direction)
+                hit.mip = find_mip_footprint(side.grid, planes, hit.footprint)
                 if is_covered_by_texels(side.grid):
-                    hit.mesh_share = fetch(planes.covered, planes, first_level, mip)[0]
+                    hit.mesh_share = fetch(planes.covered, planes, first_level, hit.mip)[0]
                 if _is_sender(side) and before[0] <= 0.0:  # else it is that of the part beside
-                    hit.radiosity = fetch(texels, planes, first_level, mip)
+                    hit.radiosity = fetch(texels, planes, first_level, hit.mip)
             hit.coverage = outline[0] * hit.mesh_share
             hit.centroid = wp.vec3(outline[1], outline[2], outline[3]) / outline[0]
             hit.inverse_distance = inverse_distance_on_side(side)
@@ -295,8 +308,10 @@ def _find_visible_parts(
             hits[i].open_share = wp.max(hits[i].open_share, _MIN_OPEN)
             side = load_side(planes, receiver, i)
             if _is_sender(side):
-                _, footprint = _visible_footprint(planes, side, cell, hits[i], before)
+                footprint = _visible_footprint(planes, side, cell, hits[i], before)
                 mip = find_mip_footprint(side.grid, planes, footprint)
+                hits[i].footprint = footprint
+                hits[i].mip = mip
                 hits[i].radiosity = fetch(texels, planes, _first_level(side), mip)
 
 
@@ -350,12 +365,11 @@ def _visible_radiosity_adjoint(
     """Add to the gradients of a local receiver, of a side's open part, and of its texels; return that of ``before``."""
     adj_before = wp.vec4()
     hit, adj_radiosity = hits[side.index], adj_hits[side.index].radiosity
-    direction, footprint = _visible_footprint(planes, side, cell, hit, before)
-    mip = find_mip_footprint(side.grid, planes, footprint)
-    adj_mip = fetch_adjoint(texels, side.grid, planes, _first_level(side), footprint, mip, adj_radiosity)
+    direction = _visible_direction(cell, hit, before)
+    adj_mip = fetch_adjoint(texels, side.grid, planes, _first_level(side), hit.footprint, hit.mip, adj_radiosity)
     if adj_texels:
-        scatter(adj_texels[instance], planes, _first_level(side), mip, adj_radiosity)
-    adj_direction = footprint_on_side_adjoint(planes, side, direction, footprint, adj_mip, receiver.sides)
+        scatter(adj_texels[instance], planes, _first_level(side), hit.mip, adj_radiosity)
+    adj_direction = footprint_on_side_adjoint(planes, side, direction, hit.footprint, adj_mip, receiver.sides)
     if not _is_wholly_open(hit, before):
         open_share, blocked_moment = _open_part(hit, before)
         visible_direction, length = _unnormalized_direction(cell, open_share, blocked_moment)

@@ -13,7 +13,6 @@ import warp as wp
 from warpshadow.device.batch import instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.stages.bounces.radiosity import reflect
 from warpshadow.stages.planes.prepared import PlaneBlockers
 from warpshadow.stages.sparse import multiply
 
@@ -47,10 +46,8 @@ def find_texels(radiosity: wp.array, patch_weights: wp.array, planes: PlaneBlock
     Differentiable: radiosity, patch_weights.
     """
     assert planes.texels_of_patches is not None
-    weighted_radiosity = reflect(patch_weights, radiosity)
-    radiosity_sums, weight_sums = (
-        multiply(planes.texels_of_patches, values) for values in (weighted_radiosity, patch_weights)
-    )
+    radiosity_sums = multiply(planes.texels_of_patches, radiosity, column_scales=patch_weights)
+    weight_sums = multiply(planes.texels_of_patches, patch_weights)
     texels = empty(radiosity_sums.shape, dtype=wp.vec3, device=radiosity.device)
     launch(_divide, radiosity_sums.shape, inputs=[radiosity_sums, weight_sums], outputs=[texels])
     return texels

@@ -27,10 +27,12 @@ from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import cached_by_values, constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
+from warpshadow.device.parallel import run_length, split_row
 from warpshadow.maths.directions import check_directions
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 from warpshadow.stages.sparse import SparseMatrix
 
+_CELL_COST = 10.0  # time of a cell of a patch [ns]
 _HIDDEN = wp.constant(0.1)  # β, by which parts count that their own body hides
 
 
@@ -128,6 +130,8 @@ def tilt_normals_off_planes(
 
 @wp.kernel
 def _project(
+    first_row: int,
+    worker: int,
     # in
     normals: wp.array2d(dtype=wp.vec3),
     transmittance: wp.array3d(dtype=wp.float32),
@@ -136,20 +140,22 @@ def _project(
     weights: wp.array(dtype=wp.float32),
     directions: wp.array(dtype=wp.vec3),
     opposite: wp.array(dtype=wp.int32),
+    length: int,
     # out
     projected_areas: wp.array3d(dtype=wp.float32),
 ):
-    """A thread owns a patch of an instance and a direction."""
-    batch, patch, direction = wp.tid()
-    projected_area = float(0.0)
-    for k in range(starts[patch], starts[patch + 1]):
-        normal = normals[instance_in(batch, normals.shape[0]), patch_samples[k]]
-        cosine = wp.max(-wp.dot(normal, directions[direction]), 0.0)
-        opposite_transmittance = transmittance[
-            instance_in(batch, transmittance.shape[0]), patch_samples[k], opposite[direction]
-        ]
-        projected_area += weights[k] * cosine * (_HIDDEN + (1.0 - _HIDDEN) * opposite_transmittance)
-    projected_areas[batch, patch, direction] = projected_area
+    """A thread owns a run of directions of a patch."""
+    i, run = wp.tid()
+    batch, patch = split_row(first_row + i, projected_areas.shape[1])
+    normal_batch = instance_in(batch, normals.shape[0])
+    transmittance_batch = instance_in(batch, transmittance.shape[0])
+    for direction in range(run * length, (run + 1) * length):
+        projected_area = float(0.0)
+        for k in range(starts[patch], starts[patch + 1]):
+            cosine = wp.max(-wp.dot(normals[normal_batch, patch_samples[k]], directions[direction]), 0.0)
+            opposite_transmittance = transmittance[transmittance_batch, patch_samples[k], opposite[direction]]
+            projected_area += weights[k] * cosine * (_HIDDEN + (1.0 - _HIDDEN) * opposite_transmittance)
+        projected_areas[batch, patch, direction] = projected_area
 
 
 @cached_by_values
@@ -180,10 +186,13 @@ def find_projected_areas(
     batch_count = common_batch({"normals": normals, "transmittance": transmittance})
     device = normals.device
     projected_areas = empty((batch_count, mean.shape[0], len(directions)), dtype=wp.float32, device=device)
+    length = run_length(device, len(directions))
     launch(
         _project,
-        projected_areas.shape,
-        inputs=[normals, transmittance, *mean.rows, *direction_arrays],
+        (batch_count * mean.shape[0], len(directions) // length),
+        inputs=[normals, transmittance, *mean.rows, *direction_arrays, length],
         outputs=[projected_areas],
+        shared=[normals, transmittance] if batch_count > 1 else [],
+        cost=_CELL_COST * length,
     )
     return projected_areas

@@ -19,9 +19,12 @@ from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
+from warpshadow.device.parallel import run_length, split_row
 from warpshadow.stages.visibility.merging import CLUSTER_SIZE, MERGING, merged_count
 
 _AVERTED_WEIGHT = wp.constant(1.0e-4)  # ε, the part of its area that a patch counts for where it shows none
+
+_CELL_COST = 3.0  # time of a cell of a proxy [ns]
 
 _BLACK_SPHERE_WEIGHT = 0.25
 """Part of its area that a convex body shows on average: the weight of spheres without patches, which are black."""
@@ -55,6 +58,8 @@ def patches_of_clusters(
 
 @wp.kernel
 def _tabulate(
+    first_row: int,
+    worker: int,
     # in
     radiosity: wp.array2d(dtype=wp.vec3),
     projected_areas: wp.array3d(dtype=wp.float32),
@@ -63,22 +68,29 @@ def _tabulate(
     patch_indices: wp.array(dtype=wp.int32),
     shares: wp.array(dtype=wp.float32),
     black_sphere_weights: wp.array(dtype=wp.float32),
+    length: int,
     # out
     proxy_radiance: wp.array3d(dtype=wp.vec4),
 ):
-    """A thread owns a proxy and a direction; shares are A / Σ A, and so sums are linear, as Warp's adjoint needs it."""
-    batch, proxy, direction = wp.tid()
-    patch_radiosity = radiosity[instance_in(batch, radiosity.shape[0])]
-    patch_projected_areas = projected_areas[instance_in(batch, projected_areas.shape[0])]
-    weights = patch_weights[instance_in(batch, patch_weights.shape[0])]
-    light = wp.vec3()
-    weight_sum = float(black_sphere_weights[proxy])
-    for k in range(starts[proxy], starts[proxy + 1]):
-        patch = patch_indices[k]
-        patch_weight = shares[k] * (weights[patch][0] * patch_projected_areas[patch, direction] + _AVERTED_WEIGHT)
-        light += patch_weight * patch_radiosity[patch]
-        weight_sum += patch_weight
-    proxy_radiance[batch, proxy, direction] = wp.vec4(light[0], light[1], light[2], weight_sum)
+    """A thread owns a run of directions of a proxy.
+
+    Shares are A / Σ A, so that sums are linear, as Warp's adjoint needs it.
+    """
+    i, run = wp.tid()
+    batch, proxy = split_row(first_row + i, proxy_radiance.shape[1])
+    radiosity_batch = instance_in(batch, radiosity.shape[0])
+    areas_batch = instance_in(batch, projected_areas.shape[0])
+    weights_batch = instance_in(batch, patch_weights.shape[0])
+    for direction in range(run * length, (run + 1) * length):
+        light = wp.vec3()
+        weight_sum = float(black_sphere_weights[proxy])
+        for k in range(starts[proxy], starts[proxy + 1]):
+            patch = patch_indices[k]
+            counted_area = patch_weights[weights_batch, patch][0] * projected_areas[areas_batch, patch, direction]
+            patch_weight = shares[k] * (counted_area + _AVERTED_WEIGHT)
+            light += patch_weight * radiosity[radiosity_batch, patch]
+            weight_sum += patch_weight
+        proxy_radiance[batch, proxy, direction] = wp.vec4(light[0], light[1], light[2], weight_sum)
 
 
 def find_proxy_radiance(
@@ -126,5 +138,13 @@ def find_proxy_radiance(
     float_tables = [shares, np.where(area_sums > 0, 0.0, _BLACK_SPHERE_WEIGHT)]
     proxy_arrays = [*int_tables, *(constant(values.astype(np.float32), wp.float32, device) for values in float_tables)]
     proxy_radiance = empty((batch_count, len(starts) - 1, projected_areas.shape[2]), dtype=wp.vec4, device=device)
-    launch(_tabulate, proxy_radiance.shape, inputs=[*arrays.values(), *proxy_arrays], outputs=[proxy_radiance])
+    length = run_length(device, projected_areas.shape[2])
+    launch(
+        _tabulate,
+        (batch_count * proxy_radiance.shape[1], projected_areas.shape[2] // length),
+        inputs=[*arrays.values(), *proxy_arrays, length],
+        outputs=[proxy_radiance],
+        shared=list(arrays.values()),
+        cost=_CELL_COST * length,
+    )
     return proxy_radiance

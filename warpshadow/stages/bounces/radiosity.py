@@ -40,10 +40,16 @@ def _reflect(
     radiosity[batch, patch] = wp.cw_mul(patch_albedo, light[instance_in(batch, light.shape[0]), patch])
 
 
-def patch_radiosity(albedo: wp.array, light: wp.array, mean: SparseMatrix, shares: wp.array | None = None) -> wp.array:
+def patch_radiosity(
+    albedo: wp.array,
+    light: wp.array,
+    mean: SparseMatrix,
+    shares: wp.array | None = None,
+    addend: wp.array | None = None,
+) -> wp.array:
     """Radiosity of patches: albedo times the mean light of their patch samples.
 
-        B_p = a_p Σ_s w_ps f_s (S_s + I_s)
+        B_p = c_p + a_p Σ_s w_ps f_s (S_s + I_s)
 
     A white patch under a radiance of 1 has radiosity 1, as receivers have.
 
@@ -54,12 +60,12 @@ def patch_radiosity(albedo: wp.array, light: wp.array, mean: SparseMatrix, share
         mean: The weights w, from :func:`mean_over_patch_samples`.
         shares: f, how much each patch sample counts, vec3 of shape [batch, patch sample], from
             :func:`.patch_weights.find_patch_weights`; None for 1.
+        addend: c, other radiosity of the patches, vec3 of shape [batch, patch]; None for 0.
     Returns:
         vec3 of shape [batch, patch]; any batch may be 1, and then serves every instance.
-    Differentiable: albedo, light, shares.
+    Differentiable: albedo, light, shares, addend.
     """
-    check.shape("albedo", albedo.shape, ("batch", mean.shape[0]))
-    return reflect(albedo, multiply(mean, light if shares is None else reflect(shares, light)))
+    return multiply(mean, light, addend=addend, row_scales=albedo, column_scales=shares)
 
 
 def reflect(albedo: wp.array, light: wp.array) -> wp.array:

@@ -73,6 +73,7 @@ def _task_type(lanes: int) -> Any:
         blocked: wp.array(dtype=Lane)  # [direction] F − T; for the adjoint its product with the factor of R
         sums: wp.array(dtype=Lane)  # [direction · sum] of R
         adj_cells: wp.array(dtype=Lane)  # [direction] the adjoint of the light · R
+        adj_blocked: wp.array(dtype=Lane)  # [direction] of F, and less that of T
         adj_light: Vectors
         proxy_radiance: wp.array2d(dtype=wp.vec4)  # [proxy, direction]
         adj_radiance: wp.array2d(dtype=wp.vec4)
@@ -102,7 +103,7 @@ def _make_load_task(lanes: int) -> wp.Function:
     """Make the kernel function that loads the receivers and directions of a thread."""
     Lane, LightTask = lane_type(lanes), _task_type(lanes)
     fn = make_lane_functions(lanes)
-    is_any_above, dot_direction = fn.is_any_above, fn.dot_direction
+    is_any_above, dot_direction, load_columns = fn.is_any_above, fn.dot_direction, fn.load_columns
     load_receivers = make_load_receivers(True, lanes)
 
     @wp.func(inline=lanes == 1)
@@ -126,6 +127,7 @@ def _make_load_task(lanes: int) -> wp.Function:
         task.ends = reached_bundles[slot, 2]
         task.blocked = scratch[slot, 0]
         task.adj_cells = scratch[slot, 1]
+        task.adj_blocked = scratch[slot, 2]
         task.sums = sums[wp.where(inputs.stores_sums, item, slot)]
         task.proxy_radiance = inputs.proxy_radiance[instance_in(batch, inputs.proxy_radiance.shape[0])]
         if inputs.equations:
@@ -142,21 +144,19 @@ def _make_load_task(lanes: int) -> wp.Function:
                 dot_direction(task.cells.axes[direction_bundle], receivers.normals),
                 -task.cells.half_angles[direction_bundle][1],
             ):
+                first_slot = bundle * BUNDLE
+                first_direction = direction_bundle * BUNDLE
+                load_columns(inputs.transmittance[batch], first_direction, BUNDLE, block, 1.0, task.blocked, first_slot)
+                if inputs.transmittance_others:
+                    others_batch = instance_in(batch, inputs.transmittance_others.shape[0])
+                    others = inputs.transmittance_others[others_batch]
+                    load_columns(others, first_direction, BUNDLE, block, 1.0, task.adj_cells, first_slot)
                 for i in range(BUNDLE):
-                    blocked = Lane()
-                    for lane in range(wp.min(lanes, inputs.traversed.points.shape[1] - block * lanes)):
-                        vertex = block * lanes + lane
-                        cell_transmittance_others = float(1.0)
-                        if inputs.transmittance_others:
-                            others_batch = instance_in(batch, inputs.transmittance_others.shape[0])
-                            cell_transmittance_others = inputs.transmittance_others[
-                                others_batch, vertex, direction_bundle * BUNDLE + i
-                            ]
-                        blocked[lane] = (
-                            cell_transmittance_others
-                            - inputs.transmittance[batch, vertex, direction_bundle * BUNDLE + i]
-                        )
-                    task.blocked[bundle * BUNDLE + i] = blocked
+                    cell_transmittance_others = Lane(1.0)
+                    if inputs.transmittance_others:
+                        cell_transmittance_others = task.adj_cells[first_slot + i]
+                    blocked = cell_transmittance_others - task.blocked[first_slot + i]
+                    task.blocked[first_slot + i] = blocked
                     if is_any_above(wp.max(blocked, -blocked), 0.0):
                         task.ends[bundle] = spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
         return batch, block, receivers, task
@@ -196,8 +196,11 @@ def _make_light(lanes: int) -> wp.Kernel:
                             share = wp.cw_mul(opacity, step)
                             radiance = task.proxy_radiance[sphere_view.node, direction_bundle * BUNDLE + i]
                             slot = (bundle * BUNDLE + i) * SUMS
-                            for c in range(SUMS):
-                                task.sums[slot + c] = task.sums[slot + c] + radiance[c] * share
+                            # (a loop is not unrolled, and reads the radiance from memory)
+                            task.sums[slot] = task.sums[slot] + radiance[0] * share
+                            task.sums[slot + 1] = task.sums[slot + 1] + radiance[1] * share
+                            task.sums[slot + 2] = task.sums[slot + 2] + radiance[2] * share
+                            task.sums[slot + 3] = task.sums[slot + 3] + radiance[3] * share
 
     traverse = make_traversal(make_cull(True, LightTask, lanes), visit, LightTask, False, lanes)
 
@@ -247,7 +250,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
     ReceiverLanes, SphereView, _SphereAdjoint = lane_structs(lanes)
     fn = make_lane_functions(lanes)
     dot_direction, dot, total, add = fn.dot_direction, fn.dot, fn.total, fn.add
-    load, add_vectors = fn.load, fn.add_vectors
+    load, add_vectors, add_columns = fn.load, fn.add_vectors, fn.add_columns
     load_task, weight_functions = _make_load_task(lanes), make_weight_functions(lanes)
     find_weight_of_proxy, weight_adjoint = weight_functions.weight, weight_functions.adjoint
     SUMS = wp.constant(_SUMS)
@@ -346,17 +349,17 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                     adj_normal.z += omega[2] * adj_cosine
                     factored_cosine = inputs.factor * wp.max(cosine, Lane(0.0))
                     adj_blocked = wp.cw_mul(factored_cosine, adj_cell)
-                    for lane in range(wp.min(lanes, inputs.traversed.points.shape[1] - block * lanes)):
-                        vertex = block * lanes + lane
-                        if adj_transmittance:
-                            adj_transmittance[batch, vertex, direction] = (
-                                adj_transmittance[batch, vertex, direction] - adj_blocked[lane]
-                            )
-                        if adj_transmittance_others:
-                            others_batch = instance_in(batch, adj_transmittance_others.shape[0])
-                            wp.atomic_add(adj_transmittance_others, others_batch, vertex, direction, adj_blocked[lane])
+                    task.adj_blocked[slot] = adj_blocked
                     task.blocked[slot] = wp.cw_mul(wp.cw_mul(factored_cosine, task.blocked[slot]), inverse)
                     task.adj_cells[slot] = adj_cell
+                first_slot = bundle * BUNDLE
+                first_direction = (task.first_bundle + bundle) * BUNDLE
+                if adj_transmittance:
+                    rows = adj_transmittance[batch]
+                    add_columns(-1.0, task.adj_blocked, first_slot, rows, first_direction, BUNDLE, block)
+                if adj_transmittance_others:
+                    rows_others = adj_transmittance_others[instance_in(batch, adj_transmittance_others.shape[0])]
+                    add_columns(1.0, task.adj_blocked, first_slot, rows_others, first_direction, BUNDLE, block)
         adj_receivers = traverse(
             receivers, batch, inputs.traversed.spheres, Gradients(adj_centers, adj_radii, adj_extents), task
         )
@@ -441,7 +444,7 @@ def sphere_light(
     variables = [points, normals, *proxies, proxy_radiance, transmittance, transmittance_others, equations]
     stores_sums = varies(variables)
     scratch = [
-        Scratch((2, span_direction_count), lane_type(lanes)),
+        Scratch((3, span_direction_count), lane_type(lanes)),
         Scratch((3, span_direction_count // BUNDLE), wp.int32),
     ]
     sums = (span_direction_count * _SUMS,), lane_type(lanes)

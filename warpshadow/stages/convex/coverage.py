@@ -1,10 +1,11 @@
 """Coverage of cells by convex blockers, such as boxes and rods.
 
-Each body covers h_q = Σ_parts h, with the moment Σ_parts μ, of cell q: h and μ are the coverage by the silhouette of a
-convex part (:mod:`warpshadow.stages.cell_coverage`), the edges between a face that a receiver sees and one that it does
-not. Parts of one body are beside each other, so they cover different parts of a cell. Prisms into which a body is cut
-both cover their seam, the face between them, where they are seen at a slant: it is taken off. How bodies relate,
-:mod:`warpshadow.stages.joint_coverage` tells. Edges are exact, and so are thin parts: spheres bulge out of them.
+Each piece of a body covers h_q = Σ_parts h, with the moment Σ_parts μ, of cell q: h and μ are the coverage by the
+silhouette of a convex part (:mod:`warpshadow.stages.cell_coverage`), the edges between a face that a receiver sees and
+one that it does not. Parts of one piece are beside each other, so they cover different parts of a cell. Prisms into
+which a piece is cut both cover their seam, the face between them, where they are seen at a slant: it is taken off. How
+pieces relate, :mod:`warpshadow.stages.joint_coverage` tells. Edges are exact, and so are thin parts: spheres bulge out
+of them.
 """
 
 import functools
@@ -45,6 +46,9 @@ _PART_COST = 200.0
 _BOUND_MARGIN = 1.001
 """Bounds are so much larger, for rounding."""
 
+_ON_SURFACE = 3.0e-4
+"""Height above a face up to which a receiver lies on it, over the radius of the part: faces are flat to 1e-4."""
+
 
 @wp.struct
 class PartInputs:
@@ -58,7 +62,8 @@ class PartInputs:
     parts: ConvexArrays
     cells: DirectionCells
     radius: float  # of cells
-    skip: int  # the body that the receivers are part of, -1 for none
+    skip: int  # the body that the receivers are part of, −1 for none
+    on_surface: bool  # whether receivers lie on the parts, which then are those of one body
 
 
 @functools.cache
@@ -77,9 +82,9 @@ def _task_type(lanes: int) -> Any:
         points: Vectors
         normals: Vectors
         lift: Lane  # 1 where there is no horizon, else 0
-        coverage: wp.array(dtype=Coverages)  # [direction] by the parts of a body, 0 between bodies
+        coverage: wp.array(dtype=Coverages)  # [direction] by the parts of a piece, 0 between pieces
         covered: wp.array(dtype=wp.int32)  # numbers of the cells in which that is not 0
-        sums: wp.array(dtype=SumsOfBlockers)  # [direction] over bodies
+        sums: wp.array(dtype=SumsOfBlockers)  # [direction] over pieces
         silhouette: Silhouette
 
     return PartsTask
@@ -101,7 +106,7 @@ def _bound_type(lanes: int) -> Any:
 
 
 class _PartFunctions(NamedTuple):
-    """Kernel functions on the parts of a body."""
+    """Kernel functions on the parts of a piece."""
 
     begin: wp.Function
     find_bound: wp.Function
@@ -121,7 +126,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
     find_block, load, sqrt, add, is_positive = fn.find_block, fn.load, fn.sqrt, fn.add, fn.is_positive
     find, find_coverage = silhouettes.find, silhouettes.find_coverage
     no_blockers, with_blocker = joint.no_blockers, joint.with_blocker
-    MARGIN = wp.constant(_BOUND_MARGIN)
+    MARGIN, ON_SURFACE = wp.constant(_BOUND_MARGIN), wp.constant(_ON_SURFACE)
 
     @wp.func
     def begin(
@@ -164,7 +169,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         return task
 
     @wp.func(inline=True)
-    def find_bound(task: PartsTask, bound: wp.vec4, radius: float):
+    def find_cones(task: PartsTask, bound: wp.vec4, radius: float):
         """Find the cones around a part, widened by the radius of cells."""
         result = PartBound()
         away = offset(wp.vec3(bound[0], bound[1], bound[2]), task.points)
@@ -179,6 +184,33 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         result.axis = scale(inverse, away)
         result.cosine = shrink * (cosine - radius * sine) - 4.0 * is_within
         result.sine = shrink * (sine + radius * cosine)
+        return result
+
+    @wp.func
+    def find_rise(parts: ConvexArrays, part: int, task: PartsTask):
+        """How far a part rises above tangent planes; not above 0 for receivers that lie on it."""
+        margin = ON_SURFACE * task.bounds[part][3]
+        above = Lane(-1.0e30)
+        is_on = Lane(0.0)
+        for face in range(parts.first_face[part], parts.first_face[part + 1]):
+            face_plane = task.silhouette.face_planes[face]
+            normal = wp.vec3(face_plane[0], face_plane[1], face_plane[2])
+            height = dot_direction(normal, task.points) - Lane(face_plane[3])
+            is_near = is_positive(Lane(margin) - wp.max(height, -height))
+            above = wp.max(above, height)
+            is_on = wp.max(is_on, wp.cw_mul(is_near, is_positive(dot_direction(normal, task.normals))))
+        is_on = wp.cw_mul(is_on, is_positive(Lane(margin) - above))
+        rise = Lane(0.0)
+        for corner in range(parts.first_corner[part], parts.first_corner[part + 1]):
+            rise = wp.max(rise, dot(task.normals, offset(task.silhouette.corners[corner], task.points)))
+        return wp.cw_mul(rise - Lane(margin), Lane(1.0) - is_on)
+
+    @wp.func
+    def find_bound(inputs: PartInputs, part: int, task: PartsTask):
+        """Find the cones around a part, and where it may block light."""
+        result = find_cones(task, task.bounds[part], inputs.radius)
+        if inputs.on_surface and is_any_above(result.rise, 0.0):
+            result.rise = wp.min(result.rise, find_rise(inputs.parts, part, task))
         return result
 
     @wp.func(inline=True)
@@ -196,14 +228,14 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         return wp.min(dot_direction(direction, bound.axis) - bound.cosine, is_above)
 
     @wp.func
-    def cover(inputs: PartInputs, body: int, task: PartsTask):
-        """Coverage by a body of cells that no other body covers wholly; returns how many it covers, and lists them."""
+    def cover(inputs: PartInputs, piece: int, task: PartsTask):
+        """Coverage by a piece of cells that no other covers wholly; returns how many it covers, and lists them."""
         parts, cells, radius = inputs.parts, inputs.cells, inputs.radius
         covered_count = int(0)
         silhouette = task.silhouette
-        enough = wp.where(parts.signs[parts.first_part[body + 1] - 1] < 0.0, 1.0e30, 1.0)  # seams take off
-        for part in range(parts.first_part[body], parts.first_part[body + 1]):
-            bound = find_bound(task, task.bounds[part], radius)
+        enough = wp.where(parts.signs[parts.first_part[piece + 1] - 1] < 0.0, 1.0e30, 1.0)  # seams take off
+        for part in range(parts.first_part[piece], parts.first_part[piece + 1]):
+            bound = find_bound(inputs, part, task)
             sign = parts.signs[part]
             if is_any_above(bound.rise, 0.0):
                 is_found = bool(False)
@@ -237,10 +269,10 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
 
     @wp.func
     def cover_all(inputs: PartInputs, task: PartsTask):
-        """Store sums over all bodies for each cell."""
-        for body in range(inputs.parts.first_part.shape[0] - 1):
-            if body != inputs.skip and inputs.parts.blocks[body] == 1:
-                covered_count = cover(inputs, body, task)
+        """Store sums over all pieces for each cell."""
+        for piece in range(inputs.parts.first_part.shape[0] - 1):
+            if inputs.parts.bodies[piece] != inputs.skip and inputs.parts.blocks[piece] == 1:
+                covered_count = cover(inputs, piece, task)
                 for k in range(covered_count):
                     q = task.covered[k]
                     task.sums[q] = with_blocker(task.sums[q], task.coverage[q])
@@ -340,10 +372,10 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
             task.coverage[q] = Coverages()
         silhouette = task.silhouette
         adj_point = Vectors()
-        for body in range(parts.first_part.shape[0] - 1):
+        for piece in range(parts.first_part.shape[0] - 1):
             covered_count = int(0)
-            if body != inputs.skip and parts.blocks[body] == 1:
-                covered_count = cover(inputs, body, task)
+            if parts.bodies[piece] != inputs.skip and parts.blocks[piece] == 1:
+                covered_count = cover(inputs, piece, task)
             affected_count = int(0)
             for k in range(covered_count):
                 q = task.covered[k]
@@ -353,8 +385,8 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
                     task.covered[affected_count] = q
                     affected_count += 1
             if affected_count > 0:
-                for part in range(parts.first_part[body], parts.first_part[body + 1]):
-                    bound = find_bound(task, task.bounds[part], radius)
+                for part in range(parts.first_part[piece], parts.first_part[piece + 1]):
+                    bound = find_bound(inputs, part, task)
                     is_found = bool(False)
                     for k in range(affected_count):
                         q = task.covered[k]
@@ -392,6 +424,7 @@ def part_coverage(
     radius: float | None = None,
     horizon_normals: wp.array | None = None,
     skip: int | None = None,
+    on_surface: bool = False,
 ) -> wp.array:
     """Coverage (h, μ) of cells by the convex parts of bodies.
 
@@ -403,6 +436,8 @@ def part_coverage(
         radius: Of cells that do not tile the sphere [rad]; by default that of so many even ones, which do.
         horizon_normals: Normals, vec3 of shape [batch, receiver]: nothing blocks cells below the horizon.
         skip: Number of the body that the receivers are part of, which blocks none of their light; None for none.
+        on_surface: Whether receivers lie on the parts, which are those of one body, and have ``horizon_normals``: a
+            part blocks no light of receivers that lie on a face of it and look out, nor below their tangent planes.
 
     Returns:
         vec4 of shape [batch, receiver, direction], for :func:`warpshadow.stages.joint_coverage.transmittance_past`.
@@ -421,6 +456,7 @@ def part_coverage(
     inputs.corners, inputs.face_planes, inputs.bounds = placed
     inputs.radius = cell_radius(len(directions)) if radius is None else radius
     inputs.skip = -1 if skip is None else skip
+    inputs.on_surface = on_surface
     lanes = lane_count(points.device)
     Lane, sums, edge_count = lane_type(lanes), sums_type(lanes), blockers.edge_count
     by_cell = (len(directions),)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -32,9 +33,10 @@ class ConvexBody(NamedTuple):
 class ConvexArrays:
     """Parts as kernels read them: corners, faces and edges of one part after another."""
 
-    blocks: wp.array(dtype=wp.int32)  # whether a body casts shadows
-    first_part: wp.array(dtype=wp.int32)  # of each body, and the end of the last
-    signs: wp.array(dtype=wp.float32)  # of the coverage of each part: −1 for seams, which are a body's last
+    bodies: wp.array(dtype=wp.int32)  # of each piece
+    blocks: wp.array(dtype=wp.int32)  # whether a piece casts shadows
+    first_part: wp.array(dtype=wp.int32)  # of each piece, and the end of the last
+    signs: wp.array(dtype=wp.float32)  # of the coverage of each part: −1 for seams, which are a piece's last
     first_corner: wp.array(dtype=wp.int32)  # of each part, and the end of the last
     first_face: wp.array(dtype=wp.int32)
     first_edge: wp.array(dtype=wp.int32)
@@ -48,12 +50,14 @@ class ConvexBlockers:
 
     Args:
         body_count: Number of bodies.
+        has_several_blocking: Whether more parts than one cast shadows.
         edge_count: Edges of a part at most.
         arrays: Their parts.
         corners_of_vertices: Matrix that finds corners, [corner, vertex].
     """
 
     body_count: int
+    has_several_blocking: bool
     edge_count: int
     arrays: ConvexArrays
     corners_of_vertices: SparseMatrix
@@ -68,8 +72,12 @@ class ConvexBlockers:
             part.edges + [first, first, 0, 0] for part, first in zip(parts, starts["corners"], strict=False)
         ]
         arrays = ConvexArrays()
-        arrays.blocks = wp.array([int(body.blocks) for body in bodies], dtype=wp.int32, device=device)
-        arrays.first_part = wp.array(_starts([len(body.parts) for body in bodies]), dtype=wp.int32, device=device)
+        pieces = [(number, part.piece) for number, body in enumerate(bodies) for part in body.parts]
+        counts = {piece: len(list(group)) for piece, group in itertools.groupby(pieces)}
+        arrays.bodies = wp.array([body for body, _ in counts], dtype=wp.int32, device=device)
+        blocks = [int(bodies[body].blocks) for body, _ in counts]
+        arrays.blocks = wp.array(blocks, dtype=wp.int32, device=device)
+        arrays.first_part = wp.array(_starts(list(counts.values())), dtype=wp.int32, device=device)
         signs = [-1.0 if part.is_seam else 1.0 for part in parts]
         arrays.signs = wp.array(signs, dtype=wp.float32, device=device)
         arrays.first_corner = wp.array(starts["corners"], dtype=wp.int32, device=device)
@@ -80,6 +88,7 @@ class ConvexBlockers:
         vertices = np.concatenate([body.first_vertex + part.corners for body in bodies for part in body.parts])
         return ConvexBlockers(
             len(bodies),
+            sum(len(body.parts) for body in bodies if body.blocks) > 1,
             max(len(part.edges) for part in parts),
             arrays,
             SparseMatrix.from_matrix(_selection_matrix(vertices, vertex_count), device=device),

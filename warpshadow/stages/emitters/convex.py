@@ -149,9 +149,10 @@ def _block_by_parts(
     part_batch = instance_in(batch, bounds.shape[0])
     ball = balls[sample_batch, emitter]
     ball_axis = wp.vec3(ball[0], ball[1], ball[2]) - point
-    for body in range(parts.blocks.shape[0]):
-        if body != skipped[0] and body != skipped[1] and parts.blocks[body] == 1:
-            for part in range(parts.first_part[body], parts.first_part[body + 1]):
+    for piece in range(parts.blocks.shape[0]):
+        body = parts.bodies[piece]
+        if body != skipped[0] and body != skipped[1] and parts.blocks[piece] == 1:
+            for part in range(parts.first_part[piece], parts.first_part[piece + 1]):
                 bound = bounds[part_batch, part]
                 offset = wp.vec3(bound[0], bound[1], bound[2]) - point
                 if parts.signs[part] > 0.0 and reaches_ball(offset, bound[3], ball_axis, ball[3]):

@@ -322,6 +322,13 @@ def visible_cell(planes: PlaneArrays, normal: wp.vec3, direction: wp.vec3):
 
 
 @wp.func
+def is_towards_side(planes: PlaneArrays, receiver: PlaneReceiver, index: int, cell: VisibleCell):
+    """Whether a cell looks at the plane of one of the sides that a receiver sees, at least in part."""
+    along_normal = wp.dot(receiver.sides[index].local_receiver.normal, cell.direction)
+    return wp.where(receiver.sides[index].is_back, along_normal, -along_normal) > -planes.radius
+
+
+@wp.func
 def footprint_on_side(planes: PlaneArrays, side: PlaneSide, direction: wp.vec3):
     """Find the footprint of a cell on a side."""
     return find_footprint(planes, _position_on_side(side), _direction_on_side(side, direction))

@@ -194,7 +194,7 @@ def _make_gather(lanes: int) -> wp.Kernel:
             else:
                 columns[q] = transmittance
         if wp.static(lanes > 1):
-            store_columns(columns, 0, inputs.directions.shape[0], block, transmittance_self[batch])
+            store_columns(columns, 0, transmittance_self[batch], 0, inputs.directions.shape[0], block)
 
     return gather
 

@@ -173,7 +173,7 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
                     task.ends[bundle] = 0  # wholly below the horizon: the cosine is zero there
         traverse(receivers, batch, inputs.spheres, Gradients(), task)
         direction_count = task.ends.shape[0] * BUNDLE
-        store_columns(task.transmittances, task.first_bundle * BUNDLE, direction_count, block, transmittance[batch])
+        store_columns(task.transmittances, 0, transmittance[batch], task.first_bundle * BUNDLE, direction_count, block)
 
     return transmit
 
@@ -183,7 +183,7 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane, TransmittanceTask = lane_type(lanes), _task_type(lanes)
     ReceiverLanes, SphereView, _SphereAdjoint = lane_structs(lanes)
     fn = make_lane_functions(lanes)
-    load_products, add_vectors = fn.load_products, fn.add_vectors
+    load_columns, multiply_by_columns, add_vectors = fn.load_columns, fn.multiply_by_columns, fn.add_vectors
     load_task = _make_load_task(has_horizon, lanes)
 
     @wp.func(inline=True)
@@ -231,9 +231,8 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
         span, row = find_run(worker, first_row + i, j)
         batch, block, receivers, task = load_task(row, span, worker, inputs, cells, all_ends, scratch, reached_bundles)
         first_direction, count = task.first_bundle * BUNDLE, task.ends.shape[0] * BUNDLE
-        load_products(
-            transmittance[batch], adj_transmittance[batch], first_direction, count, block, task.transmittances
-        )
+        load_columns(transmittance[batch], first_direction, count, block, 0.0, task.transmittances, 0)
+        multiply_by_columns(adj_transmittance[batch], first_direction, count, block, task.transmittances, 0)
         adj_receivers = traverse(receivers, batch, inputs.spheres, Gradients(adj_centers, adj_radii, adj_extents), task)
         if adj_points:
             add_vectors(adj_receivers.points, block, adj_points[batch])
