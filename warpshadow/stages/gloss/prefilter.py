@@ -212,7 +212,7 @@ def _make_look_up(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
     def find_place_angles(x: Lane, y: Lane, z: Lane):
         """Polar angles in half-turns, azimuths in turns, and sines of polar angles."""
         sine = sqrt(wp.cw_mul(x, x) + wp.cw_mul(z, z))
-        azimuth = find_angles(-z, x) / (2.0 * wp.pi)
+        azimuth = find_angles(-1.0 * z, x) / (2.0 * wp.pi)
         return find_angles(y, sine) / wp.pi, azimuth + is_positive(-azimuth), sine
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
