@@ -81,7 +81,7 @@ class GlossyPoints(LitPoints):
         source = self.method.light_input(self, light)
         texels = self.cached("prefiltered", source, lambda: self._prefiltered(source))
         radiance = Node("prefiltered light", look_up_light, texels, directions, filters, items=item_text)
-        through = self.method.lobe_transmittance(self, directions, source)
+        through = self.method.lobe_transmittance(self, directions, source, view)
         blocked = None
         if self.merged_scene.scene.bounces:
             blocked = self.method.blocked_radiance(self, self.chosen(bounced), source, view, self.chosen)

@@ -207,13 +207,14 @@ class Method:
     def _prefilter(self, light: KnownLight) -> wp.array:
         return constant(prefilter(light.radiance)[None], wp.vec3, self.merged_scene.device)
 
-    def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input) -> Node:
+    def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input, view: LitPoints) -> Node:
         """Transmittance towards the samples of lobes of points, float32 of shape [batch, receiver, sample].
 
         Args:
             points: Receivers on bodies that shine.
             directions: Node of the samples' directions, vec3 of shape [batch, receiver, sample].
             light: Known or free light, which says where shadows have to be sharp.
+            view: The receivers among which they are, which are shaded.
 
         Without shadows it is 1.
         """
@@ -227,7 +228,7 @@ class Method:
         Args:
             points, light: As for :meth:`lobe_transmittance`.
             diffuse: Node of their shading.
-            view: The receivers among which they are, which are shaded.
+            view: As for :meth:`lobe_transmittance`.
             choose: Makes a node of light on the view's receivers one of light on these.
         """
         raise NotImplementedError

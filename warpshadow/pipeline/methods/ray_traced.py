@@ -141,7 +141,7 @@ class Rays(Method):
         rays = STILL_RAYS if self.shares_directions else RAYS
         return StaticBounces(*arguments, rays=rays, progress=self.progress)
 
-    def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input) -> Node:
+    def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input, view: LitPoints) -> Node:
         """Transmittance towards the samples of lobes: rays, each of its own."""
         item_text = functools.partial(receiver_text, points.in_words)
         return Node(

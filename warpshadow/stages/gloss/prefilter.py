@@ -241,8 +241,8 @@ def _make_look_up(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
                 lower = _find_place(levels[level][0], levels[level][1], half_turns[lane], turns[lane])
                 upper = _find_place(levels[level + 1][0], levels[level + 1][1], half_turns[lane], turns[lane])
                 sharp = _interpolate_texels(light_texels, lower)
-                blurred = _interpolate_texels(light_texels, upper)
-                light[batch, receiver, first + lane] = sharp + (height - float(level)) * (blurred - sharp)
+                soft = _interpolate_texels(light_texels, upper)
+                light[batch, receiver, first + lane] = sharp + (height - float(level)) * (soft - sharp)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def look_up_adjoint(
@@ -282,13 +282,13 @@ def _make_look_up(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
                     _add_to_texels((1.0 - share) * adj, lower, adj_texels[texel_batch])
                     _add_to_texels(share * adj, upper, adj_texels[texel_batch])
                 sharp = _slopes(light_texels, lower, adj)
-                blurred = _slopes(light_texels, upper, adj)
+                soft = _slopes(light_texels, upper, adj)
                 rows = float(levels[level][1]) / wp.pi
                 blurred_rows = float(levels[level + 1][1]) / wp.pi
-                adj_polar[lane] = (1.0 - share) * rows * sharp[1] + share * blurred_rows * blurred[1]
-                adj_azimuth[lane] = (1.0 - share) * rows * sharp[2] + share * blurred_rows * blurred[2]
+                adj_polar[lane] = (1.0 - share) * rows * sharp[1] + share * blurred_rows * soft[1]
+                adj_azimuth[lane] = (1.0 - share) * rows * sharp[2] + share * blurred_rows * soft[2]
                 if adj_filters and height > 0.0 and height < float(_LEVELS) - 1.001:
-                    adj_blur = (blurred[0] - sharp[0]) / (blur * wp.log(2.0))
+                    adj_blur = (soft[0] - sharp[0]) / (blur * wp.log(2.0))
                     adj_filters[batch, receiver, first + lane] = adj_filters[batch, receiver, first + lane] + wp.vec3(
                         0.0, 0.0, adj_blur
                     )
