@@ -145,6 +145,17 @@ class Method:
         """Direct light of emitters on points, past the blockers between, vec3 of shape [batch, receiver]."""
         raise NotImplementedError
 
+    def highlights(self, points: LitPoints, materials: Materials, roughness: Node, cameras: Input) -> Node:
+        """Direct light of emitters in the lobes of points, past the blockers between: G and G', vec3 [batch, receiver].
+
+        Args:
+            points: Receivers on bodies that shine.
+            materials: Of the bodies.
+            roughness: Of the points, float32 of shape [batch, receiver].
+            cameras: Clip matrices.
+        """
+        raise NotImplementedError
+
     def shading_without_emitters(
         self, points: LitPoints, light: Light | None, materials: Materials | None = None
     ) -> Node:

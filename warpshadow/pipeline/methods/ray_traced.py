@@ -94,8 +94,19 @@ class Rays(Method):
         """Direct light of emitters on points, by rays to their samples."""
         return self._light_of_emitters_at(points, points.receivers_node, materials, "light of emitters")
 
+    def highlights(self, points: LitPoints, materials: Materials, roughness: Node, cameras: Input) -> Node:
+        """Direct light of emitters in the lobes of points, by rays to their samples."""
+        arguments = self._rays_to_emitters(points, points.receivers_node, materials, "highlights")
+        return self.emitters.traced_highlights(*arguments, roughness, cameras)
+
     def _light_of_emitters_at(self, points: LitPoints, receivers: Node, materials: Materials, name: str = "") -> Node:
-        """The same on other receivers among the same bodies. Differentiable: emission."""
+        """Direct light of emitters on other receivers among the same bodies. Differentiable: emission."""
+        return self.emitters.traced_light(*self._rays_to_emitters(points, receivers, materials, name), name)
+
+    def _rays_to_emitters(
+        self, points: LitPoints, receivers: Node, materials: Materials, name: str
+    ) -> tuple[Node, Node, Node, Node]:
+        """Receivers, samples, their radiance, and the transmittance between."""
         placed, items = self.emitters.placed(points), functools.partial(receiver_text, points.in_words)
 
         def traced() -> Node:
@@ -103,7 +114,7 @@ class Rays(Method):
             return Node(name and "rays to emitters", self._trace_emitters, *arguments, items=items, has_adjoint=False)
 
         transmittance = points.cached(f"rays to emitters {name}", receivers, traced)
-        return self.emitters.traced_light(receivers, placed, self.emitters.radiance(materials), transmittance, name)
+        return receivers, placed, self.emitters.radiance(materials), transmittance
 
     def _trace_emitters(
         self, positions: wp.array, receivers: Receivers, placed_samples: "PlacedSamples"

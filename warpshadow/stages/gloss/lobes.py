@@ -31,7 +31,8 @@ from warpshadow.device.parallel import split_row
 
 MIN_ROUGHNESS = 0.1  # roughness of the smoothest surface; maps of 128 rows have nothing sharper
 
-_MIN_COSINE = 0.02  # cosine between a receiver's normal and its viewer, of those whose interpolated normal turns away
+MIN_COSINE = 0.02  # cosine between a receiver's normal and its viewer, of those whose interpolated normal turns away
+MAX_COSINE = 0.99999
 
 _COST = 15.0  # nanoseconds that a sample takes
 
@@ -112,7 +113,7 @@ def _make_sample_lobes(lanes: int) -> wp.Kernel:
         view = wp.normalize(eye - points[point_batch, receiver])
         rough = wp.max(roughness[instance_in(batch, roughness.shape[0]), receiver], MIN_ROUGHNESS)
         width = rough * rough
-        cosine = wp.clamp(wp.dot(normal, view), _MIN_COSINE, 0.99999)
+        cosine = wp.clamp(wp.dot(normal, view), MIN_COSINE, MAX_COSINE)
         sine = wp.sqrt(1.0 - cosine * cosine)
         across_view = view - wp.dot(normal, view) * normal
         if wp.length_sq(across_view) < 1.0e-10:
