@@ -26,6 +26,7 @@ sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.references import Reference, Request
 from demos.scenes import shipped_mesh
+from demos.shapes import bottle, knot
 from warpshadow.torch import TorchRenderer
 
 ROUGHNESS = (0.2, 0.35, 0.6)
@@ -43,6 +44,9 @@ def scenes(data: Path | None, size: int, count: int) -> dict[str, ws.Scene]:
         meshes = {
             "ball": ws.icosphere(1.0, 4),
             **{Path(name).stem: ws.load_mesh(data / "meshes" / name) for name in names},
+            "bear": shipped_mesh("bear"),
+            "knot": knot(),
+            "bottle": bottle(),
         }
         lights = [
             ws.EnvironmentMap.read(data / "envmaps" / name) for name in ("apartment.exr", "city.exr", "forest.exr")

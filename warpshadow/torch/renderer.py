@@ -46,7 +46,7 @@ _ELSEWHERE = {
 """Remedies for keywords that a call does not have."""
 
 
-def _with_gloss(function: Callable[P, T]) -> Callable[P, T]:
+def with_gloss(function: Callable[P, T]) -> Callable[P, T]:
     """Let a method's signature name the arguments that its last, ``gloss``, takes."""
     signature = inspect.signature(function)
     *first, gloss = signature.parameters.values()
@@ -175,7 +175,7 @@ class TorchRenderer(torch.nn.Module):
 
     @uncompiled
     @check.keywords(**_ELSEWHERE)
-    @_with_gloss
+    @with_gloss
     @one_at_a_time
     def forward(
         self,
@@ -258,7 +258,7 @@ class TorchRenderer(torch.nn.Module):
 
     @uncompiled
     @check.keywords(**_ELSEWHERE)
-    @_with_gloss
+    @with_gloss
     @one_at_a_time
     def insert(
         self,
@@ -294,7 +294,7 @@ class TorchRenderer(torch.nn.Module):
 
     @uncompiled
     @check.keywords(**_ELSEWHERE)
-    @_with_gloss
+    @with_gloss
     @one_at_a_time
     def explain(
         self,
