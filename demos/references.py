@@ -120,6 +120,8 @@ class Request:
             texture = np.zeros(0) if body.texture is None else body.texture
             arrays += [body.albedo, texture, body.rotation, body.translation]
             arrays += [value for name in (*GLOSS_ARGUMENTS, "emission") if (value := getattr(body, name)) is not None]
+        if self.scene.shell is not None:
+            arrays.append(self.scene.shell)
         for array in arrays:
             digest.update(f"{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
         digest.update(f"{camera.width} {camera.height} {camera.near} {_ACROSS}".encode())
@@ -152,9 +154,10 @@ def turned(scene: ws.Scene, share: float = 0.382) -> ws.Scene:
 
     columns = scene.light.radiance.shape[1]
     shift = round(share * columns)
-    light = ws.EnvironmentMap(np.roll(scene.light.radiance, shift, axis=1))
     degrees = -360 * shift / columns  # columns run from -z over +x
     turn = Rotation.from_euler("y", degrees, degrees=True)
+    shell = {"radius": scene.light.radius, "center": turn.apply(np.array(scene.light.center))}
+    light = ws.EnvironmentMap(np.roll(scene.light.radiance, shift, axis=1), **shell)
     bodies = [
         dataclasses.replace(
             body,

@@ -705,3 +705,23 @@ def test_gradients_of_reflection_are_exact(quantity, double, device, check):
     lights = [(wp.vec3d, random(0, 2, 3, 3)), *((wp.vec3d, random(seed, 2, 2, 3)) for seed in (1, 2))]
     scalars = [(wp.float64, np.abs(np.tanh(random(seed, 1, 2)))) for seed in (3, 4, 5)]
     check(lambda *arguments: mix(numbers, *arguments)[quantity], *lights, *scalars)
+
+
+@pytest.mark.parametrize("is_blocked", [False, True])
+def test_gradients_of_transfer_from_a_shell_are_exact(is_blocked, double, check):
+    find, fibonacci = double("stages.shell.transfer").shell_transfer, double("maths.directions").fibonacci
+    cells, patches = fibonacci(16), fibonacci(32)
+    rng = np.random.default_rng(4)
+    given = [(wp.vec3d, 0.4 * random(5, 1, 3, 3)), (wp.vec3d, unit(random(6, 1, 3, 3)))]
+    shell = wp.vec4d, np.array([[0.1, -0.2, 0.1, 2.2]])
+    if is_blocked:
+        past = wp.float64, rng.uniform(0.05, 0.95, size=(1, 3, 16))
+        check(lambda p, n, t, s: find(p, n, t, cells, s, patches), *given, past, shell)
+    else:
+        check(lambda p, n, s: find(p, n, None, cells, s, patches), *given, shell)
+
+
+def test_gradients_of_where_rays_leave_a_shell_are_exact(double, check):
+    leave = double("stages.shell.beams").exits_from_shell
+    given = (wp.vec3d, 0.3 * random(7, 1, 3, 3)), (wp.vec3d, unit(random(8, 1, 3, 2, 3)))
+    check(leave, *given, (wp.vec4d, np.array([[0.1, -0.2, 0.1, 2.2]])))

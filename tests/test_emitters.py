@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 import warpshadow as ws
 from warpshadow import inverse
@@ -158,6 +159,45 @@ def test_emission_takes_a_batch_and_vertices_and_rays_have_its_gradient():
         count = LAMP.mesh.vertex_count
         of_vertices = renderer(emission={"lamp": torch.tensor([[6.0, 5.0, 4.0]]).expand(count, 3)})
         torch.testing.assert_close(of_vertices, images[0].detach(), atol=1e-5, rtol=1e-4)
+
+
+def light_on_wall(mesh, method, **options):
+    """Mean light of a lamp that a wall receives."""
+    wall = ws.Body(ws.plane(1.0, 4), (1, 1, 1), rotation=(90, 0, 0), translation=(0, 0, -1), name="wall")
+    lamp = ws.Body(mesh, (0, 0, 0), **{"emission": (1, 1, 1), "name": "lamp", "blockers": 8} | options)
+    camera = ws.Camera.look_at((0.9, 1.2, 1), (0.1, 0.3, -1), fov_y=12, size=(8, 8))
+    return image_of(wall, lamp, light=DARK, camera=camera, visibility=ws.Visibility(method)).mean()
+
+
+@pytest.mark.parametrize("method", ["directional", "ray-traced"])
+def test_a_lamp_hides_its_far_side(method):
+    """A ball whose faces look inward is open, and so both sides of its shell emit: the near ones alone are seen."""
+    ball = ws.icosphere(0.2, 3)
+    inward = ws.Mesh(ball.positions, ball.faces[:, ::-1])
+    assert light_on_wall(inward, method) == pytest.approx(light_on_wall(ball, method), rel=0.02)
+
+
+def test_light_of_a_shade_is_that_of_rays():
+    tube = trimesh.creation.cylinder(0.2, 0.4, sections=32)
+    shade = ws.Mesh(tube.vertices, tube.faces[np.abs(tube.face_normals[:, 2]) < 0.5])
+    kept, still = (light_on_wall(shade, method, rotation=(60, 20, 0)) for method in ("directional", "ray-traced"))
+    assert kept == pytest.approx(still, rel=0.03)
+    assert light_on_wall(shade, "directional", rotation=(60, 20, 0), blockers=0) > 1.2 * kept
+
+
+@pytest.mark.parametrize("scale", [1e-7, 1e6])
+def test_light_along_paths_does_not_depend_on_the_scale(scale):
+    images = []
+    for unit in (1.0, scale):
+        bodies = [
+            dataclasses.replace(body, scale=unit, translation=unit * np.asarray(body.translation))
+            for body in (LAMP, BALL, GROUND)
+        ]
+        eye, target = np.array([(0.5, 4.6, 3.6), (-0.2, 0.3, 0.3)]) * unit
+        camera = ws.Camera.look_at(eye, target, fov_y=20, size=(16, 16), near=0.01 * unit)
+        options = {"camera": camera, "visibility": ws.Visibility("ray-traced", samples=64), "bounces": 2}
+        images.append(image_of(*bodies, light=DARK, **options).mean())
+    assert images[1] == pytest.approx(images[0], rel=0.01)
 
 
 def test_one_side_of_a_body_that_emits_lights_that_side():

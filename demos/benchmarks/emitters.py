@@ -1,11 +1,12 @@
-"""Images in the light of lamps against Mitsuba's area lights, or the library's paths: rooms and tables lit from near.
+"""Images in near light: of lamps against Mitsuba's area lights, or the library's paths; of a map on a sphere.
 
     python demos/benchmarks/emitters.py [--by mitsuba|rays] [--size 96] [--bounces 0 all] [--scenes lamp table …]
         [--samples 4096] [--picture emitters.png]
 
 Errors are of all pixels but those that show a lamp, relative L2, noise of the reference taken off; "edges" are errors
-without the pixels where the reference jumps, beside shadows' edges and outlines. CPU time is of a renderer's
-image of moved bodies, and of that with its gradient.
+without the pixels where the reference jumps, beside shadows' edges and outlines; "far" is a renderer's error if the map
+is taken to be infinitely far away. CPU time is of a renderer's image of moved bodies, and of that with its gradient.
+Mitsuba knows no map on a sphere: scenes with one are compared by rays alone.
 """
 
 import argparse
@@ -90,6 +91,42 @@ def two_lamps(size: int) -> ws.Scene:
     return seen([*bodies, ground(), standing_lamp, cold], DARK, size, (0.3, 1.8, 3.4), (-0.1, 0.4, 0), fov_y=40)
 
 
+def windows(radius: float, center: tuple[float, float, float], height: int = 64) -> ws.EnvironmentMap:
+    """The walls of a dim room, with a large warm window and a small cold one, as a sphere."""
+    radiance = np.full((height, 2 * height, 3), 0.15)
+    radiance[: height // 2] *= 1.5
+    directions = ws.EnvironmentMap(radiance).directions()
+    for towards, angle, color in (((0.9, 0.35, 0.2), 0.3, (12, 11, 9)), ((-0.6, 0.7, 0.5), 0.18, (6, 8, 12))):
+        radiance[directions @ np.array(towards) / np.linalg.norm(towards) > np.cos(angle)] = color
+    return ws.EnvironmentMap(radiance, radius=radius, center=center)
+
+
+def near_bunny(size: int) -> ws.Scene:
+    """A bunny and a ball on a ground, the windows 2.2 away."""
+    bodies = [
+        standing(shipped_mesh("bunny"), WHITE, (0.2, 0, 0.1), 1.0),
+        standing(ws.icosphere(1.0, 3), GOLD, (-0.8, 0, 0.3), 0.6, name="ball"),
+        ground(2.6),
+    ]
+    return seen(bodies, windows(2.2, (0, 0.5, 0)), size, (0.6, 1.8, 2.8), (0, 0.4, 0))
+
+
+def near_table(size: int) -> ws.Scene:
+    """A table with things on it in a room of 6 across."""
+    return seen([*laid_table(), ground(4.0)], windows(3.0, (0, 0.8, 0)), size)
+
+
+def near_corner(size: int) -> ws.Scene:
+    """A column and a bear in a corner, the windows 2.6 away."""
+    bodies = [
+        standing(joined("column", rod((0, 0, 0), (0, 1, 0), 0.3, 32)), RED, (-0.5, 0, -0.3), 1.4, name="column"),
+        standing(shipped_mesh("bear"), GRAY, (0.5, 0, 0.1), 1.0, rotation=(0, -30, 0)),
+        body(ws.plane((2.6, 1.6), 16), WHITE, (0, 0.8, -0.9), name="wall", rotation=(90, 0, 0)),
+        ground(2.6),
+    ]
+    return seen(bodies, windows(2.6, (0, 0.6, 0)), size, (1.8, 1.7, 3.4), (0, 0.6, 0), fov_y=34)
+
+
 SCENES = {
     "lamp": small_lamp,
     "table": table,
@@ -97,6 +134,9 @@ SCENES = {
     "panel room": panel_room,
     "tube": tube,
     "two lamps": two_lamps,
+    "near bunny": near_bunny,
+    "near table": near_table,
+    "near corner": near_corner,
 }
 
 
@@ -149,25 +189,31 @@ def main() -> None:
     options = parser.parse_args()
     ws.quiet()
     torch.manual_seed(0)
-    heads = ("bounces", 8), ("renderer", 10), ("no edges", 10), ("light", 8), ("still", 8), ("light", 8), ("image", 9)
-    print(f"{'scene':12}" + "".join(f"{head:>{width}}" for head, width in (*heads, ("+ grad", 9))))
+    heads = ("bounces", 8), ("renderer", 10), ("no edges", 10), ("light", 8), ("still", 8), ("light", 8), ("far", 8)
+    print(f"{'scene':12}" + "".join(f"{head:>{width}}" for head, width in (*heads, ("image", 9), ("+ grad", 9))))
     rows, strips = [], []
     for name in options.scenes:
         for text in options.bounces:
             bounces = "all" if text == "all" else int(text)
             scene = dataclasses.replace(SCENES[name](options.size), bounces=bounces)
             deepest = 16 if bounces == "all" else bounces
-            reference = Request(scene, options.by, deepest, options.samples, options.folder).reference()
-            kept = ws.Renderer(dataclasses.replace(scene, visibility=ws.Visibility("directional"))).render()
+            way = "rays" if scene.shell is not None else options.by
+            reference = Request(scene, way, deepest, options.samples, options.folder).reference()
+            moving = dataclasses.replace(scene, visibility=ws.Visibility("directional"))
+            kept = ws.Renderer(moving).render()
             still = ws.render(scene, progress=False)
             chosen, smooth = counted(reference, scene)
             light = [image[chosen, :3].mean() / reference.mean[chosen, :3].mean() - 1 for image in (kept, still)]
             errors = [error(reference, *pair) for pair in ((kept, chosen), (kept, smooth), (still, chosen))]
+            far = ""
+            if scene.shell is not None:
+                away = dataclasses.replace(moving, light=ws.EnvironmentMap(scene.light.radiance))
+                far = f"{error(reference, ws.Renderer(away).render(), chosen):.1%}"
             times = [seconds(scene, has_gradient=has_gradient) for has_gradient in (False, True)]
             rows.append(errors)
             print(
                 f"{name:12}{text:>8}{errors[0]:10.1%}{errors[1]:10.1%}{light[0]:+8.1%}{errors[2]:8.1%}{light[1]:+8.1%}"
-                f"{times[0]:7.2f} s{times[1]:7.2f} s",
+                f"{far:>8}{times[0]:7.2f} s{times[1]:7.2f} s",
                 flush=True,
             )
             strips.append(np.concatenate([kept, still, reference.mean], axis=1)[..., :3])

@@ -75,9 +75,11 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
     "_make_look_up adjoint": lambda: prefilter._make_look_up(LANES)[1],
     "trace._make_trace": trace._make_trace,
     "sun_cells._make_trace": sun_cells._make_trace,
-    "shared_rays._make_trace": shared_rays._make_trace,
+    "shared_rays._make_trace False": partial(shared_rays._make_trace, False),
+    "shared_rays._make_trace True": partial(shared_rays._make_trace, True),
     "gloss.traced._make_trace": traced._make_trace,
-    "_make_trace_cosines": traced_transfer._make_trace_cosines,
+    "_make_trace_cosines False": partial(traced_transfer._make_trace_cosines, False),
+    "_make_trace_cosines True": partial(traced_transfer._make_trace_cosines, True),
     "_make_empty": partial(lanes._make_empty, ""),
 }
 """Makers of kernels that depend on an order, a dtype or an option, with the arguments that differ most."""

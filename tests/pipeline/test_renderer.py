@@ -245,11 +245,14 @@ def test_pixel_and_vertex_receivers_mix_in_one_image(device):
     assert relative_error(mixed, by_vertex) < 2e-3  # interpolation again, on a ball of 642 vertices
 
 
+@pytest.mark.parametrize("bounces", [0, 1])
 @pytest.mark.parametrize("receivers", ["vertex", "pixel"])
 @pytest.mark.parametrize("method", METHODS)
-def test_a_camera_that_sees_no_body_renders_nothing(device, method, receivers):
+def test_a_camera_that_sees_no_body_renders_nothing(device, method, receivers, bounces):
     camera = ws.Camera.look_at((0, 0, 5), (0, 0, 10), size=(8, 8))
-    scene = scene_of(method, ball(receivers=receivers), camera=camera)
+    if bounces and method == "none":
+        pytest.skip("has no bounces")
+    scene = dataclasses.replace(scene_of(method, ball(receivers=receivers), camera=camera), bounces=bounces)
     with pytest.warns(UserWarning, match="camera: the image shows nothing of the scene: .* behind the camera"):
         np.testing.assert_array_equal(ws.render(scene, device=device), np.zeros((8, 8, 4)))
 

@@ -17,6 +17,7 @@ from warpshadow.stages.emitters.samples import (
     find_sample_weights,
     place_samples,
 )
+from warpshadow.stages.emitters.self_visibility import find_self_visibility, look_up_self_visibility
 from warpshadow.stages.planes.grid import find_grid
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneBody
 from warpshadow.stages.ray_tracing import trace_visibility
@@ -38,10 +39,10 @@ BALL, SQUARE = ws.icosphere(0.5, 3), ws.plane(1.0, 2)
 
 def samples_of(mesh, device, *, is_two_sided=False):
     weights = find_sample_weights(mesh.positions, mesh.surface.faces, is_two_sided=is_two_sided, device=device)
-    matrices = [SparseMatrix.from_matrix(matrix, device=device) for matrix in weights]
+    matrices = [SparseMatrix.from_matrix(matrix, device=device) for matrix in weights[:2]]
     faces = wp.array(mesh.surface.faces, dtype=wp.vec3i, device=device)
     first = np.array([0, weights.vertices.shape[0]])
-    return EmitterSamples(*matrices, faces, (0,), (is_two_sided,), first)
+    return EmitterSamples(*matrices, weights.surface_points, faces, (0,), (is_two_sided,), first)
 
 
 def placed(samples, positions, device):
@@ -227,7 +228,8 @@ def test_rays_meet_what_is_between_and_not_what_is_behind(device):
     for height, share in ((0.7, 1.0), (-1.0, 0.0), (-2.5, 1.0)):
         vertices = wp.array(mesh.positions + np.float32([0, height, 0]), dtype=wp.vec3, device=device)
         wall = wp.Mesh(vertices, wp.array(mesh.surface.faces.ravel(), dtype=wp.int32, device=device))
-        got = traced.trace_transmittance(wall, *arrays, own.points[0], own.areas[0], span, rays=4).numpy()
+        lamp = samples, wp.array(BALL.positions, dtype=wp.vec3, device=device), own.points[0], own.areas[0], span
+        got = traced.trace_transmittance(wall, *arrays, *lamp, rays=4).numpy()
         faces_it = np.einsum("kx,kx->k", at[0] - numbers(own.points), numbers(own.areas)) > 0
         np.testing.assert_array_equal(got[0, faces_it], share)
         far = trace_visibility(wall, *(a.reshape((1, 1)) for a in arrays), wp.array([(0, 1.0, 0)], dtype=wp.vec3))
@@ -285,3 +287,98 @@ def test_gradients_of_light_agree_with_differences(between, device):
         difference, gradient = (loss(sides[0]) - loss(sides[1])) / 2, array.grad.numpy()
         scale = STEP * float(np.linalg.norm(gradient))
         assert (gradient * shift).sum() == pytest.approx(difference, abs=SLOPE * scale), number
+
+
+# ------------------------------------------------------------------------------------------------ self-visibility
+
+
+def tube():
+    """An open cylinder around the y axis, of radius 0.5 and height 1."""
+    mesh = trimesh.creation.cylinder(0.5, 1.0, sections=48)
+    is_wall = np.abs(mesh.face_normals[:, 2]) < 0.5
+    return ws.Mesh(mesh.vertices[:, [1, 2, 0]], mesh.faces[is_wall])
+
+
+def tube_and_samples(device):
+    mesh = tube()
+    weights = find_sample_weights(mesh.positions, mesh.surface.faces, is_two_sided=True, device=device)
+    samples = samples_of(mesh, device, is_two_sided=True)
+    rest = weights.vertices @ mesh.positions.astype(float), weights.surface_points
+    table = find_self_visibility(mesh.positions, mesh.surface.faces, *rest, is_two_sided=True, device=device)
+    return mesh, samples, table
+
+
+def turned(positions, angle=0.7, scale=3.0, shift=(5.0, -2.0, 1.0)):
+    rotation = trimesh.transformations.rotation_matrix(angle, (0.3, -0.5, 0.8))[:3, :3]
+    return scale * positions @ rotation.T + shift
+
+
+def test_points_of_samples_lie_on_them(device):
+    mesh, samples, _ = tube_and_samples(device)
+    weights = find_sample_weights(mesh.positions, mesh.surface.faces, is_two_sided=True, device=device)
+    faces, barycentrics = weights.surface_points
+    corners = mesh.positions[mesh.surface.faces[faces]]
+    points = np.einsum("spk,spkx->spx", barycentrics, corners)
+    middles = weights.vertices @ mesh.positions
+    np.testing.assert_allclose(np.linalg.norm(points[..., ::2], axis=-1), 0.5, atol=0.01)
+    assert np.linalg.norm(points.mean(axis=1) - middles, axis=-1).max() < 0.05
+    areas = np.linalg.norm(numbers(placed(samples, mesh.positions, device).areas), axis=-1)
+    assert np.linalg.norm(points - middles[:, None], axis=-1).max() < 3 * np.sqrt(areas.max() / np.pi)
+
+
+def test_a_tube_hides_its_far_side_from_outside_and_nothing_from_within(device):
+    mesh, samples, table = tube_and_samples(device)
+    span = next(samples.spans())
+    inside, outside = np.array([[(0, 0, 0), (0.1, 0.2, -0.1)]]), np.array([[(3, 0.0, 0), (0, 0.0, -2)]])
+    moved = placed(samples, turned(mesh.positions), device)
+    for points, is_inside in ((inside, True), (outside, False)):
+        array = wp.array(turned(points), dtype=wp.vec3, device=device)
+        got = numbers(look_up_self_visibility(array, moved, span, table))
+        rest = numbers(placed(samples, mesh.positions, device).points)
+        for row, point in zip(got, points[0], strict=True):
+            towards = (rest[:, ::2] * (point[::2] - rest[:, ::2])).sum(axis=1)  # positive on the near wall
+            if is_inside:
+                assert row.min() > 0.9
+            else:
+                near, far = row[towards > 0.3], row[(towards < -0.3) & (np.abs(rest[:, 1]) < 0.3)]
+                assert near.min() > 0.95 and far.max() < 0.1 and len(near) > 5 and len(far) > 5
+
+
+def test_a_convex_emitter_has_no_table(device):
+    weights = find_sample_weights(BALL.positions, BALL.surface.faces, is_two_sided=False, device=device)
+    rest = weights.vertices @ BALL.positions.astype(float), weights.surface_points
+    ball = BALL.positions, BALL.surface.faces, *rest
+    assert find_self_visibility(*ball, is_two_sided=False, device=device) is None
+
+
+def test_gradients_of_self_visibility_agree_with_differences(device):
+    """To receivers and to the pose of the emitter."""
+    mesh, samples, table = tube_and_samples(device)
+    span, rng = next(samples.spans()), np.random.default_rng(7)
+    points = turned(2.0 * twins.unit(rng.normal(size=(1, 20, 3))))
+    weights = rng.normal(size=(1, 20, span.size))
+
+    def looked_up(points, angle, scale, requires_grad=False):
+        arrays = [
+            wp.array(values, dtype=wp.vec3, device=device, requires_grad=requires_grad)
+            for values in (points, turned(mesh.positions, angle, scale)[None])
+        ]
+        return arrays, look_up_self_visibility(arrays[0], place_samples(arrays[1], samples), span, table)
+
+    with recorded() as tape:
+        arrays, result = looked_up(points, 0.7, 3.0, requires_grad=True)
+    tape.backward(grads={result: wp.array(weights, dtype=wp.float32, device=device)})
+    of_points, of_vertices = (array.grad.numpy() for array in arrays)
+
+    def loss(*arguments):
+        return float((weights * looked_up(*arguments)[1].numpy()).sum())
+
+    step = 3e-3
+    shift = rng.normal(size=points.shape)
+    difference = (loss(points + step * shift, 0.7, 3.0) - loss(points - step * shift, 0.7, 3.0)) / (2 * step)
+    assert (of_points * shift).sum() == pytest.approx(difference, abs=SLOPE * float(np.linalg.norm(of_points)))
+    for angle, scale in ((step, 0.0), (0.0, step)):
+        sides = [loss(points, 0.7 + sign * angle, 3.0 + sign * scale) for sign in (1, -1)]
+        moved = [turned(mesh.positions, 0.7 + sign * angle, 3.0 + sign * scale) for sign in (1, -1)]
+        expected, got = sides[0] - sides[1], (of_vertices[0] * (moved[0] - moved[1])).sum()
+        assert float(got) == pytest.approx(expected, rel=0.03, abs=1e-3)

@@ -1,4 +1,4 @@
-"""Distant light: equirectangular environment maps, and their projections.
+"""Light around a scene: equirectangular environment maps, and their projections.
 
 Pixel (row, col) of a map of H × 2H looks along θ = π(row+½)/H, φ = 2π(col+½)/W,
 
@@ -35,6 +35,8 @@ LIGHT = (
 )
 """The types of known light that functions accept, for messages."""
 
+_ORIGIN = np.zeros(3)
+
 _DRAWN_ROWS = 256  # of a map in a notebook, and less than twice as many
 
 
@@ -47,21 +49,28 @@ def check_coefficients(name: str, values: np.ndarray) -> None:
 
 @dataclass(frozen=True, eq=False, init=False)
 class EnvironmentMap:
-    """Light from infinitely far away, as an equirectangular map, validated; the array is a read-only copy.
+    """Light from all around, as an equirectangular map, validated; arrays are read-only copies.
+
+    It comes from infinitely far away; or with a radius from a sphere around the scene, the *shell*, such as the walls
+    of a room: then bodies at different places see it in different directions, and more of the parts that are near.
 
     The world is right-handed with y up. Pixel (row, col) of H × 2H covers a rectangle around the direction
     (sin φ sin θ, cos θ, −cos φ sin θ) of its center, θ = π(row+½)/H, φ = π(col+½)/H: the top row looks up along +y, the
     center of the map along +z, the middle of its left half along +x (Mitsuba's convention; :meth:`read` takes others).
 
     Args:
-        radiance: Linear RGB, 0 to 1e18, float32, shape [height, 2·height, 3].
+        radiance: Linear RGB, 0 to 1e18, float32, shape [height, 2·height, 3]; with a radius, as its center sees it.
+        radius: Of the shell [scene units], within which all bodies must be; None for infinitely far away.
+        center: Of the shell [scene units], float64 of shape [3].
     Raises:
         ImageError: for another shape or aspect, or NaN, Inf, negative values or values beyond 1e18.
     """
 
     radiance: np.ndarray = field(repr=False)
+    radius: float | None = None
+    center: np.ndarray = field(default_factory=lambda: _ORIGIN)
 
-    def __init__(self, radiance: npt.ArrayLike):
+    def __init__(self, radiance: npt.ArrayLike, *, radius: float | None = None, center: npt.ArrayLike = _ORIGIN):
         expected = "an array [height, 2·height, 3]; EnvironmentMap.read(path) reads a file"
         pixels = check.pixels("radiance", radiance, expected=expected, error=ImageError)
         _check_aspect(pixels)
@@ -75,15 +84,31 @@ class EnvironmentMap:
                 "or 'neighbors' repairs them on reading"
             )
         pixels.setflags(write=False)
-        object.__setattr__(self, "radiance", pixels)
+        middle = check.array("center", center, (3,), "a point (x, y, z)")
+        if radius is None and middle.any():
+            raise ValueError(f"center: got {middle.tolist()} without a radius, expected both")
+        distance = None if radius is None else check.positive("radius", radius)
+        vars(self).update(radiance=pixels, radius=distance, center=middle)
 
     def __repr__(self) -> str:
         height, width, _ = self.radiance.shape
-        return f"EnvironmentMap({width} × {height})"
+        shell = "" if self.radius is None else f", radius {self.radius:g} around {self.center.tolist()}"
+        return f"EnvironmentMap({width} × {height}{shell})"
+
+    def _with_radiance(self, radiance: npt.ArrayLike) -> EnvironmentMap:
+        """Another map of the same shell."""
+        return EnvironmentMap(radiance, radius=self.radius, center=self.center)
 
     @classmethod
     def read(
-        cls, path: AnyPath, *, sanitize: str | None = None, part: str | int | None = None, convention: str = "mitsuba"
+        cls,
+        path: AnyPath,
+        *,
+        sanitize: str | None = None,
+        part: str | int | None = None,
+        convention: str = "mitsuba",
+        radius: float | None = None,
+        center: npt.ArrayLike = _ORIGIN,
     ) -> EnvironmentMap:
         """Read a map; gray becomes RGB and alpha is dropped.
 
@@ -96,6 +121,7 @@ class EnvironmentMap:
                 "mitsuba", "openexr" and "usd" (DomeLight): +z, then -x;
                 "blender" (exported with y up) and "three.js": +x, then +z;
                 "debevec" (light probe gallery, HDRShop): -z, then +x.
+            radius, center: Of its shell, as for the class.
         Raises:
             ImageError: for a file that is not a usable map; cube maps are named as such.
         """
@@ -106,18 +132,25 @@ class EnvironmentMap:
             _check_aspect(pixels)
             if sanitize:
                 pixels = _sanitized(pixels, sanitize)
-            return cls(pixels).rotated(CONVENTIONS[convention])
+            return cls(pixels, radius=radius, center=center).rotated(CONVENTIONS[convention])
         except ImageError as error:
             raise ImageError(f"{path}: {error}") from error
 
     @classmethod
-    def constant(cls, rgb: npt.ArrayLike = 1.0, height: int = 16) -> EnvironmentMap:
-        """Make a map of the same radiance everywhere, one number or RGB."""
+    def constant(
+        cls,
+        rgb: npt.ArrayLike = 1.0,
+        height: int = 16,
+        *,
+        radius: float | None = None,
+        center: npt.ArrayLike = _ORIGIN,
+    ) -> EnvironmentMap:
+        """Make a map of the same radiance everywhere, one number or RGB; radius and center as for the class."""
         check.integer("height", height, unit="rows")
-        return cls(np.broadcast_to(_color("rgb", rgb), (height, 2 * height, 3)))
+        return cls(np.broadcast_to(_color("rgb", rgb), (height, 2 * height, 3)), radius=radius, center=center)
 
     def write(self, path: AnyPath) -> None:
-        """Write an OpenEXR file of float32 RGB."""
+        """Write an OpenEXR file of float32 RGB; scene files, not it, have a radius."""
         if Path(path).suffix.lower() != ".exr":
             raise ImageError(
                 f"{path}: got extension {Path(path).suffix!r}, expected .exr, which holds radiance unclipped"
@@ -126,11 +159,17 @@ class EnvironmentMap:
 
     @property
     def content_hash(self) -> str:
-        """SHA-256 of the radiance, in hexadecimal."""
-        return hashlib.sha256(f"{self.radiance.shape}".encode() + self.radiance.tobytes()).hexdigest()
+        """SHA-256 of the radiance, and of the shell if there is one, in hexadecimal."""
+        shell = b"" if self.shell is None else self.shell.tobytes()
+        return hashlib.sha256(f"{self.radiance.shape}".encode() + self.radiance.tobytes() + shell).hexdigest()
+
+    @property
+    def shell(self) -> np.ndarray | None:
+        """Center and radius of the shell [scene units], float32 of shape [4]; None for light infinitely far away."""
+        return None if self.radius is None else np.array([*self.center, self.radius], np.float32)
 
     def rotated(self, degrees: float) -> EnvironmentMap:
-        """Turn the light about +y, counter-clockwise seen from above: +90 takes light from +z to +x.
+        """Turn the light about +y, around its center, counter-clockwise from above: +90 takes light from +z to +x.
 
         Whole pixels are exact; between them columns are interpolated linearly, which blurs a map of few columns. Either
         way the energy is kept.
@@ -145,11 +184,11 @@ class EnvironmentMap:
         rolled_radiance = np.roll(self.radiance, int(whole_columns), axis=1)
         if fraction:
             rolled_radiance = (1 - fraction) * rolled_radiance + fraction * np.roll(rolled_radiance, 1, axis=1)
-        return EnvironmentMap(rolled_radiance)
+        return self._with_radiance(rolled_radiance)
 
     def scaled(self, factor: npt.ArrayLike) -> EnvironmentMap:
         """Multiply the radiance by one factor, or by one for each of R, G, B."""
-        return EnvironmentMap(self.radiance * _color("factor", factor))
+        return self._with_radiance(self.radiance * _color("factor", factor))
 
     def _repr_png_(self) -> bytes:
         """The map as notebooks draw it: at most some 512 columns, at its automatic exposure."""
@@ -163,7 +202,7 @@ class EnvironmentMap:
         """Radiance from directions, interpolated between pixels.
 
         Args:
-            directions: Unit vectors, shape [..., 3].
+            directions: Unit vectors from the center, shape [..., 3].
         Returns:
             Linear RGB, float64 of shape [..., 3].
         """

@@ -65,7 +65,7 @@ class SceneConvexParts:
     @functools.cached_property
     def solids(self) -> frozenset[int]:
         """Bodies whose parts block their own light, too."""
-        return solid_bodies(self._merged_scene.scene)
+        return solid_bodies(self._merged_scene.scene, self.parts)
 
     def blockers(self, bodies: tuple[int, ...], blocking_bodies: tuple[int, ...]) -> ConvexBlockers:
         """Convex blockers of some of these bodies; ``blocking_bodies`` cast shadows."""

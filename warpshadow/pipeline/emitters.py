@@ -8,13 +8,14 @@ its surface has its radiance beside the light that it reflects.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import cut
+from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node
@@ -30,8 +31,15 @@ from warpshadow.stages.emitters.samples import (
     EmitterSamples,
     EmitterSpan,
     PlacedSamples,
+    SampleWeights,
+    SurfacePoints,
     find_sample_weights,
     place_samples,
+)
+from warpshadow.stages.emitters.self_visibility import (
+    EmitterSelfVisibility,
+    find_self_visibility,
+    look_up_self_visibility,
 )
 from warpshadow.stages.emitters.spheres import find_log_transmittance
 from warpshadow.stages.gloss.highlights import sum_highlights
@@ -62,24 +70,50 @@ class SceneEmitters:
 
         merged_scene = self._merged_scene
         bodies = np.flatnonzero(merged_scene.is_emitter).tolist()
-        weights = []
-        for body in bodies:
-            mesh, is_open = merged_scene.scene.bodies[body].mesh, bool(merged_scene.is_two_sided[body])
-            surface = mesh.positions, mesh.surface.faces
-            weights.append(find_sample_weights(*surface, is_two_sided=is_open, device=merged_scene.device))
+        weights = self._sample_weights
         of_vertices = block_diag([item.vertices for item in weights], format="csr")
         vertices = np.flatnonzero(np.isin(merged_scene.body_of_vertex, bodies))
         shape = of_vertices.shape[0], int(merged_scene.first_vertex[-1])
         of_vertices = csr_matrix((of_vertices.data, vertices[of_vertices.indices], of_vertices.indptr), shape)
         is_emitting = np.isin(merged_scene.body_of_face, bodies)
+        first_faces = np.cumsum([0, *(item.faces.shape[1] for item in weights[:-1])])
+        surface_faces = [item.surface_points.faces + first for item, first in zip(weights, first_faces, strict=True)]
+        surface_weights = np.concatenate([item.surface_points.weights for item in weights])
         return EmitterSamples(
             SparseMatrix.from_matrix(of_vertices, device=merged_scene.device),
             SparseMatrix.from_matrix(block_diag([item.faces for item in weights]), device=merged_scene.device),
+            SurfacePoints(np.concatenate(surface_faces), surface_weights),
             wp.array(merged_scene.faces.numpy()[is_emitting], dtype=wp.vec3i, device=merged_scene.device),
             tuple(bodies),
             tuple(merged_scene.is_two_sided[bodies].tolist()),
             np.cumsum([0, *(item.vertices.shape[0] for item in weights)]),
         )
+
+    @functools.cached_property
+    def _sample_weights(self) -> list[SampleWeights]:
+        scene, result = self._merged_scene, []
+        for body in np.flatnonzero(scene.is_emitter):
+            surface, is_open = scene.scene.bodies[body].mesh.surface, bool(scene.is_two_sided[body])
+            positions = scene.scene.bodies[body].mesh.positions
+            result.append(find_sample_weights(positions, surface.faces, is_two_sided=is_open, device=scene.device))
+        return result
+
+    @functools.cached_property
+    def self_visibility(self) -> list[EmitterSelfVisibility | None]:
+        """Self-visibility of each emitter; None of one that hides nothing of itself."""
+        pairs = zip(self.samples.bodies, self._sample_weights, strict=True)
+        return [self._find_self_visibility(body, weights) for body, weights in pairs]
+
+    def _find_self_visibility(self, body: int, weights: SampleWeights) -> EmitterSelfVisibility | None:
+        merged_scene = self._merged_scene
+        mesh, is_open = merged_scene.scene.bodies[body].mesh, bool(merged_scene.is_two_sided[body])
+        is_convex = len(mesh.convex_parts) == 1 and not is_open
+        if merged_scene.is_flat[body] or is_convex or body not in merged_scene.casting:
+            return None
+        samples = weights.vertices @ mesh.positions.astype(np.float64), weights.surface_points
+        surface, device = (mesh.positions, mesh.surface.faces), merged_scene.device
+        with unrecorded():
+            return find_self_visibility(*surface, *samples, is_two_sided=is_open, device=device)
 
     def placed(self, points: LitPoints) -> Node:
         """Node of the samples among the bodies around points."""
@@ -125,6 +159,7 @@ class SceneEmitters:
 
 def find_emitted_light(
     emitters: EmitterSamples,
+    self_visibility: Sequence[EmitterSelfVisibility | None],
     groups: Iterable[Group],
     blockers: Blockers,
     placed_samples: PlacedSamples,
@@ -134,6 +169,7 @@ def find_emitted_light(
 
     Args:
         emitters: Their samples.
+        self_visibility: Of each; None of one that hides nothing of itself.
         groups: The receivers, with the self-visibility of their bodies in EMITTER_CELLS.
         blockers: All of them.
         placed_samples: Where the samples are.
@@ -143,7 +179,7 @@ def find_emitted_light(
 
     def light_of(portion: Group) -> wp.array:
         total = wp.zeros(portion.points.shape, dtype=wp.vec3, device=portion.points.device)
-        for span, transmittances in _find_transmittances(emitters, portion, blockers, placed_samples):
+        for span, transmittances in _find_transmittances(emitters, self_visibility, portion, blockers, placed_samples):
             lit = portion.points, portion.normals, placed_samples, radiance, span
             total = total_light([total, sum_light(*lit, **transmittances)])
         return total
@@ -153,6 +189,7 @@ def find_emitted_light(
 
 def find_highlights(
     emitters: EmitterSamples,
+    self_visibility: Sequence[EmitterSelfVisibility | None],
     groups: Iterable[Group],
     blockers: Blockers,
     placed_samples: PlacedSamples,
@@ -163,7 +200,7 @@ def find_highlights(
     """Direct light of emitters in the lobes of groups of receivers, G and G' of :mod:`.stages.gloss.highlights`.
 
     Args:
-        emitters, groups, blockers, placed_samples, radiance: As for :func:`find_emitted_light`.
+        emitters, self_visibility, groups, blockers, placed_samples, radiance: As for :func:`find_emitted_light`.
         roughness: Of all receivers of the groups, float32 of shape [batch, receiver].
         clip_matrices: Cameras, mat44 of shape [batch].
     Differentiable: as that, and roughness and clip_matrices.
@@ -175,20 +212,25 @@ def find_highlights(
         zeros = wp.zeros(portion.points.shape, dtype=wp.vec3, device=portion.points.device)
         of_emitters = [
             sum_highlights(*seen, placed_samples, radiance, span, **transmittances)
-            for span, transmittances in _find_transmittances(emitters, portion, blockers, placed_samples)
+            for span, transmittances in _find_transmittances(
+                emitters, self_visibility, portion, blockers, placed_samples
+            )
         ]
         lobe_sums.append([total_light([zeros, *parts]) for parts in zip(*of_emitters, strict=True)] or [zeros, zeros])
         first = end
-    straight, grazing = (joined(list(parts)) for parts in zip(*lobe_sums, strict=True))
-    return straight, grazing
+    return joined([straight for straight, _ in lobe_sums]), joined([grazing for _, grazing in lobe_sums])
 
 
 def _find_transmittances(
-    emitters: EmitterSamples, group: Group, blockers: Blockers, placed_samples: PlacedSamples
+    emitters: EmitterSamples,
+    self_visibility: Sequence[EmitterSelfVisibility | None],
+    group: Group,
+    blockers: Blockers,
+    placed_samples: PlacedSamples,
 ) -> Iterator[tuple[EmitterSpan, dict[str, Any]]]:
-    """Samples of all emitters but the group's own body, and the transmittance from a portion of the receivers to them.
+    """Samples of all emitters that light a portion of receivers, and transmittance to them: arguments of `sum_light`.
 
-    The latter are arguments of :func:`.sum_light`.
+    The receivers' own body is among them if it is not convex.
     """
     merged_scene, points, normals = blockers.merged_scene, group.points, group.normals
     if not points.size:
@@ -202,12 +244,13 @@ def _find_transmittances(
     spheres = merged_scene.spheres_of(sphere_bodies, blockers.spheres)
     traced_body = group.body if group.body in blockers.blocker_kinds.traced else None
     own_spheres = merged_scene.spheres_among(sphere_bodies, traced_body)
-    for body, span in zip(emitters.bodies, emitters.spans(), strict=True):
-        if body == group.body:
+    for body, span, hidden_by_itself in zip(emitters.bodies, emitters.spans(), self_visibility, strict=True):
+        is_own = body == group.body
+        if is_own and hidden_by_itself is None:
             continue
         skipped = own_spheres, merged_scene.spheres_among(sphere_bodies, body)
         transmittance_self = None
-        if cells is not None:
+        if cells is not None and not is_own:
             towards = directions_to_samples(points, placed_samples, span)
             transmittance_self = transmittance_of_directions(cells, normals, towards, EMITTER_CELLS)
         yield (
@@ -217,6 +260,9 @@ def _find_transmittances(
                 "log_of_planes": _log_of_planes(group, blockers, placed_samples, span, body),
                 "log_of_parts": _log_of_parts(group, blockers, placed_samples, span, body),
                 "transmittance": transmittance_self,
+                "transmittance_of_emitter": None
+                if hidden_by_itself is None
+                else look_up_self_visibility(points, placed_samples, span, hidden_by_itself, is_own=is_own),
             },
         )
 

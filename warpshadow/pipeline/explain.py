@@ -3,6 +3,8 @@
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 
+import numpy as np
+
 from warpshadow.pipeline.node import AnyInput, Call, Input, Node, NodeStage, Timing
 
 
@@ -106,6 +108,14 @@ def bounce_notes(count: int | str) -> list[str]:
         return []
     times = "until none is left" if count == "all" else f"{count} time{'s' * (count != 1)}"
     return [f"Light bounces {times}."]
+
+
+def shell_notes(shell: np.ndarray | None) -> list[str]:
+    """Say how far light is, where it is near."""
+    if shell is None:
+        return []
+    x, y, z, radius = shell.tolist()
+    return [f"Light comes from {radius:g} around ({x:g}, {y:g}, {z:g})."]
 
 
 def decide(image: Node, call: Call) -> dict[Node, Decision]:

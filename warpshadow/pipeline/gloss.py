@@ -14,7 +14,7 @@ import warp as wp
 
 from warpshadow.device.batch import concatenate, cut, rows
 from warpshadow.device.constants import constant
-from warpshadow.pipeline.method import Method, add_light
+from warpshadow.pipeline.method import LightInput, Method, add_light
 from warpshadow.pipeline.node import Input, Node, detached
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
@@ -27,6 +27,7 @@ from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sample_receivers import Span
+from warpshadow.stages.shell.beams import exits_from_shell
 from warpshadow.stages.textures.footprint import Footprints
 from warpshadow.stages.textures.numbers import as_colors, as_scalars, means_of_receivers
 from warpshadow.stages.textures.pyramid import Textures
@@ -80,7 +81,10 @@ class GlossyPoints(LitPoints):
         directions, filters, cosines = (Node("", operator.itemgetter(part), sampled) for part in range(3))
         source = self.method.light_input(self, light)
         texels = self.cached("prefiltered", source, lambda: self._prefiltered(source))
-        radiance = Node("prefiltered light", look_up_light, texels, directions, filters, items=item_text)
+        shell, towards = self.method.shell_of(source), directions
+        if shell is not None:
+            towards = Node("", _exits, self.receivers_node, directions, shell)
+        radiance = Node("prefiltered light", look_up_light, texels, towards, filters, items=item_text)
         through = self.method.lobe_transmittance(self, directions, source, view)
         blocked = None
         if self.merged_scene.scene.bounces:
@@ -127,7 +131,7 @@ class GlossyPoints(LitPoints):
         """Numbers of the view's samples: of textures and, on bodies without one, of vertices."""
         return as_scalars(sample_albedo(fragments, self.merged_scene.faces, as_colors(values), textures, footprints))
 
-    def _prefiltered(self, light: Input) -> Node:
+    def _prefiltered(self, light: LightInput) -> Node:
         """Node of the texels of light, vec3 of shape [batch, texel]."""
         if light.is_free:
             return Node("prefiltering", self._blurred, light, items=lambda: f"{self.method.basis.size} coefficients")
@@ -146,6 +150,11 @@ def _blurred_basis(basis: object) -> np.ndarray:
     directions = sh.equirectangular_directions(_CELL_ROWS)
     functions = basis.functions(directions.reshape(-1, 3))  # type: ignore[attr-defined]
     return prefilter(functions.reshape(_CELL_ROWS, 2 * _CELL_ROWS, -1))
+
+
+def _exits(receivers: Receivers, directions: wp.array, shell: wp.array) -> wp.array:
+    """Directions from the center of a shell to where samples of lobes meet it. Differentiable: all."""
+    return exits_from_shell(receivers.points, directions, shell)
 
 
 def _sample(

@@ -11,6 +11,7 @@ import warp as wp
 
 from warpshadow.assets.basis import Basis, HarmonicBasis, conversion
 from warpshadow.assets.harmonic_light import KnownLight, as_light
+from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.constants import constant
 from warpshadow.pipeline.geometry import Geometry
 from warpshadow.pipeline.merged_scene import MergedScene
@@ -18,12 +19,27 @@ from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.reflectance import Materials
-from warpshadow.pipeline.transfers import Light, check_light, shade_free
+from warpshadow.pipeline.transfers import Light, ShellLight, check_light, shade_free
 from warpshadow.stages.gloss.prefilter import prefilter
 from warpshadow.stages.receivers import Numbering, number_receivers
+from warpshadow.stages.shell.beams import check_shell, shell_array
 
 if TYPE_CHECKING:  # it is imported where a body emits
     from warpshadow.pipeline.emitters import SceneEmitters
+
+
+class LightInput(Input):
+    """Light as an input: known light, or free coefficients.
+
+    Args:
+        value: The light.
+        shell: Of the light, vec4 of shape [batch], where it is not the scene's; None where it is, or is infinitely far.
+        news: As for :class:`Input`.
+    """
+
+    def __init__(self, value: KnownLight | wp.array, shell: Input | None = None, *, news: str = ""):
+        super().__init__("light", value, news=news)
+        self.shell = shell
 
 
 class Method:
@@ -48,10 +64,12 @@ class Method:
         self.merged_scene, self.native_basis, self.progress = merged_scene, native_basis, progress
         self.basis = native_basis if basis is None else basis
         self.visibility = merged_scene.scene.visibility
-        self.light = Input("light", merged_scene.scene.known_light)
+        self.light = LightInput(merged_scene.scene.known_light)
         self._numberings: dict[Hashable, list[Numbering]] = {}
         self._can_receive: dict[tuple[int, ...], np.ndarray] = {}  # by the bodies out of which spheres bulge
         self.has_emitters = bool(merged_scene.is_emitter.any())
+        shell = merged_scene.scene.shell
+        self.shell = None if shell is None else shell_array(shell, merged_scene.device)
 
     def blocker_kinds(self, geometry: Geometry | None, rotations: Input | None) -> BlockerKinds:
         """Choose the kind of blocker that each body of a geometry is; the scene's geometry by default.
@@ -71,10 +89,11 @@ class Method:
     def is_adaptive(self) -> np.ndarray:
         """Flat bodies on which samples interpolate between receivers, bool of shape [body].
 
-        None where a body emits: where its shadows have edges, nobody knows.
+        None where a body emits or light is near: where shadows have edges, nobody knows.
         """
         adaptive = np.array([body.receivers == "adaptive" for body in self.merged_scene.scene.bodies])
-        return adaptive & self.merged_scene.is_flat & (not self.lights_samples) & (not self.has_emitters)
+        is_known = not (self.lights_samples or self.has_emitters or self.shell is not None)
+        return adaptive & self.merged_scene.is_flat & is_known
 
     def can_receive(self, blocker_kinds: BlockerKinds) -> np.ndarray:
         """Vertices that may be receivers, and vertices whose backs may be, bool of shape [2, vertex]."""
@@ -171,26 +190,58 @@ class Method:
             return shade()
         return points.cached("shading of the scene" if light_input is self.light else "shading", light_input, shade)
 
-    def light_input(self, points: LitPoints, light: Light | None) -> Input:
-        """The light of points as an input; the same for the same known light."""
-        if light is None or light is self.merged_scene.scene.light:
+    def light_input(self, points: LitPoints, light: Light | None) -> LightInput:
+        """The light of points as an input; the same for the same known light of the same shell."""
+        own_shell = None
+        if isinstance(light, ShellLight):
+            light, own_shell = light
+        is_of_scene = light is None or light is self.merged_scene.scene.light
+        if is_of_scene and own_shell is None:
             return self.light
+        shell = self._shell_input(points, light, own_shell)
         if isinstance(light, wp.array):
-            return Input("light", light, news="light is given")
-        points.last_light = Input.renewed("light", as_light(light), points.last_light)
+            return LightInput(light, shell, news="light is given")
+        known, last = self.light.value() if light is None else as_light(light), points.last_light
+        if last is not None and last.shell is shell and last.value() == known:
+            return last
+        points.last_light = LightInput(known, shell, news="light changed since the last call" if last else "")
         return points.last_light
 
-    def cached_transfers(self, points: LitPoints) -> Node:
-        """Transfer vectors of points to :attr:`basis`, an array [batch, receiver, coefficient] for each group."""
-        return points.cached("transfers", None, lambda: self.transfers(points))
+    def _shell_input(self, points: LitPoints, light: Light | None, shell: wp.array | None) -> Input | None:
+        """The shell of light that is not the scene's, the same while its values are; None for the scene's."""
+        if isinstance(light, EnvironmentMap) and light.shell is not None and shell is None:
+            shell = shell_array(light.shell, self.merged_scene.device)
+        if shell is None:
+            return None
+        if self.shell is None:
+            raise ValueError(
+                "light: got some with a radius for a scene whose light is infinitely far away, expected none; the "
+                "scene's light has to have one: EnvironmentMap(…, radius=…)"
+            )
+        check_shell(shell)
+        points.last_shell = Input.renewed("shell", shell, points.last_shell)
+        return points.last_shell
 
-    def known_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
+    def shell_of(self, light: LightInput) -> Input | wp.array | None:
+        """Center and radius of the sphere that sends light, vec4 of shape [batch]; None for light infinitely far."""
+        return self.shell if light.shell is None else light.shell
+
+    def cached_transfers(self, points: LitPoints, light: LightInput | None = None) -> Node:
+        """Transfer vectors of points to :attr:`basis`, an array [batch, receiver, coefficient] for each group.
+
+        Args:
+            light: Free light, whose shell they are for; None for that of the scene.
+        """
+        shell = None if light is None else light.shell
+        return points.cached("transfers", shell, lambda: self.transfers(points, light or self.light))
+
+    def known_shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
         """Shading of points in known light, which bounces from the materials."""
         raise NotImplementedError
 
-    def free_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
+    def free_shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
         """Shading of points in free light, which is converted where the transfer vectors are not."""
-        transfers = self.cached_transfers(points)
+        transfers = self.cached_transfers(points, light)
         matrix = self.native_from_basis if transfers.requires_grad else None
         items = functools.partial(receiver_text, points.in_words)
         return Node("shading", functools.partial(shade_free, matrix=matrix), transfers, light, items=items)
@@ -203,22 +254,22 @@ class Method:
             return None
         return conversion(basis, native)
 
-    def transfers(self, points: LitPoints) -> Node:
-        """Transfer vectors of points to :attr:`basis`, an array for each group."""
+    def transfers(self, points: LitPoints, light: LightInput) -> Node:
+        """Transfer vectors of points to :attr:`basis`, an array for each group; of light, its shell matters."""
         raise NotImplementedError
 
     @functools.cached_property
     def _prefiltered_from_scene(self) -> Node:
         return Node("prefiltering", self._prefilter, self.light)
 
-    def prefiltered(self, light: Input) -> Node:
+    def prefiltered(self, light: LightInput) -> Node:
         """Node of known light, prefiltered for bodies that shine, vec3 [1, texel]; the scene's is cached."""
         return self._prefiltered_from_scene if light is self.light else Node("prefiltering", self._prefilter, light)
 
     def _prefilter(self, light: KnownLight) -> wp.array:
         return constant(prefilter(light.radiance)[None], wp.vec3, self.merged_scene.device)
 
-    def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input, view: LitPoints) -> Node:
+    def lobe_transmittance(self, points: LitPoints, directions: Node, light: LightInput, view: LitPoints) -> Node:
         """Transmittance towards the samples of lobes of points, float32 of shape [batch, receiver, sample].
 
         Args:
@@ -232,7 +283,7 @@ class Method:
         return Node("", lambda towards: wp.full(towards.shape, 1.0, wp.float32, device=towards.device), directions)
 
     def blocked_radiance(
-        self, points: LitPoints, diffuse: Node, light: Input, view: LitPoints, choose: Callable[[Node], Node]
+        self, points: LitPoints, diffuse: Node, light: LightInput, view: LitPoints, choose: Callable[[Node], Node]
     ) -> Node:
         """Mean radiance of the blockers of points, where light bounces, vec3 of shape [batch, receiver].
 

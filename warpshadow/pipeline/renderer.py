@@ -22,7 +22,7 @@ from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import announced, one_at_a_time
 from warpshadow.pipeline.catchers import CatchersAlone
 from warpshadow.pipeline.delegation import delegated
-from warpshadow.pipeline.explain import Explanation, bounce_notes, decide
+from warpshadow.pipeline.explain import Explanation, bounce_notes, decide, shell_notes
 from warpshadow.pipeline.geometry import Geometry, as_geometry
 from warpshadow.pipeline.layers import LayerArrays, Layers, find_layer_arrays, find_layers
 from warpshadow.pipeline.merged_scene import MergedScene
@@ -33,7 +33,7 @@ from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.scene_views import SceneViews, camera_batch
 from warpshadow.pipeline.shading_ratio import shading_ratio
-from warpshadow.pipeline.transfers import Light, one_transfer
+from warpshadow.pipeline.transfers import Light, ShellLight, one_transfer
 from warpshadow.pipeline.view import View
 from warpshadow.pipeline.view_warnings import warn_of_vertex_receivers, warn_of_view
 from warpshadow.scene.material import GLOSS_ARGUMENTS
@@ -310,6 +310,7 @@ class SceneRenderer:
         textures: PerBody[wp.array] | None = None,
         gloss: Mapping[str, PerBody[wp.array]] | None = None,
         emission: PerBody[wp.array] | None = None,
+        shell: wp.array | None = None,
         view: View | None = None,
     ) -> wp.array:
         """Draw images.
@@ -321,14 +322,18 @@ class SceneRenderer:
             gloss: "roughness", "metallic" and "specular" of bodies that have roughness in the scene, each float32 of
                 shape [batch, 1], [batch, vertex] or, as a texture, [batch, height, width], as albedo is given.
             emission: Of bodies that have it in the scene, linear RGB, as albedo is given.
+            shell: Where the scene's light has a radius: center and radius of the sphere that sends the light [scene
+                units], vec4 of shape [batch], in place of the scene's or a map's own; all bodies are inside.
             view: From :meth:`view`, by default the scene's own.
                 Batches of 1 serve every instance of the others.
         Returns:
             Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]; the background is 0.
-        Differentiable: light, albedo, textures, gloss, emission, view.
+        Differentiable: light, albedo, textures, gloss, emission, shell, view.
         """
         view = self._checked(view)
-        return view.image(light, self._given_materials(albedo, textures, gloss, emission)).value(self._views.call(view))
+        return view.image(_from_shell(light, shell), self._given_materials(albedo, textures, gloss, emission)).value(
+            self._views.call(view)
+        )
 
     @check.keywords(**dict.fromkeys(("camera", "cameras"), "renderer.with_cameras([camera]).render()"))
     def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:
@@ -359,6 +364,7 @@ class SceneRenderer:
         textures: PerBody[wp.array] | None = None,
         gloss: Mapping[str, PerBody[wp.array]] | None = None,
         emission: PerBody[wp.array] | None = None,
+        shell: wp.array | None = None,
         geometry: Geometry[wp.array] | None = None,
         clip_matrices: wp.array | None = None,
     ) -> wp.array:
@@ -369,7 +375,7 @@ class SceneRenderer:
                 for nothing, where shadows on catchers are coverage.
             light: As for :meth:`draw`.
             albedo: As for :meth:`draw`; a catcher's matters where light bounces.
-            textures, gloss, emission: As for :meth:`draw`.
+            textures, gloss, emission, shell: As for :meth:`draw`.
             geometry: As for :meth:`view`; but static bodies have no cached rows.
             clip_matrices: As for :meth:`view`. Batches of 1 serve every instance of the others.
         Returns:
@@ -385,6 +391,7 @@ class SceneRenderer:
         if photograph is not None:
             check.shape("photograph", photograph.shape, ("batch", *self._size))
             finite_arrays({"photograph": photograph})
+        light = _from_shell(light, shell)
         catchers, materials, alone = (
             self._catchers_alone,
             self._given_materials(albedo, textures, gloss, emission),
@@ -475,6 +482,7 @@ class SceneRenderer:
         textures: PerBody[wp.array] | None = None,
         gloss: Mapping[str, PerBody[wp.array]] | None = None,
         emission: PerBody[wp.array] | None = None,
+        shell: wp.array | None = None,
         view: View | None = None,
         geometry: Geometry[wp.array] | None = None,
         clip_matrices: wp.array | None = None,
@@ -482,7 +490,7 @@ class SceneRenderer:
         """List the stages that the next call computes and skips, and why.
 
         Args:
-            light, albedo, textures, gloss, emission: As for :meth:`draw`.
+            light, albedo, textures, gloss, emission, shell: As for :meth:`draw`.
             view: As for :meth:`draw`: then only the stages after it are explained.
             geometry, clip_matrices: As for :meth:`view`, which is explained with them.
         Returns:
@@ -496,10 +504,15 @@ class SceneRenderer:
         else:
             view = self._views.view(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
         preview = view.preview()  # which the nodes' words ask, so it stays meanwhile
-        image = preview.image(light, self._given_materials(albedo, textures, gloss, emission))
+        image = preview.image(_from_shell(light, shell), self._given_materials(albedo, textures, gloss, emission))
         is_host = self.device.is_cpu or self.clock.waits
         of_receivers = receiver_notes(self._given_scene, self._choices, view.blocker_kinds.bulging)
-        notes = [*of_receivers, *bounce_notes(self.scene.bounces)]
+        notes = [*of_receivers, *bounce_notes(self.scene.bounces), *shell_notes(self.scene.shell)]
         return Explanation(
             image, self._views.call(view), self.clock.timings, is_host=is_host, hidden=hidden, notes=notes
         )
+
+
+def _from_shell(light: Light | None, shell: wp.array | None) -> Light | None:
+    """Light from a shell; from its own where none is given."""
+    return light if shell is None else ShellLight(light, shell)

@@ -91,9 +91,9 @@ class SceneViews:
             matrices = clip_matrices
             cameras = Input.renewed("cameras", matrices, self._last_cameras)
         image_count = common_batch({"geometry": poses, "clip_matrices": matrices})
-        # rays look at all moving bodies, and light goes from moving bodies to static ones
+        # rays look at all moving bodies, light goes from moving bodies to static ones, and no row knows a shell
         sends_light = self._merged_scene.scene.bounces or self._method.has_emitters
-        caches_rows = not (self._method.lights_samples or sends_light)
+        caches_rows = not (self._method.lights_samples or sends_light or self._method.shell is not None)
         if geometry is not None and geometry.moving is not None and caches_rows:
             static_bodies = self._static.get(geometry.moving)
             if static_bodies is None or not static_bodies.matches(geometry):

@@ -14,7 +14,7 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.progress import progress_bar
 from warpshadow.pipeline.convex import SceneConvexParts
 from warpshadow.pipeline.geometry import Geometry
-from warpshadow.pipeline.method import Method
+from warpshadow.pipeline.method import LightInput, Method
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached
 from warpshadow.pipeline.planes import ScenePlanes
 from warpshadow.pipeline.receivers.groups import Blockers, Group, GroupVisibility, find_groups
@@ -31,7 +31,7 @@ class SphereMethod(Method):
     """A method in which spheres stand in for the bodies: visibility, transfer vectors, and shading.
 
     Attributes:
-        free_projection: The basis in which the method projects any free light.
+        free_projection: The basis in which the method projects any free light, of the scene's shell if it has one.
         why_no_shadows: Why the method has no shadows, in words; empty if it has.
         joins_cached: Whether visibility combines cached rows with moving blockers.
         traces_self_visibility: Whether bodies' shadows on themselves may come from rays, not spheres.
@@ -125,9 +125,26 @@ class SphereMethod(Method):
         """Visibility of a group past the flat bodies around it, given its visibility past all other blockers."""
         raise NotImplementedError
 
-    def project_light(self, light: KnownLight) -> Any:
-        """Project known light for the method: its coefficients, and the cells or bands they belong to."""
+    def project_light(self, light: KnownLight, shell: wp.array | None = None) -> Any:
+        """Project known light for the method: its coefficients, and the cells or bands they belong to.
+
+        Args:
+            light: The light.
+            shell: Center and radius of the sphere that sends it, vec4 of shape [batch]; None for light infinitely far.
+        Differentiable: shell.
+        """
         raise NotImplementedError
+
+    def project_free_light(self, shell: wp.array) -> Any:
+        """The basis in which the method projects free light of another shell than the scene's."""
+        raise NotImplementedError
+
+    def free_projection_of(self, points: LitPoints, light: LightInput) -> Any:
+        """The basis in which the method projects free light, or a node of it, the same for the same shell."""
+        if light.shell is None:
+            return self.free_projection
+        make = functools.partial(Node, "", self.project_free_light, light.shell)
+        return points.cached("free projection", light.shell, make)
 
     def coefficient_count(self, light: Input | None) -> int:
         """Number of light coefficients that shading uses; all of them where the light is None, not known yet."""
@@ -167,11 +184,13 @@ class SphereMethod(Method):
 
     @functools.cached_property
     def _projected_from_scene(self) -> Node:
-        return Node("", self.project_light, self.light)
+        return Node("", self.project_light, self.light, self.shell)
 
-    def projected(self, light: Input) -> Node:
+    def projected(self, light: LightInput) -> Node:
         """Node of known light, projected; the scene's is cached."""
-        return self._projected_from_scene if light is self.light else Node("", self.project_light, light)
+        if light is self.light:
+            return self._projected_from_scene
+        return Node("", self.project_light, light, self.shell_of(light))
 
     def emitted_light(self, points: LitPoints, materials: Materials) -> Node:
         """Direct light of emitters on points, by the same blockers."""
@@ -188,14 +207,14 @@ class SphereMethod(Method):
     def _sum_over_emitters(
         self, name: str, find: Callable[..., Any], points: LitPoints, materials: Materials, *others: Node | Input
     ) -> Node:
-        samples, words = self.emitters.samples, points.in_words
+        emitters, words = (self.emitters.samples, self.emitters.self_visibility), points.in_words
         bodies_and_spheres = points.static_bodies, points.nearest_spheres
 
         def find_in_groups(
             receivers: Receivers, blockers: Blockers, self_lookups: dict[int, Any] | None, *arrays: Any
         ) -> Any:
             groups = find_groups(*bodies_and_spheres, receivers, blockers, self_lookups, None, None)
-            return find(samples, groups, blockers, *arrays)
+            return find(*emitters, groups, blockers, *arrays)
 
         def lookups() -> Node:
             if self.emitter_projection is None:
@@ -211,10 +230,10 @@ class SphereMethod(Method):
             self.emitters.placed(points),
             self.emitters.radiance(materials),
             *others,
-            items=lambda: f"{receiver_text(words)} × {samples.first[-1]} samples",
+            items=lambda: f"{receiver_text(words)} × {emitters[0].first[-1]} samples",
         )
 
-    def known_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
+    def known_shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
         """Shading of points in known light, which bounces from the materials."""
         projected_light = self.projected(light)
         if self.bounces is not None:
@@ -223,30 +242,29 @@ class SphereMethod(Method):
             return shade_all(points, projected_light, light, materials)
         return PortionedShading(self, points, projected_light, light, joined)
 
-    def free_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
+    def free_shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
         """Shading of points in free light; where it bounces between moving bodies, computed as for known light."""
         if self.bounces is None:
             return super().free_shading(points, light, materials)
         if not points.is_scene_view:
-            return self.bounces.bounced_free_shading(
-                points, Node("", self._projected_if_given, light), light, materials
-            )
+            projected_light = Node("", self._projected_if_given, light, self.free_projection_of(points, light))
+            return self.bounces.bounced_free_shading(points, projected_light, light, materials)
         direct = super().free_shading(points, light, materials)
         return self.bounces.cached_bounced_free_shading(direct, points, light, materials)
 
     def openness(self, points: LitPoints) -> Node:
         """Light that points reflect as white surfaces under an even sky of 1, vec3 of shape [batch, receiver]."""
-        sky = Input("light", EnvironmentMap.constant(1.0))
+        sky = LightInput(EnvironmentMap.constant(1.0))
         return PortionedShading(self, points, Node("", self.project_light, sky), sky, joined, where=" in an even sky")
 
-    def _projected_if_given(self, light: wp.array) -> Any:
+    def _projected_if_given(self, light: wp.array, free_projection: Any) -> Any:
         """Project given free light for the method. Differentiable: light."""
-        return self.free_projection._replace(coefficients=change_basis(light, self.native_from_basis))
+        return free_projection._replace(coefficients=change_basis(light, self.native_from_basis))
 
-    def transfers(self, points: LitPoints, where: str = "") -> Node:
+    def transfers(self, points: LitPoints, light: LightInput, where: str = "") -> Node:
         """Transfer vectors of points to :attr:`basis`; where they vary, to the method's native basis."""
-        matrix = self.native_from_basis
-        transfers = PortionedShading(self, points, self.free_projection, None, list, caches=matrix is None, where=where)
+        matrix, free_projection = self.native_from_basis, self.free_projection_of(points, light)
+        transfers = PortionedShading(self, points, free_projection, None, list, caches=matrix is None, where=where)
         if matrix is None or transfers.requires_grad:
             return transfers
 

@@ -1,6 +1,6 @@
 """Blockers: the spheres that stand in for the bodies of a scene."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import warp as wp
@@ -75,16 +75,19 @@ def blocking_parts(scene: Scene) -> dict[int, list[ConvexPart]]:
     return {number: parts for number, parts in result.items() if parts}
 
 
-def solid_bodies(scene: Scene) -> frozenset[int]:
+def solid_bodies(scene: Scene, parts: Mapping[int, Sequence[ConvexPart]]) -> frozenset[int]:
     """Find the bodies whose convex parts block their own light, too: those that consist of solids alone.
 
     Panels are chords of bent sheets, in which receivers do not lie; and rays to a sun may be asked for.
+
+    Args:
+        parts: The :func:`blocking_parts` of the scene.
     """
     visibility = scene.visibility.with_method()
     return frozenset(
         number
-        for number, parts in blocking_parts(scene).items()
-        if scene.bodies[number].self_shadows_in(visibility) == "traced" and not any(map(is_panel, parts))
+        for number, parts_of_body in parts.items()
+        if scene.bodies[number].self_shadows_in(visibility) == "traced" and not any(map(is_panel, parts_of_body))
     )
 
 

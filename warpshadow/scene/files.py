@@ -36,7 +36,7 @@ _FRAMING_KEYS = ("framing", "direction", "margin")
 _PINHOLE_KEYS = ("intrinsics", "rotation", "translation")
 _CAMERA_KEYS = (*_VIEW_KEYS, *_PINHOLE_KEYS, "pixel_centers", "size", "near")
 _PIXEL_CENTERS = {"half": np.zeros((3, 3)), "whole": HALF_PIXEL}
-_LIGHT_KEYS = ("envmap", "sky", "sh", "rotation", "scale", "bounces")
+_LIGHT_KEYS = ("envmap", "sky", "sh", "rotation", "scale", "radius", "center", "bounces")
 _PLACE_KEYS = (*(field.name for field in fields(Body) if field.name != "mesh"), "spheres", "on_ground", "creased")
 _PRIMITIVES: dict[str, Callable[..., Mesh]] = {
     "plane": plane,
@@ -166,8 +166,11 @@ def _light(table: Table, folder: Path) -> EnvironmentMap | np.ndarray:
         raise ValueError('expected one of envmap = "FILE", sky = {} and sh = [[r, g, b], …]')
     rotation = check.number("rotation", table.get("rotation", 0.0))
     scale = check.nonnegative("scale", table.get("scale", 1.0))
+    shell = {key: table[key] for key in ("radius", "center") if key in table}
+    if shell and "envmap" not in table:
+        raise ValueError(f'{next(iter(shell))}: got it without envmap, expected envmap = "FILE" beside it')
     if "envmap" in table:
-        return turned_light(EnvironmentMap.read(toml_tables.file(table, "envmap", folder)), rotation, scale)
+        return turned_light(EnvironmentMap.read(toml_tables.file(table, "envmap", folder), **shell), rotation, scale)
     if "sky" in table:
         with check.located("sky"):
             return turned_light(toml_tables.make(synthetic_sky, table["sky"]), rotation, scale)
@@ -263,6 +266,8 @@ def write_scene(scene: Scene, folder: AnyPath, *, stems: Sequence[str] | None = 
         scene.light.write(folder / "light.exr")
         written.append(folder / "light.exr")
         light: Table = {"envmap": "light.exr"}
+        if scene.light.radius is not None:
+            light |= {"radius": scene.light.radius, "center": scene.light.center.tolist()}
     else:
         light = {"sh": [_numbers(row) for row in scene.light]}
     light["bounces"] = scene.bounces if scene.bounces == "all" else int(scene.bounces)

@@ -21,6 +21,7 @@ from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.scene.body import Body
 from warpshadow.scene.visibility import BOUNCE_METHODS, DEFAULT_METHOD, GLOSS_METHODS, METHODS, Visibility
+from warpshadow.stages.shell.beams import exits_on_host
 
 MAX_BOUNCES = 16
 
@@ -88,6 +89,17 @@ def _argument_role(value: object, name: str) -> str:
     return next((role for kind, role in roles.items() if isinstance(value, kind)), name)
 
 
+def check_bodies_within(bodies: Iterable[Body], shell: np.ndarray) -> None:
+    """Raise ValueError unless all bodies are within the shell of the light, center and radius [4]."""
+    for body in bodies:
+        distance = np.linalg.norm(body.world_points() - shell[:3], axis=1).max()
+        if distance > shell[3]:
+            raise ValueError(
+                f"light: got a map of radius {shell[3]:g} around {shell[:3].tolist()}, outside of which body "
+                f"{body.name!r} reaches, {distance:.4g} from there; expected a larger radius, or smaller bodies"
+            )
+
+
 class Bodies(tuple[Body, ...]):
     """The bodies of a scene, by their numbers, from 0, or names."""
 
@@ -124,8 +136,9 @@ class Bodies(tuple[Body, ...]):
 class Scene:
     """Bodies, their light and a camera, in a right-handed world with y up, in units of length of your choice.
 
-    Light is linear RGB radiance from infinitely far away. An image is its color times reflectance, without exposure:
-    white ground under light of 1 from everywhere is 1. Pictures have their own exposure, :class:`warpshadow.Picture`.
+    Light is linear RGB radiance from infinitely far away, or from a sphere around all bodies. An image is its color
+    times reflectance, without exposure: white ground under light of 1 from everywhere is 1. Pictures have their own
+    exposure, :class:`warpshadow.Picture`.
 
     Args:
         bodies: One or more bodies; they cast shadows on each other and on themselves. ``scene.bodies`` finds them by
@@ -204,6 +217,13 @@ class Scene:
                 f"emission: got some for body {emitter.name!r}, whose light {self.visibility.method!r} lacks, "
                 f"expected None, or method = one of {', '.join(map(repr, GLOSS_METHODS))}"
             )
+        if self.shell is not None:
+            if self.visibility.method not in (*GLOSS_METHODS, None):
+                raise ValueError(
+                    f"light: got a radius, which {self.visibility.method!r} does not know, expected a map without one, "
+                    f"or method = one of {', '.join(map(repr, GLOSS_METHODS))}"
+                )
+            check_bodies_within(self.bodies, self.shell)
         if self.bounces and self.visibility.method not in (*BOUNCE_METHODS, None):
             finders = ", ".join(map(repr, BOUNCE_METHODS))
             raise ValueError(
@@ -222,6 +242,11 @@ class Scene:
         """The light with its methods, of whichever kind it is."""
         return as_light(self.light)
 
+    @property
+    def shell(self) -> np.ndarray | None:
+        """Center and radius of the sphere that sends the light, [4]; None for light from infinitely far away."""
+        return self.light.shell if isinstance(self.light, EnvironmentMap) else None
+
     def with_method(self) -> Scene:
         """The scene as renderers have it: "directional" where no method is named."""
         return self if self.visibility.method else replace(self, visibility=self.visibility.with_method())
@@ -230,6 +255,8 @@ class Scene:
         """The light as the camera sees it where no body is, linear RGB, float32 of shape [height, width, 3]."""
         supersampling = self.supersampling
         _, directions = self.camera.resized(supersampling).rays()
+        if self.shell is not None:
+            directions = exits_on_host(self.camera.eye, directions, self.shell)
         radiance = self.known_light.towards(directions)
         height, width, _ = directions.shape
         samples = radiance.reshape(height // supersampling, supersampling, width // supersampling, supersampling, 3)

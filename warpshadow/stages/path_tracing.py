@@ -23,6 +23,7 @@ from warpshadow.stages.emitters.traced import EmittingFaces, light_of_point
 from warpshadow.stages.interpolation import interpolate_at
 from warpshadow.stages.light_samples import LightSamples
 from warpshadow.stages.ray_tracing import RAY_COST, escapes, first_hit, mesh_id, progress_slices
+from warpshadow.stages.shell.beams import FAR, beam_to_shell
 from warpshadow.stages.textures.pyramid import Textures
 from warpshadow.stages.textures.sample import interpolate_uv
 
@@ -119,6 +120,7 @@ def _trace_bounces(
     first_receiver: int,
     directions: wp.array(dtype=wp.vec3),
     radiance: wp.array(dtype=wp.vec3),
+    shell: wp.vec4,
     bounce_count: int,
     path_count: int,
     # out
@@ -147,8 +149,10 @@ def _trace_bounces(
             normal = wp.where(hit.is_back, -normal, normal)
             throughput = wp.cw_mul(throughput, _albedo(surfaces, hit.face, hit.weights))
             sample_set = int(wp.randu(state) % wp.uint32(directions.shape[0]))
-            cosine = wp.dot(normal, directions[sample_set])
-            if cosine > 0.0 and escapes(surfaces.blocker_mesh, point, normal, directions[sample_set]):
+            beam = beam_to_shell(shell, point, directions[sample_set])
+            light_direction = wp.vec3(beam[0], beam[1], beam[2])
+            cosine = beam[3] * wp.dot(normal, light_direction)
+            if cosine > 0.0 and escapes(surfaces.blocker_mesh, point, normal, light_direction):
                 total += cosine * wp.cw_mul(throughput, radiance[sample_set])
             if surfaces.emitters.distribution.shape[0] > 0:
                 share = wp.randf(state)
@@ -171,6 +175,7 @@ def trace_bounces(
     *,
     bounces: int,
     paths: int,
+    shell: np.ndarray = FAR,
     progress: bool = False,
 ) -> wp.array:
     """Trace the light that reaches receivers after it bounced; add direct light (:func:`.trace_shading`) to it.
@@ -185,6 +190,7 @@ def trace_bounces(
         samples: Directions drawn from the light; each hit takes one of all the sets.
         bounces: Most bounces of a path, 1 or more.
         paths: Number of paths from each receiver.
+        shell: As for :func:`.trace_shading`.
     Returns:
         The bounced light that white surfaces send back, vec3 of shape [receiver].
     Differentiable: no.
@@ -206,6 +212,7 @@ def trace_bounces(
                 receivers.start,
                 directions,
                 radiance,
+                wp.vec4(*shell),
                 bounces,
                 paths,
             ],

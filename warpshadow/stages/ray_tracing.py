@@ -13,6 +13,7 @@ from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import split_row
 from warpshadow.device.progress import progress_bar
 from warpshadow.stages.light_samples import CellSamples, LightSamples
+from warpshadow.stages.shell.beams import FAR, beam_to_shell
 
 RAY_COST = 200.0  # nanoseconds that a ray takes
 
@@ -239,6 +240,7 @@ def _trace_shading(
     normals: wp.array[wp.vec3],
     directions: wp.array2d[wp.vec3],
     radiance: wp.array2d[wp.vec3],
+    shell: wp.vec4,
     # out
     shading: wp.array[wp.vec3],
 ):
@@ -249,15 +251,22 @@ def _trace_shading(
     normal = normals[receiver]
     total = wp.vec3()
     for sample in range(directions.shape[1]):
-        ray_direction = directions[sample_set, sample]
-        cosine = wp.dot(normal, ray_direction)
+        beam = beam_to_shell(shell, point, directions[sample_set, sample])
+        ray_direction = wp.vec3(beam[0], beam[1], beam[2])
+        cosine = beam[3] * wp.dot(normal, ray_direction)
         if cosine > 0.0 and escapes(mesh, point, normal, ray_direction):
             total += cosine * radiance[sample_set, sample]
     shading[receiver] = total / wp.pi
 
 
 def trace_shading(
-    mesh: wp.Mesh | None, points: wp.array, normals: wp.array, samples: LightSamples, *, progress: bool = False
+    mesh: wp.Mesh | None,
+    points: wp.array,
+    normals: wp.array,
+    samples: LightSamples,
+    *,
+    shell: np.ndarray = FAR,
+    progress: bool = False,
 ) -> wp.array:
     """Trace the shading of receivers: the radiance of a white surface, single bounce, as a path tracer gives it.
 
@@ -265,7 +274,8 @@ def trace_shading(
         mesh: The blockers, None for none.
         points: Receiver positions [scene units], vec3 of shape [receiver].
         normals: Unit normals, vec3 of shape [receiver].
-        samples: Directions drawn from the light.
+        samples: Directions drawn from the light, from the center of its shell.
+        shell: Center and radius of the sphere that sends the light [scene units], shape [4]; the mesh is within it.
     Returns:
         Shading, vec3 of shape [receiver].
     Differentiable: no.
@@ -278,7 +288,7 @@ def trace_shading(
         launch(
             _trace_shading,
             receivers.stop - receivers.start,
-            inputs=[mesh_id(mesh), points[receivers], normals[receivers], directions, radiance],
+            inputs=[mesh_id(mesh), points[receivers], normals[receivers], directions, radiance, wp.vec4(*shell)],
             outputs=[shading[receivers]],
             cost=RAY_COST * directions.shape[1],
         )

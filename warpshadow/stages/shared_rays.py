@@ -23,11 +23,13 @@ from warpshadow.device.constants import constant
 from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, vectors_type
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
+from warpshadow.stages.beam_packets import make_beams
 from warpshadow.stages.light_samples import LightSamples
 from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open, packets_of
 from warpshadow.stages.ray_tracing import progress_slices
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sample_receivers import MAX_SHARED_SLOPE, MIN_SHARED_COSINE
+from warpshadow.stages.shell.beams import FAR
 
 _PACKET_COST = 2000.0  # nanoseconds that a packet takes
 _PILOT_RECEIVERS = 256  # receivers that stand for all, where directions are chosen
@@ -41,9 +43,9 @@ TOLERANCE = 0.02  # part of a receiver's light that may come from rays whose vis
 
 
 @functools.cache
-def _make_trace() -> wp.Kernel:
+def _make_trace(is_near: bool) -> wp.Kernel:
     Lane, Vectors, fn = lane_type(PACKET), vectors_type(PACKET), make_lane_functions(PACKET)
-    find_open, dot_direction, bits_above = make_find_open(), fn.dot_direction, fn.bits_above
+    find_open, bits_above, (beams_to_light, cosines_of) = make_find_open(), fn.bits_above, make_beams(is_near)
 
     # In plain Warp, which branches at every lane, receivers that trace few rays take four times as long.
     @wp.func_native(f"""
@@ -91,6 +93,7 @@ def _make_trace() -> wp.Kernel:
         weights: wp.array(dtype=wp.vec4),
         tolerances: wp.array(dtype=float),
         corner_visibility: wp.array2d(dtype=wp.int32),
+        shell: wp.vec4,
         # out
         shading: wp.array(dtype=wp.vec3),
         open_lanes: wp.array2d(dtype=wp.int32),
@@ -116,8 +119,9 @@ def _make_trace() -> wp.Kernel:
         irradiance = wp.vec3()
         last_face = int(-1)
         for packet in range(directions.shape[0]):
-            ray_directions = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
-            cosine = dot_direction(normal, ray_directions)
+            towards = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
+            ray_directions = beams_to_light(shell, point, towards)
+            cosine = cosines_of(shell, normal, towards, ray_directions)
             facing_rays = bits_above(cosine, 0.0)
             open_rays = int(0)
             if facing_rays != 0:
@@ -155,14 +159,16 @@ def _make_trace() -> wp.Kernel:
     return trace_shared
 
 
-def find_shares(tree: FaceTree, points: wp.array, normals: wp.array, samples: LightSamples) -> np.ndarray:
+def find_shares(
+    tree: FaceTree, points: wp.array, normals: wp.array, samples: LightSamples, *, shell: np.ndarray = FAR
+) -> np.ndarray:
     """Find the share of receivers' light that comes from each direction, on average over dim and bright receivers.
 
     Args:
         tree: The blockers.
         points: Receiver positions [scene units], vec3 of shape [receiver]; a few stand for all.
         normals: Unit normals, vec3 of shape [receiver].
-        samples: As for :func:`trace_shared`.
+        samples, shell: As for :func:`trace_shared`.
     Returns:
         Shares, of shape [direction], whose sum is 1, or less where some receivers see no light.
     Differentiable: no.
@@ -174,7 +180,7 @@ def find_shares(tree: FaceTree, points: wp.array, normals: wp.array, samples: Li
     )
     shape = len(pilot_receivers), samples.directions.shape[1] // PACKET, PACKET
     direction_light = zeros(shape, dtype=wp.float32, device=pilot_points.device)
-    _Tracing(tree, pilot_points, pilot_normals, samples).trace(ray_light=direction_light)
+    _Tracing(tree, pilot_points, pilot_normals, samples, shell).trace(ray_light=direction_light)
     light = direction_light.numpy().reshape(len(pilot_receivers), -1)
     light /= np.maximum(light.sum(axis=1, keepdims=True), 1e-12)
     return light.sum(axis=0) / max(len(pilot_receivers), 1)
@@ -200,6 +206,7 @@ def trace_shared(
     normals: wp.array,
     samples: LightSamples,
     *,
+    shell: np.ndarray = FAR,
     corners: Corners | None = None,
     progress: bool = False,
 ) -> wp.array:
@@ -210,6 +217,7 @@ def trace_shared(
         points: Receiver positions [scene units], vec3 of shape [receiver].
         normals: Unit normals, vec3 of shape [receiver].
         samples: One set of directions, a multiple of 16, each run of 16 close to each other.
+        shell: As for :func:`warpshadow.stages.ray_tracing.trace_shading`.
         corners: Receivers around others, whose visibility they take over; None for none.
         progress: Show a progress bar where it takes longer than a second.
 
@@ -217,7 +225,7 @@ def trace_shared(
         Shading, vec3 of shape [receiver].
     Differentiable: no.
     """
-    tracing, block_size = _Tracing(tree, points, normals, samples), 2**24 // samples.directions.shape[1]
+    tracing, block_size = _Tracing(tree, points, normals, samples, shell), 2**24 // samples.directions.shape[1]
     if corners is None:
         corners = Corners.none(len(points))
     has_corners = corners.receivers[:, 0] >= 0
@@ -302,13 +310,14 @@ class _Tracing:
 
     _corners: tuple[wp.array | None, ...] = (None, None, None, None)
 
-    def __init__(self, tree: FaceTree, points: wp.array, normals: wp.array, samples: LightSamples):
+    def __init__(self, tree: FaceTree, points: wp.array, normals: wp.array, samples: LightSamples, shell: np.ndarray):
         device = points.device
         packets = packets_of(samples.directions[0])
         directions = constant(packets, lane_type(PACKET), device)
         light = constant(packets_of(samples.radiance[0]), lane_type(PACKET), device)
         self.packet_count = len(packets)
         self._inputs = tree, points, normals, directions, light
+        self._shell = shell
         self.shading = empty(points.shape, dtype=wp.vec3, device=device)
 
     def take_over(
@@ -335,9 +344,9 @@ class _Tracing:
         open_lanes = empty((0, 0), dtype=wp.int32, device=device) if open_lanes is None else open_lanes
         ray_light = empty((0, 0, 0), dtype=wp.float32, device=device) if ray_light is None else ray_light
         launch(
-            _make_trace(),
+            _make_trace(bool(self._shell[3])),
             count,
-            inputs=[*self._inputs, index_array, *self._corners],
+            inputs=[*self._inputs, index_array, *self._corners, wp.vec4(*self._shell)],
             outputs=[self.shading, open_lanes, ray_light],
             cost=_PACKET_COST * self.packet_count,
         )

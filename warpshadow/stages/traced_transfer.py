@@ -10,16 +10,18 @@ from warpshadow.device.lanes import lane_type, make_lane_functions, module_optio
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.directions import CHUNK, fibonacci
+from warpshadow.stages.beam_packets import make_beams
 from warpshadow.stages.ray_packets import PACKET, FaceTree, build_face_tree, make_find_open, packets_of
 from warpshadow.stages.ray_tracing import progress_slices
+from warpshadow.stages.shell.beams import FAR
 
 _RAY_COST = 60.0  # nanoseconds that a ray takes
 
 
 @functools.cache
-def _make_trace_cosines() -> wp.Kernel:
+def _make_trace_cosines(is_near: bool) -> wp.Kernel:
     Lane, Vectors, fn = lane_type(PACKET), vectors_type(PACKET), make_lane_functions(PACKET)
-    find_open, dot_direction, bits_above = make_find_open(), fn.dot_direction, fn.bits_above
+    find_open, bits_above, (beams_to_light, cosines_of) = make_find_open(), fn.bits_above, make_beams(is_near)
 
     @wp.kernel(module="unique", module_options=module_options(PACKET), enable_backward=False)
     def trace_cosines(
@@ -30,6 +32,7 @@ def _make_trace_cosines() -> wp.Kernel:
         points: wp.array(dtype=wp.vec3),
         normals: wp.array(dtype=wp.vec3),
         directions: wp.array2d(dtype=Lane),
+        shell: wp.vec4,
         # out
         cosines: wp.array2d(dtype=wp.float32),
     ):
@@ -39,8 +42,9 @@ def _make_trace_cosines() -> wp.Kernel:
         normal = normals[receiver]
         last_face = int(-1)
         for packet in range(directions.shape[0]):
-            ray_directions = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
-            cosine = dot_direction(normal, ray_directions)
+            towards = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
+            ray_directions = beams_to_light(shell, point, towards)
+            cosine = cosines_of(shell, normal, towards, ray_directions)
             facing_rays = bits_above(cosine, 0.0)
             open_rays, last_face = find_open(tree, point, normal, ray_directions, facing_rays, last_face)
             for lane in range(PACKET):
@@ -64,6 +68,7 @@ def trace_transfer(
     functions: Callable[[np.ndarray], np.ndarray],
     count: int,
     *,
+    shell: np.ndarray = FAR,
     progress: bool = False,
 ) -> wp.array:
     """Trace transfer vectors: light of a basis is then shadowed by the mesh itself, exactly but for sampling.
@@ -73,6 +78,7 @@ def trace_transfer(
         functions: Evaluates the basis functions of the light at unit vectors [direction, 3]: shape [direction,
             coefficient].
         count: Number of directions, evenly over the sphere.
+        shell: As for :func:`warpshadow.stages.ray_tracing.trace_shading`.
     Returns:
         Transfer vectors, float32 of shape [receiver, coefficient].
     Differentiable: no.
@@ -85,7 +91,9 @@ def trace_transfer(
     for receivers in progress_slices(points.shape[0], 2**22 // len(directions), progress):
         shape = receivers.stop - receivers.start, len(directions)
         cosines = empty(shape, dtype=wp.float32, device=points.device)
-        inputs = [tree, points[receivers], normals[receivers], packets]
-        launch(_make_trace_cosines(), shape[0], inputs=inputs, outputs=[cosines], cost=_RAY_COST * shape[1])
+        inputs = [tree, points[receivers], normals[receivers], packets, wp.vec4(*shell)]
+        launch(
+            _make_trace_cosines(bool(shell[3])), shape[0], inputs=inputs, outputs=[cosines], cost=_RAY_COST * shape[1]
+        )
         transfer[receivers] = cosines.numpy() @ values
     return wp.array(transfer, device=points.device)

@@ -184,6 +184,7 @@ class TorchRenderer(torch.nn.Module):
         albedo: PerBody[torch.Tensor] | None = None,
         textures: PerBody[torch.Tensor] | None = None,
         emission: PerBody[torch.Tensor] | None = None,
+        shell: torch.Tensor | None = None,
         geometry: Geometry[torch.Tensor] | None = None,
         clip_matrices: torch.Tensor | None = None,
         **gloss: PerBody[torch.Tensor] | None,
@@ -200,6 +201,8 @@ class TorchRenderer(torch.nn.Module):
             textures: Reflectance of bodies as images, [height, width, 3] or [batch, height, width, 3], which needs uvs;
                 a list or a mapping likewise.
             emission: Radiance that bodies emit which have emission in the scene, linear RGB, as albedo.
+            shell: Where the scene's light has a radius: center and radius of the sphere that sends the light [scene
+                units], [4] or [batch, 4], in place of the scene's; all bodies are inside.
             geometry: Vertices and spheres in world space, from :meth:`placed`; by default the scene's, which stand
                 still.
             clip_matrices: Cameras, [4, 4] or [batch, 4, 4], from :meth:`clip_matrices` or
@@ -216,7 +219,11 @@ class TorchRenderer(torch.nn.Module):
             others raise NotImplementedError then.
         """
         arguments, inputs = self._checked_inputs(
-            light, geometry, clip_matrices, {"albedo": albedo, "textures": textures, "emission": emission, **gloss}
+            light,
+            geometry,
+            clip_matrices,
+            {"albedo": albedo, "textures": textures, "emission": emission, **gloss},
+            shell,
         )
 
         def draw(inputs: dict[str, Any]) -> wp.array:
@@ -268,6 +275,7 @@ class TorchRenderer(torch.nn.Module):
         albedo: PerBody[torch.Tensor] | None = None,
         textures: PerBody[torch.Tensor] | None = None,
         emission: PerBody[torch.Tensor] | None = None,
+        shell: torch.Tensor | None = None,
         geometry: Geometry[torch.Tensor] | None = None,
         clip_matrices: torch.Tensor | None = None,
         **gloss: PerBody[torch.Tensor] | None,
@@ -277,7 +285,7 @@ class TorchRenderer(torch.nn.Module):
         Args:
             photograph: Linear RGB, of radiance in the units of the light, of the size of the cameras' images,
                 [height, width, 3] or [batch, height, width, 3].
-            light, albedo, textures, emission, geometry, clip_matrices, gloss: As for :meth:`forward`.
+            light, albedo, textures, emission, shell, geometry, clip_matrices, gloss: As for :meth:`forward`.
         Returns:
             Linear RGB, [height, width, 3] or [batch, height, width, 3]; see :mod:`warpshadow.stages.photograph`.
         Raises:
@@ -285,7 +293,11 @@ class TorchRenderer(torch.nn.Module):
         Differentiable: all, as :meth:`forward` is; both the light with and that without the other bodies are.
         """
         arguments, inputs = self._checked_inputs(
-            light, geometry, clip_matrices, {"albedo": albedo, "textures": textures, "emission": emission, **gloss}
+            light,
+            geometry,
+            clip_matrices,
+            {"albedo": albedo, "textures": textures, "emission": emission, **gloss},
+            shell,
         )
         camera = self.cameras[0]
         size = camera.height, camera.width
@@ -303,13 +315,18 @@ class TorchRenderer(torch.nn.Module):
         albedo: PerBody[torch.Tensor] | None = None,
         textures: PerBody[torch.Tensor] | None = None,
         emission: PerBody[torch.Tensor] | None = None,
+        shell: torch.Tensor | None = None,
         geometry: Geometry[torch.Tensor] | None = None,
         clip_matrices: torch.Tensor | None = None,
         **gloss: PerBody[torch.Tensor] | None,
     ) -> Explanation:
         """List the stages that a call with the same arguments computes and skips, as :meth:`Renderer.explain` does."""
         arguments, inputs = self._checked_inputs(
-            light, geometry, clip_matrices, {"albedo": albedo, "textures": textures, "emission": emission, **gloss}
+            light,
+            geometry,
+            clip_matrices,
+            {"albedo": albedo, "textures": textures, "emission": emission, **gloss},
+            shell,
         )
         return self.warp.explain(**arguments.filled(inputs))
 
@@ -319,11 +336,12 @@ class TorchRenderer(torch.nn.Module):
         geometry: Geometry[torch.Tensor] | None = None,
         clip_matrices: torch.Tensor | None = None,
         of_bodies: Mapping[str, PerBody[torch.Tensor] | None] = MappingProxyType({}),
+        shell: torch.Tensor | None = None,
     ) -> tuple[Arguments, dict[str, Any]]:
         """The tensors among the arguments of a call, checked, and the inputs of the renderer of arrays.
 
         Args:
-            light, geometry, clip_matrices: Of the call.
+            light, geometry, clip_matrices, shell: Of the call.
             of_bodies: Reflectance of the call, by name.
         """
         has_cameras = self.warp.has_camera_batch and clip_matrices is None
@@ -343,6 +361,8 @@ class TorchRenderer(torch.nn.Module):
             inputs["geometry"] = arguments.add_geometry("geometry", geometry, self.warp.rest())
         if clip_matrices is not None:
             inputs["clip_matrices"] = arguments.add("clip_matrices", clip_matrices, wp.mat44, ())
+        if shell is not None:
+            inputs["shell"] = arguments.add("shell", shell, wp.vec4, (), "its center and radius")
         for name, values in of_bodies.items():
             slots: list[Slot | None] = [None] * len(self.scene.bodies)
             for number, tensor in enumerate(self.scene.per_body(values, name)):

@@ -239,7 +239,8 @@ def coarse(light: EnvironmentMap | np.ndarray) -> EnvironmentMap | np.ndarray:
     rows, columns, _ = light.radiance.shape
     weights = light.solid_angles().reshape(-1, step, 1, 1, 1)
     blocks = light.radiance.reshape(rows // step, step, columns // step, step, 3)
-    return EnvironmentMap((weights * blocks).sum(axis=(1, 3)) / (step * weights.sum(axis=(1, 3))))
+    means = (weights * blocks).sum(axis=(1, 3)) / (step * weights.sum(axis=(1, 3)))
+    return EnvironmentMap(means, radius=light.radius, center=light.center)
 
 
 def picture(image: np.ndarray, stops: float, background: np.ndarray) -> np.ndarray:

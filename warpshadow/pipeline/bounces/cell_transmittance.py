@@ -56,7 +56,7 @@ def find_cell_transmittance(
         directions, transmittance_self = HARMONIC_GATHER_CELLS, None
         transmittance_spheres = _transmittance(method, group, nonplanar_bodies(merged_scene), spheres, directions)
     body = group.body
-    if transmittance_self is None and body is not None and group.own_parts is None and not merged_scene.is_flat[body]:
+    if transmittance_self is None and body is not None and not group.is_solid and not merged_scene.is_flat[body]:
         transmittance_self = _transmittance(method, group, [body], spheres, directions)
     if transmittance_spheres is None:
         transmittance_spheres = wp.full(

@@ -27,7 +27,8 @@ from warpshadow.pipeline.bounces.patches import ScenePatches, Senders, lit_patch
 from warpshadow.pipeline.bounces.proxies import ProjectedPatches, Proxies
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
-from warpshadow.pipeline.node import Call, Input, Node, NodeStage
+from warpshadow.pipeline.method import LightInput
+from warpshadow.pipeline.node import Call, Node, NodeStage
 from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
@@ -270,7 +271,7 @@ class MovingBounces:
         points: LitPoints,
         projected_light: Node,
         visibility_light: Any,
-        light: Input,
+        light: LightInput,
         materials: Materials,
         *,
         is_free: bool,
@@ -293,7 +294,7 @@ class MovingBounces:
         make_visibility = functools.partial(
             PortionedVisibility, method, projected_light=visibility_light, light=light, finish=list, is_shaded=False
         )
-        key, is_cached = None if is_free else light, is_free or materials is not points.materials
+        key, is_cached = light.shell if is_free else light, is_free or materials is not points.materials
         visibility = points.cached("visibility", (key, is_cached), lambda: make_visibility(points, caches=is_cached))
         of_patch_samples = points.cached(
             "of patch samples",

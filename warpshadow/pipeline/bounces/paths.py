@@ -15,6 +15,7 @@ from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.light_samples import sample_map
 from warpshadow.stages.path_tracing import PathSurfaces, trace_bounces
 from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.shell.beams import FAR
 from warpshadow.stages.textures.pyramid import Textures
 
 _LIGHT_SAMPLES = 1024  # directions of each set from which hits draw light
@@ -26,7 +27,15 @@ _RAYS_OF_PATH = 2
 
 
 def path_traced(
-    direct: Node, meshes: Node, points: LitPoints, light: Input, materials: Materials, *, samples: int, progress: bool
+    direct: Node,
+    meshes: Node,
+    points: LitPoints,
+    light: Input,
+    shell: Input | wp.array | None,
+    materials: Materials,
+    *,
+    samples: int,
+    progress: bool,
 ) -> Node:
     """Shading with bounces: direct light, and light along paths.
 
@@ -35,6 +44,7 @@ def path_traced(
         meshes: Node of the meshes that block direct light, one for each instance.
         points: The receivers.
         light: Known light.
+        shell: Center and radius of the sphere that sends it, vec4 of shape [batch]; None for light infinitely far away.
         materials: Reflectance of the bodies.
         samples: Rays of direct light for each receiver.
     """
@@ -50,12 +60,18 @@ def path_traced(
         positions: wp.array,
         normals: wp.array,
         known_light: KnownLight,
+        shell: wp.array | None,
         vertex_albedo: wp.array,
         textures: Textures | None,
         emission: wp.array | None,
     ) -> wp.array:
+        if not receivers.points.size:
+            return shading
         texels = None if textures is None else textures.texels
-        count = common_batch({"geometry": shading, "albedo": vertex_albedo, "textures": texels, "emission": emission})
+        shells = FAR[None] if shell is None else shell.numpy()
+        count = common_batch(
+            {"shell": shells, "geometry": shading, "albedo": vertex_albedo, "textures": texels, "emission": emission}
+        )
         drawn = sample_map(known_light.radiance, _LIGHT_SAMPLES, seed=1)
         bounced = empty((count, *shading.shape[1:]), dtype=wp.vec3, device=shading.device)
 
@@ -78,7 +94,8 @@ def path_traced(
                 else merged_scene.emitting_faces(of_instance(positions), of_instance(emission)),
             )
             places = of_instance(receivers.points), of_instance(receivers.normals)
-            light = trace_bounces(surfaces, *places, drawn, bounces=bounces, paths=paths, progress=progress)
+            options = {"bounces": bounces, "paths": paths, "shell": of_instance(shells), "progress": progress}
+            light = trace_bounces(surfaces, *places, drawn, **options)
             wp.copy(bounced[instance], light)
         return total_light([shading, bounced])
 
@@ -92,6 +109,7 @@ def path_traced(
         points.vertices,
         points.normals,
         light,
+        shell,
         materials.vertex_albedo,
         colors.pyramids if colors.images else None,
         materials.of_vertices("emission") if materials.emission else None,

@@ -8,7 +8,8 @@ from typing import Any
 from warpshadow.pipeline.bounces.moving_bounces import OF_PATCH_SAMPLES, MovingBounces
 from warpshadow.pipeline.bounces.patches import ScenePatches, lit_patch_samples
 from warpshadow.pipeline.bounces.static_bounces import StaticBounces
-from warpshadow.pipeline.node import Input, Node
+from warpshadow.pipeline.method import LightInput
+from warpshadow.pipeline.node import Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.sphere_method import PortionedShading, SphereMethod
@@ -26,7 +27,9 @@ class SphereBounces:
         self._method, self._patches = method, ScenePatches(method.merged_scene)
         self._moving_bounces = MovingBounces(method, self._patches)
 
-    def bounced_shading(self, points: LitPoints, projected_light: Node, light: Input, materials: Materials) -> Node:
+    def bounced_shading(
+        self, points: LitPoints, projected_light: Node, light: LightInput, materials: Materials
+    ) -> Node:
         """Node of the shading of points, direct and bounced, vec3 of shape [batch, receiver].
 
         If colors vary, the visibility of points is cached; otherwise their shading is.
@@ -40,15 +43,20 @@ class SphereBounces:
         return self._moving_bounces.shading(points, projected_light, projected_light, light, materials, is_free=False)
 
     def bounced_free_shading(
-        self, points: LitPoints, projected_light: Node, light: Input, materials: Materials
+        self, points: LitPoints, projected_light: Node, light: LightInput, materials: Materials
     ) -> Node:
         """The same in free light; the points' visibility, which holds for any light, is cached."""
         return self._moving_bounces.shading(
-            points, projected_light, self._method.free_projection, light, materials, is_free=True
+            points,
+            projected_light,
+            self._method.free_projection_of(points, light),
+            light,
+            materials,
+            is_free=True,
         )
 
     def cached_bounced_shading(
-        self, points: LitPoints, projected_light: Any, light: Input, materials: Materials
+        self, points: LitPoints, projected_light: Any, light: LightInput, materials: Materials
     ) -> Node:
         """The same for static points: visibility of receivers and patch samples is cached, as are form factors."""
         patch_samples, at_patch_samples = self._cached_patch_samples(points, materials)
@@ -62,11 +70,15 @@ class SphereBounces:
         lit = self._method.with_emitters(by_map, at_patch_samples, materials)
         return self._static_bounces.add_bounces(direct, lit, points, materials)
 
-    def cached_bounced_free_shading(self, direct: Node, points: LitPoints, light: Input, materials: Materials) -> Node:
+    def cached_bounced_free_shading(
+        self, direct: Node, points: LitPoints, light: LightInput, materials: Materials
+    ) -> Node:
         """The same in free light, given a node of the direct shading of the receivers."""
         patch_samples, at_patch_samples = self._cached_patch_samples(points, materials)
         transfers = points.cached(
-            "transfer", patch_samples, lambda: self._method.transfers(at_patch_samples, OF_PATCH_SAMPLES)
+            "transfer",
+            (patch_samples, light.shell),
+            lambda: self._method.transfers(at_patch_samples, light, OF_PATCH_SAMPLES),
         )
         if materials.emission:
             lit = self._method.light_of_emitters(at_patch_samples, materials)

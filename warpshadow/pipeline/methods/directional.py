@@ -17,12 +17,14 @@ from warpshadow.device.memory import empty
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.method import LightInput
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.pipeline.receivers.groups import CellCoverages, Group, GroupVisibility
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.self_visibility import SelfVisibilityLookup
+from warpshadow.pipeline.shell import PATCHES, ShellPatches, project_on_shell
 from warpshadow.pipeline.sphere_method import PortionedShading, SphereMethod
 from warpshadow.pipeline.transfers import LARGEST_COEFFICIENT, change_basis, joined
 from warpshadow.scene.blockers import blocking_planes
@@ -66,6 +68,7 @@ class ProjectedCells(NamedTuple):
     spot_shares: np.ndarray | None = None  # share of the light of sharp cells that their spot has [direction]
     samples: np.ndarray | None = None  # directions drawn from known light in its cells, and even ones [direction, 8, 3]
     sun: SunCells | None = None  # the brightest cells, where bodies want rays to them
+    patches: ShellPatches | None = None  # that send the light, whose coefficients are theirs; None where it is far
 
     @property
     def facing(self) -> np.ndarray:
@@ -92,11 +95,21 @@ class Directional(SphereMethod):
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
         self._directions = fibonacci(merged_scene.scene.visibility.directions)
-        super().__init__(merged_scene, CellBasis(self._directions), basis, progress=progress)
-        self.free_projection = ProjectedCells(self._directions)
+        is_near = merged_scene.scene.shell is not None
+        native_basis = PATCHES if is_near else CellBasis(self._directions)
+        super().__init__(merged_scene, native_basis, basis, progress=progress)
+        self.free_projection = ProjectedCells(
+            self._directions, patches=None if self.shell is None else ShellPatches(self.shell)
+        )
 
-    def project_light(self, light: KnownLight) -> ProjectedCells:
-        """Cells that look to where their light comes from: a sun is rarely in the middle of one."""
+    def project_light(self, light: KnownLight, shell: wp.array | None = None) -> ProjectedCells:
+        """Cells that look to where their light comes from: a sun is rarely in the middle of one.
+
+        From a shell light comes to each receiver from other directions: cells are even.
+        """
+        if shell is not None:
+            patches, radiance = project_on_shell(light, shell)
+            return self.free_projection._replace(patches=patches, coefficients=radiance)
         cells = light.cells(self._directions)
         if cells.spots is None or cells.half_angles is None:
             return ProjectedCells(cells.directions, self._on_device(cells.radiance), cells.directions)
@@ -137,9 +150,13 @@ class Directional(SphereMethod):
     def _on_device(self, coefficients: np.ndarray) -> wp.array:
         return constant(coefficients[None], wp.vec3, self.merged_scene.device)
 
+    def project_free_light(self, shell: wp.array) -> ProjectedCells:
+        """The basis of free light of another shell than the scene's. Differentiable: shell."""
+        return self.free_projection._replace(patches=ShellPatches(shell))
+
     def coefficient_count(self, light: Input | None) -> int:
         """Number of coefficients that take part: all."""
-        return len(self._directions)
+        return self.native_basis.size
 
     def self_lookups(
         self, bodies: tuple[int, ...], rotations: wp.array, projected_light: ProjectedCells
@@ -283,6 +300,9 @@ class Directional(SphereMethod):
     def transfer(self, visibility: GroupVisibility, group: Group, projected_light: ProjectedCells) -> wp.array:
         """Transfer vectors; the transmittance as it is where cached cells hold known light."""
         assert visibility.transmittance_total is not None
+        if projected_light.patches is not None:
+            arguments = group.points, group.normals, visibility.transmittance_total, projected_light.directions
+            return projected_light.patches.transfer(*arguments)
         if group.cached_rows is None:
             return directional_transfer(visibility.transmittance_total, group.normals, projected_light.facing)
         if _has_light(group.cached_rows):
@@ -299,7 +319,7 @@ class Directional(SphereMethod):
         self, visibility: GroupVisibility, group: Group, projected_light: ProjectedCells
     ) -> wp.array:
         """Shading of a group in known light."""
-        if group.cached_rows is not None:
+        if group.cached_rows is not None or projected_light.patches is not None:
             return self.shade_transfer(self.transfer(visibility, group, projected_light), group, projected_light)
         assert visibility.transmittance_total is not None and projected_light.coefficients is not None
         cells = projected_light.facing, projected_light.coefficients
@@ -358,7 +378,7 @@ class Directional(SphereMethod):
         unblocked = np.where(is_front, *whole)
         return np.divide(lit, unblocked, out=np.zeros_like(lit), where=unblocked > 0)
 
-    def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input, view: LitPoints) -> Node:
+    def lobe_transmittance(self, points: LitPoints, directions: Node, light: LightInput, view: LitPoints) -> Node:
         """Transmittance towards the samples of lobes, between cells; of known light, to where it comes from in them."""
         cells, projected_light = self._lobe_cells(points, light, view)
         item_text = functools.partial(receiver_text, points.in_words)
@@ -366,7 +386,7 @@ class Directional(SphereMethod):
         return Node("transmittance of lobes", _towards, *arguments, items=item_text)
 
     def blocked_radiance(
-        self, points: LitPoints, diffuse: Node, light: Input, view: LitPoints, choose: Callable[[Node], Node]
+        self, points: LitPoints, diffuse: Node, light: LightInput, view: LitPoints, choose: Callable[[Node], Node]
     ) -> Node:
         """Mean radiance of the blockers of points, by their light with bounces and without."""
         cells, projected_light = self._lobe_cells(points, light, view)
@@ -384,14 +404,18 @@ class Directional(SphereMethod):
         if not diffuse.size:
             return diffuse
         count = len(projected_light.directions)
-        transfer = directional_transfer(_joined_cells(cells, count), receivers.normals, projected_light.facing)
+        transmittance = _joined_cells(cells, count)
+        of_cells = transfer = directional_transfer(transmittance, receivers.normals, projected_light.facing)
+        if projected_light.patches is not None:
+            arguments = receivers.points, receivers.normals, transmittance, projected_light.directions
+            transfer = projected_light.patches.transfer(*arguments)
         light = projected_light.coefficients if free is None else change_basis(free, self.native_from_basis)
         assert light is not None
         even = wp.full((1, count), wp.vec3(1.0), dtype=wp.vec3, device=diffuse.device)
-        direct, openness = shade(transfer, light, maximum=LARGEST_COEFFICIENT), shade(transfer, even)
+        direct, openness = shade(transfer, light, maximum=LARGEST_COEFFICIENT), shade(of_cells, even)
         return blocked_radiance(diffuse, direct, openness)
 
-    def known_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
+    def known_shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
         """Shading of points in known light, which bounces from the materials."""
         if not self._shades_with_cells(points):
             return super().known_shading(points, light, materials)
@@ -401,28 +425,30 @@ class Directional(SphereMethod):
         """Whether the transmittance of cells at bodies that shine comes with the shading of a view."""
         return self.bounces is None and points.materials.roughness is not None
 
-    def _shading_with_cells(self, view: LitPoints, light: Input) -> Node:
+    def _shading_with_cells(self, view: LitPoints, light: LightInput) -> Node:
         """Node of the shading of a view in known light, and of the transmittance of its glossy receivers' cells."""
         name = "shading of the scene with cells" if light is self.light else "shading with cells"
         make = functools.partial(ShadingWithCells, self, view, self.projected(light), light, _joined_with_cells)
         return view.cached(name, light, make)
 
-    def _lobe_cells(self, points: LitPoints, light: Input, view: LitPoints) -> tuple[Node, Any]:
+    def _lobe_cells(self, points: LitPoints, light: LightInput, view: LitPoints) -> tuple[Node, Any]:
         """Node of the transmittance of cells, in portions, and the projected light that says which.
 
         In known light that does not bounce the shading of the view has found it.
         """
         if not light.is_free and self._shades_with_cells(view):
             return Node("", operator.itemgetter(1), self._shading_with_cells(view, light)), self.projected(light)
-        make = functools.partial(self.projected, light)
-        projected_light = self.free_projection if light.is_free else points.cached("projected", light, make)
+        if light.is_free:
+            projected_light = self.free_projection_of(points, light)
+        else:
+            projected_light = points.cached("projected", light, functools.partial(self.projected, light))
 
         def in_cells() -> Node:
             return PortionedCellTransmittance(
                 self, points, projected_light, None, list, where=" of gloss", is_shaded=False
             )
 
-        return points.cached("cells", None if light.is_free else light, in_cells), projected_light
+        return points.cached("cells", light.shell if light.is_free else light, in_cells), projected_light
 
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """Rows of the light of each cell that static bodies let through.

@@ -44,7 +44,7 @@ class LogSH(SphereMethod):
             min(order, self.basis.order) if isinstance(self.basis, HarmonicBasis) else order
         )
 
-    def project_light(self, light: KnownLight) -> ProjectedBands:
+    def project_light(self, light: KnownLight, shell: wp.array | None = None) -> ProjectedBands:
         """The bands that the light has."""
         count = light.bands(self._order)
         coefficients = light.sh(self._order)[None, : count**2]

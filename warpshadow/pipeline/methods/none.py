@@ -1,6 +1,26 @@
-"""The method "none": no shadows, in harmonics as by log-SH."""
+"""The method "none": no shadows, in harmonics as by log-SH; light of a shell by its patches."""
 
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.assets.basis import Basis
+from warpshadow.assets.harmonic_light import KnownLight
+from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.methods.log_sh import LogSH
+from warpshadow.pipeline.node import Input
+from warpshadow.pipeline.receivers.groups import Group, GroupVisibility
+from warpshadow.pipeline.shell import PATCHES, ShellPatches, project_on_shell
+
+_NO_CELLS = np.empty((0, 3))
+
+
+class ProjectedShell(NamedTuple):
+    """Light of a shell."""
+
+    patches: ShellPatches
+    coefficients: wp.array | None = None  # of known light, vec3 of shape [1, patch]
 
 
 class NoShadows(LogSH):
@@ -8,6 +28,30 @@ class NoShadows(LogSH):
 
     traces_self_visibility = False
     why_no_shadows = "the method is to have no shadows"
+
+    def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
+        super().__init__(merged_scene, basis, progress=progress)
+        if self.shell is not None:
+            self.native_basis, self.basis = PATCHES, PATCHES if basis is None else basis
+            self.free_projection = self.project_free_light(self.shell)
+
+    def project_light(self, light: KnownLight, shell: wp.array | None = None) -> Any:
+        """The bands that the light has, or its patches."""
+        return super().project_light(light) if shell is None else ProjectedShell(*project_on_shell(light, shell))
+
+    def project_free_light(self, shell: wp.array) -> ProjectedShell:
+        """The basis of free light of a shell. Differentiable: shell."""
+        return ProjectedShell(ShellPatches(shell))
+
+    def coefficient_count(self, light: Input | None) -> int:
+        """Number of coefficients that take part."""
+        return super().coefficient_count(light) if self.shell is None else PATCHES.size
+
+    def transfer(self, visibility: GroupVisibility, group: Group, projected_light: Any) -> wp.array:
+        """Transfer vectors, float32 of shape [batch, receiver, coefficient]."""
+        if not isinstance(projected_light, ProjectedShell):
+            return super().transfer(visibility, group, projected_light)
+        return projected_light.patches.transfer(group.points, group.normals, None, _NO_CELLS)
 
 
 METHOD = NoShadows

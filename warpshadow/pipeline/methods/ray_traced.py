@@ -11,7 +11,7 @@ from warpshadow.assets.basis import Basis, HarmonicBasis
 from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.device.batch import common_batch
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.method import Method, add_light
+from warpshadow.pipeline.method import LightInput, Method, add_light
 from warpshadow.pipeline.node import Input, Node, NodeStage, detached
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
@@ -22,6 +22,7 @@ from warpshadow.stages.ray_packets import PACKET, FaceTree, build_face_tree
 from warpshadow.stages.ray_tracing import trace_shading
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.shared_rays import find_corners, find_shares, trace_shared
+from warpshadow.stages.shell.beams import FAR, check_within
 from warpshadow.stages.traced_transfer import trace_transfer
 
 if TYPE_CHECKING:  # they are imported where light bounces, and where bodies emit
@@ -42,7 +43,7 @@ class Rays(Method):
         super().__init__(merged_scene, HarmonicBasis(merged_scene.scene.visibility.order), basis, progress=progress)
         self.shares_directions = self.visibility.sampling == "shared"
 
-    def known_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
+    def known_shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
         """Shading of points in known light, towards which rays are drawn.
 
         By the reflectance of the scene's bodies light bounces along paths, without a gradient; by reflectance that a
@@ -56,13 +57,13 @@ class Rays(Method):
         if materials is points.materials and not self.shares_directions:
             from warpshadow.pipeline.bounces.paths import path_traced
 
-            arguments = direct, meshes, points, light, materials
+            arguments = direct, meshes, points, light, self.shell_of(light), materials
             return path_traced(*arguments, samples=self._sample_count, progress=self.progress)
         patch_samples = self._bounces.patch_samples(points, materials)
 
         def shaded_patch_samples() -> Node:
             shade = self._shade_shared if self.shares_directions else self._shade
-            return Node("", shade, self._blockers(points, patch_samples), patch_samples, light)
+            return Node("", shade, self._blockers(points, patch_samples), patch_samples, light, self.shell_of(light))
 
         at_patch_samples = points.cached("direct at patch samples", (light, patch_samples), shaded_patch_samples)
         if materials.emission:
@@ -74,7 +75,7 @@ class Rays(Method):
             )
         return self._bounces.add_bounces(direct, at_patch_samples, points, materials)
 
-    def free_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
+    def free_shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
         """Shading of points in free light."""
         direct = super().free_shading(points, light, materials)
         if not self.merged_scene.scene.bounces:
@@ -82,12 +83,13 @@ class Rays(Method):
         patch_samples = self._bounces.patch_samples(points, materials)
 
         def transfers() -> Node:
-            return Node("", self._transfer, self._meshes_for(points, patch_samples), patch_samples)
+            meshes = self._meshes_for(points, patch_samples)
+            return Node("", self._transfer, meshes, patch_samples, self.shell_of(light))
 
         if materials.emission:
             emitted = self._light_of_emitters_at(points, patch_samples, materials)
             direct = self._bounces.add_bounces(direct, emitted, points, materials)
-        at_patch_samples = points.cached("transfer of patch samples", patch_samples, transfers)
+        at_patch_samples = points.cached("transfer of patch samples", (patch_samples, light.shell), transfers)
         return self._bounces.add_free_bounces(direct, at_patch_samples, light, points, materials)
 
     def emitted_light(self, points: LitPoints, materials: Materials) -> Node:
@@ -126,14 +128,14 @@ class Rays(Method):
         points, normals, samples = _checked_points(receivers.points), receivers.normals, self.emitters.samples
         count, result = common_batch({"points": points, "geometry": positions}), []
         rays = max(1, (self.visibility.ray_count if self.shares_directions else self._sample_count) // (4 * SAMPLES))
-        for body, span in zip(samples.bodies, samples.spans(), strict=True):
-            others = [number for number in self.merged_scene.casting if number != body]
+        meshes = [self.merged_scene.casting_mesh(positions[instance]) for instance in range(len(positions))]
+        for span in samples.spans():
             traced = wp.empty((count, points.shape[1], span.size), dtype=wp.float32, device=points.device)
             for instance in range(count if points.size else 0):
                 position_number, point_number = min(instance, len(positions) - 1), min(instance, len(points) - 1)
                 rows = trace_transmittance(
-                    self.merged_scene.casting_mesh(positions[position_number], others),
-                    *(points[point_number], normals[point_number]),
+                    *(meshes[position_number], points[point_number], normals[point_number]),
+                    *(samples, positions[position_number]),
                     *(placed_samples.points[position_number], placed_samples.areas[position_number]),
                     span,
                     rays=rays,
@@ -152,7 +154,7 @@ class Rays(Method):
         rays = STILL_RAYS if self.shares_directions else RAYS
         return StaticBounces(*arguments, rays=rays, progress=self.progress)
 
-    def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input, view: LitPoints) -> Node:
+    def lobe_transmittance(self, points: LitPoints, directions: Node, light: LightInput, view: LitPoints) -> Node:
         """Transmittance towards the samples of lobes: rays, each of its own."""
         item_text = functools.partial(receiver_text, points.in_words)
         return Node(
@@ -165,7 +167,7 @@ class Rays(Method):
         )
 
     def blocked_radiance(
-        self, points: LitPoints, diffuse: Node, light: Input, view: LitPoints, choose: Callable[[Node], Node]
+        self, points: LitPoints, diffuse: Node, light: LightInput, view: LitPoints, choose: Callable[[Node], Node]
     ) -> Node:
         """Mean radiance of the blockers of points, by their light with bounces and without."""
         if light.is_free:
@@ -177,7 +179,7 @@ class Rays(Method):
         openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
         return Node("light of blockers", blocked_radiance, diffuse, choose(direct), openness)
 
-    def transfers(self, points: LitPoints) -> Node:
+    def transfers(self, points: LitPoints, light: LightInput) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""
         words = points.in_words
         node = Node(
@@ -185,13 +187,14 @@ class Rays(Method):
             self._transfer,
             self._meshes(points),
             points.receivers_node,
+            self.shell_of(light),
             items=lambda: f"{receiver_text(words)} × {self.basis.size} coefficients",
         )
         if node.requires_grad:
             node.function = _refuse
         return node
 
-    def _direct_shading(self, points: LitPoints, meshes: Node, light: Input) -> Node:
+    def _direct_shading(self, points: LitPoints, meshes: Node, light: LightInput) -> Node:
         """Node of the direct shading of points in known light, given the meshes, or trees, that block it."""
         return Node(
             "shading",
@@ -199,6 +202,7 @@ class Rays(Method):
             meshes,
             points.receivers_node,
             light,
+            self.shell_of(light),
             items=functools.partial(receiver_text, points.in_words),
             stages=(NodeStage("transfer", idle="rays shade known light at once"),),
         )
@@ -249,34 +253,43 @@ class Rays(Method):
         meshes = [self.merged_scene.casting_mesh(positions[instance]) for instance in range(count)]
         return [*meshes, *meshes[-1:] * (len(points) - count)]
 
-    def _shade(self, meshes: Meshes, receivers: Receivers, light: KnownLight) -> wp.array:
-        points, normals = _checked_points(receivers.points), receivers.normals
+    def _shade(
+        self, meshes: Meshes, receivers: Receivers, light: KnownLight, shell: wp.array | None = None
+    ) -> wp.array:
+        points, normals, shells = _checked_points(receivers.points), receivers.normals, _shells(receivers, shell)
         samples = sample_map(light.radiance, self._sample_count)
         traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
         for instance, mesh in enumerate(meshes):
-            lit = trace_shading(mesh, points[instance], normals[instance], samples, progress=self.progress)
+            lit_points, own_shell = (points[instance], normals[instance]), shells[min(instance, len(shells) - 1)]
+            lit = trace_shading(mesh, *lit_points, samples, shell=own_shell, progress=self.progress)
             wp.copy(traced[instance], lit)
         return traced
 
-    def _shade_shared(self, trees: list[FaceTree], receivers: Receivers, light: KnownLight) -> wp.array:
-        """Shading by rays in directions that all receivers share."""
+    def _shade_shared(
+        self, trees: list[FaceTree], receivers: Receivers, light: KnownLight, shell: wp.array | None = None
+    ) -> wp.array:
+        """Shading by rays in directions that all receivers share, or to points of a shell."""
         points, normals, progress = _checked_points(receivers.points), receivers.normals, self.progress
+        shells = _shells(receivers, shell)
         count = -(-self.visibility.ray_count // PACKET) * PACKET
         traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
         for instance in range(len(points) if points.size else 0):
             tree = trees[min(instance, len(trees) - 1)]
             lit_points = tree, points[instance], normals[instance]
+            options = {"shell": shells[min(instance, len(shells) - 1)]}
             # a ratio image has the same directions with the bodies and without
-            pilots = None if self.merged_scene.scene.catchers else functools.partial(find_shares, *lit_points)
+            pilots = (
+                None if self.merged_scene.scene.catchers else functools.partial(find_shares, *lit_points, **options)
+            )
             samples = cut_map(light.radiance, count, pilots)
             corners = None
             if receivers.fragments.face_ids.ndim == 3:  # of an image
                 corners = find_corners(receivers, instance, self.merged_scene.scene.supersampling)
-            wp.copy(traced[instance], trace_shared(*lit_points, samples, corners=corners, progress=progress))
+            wp.copy(traced[instance], trace_shared(*lit_points, samples, corners=corners, progress=progress, **options))
         return traced
 
-    def _transfer(self, meshes: Meshes, receivers: Receivers) -> list[wp.array]:
-        points, normals = receivers.points, receivers.normals
+    def _transfer(self, meshes: Meshes, receivers: Receivers, shell: wp.array | None = None) -> list[wp.array]:
+        points, normals, shells = receivers.points, receivers.normals, _shells(receivers, shell)
         transfer = wp.empty((*points.shape, self.basis.size), dtype=wp.float32, device=points.device)
         for instance, mesh in enumerate(meshes):
             traced = trace_transfer(
@@ -285,6 +298,7 @@ class Rays(Method):
                 normals[instance],
                 self.basis.functions,
                 self.visibility.ray_count,
+                shell=shells[min(instance, len(shells) - 1)],
                 progress=self.progress,
             )
             wp.copy(transfer[instance], traced)
@@ -319,6 +333,17 @@ def _checked_points(points: wp.array) -> wp.array:
             "geometry: got arrays that require a gradient, which rays do not have; expected none, or another method"
         )
     return points
+
+
+def _shells(receivers: Receivers, shell: wp.array | None) -> np.ndarray:
+    """Center and radius of the sphere that sends light to receivers, of each instance, [batch, 4]."""
+    if shell is None:
+        return FAR[None]
+    if shell.requires_grad:
+        raise ValueError("shell: got one that requires a gradient, which rays do not have; expected another method")
+    check_within(receivers.points, shell)
+    shells: np.ndarray = shell.numpy()
+    return shells
 
 
 def _refuse(*_: object) -> None:

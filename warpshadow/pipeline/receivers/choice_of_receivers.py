@@ -128,8 +128,9 @@ def choose_receivers(
     limits = np.where(has_few, 1.0, largest)
     chosen = np.where([size.exceeds(limit) for size, limit in zip(sizes, limits, strict=True)], "pixel", "vertex")
     is_seen_large = np.array([size.area > SMALL_FACE for size in sizes])
-    # where the shadows of emitters have edges, probes do not tell
-    where_edges_are = "pixel" if merged_scene.is_emitter.any() else "adaptive"
+    # where the shadows of emitters and of light from a shell have edges, probes do not tell
+    is_near = merged_scene.is_emitter.any() or merged_scene.scene.shell is not None
+    where_edges_are = "pixel" if is_near else "adaptive"
     chosen = np.where(merged_scene.is_flat & is_sharp & is_seen_large, where_edges_are, chosen)
     is_open = (chosen == "vertex") & (np.array(requested) == AUTO) & ~merged_scene.is_flat
     unevenness = np.zeros(len(chosen))
@@ -190,7 +191,7 @@ def for_picture(scene: Scene) -> Scene:
 
 def _has_sun(scene: Scene) -> bool:
     """Whether the directional method is to find shadows of a sun."""
-    if scene.visibility.method != "directional":
+    if scene.visibility.method != "directional" or scene.shell is not None:
         return False
     cells = scene.known_light.cells(fibonacci(scene.visibility.directions))
     if cells.spots is None or cells.half_angles is None:

@@ -48,7 +48,8 @@ class Group(NamedTuple):
     self_lookup: SelfVisibilityLookup | SelfVisibilityLobes | None = None
     planes: GroupPlanes | None = None  # bodies that block as planes; None without any
     convex_parts_around: GroupConvexParts | None = None  # bodies that block as convex parts; None without any
-    own_parts: GroupConvexParts | None = None  # of that body, where it is a solid
+    is_solid: bool = False  # whether that body blocks its own light as its convex parts do
+    own_parts: GroupConvexParts | None = None  # these; None where it has one, which blocks none
     nearest_blockers: NearestBlockers | None = None  # None where receivers are not patch samples
     corners: wp.array | None = None  # of the body, vec3 of shape [batch, corner]; None where it is not known
     skip: tuple[int, int] = (0, 0)  # spheres that do not block: the first, and the one after the last
@@ -61,8 +62,8 @@ class Group(NamedTuple):
 
     @property
     def has_own_coverage(self) -> bool:
-        """Whether convex parts of the receivers' own body block its light: one alone does not."""
-        return self.own_parts is not None and self.own_parts.blockers.has_several_blocking and bool(self.points.size)
+        """Whether convex parts of the receivers' own body block their light."""
+        return self.own_parts is not None and bool(self.points.size)
 
     def own_coverage(self, directions: np.ndarray, radius: float | None = None) -> wp.array:
         """Coverage of cells by them."""
@@ -190,9 +191,9 @@ class Blockers(NamedTuple):
         return GroupConvexParts(self.parts.blockers(bodies, chosen), self.placed, skip)
 
     def own_parts(self, body: int) -> GroupConvexParts | None:
-        """The convex parts of a body, where they block its own light."""
+        """The convex parts of a body, where they block its own light: one alone does not."""
         bodies = self.blocker_kinds.convex
-        if self.placed is None or body not in self.blocker_kinds.solids:
+        if self.placed is None or body not in self.blocker_kinds.solids or len(self.parts.parts[body]) == 1:
             return None
         return GroupConvexParts(self.parts.blockers(bodies, (body,)), self.placed, on_surface=True)
 
@@ -268,7 +269,8 @@ def _groups_that_move(
             clusters = clusters or find_clusters(*spheres, blockers.merging)
             group = group._replace(skip=skip, clusters=clusters)
         if span.body >= 0:
-            group = group._replace(own_parts=blockers.own_parts(span.body))
+            is_solid = span.body in blockers.blocker_kinds.solids
+            group = group._replace(is_solid=is_solid, own_parts=blockers.own_parts(span.body))
             weights = blockers.self_visibility.probe_weights(receivers, span)
             group = group._replace(body=span.body, probe_weights=weights, self_lookup=self_lookups.get(span.body))
             if corners is not None:

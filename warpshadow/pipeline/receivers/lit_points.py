@@ -79,7 +79,8 @@ class LitPoints:
         self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
         self.call, self.static_bodies = call, static_bodies
         self.normals = Node("", vertex_normals, vertices, merged_scene.faces) if normals is None else normals
-        self.last_light: Input | None = None  # that was known, but for the scene's
+        self.last_light: Any = None  # that was known, but for the scene's: a ``LightInput``
+        self.last_shell: Input | None = None  # of light, but for the scene's
         self._cached: dict[str, tuple[Hashable, Any]] = {}
 
     def cached(self, name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:
@@ -92,7 +93,7 @@ class LitPoints:
         """Other receivers, of which nothing is cached, among the same blockers, any of which may move."""
         points = copy.copy(self)
         points.receivers_node, points.static_bodies, points.is_scene_view = receivers, None, False
-        points._cached, points.last_light = {}, None
+        points._cached, points.last_light, points.last_shell = {}, None, None
         return points
 
     def preview(self: Points) -> Points:

@@ -49,6 +49,9 @@ _BOUND_MARGIN = 1.001
 _ON_SURFACE = 3.0e-4
 """Height above a face up to which a receiver lies on it, over the radius of the part: faces are flat to 1e-4."""
 
+_ROUNDING = 1.0e-6
+"""The same, over the distance of the part from the origin: several times that of float32."""
+
 
 @wp.struct
 class PartInputs:
@@ -126,7 +129,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
     find_block, load, sqrt, add, is_positive = fn.find_block, fn.load, fn.sqrt, fn.add, fn.is_positive
     find, find_coverage = silhouettes.find, silhouettes.find_coverage
     no_blockers, with_blocker = joint.no_blockers, joint.with_blocker
-    MARGIN, ON_SURFACE = wp.constant(_BOUND_MARGIN), wp.constant(_ON_SURFACE)
+    MARGIN, ON_SURFACE, ROUNDING = wp.constant(_BOUND_MARGIN), wp.constant(_ON_SURFACE), wp.constant(_ROUNDING)
 
     @wp.func
     def begin(
@@ -189,7 +192,8 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
     @wp.func
     def find_rise(parts: ConvexArrays, part: int, task: PartsTask):
         """How far a part rises above tangent planes; not above 0 for receivers that lie on it."""
-        margin = ON_SURFACE * task.bounds[part][3]
+        bound = task.bounds[part]
+        margin = ON_SURFACE * bound[3] + ROUNDING * wp.length(wp.vec3(bound[0], bound[1], bound[2]))
         above = Lane(-1.0e30)
         is_on = Lane(0.0)
         for face in range(parts.first_face[part], parts.first_face[part + 1]):

@@ -50,14 +50,12 @@ class ConvexBlockers:
 
     Args:
         body_count: Number of bodies.
-        has_several_blocking: Whether more parts than one cast shadows.
         edge_count: Edges of a part at most.
         arrays: Their parts.
         corners_of_vertices: Matrix that finds corners, [corner, vertex].
     """
 
     body_count: int
-    has_several_blocking: bool
     edge_count: int
     arrays: ConvexArrays
     corners_of_vertices: SparseMatrix
@@ -88,7 +86,6 @@ class ConvexBlockers:
         vertices = np.concatenate([body.first_vertex + part.corners for body in bodies for part in body.parts])
         return ConvexBlockers(
             len(bodies),
-            sum(len(body.parts) for body in bodies if body.blocks) > 1,
             max(len(part.edges) for part in parts),
             arrays,
             SparseMatrix.from_matrix(_selection_matrix(vertices, vertex_count), device=device),

@@ -66,6 +66,7 @@ def _sum_light(
     log_of_planes: wp.array3d(dtype=wp.float32),
     log_of_parts: wp.array3d(dtype=wp.float32),
     transmittance: wp.array3d(dtype=wp.float32),
+    transmittance_of_emitter: wp.array3d(dtype=wp.float32),
     # out
     light: wp.array2d(dtype=wp.vec3),
 ):
@@ -91,6 +92,8 @@ def _sum_light(
             factor = wp.dot(beam, normal) * facing_area * wp.exp(exponent)
             if transmittance:
                 factor = factor * transmittance[batch, receiver, i]
+            if transmittance_of_emitter:
+                factor = factor * transmittance_of_emitter[batch, receiver, i]
             distance2 = wp.length_sq(beam)
             factor = factor / (distance2 * wp.sqrt(wp.pi * wp.pi * distance2 * distance2 + wp.length_sq(area)))
             total += factor * radiance[radiance_batch, first_sample + i]
@@ -108,6 +111,7 @@ def sum_light(
     log_of_planes: wp.array | None = None,
     log_of_parts: wp.array | None = None,
     transmittance: wp.array | None = None,
+    transmittance_of_emitter: wp.array | None = None,
 ) -> wp.array:
     """Light of an emitter on receivers.
 
@@ -119,15 +123,15 @@ def sum_light(
         span: Those of the emitter.
         log_of_spheres, log_of_planes, log_of_parts: Logarithms of transmittance, float32 of shape [batch, receiver,
             sample].
-        transmittance: A factor beside them, such as that of the receivers' own body, float32 of the same shape.
-            Any batch may be 1; None where nothing blocks.
+        transmittance, transmittance_of_emitter: Factors beside them, of the receivers' own body and of the emitter's,
+            float32 of the same shape. Any batch may be 1; None where nothing blocks.
     Returns:
         vec3 of shape [batch, receiver].
     Differentiable: points, normals, samples, radiance and all transmittance.
     """
     arrays = {"points": points, "normals": normals, "emitters": samples.points, "emission": radiance}
     rows = {"spheres": log_of_spheres, "planes": log_of_planes, "parts": log_of_parts}
-    rows["others"] = transmittance
+    rows |= {"others": transmittance, "emitter": transmittance_of_emitter}
     count = common_batch(arrays | rows)
     points, normals = expand(points, count), expand(normals, count)
     transmittances = [None if item is None else expand_rows(item, count) for item in rows.values()]

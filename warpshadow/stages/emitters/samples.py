@@ -33,7 +33,16 @@ BUNDLE = 8
 
 SAMPLES = 64  # samples of an emitter
 
+SURFACE_POINTS = 32  # points of each sample to which rays go
+
 _MAX_STRETCH = 4.0  # greatest s
+
+
+class SurfacePoints(NamedTuple):
+    """Points on the surface of an emitter, spread evenly over each sample."""
+
+    faces: np.ndarray  # face of the emitter that each lies on, int32 of shape [sample, point]
+    weights: np.ndarray  # barycentric coordinates in it, float32 of shape [sample, point, 3]
 
 
 class SampleWeights(NamedTuple):
@@ -41,6 +50,7 @@ class SampleWeights(NamedTuple):
 
     vertices: csr_matrix  # of its vertices in the samples' middles, [sample, vertex]
     faces: csr_matrix  # of its faces' area vectors in those of samples, [sample, face]
+    surface_points: SurfacePoints
 
 
 def find_sample_weights(
@@ -76,7 +86,30 @@ def find_sample_weights(
     padding = np.full(-patch_count % BUNDLE, permutation[-1] if patch_count else 0)
     is_real = np.repeat([1.0, 0.0], [patch_count, len(padding)])
     chosen = np.concatenate([permutation, padding]).astype(int)
-    return SampleWeights(of_vertices[chosen].tocsr(), (diags(is_real) @ of_faces[chosen]).tocsr())
+    surface_points = _find_surface_points(owners, pieces.corners[is_used], labels, areas)
+    return SampleWeights(
+        of_vertices[chosen].tocsr(),
+        (diags(is_real) @ of_faces[chosen]).tocsr(),
+        SurfacePoints(*(item[chosen] for item in surface_points)),
+    )
+
+
+def _find_surface_points(
+    faces: np.ndarray, corners: np.ndarray, labels: np.ndarray, areas: np.ndarray
+) -> SurfacePoints:
+    """Spread points over samples, given the pieces: their faces, corners, samples and areas."""
+    order = np.argsort(labels, kind="stable")
+    sums = np.cumsum(areas[order])
+    ends = sums[np.searchsorted(labels[order], np.arange(labels.max(initial=-1) + 1), side="right") - 1]
+    starts = np.concatenate([[0.0], ends[:-1]])
+    shares = (np.arange(SURFACE_POINTS) + 0.5) / SURFACE_POINTS
+    pieces = order[
+        np.minimum(np.searchsorted(sums, starts[:, None] + shares * (ends - starts)[:, None]), len(sums) - 1)
+    ]
+    u, v = np.random.default_rng(0).uniform(size=(2, *pieces.shape, 1))
+    in_pieces = np.concatenate([1 - np.sqrt(u), np.sqrt(u) * (1 - v), np.sqrt(u) * v], axis=-1)
+    weights = np.einsum("spk,spkc->spc", in_pieces, corners[pieces])
+    return SurfacePoints(faces[pieces].astype(np.int32), weights.astype(np.float32))
 
 
 class EmitterSpan(NamedTuple):
@@ -99,6 +132,7 @@ class EmitterSamples(NamedTuple):
     Args:
         vertices: Weights of all vertices in the samples' middles, [sample, vertex].
         face_shares: Weights of the emitting faces in the samples' area vectors, [sample, face].
+        surface_points: Points of the samples, on ``faces``.
         faces: Emitting faces, vec3i of shape [face].
         bodies: The emitters, by number.
         is_two_sided: Whether each is open.
@@ -107,6 +141,7 @@ class EmitterSamples(NamedTuple):
 
     vertices: SparseMatrix
     face_shares: SparseMatrix
+    surface_points: SurfacePoints
     faces: wp.array
     bodies: tuple[int, ...]
     is_two_sided: tuple[bool, ...]

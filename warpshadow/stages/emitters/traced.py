@@ -11,14 +11,14 @@ m the normal of the face; of an open body |m·ω| counts.
 import numpy as np
 import warp as wp
 
+from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.stages.emitters.samples import EmitterSpan, is_lit, sample_radius
+from warpshadow.stages.emitters.samples import EmitterSamples, EmitterSpan, is_lit
 from warpshadow.stages.interpolation import interpolate_at
 from warpshadow.stages.ray_tracing import RAY_COST, mesh_id, progress_slices, sees_point
 
 _SEED = 43
-_MIN_DISTANCE2 = 1.0e-12
 
 
 @wp.struct
@@ -76,9 +76,8 @@ def light_of_point(
     a = emitters.positions[corners[0]]
     area_vector = 0.5 * wp.cross(emitters.positions[corners[1]] - a, emitters.positions[corners[2]] - a)
     beam = interpolate_at(emitters.positions, corners, weights) - point
-    distance2 = wp.max(wp.length_sq(beam), _MIN_DISTANCE2)
-    distance = wp.sqrt(distance2)
-    ray_direction = beam / distance
+    distance = wp.length(beam)
+    ray_direction = wp.normalize(beam)  # 0 at distance 0, which faces nothing
     facing_area = -wp.dot(ray_direction, area_vector)
     if emitters.is_two_sided[index] == 1:
         facing_area = wp.abs(facing_area)
@@ -87,7 +86,7 @@ def light_of_point(
     is_facing = facing_area > 0.0 and cosine > 0.0 and probability > 0.0
     if is_facing and sees_point(mesh, point, normal, ray_direction, distance):
         radiance = interpolate_at(emitters.emission, corners, weights)
-        light = cosine * facing_area / (wp.pi * distance2 * probability) * radiance
+        light = cosine * (facing_area / (distance * distance)) / (wp.pi * probability) * radiance
     return light
 
 
@@ -102,6 +101,10 @@ def _trace_transmittance(
     first_receiver: int,
     sample_points: wp.array(dtype=wp.vec3),
     sample_areas: wp.array(dtype=wp.vec3),
+    positions: wp.array(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    surface_faces: wp.array2d(dtype=wp.int32),
+    surface_weights: wp.array2d(dtype=wp.vec3),
     first_sample: int,
     is_two_sided: int,
     ray_count: int,
@@ -113,26 +116,33 @@ def _trace_transmittance(
     state = wp.rand_init(_SEED, first_receiver + receiver)
     point = points[receiver]
     normal = normals[receiver]
+    point_count = surface_faces.shape[1]
     for i in range(transmittance.shape[1]):
-        area = sample_areas[first_sample + i]
-        middle = sample_points[first_sample + i]
-        share = float(1.0)
-        if is_lit(middle - point, area, normal, is_two_sided):
-            radius = sample_radius(area)
-            axis = wp.normalize(area)
-            side = wp.normalize(
-                wp.cross(axis, wp.where(wp.abs(axis[0]) < 0.5, wp.vec3(1.0, 0.0, 0.0), wp.vec3(0.0, 1.0, 0.0)))
-            )
-            open_count = int(0)
+        sample = first_sample + i
+        share = float(0.0)
+        if is_lit(sample_points[sample] - point, sample_areas[sample], normal, is_two_sided):
+            open_weight = float(0.0)
+            total_weight = float(0.0)
             for _ray in range(ray_count):
-                distance_in_disc = radius * wp.sqrt(wp.randf(state))
-                angle = 2.0 * wp.pi * wp.randf(state)
-                across_disc = wp.cos(angle) * side + wp.sin(angle) * wp.cross(axis, side)
-                beam = middle + distance_in_disc * across_disc - point
-                distance = wp.length(beam)
-                if sees_point(mesh, point, normal, beam / distance, distance):
-                    open_count += 1
-            share = float(open_count) / float(ray_count)
+                start = wp.randi(state, 0, point_count)
+                beam = wp.vec3()
+                facing = float(0.0)
+                for j in range(point_count):  # to the first point from there that faces the receiver
+                    if facing <= 0.0:
+                        at = (start + j) % point_count
+                        corners = faces[surface_faces[sample, at]]
+                        a = positions[corners[0]]
+                        face_normal = wp.normalize(wp.cross(positions[corners[1]] - a, positions[corners[2]] - a))
+                        beam = interpolate_at(positions, corners, surface_weights[sample, at]) - point
+                        facing = -wp.dot(wp.normalize(beam), face_normal)
+                        if is_two_sided == 1:
+                            facing = wp.abs(facing)
+                if facing > 0.0:
+                    total_weight += facing
+                    if sees_point(mesh, point, normal, wp.normalize(beam), wp.length(beam)):
+                        open_weight += facing
+            if total_weight > 0.0:
+                share = open_weight / total_weight
         transmittance[receiver, i] = share
 
 
@@ -140,6 +150,8 @@ def trace_transmittance(
     mesh: wp.Mesh | None,
     points: wp.array,
     normals: wp.array,
+    samples: EmitterSamples,
+    positions: wp.array,
     sample_points: wp.array,
     sample_areas: wp.array,
     span: EmitterSpan,
@@ -147,27 +159,32 @@ def trace_transmittance(
     rays: int,
     progress: bool = False,
 ) -> wp.array:
-    """Trace the transmittance between receivers and the samples of an emitter, by rays to points of their discs.
+    """Trace the transmittance between receivers and the samples of an emitter, by rays to points of its surface.
 
     Args:
-        mesh: The blockers, without the emitter; None for none.
+        mesh: The blockers, the emitter among them if it blocks light; None for none.
         points: Receivers [scene units], vec3 of shape [receiver].
         normals: Their unit normals, vec3 of shape [receiver].
+        samples: Of all emitters.
+        positions: All vertices [scene units], of one instance, vec3 of shape [vertex].
         sample_points, sample_areas: Of :class:`.samples.PlacedSamples`, of one instance.
         span: Samples of the emitter.
         rays: To each sample.
     Returns:
-        Float32 of shape [receiver, sample]; 1 where a sample sends nothing.
+        Float32 of shape [receiver, sample]; 0 where a sample sends nothing.
     Differentiable: no.
     """
-    transmittance = empty((len(points), span.size), dtype=wp.float32, device=points.device)
+    device = points.device
+    transmittance = empty((len(points), span.size), dtype=wp.float32, device=device)
+    surface_faces = constant(samples.surface_points.faces, wp.int32, device)
+    surface_weights = constant(samples.surface_points.weights, wp.vec3, device)
     for receivers in progress_slices(len(points), 2**20 // (rays * span.size), progress):
         launch(
             _trace_transmittance,
             receivers.stop - receivers.start,
             inputs=[
-                *(mesh_id(mesh), points[receivers], normals[receivers], receivers.start),
-                *(sample_points, sample_areas, span.first, int(span.is_two_sided), rays),
+                *(mesh_id(mesh), points[receivers], normals[receivers], receivers.start, sample_points, sample_areas),
+                *(positions, samples.faces, surface_faces, surface_weights, span.first, int(span.is_two_sided), rays),
             ],
             outputs=[transmittance[receivers]],
             cost=RAY_COST * rays * span.size,

@@ -54,6 +54,7 @@ def _sum_highlights(
     log_of_planes: wp.array3d(dtype=wp.float32),
     log_of_parts: wp.array3d(dtype=wp.float32),
     transmittance: wp.array3d(dtype=wp.float32),
+    transmittance_of_emitter: wp.array3d(dtype=wp.float32),
     # out
     straight: wp.array2d(dtype=wp.vec3),
     grazing_light: wp.array2d(dtype=wp.vec3),
@@ -93,6 +94,8 @@ def _sum_highlights(
             weight = weight * _reflect(wp.dot(normal, mirror), cosine, view_cosine, square)
             if transmittance:
                 weight = weight * transmittance[batch, receiver, i]
+            if transmittance_of_emitter:
+                weight = weight * transmittance_of_emitter[batch, receiver, i]
             base = wp.max(1.0 - wp.dot(view, mirror), 0.0)
             light = weight * radiance[radiance_batch, first_sample + i]
             lobe_sum += light
@@ -114,6 +117,7 @@ def sum_highlights(
     log_of_planes: wp.array | None = None,
     log_of_parts: wp.array | None = None,
     transmittance: wp.array | None = None,
+    transmittance_of_emitter: wp.array | None = None,
 ) -> tuple[wp.array, wp.array]:
     """Light of an emitter in the lobes of receivers.
 
@@ -122,8 +126,9 @@ def sum_highlights(
         normals: Their unit normals, vec3 of shape [batch, receiver].
         roughness: Float32 of shape [batch, receiver].
         clip_matrices: Cameras, mat44 of shape [batch].
-        samples, radiance, span, log_of_spheres, log_of_planes, log_of_parts, transmittance: As for
-            :func:`warpshadow.stages.emitters.light.sum_light`. Any batch may be 1.
+        samples, radiance, span: As for :func:`warpshadow.stages.emitters.light.sum_light`.
+        log_of_spheres, log_of_planes, log_of_parts, transmittance, transmittance_of_emitter: As for that. Any batch
+            may be 1.
     Returns:
         G and G', vec3 of shape [batch, receiver].
     Differentiable: all but span.
@@ -131,8 +136,9 @@ def sum_highlights(
     check.shape("roughness", roughness.shape, ("batch", points.shape[1]))
     arrays = {"points": points, "normals": normals, "roughness": roughness, "clip_matrices": clip_matrices}
     arrays |= {"emitters": samples.points, "emission": radiance}
-    blocked = {"spheres": log_of_spheres, "planes": log_of_planes, "parts": log_of_parts, "others": transmittance}
-    count = common_batch(arrays | blocked)
+    rows = {"spheres": log_of_spheres, "planes": log_of_planes, "parts": log_of_parts}
+    rows |= {"others": transmittance, "emitter": transmittance_of_emitter}
+    count = common_batch(arrays | rows)
     points, normals, roughness = (expand(array, count) for array in (points, normals, roughness))
     lobe_sums = [empty((count, points.shape[1]), dtype=wp.vec3, device=points.device) for _ in range(2)]
     launch(
@@ -141,7 +147,7 @@ def sum_highlights(
         inputs=[
             *(points, normals, roughness, clip_matrices, samples.points, samples.areas, radiance),
             *(span.first, span.size, int(span.is_two_sided)),
-            *(None if item is None else expand_rows(item, count) for item in blocked.values()),
+            *(None if item is None else expand_rows(item, count) for item in rows.values()),
         ],
         outputs=lobe_sums,
         shared=[clip_matrices, samples.points, samples.areas, radiance],

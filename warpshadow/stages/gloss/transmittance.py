@@ -6,8 +6,6 @@ over the cells near l, ρ their radius and s the smoothstep from 0 at −1 to 1 
 receiver's horizon. Of a ball, T_q is H_q: it blocks nothing above its horizon.
 """
 
-import functools
-
 import numpy as np
 import warp as wp
 
@@ -19,10 +17,7 @@ from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, scratch_slot, split_row
 from warpshadow.maths.directions import CHUNK, cell_radius, check_count
-
-KERNEL_RADIUS = 2.2  # distance of a cell from which it no longer counts, in cell radii
-
-_TABLE_ROWS = 32  # rows of the table of cells near directions, and its columns: an octahedron
+from warpshadow.stages.cell_neighbors import KERNEL_RADIUS, near_chunks, texel_of
 
 _COST = 30.0  # nanoseconds that a sample takes
 
@@ -32,42 +27,6 @@ _MIN_HORIZON_WEIGHT = 1.0e-7
 _total = make_lane_functions(CHUNK).total
 
 wp.set_module_options({"max_unroll": 1})
-
-
-@functools.lru_cache(maxsize=8)
-def _near_chunks(directions: bytes) -> np.ndarray:
-    """Chunks of cells near each texel of an octahedron, int32 of shape [texel, chunk], −1 past the last."""
-    from scipy.spatial import cKDTree
-
-    cells = np.frombuffer(directions).reshape(-1, 3)
-    row_centers = (np.arange(_TABLE_ROWS) + 0.5) / _TABLE_ROWS * 2 - 1
-    x, z = np.meshgrid(row_centers, row_centers)
-    y = 1 - np.abs(x) - np.abs(z)
-    lower_part = np.maximum(-y, 0)
-    texels = np.stack([x - np.sign(x) * lower_part, y, z - np.sign(z) * lower_part], axis=-1).reshape(-1, 3)
-    texels /= np.linalg.norm(texels, axis=1, keepdims=True)
-    search_radius = 2 * np.sin(min(KERNEL_RADIUS * cell_radius(len(cells)) + 2.2 / _TABLE_ROWS, np.pi) / 2)
-    tree, is_near = cKDTree(cells), np.zeros((len(texels), len(cells) // CHUNK), bool)
-    for texel, near_cells in enumerate(tree.query_ball_point(texels, search_radius)):
-        is_near[texel, np.array(near_cells, int) // CHUNK] = True
-    np.put_along_axis(is_near, tree.query(texels, 3)[1] // CHUNK, True, axis=1)  # for cells that lie further apart
-    chunks = np.argsort(~is_near, axis=1, kind="stable")[:, : is_near.sum(axis=1).max()]
-    return np.where(np.take_along_axis(is_near, chunks, axis=1), chunks, -1).astype(np.int32)
-
-
-@wp.func
-def _texel(direction: wp.vec3):
-    """Texel of the octahedron that a direction is in."""
-    size = wp.abs(direction[0]) + wp.abs(direction[1]) + wp.abs(direction[2])
-    x = direction[0] / size
-    z = direction[2] / size
-    if direction[1] < 0.0:
-        folded_direction = wp.sign(x) * (1.0 - wp.abs(z))
-        z = wp.sign(z) * (1.0 - wp.abs(x))
-        x = folded_direction
-    column = wp.clamp(int((x + 1.0) * 0.5 * float(_TABLE_ROWS)), 0, _TABLE_ROWS - 1)
-    row = wp.clamp(int((z + 1.0) * 0.5 * float(_TABLE_ROWS)), 0, _TABLE_ROWS - 1)
-    return row * _TABLE_ROWS + column
 
 
 @wp.func(inline=True)
@@ -92,7 +51,7 @@ def _interpolate_cells(
     normals: wp.array2d(dtype=wp.vec3),
     directions: wp.array3d(dtype=wp.vec3),
     cells: wp.array2d(dtype=Chunk),
-    near_chunks: wp.array2d(dtype=wp.int32),
+    neighbors: wp.array2d(dtype=wp.int32),
     reach_cosine: float,
     per_radius: float,
     # scratch
@@ -114,11 +73,11 @@ def _interpolate_cells(
         through[chunk] = wp.min(transmittance[batch, receiver, chunk], above[chunk])
     for i in range(means.shape[2]):
         direction = directions[batch, receiver, i]
-        texel = _texel(direction)
+        texel = texel_of(direction)
         through_sums = Chunk(0.0)
         above_sums = Chunk(0.0)
-        for k in range(near_chunks.shape[1]):
-            chunk = near_chunks[texel, k]
+        for k in range(neighbors.shape[1]):
+            chunk = neighbors[texel, k]
             if chunk < 0:
                 break
             kernel = _kernels(direction, cells[0, chunk], cells[1, chunk], cells[2, chunk], reach_cosine)
@@ -138,7 +97,7 @@ def _interpolate_cells_adjoint(
     normals: wp.array2d(dtype=wp.vec3),
     directions: wp.array3d(dtype=wp.vec3),
     cells: wp.array2d(dtype=Chunk),
-    near_chunks: wp.array2d(dtype=wp.int32),
+    neighbors: wp.array2d(dtype=wp.int32),
     reach_cosine: float,
     per_radius: float,
     weights: wp.array3d(dtype=wp.float32),
@@ -168,14 +127,14 @@ def _interpolate_cells_adjoint(
         adj_above_cells[chunk] = Chunk(0.0)
     for i in range(means.shape[2]):
         direction = directions[batch, receiver, i]
-        texel = _texel(direction)
+        texel = texel_of(direction)
         adj_through = adj_means[batch, receiver, i] / weights[batch, receiver, i]
         adj_above = -means[batch, receiver, i] * adj_through
         adj_x = Chunk(0.0)
         adj_y = Chunk(0.0)
         adj_z = Chunk(0.0)
-        for k in range(near_chunks.shape[1]):
-            chunk = near_chunks[texel, k]
+        for k in range(neighbors.shape[1]):
+            chunk = neighbors[texel, k]
             if chunk < 0:
                 break
             x = cells[0, chunk]
@@ -238,7 +197,7 @@ def transmittance_of_directions(
     inputs = [
         *(as_chunks(transmittance.contiguous()), normals, directions),
         constant(cells.T.reshape(3, -1, CHUNK), Chunk, device),
-        constant(_near_chunks(np.ascontiguousarray(cells, np.float64).tobytes()), wp.int32, device),
+        near_chunks(cells, device),
         *(float(np.cos(KERNEL_RADIUS * radius)), 1 / radius),
     ]
     chunk_count = len(cells) // CHUNK

@@ -1,0 +1,49 @@
+"""Light from a shell: an environment at a finite distance, as the patches of a sphere around the scene.
+
+The light of a shell is known or free radiance of its patches, :data:`PATCHES`: a basis of cells, of directions from its
+center. Transfer vectors are to these (:mod:`.stages.shell.transfer`), and depend on where the receivers are; all that
+is linear in light stays so. Visibility does not depend on the shell, so it is that of any light in cells.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.assets.basis import CellBasis
+from warpshadow.assets.harmonic_light import KnownLight
+from warpshadow.device.constants import constant
+from warpshadow.maths.directions import fibonacci
+from warpshadow.stages.shell.beams import check_within
+from warpshadow.stages.shell.transfer import shell_transfer
+
+PATCHES = CellBasis(fibonacci(512))
+"""Patches of a shell. Under even light, receivers at up to 0.9 radii from its center are 1% off on average; with 1024
+0.4%, in twice the time."""
+
+
+class ShellPatches(NamedTuple):
+    """The patches of a shell."""
+
+    shell: wp.array  # center and radius, vec4 of shape [batch]
+    directions: np.ndarray = PATCHES.directions  # from the center to their light [patch, 3]
+
+    def transfer(
+        self, points: wp.array, normals: wp.array, transmittance: wp.array | None, cells: np.ndarray
+    ) -> wp.array:
+        """Transfer vectors of receivers, float32 of shape [batch, receiver, patch], given transmittance in cells.
+
+        Raises:
+            ValueError: where receivers are outside.
+        Differentiable: points, normals, transmittance, and the shell.
+        """
+        check_within(points, self.shell)
+        return shell_transfer(points, normals, transmittance, cells, self.shell, self.directions)
+
+
+def project_on_shell(light: KnownLight, shell: wp.array) -> tuple[ShellPatches, wp.array]:
+    """Project known light on the patches of a shell: the patches, and their radiance, vec3 of shape [1, patch]."""
+    cells = light.cells(PATCHES.directions)
+    return ShellPatches(shell, cells.directions), constant(cells.radiance[None], wp.vec3, shell.device)

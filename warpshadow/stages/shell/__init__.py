@@ -1,0 +1,1 @@
+"""The shell: a sphere around the scene from which an environment at a finite distance sends its light."""
