@@ -228,3 +228,36 @@ def test_renderers_whose_images_are_no_batch_are_refused(mixed):
     cameras = [one.scene.camera] * 2
     with pytest.raises(ValueError, match=r"^renderers\[0\]: got one with cameras of its own"):
         MixedRenderer([TorchRenderer(one.scene, cameras=cameras)])
+
+
+def test_bodies_shine_and_emit_as_each_image_says():
+    """Numbers, one for each vertex, and images, in batches; a scene passes over a body that it has not."""
+    one, two, _ = scenes()
+    image = torch.rand(4, 3, generator=torch.Generator().manual_seed(0))
+    shiny = [
+        dataclasses.replace(
+            scene,
+            bodies=[
+                dataclasses.replace(scene.bodies[0], roughness=0.5, name="ball"),
+                *(dataclasses.replace(body, emission=(0.2, 0.3, 0.1)) for body in scene.bodies[1:-1]),
+                dataclasses.replace(scene.bodies[-1], roughness=0.5),
+            ],
+        )
+        for scene in (one, two)
+    ]
+    mixed, which = MixedRenderer(TorchRenderer(scene) for scene in shiny), [1, 0, 1]
+    count = max(scene.bodies[0].mesh.vertex_count for scene in shiny)
+    rough = (0.3 + 0.1 * torch.rand(3, count, generator=torch.Generator().manual_seed(1))).requires_grad_()
+    metallic, glow = torch.tensor([[0.1], [0.9], [0.5]]), torch.rand(3, 1, 3)
+    given = {"metallic": {"ball": metallic}, "emission": {"other": glow}, "roughness": {"ball": rough, "ground": image}}
+    images = mixed(which, **given)
+    for row, scene in enumerate(which):
+        vertices = shiny[scene].bodies[0].mesh.vertex_count
+        own = {"ball": rough[row, :vertices], "ground": image}
+        emission = {"other": glow[row]} if scene == 1 else None
+        single = mixed.renderers[scene](roughness=own, metallic={"ball": metallic[row]}, emission=emission)
+        assert torch.equal(images[row], single)
+    images.square().sum().backward()
+    assert rough.grad[1].any() and not rough.grad[0, shiny[1].bodies[0].mesh.vertex_count :].any()
+    with pytest.raises(ValueError, match=r"roughness\['ball'\]: got shape"):
+        mixed(which, roughness={"ball": torch.rand(5)})

@@ -26,6 +26,7 @@ sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.references import Reference, Request
 from demos.scenes import shipped_mesh
+from demos.shapes import bottle, knot
 from warpshadow.torch import TorchRenderer
 
 ROUGHNESS = (0.2, 0.35, 0.6)
@@ -43,6 +44,9 @@ def scenes(data: Path | None, size: int, count: int) -> dict[str, ws.Scene]:
         meshes = {
             "ball": ws.icosphere(1.0, 4),
             **{Path(name).stem: ws.load_mesh(data / "meshes" / name) for name in names},
+            "bear": shipped_mesh("bear"),
+            "knot": knot(),
+            "bottle": bottle(),
         }
         lights = [
             ws.EnvironmentMap.read(data / "envmaps" / name) for name in ("apartment.exr", "city.exr", "forest.exr")
@@ -113,19 +117,19 @@ def body_error(reference: Reference, shown: np.ndarray) -> float:
     return float(np.sqrt(max(error**2 - noise**2, 0)) / np.linalg.norm(truth))
 
 
-def iteration_seconds(scene: ws.Scene, count: int = 5) -> float:
-    """CPU time of an image of a moved body and its gradient, the median of some, after one that prepares."""
+def iteration_seconds(scene: ws.Scene, count: int = 9, preparing: int = 4) -> float:
+    """CPU time of an image of a moved body and its gradient, the median of some after others that prepare."""
     renderer = TorchRenderer(scene, progress=False)
     rotations, translations, scales = renderer.scene_poses()
     seconds = []
-    for number in range(count + 1):
+    for number in range(count + preparing):
         shift = torch.tensor([0.01 * number, 0.0, 0.0]) * torch.tensor([[1.0], [0.0]])
         moved = (translations + shift).requires_grad_()
         start = time.process_time()
         renderer(geometry=renderer.placed(rotations, moved, scales, moving=[0])).square().sum().backward()
         seconds.append(time.process_time() - start)
         assert moved.grad is not None and moved.grad[0].any()
-    return float(np.median(seconds[1:]))
+    return float(np.median(seconds[preparing:]))
 
 
 def print_loops(of_bodies: dict[str, ws.Scene], bounces: int) -> None:

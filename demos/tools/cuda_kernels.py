@@ -15,7 +15,8 @@ from warpshadow.spheres import refine
 from warpshadow.stages import shared_rays, traced_transfer, transfer
 from warpshadow.stages.bounces import sphere_light
 from warpshadow.stages.convex import coverage as convex
-from warpshadow.stages.gloss import traced
+from warpshadow.stages.gloss import lobes as glossy_lobes
+from warpshadow.stages.gloss import prefilter, traced
 from warpshadow.stages.interpolation import _make_interpolate
 from warpshadow.stages.self_visibility import gather, lobes, sun_cells, trace
 from warpshadow.stages.silhouettes import smooth
@@ -69,6 +70,9 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
     **{make.__name__: partial(make, LANES) for make in (convex._make_cover, convex._make_cover_adjoint)},
     **{make.__name__: partial(make, LANES) for make in (refine._make_project, refine._make_project_adjoint)},
     **{make.__name__: partial(make, LANES) for make in (gather._make_gather, gather._make_gather_adjoint)},
+    "_make_sample_lobes": partial(glossy_lobes._make_sample_lobes, LANES),
+    "_make_look_up": lambda: prefilter._make_look_up(LANES)[0],
+    "_make_look_up adjoint": lambda: prefilter._make_look_up(LANES)[1],
     "trace._make_trace": trace._make_trace,
     "sun_cells._make_trace": sun_cells._make_trace,
     "shared_rays._make_trace False": partial(shared_rays._make_trace, False),

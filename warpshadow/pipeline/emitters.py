@@ -8,15 +8,17 @@ its surface has its radiance beside the light that it reflects.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import warp as wp
 
+from warpshadow.device.batch import cut
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.node import Node
+from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.receivers.groups import Blockers, Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.reflectance import Materials
@@ -40,6 +42,7 @@ from warpshadow.stages.emitters.self_visibility import (
     look_up_self_visibility,
 )
 from warpshadow.stages.emitters.spheres import find_log_transmittance
+from warpshadow.stages.gloss.highlights import sum_highlights
 from warpshadow.stages.gloss.transmittance import transmittance_of_directions
 from warpshadow.stages.joint_coverage import transmittance_past
 from warpshadow.stages.receivers import Receivers
@@ -132,6 +135,27 @@ class SceneEmitters:
 
         return Node(name, light, receivers, placed, radiance, transmittance)
 
+    def traced_highlights(
+        self, receivers: Node, placed: Node, radiance: Node, transmittance: Node, roughness: Node, cameras: Input
+    ) -> Node:
+        """Node of their light in the lobes of receivers, G and G', given transmittance as for :meth:`traced_light`."""
+
+        def highlights(
+            receivers: Receivers,
+            placed_samples: PlacedSamples,
+            radiance: wp.array,
+            transmittance: list[wp.array],
+            roughness: wp.array,
+            clip_matrices: wp.array,
+        ) -> tuple[wp.array, wp.array]:
+            seen = receivers.points, receivers.normals, roughness, clip_matrices, placed_samples, radiance
+            pairs = zip(self.samples.spans(), transmittance, strict=True)
+            of_emitters = [sum_highlights(*seen, span, transmittance=item) for span, item in pairs]
+            straight, grazing = (total_light(list(parts)) for parts in zip(*of_emitters, strict=True))
+            return straight, grazing
+
+        return Node("highlights", highlights, receivers, placed, radiance, transmittance, roughness, cameras)
+
 
 def find_emitted_light(
     emitters: EmitterSamples,
@@ -152,25 +176,65 @@ def find_emitted_light(
         radiance: Of the samples, vec3 of shape [batch, sample].
     Differentiable: blockers, receivers of the groups, placed_samples, radiance.
     """
-    portions = (portion for group in groups for portion in group.portions())
-    return joined(
-        [_light_of(emitters, self_visibility, portion, blockers, placed_samples, radiance) for portion in portions]
-    )
+
+    def light_of(portion: Group) -> wp.array:
+        total = wp.zeros(portion.points.shape, dtype=wp.vec3, device=portion.points.device)
+        for span, transmittances in _find_transmittances(emitters, self_visibility, portion, blockers, placed_samples):
+            lit = portion.points, portion.normals, placed_samples, radiance, span
+            total = total_light([total, sum_light(*lit, **transmittances)])
+        return total
+
+    return joined([light_of(portion) for group in groups for portion in group.portions()])
 
 
-def _light_of(
+def find_highlights(
+    emitters: EmitterSamples,
+    self_visibility: Sequence[EmitterSelfVisibility | None],
+    groups: Iterable[Group],
+    blockers: Blockers,
+    placed_samples: PlacedSamples,
+    radiance: wp.array,
+    roughness: wp.array,
+    clip_matrices: wp.array,
+) -> tuple[wp.array, wp.array]:
+    """Direct light of emitters in the lobes of groups of receivers, G and G' of :mod:`.stages.gloss.highlights`.
+
+    Args:
+        emitters, self_visibility, groups, blockers, placed_samples, radiance: As for :func:`find_emitted_light`.
+        roughness: Of all receivers of the groups, float32 of shape [batch, receiver].
+        clip_matrices: Cameras, mat44 of shape [batch].
+    Differentiable: as that, and roughness and clip_matrices.
+    """
+    lobe_sums, first = [], 0
+    for portion in (portion for group in groups for portion in group.portions()):
+        end = first + portion.points.shape[1]
+        seen = portion.points, portion.normals, cut(roughness, first, end), clip_matrices
+        zeros = wp.zeros(portion.points.shape, dtype=wp.vec3, device=portion.points.device)
+        of_emitters = [
+            sum_highlights(*seen, placed_samples, radiance, span, **transmittances)
+            for span, transmittances in _find_transmittances(
+                emitters, self_visibility, portion, blockers, placed_samples
+            )
+        ]
+        lobe_sums.append([total_light([zeros, *parts]) for parts in zip(*of_emitters, strict=True)] or [zeros, zeros])
+        first = end
+    return joined([straight for straight, _ in lobe_sums]), joined([grazing for _, grazing in lobe_sums])
+
+
+def _find_transmittances(
     emitters: EmitterSamples,
     self_visibility: Sequence[EmitterSelfVisibility | None],
     group: Group,
     blockers: Blockers,
     placed_samples: PlacedSamples,
-    radiance: wp.array,
-) -> wp.array:
-    """Light of all emitters on a portion of the receivers; that of their own body where it is not convex."""
+) -> Iterator[tuple[EmitterSpan, dict[str, Any]]]:
+    """Samples of all emitters that light a portion of receivers, and transmittance to them: arguments of `sum_light`.
+
+    The receivers' own body is among them if it is not convex.
+    """
     merged_scene, points, normals = blockers.merged_scene, group.points, group.normals
-    total = wp.zeros(points.shape, dtype=wp.vec3, device=points.device)
     if not points.size:
-        return total
+        return
     cells = (
         transmittance_past(None, group.own_coverage(EMITTER_CELLS))
         if group.has_own_coverage
@@ -189,18 +253,18 @@ def _light_of(
         if cells is not None and not is_own:
             towards = directions_to_samples(points, placed_samples, span)
             transmittance_self = transmittance_of_directions(cells, normals, towards, EMITTER_CELLS)
-        light = sum_light(
-            *(points, normals, placed_samples, radiance, span),
-            log_of_spheres=find_log_transmittance(points, normals, placed_samples, span, *spheres, skipped),
-            log_of_planes=_log_of_planes(group, blockers, placed_samples, span, body),
-            log_of_parts=_log_of_parts(group, blockers, placed_samples, span, body),
-            transmittance=transmittance_self,
-            transmittance_of_emitter=None
-            if hidden_by_itself is None
-            else look_up_self_visibility(points, placed_samples, span, hidden_by_itself, is_own=is_own),
+        yield (
+            span,
+            {
+                "log_of_spheres": find_log_transmittance(points, normals, placed_samples, span, *spheres, skipped),
+                "log_of_planes": _log_of_planes(group, blockers, placed_samples, span, body),
+                "log_of_parts": _log_of_parts(group, blockers, placed_samples, span, body),
+                "transmittance": transmittance_self,
+                "transmittance_of_emitter": None
+                if hidden_by_itself is None
+                else look_up_self_visibility(points, placed_samples, span, hidden_by_itself, is_own=is_own),
+            },
         )
-        total = total_light([total, light])
-    return total
 
 
 def _log_of_planes(

@@ -14,7 +14,7 @@ import warp as wp
 
 from warpshadow.device.batch import concatenate, cut, rows
 from warpshadow.device.constants import constant
-from warpshadow.pipeline.method import LightInput, Method
+from warpshadow.pipeline.method import LightInput, Method, add_light
 from warpshadow.pipeline.node import Input, Node, detached
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
@@ -85,12 +85,18 @@ class GlossyPoints(LitPoints):
         if shell is not None:
             towards = Node("", _exits, self.receivers_node, directions, shell)
         radiance = Node("prefiltered light", look_up_light, texels, towards, filters, items=item_text)
-        through = self.method.lobe_transmittance(self, directions, source)
+        through = self.method.lobe_transmittance(self, directions, source, view)
         blocked = None
         if self.merged_scene.scene.bounces:
             blocked = self.method.blocked_radiance(self, self.chosen(bounced), source, view, self.chosen)
         sums = Node("gloss", sum_lobes, filters, radiance, through, blocked, items=item_text)
         straight, grazing = (Node("", operator.itemgetter(part), sums) for part in range(2))
+        if materials.emission:
+            highlights = self.method.highlights(self, materials, roughness, self._cameras)
+            straight, grazing = (
+                Node("", add_light, lobe, Node("", operator.itemgetter(part), highlights))
+                for part, lobe in enumerate((straight, grazing))
+            )
         arguments = self._numbers, diffuse, straight, grazing, cosines, metallic, specular
         mix = Node("reflection", mix_reflection, *arguments, items=item_text)
         return Node("", operator.itemgetter(0), mix), Node("", operator.itemgetter(1), mix)

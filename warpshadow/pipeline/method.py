@@ -164,6 +164,17 @@ class Method:
         """Direct light of emitters on points, past the blockers between, vec3 of shape [batch, receiver]."""
         raise NotImplementedError
 
+    def highlights(self, points: LitPoints, materials: Materials, roughness: Node, cameras: Input) -> Node:
+        """Direct light of emitters in the lobes of points, past the blockers between: G and G', vec3 [batch, receiver].
+
+        Args:
+            points: Receivers on bodies that shine.
+            materials: Of the bodies.
+            roughness: Of the points, float32 of shape [batch, receiver].
+            cameras: Clip matrices.
+        """
+        raise NotImplementedError
+
     def shading_without_emitters(
         self, points: LitPoints, light: Light | None, materials: Materials | None = None
     ) -> Node:
@@ -258,13 +269,14 @@ class Method:
     def _prefilter(self, light: KnownLight) -> wp.array:
         return constant(prefilter(light.radiance)[None], wp.vec3, self.merged_scene.device)
 
-    def lobe_transmittance(self, points: LitPoints, directions: Node, light: LightInput) -> Node:
+    def lobe_transmittance(self, points: LitPoints, directions: Node, light: LightInput, view: LitPoints) -> Node:
         """Transmittance towards the samples of lobes of points, float32 of shape [batch, receiver, sample].
 
         Args:
             points: Receivers on bodies that shine.
             directions: Node of the samples' directions, vec3 of shape [batch, receiver, sample].
             light: Known or free light, which says where shadows have to be sharp.
+            view: The receivers among which they are, which are shaded.
 
         Without shadows it is 1.
         """
@@ -278,7 +290,7 @@ class Method:
         Args:
             points, light: As for :meth:`lobe_transmittance`.
             diffuse: Node of their shading.
-            view: The receivers among which they are, which are shaded.
+            view: As for :meth:`lobe_transmittance`.
             choose: Makes a node of light on the view's receivers one of light on these.
         """
         raise NotImplementedError

@@ -194,14 +194,25 @@ class SphereMethod(Method):
         """Direct light of emitters on points, by the same blockers."""
         from warpshadow.pipeline.emitters import find_emitted_light
 
+        return self._sum_over_emitters("light of emitters", find_emitted_light, points, materials)
+
+    def highlights(self, points: LitPoints, materials: Materials, roughness: Node, cameras: Input) -> Node:
+        """Direct light of emitters in the lobes of points, by the same blockers."""
+        from warpshadow.pipeline.emitters import find_highlights
+
+        return self._sum_over_emitters("highlights", find_highlights, points, materials, roughness, cameras)
+
+    def _sum_over_emitters(
+        self, name: str, find: Callable[..., Any], points: LitPoints, materials: Materials, *others: Node | Input
+    ) -> Node:
         emitters, words = (self.emitters.samples, self.emitters.self_visibility), points.in_words
         bodies_and_spheres = points.static_bodies, points.nearest_spheres
 
-        def find(
-            receivers: Receivers, blockers: Blockers, self_lookups: dict[int, Any] | None, *placed: Any
-        ) -> wp.array:
+        def find_in_groups(
+            receivers: Receivers, blockers: Blockers, self_lookups: dict[int, Any] | None, *arrays: Any
+        ) -> Any:
             groups = find_groups(*bodies_and_spheres, receivers, blockers, self_lookups, None, None)
-            return find_emitted_light(*emitters, groups, blockers, *placed)
+            return find(*emitters, groups, blockers, *arrays)
 
         def lookups() -> Node:
             if self.emitter_projection is None:
@@ -209,13 +220,14 @@ class SphereMethod(Method):
             return _self_visibility(self, points, self.emitter_projection)
 
         return Node(
-            "light of emitters",
-            find,
+            name,
+            find_in_groups,
             points.receivers_node,
             placed_blockers(self, points),
             points.cached("self-visibility towards emitters", None, lookups),
             self.emitters.placed(points),
             self.emitters.radiance(materials),
+            *others,
             items=lambda: f"{receiver_text(words)} × {emitters[0].first[-1]} samples",
         )
 

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.constants import constant
-from warpshadow.maths.directions import cell_radius
+from warpshadow.maths.directions import CHUNK, cell_radius
 
 KERNEL_RADIUS = 2.2  # distance of a cell from which it no longer counts, in cell radii
 
@@ -33,6 +33,17 @@ def _find_neighbors(directions: bytes, kernel_radius: float) -> np.ndarray:
     return tree.query(texels, min(max(count, 3), len(cells)))[1].astype(np.int32)
 
 
+@functools.lru_cache(maxsize=8)
+def _find_near_chunks(directions: bytes, kernel_radius: float) -> np.ndarray:
+    """Chunks of the cells near each texel of an octahedron, int32 of shape [texel, chunk], −1 past the last."""
+    neighbors = _find_neighbors(directions, kernel_radius) // CHUNK
+    texels = np.arange(len(neighbors))[:, None]
+    is_near = np.zeros((len(neighbors), neighbors.max() + 1), bool)
+    is_near[texels, neighbors] = True
+    chunks = np.argsort(~is_near, axis=1, kind="stable")[:, : is_near.sum(axis=1).max()]
+    return np.where(is_near[texels, chunks], chunks, -1).astype(np.int32)
+
+
 def cell_neighbors(cells: np.ndarray, device: wp.DeviceLike, kernel_radius: float = KERNEL_RADIUS) -> wp.array:
     """Make the table of the cells within a kernel's radius of each texel, int32 of shape [texel, cell].
 
@@ -42,6 +53,12 @@ def cell_neighbors(cells: np.ndarray, device: wp.DeviceLike, kernel_radius: floa
     """
     neighbors = _find_neighbors(np.ascontiguousarray(cells, np.float64).tobytes(), kernel_radius)
     return constant(neighbors, wp.int32, device)
+
+
+def near_chunks(cells: np.ndarray, device: wp.DeviceLike, kernel_radius: float = KERNEL_RADIUS) -> wp.array:
+    """Make the table of the chunks of such cells, int32 of shape [texel, chunk], −1 past the last of a texel."""
+    chunks = _find_near_chunks(np.ascontiguousarray(cells, np.float64).tobytes(), kernel_radius)
+    return constant(chunks, wp.int32, device)
 
 
 @wp.func

@@ -18,7 +18,7 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.pipeline.geometry import Geometry, as_geometry
 from warpshadow.scene.scene import BodyLike, PerBody
 from warpshadow.torch.autograd import check_float32, uncompiled
-from warpshadow.torch.renderer import TorchRenderer
+from warpshadow.torch.renderer import TorchRenderer, with_gloss
 
 
 class _Placed(list[Geometry[torch.Tensor] | None]):
@@ -68,6 +68,7 @@ class MixedRenderer(torch.nn.Module):
         return self._renderer(0).device
 
     @uncompiled
+    @with_gloss
     def forward(
         self,
         which: torch.Tensor | Sequence[int],
@@ -75,34 +76,48 @@ class MixedRenderer(torch.nn.Module):
         *,
         albedo: PerBody[torch.Tensor] | None = None,
         textures: PerBody[torch.Tensor] | None = None,
+        emission: PerBody[torch.Tensor] | None = None,
         geometry: Sequence[Geometry[torch.Tensor] | None] | None = None,
         clip_matrices: torch.Tensor | None = None,
+        **gloss: PerBody[torch.Tensor] | None,
     ) -> torch.Tensor:
-        """Render a batch of images, in which bodies shine as their scenes say.
+        """Render a batch of images.
 
         Args:
             which: Scene of each image, from 0, whole numbers of shape [batch]. The host reads them: best on a CPU.
             light: As of a TorchRenderer; a missing one is each scene's own.
             albedo: Likewise: a list for as many bodies as the scene with the most has, or a mapping by numbers or
                 names. A scene passes over bodies that it has not.
-            textures: Likewise.
+            textures, emission: Likewise.
             geometry: From :meth:`placed` with the same ``which``; or a list of the results of the renderers' own
                 ``placed``, for each scene that of its images, in their order, None where it has no image.
             clip_matrices: As of a TorchRenderer; any of the renderers composes them.
+            gloss: ``roughness``, ``metallic`` and ``specular``, likewise; as images those that are as wide as the mesh
+                with the most vertices has of them, or 1 wide, need the batch.
         Returns:
             Linear RGB, premultiplied, and coverage, float32 of shape [batch, height, width, 4]: the images of the
             renderers of each scene.
-        Differentiable: light, albedo, textures, geometry, clip_matrices.
+        Differentiable: all but which.
         """
         batch = _Batch(which, len(self.renderers))
         lights, cameras = batch.split("light", light, 2), batch.split("clip_matrices", clip_matrices, 2)
         colors = {
-            body: batch.split(f"albedo[{body!r}]", self._checked_colors(body, color), 2)
-            for body, color in self._by_body("albedo", albedo).items()
+            name: {
+                body: batch.split(f"{name}[{body!r}]", self._checked_colors(name, body, color), 2)
+                for body, color in self._by_body(name, values).items()
+            }
+            for name, values in (("albedo", albedo), ("emission", emission))
         }
         maps = {
             body: batch.split(f"textures[{body!r}]", texture, 3)
             for body, texture in self._by_body("textures", textures).items()
+        }
+        numbers = {
+            name: {
+                body: (batch.split(f"{name}[{body!r}]", value, ndim), ndim)
+                for body, (value, ndim) in self._checked_numbers(name, self._by_body(name, values)).items()
+            }
+            for name, values in gloss.items()
         }
         geometries = batch.of_scenes(geometry)
         images_of_scenes = {}
@@ -110,7 +125,18 @@ class MixedRenderer(torch.nn.Module):
             counts = self._vertex_counts[scene]
             images_of_scenes[scene] = self._renderer(scene)(
                 lights(scene),
-                albedo={body: _cut(of(scene), 2, counts[body]) for body, of in colors.items() if body in counts},
+                **{
+                    name: {body: _cut(of(scene), 2, counts[body]) for body, of in values.items() if body in counts}
+                    for name, values in colors.items()
+                },
+                **{
+                    name: {
+                        body: of(scene) if ndim == 2 else _cut(of(scene), 1, counts[body])
+                        for body, (of, ndim) in values.items()
+                        if body in counts
+                    }
+                    for name, values in numbers.items()
+                },
                 textures={body: of(scene) for body, of in maps.items() if body in counts},
                 geometry=geometries[scene],
                 clip_matrices=cameras(scene),
@@ -228,9 +254,9 @@ class MixedRenderer(torch.nn.Module):
             pairs = dict(enumerate(tensors)).items()
         return {body: tensor for body, tensor in pairs if tensor is not None}
 
-    def _checked_colors(self, body: BodyLike, colors: torch.Tensor) -> torch.Tensor:
+    def _checked_colors(self, argument: str, body: BodyLike, colors: torch.Tensor) -> torch.Tensor:
         """Colors of a body, padded where they are one for each vertex."""
-        name, maximum = f"albedo[{body!r}]", self._maximum_vertices[body]
+        name, maximum = f"{argument}[{body!r}]", self._maximum_vertices[body]
         check_float32(name, colors)
         if colors.ndim > 1 and colors.shape[-2] != 1:
             shape = ("batch", maximum, 3) if colors.ndim > 2 else (maximum, 3)
@@ -238,6 +264,18 @@ class MixedRenderer(torch.nn.Module):
                 name, tuple(colors.shape), shape, f"or one color; the mesh with the most vertices has {maximum}"
             )
         return colors
+
+    def _checked_numbers(self, argument: str, values: dict[Any, torch.Tensor]) -> dict[Any, tuple[torch.Tensor, int]]:
+        """Numbers of bodies, padded where they are one for each vertex, and dimensions of an item: 2 of an image."""
+        result = {}
+        for body, value in values.items():
+            name, maximum = f"{argument}[{body!r}]", self._maximum_vertices[body]
+            check_float32(name, value)
+            ndim = 2 if value.ndim > 2 or (value.ndim == 2 and value.shape[1] not in (1, maximum)) else 1
+            if value.ndim == 1 and len(value) != 1:
+                check.shape(name, tuple(value.shape), (maximum,), "or one number, or an image")
+            result[body] = value, ndim
+        return result
 
     def _checked_poses(self, name: str, poses: torch.Tensor | None, item: tuple[int, ...]) -> torch.Tensor | None:
         """Poses of as many bodies as the scene with the most has."""

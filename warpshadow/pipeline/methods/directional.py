@@ -1,6 +1,7 @@
 """The directional method: transmittance of the spheres for cells of directions, lit by the light of each cell."""
 
 import functools
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.pipeline.receivers.groups import CellCoverages, Group, GroupVisibility
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
+from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.self_visibility import SelfVisibilityLookup
 from warpshadow.pipeline.shell import PATCHES, ShellPatches, project_on_shell
 from warpshadow.pipeline.sphere_method import PortionedShading, SphereMethod
@@ -380,9 +382,9 @@ class Directional(SphereMethod):
         unblocked = np.where(is_front, *whole)
         return np.divide(lit, unblocked, out=np.zeros_like(lit), where=unblocked > 0)
 
-    def lobe_transmittance(self, points: LitPoints, directions: Node, light: LightInput) -> Node:
+    def lobe_transmittance(self, points: LitPoints, directions: Node, light: LightInput, view: LitPoints) -> Node:
         """Transmittance towards the samples of lobes, between cells; of known light, to where it comes from in them."""
-        cells, projected_light = self._lobe_cells(points, light)
+        cells, projected_light = self._lobe_cells(points, light, view)
         item_text = functools.partial(receiver_text, points.in_words)
         arguments = cells, points.receivers_node, directions, projected_light
         return Node("transmittance of lobes", _towards, *arguments, items=item_text)
@@ -391,7 +393,7 @@ class Directional(SphereMethod):
         self, points: LitPoints, diffuse: Node, light: LightInput, view: LitPoints, choose: Callable[[Node], Node]
     ) -> Node:
         """Mean radiance of the blockers of points, by their light with bounces and without."""
-        cells, projected_light = self._lobe_cells(points, light)
+        cells, projected_light = self._lobe_cells(points, light, view)
         free = light if light.is_free else None
         return Node("light of blockers", self._blocked, cells, points.receivers_node, projected_light, diffuse, free)
 
@@ -417,8 +419,29 @@ class Directional(SphereMethod):
         direct, openness = shade(transfer, light, maximum=LARGEST_COEFFICIENT), shade(of_cells, even)
         return blocked_radiance(diffuse, direct, openness)
 
-    def _lobe_cells(self, points: LitPoints, light: LightInput) -> tuple[Node, Any]:
-        """Node of the transmittance of cells, in portions, and the projected light that says which."""
+    def known_shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
+        """Shading of points in known light, which bounces from the materials."""
+        if not self._shades_with_cells(points):
+            return super().known_shading(points, light, materials)
+        return Node("", operator.itemgetter(0), self._shading_with_cells(points, light))
+
+    def _shades_with_cells(self, points: LitPoints) -> bool:
+        """Whether the transmittance of cells at bodies that shine comes with the shading of a view."""
+        return self.bounces is None and points.materials.roughness is not None
+
+    def _shading_with_cells(self, view: LitPoints, light: LightInput) -> Node:
+        """Node of the shading of a view in known light, and of the transmittance of its glossy receivers' cells."""
+        name = "shading of the scene with cells" if light is self.light else "shading with cells"
+        make = functools.partial(ShadingWithCells, self, view, self.projected(light), light, _joined_with_cells)
+        return view.cached(name, light, make)
+
+    def _lobe_cells(self, points: LitPoints, light: LightInput, view: LitPoints) -> tuple[Node, Any]:
+        """Node of the transmittance of cells, in portions, and the projected light that says which.
+
+        In known light that does not bounce the shading of the view has found it.
+        """
+        if not light.is_free and self._shades_with_cells(view):
+            return Node("", operator.itemgetter(1), self._shading_with_cells(view, light)), self.projected(light)
         if light.is_free:
             projected_light = self.free_projection_of(points, light)
         else:
@@ -470,6 +493,23 @@ class PortionedCellTransmittance(PortionedShading):
     ) -> wp.array:
         """Find the transmittance of a portion."""
         return self.find_visibility(call, portion, projected_light).transmittance_total
+
+
+class ShadingWithCells(PortionedShading):
+    """Shading of receivers, in portions, and their transmittance towards cells if their body shines."""
+
+    def find(
+        self, call: Call, portion: Group, projected_light: ProjectedCells, spheres: tuple[wp.array, wp.array]
+    ) -> tuple[wp.array, wp.array | None]:
+        """Shade a portion."""
+        visibility = self.find_visibility(call, portion, projected_light)
+        is_glossy = portion.body is not None and self.method.merged_scene.is_glossy[portion.body]
+        shading = self.light(call, portion, visibility, projected_light)
+        return shading, visibility.transmittance_total if is_glossy else None
+
+
+def _joined_with_cells(portions: list[tuple[wp.array, wp.array | None]]) -> tuple[wp.array, list[wp.array]]:
+    return joined([shading for shading, _ in portions]), [cells for _, cells in portions if cells is not None]
 
 
 def _towards(

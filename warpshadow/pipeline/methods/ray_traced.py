@@ -12,7 +12,7 @@ from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.device.batch import common_batch
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.method import LightInput, Method, add_light
-from warpshadow.pipeline.node import Node, NodeStage, detached
+from warpshadow.pipeline.node import Input, Node, NodeStage, detached
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.gloss.reflection import blocked_radiance
@@ -96,8 +96,19 @@ class Rays(Method):
         """Direct light of emitters on points, by rays to their samples."""
         return self._light_of_emitters_at(points, points.receivers_node, materials, "light of emitters")
 
+    def highlights(self, points: LitPoints, materials: Materials, roughness: Node, cameras: Input) -> Node:
+        """Direct light of emitters in the lobes of points, by rays to their samples."""
+        arguments = self._rays_to_emitters(points, points.receivers_node, materials, "highlights")
+        return self.emitters.traced_highlights(*arguments, roughness, cameras)
+
     def _light_of_emitters_at(self, points: LitPoints, receivers: Node, materials: Materials, name: str = "") -> Node:
-        """The same on other receivers among the same bodies. Differentiable: emission."""
+        """Direct light of emitters on other receivers among the same bodies. Differentiable: emission."""
+        return self.emitters.traced_light(*self._rays_to_emitters(points, receivers, materials, name), name)
+
+    def _rays_to_emitters(
+        self, points: LitPoints, receivers: Node, materials: Materials, name: str
+    ) -> tuple[Node, Node, Node, Node]:
+        """Receivers, samples, their radiance, and the transmittance between."""
         placed, items = self.emitters.placed(points), functools.partial(receiver_text, points.in_words)
 
         def traced() -> Node:
@@ -105,7 +116,7 @@ class Rays(Method):
             return Node(name and "rays to emitters", self._trace_emitters, *arguments, items=items, has_adjoint=False)
 
         transmittance = points.cached(f"rays to emitters {name}", receivers, traced)
-        return self.emitters.traced_light(receivers, placed, self.emitters.radiance(materials), transmittance, name)
+        return receivers, placed, self.emitters.radiance(materials), transmittance
 
     def _trace_emitters(
         self, positions: wp.array, receivers: Receivers, placed_samples: "PlacedSamples"
@@ -143,7 +154,7 @@ class Rays(Method):
         rays = STILL_RAYS if self.shares_directions else RAYS
         return StaticBounces(*arguments, rays=rays, progress=self.progress)
 
-    def lobe_transmittance(self, points: LitPoints, directions: Node, light: LightInput) -> Node:
+    def lobe_transmittance(self, points: LitPoints, directions: Node, light: LightInput, view: LitPoints) -> Node:
         """Transmittance towards the samples of lobes: rays, each of its own."""
         item_text = functools.partial(receiver_text, points.in_words)
         return Node(

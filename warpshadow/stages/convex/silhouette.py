@@ -6,11 +6,11 @@ some of them have on their silhouette has the sign 0 for the others. One receive
 """
 
 import functools
-import math
 from typing import Any, NamedTuple
 
 import warp as wp
 
+from warpshadow.device.lane_code import ANGLE
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 from warpshadow.stages.cell_coverage import MIN_DISTANCE
 from warpshadow.stages.convex.joint_lanes import coverage_type
@@ -67,24 +67,6 @@ _CHORD = """
     const float length = crosses ? end - begin : (float)0;
 """
 """The chord of an edge: an end behind the receiver is at the disc's border."""
-
-_ARCTANGENT = functools.reduce(
-    lambda rest, k: f"((float){(-1) ** k / (2 * k + 1)!r} + t2 * {rest})", reversed(range(12)), "(float)0"
-)
-"""Σ (−1)ᵏ t²ᵏ / (2k + 1), the arctangent of t over t: up to t = tan π/8 terms left out are below 1e-11."""
-
-_ANGLE = f"""
-    const float size_x = x > (float)0 ? x : -x, size_y = y > (float)0 ? y : -y;
-    const float larger = size_x > size_y ? size_x : size_y, smaller = size_x > size_y ? size_y : size_x;
-    const bool is_past = smaller > (float){math.tan(math.pi / 8)!r} * larger;
-    const float t = (is_past ? smaller - larger : smaller) / (is_past ? smaller + larger : larger), t2 = t * t;
-    const float octant = t * {_ARCTANGENT} + (is_past ? (float){math.pi / 4!r} : (float)0);
-    const float quadrant = size_y > size_x ? (float){math.pi / 2!r} - octant : octant;
-    const float half = x < (float)0 ? (float){math.pi!r} - quadrant : quadrant;
-    const float angle = y < (float)0 ? -half : half;
-"""
-"""The angle of x + iy, by the series of the arctangent up to π/8. With the C library's, which takes one lane after
-another, coverage by sixty boxes and rods took a quarter longer."""
 
 _DIRECTION = "const float dx = direction.c[0], dy = direction.c[1], dz = direction.c[2];"
 
@@ -209,7 +191,7 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
     wp::vec_t<{lanes}, float> share;
     for (int lane = 0; lane < {lanes}; ++lane) {{
         const float cosine = nearest.c[lane], x = wp::index(sums, 1).c[lane], y = wp::index(sums, 2).c[lane];
-        {_ANGLE}
+        {ANGLE}
         const float sector = (float)0.5 * radius * radius * (angle + (float)2 * pi * wp::index(sums, 3).c[lane]);
         const float part = (wp::index(sums, 0).c[lane] + sector) / (pi * radius * radius);
         const float sum = (cosine > (float)0 ? (float)1 : (float)0) + part;

@@ -12,8 +12,12 @@ with Spherical Caps]: sample i of N has the weight
 
 so that ∫ f L c dω = Σ w L, and the light of F₀ + (1 − F₀)(1 − v·h)⁵ is F₀ Σ w L + (1 − F₀) Σ w' L. Each sample stands
 for a solid angle of 1 / (N p), p = D / (2 (μ + Λ(μ))), so it looks up light that is blurred by a Gaussian of as large
-a solid angle, 2π σ² [Křivánek and Colbert 2008, Real-time Shading with Filtered Importance Sampling].
+a solid angle, 2π σ² [Křivánek and Colbert 2008, Real-time Shading with Filtered Importance Sampling]:
+
+    σ = (1 − (1 − α²) (n·h)²) √((μ + Λ(μ)) / N) / α.
 """
+
+import functools
 
 import numpy as np
 import warp as wp
@@ -21,23 +25,28 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
+from warpshadow.device.lanes import lane_count, lane_type, make_lane_functions, module_options
 from warpshadow.device.launch import launch
 from warpshadow.device.parallel import split_row
 
 MIN_ROUGHNESS = 0.1  # roughness of the smoothest surface; maps of 128 rows have nothing sharper
 
-_MIN_COSINE = 0.02  # cosine between a receiver's normal and its viewer, of those whose interpolated normal turns away
+MIN_COSINE = 0.02  # cosine between a receiver's normal and its viewer, of those whose interpolated normal turns away
+MAX_COSINE = 0.99999
 
-_COST = 60.0  # nanoseconds that a sample takes
+_COST = 15.0  # nanoseconds that a sample takes
 
 wp.set_module_options({"max_unroll": 1})
 
 
-def hemisphere_points(count: int) -> np.ndarray:
-    """Height in the cap and cosine and sine of the azimuth of each sample, on a spiral: shape [sample, 3]."""
-    i = np.arange(count)
+def hemisphere_points(count: int, sample_count: int) -> np.ndarray:
+    """Height in the cap and cosine and sine of the azimuth of samples, on a spiral: shape [sample, 3].
+
+    Those past the last, up to a count, are all the same.
+    """
+    i = np.minimum(np.arange(count), sample_count - 1)
     azimuth = np.pi * (1 + np.sqrt(5)) * i
-    return np.stack([(i + 0.5) / count, np.cos(azimuth), np.sin(azimuth)], axis=1)
+    return np.stack([(i + 0.5) / sample_count, np.cos(azimuth), np.sin(azimuth)], axis=1)
 
 
 @wp.func
@@ -58,12 +67,6 @@ def eye_position(clip_matrix: wp.mat44):
 
 
 @wp.func
-def _slant(x: float, width: float):
-    """Λ."""
-    return wp.sqrt(x * x * (1.0 - width * width) + width * width)
-
-
-@wp.func
 def _axis_across(direction: wp.vec3):
     """The axis along which a direction has its smallest component."""
     x, y, z = wp.abs(direction[0]), wp.abs(direction[1]), wp.abs(direction[2])
@@ -74,74 +77,89 @@ def _axis_across(direction: wp.vec3):
     return wp.vec3(0.0, 0.0, 1.0)
 
 
-@wp.kernel
-def _sample_lobes(
-    first_row: int,
-    worker: int,
-    # in
-    points: wp.array2d(dtype=wp.vec3),
-    normals: wp.array2d(dtype=wp.vec3),
-    roughness: wp.array2d(dtype=wp.float32),
-    clip_matrices: wp.array(dtype=wp.mat44),
-    sample_points: wp.array(dtype=wp.vec3),
-    # out
-    directions: wp.array3d(dtype=wp.vec3),
-    filters: wp.array3d(dtype=wp.vec3),
-    cosines: wp.array2d(dtype=wp.float32),
-):
-    """A thread owns a receiver."""
-    batch, receiver = split_row(first_row + wp.tid(), cosines.shape[1])
-    point_batch = instance_in(batch, points.shape[0])
-    normal = normals[point_batch, receiver]
-    eye = eye_position(clip_matrices[instance_in(batch, clip_matrices.shape[0])])
-    view = wp.normalize(eye - points[point_batch, receiver])
-    rough = wp.max(roughness[instance_in(batch, roughness.shape[0]), receiver], MIN_ROUGHNESS)
-    width = rough * rough
-    cosine = wp.clamp(wp.dot(normal, view), _MIN_COSINE, 0.99999)
-    sine = wp.sqrt(1.0 - cosine * cosine)
-    across_view = view - wp.dot(normal, view) * normal
-    if wp.length_sq(across_view) < 1.0e-10:
-        across_view = wp.cross(normal, _axis_across(normal))
-    tangent = wp.normalize(across_view)
-    bitangent = wp.cross(normal, tangent)
-    slant = _slant(cosine, width)
-    cosines[batch, receiver] = cosine
-    # in the frame of tangent, bitangent and normal; the cap is that of mirrors of width 1
-    stretched_view = wp.normalize(wp.vec3(width * sine, 0.0, cosine))
-    for i in range(directions.shape[2]):
-        sample_point = sample_points[i]
-        height = (1.0 - sample_point[0]) * (1.0 + stretched_view[2]) - stretched_view[2]
-        radius = wp.sqrt(wp.max(1.0 - height * height, 1.0e-12))
-        mirror = wp.normalize(
-            wp.vec3(
-                width * (radius * sample_point[1] + stretched_view[0]),
-                width * radius * sample_point[2],
-                (1.0 - sample_point[0]) * (1.0 + stretched_view[2]),
-            )
-        )
-        view_cosine = mirror[0] * sine + mirror[2] * cosine
-        reflected_cosine = 2.0 * view_cosine * mirror[2] - cosine
-        direction = (
-            (2.0 * view_cosine * mirror[0] - sine) * tangent
-            + 2.0 * view_cosine * mirror[1] * bitangent
-            + reflected_cosine * normal
-        )
-        directions[batch, receiver, i] = wp.normalize(direction)
-        weight = float(0.0)
-        if reflected_cosine > 0.0:
-            weight = (
-                reflected_cosine
-                * (cosine + slant)
-                / (reflected_cosine * slant + cosine * _slant(reflected_cosine, width))
-                / float(directions.shape[2])
-            )
-        grazing_base = wp.max(1.0 - view_cosine, 0.0)
-        ellipsoid = mirror[2] * mirror[2] * (width * width - 1.0) + 1.0
-        density = width * width / (wp.pi * ellipsoid * ellipsoid) / (2.0 * (cosine + slant))
-        blur = wp.sqrt(1.0 / (2.0 * wp.pi * float(directions.shape[2]) * density))
-        filters[batch, receiver, i] = wp.vec3(
-            weight, weight * grazing_base * grazing_base * grazing_base * grazing_base * grazing_base, blur
-        )
+@functools.cache
+def _make_sample_lobes(lanes: int) -> wp.Kernel:
+    """Make the kernel, which takes as many samples of a lobe at once as there are lanes."""
+    Lane, sqrt = lane_type(lanes), make_lane_functions(lanes).sqrt
+
+    @wp.func
+    def root(value: Lane):
+        return sqrt(value)
+
+    @wp.func_grad(root)
+    def root_adjoint(value: Lane, adj_root: Lane):
+        wp.adjoint[value] += wp.cw_div(0.5 * adj_root, sqrt(value))
+
+    @wp.kernel(module="unique", module_options=module_options(lanes))
+    def sample_lobes(
+        first_row: int,
+        worker: int,
+        # in
+        points: wp.array2d(dtype=wp.vec3),
+        normals: wp.array2d(dtype=wp.vec3),
+        roughness: wp.array2d(dtype=wp.float32),
+        clip_matrices: wp.array(dtype=wp.mat44),
+        sample_points: wp.array2d(dtype=Lane),
+        # out
+        directions: wp.array3d(dtype=wp.vec3),
+        filters: wp.array3d(dtype=wp.vec3),
+        cosines: wp.array2d(dtype=wp.float32),
+    ):
+        """A thread owns a receiver."""
+        batch, receiver = split_row(first_row + wp.tid(), cosines.shape[1])
+        point_batch = instance_in(batch, points.shape[0])
+        normal = normals[point_batch, receiver]
+        eye = eye_position(clip_matrices[instance_in(batch, clip_matrices.shape[0])])
+        view = wp.normalize(eye - points[point_batch, receiver])
+        rough = wp.max(roughness[instance_in(batch, roughness.shape[0]), receiver], MIN_ROUGHNESS)
+        width = rough * rough
+        cosine = wp.clamp(wp.dot(normal, view), MIN_COSINE, MAX_COSINE)
+        sine = wp.sqrt(1.0 - cosine * cosine)
+        across_view = view - wp.dot(normal, view) * normal
+        if wp.length_sq(across_view) < 1.0e-10:
+            across_view = wp.cross(normal, _axis_across(normal))
+        tangent = wp.normalize(across_view)
+        bitangent = wp.cross(normal, tangent)
+        square = width * width
+        slant = wp.sqrt(cosine * cosine * (1.0 - square) + square)
+        blur_of_flat = wp.sqrt((cosine + slant) / (float(directions.shape[2]) * square))
+        weight_scale = (cosine + slant) / float(directions.shape[2])
+        cosines[batch, receiver] = cosine
+        # in the frame of tangent, bitangent and normal; the cap is that of mirrors of width 1
+        stretched_view = wp.normalize(wp.vec3(width * sine, 0.0, cosine))
+        for block in range(sample_points.shape[1]):
+            mirror_z = (1.0 + stretched_view[2]) * (Lane(1.0) - sample_points[0, block])
+            height = mirror_z - Lane(stretched_view[2])
+            radius = root(wp.max(Lane(1.0) - wp.cw_mul(height, height), Lane(1.0e-12)))
+            mirror_x = width * (wp.cw_mul(radius, sample_points[1, block]) + Lane(stretched_view[0]))
+            mirror_y = width * wp.cw_mul(radius, sample_points[2, block])
+            horizontal = wp.cw_mul(mirror_x, mirror_x) + wp.cw_mul(mirror_y, mirror_y)
+            length = root(horizontal + wp.cw_mul(mirror_z, mirror_z))
+            mirror_x = wp.cw_div(mirror_x, length)
+            mirror_y = wp.cw_div(mirror_y, length)
+            mirror_z = wp.cw_div(mirror_z, length)
+            view_cosine = sine * mirror_x + cosine * mirror_z
+            x = 2.0 * wp.cw_mul(view_cosine, mirror_x) - Lane(sine)
+            y = 2.0 * wp.cw_mul(view_cosine, mirror_y)
+            z = 2.0 * wp.cw_mul(view_cosine, mirror_z) - Lane(cosine)
+            direction_x = tangent[0] * x + bitangent[0] * y + normal[0] * z
+            direction_y = tangent[1] * x + bitangent[1] * y + normal[1] * z
+            direction_z = tangent[2] * x + bitangent[2] * y + normal[2] * z
+            up = wp.max(z, Lane(0.0))
+            reflected_slant = root((1.0 - square) * wp.cw_mul(up, up) + Lane(square))
+            weight = wp.cw_div(weight_scale * up, slant * up + cosine * reflected_slant)
+            grazing_base = wp.max(Lane(1.0) - view_cosine, Lane(0.0))
+            grazing_square = wp.cw_mul(grazing_base, grazing_base)
+            grazing = wp.cw_mul(weight, wp.cw_mul(wp.cw_mul(grazing_square, grazing_square), grazing_base))
+            blur = blur_of_flat * (Lane(1.0) - (1.0 - square) * wp.cw_mul(mirror_z, mirror_z))
+            first = block * lanes
+            for lane in range(wp.min(lanes, directions.shape[2] - first)):
+                directions[batch, receiver, first + lane] = wp.vec3(
+                    direction_x[lane], direction_y[lane], direction_z[lane]
+                )
+                filters[batch, receiver, first + lane] = wp.vec3(weight[lane], grazing[lane], blur[lane])
+
+    return sample_lobes
 
 
 def sample_lobes(
@@ -169,12 +187,15 @@ def sample_lobes(
     device, shape = points.device, (count, points.shape[1], sample_count)
     directions, filters = (wp.empty(shape, dtype=wp.vec3, device=device) for _ in range(2))
     cosines = wp.empty(shape[:2], dtype=wp.float32, device=device)
+    lanes = lane_count(device)
+    sample_points = hemisphere_points(-(-sample_count // lanes) * lanes, sample_count)
+    inputs = [points, normals, roughness, clip_matrices]
     launch(
-        _sample_lobes,
+        _make_sample_lobes(lanes),
         shape[0] * shape[1],
-        inputs=[points, normals, roughness, clip_matrices, constant(hemisphere_points(sample_count), wp.vec3, device)],
+        inputs=[*inputs, constant(sample_points.T.reshape(3, -1, lanes), lane_type(lanes), device)],
         outputs=[directions, filters, cosines],
-        shared=[clip_matrices, points, normals, roughness],
+        shared=[clip_matrices, *(array for array in inputs[:3] if len(array) < count)],
         cost=_COST * sample_count,
     )
     return directions, filters, cosines

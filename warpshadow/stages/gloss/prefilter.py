@@ -11,9 +11,12 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.batch import common_batch, expand_rows, instance_in
 from warpshadow.device.constants import constant
-from warpshadow.device.launch import launch
+from warpshadow.device.lane_code import ANGLE
+from warpshadow.device.lanes import lane_count, lane_type, make_lane_functions, module_options, vectors_type
+from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 from warpshadow.maths import sh
 
@@ -98,54 +101,213 @@ def _level_offsets(texel_count: int) -> np.ndarray:
     return np.stack([np.cumsum(2 * rows**2) - 2 * rows**2, rows], axis=1)
 
 
+@wp.struct
+class TexelPlace:
+    """Four texels of a level around a direction, and where it is between them."""
+
+    upper_left: int
+    upper_right: int
+    lower_left: int
+    lower_right: int
+    lower_share: float
+    right_share: float
+    is_between_rows: float  # 1; 0 beyond the first and the last
+
+
 @wp.func
-def _interpolate_level(texels: wp.array(dtype=wp.vec3), first: int, rows: int, polar: float, azimuth: float):
-    """Interpolate a level at a direction; rows end at the poles, columns go around."""
-    row = wp.clamp(polar * float(rows) - 0.5, 0.0, float(rows) - 1.0)
-    column = azimuth * float(2 * rows) - 0.5
+def _find_place(first: int, rows: int, half_turns: float, turns: float):
+    """The texels around a direction; rows end at the poles, columns go around."""
+    height = half_turns * float(rows) - 0.5
+    row = wp.clamp(height, 0.0, float(rows) - 1.0)
+    column = turns * float(2 * rows) + 0.5
     upper = wp.min(int(row), rows - 2)
-    left_column = int(wp.floor(column))
-    lower_share = row - float(upper)
-    right_share = column - float(left_column)
-    next_column = wp.where(left_column + 1 >= 2 * rows, 0, left_column + 1)
-    left_column = wp.where(left_column < 0, left_column + 2 * rows, left_column)
+    right_column = int(column)
+    place = TexelPlace()
+    place.lower_share = row - float(upper)
+    place.right_share = column - float(right_column)
+    place.is_between_rows = wp.where(row == height, 1.0, 0.0)
+    left_column = wp.where(right_column > 0, right_column - 1, 2 * rows - 1)
+    right_column = wp.where(right_column < 2 * rows, right_column, 0)
     upper_row = first + upper * 2 * rows
-    lower_row = upper_row + 2 * rows
-    return (1.0 - lower_share) * (
-        (1.0 - right_share) * texels[upper_row + left_column] + right_share * texels[upper_row + next_column]
-    ) + lower_share * (
-        (1.0 - right_share) * texels[lower_row + left_column] + right_share * texels[lower_row + next_column]
+    place.upper_left = upper_row + left_column
+    place.upper_right = upper_row + right_column
+    place.lower_left = upper_row + 2 * rows + left_column
+    place.lower_right = upper_row + 2 * rows + right_column
+    return place
+
+
+@wp.func
+def _interpolate_texels(texels: wp.array(dtype=wp.vec3), place: TexelPlace):
+    above = texels[place.upper_left]
+    above += place.right_share * (texels[place.upper_right] - above)
+    below = texels[place.lower_left]
+    below += place.right_share * (texels[place.lower_right] - below)
+    return above + place.lower_share * (below - above)
+
+
+@wp.func
+def _slopes(texels: wp.array(dtype=wp.vec3), place: TexelPlace, adj: wp.vec3):
+    """The gradient's product with the light of a level, and with its slopes along rows and columns."""
+    upper_left = wp.dot(adj, texels[place.upper_left])
+    upper_right = wp.dot(adj, texels[place.upper_right])
+    lower_left = wp.dot(adj, texels[place.lower_left])
+    lower_right = wp.dot(adj, texels[place.lower_right])
+    above = upper_left + place.right_share * (upper_right - upper_left)
+    below = lower_left + place.right_share * (lower_right - lower_left)
+    return wp.vec3(
+        above + place.lower_share * (below - above),
+        place.is_between_rows * (below - above),
+        upper_right - upper_left + place.lower_share * (lower_right - lower_left - upper_right + upper_left),
     )
 
 
-@wp.kernel
-def _interpolate_levels(
-    first_row: int,
-    worker: int,
-    # in
-    texels: wp.array2d(dtype=wp.vec3),
-    levels: wp.array(dtype=wp.vec2i),
-    directions: wp.array3d(dtype=wp.vec3),
-    filters: wp.array3d(dtype=wp.vec3),
-    # out
-    light: wp.array3d(dtype=wp.vec3),
-):
-    """A thread owns a receiver."""
-    batch, receiver = split_row(first_row + wp.tid(), light.shape[1])
-    light_texels = texels[instance_in(batch, texels.shape[0])]
-    direction_batch = instance_in(batch, directions.shape[0])
-    for i in range(light.shape[2]):
-        direction = directions[direction_batch, receiver, i]
-        polar = wp.acos(wp.clamp(direction[1], -0.999999, 0.999999)) / wp.pi
-        azimuth = wp.atan2(direction[0], -direction[2]) / (2.0 * wp.pi)
-        azimuth = azimuth - wp.floor(azimuth)
-        # half a texel of the map itself is between levels 0 and 1
-        blur = wp.max(filters[direction_batch, receiver, i][2] * float(levels[0][1]) / wp.pi, 0.5)
-        height = wp.clamp(wp.log2(blur) + 1.0, 0.0, float(_LEVELS) - 1.001)
-        level = int(height)
-        a = _interpolate_level(light_texels, levels[level][0], levels[level][1], polar, azimuth)
-        b = _interpolate_level(light_texels, levels[level + 1][0], levels[level + 1][1], polar, azimuth)
-        light[batch, receiver, i] = a + (height - float(level)) * (b - a)
+@wp.func
+def _add_to_texels(adj: wp.vec3, place: TexelPlace, adj_texels: wp.array(dtype=wp.vec3)):
+    wp.atomic_add(adj_texels, place.upper_left, (1.0 - place.lower_share) * (1.0 - place.right_share) * adj)
+    wp.atomic_add(adj_texels, place.upper_right, (1.0 - place.lower_share) * place.right_share * adj)
+    wp.atomic_add(adj_texels, place.lower_left, place.lower_share * (1.0 - place.right_share) * adj)
+    wp.atomic_add(adj_texels, place.lower_right, place.lower_share * place.right_share * adj)
+
+
+@wp.func
+def _find_height(blur: float, texels_per_radian: float):
+    """Height of a blur [radians] over level 0, in levels."""
+    # half a texel of the map itself is between levels 0 and 1
+    return wp.clamp(wp.log2(wp.max(blur * texels_per_radian, 0.5)) + 1.0, 0.0, float(_LEVELS) - 1.001)
+
+
+@functools.cache
+def _make_look_up(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
+    """Make the kernel and its adjoint, which find the angles of as many samples at once as there are lanes."""
+    Lane, Vectors, fn = lane_type(lanes), vectors_type(lanes), make_lane_functions(lanes)
+    sqrt, is_positive = fn.sqrt, fn.is_positive
+
+    @wp.func_native(f"""
+    wp::vec_t<{lanes}, float> angles;
+    for (int lane = 0; lane < {lanes}; ++lane) {{
+        const float y = imaginary.c[lane], x = y != (float)0 || real.c[lane] != (float)0 ? real.c[lane] : (float)1;
+        {ANGLE}
+        angles.c[lane] = angle;
+    }}
+    return angles;
+    """)
+    def find_angles(real: Lane, imaginary: Lane) -> Lane:  # type: ignore[empty-body, valid-type]
+        """Angles of complex numbers, from −π to π."""
+        ...
+
+    @wp.func
+    def load_samples(vectors: wp.array(dtype=wp.vec3), first: int):
+        """A block of vectors; the last again past it."""
+        x = Lane()
+        y = Lane()
+        z = Lane()
+        for lane in range(lanes):
+            vector = vectors[wp.min(first + lane, vectors.shape[0] - 1)]
+            x[lane] = vector[0]
+            y[lane] = vector[1]
+            z[lane] = vector[2]
+        return Vectors(x, y, z)
+
+    @wp.func
+    def find_place_angles(x: Lane, y: Lane, z: Lane):
+        """Polar angles in half-turns, azimuths in turns, and sines of polar angles."""
+        sine = sqrt(wp.cw_mul(x, x) + wp.cw_mul(z, z))
+        azimuth = find_angles(-1.0 * z, x) / (2.0 * wp.pi)
+        return find_angles(y, sine) / wp.pi, azimuth + is_positive(-azimuth), sine
+
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
+    def look_up(
+        first_row: int,
+        worker: int,
+        # in
+        texels: wp.array2d(dtype=wp.vec3),
+        levels: wp.array(dtype=wp.vec2i),
+        directions: wp.array3d(dtype=wp.vec3),
+        filters: wp.array3d(dtype=wp.vec3),
+        # out
+        light: wp.array3d(dtype=wp.vec3),
+    ):
+        """A thread owns a receiver."""
+        batch, receiver = split_row(first_row + wp.tid(), light.shape[1])
+        light_texels = texels[instance_in(batch, texels.shape[0])]
+        texels_per_radian = float(levels[0][1]) / wp.pi
+        for block in range((light.shape[2] + lanes - 1) // lanes):
+            first = block * lanes
+            towards = load_samples(directions[batch, receiver], first)
+            half_turns, turns, _sine = find_place_angles(towards.x, towards.y, towards.z)
+            for lane in range(wp.min(lanes, light.shape[2] - first)):
+                height = _find_height(filters[batch, receiver, first + lane][2], texels_per_radian)
+                level = int(height)
+                lower = _find_place(levels[level][0], levels[level][1], half_turns[lane], turns[lane])
+                upper = _find_place(levels[level + 1][0], levels[level + 1][1], half_turns[lane], turns[lane])
+                sharp = _interpolate_texels(light_texels, lower)
+                soft = _interpolate_texels(light_texels, upper)
+                light[batch, receiver, first + lane] = sharp + (height - float(level)) * (soft - sharp)
+
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
+    def look_up_adjoint(
+        first_row: int,
+        worker: int,
+        # in
+        texels: wp.array2d(dtype=wp.vec3),
+        levels: wp.array(dtype=wp.vec2i),
+        directions: wp.array3d(dtype=wp.vec3),
+        filters: wp.array3d(dtype=wp.vec3),
+        adj_light: wp.array3d(dtype=wp.vec3),
+        # out
+        adj_directions: wp.array3d(dtype=wp.vec3),
+        adj_filters: wp.array3d(dtype=wp.vec3),
+        adj_texels: wp.array2d(dtype=wp.vec3),
+    ):
+        """A thread owns a receiver."""
+        batch, receiver = split_row(first_row + wp.tid(), adj_light.shape[1])
+        texel_batch = instance_in(batch, texels.shape[0])
+        light_texels = texels[texel_batch]
+        texels_per_radian = float(levels[0][1]) / wp.pi
+        for block in range((adj_light.shape[2] + lanes - 1) // lanes):
+            first = block * lanes
+            towards = load_samples(directions[batch, receiver], first)
+            half_turns, turns, sine = find_place_angles(towards.x, towards.y, towards.z)
+            adj_polar = Lane()
+            adj_azimuth = Lane()
+            for lane in range(wp.min(lanes, adj_light.shape[2] - first)):
+                adj = adj_light[batch, receiver, first + lane]
+                blur = filters[batch, receiver, first + lane][2]
+                height = _find_height(blur, texels_per_radian)
+                level = int(height)
+                share = height - float(level)
+                lower = _find_place(levels[level][0], levels[level][1], half_turns[lane], turns[lane])
+                upper = _find_place(levels[level + 1][0], levels[level + 1][1], half_turns[lane], turns[lane])
+                if adj_texels:
+                    _add_to_texels((1.0 - share) * adj, lower, adj_texels[texel_batch])
+                    _add_to_texels(share * adj, upper, adj_texels[texel_batch])
+                sharp = _slopes(light_texels, lower, adj)
+                soft = _slopes(light_texels, upper, adj)
+                rows = float(levels[level][1]) / wp.pi
+                blurred_rows = float(levels[level + 1][1]) / wp.pi
+                adj_polar[lane] = (1.0 - share) * rows * sharp[1] + share * blurred_rows * soft[1]
+                adj_azimuth[lane] = (1.0 - share) * rows * sharp[2] + share * blurred_rows * soft[2]
+                if adj_filters and height > 0.0 and height < float(_LEVELS) - 1.001:
+                    adj_blur = (soft[0] - sharp[0]) / (blur * wp.log(2.0))
+                    adj_filters[batch, receiver, first + lane] = adj_filters[batch, receiver, first + lane] + wp.vec3(
+                        0.0, 0.0, adj_blur
+                    )
+            if adj_directions:
+                # of the angle of y + i sine, and of that of -z + i x
+                square = wp.max(wp.cw_mul(sine, sine), Lane(1.0e-12))
+                adj_polar = wp.cw_div(adj_polar, square + wp.cw_mul(towards.y, towards.y))
+                adj_square = wp.cw_mul(wp.cw_mul(adj_polar, towards.y), wp.cw_div(sine, square))
+                adj_azimuth = wp.cw_div(adj_azimuth, square)
+                x = wp.cw_mul(adj_square, towards.x) - wp.cw_mul(adj_azimuth, towards.z)
+                y = -wp.cw_mul(adj_polar, sine)
+                z = wp.cw_mul(adj_square, towards.z) + wp.cw_mul(adj_azimuth, towards.x)
+                for lane in range(wp.min(lanes, adj_light.shape[2] - first)):
+                    adj_direction = wp.vec3(x[lane], y[lane], z[lane])
+                    adj_directions[batch, receiver, first + lane] = (
+                        adj_directions[batch, receiver, first + lane] + adj_direction
+                    )
+
+    return look_up, look_up_adjoint
 
 
 def look_up_light(texels: wp.array, directions: wp.array, filters: wp.array) -> wp.array:
@@ -161,15 +323,21 @@ def look_up_light(texels: wp.array, directions: wp.array, filters: wp.array) -> 
     Differentiable: texels, directions, filters.
     """
     check.shape("filters", filters.shape, directions.shape)
-    count = common_batch({"texels": texels, "directions": directions})
-    light = wp.empty((count, *directions.shape[1:]), dtype=wp.vec3, device=directions.device)
-    levels = constant(_level_offsets(texels.shape[1]), wp.vec2i, directions.device)
-    launch(
-        _interpolate_levels,
-        count * directions.shape[1],
-        inputs=[texels, levels, directions, filters],
-        outputs=[light],
-        shared=[texels, directions, filters],
-        cost=_COST * directions.shape[2],
+    count, device = common_batch({"texels": texels, "directions": directions}), directions.device
+    directions, filters = expand_rows(directions, count), expand_rows(filters, count)
+    inputs = [texels, constant(_level_offsets(texels.shape[1]), wp.vec2i, device), directions, filters]
+    look_up, look_up_adjoint = _make_look_up(lane_count(device))
+    row_count, cost = count * directions.shape[1], _COST * directions.shape[2]
+    return differentiable(
+        lambda light: launch(look_up, row_count, inputs=inputs, outputs=[light], cost=cost),
+        lambda adj_light: launch(
+            look_up_adjoint,
+            row_count,
+            inputs=[*inputs, adj_light],
+            outputs=[directions.grad, filters.grad],
+            sums=[texels.grad],
+            cost=2 * cost,
+        ),
+        result=empty(directions.shape, dtype=wp.vec3, device=device),
+        variables=[texels, directions, filters],
     )
-    return light

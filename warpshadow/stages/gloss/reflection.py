@@ -96,7 +96,7 @@ def sum_lobes(
         count * filters.shape[1],
         inputs=[filters, light, transmittance, blocked_light],
         outputs=lobe_sums,
-        shared=[filters, light, transmittance, blocked_light],
+        shared=[array for array in arrays.values() if array is not None and len(array) < count],
         cost=_COST * filters.shape[2],
     )
     return lobe_sums[0], lobe_sums[1]

@@ -10,63 +10,164 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.batch import common_batch, expand, expand_rows
 from warpshadow.device.constants import constant
-from warpshadow.device.launch import launch
-from warpshadow.device.parallel import split_row
-from warpshadow.maths.directions import cell_radius
-from warpshadow.stages.cell_neighbors import KERNEL_RADIUS, cell_neighbors, texel_of
+from warpshadow.device.lanes import Chunk, as_chunks, make_lane_functions, use_vector_registers
+from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import empty
+from warpshadow.device.parallel import Scratch, scratch_slot, split_row
+from warpshadow.maths.directions import CHUNK, cell_radius, check_count
+from warpshadow.stages.cell_neighbors import KERNEL_RADIUS, near_chunks, texel_of
 
-_COST = 60.0  # nanoseconds that a sample takes
+_COST = 30.0  # nanoseconds that a sample takes
 
-_NEGLIGIBLE = 1.0e-7
+_MIN_KERNEL = 1.0e-10  # ε: of cells that are further away, where none is near
+_MIN_HORIZON_WEIGHT = 1.0e-7
+
+_total = make_lane_functions(CHUNK).total
 
 wp.set_module_options({"max_unroll": 1})
 
 
-@wp.kernel
-def _sum_near(
+@wp.func(inline=True)
+def _heights(normal: wp.vec3, x: Chunk, y: Chunk, z: Chunk, per_radius: float):
+    """Heights of cells over the horizon, from 0 to 1."""
+    cosine = normal[0] * x + normal[1] * y + normal[2] * z
+    return wp.min(wp.max(0.5 * per_radius * cosine + Chunk(0.5), Chunk(0.0)), Chunk(1.0))
+
+
+@wp.func(inline=True)
+def _kernels(direction: wp.vec3, x: Chunk, y: Chunk, z: Chunk, reach_cosine: float):
+    """√k of cells, but for ε."""
+    return wp.max(direction[0] * x + direction[1] * y + direction[2] * z - Chunk(reach_cosine), Chunk(0.0))
+
+
+@wp.kernel(enable_backward=False)
+def _interpolate_cells(
     first_row: int,
     worker: int,
     # in
-    transmittance: wp.array3d(dtype=wp.float32),
+    transmittance: wp.array3d(dtype=Chunk),
     normals: wp.array2d(dtype=wp.vec3),
     directions: wp.array3d(dtype=wp.vec3),
-    cells: wp.array(dtype=wp.vec3),
+    cells: wp.array2d(dtype=Chunk),
     neighbors: wp.array2d(dtype=wp.int32),
     reach_cosine: float,
     per_radius: float,
+    # scratch
+    scratch: wp.array3d(dtype=Chunk),
     # out
-    weighted_sums: wp.array3d(dtype=wp.vec2),
-):
-    """A thread owns a receiver: the sums of k min(T, H) and of k H."""
-    batch, receiver = split_row(first_row + wp.tid(), weighted_sums.shape[1])
-    direction_batch = instance_in(batch, directions.shape[0])
-    normal = normals[instance_in(batch, normals.shape[0]), receiver]
-    row = transmittance[instance_in(batch, transmittance.shape[0])]
-    for i in range(weighted_sums.shape[2]):
-        direction = directions[direction_batch, receiver, i]
-        texel = texel_of(direction)
-        weighted_sum = wp.vec2()
-        for k in range(neighbors.shape[1]):
-            cell = neighbors[texel, k]
-            kernel_weight = wp.max(wp.dot(direction, cells[cell]) - reach_cosine, 0.0)
-            weight = kernel_weight * kernel_weight + _NEGLIGIBLE
-            horizon_weight = wp.smoothstep(-1.0, 1.0, per_radius * wp.dot(normal, cells[cell])) + _NEGLIGIBLE
-            weighted_sum += weight * wp.vec2(wp.min(row[receiver, cell], horizon_weight), horizon_weight)
-        weighted_sums[batch, receiver, i] = weighted_sum
-
-
-@wp.kernel
-def _divide(
-    # in
-    weighted_sums: wp.array3d(dtype=wp.vec2),
-    # out
+    weights: wp.array3d(dtype=wp.float32),
     means: wp.array3d(dtype=wp.float32),
 ):
-    """A thread owns a sample."""
-    batch, receiver, i = wp.tid()
-    means[batch, receiver, i] = weighted_sums[batch, receiver, i][0] / weighted_sums[batch, receiver, i][1]
+    """A thread owns a receiver: Σ k H and T of its samples."""
+    item = first_row + wp.tid()
+    batch, receiver = split_row(item, means.shape[1])
+    normal = normals[batch, receiver]
+    slot = scratch_slot(worker, item)
+    through = scratch[slot, 0]
+    above = scratch[slot, 1]
+    for chunk in range(cells.shape[1]):
+        t = _heights(normal, cells[0, chunk], cells[1, chunk], cells[2, chunk], per_radius)
+        above[chunk] = wp.cw_mul(wp.cw_mul(t, t), Chunk(3.0) - 2.0 * t) + Chunk(_MIN_HORIZON_WEIGHT)
+        through[chunk] = wp.min(transmittance[batch, receiver, chunk], above[chunk])
+    for i in range(means.shape[2]):
+        direction = directions[batch, receiver, i]
+        texel = texel_of(direction)
+        through_sums = Chunk(0.0)
+        above_sums = Chunk(0.0)
+        for k in range(neighbors.shape[1]):
+            chunk = neighbors[texel, k]
+            if chunk < 0:
+                break
+            kernel = _kernels(direction, cells[0, chunk], cells[1, chunk], cells[2, chunk], reach_cosine)
+            weight = wp.cw_mul(kernel, kernel) + Chunk(_MIN_KERNEL)
+            through_sums += wp.cw_mul(weight, through[chunk])
+            above_sums += wp.cw_mul(weight, above[chunk])
+        weights[batch, receiver, i] = _total(above_sums)
+        means[batch, receiver, i] = _total(through_sums) / weights[batch, receiver, i]
+
+
+@wp.kernel(enable_backward=False)
+def _interpolate_cells_adjoint(
+    first_row: int,
+    worker: int,
+    # in
+    transmittance: wp.array3d(dtype=Chunk),
+    normals: wp.array2d(dtype=wp.vec3),
+    directions: wp.array3d(dtype=wp.vec3),
+    cells: wp.array2d(dtype=Chunk),
+    neighbors: wp.array2d(dtype=wp.int32),
+    reach_cosine: float,
+    per_radius: float,
+    weights: wp.array3d(dtype=wp.float32),
+    means: wp.array3d(dtype=wp.float32),
+    adj_means: wp.array3d(dtype=wp.float32),
+    # scratch
+    scratch: wp.array3d(dtype=Chunk),
+    # out
+    adj_transmittance: wp.array3d(dtype=Chunk),
+    adj_normals: wp.array2d(dtype=wp.vec3),
+    adj_directions: wp.array3d(dtype=wp.vec3),
+):
+    """A thread owns a receiver. With T = t / h:  t̄ = T̄ / h,  h̄ = −T t̄, and from them k̄ and the cells' gradients."""
+    item = first_row + wp.tid()
+    batch, receiver = split_row(item, means.shape[1])
+    normal = normals[batch, receiver]
+    slot = scratch_slot(worker, item)
+    through = scratch[slot, 0]
+    above = scratch[slot, 1]
+    adj_through_cells = scratch[slot, 2]
+    adj_above_cells = scratch[slot, 3]
+    for chunk in range(cells.shape[1]):
+        t = _heights(normal, cells[0, chunk], cells[1, chunk], cells[2, chunk], per_radius)
+        above[chunk] = wp.cw_mul(wp.cw_mul(t, t), Chunk(3.0) - 2.0 * t) + Chunk(_MIN_HORIZON_WEIGHT)
+        through[chunk] = wp.min(transmittance[batch, receiver, chunk], above[chunk])
+        adj_through_cells[chunk] = Chunk(0.0)
+        adj_above_cells[chunk] = Chunk(0.0)
+    for i in range(means.shape[2]):
+        direction = directions[batch, receiver, i]
+        texel = texel_of(direction)
+        adj_through = adj_means[batch, receiver, i] / weights[batch, receiver, i]
+        adj_above = -means[batch, receiver, i] * adj_through
+        adj_x = Chunk(0.0)
+        adj_y = Chunk(0.0)
+        adj_z = Chunk(0.0)
+        for k in range(neighbors.shape[1]):
+            chunk = neighbors[texel, k]
+            if chunk < 0:
+                break
+            x = cells[0, chunk]
+            y = cells[1, chunk]
+            z = cells[2, chunk]
+            kernel = _kernels(direction, x, y, z, reach_cosine)
+            weight = wp.cw_mul(kernel, kernel) + Chunk(_MIN_KERNEL)
+            adj_weight = adj_through * through[chunk] + adj_above * above[chunk]
+            adj_kernel = 2.0 * wp.cw_mul(kernel, adj_weight)
+            adj_x += wp.cw_mul(adj_kernel, x)
+            adj_y += wp.cw_mul(adj_kernel, y)
+            adj_z += wp.cw_mul(adj_kernel, z)
+            adj_through_cells[chunk] = adj_through_cells[chunk] + adj_through * weight
+            adj_above_cells[chunk] = adj_above_cells[chunk] + adj_above * weight
+        if adj_directions:
+            adj_direction = wp.vec3(_total(adj_x), _total(adj_y), _total(adj_z))
+            adj_directions[batch, receiver, i] = adj_directions[batch, receiver, i] + adj_direction
+    adj_normal = wp.vec3()
+    for chunk in range(cells.shape[1]):
+        x = cells[0, chunk]
+        y = cells[1, chunk]
+        z = cells[2, chunk]
+        is_blocked = wp.min(wp.max(1.0e30 * (above[chunk] - through[chunk]), Chunk(0.0)), Chunk(1.0))
+        adj_blocked = wp.cw_mul(is_blocked, adj_through_cells[chunk])
+        if adj_transmittance:
+            adj_transmittance[batch, receiver, chunk] = adj_transmittance[batch, receiver, chunk] + adj_blocked
+        if adj_normals:
+            t = _heights(normal, x, y, z, per_radius)
+            adj_heights = adj_above_cells[chunk] + adj_through_cells[chunk] - adj_blocked
+            adj_cosines = 3.0 * per_radius * wp.cw_mul(wp.cw_mul(t, Chunk(1.0) - t), adj_heights)
+            adj_normal += wp.vec3(wp.dot(adj_cosines, x), wp.dot(adj_cosines, y), wp.dot(adj_cosines, z))
+    if adj_normals:
+        adj_normals[batch, receiver] = adj_normals[batch, receiver] + adj_normal
 
 
 def transmittance_of_directions(
@@ -85,21 +186,46 @@ def transmittance_of_directions(
 
     Differentiable: transmittance, normals, directions.
     """
+    check_count("cells", len(cells))
     check.shape("transmittance", transmittance.shape, ("batch", directions.shape[1], len(cells)))
     arrays = {"transmittance": transmittance, "directions": directions, "normals": normals}
     count, device = common_batch(arrays), directions.device
+    transmittance, directions = expand_rows(transmittance, count), expand_rows(directions, count)
+    normals = expand(normals, count)
+    use_vector_registers(__name__, device)
     radius = float(cell_radius(len(cells)))
-    cos_radius = float(np.cos(KERNEL_RADIUS * radius))
-    weighted_sums = wp.empty((count, *directions.shape[1:]), dtype=wp.vec2, device=device)
-    cell_directions, neighbors = constant(cells, wp.vec3, device), cell_neighbors(cells, device)
-    launch(
-        _sum_near,
-        count * directions.shape[1],
-        inputs=[transmittance, normals, directions, cell_directions, neighbors, cos_radius, 1 / radius],
-        outputs=[weighted_sums],
-        shared=[transmittance, normals, directions],
-        cost=_COST * directions.shape[2],
+    inputs = [
+        *(as_chunks(transmittance.contiguous()), normals, directions),
+        constant(cells.T.reshape(3, -1, CHUNK), Chunk, device),
+        near_chunks(cells, device),
+        *(float(np.cos(KERNEL_RADIUS * radius)), 1 / radius),
+    ]
+    chunk_count = len(cells) // CHUNK
+    weights = empty(directions.shape, dtype=wp.float32, device=device)
+    row_count, cost = count * directions.shape[1], _COST * directions.shape[2]
+
+    def adjoint(adj_means: wp.array) -> None:
+        outputs = [as_chunks(transmittance.grad), normals.grad, directions.grad]
+        launch(
+            _interpolate_cells_adjoint,
+            row_count,
+            inputs=[*inputs, weights, means, adj_means],
+            scratch=[Scratch((4, chunk_count), Chunk)],
+            outputs=outputs,
+            cost=3 * cost,
+        )
+
+    means = empty(directions.shape, dtype=wp.float32, device=device)
+    return differentiable(
+        lambda result: launch(
+            _interpolate_cells,
+            row_count,
+            inputs=inputs,
+            scratch=[Scratch((2, chunk_count), Chunk)],
+            outputs=[weights, result],
+            cost=cost,
+        ),
+        adjoint,
+        result=means,
+        variables=[transmittance, normals, directions],
     )
-    means = wp.empty(weighted_sums.shape, dtype=wp.float32, device=device)
-    launch(_divide, means.shape, inputs=[weighted_sums], outputs=[means])
-    return means
