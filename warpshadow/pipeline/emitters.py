@@ -43,6 +43,7 @@ from warpshadow.stages.emitters.self_visibility import (
 )
 from warpshadow.stages.emitters.spheres import find_log_transmittance
 from warpshadow.stages.gloss.highlights import sum_highlights
+from warpshadow.stages.gloss.reflection import LobeLight
 from warpshadow.stages.gloss.transmittance import transmittance_of_directions
 from warpshadow.stages.joint_coverage import transmittance_past
 from warpshadow.stages.receivers import Receivers
@@ -147,12 +148,11 @@ class SceneEmitters:
             transmittance: list[wp.array],
             roughness: wp.array,
             clip_matrices: wp.array,
-        ) -> tuple[wp.array, wp.array]:
+        ) -> LobeLight:
             seen = receivers.points, receivers.normals, roughness, clip_matrices, placed_samples, radiance
             pairs = zip(self.samples.spans(), transmittance, strict=True)
             of_emitters = [sum_highlights(*seen, span, transmittance=item) for span, item in pairs]
-            straight, grazing = (total_light(list(parts)) for parts in zip(*of_emitters, strict=True))
-            return straight, grazing
+            return LobeLight(*(total_light(list(parts)) for parts in zip(*of_emitters, strict=True)))
 
         return Node("highlights", highlights, receivers, placed, radiance, transmittance, roughness, cameras)
 
@@ -196,8 +196,8 @@ def find_highlights(
     radiance: wp.array,
     roughness: wp.array,
     clip_matrices: wp.array,
-) -> tuple[wp.array, wp.array]:
-    """Direct light of emitters in the lobes of groups of receivers, G and G' of :mod:`.stages.gloss.highlights`.
+) -> LobeLight:
+    """Direct light of emitters in the lobes of groups of receivers (:mod:`.stages.gloss.highlights`).
 
     Args:
         emitters, self_visibility, groups, blockers, placed_samples, radiance: As for :func:`find_emitted_light`.
@@ -218,7 +218,7 @@ def find_highlights(
         ]
         lobe_sums.append([total_light([zeros, *parts]) for parts in zip(*of_emitters, strict=True)] or [zeros, zeros])
         first = end
-    return joined([straight for straight, _ in lobe_sums]), joined([grazing for _, grazing in lobe_sums])
+    return LobeLight(*(joined(list(portions)) for portions in zip(*lobe_sums, strict=True)))
 
 
 def _find_transmittances(

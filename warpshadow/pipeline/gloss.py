@@ -7,7 +7,6 @@ and its transmittance in the way of the method. Diffuse light is found as for al
 from __future__ import annotations
 
 import functools
-import operator
 
 import numpy as np
 import warp as wp
@@ -15,14 +14,14 @@ import warp as wp
 from warpshadow.device.batch import concatenate, cut, rows
 from warpshadow.device.constants import constant
 from warpshadow.pipeline.method import LightInput, Method, add_light
-from warpshadow.pipeline.node import Input, Node, detached
+from warpshadow.pipeline.node import Input, Node, detached, field_of
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.transfers import Light, change_basis
 from warpshadow.scene.material import GLOSS_ARGUMENTS
-from warpshadow.stages.gloss.lobes import sample_lobes
+from warpshadow.stages.gloss.lobes import LobeSamples, sample_lobes
 from warpshadow.stages.gloss.prefilter import look_up_light, prefilter
-from warpshadow.stages.gloss.reflection import mix_reflection, number_runs, sum_lobes
+from warpshadow.stages.gloss.reflection import LobeLight, mix_reflection, number_runs, sum_lobes
 from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import Receivers
@@ -78,7 +77,7 @@ class GlossyPoints(LitPoints):
             return Node("lobes", _sample, *inputs, items=item_text)
 
         sampled = self.cached("lobes", key, lobes)
-        directions, filters, cosines = (Node("", operator.itemgetter(part), sampled) for part in range(3))
+        directions, filters = field_of(sampled, "directions"), field_of(sampled, "filters")
         source = self.method.light_input(self, light)
         texels = self.cached("prefiltered", source, lambda: self._prefiltered(source))
         shell, towards = self.method.shell_of(source), directions
@@ -90,16 +89,12 @@ class GlossyPoints(LitPoints):
         if self.merged_scene.scene.bounces:
             blocked = self.method.blocked_radiance(self, self.chosen(bounced), source, view, self.chosen)
         sums = Node("gloss", sum_lobes, filters, radiance, through, blocked, items=item_text)
-        straight, grazing = (Node("", operator.itemgetter(part), sums) for part in range(2))
         if materials.emission:
-            highlights = self.method.highlights(self, materials, roughness, self._cameras)
-            straight, grazing = (
-                Node("", add_light, lobe, Node("", operator.itemgetter(part), highlights))
-                for part, lobe in enumerate((straight, grazing))
-            )
-        arguments = self._numbers, diffuse, straight, grazing, cosines, metallic, specular
+            sums = Node("", _add, sums, self.method.highlights(self, materials, roughness, self._cameras))
+        lobe_light = field_of(sums, "straight"), field_of(sums, "grazing")
+        arguments = self._numbers, diffuse, *lobe_light, field_of(sampled, "cosines"), metallic, specular
         mix = Node("reflection", mix_reflection, *arguments, items=item_text)
-        return Node("", operator.itemgetter(0), mix), Node("", operator.itemgetter(1), mix)
+        return field_of(mix, "colored"), field_of(mix, "white")
 
     def chosen(self, light: Node) -> Node:
         """Node of light on these receivers, given that of all receivers of the view."""
@@ -157,9 +152,12 @@ def _exits(receivers: Receivers, directions: wp.array, shell: wp.array) -> wp.ar
     return exits_from_shell(receivers.points, directions, shell)
 
 
-def _sample(
-    receivers: Receivers, roughness: wp.array, cameras: wp.array, sample_count: int
-) -> tuple[wp.array, wp.array, wp.array]:
+def _add(lobe_light: LobeLight, highlights: LobeLight) -> LobeLight:
+    """Light in lobes, of emitters, too. Differentiable: all."""
+    return LobeLight(*(add_light(*pair) for pair in zip(lobe_light, highlights, strict=True)))
+
+
+def _sample(receivers: Receivers, roughness: wp.array, cameras: wp.array, sample_count: int) -> LobeSamples:
     return sample_lobes(receivers.points, receivers.normals, roughness, cameras, sample_count)
 
 

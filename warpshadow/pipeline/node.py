@@ -7,6 +7,7 @@ comes before it. Only values with a gradient are not cached: a tape is good for 
 """
 
 import contextlib
+import operator
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
@@ -237,6 +238,11 @@ def detached(node: AnyInput, *, is_constant: bool = False) -> Node:
     if is_constant:
         result.before, result.root_inputs, result.requires_grad = [], {}, False
     return result
+
+
+def field_of(node: Node, name: str, *, caches: bool = True) -> Node:
+    """Make a node of a field of a node's value, which is a named tuple."""
+    return Node("", operator.attrgetter(name), node, caches=caches)
 
 
 class Timing:

@@ -1,7 +1,6 @@
 """Views: a geometry seen by cameras, wired from the vertices to the image."""
 
 import functools
-import operator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +10,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.method import Method
-from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached, identity
+from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached, field_of, identity
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials, SampleReflectance
 from warpshadow.pipeline.transfers import Light
@@ -261,7 +260,7 @@ class View(LitPoints):
         inputs = detached(self.fragments_node), reflectance.samples, unshadowed
         ratio = Node("ratio", divide, *inputs, items=self._samples, caches=False)
         body_light, inverse_light, base_factor = (
-            Node("", operator.itemgetter(part), ratio, caches=False) for part in range(3)
+            field_of(ratio, name, caches=False) for name in ("body_light", "inverse_light", "base_factor")
         )
         parts = (
             self._shining(shading, light, materials, body_light)

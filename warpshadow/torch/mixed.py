@@ -21,6 +21,8 @@ from warpshadow.scene.scene import BodyLike, PerBody
 from warpshadow.torch.autograd import check_float32, uncompiled
 from warpshadow.torch.renderer import TorchRenderer
 
+MixedTensors = ImageInputs[torch.Tensor, Sequence[Geometry[torch.Tensor] | None]]
+
 
 class _Placed(list[Geometry[torch.Tensor] | None]):
     """Geometries of scenes, and which scene each image was of when they were placed; None where all had one pose."""
@@ -69,69 +71,46 @@ class MixedRenderer(torch.nn.Module):
         return self._renderer(0).device
 
     @uncompiled
-    @takes(ImageInputs[torch.Tensor, Sequence[Geometry[torch.Tensor] | None]])
-    def forward(
-        self,
-        which: torch.Tensor | Sequence[int],
-        inputs: ImageInputs[torch.Tensor, Sequence[Geometry[torch.Tensor] | None]],
-    ) -> torch.Tensor:
+    @takes(MixedTensors)
+    def forward(self, which: torch.Tensor | Sequence[int], inputs: MixedTensors) -> torch.Tensor:
         """Render a batch of images.
 
-        A missing input is each scene's own. Lists for bodies are for as many as the scene with the most has, and a scene
-        passes over bodies that it has not. Images of roughness and the like that are as wide as the mesh with the most
-        vertices has of them, or 1 wide, need the batch. Geometry is from :meth:`placed` with the same ``which``; or a
-        list of the results of the renderers' own ``placed``, for each scene that of its images, in their order, None
-        where it has no image.
+        Lists for bodies are as long as the scene with the most has bodies. A scene passes over bodies that it has not.
+        Images of roughness and the like that are as wide as the mesh with the most vertices has of them, or 1 wide,
+        need the batch.
 
         Args:
             which: Scene of each image, from 0, whole numbers of shape [batch]. The host reads them: best on a CPU.
-            inputs: All that an image takes.
+            inputs: All that an image takes, with an item for each image; a missing one is each scene's own. The
+                geometry is from :meth:`placed` with the same ``which``; or a list of the results of the renderers' own
+                ``placed``, for each scene that of its images, in their order, None where it has no image.
         Returns:
             Linear RGB, premultiplied, and coverage, float32 of shape [batch, height, width, 4]: the images of the
             renderers of each scene.
         Differentiable: all but which.
         """
         batch = _Batch(which, len(self.renderers))
-        dimensions = {"light": 2, "shell": 1, "clip_matrices": 2}
-        of_all = {name: batch.split(name, getattr(inputs, name), ndim) for name, ndim in dimensions.items()}
-        colors = {
-            name: {
-                body: batch.split(f"{name}[{body!r}]", self._checked_colors(name, body, color), 2)
-                for body, color in self._by_body(name, values).items()
-            }
-            for name, values in (("albedo", inputs.albedo), ("emission", inputs.emission))
+        whole_inputs = {
+            name: batch.split(name, getattr(inputs, name), ndim)
+            for name, ndim in (("light", 2), ("clip_matrices", 2), ("shell", 1))
         }
-        maps = {
-            body: batch.split(f"textures[{body!r}]", texture, 3)
-            for body, texture in self._by_body("textures", inputs.textures).items()
-        }
-        numbers = {
+        of_bodies = {
             name: {
-                body: (batch.split(f"{name}[{body!r}]", value, ndim), ndim)
-                for body, (value, ndim) in self._checked_numbers(name, self._by_body(name, values)).items()
+                body: self._split_item(batch, name, body, tensor)
+                for body, tensor in self._by_body(name, values).items()
             }
             for name, values in inputs.of_bodies.items()
-            if name in GLOSS_ARGUMENTS
         }
         geometries = batch.of_scenes(inputs.geometry)
         images_of_scenes = {}
         for scene in batch.rows:
             counts = self._vertex_counts[scene]
             images_of_scenes[scene] = self._renderer(scene)(
-                **{name: of(scene) for name, of in of_all.items()},
+                **{name: of_scene(scene) for name, of_scene in whole_inputs.items()},
                 **{
-                    name: {body: _cut(of(scene), 2, counts[body]) for body, of in values.items() if body in counts}
-                    for name, values in colors.items()
+                    name: {body: of_scene(scene) for body, of_scene in items.items() if body in counts}
+                    for name, items in of_bodies.items()
                 },
-                **{
-                    name: {
-                        body: of(scene) if ndim == 2 else _cut(of(scene), 1, counts[body])
-                        for body, (of, ndim) in values.items()
-                        if body in counts
-                    }
-                    for name, values in numbers.items()
-                },
-                textures={body: of(scene) for body, of in maps.items() if body in counts},
                 geometry=geometries[scene],
             )
         return batch.join(images_of_scenes)
@@ -247,28 +226,26 @@ class MixedRenderer(torch.nn.Module):
             pairs = dict(enumerate(tensors)).items()
         return {body: tensor for body, tensor in pairs if tensor is not None}
 
-    def _checked_colors(self, argument: str, body: BodyLike, colors: torch.Tensor) -> torch.Tensor:
-        """Colors of a body, padded where they are one for each vertex."""
+    def _split_item(self, batch: "_Batch", argument: str, body: BodyLike, tensor: Any) -> Callable[[int], Any]:
+        """An input of a body for the images of a scene, checked; without padding where it is of vertices."""
         name, maximum = f"{argument}[{body!r}]", self._maximum_vertices[body]
-        check_float32(name, colors)
-        if colors.ndim > 1 and colors.shape[-2] != 1:
-            shape = ("batch", maximum, 3) if colors.ndim > 2 else (maximum, 3)
-            check.shape(
-                name, tuple(colors.shape), shape, f"or one color; the mesh with the most vertices has {maximum}"
-            )
-        return colors
-
-    def _checked_numbers(self, argument: str, values: dict[Any, torch.Tensor]) -> dict[Any, tuple[torch.Tensor, int]]:
-        """Numbers of bodies, padded where they are one for each vertex, and dimensions of an item: 2 of an image."""
-        result = {}
-        for body, value in values.items():
-            name, maximum = f"{argument}[{body!r}]", self._maximum_vertices[body]
-            check_float32(name, value)
-            ndim = 2 if value.ndim > 2 or (value.ndim == 2 and value.shape[1] not in (1, maximum)) else 1
-            if value.ndim == 1 and len(value) != 1:
-                check.shape(name, tuple(value.shape), (maximum,), "or one number, or an image")
-            result[body] = value, ndim
-        return result
+        if argument == "textures":
+            return batch.split(name, tensor, 3)
+        check_float32(name, tensor)
+        if argument in GLOSS_ARGUMENTS:
+            if tensor.ndim > 2 or (tensor.ndim == 2 and tensor.shape[1] not in (1, maximum)):
+                return batch.split(name, tensor, 2)  # an image
+            if tensor.ndim == 1 and len(tensor) != 1:
+                check.shape(name, tuple(tensor.shape), (maximum,), "or one number, or an image")
+            ndim = 1
+        else:
+            if tensor.ndim > 1 and tensor.shape[-2] != 1:
+                shape = ("batch", maximum, 3) if tensor.ndim > 2 else (maximum, 3)
+                meaning = f"or one color; the mesh with the most vertices has {maximum}"
+                check.shape(name, tuple(tensor.shape), shape, meaning)
+            ndim = 2
+        of_scene = batch.split(name, tensor, ndim)
+        return lambda scene: _cut(of_scene(scene), ndim, self._vertex_counts[scene][body])
 
     def _checked_poses(self, name: str, poses: torch.Tensor | None, item: tuple[int, ...]) -> torch.Tensor | None:
         """Poses of as many bodies as the scene with the most has."""

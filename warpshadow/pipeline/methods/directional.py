@@ -1,7 +1,6 @@
 """The directional method: transmittance of the spheres for cells of directions, lit by the light of each cell."""
 
 import functools
-import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -18,7 +17,7 @@ from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.method import LightInput
-from warpshadow.pipeline.node import Call, Input, Node
+from warpshadow.pipeline.node import Call, Input, Node, field_of
 from warpshadow.pipeline.receivers.groups import CellCoverages, Group, GroupVisibility
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
@@ -423,7 +422,7 @@ class Directional(SphereMethod):
         """Shading of points in known light, which bounces from the materials."""
         if not self._shades_with_cells(points):
             return super().known_shading(points, light, materials)
-        return Node("", operator.itemgetter(0), self._shading_with_cells(points, light))
+        return field_of(self._shading_with_cells(points, light), "shading")
 
     def _shades_with_cells(self, points: LitPoints) -> bool:
         """Whether the transmittance of cells at bodies that shine comes with the shading of a view."""
@@ -441,7 +440,7 @@ class Directional(SphereMethod):
         In known light that does not bounce the shading of the view has found it.
         """
         if not light.is_free and self._shades_with_cells(view):
-            return Node("", operator.itemgetter(1), self._shading_with_cells(view, light)), self.projected(light)
+            return field_of(self._shading_with_cells(view, light), "cells"), self.projected(light)
         if light.is_free:
             projected_light = self.free_projection_of(points, light)
         else:
@@ -508,8 +507,16 @@ class ShadingWithCells(PortionedShading):
         return shading, visibility.transmittance_total if is_glossy else None
 
 
-def _joined_with_cells(portions: list[tuple[wp.array, wp.array | None]]) -> tuple[wp.array, list[wp.array]]:
-    return joined([shading for shading, _ in portions]), [cells for _, cells in portions if cells is not None]
+class _LightAndCells(NamedTuple):
+    """Light on receivers, and their transmittance towards cells."""
+
+    shading: wp.array  # vec3 of shape [batch, receiver]
+    cells: list[wp.array]  # of portions of bodies that shine, float32 of shape [batch, receiver, direction]
+
+
+def _joined_with_cells(portions: list[tuple[wp.array, wp.array | None]]) -> _LightAndCells:
+    cells_of_glossy = [cells for _, cells in portions if cells is not None]
+    return _LightAndCells(joined([shading for shading, _ in portions]), cells_of_glossy)
 
 
 def _towards(

@@ -19,6 +19,7 @@ from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, is_lit
 from warpshadow.stages.gloss.lobes import MAX_COSINE, MIN_COSINE, MIN_ROUGHNESS, eye_position
+from warpshadow.stages.gloss.reflection import LobeLight
 
 _COST = 20.0  # nanoseconds that a sample takes
 
@@ -118,7 +119,7 @@ def sum_highlights(
     log_of_parts: wp.array | None = None,
     transmittance: wp.array | None = None,
     transmittance_of_emitter: wp.array | None = None,
-) -> tuple[wp.array, wp.array]:
+) -> LobeLight:
     """Light of an emitter in the lobes of receivers.
 
     Args:
@@ -129,8 +130,6 @@ def sum_highlights(
         samples, radiance, span: As for :func:`warpshadow.stages.emitters.light.sum_light`.
         log_of_spheres, log_of_planes, log_of_parts, transmittance, transmittance_of_emitter: As for that. Any batch
             may be 1.
-    Returns:
-        G and G', vec3 of shape [batch, receiver].
     Differentiable: all but span.
     """
     check.shape("roughness", roughness.shape, ("batch", points.shape[1]))
@@ -153,4 +152,4 @@ def sum_highlights(
         shared=[clip_matrices, samples.points, samples.areas, radiance],
         cost=_COST * span.size,
     )
-    return lobe_sums[0], lobe_sums[1]
+    return LobeLight(*lobe_sums)

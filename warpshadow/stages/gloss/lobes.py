@@ -18,6 +18,7 @@ a solid angle, 2π σ² [Křivánek and Colbert 2008, Real-time Shading with Fil
 """
 
 import functools
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -162,9 +163,17 @@ def _make_sample_lobes(lanes: int) -> wp.Kernel:
     return sample_lobes
 
 
+class LobeSamples(NamedTuple):
+    """Samples of the lobes of receivers, and the receivers' cosines."""
+
+    directions: wp.array  # unit vectors, vec3 of shape [batch, receiver, sample]
+    filters: wp.array  # w, w' and the blur σ [radians], vec3 of the same shape
+    cosines: wp.array  # μ between normals and viewers, float32 of shape [batch, receiver]
+
+
 def sample_lobes(
     points: wp.array, normals: wp.array, roughness: wp.array, clip_matrices: wp.array, sample_count: int
-) -> tuple[wp.array, wp.array, wp.array]:
+) -> LobeSamples:
     """Sample the lobes of receivers.
 
     Args:
@@ -174,10 +183,6 @@ def sample_lobes(
         clip_matrices: Cameras, mat44 of shape [batch].
             Any batch may be 1 and then serves every instance.
         sample_count: Number of samples.
-
-    Returns:
-        Directions, unit vectors, vec3 of shape [batch, receiver, sample]; filters, w, w' and the blur σ [radians],
-        vec3 of the same shape; and the cosines μ between normals and viewers, float32 of shape [batch, receiver].
 
     Differentiable: points, normals, roughness, clip_matrices.
     """
@@ -198,4 +203,4 @@ def sample_lobes(
         shared=[clip_matrices, *(array for array in inputs[:3] if len(array) < count)],
         cost=_COST * sample_count,
     )
-    return directions, filters, cosines
+    return LobeSamples(directions, filters, cosines)

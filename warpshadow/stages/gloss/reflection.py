@@ -13,6 +13,7 @@ E' is diffuse light times (1 − v·h)⁵: of even light it is E e(μ), which is
 
 import functools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -66,9 +67,16 @@ def _sum_lobes(
     grazing_light[batch, receiver] = total_grazing
 
 
+class LobeLight(NamedTuple):
+    """Light in the lobes of receivers, vec3 of shape [batch, receiver]."""
+
+    straight: wp.array  # G
+    grazing: wp.array  # G'
+
+
 def sum_lobes(
     filters: wp.array, light: wp.array, transmittance: wp.array, blocked_light: wp.array | None = None
-) -> tuple[wp.array, wp.array]:
+) -> LobeLight:
     """Sum the light of lobes.
 
     Args:
@@ -77,9 +85,6 @@ def sum_lobes(
         transmittance: Float32 of shape [batch, receiver, sample].
         blocked_light: R, of :func:`blocked_radiance`, vec3 of shape [batch, receiver]; None where light does not
             bounce.
-
-    Returns:
-        G and G', vec3 of shape [batch, receiver].
 
     Differentiable: all.
     """
@@ -99,7 +104,7 @@ def sum_lobes(
         shared=[array for array in arrays.values() if array is not None and len(array) < count],
         cost=_COST * filters.shape[2],
     )
-    return lobe_sums[0], lobe_sums[1]
+    return LobeLight(*lobe_sums)
 
 
 @wp.kernel
@@ -230,6 +235,13 @@ def number_runs(count: int, runs: Sequence[tuple[int, int]], device: wp.DeviceLi
     return numbers
 
 
+class ReflectedLight(NamedTuple):
+    """Light that receivers reflect, vec3 of shape [batch, receiver]; E and 0 of diffuse ones."""
+
+    colored: wp.array  # A, in the color of the surface
+    white: wp.array  # C
+
+
 def mix_reflection(
     receiver_indices: wp.array,
     diffuse: wp.array,
@@ -238,7 +250,7 @@ def mix_reflection(
     cosines: wp.array,
     metallic: wp.array,
     specular: wp.array,
-) -> tuple[wp.array, wp.array]:
+) -> ReflectedLight:
     """Mix diffuse and glossy light.
 
     Args:
@@ -248,15 +260,12 @@ def mix_reflection(
         cosines: μ of them, float32 of shape [batch, glossy].
         metallic, specular: m and s of them, float32 of shape [batch, glossy].
 
-    Returns:
-        A and C, vec3 of shape [batch, receiver]; E and 0 of diffuse ones.
-
     Differentiable: all but receiver_indices.
     """
     check.shape("receiver_indices", receiver_indices.shape, diffuse.shape[1:])
     arrays = {"diffuse": diffuse, "gloss": straight, "cosines": cosines, "metallic": metallic, "specular": specular}
     shape = common_batch(arrays), diffuse.shape[1]
-    colored_reflection, white = (wp.empty(shape, dtype=wp.vec3, device=diffuse.device) for _ in range(2))
+    reflected = ReflectedLight(*(wp.empty(shape, dtype=wp.vec3, device=diffuse.device) for _ in range(2)))
     inputs = [receiver_indices, diffuse, straight, grazing_light, cosines, metallic, specular, even_grazing()]
-    launch(_mix_reflection, shape, inputs=inputs, outputs=[colored_reflection, white])
-    return colored_reflection, white
+    launch(_mix_reflection, shape, inputs=inputs, outputs=[*reflected])
+    return reflected
