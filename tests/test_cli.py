@@ -211,7 +211,7 @@ def test_a_mesh_is_shown_in_place_of_a_scene(cone, monkeypatch):
     assert result.exit_code == 0, result.output
     assert "z is taken to be up" in result.stdout
     ((scene, path),) = served
-    assert path is None and [body.called for body in scene.bodies] == ["cone", "infinite_ground"]
+    assert path is None and [body.name for body in scene.bodies] == ["cone", "infinite_ground"]
 
 
 def test_a_picture_without_its_option_gets_the_option(cone, tmp_path):

@@ -1,11 +1,15 @@
 """The photographs whose truth is known: what lies beside their script is what it says."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 import warpshadow as ws
 from demos.examples.photographs.cases import BODY, CASES, alone
-from demos.examples.photographs.table import lamp_error, problem
+from demos.examples.photographs.table import LAMP, lamp_error, problem, relighting_error
+
+SCALED = 1e-3  # relative L2 of an image in twice the light, scaled
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
@@ -37,4 +41,14 @@ def test_starts_are_away_and_light_is_measured_from_the_lamp():
     cells = ws.fibonacci(256)
     lamp = np.array(case.lamp) - (0, 0.5, 0)
     radiance = np.where((cells @ lamp / np.linalg.norm(lamp))[:, None] > 0.97, 5.0, 0.1) * np.ones(3)
-    assert lamp_error(case, ws.CellBasis(cells).to_map(radiance)) < 5
+    truth = case.truth()
+    lit = dataclasses.replace(truth, light=ws.CellBasis(cells).to_map(radiance))
+    assert lamp_error(case, lit) < 5
+    bright = dataclasses.replace(LAMP, emission=(500.0,) * 3, translation=(-3, 5, 0))
+    lit = dataclasses.replace(lit, bodies=(*truth.bodies, bright))
+    assert lamp_error(case, lit) > 30
+    assert relighting_error(case, lit) > 0.2
+    bright = dataclasses.replace(LAMP, mesh=ws.icosphere(0.35, 3), emission=(68, 60, 48), translation=case.lamp)
+    sky = np.broadcast_to(np.float32([0.44, 0.5, 0.6]), (8, 16, 3))
+    lit = dataclasses.replace(truth, bodies=(*truth.bodies, bright), light=ws.EnvironmentMap(sky))
+    assert relighting_error(case, lit) < SCALED

@@ -171,7 +171,7 @@ def test_four_scenes_are_measured_and_drawn(tmp_path, monkeypatch, capsys):
         for setting, figures in result["settings"].items():
             assert 0 < figures["error"] < min(BOUNDS[name], figures["block"])
             assert figures["peak MiB"] > 50 and ("moved CPU ms" in figures) == setting.startswith("renderer")
-            assert list(figures["bodies"]) == [body.called for body in scene.bodies]
+            assert list(figures["bodies"]) == [body.name for body in scene.bodies]
             assert all(abs(error) < 0.7 for error in figures["bodies"].values() if error is not None)
             assert abs(list(figures["bodies"].values())[-1]) < 0.2
             assert f"{name:20}{setting}" in printed

@@ -267,6 +267,8 @@ def test_no_candidates_are_tried_after_one_whose_loss_stands_out(tmp_path):
     result = fit(problem, stages, checkpoint=tmp_path / "fit")
     assert len(result.losses) == 2
     assert same(fit(problem, stages, checkpoint=tmp_path / "fit"), result)
+    along = dataclasses.replace(stages[1], iterations=1, scatter="flat")  # no other turns, which are done with
+    assert len(fit(problem, [*stages, along]).losses) == 2 + 3
     everyone = fit(problem, [dataclasses.replace(stage, standout=0.0) for stage in stages])
     assert len(everyone.losses) == 7 and everyone.losses[0] == result.losses[0]
 

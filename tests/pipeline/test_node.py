@@ -180,7 +180,7 @@ def wired(vertices=2, cameras=3, **options):
     normals = Node("normals", lambda a: 1, vertices)
     sides = Node("sides", lambda clip: clip, clip, idle="every body is closed")
     image = Node("image", lambda *given: sum(given), sides, detached(silhouettes), normals, caches=False)
-    return image, {node.name: node for node in (clip, silhouettes, normals, sides, image)}
+    return image, {node.stage.name: node for node in (clip, silhouettes, normals, sides, image)}
 
 
 def test_each_node_says_why_it_runs_or_does_not(clock):

@@ -183,9 +183,9 @@ def test_scene_files_name_bodies(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_text(SCENE, encoding="utf-8")
     scene = ws.load_scene(path)
-    assert [body.called for body in scene.bodies] == ["Ball №1", "plane"]
+    assert [body.name for body in scene.bodies] == ["Ball №1", "plane"]
     again = ws.load_scene(ws.write_scene(scene, tmp_path / "again")[0])
-    assert [body.called for body in again.bodies] == ["Ball №1", "plane"]
+    assert [body.name for body in again.bodies] == ["Ball №1", "plane"]
     path.write_text(SCENE.replace('"Ball №1"', "3"), encoding="utf-8")
     with pytest.raises(SceneError, match=r"1st \[\[body\]\]: name: got 3, expected a name"):
         ws.load_scene(path)

@@ -67,7 +67,7 @@ def test_without_a_mesh_there_is_a_bunny(tmp_path, monkeypatch):
     pytest.importorskip("pxr")
     monkeypatch.chdir(tmp_path)
     assert CliRunner().invoke(app, ["scene"]).exit_code == 0
-    assert [body.called for body in ws.load_scene("scene.toml").bodies] == ["bunny", "infinite_ground"]
+    assert [body.name for body in ws.load_scene("scene.toml").bodies] == ["bunny", "infinite_ground"]
     assert write_bunny(Path()) == Path("bunny.obj")  # again
     ws.icosphere(0.5, 1).write("bunny.obj")
     with pytest.raises(FileExistsError, match="bunny.obj: got another file than Warp's bunny"):
@@ -79,6 +79,12 @@ def test_a_sky_of_a_scene_file_is_that_of_python(tmp_path):
     (tmp_path / "a.toml").write_text(text + "sky = {sun_direction = [0, 1, 0], height = 16}\nscale = 2.0\n")
     expected = ws.synthetic_sky((0, 1, 0), height=16).scaled(2.0)
     np.testing.assert_array_equal(ws.load_scene(tmp_path / "a.toml").light.radiance, expected.radiance)
+    (tmp_path / "a.toml").write_text(text + "sky = {height = 16}\nsun = {direction = [0, 1, 0], irradiance = 3}\n")
+    expected = ws.synthetic_sky(height=16).with_sun((0, 1, 0), 3)
+    np.testing.assert_array_equal(ws.load_scene(tmp_path / "a.toml").light.radiance, expected.radiance)
+    (tmp_path / "a.toml").write_text(text + "sky = {}\nsun = {direction = [0, 1, 0]}\n")
+    with pytest.raises(ws.SceneError, match=r"\[light\]: sun: irradiance: missing"):
+        ws.load_scene(tmp_path / "a.toml")
     (tmp_path / "a.toml").write_text(text + "sky = {sun = [0, 1, 0]}\n")
     with pytest.raises(ws.SceneError, match=r"\[light\]: sky: unknown key 'sun'"):
         ws.load_scene(tmp_path / "a.toml")

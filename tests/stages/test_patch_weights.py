@@ -77,5 +77,5 @@ def test_of_a_patch_that_is_buried_wholly_all_patch_samples_count(device):
 def test_what_does_not_fit_is_refused(device):
     normals = wp.zeros((1, 5), dtype=wp.vec3, device=device)
     passing = wp.zeros((1, 5, 8), dtype=wp.float32, device=device)
-    with pytest.raises(ValueError, match=r"transmittance_spheres: got shape \(1, 5, 8\), expected \[batch, 5, 32\]"):
+    with pytest.raises(ValueError, match=r"transmittance_nonplanar: got shape \(1, 5, 8\), expected \[batch, 5, 32\]"):
         find_mean_transmittance(normals, None, passing, DIRECTIONS)

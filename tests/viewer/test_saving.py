@@ -73,7 +73,7 @@ def assert_same(read, shown):
     np.testing.assert_allclose(read.light.radiance, shown.light.radiance, atol=ROUNDING)
     np.testing.assert_allclose(read.camera.clip_matrix(), shown.camera.clip_matrix(), atol=ROUNDING)
     for one, other in zip(read.bodies, shown.bodies, strict=True):
-        assert (one.receivers, one.called) == (other.receivers, other.called)
+        assert (one.receivers, one.name) == (other.receivers, other.name)
         np.testing.assert_allclose(one.rotation, other.rotation)
         np.testing.assert_allclose(one.translation, other.translation)
         np.testing.assert_allclose(one.albedo, other.albedo)

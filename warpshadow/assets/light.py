@@ -37,6 +37,7 @@ LIGHT = (
 
 _ORIGIN = np.zeros(3)
 
+_MAX_SUN_ROWS = 4096  # of a map that gets a sun
 _DRAWN_ROWS = 256  # of a map in a notebook, and less than twice as many
 
 
@@ -189,6 +190,39 @@ class EnvironmentMap:
     def scaled(self, factor: npt.ArrayLike) -> EnvironmentMap:
         """Multiply the radiance by one factor, or by one for each of R, G, B."""
         return self._with_radiance(self.radiance * _color("factor", factor))
+
+    @check.keywords(**dict.fromkeys(("radius", "sun_radius", "size"), "angular_radius, in degrees"), color="irradiance")
+    def with_sun(
+        self, direction: npt.ArrayLike, irradiance: npt.ArrayLike, *, angular_radius: float = 0.27
+    ) -> EnvironmentMap:
+        """Add a sun: an even disc, whose shadows have edges as soft as it is wide.
+
+        Args:
+            direction: Towards the sun, of any length, shape [3].
+            irradiance: Of a surface that faces it [the map's radiance · sr], one number or RGB; white there looks
+                irradiance / π.
+            angular_radius: Of the disc [degrees]; the real sun's is the default. The pixels of the result are no wider
+                than the disc: those of a coarser map are divided, which changes none of its light.
+        Raises:
+            ValueError: for a disc so small that the map would have more than 4096 rows.
+        """
+        axis = check.array("direction", direction, (3,), "a direction (x, y, z)")
+        if not axis.any():
+            raise ValueError("direction: got a zero vector, expected a direction")
+        radius, rows = np.radians(check.positive("angular_radius", angular_radius)), len(self.radiance)
+        division = max(1, math.ceil(np.pi / rows / (2 * radius)))
+        if division > 1 and rows * division > _MAX_SUN_ROWS:
+            raise ValueError(
+                f"angular_radius: got {angular_radius:g}, expected {90 / (_MAX_SUN_ROWS // rows * rows):.2g} or more, "
+                f"for which this map gets {_MAX_SUN_ROWS} rows"
+            )
+        pixels = self.radiance.repeat(division, axis=0).repeat(division, axis=1)
+        height = rows * division
+        pixel = np.pi / height
+        cosines = sh.equirectangular_directions(height) @ (axis / np.linalg.norm(axis))
+        disc = np.clip((radius + pixel / 2 - np.arccos(np.clip(cosines, -1, 1))) / pixel, 0, 1)
+        disc /= np.sum(disc * sh.pixel_solid_angles(height)[:, None])
+        return self._with_radiance(pixels + disc[..., None] * _color("irradiance", irradiance))
 
     def _repr_png_(self) -> bytes:
         """The map as notebooks draw it: at most some 512 columns, at its automatic exposure."""

@@ -5,8 +5,7 @@ a thread owns a *block* of receivers and holds each quantity as one vector with 
 vector register has floats on a CPU, 1 on a GPU, where threads play that part. Arrays in memory stay [batch, vertex, …];
 only scratch is [batch, block, …] of lanes. A block that runs past the last receiver repeats it and writes it once.
 
-Small functions on structs are inlined by force. Otherwise LLVM calls them, and copies the structs through memory:
-kernels of visibility take 1.1 to 1.35 times as long.
+Small functions on structs are inlined by force. Otherwise LLVM calls them, and copies the structs through memory.
 
 How wide registers are is asked of the LLVM that compiles the kernels. For some CPUs it prefers narrower ones than there
 are, so the width is among the flags. ``python demos/benchmarks/lane_choice.py`` times the alternatives.

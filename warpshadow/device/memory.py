@@ -1,7 +1,7 @@
 """Memory: new arrays, huge pages for large ones, and views of arrays.
 
-Memory that is new to a process comes in pages of 4 kB, each of which stops the kernel that first writes to it: a fifth
-of a call on 64 small images. Huge pages, of 2 MB, take a fourth of that. Linux gives them on request.
+Memory that is new to a process comes in pages of 4 kB, each of which stops the kernel that first writes to it. Huge
+pages, of 2 MB, stop it less often. Linux gives them on request.
 """
 
 import ctypes

@@ -12,11 +12,13 @@ from warpshadow.inverse.found_light import FoundLight
 from warpshadow.inverse.free.base import Free
 from warpshadow.inverse.free.emission import Emission
 from warpshadow.inverse.free.gloss import Metallic, Roughness
+from warpshadow.inverse.free.lamp import Lamp
 from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.free.plane import Plane
 from warpshadow.inverse.free.pose import Pose
 from warpshadow.inverse.free.reflectance import Albedo, Texture
 from warpshadow.inverse.free.shape import Deformation, Radii
+from warpshadow.inverse.free.shell import Shell
 from warpshadow.inverse.free.views import CameraPose, Exposure, OutlineOffset
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.many import Ending, find_fits, fit_many
@@ -44,6 +46,7 @@ __all__ = [
     "FitWarning",
     "FoundLight",
     "Free",
+    "Lamp",
     "Light",
     "Loss",
     "Metallic",
@@ -56,6 +59,7 @@ __all__ = [
     "Radii",
     "Result",
     "Roughness",
+    "Shell",
     "Stage",
     "Target",
     "Texture",

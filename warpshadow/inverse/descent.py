@@ -19,7 +19,8 @@ from warpshadow.device.progress import progress_bar
 from warpshadow.inverse import checkpoint as checkpoints
 from warpshadow.inverse.diagnostics import warn_of
 from warpshadow.inverse.free.base import Free, Values
-from warpshadow.inverse.free.light import Light
+from warpshadow.inverse.free.lamp import Lamp
+from warpshadow.inverse.free.shell import Shell
 from warpshadow.inverse.free.views import OutlineOffset
 from warpshadow.inverse.one_thread import torch_on_one_thread
 from warpshadow.inverse.preview import write_preview
@@ -106,18 +107,31 @@ class _Descent:
 
     def _candidates_of_stage(self, best: list[_Candidate]) -> list[_Candidate]:
         """The candidates of a stage: the best so far, and others scattered around the first where it wants more."""
-        count = 1 if self.is_found else self.stages[self.stage].candidates
+        count = self._candidate_count(self.stages[self.stage])
         perturbed = self._perturbed_candidates(best[0].values, count - len(best))
         return [*best[:count], *(_Candidate(values, None) for values in perturbed)]
 
+    def _candidate_count(self, stage: Stage) -> int:
+        """Candidates of a stage: one that stood out is not turned any more."""
+        return 1 if self.is_found and stage.scatter == "turned" else stage.candidates
+
     def _perturbed_candidates(self, values: Mapping[str, Values], count: int) -> list[dict[str, Values]]:
-        if count > 0 and self.stages[self.stage].scatter == "flat":
+        scatter = self.stages[self.stage].scatter
+        if count > 0 and scatter == "flat":
             return candidates_along_flat_direction(self.problem, self.setting, values, count)
+        if scatter == "lamps":
+            return [self._relocated(values, number) for number in range(count)]
         generator = torch.Generator().manual_seed(self.seed)
         return [
             {free.name: free.scattered(values[free.name], number, generator) for free in self.problem.free}
             for number in range(count)
         ]
+
+    def _relocated(self, values: Mapping[str, Values], number: int) -> dict[str, Values]:
+        """Values with free lamps elsewhere."""
+        lamps = {free.name: free for free in self.problem.free if isinstance(free, Lamp)}
+        copies = _copied(values)
+        return copies | {name: lamp.relocated(copies[name], self.setting, number) for name, lamp in lamps.items()}
 
     def begin_stage(self) -> None:
         """Set up the model of a stage, and its first candidate."""
@@ -211,7 +225,7 @@ class _Descent:
             return True
         self.ended.append(self._ended_run())
         self.is_found = self.is_found or (len(self.candidates) > 1 and self._is_clearly_best(self.ended[-1]))
-        if len(self.ended) < len(self.candidates) and not self.is_found:
+        if len(self.ended) < min(len(self.candidates), self._candidate_count(stage)):
             self._begin_run(self.candidates[len(self.ended)])
             self.losses.append([])
             self.descents[-1] += 1
@@ -242,9 +256,7 @@ class _Descent:
             return 0
         stage, *later_stages = self.stages[self.stage :]
         remaining_iterations = (len(self.candidates) - len(self.ended)) * stage.iterations - len(self.losses[-1])
-        return remaining_iterations + sum(
-            (1 if self.is_found else item.candidates) * item.iterations for item in later_stages
-        )
+        return remaining_iterations + sum(self._candidate_count(item) * item.iterations for item in later_stages)
 
     def _has_converged(self) -> bool:
         """Whether the loss has stopped falling by more than the tolerance; the optimizer decides where it can."""
@@ -322,10 +334,10 @@ class _Descent:
 
 
 def _descends(free: Free, stage: Stage) -> bool:
-    """Whether a stage has a gradient for a parameter."""
+    """Whether a stage descends to a parameter."""
     if stage.compares == "outlines":
-        return free.moves or isinstance(free, OutlineOffset)
-    return not (stage.solves_light and isinstance(free, Light))
+        return (free.moves and not isinstance(free, (Lamp, Shell))) or isinstance(free, OutlineOffset)
+    return not (stage.solves_light and free.is_light)
 
 
 def _copied(values: Mapping[str, Values], device: torch.device | None = None) -> dict[str, Values]:

@@ -20,11 +20,13 @@ from warpshadow.inverse.encoding import is_curve_file
 from warpshadow.inverse.free.base import Free
 from warpshadow.inverse.free.emission import Emission
 from warpshadow.inverse.free.gloss import Metallic, Roughness
+from warpshadow.inverse.free.lamp import Lamp
 from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.free.plane import Plane
 from warpshadow.inverse.free.pose import Pose
 from warpshadow.inverse.free.reflectance import Albedo, Texture
 from warpshadow.inverse.free.shape import Deformation, Radii
+from warpshadow.inverse.free.shell import Shell
 from warpshadow.inverse.free.views import CameraPose, Exposure, OutlineOffset
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.problem import Problem
@@ -41,9 +43,9 @@ from warpshadow.scene.visibility import Visibility
 _KEYS = ("scene", "tolerance", "seed", "stages", "target", "free", "loss", "still", "optimizer", "stage")
 _PHOTOGRAPH_KEYS = ("encoding", "exposure", "white_balance", "saturation", "distortion")
 _TARGET_KEYS = ("image", "mask", "camera", "outlines", *_PHOTOGRAPH_KEYS)
-_FREE_OF_SCENE: dict[str, type[Free]] = {kind.key: kind for kind in (Light, Exposure, CameraPose, OutlineOffset)}
+_FREE_OF_SCENE: dict[str, type[Free]] = {kind.key: kind for kind in (Light, Shell, Exposure, CameraPose, OutlineOffset)}
 _FREE_OF_BODIES: dict[str, type[Free]] = {
-    kind.key: kind for kind in (Albedo, Texture, Roughness, Metallic, Emission, Pose, Plane, Deformation, Radii)
+    kind.key: kind for kind in (Albedo, Texture, Roughness, Metallic, Emission, Lamp, Pose, Plane, Deformation, Radii)
 }
 
 

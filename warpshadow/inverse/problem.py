@@ -15,8 +15,10 @@ from warpshadow.assets.basis import Basis
 from warpshadow.assets.camera import Camera
 from warpshadow.check import AnyPath
 from warpshadow.inverse.free.base import Free, Values
+from warpshadow.inverse.free.lamp import Lamp
 from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.free.plane import with_planes_last
+from warpshadow.inverse.free.pose import Pose
 from warpshadow.inverse.free.reflectance import Albedo, Texture
 from warpshadow.inverse.free.shape import Deformation, Radii
 from warpshadow.inverse.loss import Loss
@@ -85,6 +87,8 @@ class Problem:
         for body in range(len(self.scene.bodies)):
             if {Albedo(body).name, Texture(body).name} <= set(names):
                 raise ValueError(f"free: got Albedo({body}) and Texture({body}), expected one of them for a body")
+            if {Lamp(body).name, Pose(body).name} <= set(names):
+                raise ValueError(f"free: got Lamp({body}) and Pose({body}), expected one of them for a body")
         if self.still is not None:
             object.__setattr__(self, "still", self.still.with_method())
             check.choice("still.method", self.still.method, METHODS)

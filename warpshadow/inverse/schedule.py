@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from warpshadow import check
+from warpshadow.inverse.free.lamp import STARTS, Lamp
 from warpshadow.inverse.problem import Problem
 from warpshadow.maths.directions import check_count
 from warpshadow.scene.scene import check_supersampling
@@ -30,13 +31,14 @@ class Stage:
         supersampling: Samples a pixel across and down; by default the scene's.
         candidates: How many descents take part. They go on from the best of the stage before; missing ones start
             scattered around the best. The least loss tells them apart.
-        standout: A candidate has found it, and no others are tried from then on, if its loss is below this part of
+        standout: A candidate has found it, and no others are turned from then on, if its loss is below this part of
             that of each of six values scattered around it. 0: all are tried.
         tolerance: In place of the fit's.
         compares: "all", or "outlines" alone, for which nothing is shaded.
         solves_light: Solve for the light at each geometry in place of descending to it; see
             :mod:`~warpshadow.inverse.variable_projection`.
-        scatter: How candidates differ: "turned", or "flat", moved along the direction that the images tell least of.
+        scatter: How candidates differ: "turned"; "flat", moved along the direction that the images tell least of; or
+            "lamps", with free lamps in other directions.
         regularization: Factor of all regularizers: coarse stages want more of them.
     """
 
@@ -58,7 +60,7 @@ class Stage:
         check.integer("iterations", self.iterations)
         check.integer("candidates", self.candidates)
         check.choice("compares", self.compares, ("all", "outlines"))
-        check.choice("scatter", self.scatter, ("turned", "flat"))
+        check.choice("scatter", self.scatter, ("turned", "flat", "lamps"))
         check.flag("solves_light", self.solves_light)
         if not (check.is_number(self.learning_rate) and self.learning_rate > 0):
             raise ValueError(f"learning_rate: got {self.learning_rate!r}, expected a positive number")
@@ -159,9 +161,10 @@ def photograph_stages(problem: Problem) -> tuple[Stage, ...]:
     A light that is fitted at a wrong pose confirms it. So the light is solved for at each pose, and of five poses along
     the flat direction that with the least loss goes on.
     """
-    side = {size: _scale(problem, size) for size in (32, 64, 96, 160)}
+    side = {size: _scale(problem, size) for size in (32, 64, 160)}
     stages: list[Stage] = []
-    if all(target.outlines for target in problem.targets):
+    has_outlines = all(target.outlines for target in problem.targets)
+    if has_outlines:
         first: dict[str, Any] = {"compares": "outlines", "tolerance": 0.01}
         stages += [
             Stage(30, 0.1, side[32], candidates=7, standout=0.08, **first),
@@ -169,10 +172,14 @@ def photograph_stages(problem: Problem) -> tuple[Stage, ...]:
             Stage(20, 0.01, side[160], **first),
         ]
     solved_settings: dict[str, Any] = {"solves_light": problem.basis is not None, "supersampling": 1}
-    scatter = "flat" if stages else "turned"
+    if problem.basis is not None and any(isinstance(free, Lamp) for free in problem.free):
+        stages.append(
+            Stage(6, 0.1, side[32], candidates=1 + STARTS, scatter="lamps", tolerance=0.01, **solved_settings)
+        )
+    scatter = "flat" if has_outlines else "turned"
     return (
         *stages,
-        Stage(12, 0.03, side[96], candidates=5, scatter=scatter, tolerance=0.01, **solved_settings),
+        Stage(12, 0.03, side[64], candidates=5, scatter=scatter, tolerance=0.01, **solved_settings),
         Stage(20, 0.01, side[160], tolerance=1e-3, **solved_settings),
     )
 

@@ -118,7 +118,7 @@ class NormalMatrix:
         stage = small_stage(problem)
         has_light = any(isinstance(free, Light) for free in problem.free)
         self.model = (ProjectedModel if has_light else Model)(problem, setting, stage)
-        self.parameter_entries = _few_number_entries(self.values)
+        self.parameter_entries = _few_number_entries(problem, self.values)
         self.directions = self._directions()
         self.roots: list[torch.Tensor] = []  # of the weights of colors, and of coverage
         with torch.no_grad():
@@ -222,10 +222,10 @@ class NormalMatrix:
     def _project_light(self) -> float:
         """Take the best change of the light out of the columns; the relative deviation of its total."""
         assert isinstance(self.model, ProjectedModel)
-        design = (self.model.design(self.values) * self.roots[0]).double().cpu().numpy()
-        design = np.tensordot(self.model.atoms, design, axes=1)  # [atom, view, height, width, 3]
-        radiance = self.model.solution
-        prior, total, variance = self.model.prior(), 0.0, 0.0
+        model = self.model
+        design = (model.design(self.values, model.emitted(self.values)) * self.roots[0]).double().cpu().numpy()
+        radiance, is_lamp = model.solution, np.arange(len(model.solution)) >= len(model.atoms)
+        prior, total, variance = model.prior(), 0.0, 0.0
         for color in range(3):
             active = radiance[:, color] > 1e-3 * radiance[:, color].max()
             basis = design[active][..., color].reshape(int(active.sum()), -1).T  # [pixel, atom]
@@ -238,8 +238,8 @@ class NormalMatrix:
             errors = self.residuals[..., color]
             shape = (*errors.shape, 1, basis.shape[1])
             scores = _by_tiles((basis * errors.reshape(-1, 1)).reshape(shape))
-            ones = np.linalg.solve(form, np.ones(len(form)))
-            total += radiance[active, color].sum()
+            ones = np.linalg.solve(form, 1.0 - is_lamp[active])
+            total += radiance[active & ~is_lamp, color].sum()
             variance += float(((scores @ ones) ** 2).sum())
         return float(np.sqrt(variance) / total) if total > 0 else 0.0
 
@@ -290,7 +290,7 @@ def uncertainty(
         problem, setting, values: Of the result.
         fitted: The scene that was found.
     """
-    if not _few_number_entries(values):
+    if not _few_number_entries(problem, values):
         return None
     normal = NormalMatrix(problem, setting, values)
     inverse = normal.directions @ np.linalg.inv(normal.normal_matrix)
@@ -347,12 +347,16 @@ def candidates_along_flat_direction(
     ]
 
 
-def _few_number_entries(values: Mapping[str, Values]) -> list[tuple[str, str, int]]:
-    """Name, key and index of the numbers of parameters that have few."""
+def _few_number_entries(problem: Problem, values: Mapping[str, Values]) -> list[tuple[str, str, int]]:
+    """Name, key and index of the numbers of parameters that have few.
+
+    Light is projected out: that of a map, and beside it that of lamps, whose emission is then left out here.
+    """
+    light_names = {free.name for free in problem.free if free.is_light and problem.basis is not None}
     return [
         (name, key, number)
         for name, parts in values.items()
         for key, tensor in parts.items()
-        if name != Light.key and tensor.numel() <= MAX_UNCERTAIN_NUMBERS
+        if name not in light_names and tensor.numel() <= MAX_UNCERTAIN_NUMBERS
         for number in range(tensor.numel())
     ]

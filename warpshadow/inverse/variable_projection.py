@@ -1,7 +1,7 @@
 """Variable projection: a light that is solved for at each geometry, not descended to [Golub and Pereyra 1973].
 
-For known geometry and reflectance images are linear in the light, I = A L, beside the light of emitters, which is
-subtracted from the images. The loss at the best light,
+For known geometry and reflectance images are linear in the light, I = A L: that of the map, and that of lamps whose
+emission is free and one color. The light of other emitters is subtracted. The loss at the best light,
 
     f(θ) = min_{L ≥ 0} loss(A(θ) L, I),
 
@@ -22,11 +22,12 @@ import torch
 
 from warpshadow.assets.basis import CellBasis
 from warpshadow.inverse.free.base import Values
+from warpshadow.inverse.free.emission import Emission
 from warpshadow.inverse.free.light import Light, neighboring_cells
 from warpshadow.inverse.model import LightModel, Model
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
-from warpshadow.inverse.world import Setting
+from warpshadow.inverse.world import Setting, World
 from warpshadow.maths.directions import fibonacci
 
 _REWEIGHTINGS = 6  # of losses that are not squares
@@ -43,7 +44,9 @@ class ProjectedModel(Model):
         super().__init__(problem, setting, stage)
         self.light = next(free for free in problem.free if isinstance(free, Light))
         self.atoms = atoms(self.light)
-        self.solution = np.zeros((len(self.atoms), 3))  # radiance of the atoms that was found last
+        self.lamps = [free for free in problem.free if isinstance(free, Emission) and free.is_light]
+        self.lamp_units = np.ones(len(self.lamps))  # emission that lights an image as much as an atom does
+        self.solution = np.zeros((len(self.atoms) + len(self.lamps), 3))  # radiance of atoms and lamps, found last
 
     def loss(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor | None]:
         """The loss at the best light, and the images. Differentiable: values, but for the light's, which it sets."""
@@ -52,29 +55,44 @@ class ProjectedModel(Model):
         return super().loss(values)
 
     def emitted(self, values: Mapping[str, Values]) -> torch.Tensor | float:
-        """Images by emitters alone, [view, height, width, 3]; 0 where no body emits."""
-        if not any(body.is_emitter for body in self.setting.scene.bodies):
+        """Images by emitters that are not solved for, [view, height, width, 3]; 0 where no body emits."""
+        lamp_numbers = {lamp.number for lamp in self.lamps}
+        if not any(body.is_emitter and n not in lamp_numbers for n, body in enumerate(self.setting.scene.bodies)):
             return 0.0
-        world = self.world(values)
-        world.light = torch.zeros(self.light.basis.size, 3, device=self.setting.device)
-        return world.images().reshape(*self.targets.shape[:3], 4)[..., :3]
+        return self._lit(self.world(values), self._darkness)[0]
 
-    def design(self, values: Mapping[str, Values], emitted: torch.Tensor | float = 0.0) -> torch.Tensor:
-        """Images by single coefficients of light, less those by emitters: [coefficient, view, height, width, 3]."""
-        world = self.world(values)
-        units = torch.eye(self.light.basis.size, device=self.setting.device)[..., None].expand(-1, -1, 3).contiguous()
+    @property
+    def _darkness(self) -> torch.Tensor:
+        return torch.zeros(1, self.light.basis.size, 3, device=self.setting.device)
+
+    def _lit(self, world: World, lights: torch.Tensor, shining: Emission | None = None) -> torch.Tensor:
+        """Images by lights [light, coefficient, 3] and one of the solved lamps: [light, view, height, width, 3]."""
+        for lamp in self.lamps:
+            radiance = torch.full((1, 3), float(lamp is shining), device=self.setting.device)
+            lamp.apply({"radiance": radiance}, self.setting, world)
         images = []
-        for part in units if len(self.cameras) > 1 else units.split(_LIGHTS_AT_ONCE):
+        for part in lights if len(self.cameras) > 1 else lights.split(_LIGHTS_AT_ONCE):
             world.light = part
-            lit = world.images().reshape(-1, len(self.cameras), *self.targets.shape[1:3], 4)
-            images.append(lit[..., :3] - emitted)
+            images.append(world.images().reshape(-1, *self.targets.shape[:3], 4)[..., :3])
         return torch.cat(images)
 
+    def design(self, values: Mapping[str, Values], emitted: torch.Tensor | float = 0.0) -> torch.Tensor:
+        """Images by single atoms and single lamps, less those by other emitters: [atom, view, height, width, 3]."""
+        world = self.world(values)
+        coefficients = torch.eye(self.light.basis.size, device=self.setting.device)[..., None].expand(-1, -1, 3)
+        images = self._lit(world, coefficients.contiguous()) - emitted
+        images = torch.tensordot(torch.from_numpy(self.atoms).to(images), images, dims=1)
+        if not self.lamps:
+            return images
+        lamps = torch.cat([self._lit(world, self._darkness, lamp) for lamp in self.lamps]) - emitted
+        units = images.flatten(1).norm(dim=1).mean() / lamps.flatten(1).norm(dim=1).clamp_min(1e-12)
+        self.lamp_units = units.cpu().numpy()
+        return torch.cat([images, lamps * units[:, None, None, None, None]])
+
     def solve(self, values: Mapping[str, Values]) -> None:
-        """Set the light to that of the least loss, for the other values."""
+        """Set light and lamps to those of the least loss, for the other values."""
         emitted = self.emitted(values)
-        design = self.design(values, emitted).permute(4, 0, 1, 2, 3).flatten(2)  # [color, coefficient, pixel]
-        design = torch.einsum("ak,ckp->cap", torch.from_numpy(self.atoms).to(design), design)
+        design = self.design(values, emitted).permute(4, 0, 1, 2, 3).flatten(2)  # [color, atom, pixel]
         target = ((self.targets[..., :3] - emitted) / self.setting.unit).permute(3, 0, 1, 2).flatten(1)
         share = self.problem.loss.pixel_shares(self.weights).flatten()
         prior = self.prior()
@@ -88,7 +106,9 @@ class ProjectedModel(Model):
             images = torch.einsum("cap,ca->cp", design, torch.from_numpy(radiance).to(design))
             weights = share * self._reweighted(images, target)
         self.solution = radiance.T
-        self._store(self.solution, values[self.light.name])
+        self._store(self.solution[: len(self.atoms)], values[self.light.name])
+        for lamp, unit, emission in zip(self.lamps, self.lamp_units, self.solution[len(self.atoms) :], strict=True):
+            values[lamp.name]["radiance"].copy_(self.setting.tensor(unit * self.setting.unit * emission))
 
     def _reweighted(self, images: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """Weights of squares that stand for the loss at images, [color, pixel]; 0 where saturation allows them."""
@@ -101,7 +121,7 @@ class ProjectedModel(Model):
     def prior(self) -> np.ndarray:
         """Quadratic form of the smoothness of cells, as :meth:`Light.regularizer` has it, [atom, atom]."""
         count = len(self.atoms)
-        form = np.zeros((count, count))
+        form = np.zeros((len(self.solution),) * 2)
         if isinstance(self.light.basis, CellBasis) and self.light.smoothness:
             first, second = (part.numpy() for part in neighboring_cells(count))
             weight = self.regularization * self.light.smoothness / (3 * len(first))
@@ -140,7 +160,8 @@ def nonnegative_least_squares(form: np.ndarray, slope: np.ndarray) -> np.ndarray
     scale = np.trace(form) / len(form)
     if scale <= 0:
         return np.zeros(len(form))
-    values, vectors = np.linalg.eigh(form / scale)
+    # by torch, which a fit keeps on one thread: NumPy's threads wait for each other 50 times as long as they work
+    values, vectors = (part.numpy() for part in torch.linalg.eigh(torch.from_numpy(form / scale)))
     roots = np.sqrt(np.maximum(values, _RIDGE))
     solution, _ = nnls(roots[:, None] * vectors.T, vectors.T @ slope / (scale * roots))
     return solution

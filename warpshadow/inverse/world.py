@@ -108,7 +108,7 @@ class World:
     Attributes:
         light, albedo, textures: As :class:`warpshadow.torch.TorchRenderer` takes them.
         gloss: Its roughness and the like, by name.
-        emission: As it takes it.
+        emission, shell: As it takes them.
         rotations, translations, scales: Of each body.
         rest: The bodies in their own spaces, None for the scene's.
         moving: Bodies that do not stand where the scene has them.
@@ -126,6 +126,7 @@ class World:
         self.textures: list[torch.Tensor | None] = [None] * count
         self.gloss: dict[str, list[torch.Tensor | None]] = {name: [None] * count for name in GLOSS_ARGUMENTS}
         self.emission: list[torch.Tensor | None] = [None] * count
+        self.shell: torch.Tensor | None = None
         self.rotations, self.translations, self.scales = (list(poses.unbind()) for poses in renderer.scene_poses())
         self.rest: Geometry | None = None
         self.moving: set[int] = set()
@@ -151,6 +152,7 @@ class World:
             albedo=self.albedo,
             textures=self.textures,
             emission=self.emission,
+            shell=self.shell,
             geometry=self.geometry,
             clip_matrices=self.clip_matrices,
             **self.gloss,

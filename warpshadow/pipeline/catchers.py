@@ -12,10 +12,10 @@ import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.geometry import Geometry
+from warpshadow.pipeline.image_inputs import ImageArrays
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.transfers import Light
 from warpshadow.pipeline.view import View
-from warpshadow.scene.scene import PerBody
 
 
 class CatchersAlone:
@@ -46,27 +46,19 @@ class CatchersAlone:
         has_moved = geometry.moving is None or set(geometry.moving) & set(self._numbers)
         return self._merged_scene.part(geometry, self._numbers) if has_moved else None
 
-    def light(
-        self,
-        geometry: Geometry[wp.array] | None,
-        clip_matrices: wp.array | None,
-        light: Light | None,
-        albedo: PerBody[wp.array] | None,
-        textures: PerBody[wp.array] | None,
-        view: View,
-    ) -> wp.array:
+    def light(self, inputs: ImageArrays, light: Light | None, view: View) -> wp.array:
         """Light received by samples of catchers, and whether they see one; vec4, as of :meth:`.view.View.white`.
 
         Args:
-            geometry: Of the catchers, from :meth:`moved_geometry`.
-            clip_matrices, light, albedo, textures: Of the whole scene, as for ``SceneRenderer.insert``.
+            inputs: Of the whole scene, but for the geometry, which is that of the catchers, from
+                :meth:`moved_geometry`.
+            light: Of these, with its shell.
             view: The view of the whole scene.
         """
         renderer, scene = self._renderer, self._merged_scene.scene
-        colors, images = scene.per_body(albedo, "albedo"), scene.per_body(textures, "textures")
-        colors, images = ([item[body] for body in self._numbers] for item in (colors, images))
-        materials = renderer._given_materials(colors, images)
-        alone = renderer.view(geometry, clip_matrices)
+        of_scene = {name: scene.per_body(inputs.of_bodies[name], name) for name in ("albedo", "textures")}
+        materials = renderer.materials({name: [items[n] for n in self._numbers] for name, items in of_scene.items()})
+        alone = renderer.view(inputs.geometry, inputs.clip_matrices)
         if renderer._method.lights_samples:  # rays are drawn by the number of a receiver, and so are the same for both
             alone = alone.at_receivers_of(view)
         return alone.white(light, materials).value(renderer._views.call(alone))

@@ -242,7 +242,7 @@ def _find_transmittances(
     )
     sphere_bodies = blockers.sphere_blockers(blockers.bodies)
     spheres = merged_scene.spheres_of(sphere_bodies, blockers.spheres)
-    traced_body = group.body if group.body in blockers.blocker_kinds.traced else None
+    traced_body = group.body if group.body in blockers.blocker_kinds.self_traced else None
     own_spheres = merged_scene.spheres_among(sphere_bodies, traced_body)
     for body, span, hidden_by_itself in zip(emitters.bodies, emitters.spans(), self_visibility, strict=True):
         is_own = body == group.body

@@ -68,9 +68,8 @@ class Explanation:
         self.stages: dict[str, StageReport] = {}
         for node in decisions:
             if node not in hidden:
-                reports = [_report(stage, node, _stage_decision(stage, decisions[node])) for stage in node.stages]
-                reports += [_report(node, node, decisions[node])] if node.name else []
-                self.stages |= {report.name: report for report in reports}
+                for stage in node.stages:
+                    self.stages[stage.name] = _report(stage, node, _stage_decision(stage, node, decisions[node]))
         self.timings = dict(timings)
         self.notes = list(notes)
         if not is_host:
@@ -144,7 +143,7 @@ def _decision(node: Node, call: Call, reason: Decision) -> Decision:
     """Whether a node runs, given why it is asked for, or why it is not."""
     if node.value_if_known(call) is not None:
         return Decision(False, f"cached: {_names(node.root_inputs)} are the same")
-    if idle := _text(node.idle):
+    if node.stage is not None and (idle := _text(node.stage.idle)):
         return Decision(False, idle)
     return _reason_to_run([node], reason, "nothing is cached yet" if node.caches else "")
 
@@ -161,17 +160,18 @@ def _reason_to_run(inputs: Iterable[AnyInput], reason: Decision, otherwise: str 
     return Decision(True, otherwise) if otherwise else reason
 
 
-def _stage_decision(stage: NodeStage, decision: Decision) -> Decision:
+def _stage_decision(stage: NodeStage, node: Node, decision: Decision) -> Decision:
     """Whether a stage of a node runs, given the decision about the node."""
+    if stage is node.stage:
+        return decision
     if idle := _text(stage.idle):
         return Decision(False, idle)
     return _reason_to_run(stage.inputs, decision)
 
 
-def _report(stage: Node | NodeStage, node: Node, forward: Decision) -> StageReport:
+def _report(stage: NodeStage, node: Node, forward: Decision) -> StageReport:
     """A stage of a node; its adjoint runs if it runs itself and something before it requires a gradient."""
-    inputs = stage.inputs if isinstance(stage, NodeStage) else ()
-    differentiated = dict.fromkeys(root for item in inputs or (node,) for root in item.differentiated_inputs)
+    differentiated = dict.fromkeys(root for item in stage.inputs or (node,) for root in item.differentiated_inputs)
     if not forward:
         backward = Decision(False, "nothing is computed")
     elif differentiated and stage.has_adjoint:

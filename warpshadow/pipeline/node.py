@@ -110,7 +110,7 @@ def _is_same_array(array: wp.array, before: wp.array, copy: wp.array) -> bool:
 
 
 class NodeStage(NamedTuple):
-    """A stage as it is timed and explained. A node with a name is one; the function of a node may have more.
+    """A stage as it is timed and explained. A node with a name has one, and others that its function runs or replaces.
 
     Args:
         name: Its name.
@@ -133,15 +133,16 @@ class Node:
     """A value of the pipeline that a function computes from inputs.
 
     Args:
-        name: Name of the stage; empty for a node that is neither timed nor explained.
+        name: Name of its own stage; empty for a node that is neither timed nor explained.
         function: Computes the value from the inputs' values; None where there is nothing to compute: the value is None.
         inputs: Nodes and inputs of the pipeline; anything else is passed on as it is.
         items, idle, has_adjoint: As for :class:`NodeStage`; a function of an idle node passes something on.
         caches: Whether the value may outlive a call.
         extra_inputs: Other nodes that run for this one.
-        stages: Stages that are explained before it: those that its function times, and stages that it makes needless.
+        stages: Further stages, explained before its own: such as its function times, and such as it makes needless.
 
     Attributes:
+        stage: Its own stage; None without a name.
         before: The nodes and inputs that it depends on at once.
         root_inputs: All inputs that it depends on.
         requires_grad: Whether a gradient to any of them is asked for; then nothing is cached.
@@ -160,8 +161,9 @@ class Node:
         extra_inputs: tuple["Node", ...] = (),
         stages: tuple[NodeStage, ...] = (),
     ):
-        self.name, self.function, self.inputs, self.stages = name, function, inputs, stages
-        self.items, self.idle, self.has_adjoint = items, idle, has_adjoint
+        self.function, self.inputs = function, inputs
+        self.stage = NodeStage(name, items, idle, has_adjoint) if name else None
+        self.stages = stages if self.stage is None else (*stages, self.stage)
         self.before: list[AnyInput] = []
         self.root_inputs: dict[Input, None] = {}  # in order
         self.differentiated_inputs: dict[Input, None] = {}
@@ -195,9 +197,9 @@ class Node:
         if self.function is None:
             return None
         values = self.values(call)
-        if not self.name or isinstance(self.idle, str) and self.idle:
+        if self.stage is None or isinstance(self.stage.idle, str) and self.stage.idle:
             return self.function(*values)
-        with call.timed(self.name, is_marked=self.has_adjoint and bool(self.differentiated_inputs)):
+        with self.timed(call, self.stage):
             return self.function(*values)
 
     def timed(self, call: "Call", stage: NodeStage) -> AbstractContextManager[None]:

@@ -5,7 +5,7 @@
 
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,6 +24,7 @@ from warpshadow.pipeline.catchers import CatchersAlone
 from warpshadow.pipeline.delegation import delegated
 from warpshadow.pipeline.explain import Explanation, bounce_notes, decide, shell_notes
 from warpshadow.pipeline.geometry import Geometry, as_geometry
+from warpshadow.pipeline.image_inputs import ImageArrays, takes
 from warpshadow.pipeline.layers import LayerArrays, Layers, find_layer_arrays, find_layers
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.methods.by_name import make_method
@@ -36,11 +37,23 @@ from warpshadow.pipeline.shading_ratio import shading_ratio
 from warpshadow.pipeline.transfers import Light, ShellLight, one_transfer
 from warpshadow.pipeline.view import View
 from warpshadow.pipeline.view_warnings import warn_of_vertex_receivers, warn_of_view
-from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.scene.scene import BodyLike, PerBody, Scene, check_scene
 from warpshadow.scene.visibility import METHODS
 
 RendererType = TypeVar("RendererType", bound="SceneRenderer")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ViewArrays(ImageArrays):
+    """All that an image takes, and its view, which may be made before.
+
+    Args:
+        view: From ``view``, in place of geometry and cameras; by default the scene's own. Where it is given, only the
+            stages after it are explained.
+    """
+
+    view: View | None = None
+
 
 _OF_CAMERAS = ("_scene_view", "_catchers_alone")  # cached values of a renderer's cameras
 
@@ -269,7 +282,8 @@ class SceneRenderer:
         Differentiable: albedo, textures, view.
         """
         view = self._checked(view)
-        return view.reflectance(self._given_materials(albedo, textures)).samples.value(self._views.call(view))
+        materials = self.materials({"albedo": albedo, "textures": textures})
+        return view.reflectance(materials).samples.value(self._views.call(view))
 
     @one_at_a_time
     def seen_texels(self, body: BodyLike) -> np.ndarray:
@@ -285,55 +299,28 @@ class SceneRenderer:
         """
         return self._scene_view.seen_texels(self.scene.body_number(body))
 
-    def _given_materials(
-        self,
-        albedo: PerBody[wp.array] | None,
-        textures: PerBody[wp.array] | None,
-        gloss: Mapping[str, PerBody[wp.array]] | None = None,
-        emission: PerBody[wp.array] | None = None,
-    ) -> Materials:
-        """The scene's materials with others in their place, checked."""
-        check.known_keys("gloss", gloss or {}, GLOSS_ARGUMENTS)
-        replacements = {"albedo": albedo, "textures": textures, "emission": emission, **(gloss or {})}
-        return self._materials.replaced(
-            {name: self.scene.per_body(values, name) for name, values in replacements.items()}
-        )
+    def materials(self, of_bodies: Mapping[str, PerBody[wp.array] | None]) -> Materials:
+        """The scene's materials with others in their place, by name, checked."""
+        return self._materials.replaced({name: self.scene.per_body(values, name) for name, values in of_bodies.items()})
 
     # ------------------------------------------------------------------------------------------ image
 
     @announced
-    def draw(
-        self,
-        light: Light | None = None,
-        *,
-        albedo: PerBody[wp.array] | None = None,
-        textures: PerBody[wp.array] | None = None,
-        gloss: Mapping[str, PerBody[wp.array]] | None = None,
-        emission: PerBody[wp.array] | None = None,
-        shell: wp.array | None = None,
-        view: View | None = None,
-    ) -> wp.array:
+    @takes(ViewArrays)
+    def draw(self, inputs: ViewArrays) -> wp.array:
         """Draw images.
 
         Args:
-            light: As for :meth:`shade`.
-            albedo: As for :meth:`reflect`.
-            textures: As for :meth:`reflect`.
-            gloss: "roughness", "metallic" and "specular" of bodies that have roughness in the scene, each float32 of
-                shape [batch, 1], [batch, vertex] or, as a texture, [batch, height, width], as albedo is given.
-            emission: Of bodies that have it in the scene, linear RGB, as albedo is given.
-            shell: Where the scene's light has a radius: center and radius of the sphere that sends the light [scene
-                units], vec4 of shape [batch], in place of the scene's or a map's own; all bodies are inside.
-            view: From :meth:`view`, by default the scene's own.
-                Batches of 1 serve every instance of the others.
+            inputs: All that an image takes.
         Returns:
             Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]; the background is 0.
-        Differentiable: light, albedo, textures, gloss, emission, shell, view.
+        Differentiable: all.
         """
+        view = inputs.view
+        if view is None and not (inputs.geometry is None and inputs.clip_matrices is None):
+            view = self.view(inputs.geometry, inputs.clip_matrices)
         view = self._checked(view)
-        return view.image(_from_shell(light, shell), self._given_materials(albedo, textures, gloss, emission)).value(
-            self._views.call(view)
-        )
+        return view.image(_light_of(inputs), self.materials(inputs.of_bodies)).value(self._views.call(view))
 
     @check.keywords(**dict.fromkeys(("camera", "cameras"), "renderer.with_cameras([camera]).render()"))
     def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:
@@ -355,29 +342,15 @@ class SceneRenderer:
         return images if self.has_camera_batch else images[0]
 
     @announced
-    def insert(
-        self,
-        photograph: wp.array | None,
-        light: Light | None = None,
-        *,
-        albedo: PerBody[wp.array] | None = None,
-        textures: PerBody[wp.array] | None = None,
-        gloss: Mapping[str, PerBody[wp.array]] | None = None,
-        emission: PerBody[wp.array] | None = None,
-        shell: wp.array | None = None,
-        geometry: Geometry[wp.array] | None = None,
-        clip_matrices: wp.array | None = None,
-    ) -> wp.array:
+    @takes(ImageArrays)
+    def insert(self, photograph: wp.array | None, inputs: ImageArrays) -> wp.array:
         """Draw images of the bodies in a photograph whose surfaces the shadow catchers model.
 
         Args:
             photograph: Linear RGB, of radiance in the units of the light, vec3 of shape [batch, height, width]; None
                 for nothing, where shadows on catchers are coverage.
-            light: As for :meth:`draw`.
-            albedo: As for :meth:`draw`; a catcher's matters where light bounces.
-            textures, gloss, emission, shell: As for :meth:`draw`.
-            geometry: As for :meth:`view`; but static bodies have no cached rows.
-            clip_matrices: As for :meth:`view`. Batches of 1 serve every instance of the others.
+            inputs: All that an image takes; static bodies have no cached rows. A catcher's albedo matters where light
+                bounces.
         Returns:
             Linear RGB, vec3 of shape [batch, height, width]; vec4 with coverage, without a photograph.
         Raises:
@@ -391,20 +364,15 @@ class SceneRenderer:
         if photograph is not None:
             check.shape("photograph", photograph.shape, ("batch", *self._size))
             finite_arrays({"photograph": photograph})
-        light = _from_shell(light, shell)
-        catchers, materials, alone = (
-            self._catchers_alone,
-            self._given_materials(albedo, textures, gloss, emission),
-            None,
-        )
-        if geometry is not None:
-            geometry = as_geometry("geometry", geometry)
+        catchers, materials, light = self._catchers_alone, self.materials(inputs.of_bodies), _light_of(inputs)
+        geometry, alone = None, None
+        if inputs.geometry is not None:
+            geometry = as_geometry("geometry", inputs.geometry)
             alone = catchers.moved_geometry(geometry)
             geometry = replace(geometry, moving=None)  # else static catchers would be lit in another way than alone
-        view = self.view(geometry, clip_matrices)
-        unshadowed = Input(
-            "light without the others", catchers.light(alone, clip_matrices, light, albedo, textures, view)
-        )
+        view = self.view(geometry, inputs.clip_matrices)
+        of_catchers = catchers.light(replace(inputs, geometry=alone), light, view)
+        unshadowed = Input("light without the others", of_catchers)
         photo_input = None if photograph is None else Input("photograph", photograph)
         arguments = photo_input, unshadowed, catchers.has_face, light, materials
         return view.in_photograph(*arguments).value(self._views.call(view))
@@ -474,37 +442,25 @@ class SceneRenderer:
     # ------------------------------------------------------------------------------------------ explanation
 
     @one_at_a_time
-    def explain(
-        self,
-        light: Light | None = None,
-        *,
-        albedo: PerBody[wp.array] | None = None,
-        textures: PerBody[wp.array] | None = None,
-        gloss: Mapping[str, PerBody[wp.array]] | None = None,
-        emission: PerBody[wp.array] | None = None,
-        shell: wp.array | None = None,
-        view: View | None = None,
-        geometry: Geometry[wp.array] | None = None,
-        clip_matrices: wp.array | None = None,
-    ) -> Explanation:
+    @takes(ViewArrays)
+    def explain(self, inputs: ViewArrays) -> Explanation:
         """List the stages that the next call computes and skips, and why.
 
         Args:
-            light, albedo, textures, gloss, emission, shell: As for :meth:`draw`.
-            view: As for :meth:`draw`: then only the stages after it are explained.
-            geometry, clip_matrices: As for :meth:`view`, which is explained with them.
+            inputs: All that an image takes.
         Returns:
             The stages, which print as a table: whether each runs and on how many items, how long it took last, and why
             it does or does not run; then the same of the adjoints. Nothing is computed.
         """
         hidden: set[Node] = set()
-        if view is not None:
-            view = self._checked(view)
+        if inputs.view is not None:
+            view = self._checked(inputs.view)
             hidden = {*decide(view.receivers_node, view.call), view.silhouettes}
         else:
-            view = self._views.view(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
+            geometry = None if inputs.geometry is None else as_geometry("geometry", inputs.geometry)
+            view = self._views.view(geometry, inputs.clip_matrices)
         preview = view.preview()  # which the nodes' words ask, so it stays meanwhile
-        image = preview.image(_from_shell(light, shell), self._given_materials(albedo, textures, gloss, emission))
+        image = preview.image(_light_of(inputs), self.materials(inputs.of_bodies))
         is_host = self.device.is_cpu or self.clock.waits
         of_receivers = receiver_notes(self._given_scene, self._choices, view.blocker_kinds.bulging)
         notes = [*of_receivers, *bounce_notes(self.scene.bounces), *shell_notes(self.scene.shell)]
@@ -513,6 +469,6 @@ class SceneRenderer:
         )
 
 
-def _from_shell(light: Light | None, shell: wp.array | None) -> Light | None:
-    """Light from a shell; from its own where none is given."""
-    return light if shell is None else ShellLight(light, shell)
+def _light_of(inputs: ImageArrays) -> Light | None:
+    """The light of an image, with its own shell where one is given."""
+    return inputs.light if inputs.shell is None else ShellLight(inputs.light, inputs.shell)

@@ -94,10 +94,8 @@ class SphereMethod(Method):
     def _can_bulge(self) -> list[bool]:
         """Whether each body is thin, so that its spheres bulge out of it, and its receivers were chosen, not asked for.
 
-        They are at vertices where its spheres block its own light. By pixel and at vertices, in 64² pixels, gradients
-        to free vertices are off by 80 and 9% on an arched cloth, 162 and 15% on a table of five boxes, 40 and 19% on a
-        wall of four; and these bodies are 39 and 23%, 7 and 1%, 6 and 1% too dark. Images of others are nearer to rays
-        by pixel.
+        They are at vertices where its spheres block its own light: pipeline/README.md has figures. Images of others
+        are nearer to rays by pixel.
         """
         return [
             is_chosen and body.casts_shadow and not body.is_glossy and body.is_thin
@@ -440,7 +438,7 @@ def self_visibility_node(method: SphereMethod, points: LitPoints, projected_ligh
 
 
 def _self_visibility(method: SphereMethod, points: LitPoints, projected_light: Any) -> Node:
-    bodies, rotations, words = points.blocker_kinds.traced, points.blocker_kinds.rotations, points.in_words
+    bodies, rotations, words = points.blocker_kinds.self_traced, points.blocker_kinds.rotations, points.in_words
     curved_bodies = [body for body in bodies if not method.merged_scene.is_flat[body]]
     if not curved_bodies or rotations is None:
         return Node("self-shadows", None, idle=lambda: _why_no_self_visibility(method, words))

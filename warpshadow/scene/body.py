@@ -174,11 +174,6 @@ class Body:
         return f"Body({self.name!r}, {mesh}, {count} spheres{texture})"
 
     @property
-    def called(self) -> str:
-        """Its ``name``, by a former word."""
-        return self.name
-
-    @property
     def has_own_name(self) -> bool:
         """Whether its name is another than its mesh's."""
         return self.name != self.mesh.name

@@ -36,7 +36,7 @@ _FRAMING_KEYS = ("framing", "direction", "margin")
 _PINHOLE_KEYS = ("intrinsics", "rotation", "translation")
 _CAMERA_KEYS = (*_VIEW_KEYS, *_PINHOLE_KEYS, "pixel_centers", "size", "near")
 _PIXEL_CENTERS = {"half": np.zeros((3, 3)), "whole": HALF_PIXEL}
-_LIGHT_KEYS = ("envmap", "sky", "sh", "rotation", "scale", "radius", "center", "bounces")
+_LIGHT_KEYS = ("envmap", "sky", "sh", "sun", "rotation", "scale", "radius", "center", "bounces")
 _PLACE_KEYS = (*(field.name for field in fields(Body) if field.name != "mesh"), "spheres", "on_ground", "creased")
 _PRIMITIVES: dict[str, Callable[..., Mesh]] = {
     "plane": plane,
@@ -169,16 +169,29 @@ def _light(table: Table, folder: Path) -> EnvironmentMap | np.ndarray:
     shell = {key: table[key] for key in ("radius", "center") if key in table}
     if shell and "envmap" not in table:
         raise ValueError(f'{next(iter(shell))}: got it without envmap, expected envmap = "FILE" beside it')
+    if "sh" in table and "sun" in table:
+        raise ValueError("sun: got it beside sh, expected envmap or sky beside it, which hold one")
     if "envmap" in table:
-        return turned_light(EnvironmentMap.read(toml_tables.file(table, "envmap", folder), **shell), rotation, scale)
+        envmap = EnvironmentMap.read(toml_tables.file(table, "envmap", folder), **shell)
+        return turned_light(_with_sun(envmap, table), rotation, scale)
     if "sky" in table:
         with check.located("sky"):
-            return turned_light(toml_tables.make(synthetic_sky, table["sky"]), rotation, scale)
+            sky = toml_tables.make(synthetic_sky, table["sky"])
+        return turned_light(_with_sun(sky, table), rotation, scale)
     coefficients = check.numbers("sh", table["sh"], expected="rows of 3 finite numbers", dtype=np.float64)
     check.shape("sh", coefficients.shape, ("order²", 3), "rows of 3 finite numbers")
     check.finite("sh", coefficients)
     sh.order_of("sh", coefficients)
     return turned_light(coefficients, rotation, scale)
+
+
+def _with_sun(envmap: EnvironmentMap, table: Table) -> EnvironmentMap:
+    """A map with the sun that a table may have."""
+    if "sun" not in table:
+        return envmap
+    with check.located("sun"):
+        toml_tables.check_table(table["sun"])
+        return toml_tables.make(envmap.with_sun, table["sun"])
 
 
 def turned_light(light: EnvironmentMap | np.ndarray, rotation: float, scale: float) -> EnvironmentMap | np.ndarray:

@@ -18,7 +18,7 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.pipeline.geometry import Geometry, as_geometry
 from warpshadow.scene.scene import BodyLike, PerBody
 from warpshadow.torch.autograd import check_float32, uncompiled
-from warpshadow.torch.renderer import TorchRenderer, with_gloss
+from warpshadow.torch.renderer import TorchRenderer
 
 
 class _Placed(list[Geometry[torch.Tensor] | None]):
@@ -68,7 +68,6 @@ class MixedRenderer(torch.nn.Module):
         return self._renderer(0).device
 
     @uncompiled
-    @with_gloss
     def forward(
         self,
         which: torch.Tensor | Sequence[int],
@@ -77,9 +76,11 @@ class MixedRenderer(torch.nn.Module):
         albedo: PerBody[torch.Tensor] | None = None,
         textures: PerBody[torch.Tensor] | None = None,
         emission: PerBody[torch.Tensor] | None = None,
+        roughness: PerBody[torch.Tensor] | None = None,
+        metallic: PerBody[torch.Tensor] | None = None,
+        specular: PerBody[torch.Tensor] | None = None,
         geometry: Sequence[Geometry[torch.Tensor] | None] | None = None,
         clip_matrices: torch.Tensor | None = None,
-        **gloss: PerBody[torch.Tensor] | None,
     ) -> torch.Tensor:
         """Render a batch of images.
 
@@ -89,11 +90,11 @@ class MixedRenderer(torch.nn.Module):
             albedo: Likewise: a list for as many bodies as the scene with the most has, or a mapping by numbers or
                 names. A scene passes over bodies that it has not.
             textures, emission: Likewise.
+            roughness, metallic, specular: Likewise; as images those that are as wide as the mesh with the most vertices
+                has of them, or 1 wide, need the batch.
             geometry: From :meth:`placed` with the same ``which``; or a list of the results of the renderers' own
                 ``placed``, for each scene that of its images, in their order, None where it has no image.
             clip_matrices: As of a TorchRenderer; any of the renderers composes them.
-            gloss: ``roughness``, ``metallic`` and ``specular``, likewise; as images those that are as wide as the mesh
-                with the most vertices has of them, or 1 wide, need the batch.
         Returns:
             Linear RGB, premultiplied, and coverage, float32 of shape [batch, height, width, 4]: the images of the
             renderers of each scene.
@@ -117,7 +118,7 @@ class MixedRenderer(torch.nn.Module):
                 body: (batch.split(f"{name}[{body!r}]", value, ndim), ndim)
                 for body, (value, ndim) in self._checked_numbers(name, self._by_body(name, values)).items()
             }
-            for name, values in gloss.items()
+            for name, values in (("roughness", roughness), ("metallic", metallic), ("specular", specular))
         }
         geometries = batch.of_scenes(geometry)
         images_of_scenes = {}

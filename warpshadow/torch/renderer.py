@@ -1,10 +1,8 @@
 """A renderer of one scene, whose arguments are tensors."""
 
-import inspect
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from types import MappingProxyType
-from typing import Any, NamedTuple, ParamSpec, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,11 +11,11 @@ import warp as wp
 from warpshadow import check
 from warpshadow.assets.basis import Basis, describe_coefficients
 from warpshadow.assets.camera import Camera
-from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.explain import Explanation
 from warpshadow.pipeline.geometry import GEOMETRY_DTYPES, Geometry
+from warpshadow.pipeline.image_inputs import ImageInputs, takes
 from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.scene.scene import BodyLike, PerBody, Scene
 from warpshadow.stages.deform import DeformationGraph
@@ -27,9 +25,6 @@ from warpshadow.torch.arguments import Arguments, Slot
 from warpshadow.torch.autograd import uncompiled
 from warpshadow.torch.replay import Replays
 from warpshadow.tuning.renderer import Renderer
-
-P = ParamSpec("P")
-T = TypeVar("T")
 
 _ELSEWHERE = {
     **dict.fromkeys(
@@ -46,15 +41,7 @@ _ELSEWHERE = {
 """Remedies for keywords that a call does not have."""
 
 
-def with_gloss(function: Callable[P, T]) -> Callable[P, T]:
-    """Let a method's signature name the arguments that its last, ``gloss``, takes."""
-    signature = inspect.signature(function)
-    *first, gloss = signature.parameters.values()
-    arguments = [gloss.replace(name=name, kind=gloss.KEYWORD_ONLY, default=None) for name in GLOSS_ARGUMENTS]
-    function.__signature__ = signature.replace(parameters=[*first, *arguments])  # type: ignore[attr-defined]
-    types = {name: kind for name, kind in function.__annotations__.items() if name != "gloss"}
-    function.__annotations__ = types | dict.fromkeys(GLOSS_ARGUMENTS, gloss.annotation)
-    return function
+ImageTensors = ImageInputs[torch.Tensor, Geometry[torch.Tensor]]
 
 
 class LayerTensors(NamedTuple):
@@ -175,42 +162,13 @@ class TorchRenderer(torch.nn.Module):
 
     @uncompiled
     @check.keywords(**_ELSEWHERE)
-    @with_gloss
+    @takes(ImageTensors)
     @one_at_a_time
-    def forward(
-        self,
-        light: torch.Tensor | EnvironmentMap | None = None,
-        *,
-        albedo: PerBody[torch.Tensor] | None = None,
-        textures: PerBody[torch.Tensor] | None = None,
-        emission: PerBody[torch.Tensor] | None = None,
-        shell: torch.Tensor | None = None,
-        geometry: Geometry[torch.Tensor] | None = None,
-        clip_matrices: torch.Tensor | None = None,
-        **gloss: PerBody[torch.Tensor] | None,
-    ) -> torch.Tensor:
+    def forward(self, inputs: ImageTensors) -> torch.Tensor:
         """Render images.
 
         Args:
-            light: Free light, coefficients in :attr:`basis`, linear RGB, shape [coefficient, 3] or [batch, coefficient,
-                3]; or known light, which is shaded more accurately than free light can be, by default the scene's.
-            albedo: Reflectance of bodies in linear RGB, one color [3], one for each vertex [vertex, 3], or either in a
-                batch, [batch, 1 or vertex, 3]: a list for all bodies, None for the scene's own, or a mapping for some,
-                by their numbers or names: ``{"bunny": color}``. Values above 1, which a Body refuses, are taken as they
-                are: free ones may pass 1 on their way.
-            textures: Reflectance of bodies as images, [height, width, 3] or [batch, height, width, 3], which needs uvs;
-                a list or a mapping likewise.
-            emission: Radiance that bodies emit which have emission in the scene, linear RGB, as albedo.
-            shell: Where the scene's light has a radius: center and radius of the sphere that sends the light [scene
-                units], [4] or [batch, 4], in place of the scene's; all bodies are inside.
-            geometry: Vertices and spheres in world space, from :meth:`placed`; by default the scene's, which stand
-                still.
-            clip_matrices: Cameras, [4, 4] or [batch, 4, 4], from :meth:`clip_matrices` or
-                :func:`~warpshadow.torch.clip_matrices_from_opengl`; by default the renderer's own.
-            gloss: ``roughness``, ``metallic`` and ``specular`` of bodies that have roughness in the scene, in [0, 1],
-                one number, [] or [1], one for each vertex, [vertex], or either in a batch, [batch, 1 or vertex]; or as
-                images, [height, width] or [batch, height, width], of bodies with uvs: one that is as wide as there are
-                vertices, or 1 wide, needs the batch. A list or a mapping, as albedo.
+            inputs: All that an image takes.
         Returns:
             Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4], or [batch, height, width, 4]
             where an argument has a batch dimension or the renderer's own cameras have; the background is 0.
@@ -218,13 +176,7 @@ class TorchRenderer(torch.nn.Module):
             and where no light bounces to albedo and textures, may be differentiated again, in all of these;
             others raise NotImplementedError then.
         """
-        arguments, inputs = self._checked_inputs(
-            light,
-            geometry,
-            clip_matrices,
-            {"albedo": albedo, "textures": textures, "emission": emission, **gloss},
-            shell,
-        )
+        arguments, arrays = self._arrays_of(inputs)
 
         def draw(inputs: dict[str, Any]) -> wp.array:
             geometry_and_cameras = inputs.pop("geometry"), inputs.pop("clip_matrices")
@@ -237,7 +189,7 @@ class TorchRenderer(torch.nn.Module):
             "textures": not self.scene.bounces,
         }
         affine = [name for name in arguments.names if is_affine.get(name.partition("[")[0])]
-        return arguments.apply(draw, inputs, affine=affine, replays=self.replays)
+        return arguments.apply(draw, arrays, affine=affine, replays=self.replays)
 
     @uncompiled
     @one_at_a_time
@@ -252,101 +204,59 @@ class TorchRenderer(torch.nn.Module):
             have no gradient for another that comes in front of it; masks and coverage have that of silhouettes, as
             images have.
         """
-        arguments, inputs = self._checked_inputs(None, geometry, clip_matrices)
+        arguments, arrays = self._arrays_of(ImageInputs(geometry=geometry, clip_matrices=clip_matrices))
 
         def find(inputs: dict[str, Any]) -> tuple[wp.array, ...]:
             view = self.warp.view(inputs["geometry"], inputs["clip_matrices"])
             result = self.warp.layer_arrays(view)
             return (*result[:3], *result.masks)
 
-        depth, normals, bodies, *quartets = arguments.apply(find, inputs)
+        depth, normals, bodies, *quartets = arguments.apply(find, arrays)
         masks = torch.cat(quartets, dim=-1)[..., : len(self.scene.bodies)]
         return LayerTensors(depth, normals, bodies, masks.movedim(-1, -3))
 
     @uncompiled
     @check.keywords(**_ELSEWHERE)
-    @with_gloss
+    @takes(ImageTensors)
     @one_at_a_time
-    def insert(
-        self,
-        photograph: torch.Tensor,
-        light: torch.Tensor | EnvironmentMap | None = None,
-        *,
-        albedo: PerBody[torch.Tensor] | None = None,
-        textures: PerBody[torch.Tensor] | None = None,
-        emission: PerBody[torch.Tensor] | None = None,
-        shell: torch.Tensor | None = None,
-        geometry: Geometry[torch.Tensor] | None = None,
-        clip_matrices: torch.Tensor | None = None,
-        **gloss: PerBody[torch.Tensor] | None,
-    ) -> torch.Tensor:
+    def insert(self, photograph: torch.Tensor, inputs: ImageTensors) -> torch.Tensor:
         """Render the bodies in a photograph whose surfaces the scene's shadow catchers model.
 
         Args:
             photograph: Linear RGB, of radiance in the units of the light, of the size of the cameras' images,
                 [height, width, 3] or [batch, height, width, 3].
-            light, albedo, textures, emission, shell, geometry, clip_matrices, gloss: As for :meth:`forward`.
+            inputs: All that an image takes.
         Returns:
             Linear RGB, [height, width, 3] or [batch, height, width, 3]; see :mod:`warpshadow.stages.photograph`.
         Raises:
             ValueError: where no body of the scene is a catcher.
         Differentiable: all, as :meth:`forward` is; both the light with and that without the other bodies are.
         """
-        arguments, inputs = self._checked_inputs(
-            light,
-            geometry,
-            clip_matrices,
-            {"albedo": albedo, "textures": textures, "emission": emission, **gloss},
-            shell,
-        )
+        arguments, arrays = self._arrays_of(inputs)
         camera = self.cameras[0]
         size = camera.height, camera.width
-        inputs["photograph"] = arguments.add("photograph", photograph, wp.vec3, size, "linear RGB")
-        return arguments.apply(lambda inputs: self.warp.insert(**inputs), inputs)
+        arrays["photograph"] = arguments.add("photograph", photograph, wp.vec3, size, "linear RGB")
+        return arguments.apply(lambda inputs: self.warp.insert(inputs.pop("photograph"), **inputs), arrays)
 
     @uncompiled
     @check.keywords(**_ELSEWHERE)
-    @with_gloss
+    @takes(ImageTensors)
     @one_at_a_time
-    def explain(
-        self,
-        light: torch.Tensor | EnvironmentMap | None = None,
-        *,
-        albedo: PerBody[torch.Tensor] | None = None,
-        textures: PerBody[torch.Tensor] | None = None,
-        emission: PerBody[torch.Tensor] | None = None,
-        shell: torch.Tensor | None = None,
-        geometry: Geometry[torch.Tensor] | None = None,
-        clip_matrices: torch.Tensor | None = None,
-        **gloss: PerBody[torch.Tensor] | None,
-    ) -> Explanation:
-        """List the stages that a call with the same arguments computes and skips, as :meth:`Renderer.explain` does."""
-        arguments, inputs = self._checked_inputs(
-            light,
-            geometry,
-            clip_matrices,
-            {"albedo": albedo, "textures": textures, "emission": emission, **gloss},
-            shell,
-        )
-        return self.warp.explain(**arguments.filled(inputs))
-
-    def _checked_inputs(
-        self,
-        light: torch.Tensor | EnvironmentMap | None = None,
-        geometry: Geometry[torch.Tensor] | None = None,
-        clip_matrices: torch.Tensor | None = None,
-        of_bodies: Mapping[str, PerBody[torch.Tensor] | None] = MappingProxyType({}),
-        shell: torch.Tensor | None = None,
-    ) -> tuple[Arguments, dict[str, Any]]:
-        """The tensors among the arguments of a call, checked, and the inputs of the renderer of arrays.
+    def explain(self, inputs: ImageTensors) -> Explanation:
+        """List the stages that a call with the same arguments computes and skips, as :meth:`Renderer.explain` does.
 
         Args:
-            light, geometry, clip_matrices, shell: Of the call.
-            of_bodies: Reflectance of the call, by name.
+            inputs: All that an image takes.
         """
+        arguments, arrays = self._arrays_of(inputs)
+        return self.warp.explain(**arguments.filled(arrays))
+
+    def _arrays_of(self, inputs: ImageTensors) -> tuple[Arguments, dict[str, Any]]:
+        """The tensors among the inputs of an image, checked, and the arguments of the renderer of arrays."""
+        light, geometry, clip_matrices = inputs.light, inputs.geometry, inputs.clip_matrices
         has_cameras = self.warp.has_camera_batch and clip_matrices is None
         arguments = Arguments(self.device, cameras=self.cameras if has_cameras else None)
-        inputs: dict[str, Any] = {"light": light, "geometry": None, "clip_matrices": None}
+        arrays: dict[str, Any] = {"light": light, "geometry": None, "clip_matrices": None}
         if isinstance(light, torch.Tensor):
             description = describe_coefficients(self.basis, light.shape[-2] if light.ndim > 1 else 0)
             if light.ndim == 3 and light.shape[1] == 2 * light.shape[0]:
@@ -354,24 +264,24 @@ class TorchRenderer(torch.nn.Module):
                     "; of a map [height, width, 3] that is known, light=EnvironmentMap(map.numpy()); its coefficients "
                     "are torch.as_tensor(renderer.basis.coefficients(EnvironmentMap(map.numpy())), dtype=torch.float32)"
                 )
-            inputs["light"] = arguments.add("light", light, wp.vec3, (self.basis.size,), description)
+            arrays["light"] = arguments.add("light", light, wp.vec3, (self.basis.size,), description)
         elif isinstance(light, np.ndarray):  # which a renderer takes for known light
             raise ValueError("light: got ndarray, expected a tensor of torch.float32: torch.as_tensor makes one")
         if geometry is not None:
-            inputs["geometry"] = arguments.add_geometry("geometry", geometry, self.warp.rest())
+            arrays["geometry"] = arguments.add_geometry("geometry", geometry, self.warp.rest())
         if clip_matrices is not None:
-            inputs["clip_matrices"] = arguments.add("clip_matrices", clip_matrices, wp.mat44, ())
-        if shell is not None:
-            inputs["shell"] = arguments.add("shell", shell, wp.vec4, (), "its center and radius")
-        for name, values in of_bodies.items():
+            arrays["clip_matrices"] = arguments.add("clip_matrices", clip_matrices, wp.mat44, ())
+        if inputs.shell is not None:
+            arrays["shell"] = arguments.add("shell", inputs.shell, wp.vec4, (), "its center and radius")
+        for name, values in inputs.of_bodies.items():
             slots: list[Slot | None] = [None] * len(self.scene.bodies)
             for number, tensor in enumerate(self.scene.per_body(values, name)):
                 if tensor is not None:
                     message_name = self._item_name(name, values, number)
                     body_rows = self._body_rows(name, number, tensor)
                     slots[number] = arguments.add(f"{name}[{number}]", *body_rows, message_name=message_name)
-            (inputs.setdefault("gloss", {}) if name in GLOSS_ARGUMENTS else inputs)[name] = slots
-        return arguments, inputs
+            arrays[name] = slots
+        return arguments, arrays
 
     def _body_rows(
         self, name: str, number: int, tensor: torch.Tensor

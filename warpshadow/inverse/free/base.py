@@ -30,6 +30,11 @@ class Free(abc.ABC):
     """Whether geometry or cameras change with it."""
 
     @property
+    def is_light(self) -> bool:
+        """Whether images are linear in it, so that variable projection solves for it."""
+        return False
+
+    @property
     def name(self) -> str:
         """Its name in values and messages."""
         return self.key

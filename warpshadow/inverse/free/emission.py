@@ -32,10 +32,14 @@ class Emission(FreeOfBody):
         super().__post_init__()
         check.flag("per_vertex", self.per_vertex)
 
+    @property
+    def is_light(self) -> bool:
+        """Images are linear in it; one color is solved for, numbers of many vertices are descended to."""
+        return not self.per_vertex
+
     def check_scene(self, scene: Scene) -> None:
         """Raise ValueError for a body that does not emit."""
-        if scene.bodies[self.number].emission is None:
-            raise ValueError(f"body: got {self.number}, which does not emit; expected one that has emission")
+        check_emits(scene, self.number)
 
     def _unit(self, setting: Setting) -> float:
         """Radiance that counts as 1: a lamp is far brighter than its image."""
@@ -68,3 +72,9 @@ class Emission(FreeOfBody):
         """The radiance, of a body that has one."""
         emission = fitted.scene.bodies[self.number].emission
         return {} if self.per_vertex or emission is None else {f"{self.called(fitted)}.emission": emission}
+
+
+def check_emits(scene: Scene, body: int) -> None:
+    """Raise ValueError for a body that does not emit."""
+    if scene.bodies[body].emission is None:
+        raise ValueError(f"body: got {body}, which does not emit; expected one that has emission")

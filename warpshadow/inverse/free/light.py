@@ -11,10 +11,12 @@ import torch
 
 from warpshadow import check
 from warpshadow.assets.basis import Basis, CellBasis, HarmonicBasis
+from warpshadow.assets.light import EnvironmentMap
 from warpshadow.inverse.free.base import Free, Values
 from warpshadow.inverse.world import FittedScene, Setting, World
 from warpshadow.maths.directions import check_count, fibonacci
 from warpshadow.maths.sh import check_order
+from warpshadow.scene.scene import Scene
 
 # light of cells starts no lower [radiance of the targets]: a logarithm has to come back from there
 _MIN_RADIANCE = 1e-3
@@ -53,6 +55,18 @@ class Light(Free):
         for name in ("nonnegativity", "smoothness"):
             check.nonnegative(name, getattr(self, name))
 
+    def check_scene(self, scene: Scene) -> None:
+        """Raise ValueError for spherical harmonics in place of light that has a radius."""
+        if scene.shell is not None and self.order is not None:
+            raise ValueError(
+                f"order: got {self.order} for light that has a radius, expected cells: Light(None, directions=512)"
+            )
+
+    @property
+    def is_light(self) -> bool:
+        """Images are linear in it."""
+        return True
+
     @functools.cached_property
     def basis(self) -> Basis:
         """The basis of the light."""
@@ -88,9 +102,12 @@ class Light(Free):
         return self.nonnegativity * torch.relu(-radiance).square().mean()
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
-        """Spherical harmonics stay; cells become a map."""
+        """Spherical harmonics stay; cells become a map, of the radius that the scene's light has."""
         coefficients = self.coefficients(values, setting).cpu().numpy()
-        light = self.basis.to_map(coefficients) if isinstance(self.basis, CellBasis) else coefficients
+        light: np.ndarray | EnvironmentMap = coefficients
+        if isinstance(self.basis, CellBasis):
+            *center, radius = (0, 0, 0, None) if fitted.scene.shell is None else fitted.scene.shell.tolist()
+            light = EnvironmentMap(self.basis.to_map(coefficients).radiance, radius=radius, center=center)
         fitted.scene = replace(fitted.scene, light=light)
 
 

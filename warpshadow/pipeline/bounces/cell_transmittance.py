@@ -23,7 +23,7 @@ class CellTransmittance(NamedTuple):
     """Transmittance of a portion of the receivers in cells of directions."""
 
     transmittance_self: wp.array | None  # [batch, receiver, cell], past its own body; None where that is 1
-    transmittance_spheres: wp.array  # [batch, receiver, cell], past all bodies but planes, its own included
+    transmittance_nonplanar: wp.array  # [batch, receiver, cell], past all bodies but planes, its own included
     directions: np.ndarray  # [cell, 3]
     part_coverages: wp.array | None  # coverage by convex parts, vec4 of shape [batch, receiver, cell]; None without any
 
@@ -47,23 +47,23 @@ def find_cell_transmittance(
     merged_scene = method.merged_scene
     if method.sees_cells:
         directions, transmittance_self = projected_light.directions, visibility.transmittance_self
-        transmittance_spheres = (
+        transmittance_nonplanar = (
             visibility.transmittance_total
-            if visibility.transmittance_spheres is None
-            else visibility.transmittance_spheres
+            if visibility.transmittance_nonplanar is None
+            else visibility.transmittance_nonplanar
         )
     else:
         directions, transmittance_self = HARMONIC_GATHER_CELLS, None
-        transmittance_spheres = _transmittance(method, group, nonplanar_bodies(merged_scene), spheres, directions)
+        transmittance_nonplanar = _transmittance(method, group, nonplanar_bodies(merged_scene), spheres, directions)
     body = group.body
     if transmittance_self is None and body is not None and not group.is_solid and not merged_scene.is_flat[body]:
         transmittance_self = _transmittance(method, group, [body], spheres, directions)
-    if transmittance_spheres is None:
-        transmittance_spheres = wp.full(
+    if transmittance_nonplanar is None:
+        transmittance_nonplanar = wp.full(
             (*group.points.shape, len(directions)), 1.0, wp.float32, device=group.points.device
         )
     parts = None if visibility.part_coverages is None else visibility.part_coverages.cells
-    return CellTransmittance(transmittance_self, transmittance_spheres, directions, parts)
+    return CellTransmittance(transmittance_self, transmittance_nonplanar, directions, parts)
 
 
 def _transmittance(

@@ -147,7 +147,7 @@ class Gathering:
         # Cells look to where the light of the sky is, above horizons; light of planes is found around their middles. A
         # ball on a ground lost 4% of the ground's light by the former.
         middles = fibonacci(len(cells.directions))
-        arguments = points, group.normals, cells.transmittance_spheres, outgoing.frames, outgoing.texels, planes.all
+        arguments = points, group.normals, cells.transmittance_nonplanar, outgoing.frames, outgoing.texels, planes.all
         return plane_light(*arguments, middles, coverages=cells.part_coverages, fronts=fronts, skip=skip)
 
     def _from_spheres(self, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
@@ -166,7 +166,7 @@ class Gathering:
             centers,
             radii,
             proxy_radiance,
-            expand_rows(cells.transmittance_spheres, count),
+            expand_rows(cells.transmittance_nonplanar, count),
             cells.transmittance_self,
             cells.directions,
             softness=softness,

@@ -122,7 +122,7 @@ def _patch_weights(senders: Senders, visibility: list[PortionVisibility]) -> Pat
         find_mean_transmittance(
             portion.group.normals,
             portion.cells.transmittance_self,
-            portion.cells.transmittance_spheres,
+            portion.cells.transmittance_nonplanar,
             portion.cells.directions,
         )
         for portion in visibility

@@ -187,7 +187,7 @@ class Proxies:
                 numbers = np.where(self.overlays[1][senders.patch_of_sample] > 0, np.int32(-1), numbers)
             normals = tilt_normals_off_planes(points, normals, radii, numbers, fronts, frames, planes.all)
         rows = [
-            wp.full_like(portion.transmittance_spheres, 1.0, requires_grad=False)
+            wp.full_like(portion.transmittance_nonplanar, 1.0, requires_grad=False)
             if portion.transmittance_self is None
             else portion.transmittance_self
             for portion in cells

@@ -172,20 +172,24 @@ class Directional(SphereMethod):
         transmittance_self = self._transmittance_self(group, projected_light)
         # cached cells have light although their middles are below the horizon
         horizon_normals = normals if cached_rows is None else None
-        curved, parts = transmittance_self, None
+        past_spheres, parts = transmittance_self, None
         if points.size and radii.shape[1]:
-            spheres = self._past_spheres(group, horizon_normals, projected_light)
-            curved = spheres if curved is None else multiply_transmittances(curved, spheres)
+            of_spheres = self._past_spheres(group, horizon_normals, projected_light)
+            past_spheres = of_spheres if past_spheres is None else multiply_transmittances(past_spheres, of_spheres)
         if points.size and group.convex_parts_around is not None:
             cover = functools.partial(group.convex_parts_around.coverage, points, horizon_normals)
             parts = self._coverages(cover, projected_light)
         if group.is_before_planes and self.bounces is None:  # nobody asks for transmittance past all else
-            return GroupVisibility(None, transmittance_self, transmittance_curved=curved, part_coverages=parts)
-        total = curved if parts is None else self._past_coverages(curved, parts, None, projected_light)
+            return GroupVisibility(
+                None, transmittance_self, transmittance_self_and_spheres=past_spheres, part_coverages=parts
+            )
+        total = past_spheres if parts is None else self._past_coverages(past_spheres, parts, None, projected_light)
         if total is None:
             total = empty((*points.shape, len(projected_light.directions)), dtype=wp.float32, device=points.device)
             total.fill_(1.0)
-        return GroupVisibility(total, transmittance_self, transmittance_curved=curved, part_coverages=parts)
+        return GroupVisibility(
+            total, transmittance_self, transmittance_self_and_spheres=past_spheres, part_coverages=parts
+        )
 
     def _coverages(self, cover: Callable[..., wp.array], projected_light: ProjectedCells) -> CellCoverages:
         """Coverage of all cells and of sharp ones."""
@@ -272,9 +276,9 @@ class Directional(SphereMethod):
                 cells=coverage_of_light(points, covered.cells, planes.frames, planes.planes, *cells, **options)
             )
         total = self._past_coverages(
-            visibility.transmittance_curved, covered, visibility.part_coverages, projected_light
+            visibility.transmittance_self_and_spheres, covered, visibility.part_coverages, projected_light
         )
-        return visibility._replace(transmittance_total=total, transmittance_spheres=visibility.transmittance_total)
+        return visibility._replace(transmittance_total=total, transmittance_nonplanar=visibility.transmittance_total)
 
     def _transmittance_self(self, group: Group, projected_light: ProjectedCells) -> wp.array | None:
         """Transmittance past the body of the receivers: by its parts, or looked up, and by rays where asked."""

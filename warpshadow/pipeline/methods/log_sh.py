@@ -113,9 +113,9 @@ class LogSH(SphereMethod):
 
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """The log-visibility of the static spheres, for any light, [row, 1, order²]; and lobes, if one has its own."""
-        if any(body in blocker_kinds.traced for body in static_bodies.bodies):
-            find = functools.partial(self._accumulate_and_turn, blocker_kinds.traced)
-            return static_bodies.rows(("log sums and lobes", blocker_kinds.traced), find)
+        if any(body in blocker_kinds.self_traced for body in static_bodies.bodies):
+            find = functools.partial(self._accumulate_and_turn, blocker_kinds.self_traced)
+            return static_bodies.rows(("log sums and lobes", blocker_kinds.self_traced), find)
         return static_bodies.rows("log sums", self._accumulate)
 
     def _accumulate(self, static_bodies: StaticBodies, vertices: np.ndarray, normals: wp.array) -> wp.array:

@@ -2,10 +2,10 @@
 
 So are bodies on whose faces the light varies, from creases to the open or across shadows' edges (:data:`UNEVEN`).
 
-Flat bodies whose faces have more than 2 pixels are adaptive (:mod:`.receivers.adaptive`) where shadows may
-have edges, with directional visibility, where the light is known, and where arrays are readable, on a CPU: an image
-takes about 1.5 times as long as at the vertices of 64² quads, an iteration of a pose 1.2 times, and the ground has
-about the error that it has by pixel. Where a renderer has a basis, light is free, and nobody knows where edges will be.
+Flat bodies whose faces have more than 2 pixels are adaptive (:mod:`.receivers.adaptive`) where shadows may have edges,
+with directional visibility, where the light is known, and where arrays are readable, on a CPU: the ground has about the
+error that it has by pixel, in less time. Where a renderer has a basis, light is free, and nobody knows where edges will
+be.
 
 Between vertices light is interpolated, which shows where a face is large, or small and long, as spokes and rails are;
 so faces count by their pixels and by their longest edges. A picture that is made once can afford per-pixel receivers on
@@ -57,20 +57,7 @@ and cylinders of 100 pixels each the worst one was 33% too dark at vertices, and
 (0.54 s of CPU time for an image of moved bodies, and 0.66 s)."""
 
 UNEVEN = 0.06
-"""Error of light that is interpolated between vertices, relative L2, from which a body is shaded by pixel.
-
-Renderers' images of demos/kinds.py, 128², direct light, at vertices and by pixel, and CPU time of a moved one:
-
-    body, and its error foretold       at vertices       by pixel
-    stone in the pile, 25%             2.9%, 127 ms      1.8%, 146 ms
-    small bear, 19%                    3.7%,  26 ms      2.2%,  31 ms
-    bracket, 18%                       2.9%,  57 ms      1.9%,  98 ms
-    bear in the bowl, 12%              3.1%,  40 ms      2.6%,  52 ms
-    dunes of the land, 7%              5.5%, 107 ms      4.0%, 234 ms
-    bowl, 4%                           2.6%,  53 ms      2.6%,  74 ms
-
-Smooth bodies alone on a ground, such as bunnies, have 2 to 4%.
-"""
+"""Error of light that is interpolated between vertices, relative L2, from which a body is shaded by pixel."""
 
 _LONG_SHARE = 0.05  # share of a body's pixels that its longest faces show …
 
@@ -157,20 +144,15 @@ def with_receivers(scene: Scene, choices: Sequence[ReceiverChoice]) -> Scene:
 def for_picture(scene: Scene) -> Scene:
     """The scene, for a still: by rays, where it names neither a method nor settings that rays leave unused.
 
-    All receivers share their directions, as many as ``samples`` says, 512 by default: of 24 scenes of demos/kinds.py
-    (128², direct light) such pictures have a mean error of 1.5%, at worst 2.6%. They need no spheres and no tables,
-    whose making a picture would wait for, and the picture does not depend on the cache. Bodies with spheres
-    or ``self_shadows`` of their own name "directional", which has them.
+    All receivers share their directions, as many as ``samples`` says, 512 by default. They need no spheres and no
+    tables, whose making a picture would wait for, and the picture does not depend on the cache. Bodies with spheres or
+    ``self_shadows`` of their own name "directional", which has them.
 
     By other methods flat bodies that leave their receivers open are shaded by pixel, unless spheres bulge out of them.
 
     Interpolation between the vertices of a ground makes shadows' edges jagged. Under a sun so are all other bodies,
     and where their shadows on themselves are "traced", a sun's are found by "rays", as nobody asks for a gradient:
-    edges are as clean as of ``ray-traced``. Measured at 768 × 768 pixels, error of the image:
-
-        body, sun of 1° radius       at vertices       by pixel, looked up    by pixel and rays
-        spot, 2930 vertices          3.4%, 0.13 s      2.0%, 0.31 s           1.2%, 0.35 s
-        bear, 1986 vertices          7.3%, 0.11 s      3.6%, 0.20 s           1.9%, 0.34 s
+    edges are as clean as of ``ray-traced``.
     """
     if scene.visibility.method is None:
         if not any(isinstance(body.blockers, Spheres) or body.self_shadows for body in scene.bodies):

@@ -140,8 +140,9 @@ class GroupVisibility(NamedTuple):
 
     transmittance_total: wp.array | None  # visibility or transmittance past all bodies; None where nothing blocks
     transmittance_self: wp.array | None = None  # a factor of it: transmittance past its own body; None where that is 1
-    transmittance_spheres: wp.array | None = None  # transmittance past all but planes; None where no planes block
-    transmittance_curved: wp.array | None = None  # transmittance past its own body and spheres; None where that is 1
+    transmittance_nonplanar: wp.array | None = None  # past all but planes; None where no planes block
+    # transmittance past its own body and spheres, without convex parts and planes; None where that is 1
+    transmittance_self_and_spheres: wp.array | None = None
     part_coverages: CellCoverages | None = None  # coverage by convex parts; None where there are none around
 
 
@@ -259,7 +260,7 @@ def _groups_that_move(
         assert receivers.vertices is not None
         if span.first < receivers.vertices.size and len(blockers.positions) == 1:  # all cameras see the same vertices
             points_and_normals = receivers.points[:1], receivers.normals[:1]
-        is_traced = span.body in blockers.blocker_kinds.traced
+        is_traced = span.body in blockers.blocker_kinds.self_traced
         skip = blockers.merged_scene.spheres_among(sphere_bodies, span.body) if is_traced else (0, 0)
         others = none if skip == (0, spheres[1].shape[1]) else spheres
         points, normals = (cut(array, span.first, span.end) for array in points_and_normals)

@@ -25,7 +25,7 @@ Points = TypeVar("Points", bound="LitPoints")
 class BlockerKinds(NamedTuple):
     """Which bodies block light as planes, convex parts or by traced self-visibility; spheres block the rest."""
 
-    traced: tuple[int, ...] = ()  # bodies that block their own light as rays found, not by their spheres
+    self_traced: tuple[int, ...] = ()  # bodies whose self-visibility is traced, not that of their spheres
     rotations: Input | None = None  # of all bodies, mat33 of shape [batch, body]; None where they are not known
     why_spheres: tuple[str, ...] = ()  # of each body, why it blocks its own light by spheres; empty for others
     planes: tuple[int, ...] = ()  # bodies that block all light as the planes in which they lie
@@ -36,7 +36,7 @@ class BlockerKinds(NamedTuple):
     @property
     def separate(self) -> set[int]:
         """Bodies whose receivers form a group each."""
-        return {*self.traced, *self.solids, *self.planes}
+        return {*self.self_traced, *self.solids, *self.planes}
 
 
 ONLY_SPHERES = BlockerKinds()  # all bodies block by their spheres

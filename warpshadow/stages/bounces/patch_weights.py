@@ -7,8 +7,6 @@ with s a patch sample of patch p, T the transmittance past all bodies but planes
 the weights of patch samples by area. The light of a patch is Σ_s w_ps f_s L_s: samples that lie inside another body, or
 between books on a shelf, are dark, and few see them. By v, patches that other bodies bury wholly count hardly at all
 beside others, in a texel of a plane or among the proxies that a receiver sees through a cell.
-
-Without f a pile of bodies that stick in each other was 19% too dark, without v the ground around it 11%.
 """
 
 from __future__ import annotations
@@ -38,7 +36,7 @@ def _average_transmittance(
     # in
     normals: wp.array2d(dtype=wp.vec3),
     transmittance_self: wp.array3d(dtype=wp.float32),
-    transmittance_spheres: wp.array3d(dtype=wp.float32),
+    transmittance_nonplanar: wp.array3d(dtype=wp.float32),
     directions: wp.array(dtype=wp.vec3),
     # out
     mean_transmittance: wp.array2d(dtype=wp.vec3),
@@ -53,7 +51,7 @@ def _average_transmittance(
         sample_transmittance_self = float(1.0)
         if transmittance_self:
             sample_transmittance_self = transmittance_self[batch, patch_sample, q]
-        sums += cosine * wp.vec3(transmittance_spheres[batch, patch_sample, q], sample_transmittance_self, 0.0)
+        sums += cosine * wp.vec3(transmittance_nonplanar[batch, patch_sample, q], sample_transmittance_self, 0.0)
     mean_transmittance[batch, patch_sample] = sums
 
 
@@ -64,13 +62,13 @@ def _average_transmittance_adjoint(
     # in
     normals: wp.array2d(dtype=wp.vec3),
     transmittance_self: wp.array3d(dtype=wp.float32),
-    transmittance_spheres: wp.array3d(dtype=wp.float32),
+    transmittance_nonplanar: wp.array3d(dtype=wp.float32),
     directions: wp.array(dtype=wp.vec3),
     adj_mean_transmittance: wp.array2d(dtype=wp.vec3),
     # out
     adj_normals: wp.array2d(dtype=wp.vec3),
     adj_transmittance_self: wp.array3d(dtype=wp.float32),
-    adj_transmittance_spheres: wp.array3d(dtype=wp.float32),
+    adj_transmittance_nonplanar: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a patch sample of an instance."""
     batch, patch_sample = split_row(first_row + wp.tid(), normals.shape[1])
@@ -81,15 +79,15 @@ def _average_transmittance_adjoint(
         direction = directions[q]
         cosine = wp.dot(normal, direction)
         if cosine > 0.0:
-            adj_cosine = adj_mean[0] * transmittance_spheres[batch, patch_sample, q]
+            adj_cosine = adj_mean[0] * transmittance_nonplanar[batch, patch_sample, q]
             if transmittance_self:
                 adj_cosine += adj_mean[1] * transmittance_self[batch, patch_sample, q]
             else:
                 adj_cosine += adj_mean[1]
             adj_normal += adj_cosine * direction
-            if adj_transmittance_spheres:
-                adj_transmittance_spheres[batch, patch_sample, q] = (
-                    adj_transmittance_spheres[batch, patch_sample, q] + adj_mean[0] * cosine
+            if adj_transmittance_nonplanar:
+                adj_transmittance_nonplanar[batch, patch_sample, q] = (
+                    adj_transmittance_nonplanar[batch, patch_sample, q] + adj_mean[0] * cosine
                 )
             if adj_transmittance_self:
                 adj_transmittance_self[batch, patch_sample, q] = (
@@ -100,30 +98,30 @@ def _average_transmittance_adjoint(
 
 
 def find_mean_transmittance(
-    normals: wp.array, transmittance_self: wp.array | None, transmittance_spheres: wp.array, directions: np.ndarray
+    normals: wp.array, transmittance_self: wp.array | None, transmittance_nonplanar: wp.array, directions: np.ndarray
 ) -> wp.array:
     """Find the mean transmittance of the hemispheres of patch samples, past all bodies and past their own.
 
     Args:
         normals: Of the patch samples, vec3 of shape [batch, patch sample].
         transmittance_self: T_self, float32 of shape [batch, patch sample, direction]; None for 1.
-        transmittance_spheres: T, of the same shape. Any batch may be 1.
+        transmittance_nonplanar: T, of the same shape. Any batch may be 1.
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
     Returns:
         ⟨T⟩ + ε, ⟨T_self⟩ + ε and 0, vec3 of shape [batch, patch sample].
-    Differentiable: normals, transmittance_self, transmittance_spheres.
+    Differentiable: normals, transmittance_self, transmittance_nonplanar.
     """
     shape = "batch", normals.shape[1], len(directions)
-    check.shape("transmittance_spheres", transmittance_spheres.shape, shape)
-    arrays = {"normals": normals, "transmittance_spheres": transmittance_spheres}
+    check.shape("transmittance_nonplanar", transmittance_nonplanar.shape, shape)
+    arrays = {"normals": normals, "transmittance_nonplanar": transmittance_nonplanar}
     if transmittance_self is not None:
         check.shape("transmittance_self", transmittance_self.shape, shape)
         arrays["transmittance_self"] = transmittance_self
     batch_count, device = common_batch(arrays), normals.device
-    normals, transmittance_spheres = expand(normals, batch_count), expand_rows(transmittance_spheres, batch_count)
+    normals, transmittance_nonplanar = expand(normals, batch_count), expand_rows(transmittance_nonplanar, batch_count)
     if transmittance_self is not None:
         transmittance_self = expand_rows(transmittance_self, batch_count)
-    variables = [normals, transmittance_self, transmittance_spheres]
+    variables = [normals, transmittance_self, transmittance_nonplanar]
     inputs = [*variables, constant(np.asarray(directions, np.float32), wp.vec3, device)]
     cost = _CELL_COST * len(directions)
     return differentiable(

@@ -4,10 +4,9 @@
 
 L_k is the radiance of sample k, A_k its area vector, d_k and ω_k the distance and the direction to its middle, T_k the
 transmittance on the way. E is over π, as all shading is. The root is π d² but for receivers closer to a sample than
-samples are to each other, where nothing becomes infinite. With 64 samples a ball of radius r is 0.1% off from a
-distance of r above it, 1% from r/2. (With π d² + |A| in place of the root, the form factor of a disc on its axis, which
-samples beside each other are not, it would be 4% and 12% too dark.)
-An open body sends light to both sides: |A_k·ω_k| is in place of the maximum.
+samples are to each other, where nothing becomes infinite. (The form factor of a disc on its axis has π d² + |A| in
+place of the root; samples are beside each other.) An open body sends light to both sides: |A_k·ω_k| is in place of the
+maximum.
 """
 
 import warp as wp

@@ -12,8 +12,7 @@ distance d below the receiver:
 The part of the cell that the plane takes, h, is that within its outline (:mod:`warpshadow.stages.cell_coverage`); where
 edges are many, that within its rectangle, multiplied with the mesh's share of the footprint, by texels. Radiosity is
 bilinear in two mip levels of the grid, which are blended so that their texels are half as wide as the footprint is in
-the mean of both axes, t ρ / √c′. With texels as wide as it, bilinear means reach twice as far as the cell: under the
-roof of a barn with the sun outside light of the ground was 17 to 23% too strong, and is within 7% so.
+the mean of both axes, t ρ / √c′. With texels as wide as it, bilinear means would reach twice as far as the cell.
 
 No receiver is nearer to a side than a margin, so that t is not 0. Which side it is on, :mod:`.fronts` says; by height
 alone the front fades away and the back appears from the plane to a margin below it.

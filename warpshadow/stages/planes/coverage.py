@@ -4,8 +4,6 @@
 
 h_qk and μ_qk are the coverage of cell q by plane k (:mod:`warpshadow.stages.cell_coverage`). Plane blockers that share
 a cell mostly meet in it, as walls do, and cover different parts of it.
-
-On a cow over a ground the error of direct light is 0.7% of the image's mean by this, and 2.3% by a large sphere.
 """
 
 import numpy as np

@@ -5,8 +5,6 @@
 of a cell whose coverage by all planes is C, neither 0 nor 1, as of cells through which light comes from a window: eight
 directions ω_s are drawn from its light, each with a cell of its own around it, of which plane k covers h_k. c_s is
 max(n·ω_s, 0) for receivers in a plane; for others 1 above the horizon and 0 below it. Other cells take no time.
-
-A wall behind a window, in 32, 64 and 128 cells, is 15, 5.4 and 3.4% off by C, and 8.0, 4.5 and 2.6% by C′.
 """
 
 from __future__ import annotations

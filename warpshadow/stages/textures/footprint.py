@@ -213,7 +213,7 @@ def find_footprints(
     Returns:
         Footprints.
     Differentiable: clip_positions, barycentrics of the fragments, uvs; the width and the direction of a footprint
-    included, which matter: neglected, they were 1% to 15% of the gradient of a textured plane's pose.
+    included.
     """
     check.shape("uv_faces", uv_faces.shape, faces.shape)
     check.shape("texture_of_face", texture_of_face.shape, faces.shape)

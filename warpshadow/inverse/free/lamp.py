@@ -1,0 +1,109 @@
+"""A free lamp: the place of a body that emits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+
+from warpshadow.inverse import constraints
+from warpshadow.inverse.free.base import FreeOfBody, Values
+from warpshadow.inverse.free.emission import check_emits
+from warpshadow.inverse.world import FittedScene, Setting, World
+from warpshadow.maths.directions import fibonacci
+from warpshadow.scene.scene import Scene
+
+STARTS = 8
+"""Directions above the middle of a scene from which the search for a lamp starts."""
+
+_REACH = 4.0  # turn [radians], and logarithm of the distance, for a value of 1: a lamp moves farther than a pose
+
+
+@dataclass(frozen=True)
+class Lamp(FreeOfBody):
+    """The place of a lamp, a body that emits: its direction and distance from the middle of the others.
+
+    It keeps the size that it has as seen from there. So its distance says how fast its light falls off and how shadows
+    spread, and neither how bright the middle is nor how soft shadows are there. Its radiance is :class:`Emission`.
+
+    Args:
+        body: The body, its number or name.
+    """
+
+    key: ClassVar[str] = "lamp"
+    moves: ClassVar[bool] = True
+
+    def check_scene(self, scene: Scene) -> None:
+        """Raise ValueError for a body that does not emit, and for one that is alone."""
+        check_emits(scene, self.number)
+        if all(body.is_emitter for body in scene.bodies):
+            raise ValueError(f"body: got {self.number} in a scene of lamps alone, expected another body that it lights")
+
+    def start(self, setting: Setting) -> Values:
+        """Where the scene has it."""
+        return {"turn": setting.tensor(np.zeros(2)), "log_distance": setting.tensor(0.0)}
+
+    def _middle(self, setting: Setting) -> np.ndarray:
+        """Middle of the bodies that do not emit; of those that are not flat, if there are any."""
+        others = [body for body in setting.scene.bodies if not body.is_emitter]
+        solid = [body for body in others if not body.mesh.is_flat]
+        return np.mean([np.mean(body.world_mesh().bounds, axis=0) for body in solid or others], axis=0)
+
+    def _start(self, setting: Setting) -> tuple[np.ndarray, np.ndarray, float]:
+        """Middle of the others, and from there the direction and the distance of the lamp in the scene."""
+
+        def find() -> tuple[np.ndarray, np.ndarray, float]:
+            middle = self._middle(setting)
+            offset = setting.scene.bodies[self.number].to_world(setting.middle(self.number)) - middle
+            distance = float(np.linalg.norm(offset))
+            return middle, (offset / distance if distance > 0 else np.array(constraints.UP)), distance
+
+        return setting.cached(self, find)
+
+    def _placed(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor]:
+        """Translation and scale of the body. Differentiable: values."""
+        middle, towards, distance = self._start(setting)
+        body = setting.scene.bodies[self.number]
+        factor = (_REACH * values["log_distance"]).exp()
+        tangents = setting.tensor(constraints.remaining([towards]))
+        turn = _REACH * values["turn"]
+        angle = (turn.square().sum() + 1e-12).sqrt()
+        direction = angle.cos() * setting.tensor(towards) + angle.sin() / angle * (turn @ tangents)
+        scale = body.scale * factor
+        own_middle = setting.tensor(body.rotation_matrix() @ setting.middle(self.number))
+        return setting.tensor(middle) + distance * factor * direction - scale * own_middle, scale
+
+    def relocated(self, values: Values, setting: Setting, number: int) -> Values:
+        """The lamp in another direction above, as far away.
+
+        Args:
+            values: Of the lamp.
+            setting: Of the fit.
+            number: Of the direction, 0 to STARTS − 1; they repeat.
+        """
+        _, towards, _ = self._start(setting)
+        above = fibonacci(2 * STARTS)[:, [0, 2, 1]]
+        direction = above[above[:, 1] > 0][number % STARTS]
+        sideways = constraints.remaining([towards]) @ direction
+        angle = np.arctan2(np.linalg.norm(sideways), direction @ towards)
+        turn = angle / max(float(np.linalg.norm(sideways)), 1e-12) * sideways / _REACH
+        return {"turn": setting.tensor(turn), "log_distance": values["log_distance"].detach().clone()}
+
+    def apply(self, values: Values, setting: Setting, world: World) -> None:
+        """Move the lamp."""
+        world.translations[self.number], world.scales[self.number] = self._placed(values, setting)
+        world.moving.add(self.number)
+
+    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
+        """Move the lamp."""
+        translation, scale = (part.cpu().numpy() for part in self._placed(values, setting))
+        fitted.change_body(self.number, translation=translation, scale=float(scale))
+
+    def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
+        """Its place and scale."""
+        body = fitted.scene.bodies[self.number]
+        return {f"{self.called(fitted)}.{name}": getattr(body, name) for name in ("translation", "scale")}
