@@ -24,6 +24,8 @@ _COST = 30.0  # nanoseconds that a sample takes
 _MIN_KERNEL = 1.0e-10  # ε: of cells that are further away, where none is near
 _MIN_HORIZON_WEIGHT = 1.0e-7
 
+_ONES = wp.constant(Chunk(1.0))
+
 wp.set_module_options({"max_unroll": 1})
 
 
@@ -82,8 +84,8 @@ def _interpolate_cells(
             weight = wp.cw_mul(kernel, kernel) + Chunk(_MIN_KERNEL)
             through_sums += wp.cw_mul(weight, through[chunk])
             above_sums += wp.cw_mul(weight, above[chunk])
-        weights[batch, receiver, i] = wp.dot(above_sums, Chunk(1.0))
-        means[batch, receiver, i] = wp.dot(through_sums, Chunk(1.0)) / weights[batch, receiver, i]
+        weights[batch, receiver, i] = wp.dot(above_sums, _ONES)
+        means[batch, receiver, i] = wp.dot(through_sums, _ONES) / weights[batch, receiver, i]
 
 
 @wp.kernel(enable_backward=False)
@@ -148,7 +150,7 @@ def _interpolate_cells_adjoint(
             adj_through_cells[chunk] = adj_through_cells[chunk] + adj_through * weight
             adj_above_cells[chunk] = adj_above_cells[chunk] + adj_above * weight
         if adj_directions:
-            adj_direction = wp.vec3(wp.dot(adj_x, Chunk(1.0)), wp.dot(adj_y, Chunk(1.0)), wp.dot(adj_z, Chunk(1.0)))
+            adj_direction = wp.vec3(wp.dot(adj_x, _ONES), wp.dot(adj_y, _ONES), wp.dot(adj_z, _ONES))
             adj_directions[batch, receiver, i] = adj_directions[batch, receiver, i] + adj_direction
     adj_normal = wp.vec3()
     for chunk in range(cells.shape[1]):
