@@ -7,7 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import ParamSpec, Protocol, TypeAlias, TypeVar, overload
+from typing import Any, NamedTuple, ParamSpec, Protocol, TypeAlias, TypeVar, overload
 
 import torch
 import warp as wp
@@ -39,7 +39,17 @@ class Replayable(Protocol):
         """The results, and the call for its gradients."""
 
 
-FindCapture: TypeAlias = Callable[..., Replayable | None]  # of function, tensors, dtypes, requires_grad, device
+class TensorCall(NamedTuple):
+    """A call of a function of arrays with tensors."""
+
+    function: Callable[..., Any]
+    tensors: Sequence[torch.Tensor]
+    dtypes: Sequence[type]
+    requires_grad: Sequence[bool]  # whether a gradient to each tensor is asked for
+    device: torch.device
+
+
+FindCapture: TypeAlias = Callable[[TensorCall], Replayable | None]
 
 
 def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
@@ -242,8 +252,8 @@ class _WarpFunction(torch.autograd.Function):
     @staticmethod
     def forward(ctx, call: _Call, requires_grad: tuple[bool, ...], *tensors: torch.Tensor):
         with one_call:
-            call_arguments = call.function, tensors, call.dtypes, requires_grad, call.device
-            if call.find_capture is not None and (capture := call.find_capture(*call_arguments)) is not None:
+            tensor_call = TensorCall(call.function, tensors, call.dtypes, requires_grad, call.device)
+            if call.find_capture is not None and (capture := call.find_capture(tensor_call)) is not None:
                 ctx.save_for_backward(*tensors)
                 outputs, ctx.playback = capture.replay(tensors)
                 ctx.call, varies = call, capture.results_require_grad

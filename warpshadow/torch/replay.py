@@ -25,7 +25,7 @@ from warpshadow.device import cuda_graph
 from warpshadow.device.constants import collected
 from warpshadow.device.memory import require_gradient
 from warpshadow.device.tape import recorded, unrecorded
-from warpshadow.torch.autograd import array_of, as_array, current_stream, is_capturing
+from warpshadow.torch.autograd import TensorCall, array_of, as_array, current_stream, is_capturing
 
 _PLAIN_CALLS = 2  # of a kind before it is captured: the first compiles kernels and fills caches, as may the second
 _MAX_FAILURES = 2  # after which calls of a kind stay plain
@@ -50,33 +50,24 @@ class Replays:
         """Copies begin anew."""
         return functools.partial(Replays, is_on=self.is_on), ()
 
-    def find(
-        self,
-        key: Hashable,
-        reused: Collection[int],
-        function: Callable[..., Any],
-        tensors: Sequence[torch.Tensor],
-        dtypes: Sequence[type],
-        requires_grad: Sequence[bool],
-        device: torch.device,
-    ) -> Capture | None:
+    def find(self, key: Hashable, reused: Collection[int], call: TensorCall) -> Capture | None:
         """Find or make the capture of a call; None if it is to be plain.
 
         Args:
             key: Arguments of the call but the tensors.
             reused: Indices of tensors about which results are cached while they stay the same.
-            function, tensors, dtypes, requires_grad, device: The call, as of :func:`~warpshadow.torch.apply`.
+            call: The call.
         """
-        capture, self.reason = None, self._why_plain(device)
+        capture, self.reason = None, self._why_plain(call.device)
         if not self.reason:
-            shapes = tuple((tuple(tensor.shape), needs) for tensor, needs in zip(tensors, requires_grad, strict=True))
-            kind_key = str(device), key, shapes
+            pairs = zip(call.tensors, call.requires_grad, strict=True)
+            kind_key = str(call.device), key, tuple((tuple(tensor.shape), needs) for tensor, needs in pairs)
             kind = self._kinds.pop(kind_key, None) or _Kind()
             self._kinds[kind_key] = kind  # the last that was used
             while len(self._kinds) > _MAX_KINDS:
                 del self._kinds[next(iter(self._kinds))]
-            static = [tensors[number] for number in reused if not requires_grad[number]]
-            capture, self.reason = kind.find(function, tensors, dtypes, requires_grad, device, static)
+            static = [call.tensors[number] for number in reused if not call.requires_grad[number]]
+            capture, self.reason = kind.find(call, static)
         return capture
 
     def _why_plain(self, device: torch.device) -> str:
@@ -97,15 +88,7 @@ class _Kind:
         self._static: list[torch.Tensor] = []  # of the last call: held, so that no other lies where they did
         self._versions: list[tuple[int, int]] | None = None  # of these
 
-    def find(
-        self,
-        function: Callable[..., Any],
-        tensors: Sequence[torch.Tensor],
-        dtypes: Sequence[type],
-        requires_grad: Sequence[bool],
-        device: torch.device,
-        static: Sequence[torch.Tensor],
-    ) -> tuple[Capture | None, str]:
+    def find(self, call: TensorCall, static: Sequence[torch.Tensor]) -> tuple[Capture | None, str]:
         """The capture, or why there is none."""
         before, self._versions = self._versions, [(tensor.data_ptr(), tensor._version) for tensor in static]
         self._static = [tensor.detach() for tensor in static]
@@ -118,7 +101,7 @@ class _Kind:
             return None, "calls of this kind have not come often enough"
         if self._capture is None:
             try:
-                capture = Capture(function, tensors, dtypes, requires_grad, device)
+                capture = Capture(call)
             except (RuntimeError, MemoryError) as error:  # such as for a constant that is missing: plain calls make it
                 self._plain_calls, self._failures = 0, self._failures + 1
                 self._failure = f"it cannot be captured: {error}"
@@ -136,7 +119,7 @@ class Capture:
     """A call as graphs: one forward, and one backward if a tensor requires a gradient.
 
     Args:
-        function, tensors, dtypes, requires_grad, device: As of :func:`~warpshadow.torch.apply`.
+        call: The call, whose tensors are copied.
     Raises:
         RuntimeError: where the function cannot be captured.
         MemoryError: likewise.
@@ -144,14 +127,8 @@ class Capture:
         seconds, plain_seconds: How long it takes forward as a graph, and as a plain call.
     """
 
-    def __init__(
-        self,
-        function: Callable[..., Any],
-        tensors: Sequence[torch.Tensor],
-        dtypes: Sequence[type],
-        requires_grad: Sequence[bool],
-        device: torch.device,
-    ):
+    def __init__(self, call: TensorCall):
+        function, tensors, dtypes, requires_grad, device = call
         self._device = device
         self._inputs = [tensor.detach().clone(memory_format=torch.contiguous_format) for tensor in tensors]
         self._arguments = [as_array(*pair) for pair in zip(self._inputs, dtypes, strict=True)]
