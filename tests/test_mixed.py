@@ -261,3 +261,15 @@ def test_bodies_shine_and_emit_as_each_image_says():
     assert rough.grad[1].any() and not rough.grad[0, shiny[1].bodies[0].mesh.vertex_count :].any()
     with pytest.raises(ValueError, match=r"roughness\['ball'\]: got shape"):
         mixed(which, roughness={"ball": torch.rand(5)})
+
+
+def test_each_image_may_have_a_shell_of_its_own():
+    light = ws.EnvironmentMap(np.random.default_rng(0).random((4, 8, 3), np.float32), radius=5.0)
+    near = [dataclasses.replace(scene, light=light, visibility=ws.Visibility("none")) for scene in scenes()[:2]]
+    mixed, which = MixedRenderer(TorchRenderer(scene) for scene in near), [1, 0, 1]
+    shells = torch.tensor([[0.0, 0, 0, 5], [0, 1, 0, 4], [0.5, 0, 0, 6]], requires_grad=True)
+    images = mixed(which, shell=shells)
+    expected = [mixed.renderers[scene](shell=shell) for scene, shell in zip(which, shells, strict=True)]
+    assert_images(images, expected)
+    images.square().sum().backward()
+    assert shells.grad.any(dim=1).all()
