@@ -197,6 +197,19 @@ def test_parts_block_no_light_of_receivers_that_lie_on_them(point, normal, block
     np.testing.assert_array_equal(got[~is_above], 0)
 
 
+@pytest.mark.parametrize("height", [0.09, 0.11])
+def test_segments_of_bent_tubes_block_no_light_of_the_surface_they_stand_for(height, device):
+    """The surface lies within a segment at its inner side, and outside at its outer one."""
+    (part,) = find_convex_parts(SLAB.vertices, SLAB.faces)
+    radius = np.linalg.norm(SLAB.extents) / 2
+    at, facing = (wp.array([[v]], dtype=wp.vec3, device=device) for v in ((-0.3, height, 0.2), (0, 1, 0)))
+    for gap, shares in ((0.0, 1.0 if height < 0.1 else 0.0), (0.012 / radius, 0.0)):
+        some = ConvexBlockers.from_bodies([ConvexBody([part._replace(gap=gap)], 0)], 8, device=device)
+        placed = some.placed(wp.array(SLAB.vertices[None], dtype=wp.vec3, device=device))
+        got = part_coverage(at, placed, some, DIRECTIONS, horizon_normals=facing, on_surface=True).numpy()[0, 0, :, 0]
+        np.testing.assert_array_equal(got[DIRECTIONS[:, 1] > 0], shares)
+
+
 def test_narrow_cells_and_a_receivers_own_body_are_left_to_it(device):
     # beside corners, where silhouettes are
     toward = np.concatenate([VERTICES[0], VERTICES[1]])[:16] - POINTS[0] + 0.004

@@ -391,3 +391,23 @@ def test_auto_of_a_scene_with_bounces_has_shadows_and_bounces(few):
     scene = make_scene(visibility=ws.Visibility("auto", error=0.5))
     chosen = resolved(dataclasses.replace(scene, bounces=1))
     assert (chosen.visibility.method, chosen.bounces) == ("directional", 1)
+
+
+@pytest.mark.parametrize("bounces", [0, 1])
+@pytest.mark.parametrize("feature", ["gloss", "emission", "near light"])
+def test_scenes_of_which_one_method_shows_all_are_tuned_and_left_to_auto(few, feature, bounces):
+    scene = dataclasses.replace(make_scene(), bounces=bounces)
+    ball, ground = scene.bodies
+    if feature == "gloss":
+        ball = dataclasses.replace(ball, roughness=0.4, receivers="auto")
+    elif feature == "emission":
+        ball = dataclasses.replace(ball, emission=(1.0, 1.0, 1.0))
+    light = ws.EnvironmentMap(scene.light.radiance, radius=9.0) if feature == "near light" else scene.light
+    scene = dataclasses.replace(scene, bodies=(ball, ground), light=light)
+    tuning = ws.tune(scene, error=0.1, progress=False)
+    methods = {trial.scene.visibility.method for trial in tuning.trials}
+    assert methods == {"directional"} | ({"none"} if not bounces else set())
+    assert tuning.is_reached and ws.render(tuning.scene, progress=False)[..., 3].any()
+    automatic = dataclasses.replace(scene, visibility=ws.Visibility("auto", error=0.1))
+    assert resolved(automatic).visibility.method == "directional"
+    assert "shading" in str(ws.Renderer(automatic, progress=False).explain())

@@ -240,6 +240,21 @@ def _sum_of_halves(lanes: int) -> str:
     return "\n".join([*lines, "return part_1;"])
 
 
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    float sum = value.c[0];
+    for (int k = 1; k < {CHUNK}; ++k)
+        sum += value.c[k];
+    return sum;
+#else
+{_sum_of_halves(CHUNK)}
+#endif
+""")
+def total_of_chunk(value: Chunk) -> float:  # type: ignore[empty-body, valid-type]
+    """Sum of a chunk, on any device."""
+    ...
+
+
 def _on_columns(statement: str, lanes: int) -> str:
     """C++ that runs a statement on each ``number`` of rows of a block's vertices and its ``item`` of scratch memory.
 

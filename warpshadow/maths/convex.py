@@ -1,5 +1,5 @@
 """Convex parts of a mesh: its closed convex pieces, such as the boxes and rods of furniture, convex prisms into which
-other pieces are cut, such as a thick wall with a window, and panels of its sheets.
+other pieces are cut, such as a thick wall with a window, segments of bent rods, and panels of its sheets.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from warpshadow.maths.adjacency import edges_of
 from warpshadow.maths.components import connected_components
 from warpshadow.maths.outline import cut_outline, find_outline
 from warpshadow.maths.panels import MAX_PANELS, TOLERANCES, find_panels
+from warpshadow.maths.tubes import MAX_SEGMENTS, find_tube
 
 MAX_FACES = 64
 """Faces of a part at most; a cylinder of 48 sides has 50."""
@@ -29,6 +30,8 @@ _FLATNESS = 1e-4
 """Height over the size of the part up to which vertices lie in the plane of a face, and on a straight edge; and
 1 − cos α of the angle between neighboring triangles up to which they are of one face."""
 
+_TWIST = 5e-3  # the same of faces of segments of bent tubes, whose sides twist
+
 
 class ConvexPart(NamedTuple):
     """A closed convex piece of a mesh, without the edges inside its faces; or a panel, whose faces are its sides."""
@@ -43,6 +46,8 @@ class ConvexPart(NamedTuple):
     """Whether it is the face that two prisms share: seen at a slant both cover it, so it is to be taken off."""
     piece: int = 0
     """Number of the piece of the mesh, from 0. Parts of one piece are beside each other. All panels are of one."""
+    gap: float = 0.0
+    """Distance of the mesh from a part that stands in for a bent piece of it, at most, over the radius of the part."""
 
 
 def is_panel(part: ConvexPart) -> bool:
@@ -63,17 +68,16 @@ def find_convex_parts(
 
     Returns:
         The parts, which may touch and overlap: for each closed piece of the mesh a solid, or the prisms into which it
-        is cut if it is one, with holes or without; panels for each open one. They come by pieces, and in each the seams
-        of prisms come last. None where
-        a closed piece is hollow or curved otherwise, where a part has more than 64 faces, or where there are more than
-        32 prisms of a piece, or 64 panels.
+        is cut if it is one, with holes or without, or the segments of a bent tube; panels for each open one. They come
+        by pieces, and in each the seams come last. None where a closed piece is hollow or curved otherwise, where a
+        part has more than 64 faces, or where there are more than 32 prisms of a piece, 128 segments or 64 panels.
     """
     _, first, vertex = np.unique(positions, axis=0, return_index=True, return_inverse=True)
     triangles = vertex.reshape(-1)[faces]
     triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
     if not len(triangles):
         return None
-    points, pieces, sheets = positions.astype(np.float64)[first], [], []
+    points, pieces, sheets, segment_count = positions.astype(np.float64)[first], [], [], 0
     piece = _pieces(triangles)
     for number in range(piece.max() + 1):
         piece_triangles = triangles[piece == number]
@@ -81,10 +85,13 @@ def find_convex_parts(
             sheets.append(piece_triangles)
             continue
         solid = _solid(points, piece_triangles)
-        prisms = _prisms(points, piece_triangles) if solid is None else [solid]
-        if prisms is None:
-            return None
-        pieces.append(prisms)
+        parts_of_piece = [solid] if solid else _prisms(points, piece_triangles)
+        if parts_of_piece is None:
+            parts_of_piece = _segments(points, piece_triangles, MAX_SEGMENTS - segment_count)
+            if parts_of_piece is None:
+                return None
+            segment_count += len(parts_of_piece) - sum(part.is_seam for part in parts_of_piece)
+        pieces.append(parts_of_piece)
     panels = _find_panels(points, sheets, tolerances)
     if panels is None:
         return None
@@ -137,7 +144,7 @@ def _panel(corners: np.ndarray) -> ConvexPart:
     return ConvexPart(corners, sides, edges)
 
 
-def _solid(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
+def _solid(points: np.ndarray, triangles: np.ndarray, flatness: float = _FLATNESS) -> ConvexPart | None:
     """The convex solid that triangles enclose; None where they enclose none."""
     if len(triangles) > _MAX_TRIANGLES:
         return None
@@ -150,17 +157,17 @@ def _solid(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     volume, size = (normals * corners[:, 0]).sum() / 6, np.ptp(points[used_vertices], axis=0).max()
     if volume < 0:
-        return _solid(points, triangles[:, ::-1])
+        return _solid(points, triangles[:, ::-1], flatness)
     lengths = np.linalg.norm(normals, axis=1)
-    if volume <= _FLATNESS**2 * size**3 or not lengths.all():
+    if volume <= flatness**2 * size**3 or not lengths.all():
         return None
     units = normals / lengths[:, None]
     heights = (points[used_vertices] - points[triangles[:, 0]][:, None]) @ units[..., None]  # [triangle, vertex, 1]
-    if heights.max() > _FLATNESS * size:
+    if heights.max() > flatness * size:
         return None
     right = np.array([triangle_at[b, a] for a, b in edges.tolist()])
     left = np.tile(np.arange(count), 3)
-    is_flat = (units[left] * units[right]).sum(axis=1) > 1 - _FLATNESS
+    is_flat = (units[left] * units[right]).sum(axis=1) > 1 - flatness
     pairs = np.stack([left, right])[:, is_flat]
     face = connected_components(pairs[0], pairs[1], count)
     face_count = face.max() + 1
@@ -168,7 +175,7 @@ def _solid(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
         return None
     largest_faces = [np.flatnonzero(face == number)[lengths[face == number].argmax()] for number in range(face_count)]
     plane_offsets = points[triangles] - points[triangles[largest_faces, 0]][face][:, None]
-    if np.abs(plane_offsets @ units[largest_faces][face][..., None]).max() > _FLATNESS * size:
+    if np.abs(plane_offsets @ units[largest_faces][face][..., None]).max() > flatness * size:
         return None  # small bends add up to a curve
     runs: dict[tuple[int, int], list[list[int]]] = {}
     for (a, b), f, g in zip(edges.tolist(), face[left].tolist(), face[right].tolist(), strict=True):
@@ -180,7 +187,7 @@ def _solid(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
         if len(starts - ends) != 1 or len(ends - starts) != 1:
             return None
         (begin,), (end,) = starts - ends, ends - starts
-        if _bulge(points[[*starts | ends]], points[begin], points[end]) > _FLATNESS * size:
+        if _bulge(points[[*starts | ends]], points[begin], points[end]) > flatness * size:
             return None
         straight.append([begin, end, f, g])
     return ConvexPart(
@@ -238,6 +245,24 @@ def _prisms_along(
     prisms = [_prism(polygon, np.array([below_top[corner] for corner in polygon.tolist()])) for polygon in polygons]
     seams = [[a, b, below_top[b], below_top[a]] for a, b in _shared_sides(plane, polygons)]
     return prisms + [_panel(np.array(corners))._replace(is_seam=True) for corners in seams]
+
+
+def _segments(points: np.ndarray, triangles: np.ndarray, maximum: int) -> list[ConvexPart] | None:
+    """The straight segments of the tube that triangles enclose; None where they enclose none."""
+    tube = find_tube(points, triangles, maximum)
+    if tube is None:
+        return None
+    parts = []
+    for segment, gap in zip(tube.segments, tube.gaps.tolist(), strict=True):
+        solid = _solid(points, segment, _TWIST)
+        if solid is None:
+            return None
+        corners = points[solid.corners]
+        radius = np.linalg.norm(corners - corners.mean(axis=0), axis=1).max()
+        parts.append(solid._replace(gap=gap / radius + _TWIST))
+    sections = tube.sections
+    is_closed = (sections[0] == sections[-1]).all()
+    return parts + [_panel(section)._replace(is_seam=True) for section in sections[int(not is_closed) : -1]]
 
 
 def _shared_sides(plane: np.ndarray, polygons: Sequence[np.ndarray]) -> list[tuple[int, int]]:

@@ -85,12 +85,13 @@ class PointSample:
 
     @functools.cached_property
     def interpolated_reference(self) -> np.ndarray:
-        """Shading by rays at the corners of faces, interpolated, of shape [point, 3]."""
+        """Shading by rays at the corners of faces, interpolated, but of bodies that shine; of shape [point, 3]."""
         return self._trace("vertex")
 
     def _trace(self, receivers: str) -> np.ndarray:
         visibility = Visibility(method="ray-traced", samples=self._direction_count)
-        scene = change_bodies(self._scene, "receivers", dict.fromkeys(range(len(self._scene.bodies)), receivers))
+        changes = {k: "pixel" if body.is_glossy else receivers for k, body in enumerate(self._scene.bodies)}
+        scene = change_bodies(self._scene, "receivers", changes)
         return self.shading(replace(scene, visibility=visibility, supersampling=1, bounces=self._bounces))
 
     def decided(self, scene: Scene) -> Scene:

@@ -25,7 +25,7 @@ from warpshadow.device.threads import one_at_a_time
 from warpshadow.scene import toml_tables
 from warpshadow.scene.blockers import fitted_counts, fitted_meshes
 from warpshadow.scene.scene import Bounces, Scene, change_bodies, check_bounces, check_scene
-from warpshadow.scene.visibility import AUTO, METHOD_TRAITS, SPHERE_METHODS, Visibility
+from warpshadow.scene.visibility import AUTO, GLOSS_METHODS, METHOD_TRAITS, SPHERE_METHODS, Visibility
 from warpshadow.spheres import Spheres, fit_spheres, is_fitted
 from warpshadow.stages.visibility.zonal_logs import LOGS
 from warpshadow.tuning.point_sample import PointSample
@@ -205,12 +205,13 @@ def tune(
 ) -> Tuning:
     """Measure settings of a scene, and choose the cheapest that reaches an error, or the best within a time.
 
-    Tried are all methods but rays; 32 to 512 directions; orders 4, 6 and 8; 16 to 512 spheres for bodies that say how
-    many; and every pixel as a receiver for bodies whose vertices miss shadows.
+    Tried are all methods but rays, as far as they show all that the scene has; 32 to 512 directions; orders 4, 6 and 8;
+    16 to 512 spheres for bodies that say how many; and every pixel as a receiver for bodies whose vertices miss
+    shadows.
 
     Args:
         scene: The scene; its "auto" is not looked at.
-        error: Largest relative error of the shading, such as 0.03.
+        error: Largest relative error of the shading, such as 0.03: of diffuse light, whether bodies shine or not.
         milliseconds: In place of an error the longest time of an image.
         bounces: How often light bounces in the reference, such as 12 or "all": then 0, 1, 2 and 4 bounces are tried,
             too, as far as there are so many, and "all". By default the scene's, which are not varied.
@@ -243,7 +244,10 @@ def tune(
     pairs = zip(
         scene.bodies, sample.decided(scene).bodies, np.where(is_coarse, "pixel", "vertex").tolist(), strict=True
     )
-    fine = [body.receivers if receivers == decided.receivers else receivers for body, decided, receivers in pairs]
+    fine = [
+        body.receivers if receivers == decided.receivers or body.is_glossy else receivers
+        for body, decided, receivers in pairs
+    ]
     counts: Sequence[Bounces] = (scene.bounces,)
     if bounces is not None:
         counts = (*BOUNCE_COUNTS, "all") if bounces == "all" else [count for count in BOUNCE_COUNTS if count <= bounces]
@@ -416,9 +420,15 @@ def _settings(scene: Scene, fine: Sequence[str], fits: bool, device: wp.DeviceLi
         if not scene.bounces:
             yield replace(scene_with_receivers, visibility=scene.visibility.by("none"))
         for variant in _sphere_variants(scene_with_receivers, fits, device):
-            for method in SPHERE_METHODS:
+            for method in _sphere_methods(scene):
                 for visibility in _variants(scene.visibility, method):
                     yield replace(variant, visibility=visibility)
+
+
+def _sphere_methods(scene: Scene) -> list[str]:
+    """Methods with spheres that know gloss, emitters and near light where a scene has such."""
+    is_any = scene.shell is None and not any(body.is_glossy or body.is_emitter for body in scene.bodies)
+    return [method for method in SPHERE_METHODS if is_any or method in GLOSS_METHODS]
 
 
 def _sphere_variants(scene: Scene, fits: bool, device: wp.DeviceLike) -> Iterator[Scene]:

@@ -9,6 +9,7 @@ import trimesh
 import warpshadow as ws
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.receivers.choice_of_receivers import UNEVEN, choose_receivers
+from warpshadow.scene.scene import change_bodies
 
 
 def scene_of(*, sunk=0.1, **options):
@@ -61,6 +62,29 @@ def test_their_light_is_that_of_rays():
         image = ws.Renderer(dataclasses.replace(scene, bodies=bodies)).render()
         errors.append(np.abs(image - truth)[shows].mean())
     assert errors[0] < 0.7 * errors[1]
+
+
+def slats(count):
+    """Slats over a ground whose faces are smaller than two pixels."""
+    boxes = [trimesh.creation.box((0.06, 0.1, 1.6)).apply_translation((x, 1, 0)) for x in np.linspace(-1, 1, count)]
+    mesh = trimesh.util.concatenate(boxes)
+    bodies = [ws.Body(ws.Mesh(mesh.vertices, mesh.faces).creased()), ws.Body(ws.plane(6.0, 64), name="ground")]
+    camera = ws.Camera.look_at((1.6, 2.6, 4.6), (0, 0.5, 0), fov_y=36, size=(64, 64))
+    return ws.Scene(bodies, ws.synthetic_sky((0.4, 0.9, 0.3)), camera)
+
+
+@pytest.mark.parametrize(("count", "expected"), [(12, "adaptive"), (1, "vertex")])
+def test_grounds_have_receivers_where_shadows_are_narrower_than_their_faces(count, expected):
+    _, ground = chosen(slats(count))
+    assert ground.size.area < 2 and ground.receivers == expected
+
+
+def test_shadows_of_slats_are_those_of_rays():
+    scene = slats(12)
+    truth = ws.render(scene)[..., :3]
+    images = [ws.Renderer(scene), ws.Renderer(change_bodies(scene, "receivers", {1: "vertex"}))]
+    error, at_vertices = (np.linalg.norm(each.render()[..., :3] - truth) / np.linalg.norm(truth) for each in images)
+    assert error < 0.04 < at_vertices
 
 
 def waves(**options):

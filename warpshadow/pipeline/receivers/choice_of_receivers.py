@@ -2,10 +2,10 @@
 
 So are bodies on whose faces the light varies, from creases to the open or across shadows' edges (:data:`UNEVEN`).
 
-Flat bodies whose faces have more than 2 pixels are adaptive (:mod:`.receivers.adaptive`) where shadows may have edges,
-with directional visibility, where the light is known, and where arrays are readable, on a CPU: the ground has about the
-error that it has by pixel, in less time. Where a renderer has a basis, light is free, and nobody knows where edges will
-be.
+Flat bodies whose faces have more than 2 pixels, or between whose vertices light varies, are adaptive
+(:mod:`.receivers.adaptive`) where shadows may have edges, with directional visibility, where the light is known, and
+where arrays are readable, on a CPU: the ground has about the error that it has by pixel, in less time. Where a renderer
+has a basis, light is free, and nobody knows where edges will be.
 
 Between vertices light is interpolated, which shows where a face is large, or small and long, as spokes and rails are;
 so faces count by their pixels and by their longest edges. A picture that is made once can afford per-pixel receivers on
@@ -43,11 +43,11 @@ LARGE_SHARE = 2.0**-12
 COARSE_FACE = 400.0  # … up to so many pixels: beyond, interpolation shows, and draws a warning if the user asked for it
 
 SMALL_FACE = 2.0
-"""Pixels of an average face up to which the vertices of a flat body are as close as shadows need; in a small image an
-edge is as sharp there (a ground of 64² quads in 64² pixels is 0.9% off its image by pixel, adaptive 1.1%). Thin things
-need more: on grounds whose faces have 2.7 to 2.9 pixels, in 128² pixels, adaptive receivers took the errors of the
-chair, wheel and fence of demos/kinds.py from 7.3 to 5.5%, of the tent from 6.5 to 3.7% and of the cage from 9.3 to
-8.7%, in 1.1 to 1.2 times the time.
+"""Pixels of an average face up to which the vertices of a flat body are as close as shadows need, unless light is off
+by :data:`UNEVEN` between them; in a small image an edge is as sharp there (a ground of 64² quads in 64² pixels is 0.9%
+off its image by pixel, adaptive 1.1%). Thin things need more: on grounds whose faces have 2.7 to 2.9 pixels, in 128²
+pixels, adaptive receivers took the errors of the chair, wheel and fence of demos/kinds.py from 7.3 to 5.5%, of the tent
+from 6.5 to 3.7% and of the cage from 9.3 to 8.7%, in 1.1 to 1.2 times the time.
 """
 
 FEW_FACES = 256
@@ -57,7 +57,8 @@ and cylinders of 100 pixels each the worst one was 33% too dark at vertices, and
 (0.54 s of CPU time for an image of moved bodies, and 0.66 s)."""
 
 UNEVEN = 0.06
-"""Error of light that is interpolated between vertices, relative L2, from which a body is shaded by pixel."""
+"""Error of light that is interpolated between vertices, relative L2, from which a body is shaded by pixel, or a flat
+one adaptively."""
 
 _LONG_SHARE = 0.05  # share of a body's pixels that its longest faces show …
 
@@ -119,7 +120,7 @@ def choose_receivers(
     is_near = merged_scene.is_emitter.any() or merged_scene.scene.shell is not None
     where_edges_are = "pixel" if is_near else "adaptive"
     chosen = np.where(merged_scene.is_flat & is_sharp & is_seen_large, where_edges_are, chosen)
-    is_open = (chosen == "vertex") & (np.array(requested) == AUTO) & ~merged_scene.is_flat
+    is_open = (chosen == "vertex") & (np.array(requested) == AUTO) & (~merged_scene.is_flat | is_sharp)
     unevenness = np.zeros(len(chosen))
     if is_open.any() and merged_scene.scene.visibility.method != "none":
         faces = [np.unique(face_ids[face_ids >= 0], return_counts=True) for face_ids, _ in images]
@@ -127,7 +128,7 @@ def choose_receivers(
         light = EnvironmentMap.constant() if is_light_free else merged_scene.scene.known_light
         bodies = np.flatnonzero(is_open).tolist()
         unevenness[is_open] = light_unevenness(merged_scene, positions, seen, bodies, light)
-    chosen[unevenness > UNEVEN] = "pixel"
+    chosen = np.where(unevenness > UNEVEN, np.where(merged_scene.is_flat, where_edges_are, "pixel"), chosen)
     return [
         ReceiverChoice(choice if receivers == AUTO else receivers, size, float(error))
         for choice, receivers, size, error in zip(chosen.tolist(), requested, sizes, unevenness, strict=True)

@@ -47,7 +47,8 @@ _BOUND_MARGIN = 1.001
 """Bounds are so much larger, for rounding."""
 
 _ON_SURFACE = 3.0e-4
-"""Height above a face up to which a receiver lies on it, over the radius of the part: faces are flat to 1e-4."""
+"""Height above a face up to which a receiver lies on it, over the radius of the part: faces are flat to 1e-4. Where the
+part is a chord of a bent surface, its gap is added."""
 
 _ROUNDING = 1.0e-6
 """The same, over the distance of the part from the origin: several times that of float32."""
@@ -189,11 +190,16 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         result.sine = shrink * (sine + radius * cosine)
         return result
 
+    @wp.func(inline=True)
+    def find_margin(parts: ConvexArrays, part: int, bound: wp.vec4):
+        """Height above a face up to which a receiver lies on it."""
+        return (ON_SURFACE + parts.gaps[part]) * bound[3] + ROUNDING * wp.length(wp.vec3(bound[0], bound[1], bound[2]))
+
     @wp.func
     def find_rise(parts: ConvexArrays, part: int, task: PartsTask):
         """How far a part rises above tangent planes; not above 0 for receivers that lie on it."""
         bound = task.bounds[part]
-        margin = ON_SURFACE * bound[3] + ROUNDING * wp.length(wp.vec3(bound[0], bound[1], bound[2]))
+        margin = find_margin(parts, part, bound)
         above = Lane(-1.0e30)
         is_on = Lane(0.0)
         for face in range(parts.first_face[part], parts.first_face[part + 1]):
@@ -212,9 +218,12 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
     @wp.func
     def find_bound(inputs: PartInputs, part: int, task: PartsTask):
         """Find the cones around a part, and where it may block light."""
-        result = find_cones(task, task.bounds[part], inputs.radius)
+        bound = task.bounds[part]
+        result = find_cones(task, bound, inputs.radius)
         if inputs.on_surface and is_any_above(result.rise, 0.0):
-            result.rise = wp.min(result.rise, find_rise(inputs.parts, part, task))
+            depth = Lane(2.0 * bound[3] + find_margin(inputs.parts, part, bound)) - result.rise
+            if is_any_above(depth, 0.0):  # else it is above tangent planes
+                result.rise = wp.min(result.rise, find_rise(inputs.parts, part, task))
         return result
 
     @wp.func(inline=True)

@@ -37,6 +37,7 @@ class ConvexArrays:
     blocks: wp.array(dtype=wp.int32)  # whether a piece casts shadows
     first_part: wp.array(dtype=wp.int32)  # of each piece, and the end of the last
     signs: wp.array(dtype=wp.float32)  # of the coverage of each part: −1 for seams, which are a piece's last
+    gaps: wp.array(dtype=wp.float32)  # height above each part up to which receivers of its body lie, over its radius
     first_corner: wp.array(dtype=wp.int32)  # of each part, and the end of the last
     first_face: wp.array(dtype=wp.int32)
     first_edge: wp.array(dtype=wp.int32)
@@ -78,6 +79,7 @@ class ConvexBlockers:
         arrays.first_part = wp.array(_starts(list(counts.values())), dtype=wp.int32, device=device)
         signs = [-1.0 if part.is_seam else 1.0 for part in parts]
         arrays.signs = wp.array(signs, dtype=wp.float32, device=device)
+        arrays.gaps = wp.array([part.gap for part in parts], dtype=wp.float32, device=device)
         arrays.first_corner = wp.array(starts["corners"], dtype=wp.int32, device=device)
         arrays.first_face = wp.array(starts["faces"], dtype=wp.int32, device=device)
         arrays.first_edge = wp.array(starts["edges"], dtype=wp.int32, device=device)

@@ -12,7 +12,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, expand_rows
 from warpshadow.device.constants import constant
-from warpshadow.device.lanes import Chunk, as_chunks, use_vector_registers
+from warpshadow.device.lanes import Chunk, as_chunks, total_of_chunk, use_vector_registers
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, scratch_slot, split_row
@@ -23,8 +23,6 @@ _COST = 30.0  # nanoseconds that a sample takes
 
 _MIN_KERNEL = 1.0e-10  # ε: of cells that are further away, where none is near
 _MIN_HORIZON_WEIGHT = 1.0e-7
-
-_ONES = wp.constant(Chunk(1.0))
 
 wp.set_module_options({"max_unroll": 1})
 
@@ -84,8 +82,8 @@ def _interpolate_cells(
             weight = wp.cw_mul(kernel, kernel) + Chunk(_MIN_KERNEL)
             through_sums += wp.cw_mul(weight, through[chunk])
             above_sums += wp.cw_mul(weight, above[chunk])
-        weights[batch, receiver, i] = wp.dot(above_sums, _ONES)
-        means[batch, receiver, i] = wp.dot(through_sums, _ONES) / weights[batch, receiver, i]
+        weights[batch, receiver, i] = total_of_chunk(above_sums)
+        means[batch, receiver, i] = total_of_chunk(through_sums) / weights[batch, receiver, i]
 
 
 @wp.kernel(enable_backward=False)
@@ -150,7 +148,7 @@ def _interpolate_cells_adjoint(
             adj_through_cells[chunk] = adj_through_cells[chunk] + adj_through * weight
             adj_above_cells[chunk] = adj_above_cells[chunk] + adj_above * weight
         if adj_directions:
-            adj_direction = wp.vec3(wp.dot(adj_x, _ONES), wp.dot(adj_y, _ONES), wp.dot(adj_z, _ONES))
+            adj_direction = wp.vec3(total_of_chunk(adj_x), total_of_chunk(adj_y), total_of_chunk(adj_z))
             adj_directions[batch, receiver, i] = adj_directions[batch, receiver, i] + adj_direction
     adj_normal = wp.vec3()
     for chunk in range(cells.shape[1]):
