@@ -44,6 +44,24 @@ def test_light_turns_as_in_scene_files(scene):
     )
 
 
+@pytest.mark.parametrize("feature", ["gloss", "emission", "near light"])
+def test_settings_of_a_scene_that_shows_more_can_all_be_chosen(scene, feature):
+    ball, ground = scene.bodies
+    ball = dataclasses.replace(
+        ball, **{"gloss": {"roughness": 0.4}, "emission": {"emission": (1, 1, 1)}}.get(feature, {})
+    )
+    radius = 20.0 if feature == "near light" else None
+    light = ws.EnvironmentMap(scene.light.radiance, radius=radius)
+    scene = dataclasses.replace(scene, bodies=[ball, ground], light=light)
+    assert scene.methods == ("directional", "none", "ray-traced")
+    for method in scene.methods:
+        viewer_state = dataclasses.replace(ViewerState.of(scene), method=method, receivers="vertex", turn=90.0)
+        shown = viewer_state.scene(scene)
+        assert shown.visibility.method == method and shown.light.radius == radius
+        assert [body.receivers for body in shown.bodies] == ["auto" if ball.is_glossy else "vertex", "vertex"]
+    assert ws.render(shown, progress=False)[..., 3].any()
+
+
 def test_settings_change_what_they_name_and_a_quality_bounds_them(scene):
     viewer_state = dataclasses.replace(
         ViewerState.of(scene), directions=256, softness=0.5, receivers="pixel", bounces=2

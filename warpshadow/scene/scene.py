@@ -247,6 +247,12 @@ class Scene:
         """Center and radius of the sphere that sends the light, [4]; None for light from infinitely far away."""
         return self.light.shell if isinstance(self.light, EnvironmentMap) else None
 
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Methods of visibility that show all that the scene has: gloss, emission and near light."""
+        is_any = self.shell is None and not any(body.is_glossy or body.is_emitter for body in self.bodies)
+        return tuple(method for method in METHODS if is_any or method in GLOSS_METHODS)
+
     def with_method(self) -> Scene:
         """The scene as renderers have it: "directional" where no method is named."""
         return self if self.visibility.method else replace(self, visibility=self.visibility.with_method())

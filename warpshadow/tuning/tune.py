@@ -25,7 +25,7 @@ from warpshadow.device.threads import one_at_a_time
 from warpshadow.scene import toml_tables
 from warpshadow.scene.blockers import fitted_counts, fitted_meshes
 from warpshadow.scene.scene import Bounces, Scene, change_bodies, check_bounces, check_scene
-from warpshadow.scene.visibility import AUTO, GLOSS_METHODS, METHOD_TRAITS, SPHERE_METHODS, Visibility
+from warpshadow.scene.visibility import AUTO, METHOD_TRAITS, SPHERE_METHODS, Visibility
 from warpshadow.spheres import Spheres, fit_spheres, is_fitted
 from warpshadow.stages.visibility.zonal_logs import LOGS
 from warpshadow.tuning.point_sample import PointSample
@@ -420,15 +420,9 @@ def _settings(scene: Scene, fine: Sequence[str], fits: bool, device: wp.DeviceLi
         if not scene.bounces:
             yield replace(scene_with_receivers, visibility=scene.visibility.by("none"))
         for variant in _sphere_variants(scene_with_receivers, fits, device):
-            for method in _sphere_methods(scene):
-                for visibility in _variants(scene.visibility, method):
+            for method in SPHERE_METHODS:
+                for visibility in _variants(scene.visibility, method) if method in scene.methods else ():
                     yield replace(variant, visibility=visibility)
-
-
-def _sphere_methods(scene: Scene) -> list[str]:
-    """Methods with spheres that know gloss, emitters and near light where a scene has such."""
-    is_any = scene.shell is None and not any(body.is_glossy or body.is_emitter for body in scene.bodies)
-    return [method for method in SPHERE_METHODS if is_any or method in GLOSS_METHODS]
 
 
 def _sphere_variants(scene: Scene, fits: bool, device: wp.DeviceLike) -> Iterator[Scene]:

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.primitives import icosphere
 from warpshadow.scene.body import RECEIVERS
-from warpshadow.scene.visibility import METHODS
 from warpshadow.viewer import gizmo
 from warpshadow.viewer.loop import Loop
 from warpshadow.viewer.page_camera import PAGE_RADIUS, quaternion
@@ -79,7 +78,7 @@ class Panel:
         gui, viewer_state = self._server.gui, self._loop.viewer_state
         cells, counts = sorted({*_CELLS, viewer_state.directions}), (AS_GIVEN, *map(str, _SPHERES))
         with gui.add_folder("Shadows"):
-            method = gui.add_dropdown("Method", METHODS, initial_value=viewer_state.method)
+            method = gui.add_dropdown("Method", self._scene.methods, initial_value=viewer_state.method)
             self._bind(method, "method")
             directions = gui.add_dropdown(
                 "Directions", tuple(map(str, cells)), initial_value=str(viewer_state.directions)

@@ -141,11 +141,18 @@ class ViewerState:
         return Visibility.of(vars(requested_visibility) | bounded_settings)
 
     def bodies(self, bodies: tuple[Body, ...]) -> tuple[Body, ...]:
-        """Bodies with the spheres and receivers that are asked for, where the scene has them."""
+        """Bodies with the spheres and receivers that are asked for, where the scene has them.
+
+        Bodies that shine keep their receivers.
+        """
         changed_settings: dict[str, object] = {} if self.receivers == AS_GIVEN else {"receivers": self.receivers}
         counts = {} if self.spheres is None else {"blockers": self.spheres}
         return tuple(
-            dataclasses.replace(body, **changed_settings, **(counts if body.casts_shadow else {}))  # type: ignore[arg-type]
+            dataclasses.replace(
+                body,
+                **({} if body.is_glossy else changed_settings),  # type: ignore[arg-type]
+                **(counts if body.casts_shadow else {}),  # type: ignore[arg-type]
+            )
             for body in bodies
         )
 
