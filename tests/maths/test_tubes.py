@@ -30,6 +30,19 @@ def hook(corners=12):
     return mesh
 
 
+def column(depth):
+    """A column turned on a lathe, of twelve grooves."""
+    heights, around = np.linspace(0, 1, 121), 2 * np.pi * np.arange(24) / 24
+    radii = 0.3 * (1 + depth * np.sin(2 * np.pi * 12 * heights))
+    points = np.stack([radii[:, None] * np.cos(around), radii[:, None] * np.sin(around)], axis=-1)
+    points = np.concatenate([points, np.broadcast_to(2 * heights[:, None, None], (121, 24, 1))], axis=-1)
+    number = np.arange(121 * 24).reshape(121, 24)
+    a, b, c, d = number[:-1], np.roll(number, -1, 1)[:-1], np.roll(number, -1, 1)[1:], number[1:]
+    sides = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    fans = [[(end[0], end[k], end[k + 1]) for k in range(1, 23)] for end in (number[0, ::-1], number[-1])]
+    return trimesh.Trimesh(points.reshape(-1, 3), np.concatenate([sides, *fans]), process=False)
+
+
 def parts_of(mesh):
     return find_convex_parts(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces))
 
@@ -80,3 +93,10 @@ def test_a_mesh_of_too_many_segments_has_no_parts():
     links = [ring().apply_translation((k, 0, 0)) for k in range(MAX_SEGMENTS // 24 + 1)]
     assert parts_of(trimesh.util.concatenate(links[:-1])) is not None
     assert parts_of(trimesh.util.concatenate(links)) is None
+
+
+@pytest.mark.parametrize("depth", [0.05, 0.1, 0.19])
+def test_grooves_are_not_filled(depth):
+    """They are within the slack of a single segment, which would have no shadow on itself."""
+    solids = [part for part in parts_of(column(depth)) if not part.is_seam]
+    assert len(solids) >= 24 and max(part.gap for part in solids) < 0.05

@@ -195,25 +195,29 @@ class EnvironmentMap:
     def with_sun(
         self, direction: npt.ArrayLike, irradiance: npt.ArrayLike, *, angular_radius: float = 0.27
     ) -> EnvironmentMap:
-        """Add a sun: an even disc, whose shadows have edges as soft as it is wide.
+        """Add a sun: an even disc infinitely far away, whose shadows have edges as soft as it is wide.
 
         Args:
             direction: Towards the sun, of any length, shape [3].
             irradiance: Of a surface that faces it [the map's radiance · sr], one number or RGB; white there looks
                 irradiance / π.
-            angular_radius: Of the disc [degrees]; the real sun's is the default. The pixels of the result are no wider
-                than the disc: those of a coarser map are divided, which changes none of its light.
+            angular_radius: Of the disc [degrees], up to 90; the real sun's is the default. The pixels of the result are
+                no wider than that: those of a coarser map are divided, which changes none of its light.
         Raises:
-            ValueError: for a disc so small that the map would have more than 4096 rows.
+            ValueError: for a disc so small that the map would have more than 4096 rows, and for a map with a radius.
         """
+        if self.radius is not None:
+            raise ValueError(f"radius: got {self.radius:g}, expected a map infinitely far away, as a sun is")
         axis = check.array("direction", direction, (3,), "a direction (x, y, z)")
         if not axis.any():
             raise ValueError("direction: got a zero vector, expected a direction")
-        radius, rows = np.radians(check.positive("angular_radius", angular_radius)), len(self.radiance)
-        division = max(1, math.ceil(np.pi / rows / (2 * radius)))
+        if check.positive("angular_radius", angular_radius) > 90:
+            raise ValueError(f"angular_radius: got {angular_radius:g}, expected degrees up to 90")
+        radius, rows = np.radians(angular_radius), len(self.radiance)
+        division = max(1, math.ceil(np.pi / rows / radius))
         if division > 1 and rows * division > _MAX_SUN_ROWS:
             raise ValueError(
-                f"angular_radius: got {angular_radius:g}, expected {90 / (_MAX_SUN_ROWS // rows * rows):.2g} or more, "
+                f"angular_radius: got {angular_radius:g}, expected {180 / (_MAX_SUN_ROWS // rows * rows):.2g} or more, "
                 f"for which this map gets {_MAX_SUN_ROWS} rows"
             )
         pixels = self.radiance.repeat(division, axis=0).repeat(division, axis=1)
@@ -221,7 +225,7 @@ class EnvironmentMap:
         pixel = np.pi / height
         cosines = sh.equirectangular_directions(height) @ (axis / np.linalg.norm(axis))
         disc = np.clip((radius + pixel / 2 - np.arccos(np.clip(cosines, -1, 1))) / pixel, 0, 1)
-        disc /= np.sum(disc * sh.pixel_solid_angles(height)[:, None])
+        disc /= np.sum(disc * np.maximum(cosines, 0) * sh.pixel_solid_angles(height)[:, None])
         return self._with_radiance(pixels + disc[..., None] * _color("irradiance", irradiance))
 
     def _repr_png_(self) -> bytes:

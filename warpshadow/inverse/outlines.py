@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from warpshadow.inverse.edges import signed_distances
 from warpshadow.inverse.target import Target, area_means
 from warpshadow.scene.scene import Scene
 
@@ -60,19 +61,3 @@ def outlines_of(targets: Sequence[Target], scene: Scene, scale: float, device: t
     height_means, width_means = (area_means(count, max(1, round(count * scale))) for count in distances.shape[1:])
     small_distances = torch.einsum("ih,ohw,jw->oij", height_means, torch.from_numpy(distances), width_means)
     return Outlines(views, bodies, small_distances.contiguous().to(device), scale)
-
-
-def signed_distances(mask: np.ndarray) -> np.ndarray:
-    """Distance of pixel centers from the edge of a mask [pixels], positive inside, float32 of shape [height, width].
-
-    Where the edge crosses a pixel, the part that is covered tells its distance.
-    """
-    from scipy.ndimage import distance_transform_edt
-
-    is_inside = mask >= 0.5
-    if is_inside.all() or not is_inside.any():
-        return np.full(mask.shape, np.hypot(*mask.shape) * (1 if is_inside.all() else -1), np.float32)
-    signed_distance = distance_transform_edt(is_inside) - distance_transform_edt(~is_inside)
-    signed_distance -= 0.5 * np.sign(signed_distance)
-    crosses = np.abs(signed_distance) <= 0.5
-    return np.where(crosses, mask - 0.5, signed_distance).astype(np.float32)

@@ -15,6 +15,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.lens import checked_distortion, undistorted
 from warpshadow.assets.picture import development
 from warpshadow.check import AnyPath
+from warpshadow.inverse.edges import edge_offset, moved_outline
 from warpshadow.inverse.encoding import Encoding, checked_encoding, decoded, guess_encoding, read_linear, read_mask
 from warpshadow.scene.scene import BodyLike
 
@@ -42,6 +43,8 @@ class Target:
             there. None: none is, but 1 in a picture as above.
         outlines: Where bodies are seen, by their numbers or names: masks as above, which the bodies' own are to cover.
             They tell a pose even where light and reflectance are unknown.
+        moves_outlines: Move each outline outwards or inwards to the edges of the image beside it, as far as three
+            pixels; see :func:`~warpshadow.inverse.edges.edge_offset`. For masks that are not right to the pixel.
         distortion: OpenCV's coefficients k1, k2, p1, p2[, k3] of the camera's lens: the image is made that of a
             pinhole, and pixels that the lens did not see do not count.
     """
@@ -64,6 +67,7 @@ class Target:
         white_balance: npt.ArrayLike | None = None,
         saturation: float | None = None,
         outlines: Mapping[BodyLike, npt.ArrayLike | AnyPath] | None = None,
+        moves_outlines: bool = False,
         distortion: npt.ArrayLike | None = None,
     ):
         checked_curve = None if encoding is None else checked_encoding(encoding)
@@ -105,8 +109,12 @@ class Target:
                     "8 bits: mask / 255"
                 )
             object.__setattr__(self, "mask", mask)
-            image[mask == 0] = 0  # whatever the value
         object.__setattr__(self, "outlines", _outlines(outlines or {}, image.shape[:2]))
+        check.flag("moves_outlines", moves_outlines)
+        if moves_outlines:
+            self.outlines.update({body: _at_edges(image, outline) for body, outline in self.outlines.items()})
+        if self.mask is not None:
+            image[self.mask == 0] = 0  # whatever the value
         size = image.shape[1], image.shape[0]
         check.instance("camera", self.camera, (Camera, type(None)), "a Camera, or None for the scene's")
         if self.camera is not None and (self.camera.width, self.camera.height) != size:
@@ -162,6 +170,10 @@ def _outlines(
             check.finite("mask", mask, minimum=0, maximum=1)
         masks[body] = mask
     return masks
+
+
+def _at_edges(image: np.ndarray, outline: np.ndarray) -> np.ndarray:
+    return moved_outline(outline, edge_offset(np.nan_to_num(image[..., :3]), outline))
 
 
 def _gains(white_balance: npt.ArrayLike | None) -> np.ndarray:

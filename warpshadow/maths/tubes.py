@@ -21,6 +21,10 @@ _MAX_BEND = (
     0.95  # cosine of the angle between neighboring segments at least, 18°: with 30° shadows of rings had corners
 )
 
+_MAX_SWELL = 0.03
+"""Distance of the corners of a section from its middle, over that of straight segments, from 1 at most: rods are bent,
+not turned on a lathe. Grooves of a column would have no shadows on it."""
+
 _MAX_TWIST = 0.02  # 1 − cos α of the angle between the triangles of a quad at most, 11°; and error of the volume
 
 
@@ -96,11 +100,18 @@ def _bulge(points: np.ndarray, section: np.ndarray, next_section: np.ndarray, be
     return float(np.linalg.norm(np.cross(points[between] - starts, units), axis=-1).max(initial=0.0))
 
 
+def _swell(radii: np.ndarray, chosen: np.ndarray) -> float:
+    """Largest part by which radii of sections, [section, corner], differ from those between chosen ones."""
+    places = np.arange(len(radii))
+    expected = np.stack([np.interp(places, chosen, column) for column in radii[chosen].T], axis=1)
+    return float(np.abs(radii / expected - 1).max())
+
+
 def _straightened(points: np.ndarray, sections: np.ndarray, maximum: int) -> Tube | None:
     """The tube of as few of the sections as there may be, about as many apart; None if they are too many."""
     middles = points[sections].mean(axis=1)
     radius = np.linalg.norm(points[sections] - middles[:, None], axis=2).mean()
-    last = len(sections) - 1
+    radii, last = np.linalg.norm(points[sections] - middles[:, None], axis=2), len(sections) - 1
     for count in range(1, min(maximum, last) + 1):
         chosen = np.linspace(0, last, count + 1).round().astype(int)
         steps = np.diff(middles[chosen], axis=0)
@@ -108,6 +119,8 @@ def _straightened(points: np.ndarray, sections: np.ndarray, maximum: int) -> Tub
             steps = np.concatenate([steps, steps[:1]])
         lengths = np.linalg.norm(steps, axis=1)
         if not lengths.all() or ((steps[1:] * steps[:-1]).sum(axis=1) < _MAX_BEND * lengths[1:] * lengths[:-1]).any():
+            continue
+        if _swell(radii, chosen) > _MAX_SWELL:
             continue
         gaps = [_bulge(points, sections[a], sections[b], sections[a + 1 : b]) for a, b in itertools.pairwise(chosen)]
         if max(gaps) <= SLACK * radius:

@@ -74,7 +74,7 @@ class Case:
         table = ws.Body(ws.plane(TABLE_SIZE, 64), albedo=(0.5,) * 3, name=TABLE)
         return ws.Scene((body, table), ws.EnvironmentMap.constant(1.0), self.camera, ws.Visibility(directions=64))
 
-    def target(self, grown: int = 0) -> inverse.Target:
+    def target(self, grown: int = 0, *, moves_outlines: bool = True) -> inverse.Target:
         """The photograph with its masks; that of the body grown by some pixels, or shrunk."""
         from scipy import ndimage
 
@@ -88,6 +88,7 @@ class Case:
             self.camera,
             saturation=250 / 255,
             outlines={BODY: outline.astype(np.float32)},
+            moves_outlines=moves_outlines,
             distortion=self.lens if any(self.lens) else None,
         )
 

@@ -3,9 +3,10 @@
     python demos/examples/photographs/table.py
     python demos/examples/photographs/table.py lamp_1m lamp_2m  # these alone
 
-Each start is fitted by ``stages = "photograph"``, once as painted, and with ``--masks`` with masks that are a pixel too
-large and too small. Light is a map and a lamp, which starts straight above; with ``--light map`` it is a map alone. A
-sphere in place of the body is relit by both lights, the true one and the one that was found.
+Each start is fitted by ``stages = "photograph"``, with the painted mask, and with ``--masks`` with masks that are a
+pixel too large and too small; all are moved to the edges of the image first, unless ``--as-painted``. Light is a map
+and a lamp, which starts straight above; with ``--light map`` it is a map alone. A sphere in place of the body is relit
+by both lights, the true one and the one that was found.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ def problem(
     table: str = "known",
     light: str = "lamp",
     stands: bool = True,
+    moves_outlines: bool = True,
 ) -> inverse.Problem:
     """A start 15° and 10% away, of which color, light and pose are unknown; its table may be wrong, or free, too."""
     truth = case.truth()
@@ -58,7 +60,9 @@ def problem(
     if light == "lamp":
         scene = dataclasses.replace(scene, bodies=(*scene.bodies, LAMP))
         free += [inverse.Lamp("lamp"), inverse.Emission("lamp")]
-    return inverse.Problem(scene, case.target(grown), free, inverse.Loss("huber"), still=None)
+    return inverse.Problem(
+        scene, case.target(grown, moves_outlines=moves_outlines), free, inverse.Loss("huber"), still=None
+    )
 
 
 def lamp_error(case: Case, scene: ws.Scene) -> float:
@@ -156,7 +160,9 @@ if __name__ == "__main__":
     parser.add_argument("--table", choices=("known", "wrong", "free"), default="known", help=tables)
     parser.add_argument("--light", choices=("lamp", "map"), default="lamp", help="a lamp and a map, or a map alone")
     parser.add_argument("--no-plane", action="store_true", help="nobody knows that the body stands on the table")
+    parser.add_argument("--as-painted", action="store_true", help="masks as painted, not moved to the image's edges")
     arguments = parser.parse_args()
     masks = [0, 1, -1] if arguments.masks else [0]
-    known = {"shadows": not arguments.no_shadows, "table": arguments.table, "light": arguments.light}
-    main(arguments.names, arguments.starts, masks, **known, stands=not arguments.no_plane)
+    known: dict[str, object] = {"shadows": not arguments.no_shadows, "table": arguments.table, "light": arguments.light}
+    known |= {"stands": not arguments.no_plane, "moves_outlines": not arguments.as_painted}
+    main(arguments.names, arguments.starts, masks, **known)
