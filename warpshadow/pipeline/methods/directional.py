@@ -166,7 +166,7 @@ class Directional(SphereMethod):
         return self.self_visibility.lookups(bodies, rotations, towards, projected_light.half_angles, has_sun=has_sun)
 
     def find_visibility(self, group: Group, projected_light: ProjectedCells) -> GroupVisibility:
-        """Transmittance, float32 of shape [batch, receiver, direction]."""
+        """Transmittance of a group past its own body, spheres and convex parts."""
         points, normals, radii, cached_rows = group.points, group.normals, group.radii, group.cached_rows
         transmittance_self = self._transmittance_self(group, projected_light)
         # cached cells have light although their middles are below the horizon

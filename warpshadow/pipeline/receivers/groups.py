@@ -138,7 +138,8 @@ class CellCoverages(NamedTuple):
 class GroupVisibility(NamedTuple):
     """Visibility of a group."""
 
-    transmittance_total: wp.array | None  # visibility or transmittance past all bodies; None where nothing blocks
+    # visibility or transmittance past all bodies; None before those of planes, where light does not bounce
+    transmittance_total: wp.array | None
     transmittance_self: wp.array | None = None  # a factor of it: transmittance past its own body; None where that is 1
     transmittance_nonplanar: wp.array | None = None  # past all but planes; None where no planes block
     # transmittance past its own body and spheres, without convex parts and planes; None where that is 1
