@@ -45,19 +45,6 @@ def weights():
     return torch.tensor(np.stack([np.sin(3 * row + 2 * column), np.cos(2 * row), 1 + column, 0 * row], -1)).float()
 
 
-def slopes(loss, value, step):
-    """The gradient of a loss by the tape, and central differences of it, along each of some directions."""
-    value = value.clone().requires_grad_()
-    loss(value).backward()
-    differences = []
-    with torch.no_grad():
-        for place in np.ndindex(*value.shape):
-            shift = torch.zeros_like(value)
-            shift[place] = step
-            differences.append(float(loss(value + shift) - loss(value - shift)) / (2 * step))
-    return value.grad.numpy().ravel(), np.array(differences)
-
-
 def test_a_diffuse_scene_makes_the_same_launches_and_bits_beside_no_gloss():
     plain = dataclasses.replace(BALL, roughness=None, metallic=None)
     renderer = ws.Renderer(scene_of(plain, GROUND))
@@ -148,7 +135,7 @@ def test_gradients_to_gloss_agree_with_differences(name):
     def loss(value):
         return (renderer(**{name: {"ball": value}}) * image).sum()
 
-    gradient, difference = slopes(loss, torch.tensor([0.45]), 3e-3)
+    gradient, difference = twins.slopes(loss, torch.tensor([0.45]), 3e-3)
     assert gradient == pytest.approx(difference, rel=SMOOTH)
 
 
@@ -180,7 +167,7 @@ def test_gradients_to_textures_of_gloss_agree_with_differences(name):
         given = {key: {"ground": texture} for key, texture in (others | {name: value}).items()}
         return (renderer(**given).double() * image).sum()  # float32 would round differences of small steps
 
-    gradient, difference = slopes(loss, texels(2, 4, low=0.4), 1e-3)
+    gradient, difference = twins.slopes(loss, texels(2, 4, low=0.4), 1e-3)
     assert np.linalg.norm(gradient - difference) < SMOOTH * np.linalg.norm(difference)
 
 
@@ -194,7 +181,7 @@ def test_gradients_to_a_pose_go_through_footprints_in_textures_of_gloss():
         shifts = torch.cat([torch.zeros(1, 3), value, torch.zeros(1, 3)])
         return (renderer(geometry=renderer.placed(rotations, translations + shifts, scales), **given) * image).sum()
 
-    gradient, difference = slopes(loss, torch.zeros(1, 3), 1e-3)
+    gradient, difference = twins.slopes(loss, torch.zeros(1, 3), 1e-3)
     assert np.linalg.norm(gradient - difference) < SMOOTH * np.linalg.norm(difference)
 
 
@@ -263,13 +250,13 @@ def test_gradients_to_light_agree_with_differences():
     def loss(value):
         return (renderer(light + value * chosen) * image).sum()
 
-    gradient, difference = slopes(loss, torch.tensor([0.0]), 0.1)
+    gradient, difference = twins.slopes(loss, torch.tensor([0.0]), 0.1)
     assert gradient == pytest.approx(difference, rel=1e-3)
 
 
 def test_gradients_to_colors_agree_with_differences():
     renderer, image = TorchRenderer(scene_of(), progress=False), weights()
-    gradient, difference = slopes(
+    gradient, difference = twins.slopes(
         lambda value: (renderer(albedo={"ball": value}) * image).sum(), torch.tensor([0.8, 0.5, 0.3]), 0.05
     )
     np.testing.assert_allclose(gradient, difference, rtol=1e-3)
@@ -284,7 +271,7 @@ def test_gradients_to_poses_of_blockers_and_of_bodies_that_shine_agree_with_diff
         shifts = torch.cat([value[:1], shifts[1:2], value[1:]])
         return (renderer(geometry=renderer.placed(rotations, translations + shifts, scales)) * image).sum()
 
-    gradient, difference = slopes(loss, torch.zeros(2, 3), 3e-3)
+    gradient, difference = twins.slopes(loss, torch.zeros(2, 3), 3e-3)
     assert np.linalg.norm(gradient - difference) < SMOOTH * np.linalg.norm(difference)
 
 
@@ -296,7 +283,7 @@ def test_gradients_to_the_camera_agree_with_differences():
         turned = rotation_matrices(value[0]) @ R
         return (renderer(clip_matrices=renderer.clip_matrices(turned, t + value[1], K)) * image).sum()
 
-    gradient, difference = slopes(loss, torch.zeros(2, 3), 1e-3)
+    gradient, difference = twins.slopes(loss, torch.zeros(2, 3), 1e-3)
     assert np.linalg.norm(gradient - difference) < SMOOTH * np.linalg.norm(difference)
 
 

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+import twins
 
 import warpshadow as ws
 from warpshadow.torch import TorchRenderer
@@ -67,18 +68,6 @@ def test_highlights_add_to_the_light_of_the_map_and_are_linear_in_emission(bounc
     np.testing.assert_allclose(double - off, 2 * (once - off), atol=2e-4)
 
 
-def slopes(loss, value, step):
-    value = value.clone().requires_grad_()
-    loss(value).backward()
-    differences = []
-    with torch.no_grad():
-        for place in np.ndindex(*value.shape):
-            shift = torch.zeros_like(value)
-            shift[place] = step
-            differences.append(float(loss(value + shift) - loss(value - shift)) / (2 * step))
-    return value.grad.numpy().ravel(), np.array(differences)
-
-
 WEIGHTS = torch.tensor(np.sin(0.1 * np.arange(32 * 32 * 3)).reshape(32, 32, 3))
 
 
@@ -92,7 +81,7 @@ def test_gradients_of_highlights_agree_with_differences(name, value):
     def loss(values):
         return (renderer(**{name: {body: values}})[..., :3].double() * WEIGHTS).sum()
 
-    gradient, difference = slopes(loss, torch.tensor(value), 3e-3)
+    gradient, difference = twins.slopes(loss, torch.tensor(value), 3e-3)
     np.testing.assert_allclose(gradient, difference, rtol=SMOOTH, atol=1e-3)
 
 
@@ -105,5 +94,5 @@ def test_gradients_to_the_pose_of_a_lamp_agree_with_differences():
         image = renderer(geometry=renderer.placed(rotations, translations + shifts, scales))
         return (image[..., :3].double() * WEIGHTS).sum()
 
-    gradient, difference = slopes(loss, torch.zeros(1, 3), 3e-3)
+    gradient, difference = twins.slopes(loss, torch.zeros(1, 3), 3e-3)
     assert np.linalg.norm(gradient - difference) < SMOOTH * np.linalg.norm(difference)

@@ -474,6 +474,21 @@ def central_differences(function, values, step=1e-6):
     return gradient
 
 
+def slopes(loss, value, step):
+    """Gradient of a loss by a tensor, of its tape, and by central differences of each of its numbers."""
+    import torch
+
+    value = value.clone().requires_grad_()
+    loss(value).backward()
+    differences = []
+    with torch.no_grad():
+        for place in np.ndindex(*value.shape):
+            shift = torch.zeros_like(value)
+            shift[place] = step
+            differences.append(float(loss(value + shift) - loss(value - shift)) / (2 * step))
+    return value.grad.numpy().ravel(), np.array(differences)
+
+
 # ------------------------------------------------------------------------------------------ gloss
 
 

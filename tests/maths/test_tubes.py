@@ -12,6 +12,16 @@ def ring(sections=48, corners=12, thickness=0.13):
     return trimesh.creation.torus(0.4, thickness, major_sections=sections, minor_sections=corners)
 
 
+def lofted(points):
+    """The closed mesh of sections of points, [section, corner, 3], flat at both ends."""
+    number = np.arange(points[..., 0].size).reshape(points.shape[:2])
+    a, b, c, d = number[:-1], np.roll(number, -1, 1)[:-1], np.roll(number, -1, 1)[1:], number[1:]
+    sides = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    rest = range(1, points.shape[1] - 1)
+    fans = [[(end[0], end[k], end[k + 1]) for k in rest] for end in (number[0, ::-1], number[-1])]
+    return trimesh.Trimesh(points.reshape(-1, 3), np.concatenate([sides, *fans]), process=False)
+
+
 def hook(corners=12):
     """A rod that is straight at first, and then bends in a plane; flat at both ends."""
     angles = np.append([0, 0, 0], np.linspace(0, np.pi, 25))
@@ -20,11 +30,7 @@ def hook(corners=12):
     around = 2 * np.pi * np.arange(corners) / corners
     outward = np.stack([-np.cos(angles), np.sin(angles), 0 * angles], axis=1)
     points = middles[:, None] + 0.1 * (np.cos(around)[:, None] * outward[:, None] + np.sin(around)[:, None] * [0, 0, 1])
-    number = np.arange(points[..., 0].size).reshape(-1, corners)
-    a, b, c, d = number[:-1], np.roll(number, -1, 1)[:-1], np.roll(number, -1, 1)[1:], number[1:]
-    sides = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
-    fans = [[(end[0], end[k], end[k + 1]) for k in range(1, corners - 1)] for end in (number[0, ::-1], number[-1])]
-    mesh = trimesh.Trimesh(points.reshape(-1, 3), np.concatenate([sides, *fans]), process=False)
+    mesh = lofted(points)
     mesh.fix_normals()
     assert mesh.is_watertight
     return mesh
@@ -35,12 +41,7 @@ def column(depth):
     heights, around = np.linspace(0, 1, 121), 2 * np.pi * np.arange(24) / 24
     radii = 0.3 * (1 + depth * np.sin(2 * np.pi * 12 * heights))
     points = np.stack([radii[:, None] * np.cos(around), radii[:, None] * np.sin(around)], axis=-1)
-    points = np.concatenate([points, np.broadcast_to(2 * heights[:, None, None], (121, 24, 1))], axis=-1)
-    number = np.arange(121 * 24).reshape(121, 24)
-    a, b, c, d = number[:-1], np.roll(number, -1, 1)[:-1], np.roll(number, -1, 1)[1:], number[1:]
-    sides = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
-    fans = [[(end[0], end[k], end[k + 1]) for k in range(1, 23)] for end in (number[0, ::-1], number[-1])]
-    return trimesh.Trimesh(points.reshape(-1, 3), np.concatenate([sides, *fans]), process=False)
+    return lofted(np.concatenate([points, np.broadcast_to(2 * heights[:, None, None], (121, 24, 1))], axis=-1))
 
 
 def parts_of(mesh):

@@ -20,8 +20,6 @@ from warpshadow.inverse import checkpoint as checkpoints
 from warpshadow.inverse.diagnostics import warn_of
 from warpshadow.inverse.free.base import Free, Values
 from warpshadow.inverse.free.lamp import Lamp
-from warpshadow.inverse.free.shell import Shell
-from warpshadow.inverse.free.views import OutlineOffset
 from warpshadow.inverse.one_thread import torch_on_one_thread
 from warpshadow.inverse.preview import write_preview
 from warpshadow.inverse.problem import Problem
@@ -336,7 +334,7 @@ class _Descent:
 def _descends(free: Free, stage: Stage) -> bool:
     """Whether a stage descends to a parameter."""
     if stage.compares == "outlines":
-        return (free.moves and not isinstance(free, (Lamp, Shell))) or isinstance(free, OutlineOffset)
+        return free.shows_in_outlines
     return not (stage.solves_light and free.is_light)
 
 

@@ -17,9 +17,8 @@ SLACK = 0.2
 MAX_SEGMENTS = 128
 """Segments of the tubes of a mesh at most: beyond, spheres are faster."""
 
-_MAX_BEND = (
-    0.95  # cosine of the angle between neighboring segments at least, 18°: with 30° shadows of rings had corners
-)
+_MAX_BEND = 0.95
+"""Cosine of the angle between neighboring segments at least, 18°: with 30° shadows of rings had corners."""
 
 _MAX_SWELL = 0.03
 """Distance of the corners of a section from its middle, over that of straight segments, from 1 at most: rods are bent,
@@ -110,7 +109,6 @@ def _swell(radii: np.ndarray, chosen: np.ndarray) -> float:
 def _straightened(points: np.ndarray, sections: np.ndarray, maximum: int) -> Tube | None:
     """The tube of as few of the sections as there may be, about as many apart; None if they are too many."""
     middles = points[sections].mean(axis=1)
-    radius = np.linalg.norm(points[sections] - middles[:, None], axis=2).mean()
     radii, last = np.linalg.norm(points[sections] - middles[:, None], axis=2), len(sections) - 1
     for count in range(1, min(maximum, last) + 1):
         chosen = np.linspace(0, last, count + 1).round().astype(int)
@@ -123,7 +121,7 @@ def _straightened(points: np.ndarray, sections: np.ndarray, maximum: int) -> Tub
         if _swell(radii, chosen) > _MAX_SWELL:
             continue
         gaps = [_bulge(points, sections[a], sections[b], sections[a + 1 : b]) for a, b in itertools.pairwise(chosen)]
-        if max(gaps) <= SLACK * radius:
+        if max(gaps) <= SLACK * radii.mean():
             segments = [_hull(points, pair) for pair in itertools.pairwise(sections[chosen])]
             hulls = sum(_volume(points, segment) for segment in segments)
             solids = sum(_volume(points, _lofted(*pair)) for pair in itertools.pairwise(sections[chosen]))

@@ -30,6 +30,11 @@ class Free(abc.ABC):
     """Whether geometry or cameras change with it."""
 
     @property
+    def shows_in_outlines(self) -> bool:
+        """Whether outlines change with it, so that stages that compare these alone descend to it."""
+        return self.moves
+
+    @property
     def is_light(self) -> bool:
         """Whether images are linear in it, so that variable projection solves for it."""
         return False

@@ -37,6 +37,11 @@ class Lamp(FreeOfBody):
     key: ClassVar[str] = "lamp"
     moves: ClassVar[bool] = True
 
+    @property
+    def shows_in_outlines(self) -> bool:
+        """A lamp is seen by its light alone."""
+        return False
+
     def check_scene(self, scene: Scene) -> None:
         """Raise ValueError for a body that does not emit, and for one that is alone."""
         check_emits(scene, self.number)

@@ -106,8 +106,9 @@ class Light(Free):
         coefficients = self.coefficients(values, setting).cpu().numpy()
         light: np.ndarray | EnvironmentMap = coefficients
         if isinstance(self.basis, CellBasis):
-            *center, radius = (0, 0, 0, None) if fitted.scene.shell is None else fitted.scene.shell.tolist()
-            light = EnvironmentMap(self.basis.to_map(coefficients).radiance, radius=radius, center=center)
+            light, before = self.basis.to_map(coefficients), fitted.scene.light
+            if isinstance(before, EnvironmentMap):
+                light = replace(before, radiance=light.radiance)
         fitted.scene = replace(fitted.scene, light=light)
 
 

@@ -31,6 +31,11 @@ class Shell(Free):
     key: ClassVar[str] = "shell"
     moves: ClassVar[bool] = True  # rays, which lights alone may have, have no gradient to it
 
+    @property
+    def shows_in_outlines(self) -> bool:
+        """A shell is seen by its light alone."""
+        return False
+
     def check_scene(self, scene: Scene) -> None:
         """Raise ValueError for light that is infinitely far away."""
         if scene.shell is None:
@@ -68,9 +73,8 @@ class Shell(Free):
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
         """Give the scene's light the radius."""
-        *center, radius = self.shell(values, setting).tolist()
         assert isinstance(fitted.scene.light, EnvironmentMap)
-        light = EnvironmentMap(fitted.scene.light.radiance, radius=radius, center=center)
+        light = replace(fitted.scene.light, radius=float(self.shell(values, setting)[3]))
         fitted.scene = replace(fitted.scene, light=light)
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:

@@ -76,6 +76,11 @@ class OutlineOffset(Free):
     def __post_init__(self) -> None:
         check.positive("deviation", self.deviation)
 
+    @property
+    def shows_in_outlines(self) -> bool:
+        """Outlines alone have an offset."""
+        return True
+
     def start(self, setting: Setting) -> Values:
         """Offsets of 0."""
         return {"offset": setting.tensor(np.zeros(len(setting.cameras)))}

@@ -48,6 +48,33 @@ def directions_to_samples(points: wp.array, samples: PlacedSamples, span: Emitte
     return directions
 
 
+@wp.func
+def transmittance_to_sample(
+    log_of_spheres: wp.array3d(dtype=wp.float32),
+    log_of_planes: wp.array3d(dtype=wp.float32),
+    log_of_parts: wp.array3d(dtype=wp.float32),
+    transmittance: wp.array3d(dtype=wp.float32),
+    transmittance_of_emitter: wp.array3d(dtype=wp.float32),
+    batch: int,
+    receiver: int,
+    i: int,
+):
+    """T of a sample, past all that blocks."""
+    exponent = float(0.0)
+    if log_of_spheres:
+        exponent += log_of_spheres[batch, receiver, i]
+    if log_of_planes:
+        exponent += log_of_planes[batch, receiver, i]
+    if log_of_parts:
+        exponent += log_of_parts[batch, receiver, i]
+    through = wp.exp(exponent)
+    if transmittance:
+        through = through * transmittance[batch, receiver, i]
+    if transmittance_of_emitter:
+        through = through * transmittance_of_emitter[batch, receiver, i]
+    return through
+
+
 @wp.kernel
 def _sum_light(
     first_row: int,
@@ -81,18 +108,17 @@ def _sum_light(
         area = sample_areas[sample_batch, first_sample + i]
         if is_lit(beam, area, normal, is_two_sided):
             facing_area = wp.abs(wp.dot(beam, area))
-            exponent = float(0.0)
-            if log_of_spheres:
-                exponent += log_of_spheres[batch, receiver, i]
-            if log_of_planes:
-                exponent += log_of_planes[batch, receiver, i]
-            if log_of_parts:
-                exponent += log_of_parts[batch, receiver, i]
-            factor = wp.dot(beam, normal) * facing_area * wp.exp(exponent)
-            if transmittance:
-                factor = factor * transmittance[batch, receiver, i]
-            if transmittance_of_emitter:
-                factor = factor * transmittance_of_emitter[batch, receiver, i]
+            through = transmittance_to_sample(
+                log_of_spheres,
+                log_of_planes,
+                log_of_parts,
+                transmittance,
+                transmittance_of_emitter,
+                batch,
+                receiver,
+                i,
+            )
+            factor = wp.dot(beam, normal) * facing_area * through
             distance2 = wp.length_sq(beam)
             factor = factor / (distance2 * wp.sqrt(wp.pi * wp.pi * distance2 * distance2 + wp.length_sq(area)))
             total += factor * radiance[radiance_batch, first_sample + i]

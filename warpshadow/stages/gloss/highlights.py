@@ -17,6 +17,7 @@ from warpshadow.device.batch import common_batch, expand, expand_rows, instance_
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
+from warpshadow.stages.emitters.light import transmittance_to_sample
 from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, is_lit
 from warpshadow.stages.gloss.lobes import MAX_COSINE, MIN_COSINE, MIN_ROUGHNESS, eye_position
 from warpshadow.stages.gloss.reflection import LobeLight
@@ -76,13 +77,16 @@ def _sum_highlights(
         beam = sample_points[sample_batch, first_sample + i] - point
         area = sample_areas[sample_batch, first_sample + i]
         if is_lit(beam, area, normal, is_two_sided):
-            exponent = float(0.0)
-            if log_of_spheres:
-                exponent += log_of_spheres[batch, receiver, i]
-            if log_of_planes:
-                exponent += log_of_planes[batch, receiver, i]
-            if log_of_parts:
-                exponent += log_of_parts[batch, receiver, i]
+            through = transmittance_to_sample(
+                log_of_spheres,
+                log_of_planes,
+                log_of_parts,
+                transmittance,
+                transmittance_of_emitter,
+                batch,
+                receiver,
+                i,
+            )
             distance2 = wp.length_sq(beam)
             distance = wp.sqrt(distance2)
             # pi d² facing / √(π² d⁴ + |A|²), as for diffuse light
@@ -91,12 +95,8 @@ def _sum_highlights(
             cosine = wp.dot(beam, normal) / distance
             mirror = wp.normalize(view + beam / distance)
             square = wp.min(rough * rough * rough * rough + solid_angle / (4.0 * wp.pi), 1.0)
-            weight = cosine * solid_angle * wp.exp(exponent)
+            weight = cosine * solid_angle * through
             weight = weight * _reflect(wp.dot(normal, mirror), cosine, view_cosine, square)
-            if transmittance:
-                weight = weight * transmittance[batch, receiver, i]
-            if transmittance_of_emitter:
-                weight = weight * transmittance_of_emitter[batch, receiver, i]
             base = wp.max(1.0 - wp.dot(view, mirror), 0.0)
             light = weight * radiance[radiance_batch, first_sample + i]
             lobe_sum += light

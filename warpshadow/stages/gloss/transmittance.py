@@ -35,6 +35,12 @@ def _heights(normal: wp.vec3, x: Chunk, y: Chunk, z: Chunk, per_radius: float):
 
 
 @wp.func(inline=True)
+def _horizon_weights(heights: Chunk):
+    """H of cells, and a little more, so that none is 0."""
+    return wp.cw_mul(wp.cw_mul(heights, heights), Chunk(3.0) - 2.0 * heights) + Chunk(_MIN_HORIZON_WEIGHT)
+
+
+@wp.func(inline=True)
 def _kernels(direction: wp.vec3, x: Chunk, y: Chunk, z: Chunk, reach_cosine: float):
     """√k of cells, but for ε."""
     return wp.max(direction[0] * x + direction[1] * y + direction[2] * z - Chunk(reach_cosine), Chunk(0.0))
@@ -66,8 +72,8 @@ def _interpolate_cells(
     through = scratch[slot, 0]
     above = scratch[slot, 1]
     for chunk in range(cells.shape[1]):
-        t = _heights(normal, cells[0, chunk], cells[1, chunk], cells[2, chunk], per_radius)
-        above[chunk] = wp.cw_mul(wp.cw_mul(t, t), Chunk(3.0) - 2.0 * t) + Chunk(_MIN_HORIZON_WEIGHT)
+        heights = _heights(normal, cells[0, chunk], cells[1, chunk], cells[2, chunk], per_radius)
+        above[chunk] = _horizon_weights(heights)
         through[chunk] = wp.min(transmittance[batch, receiver, chunk], above[chunk])
     for i in range(means.shape[2]):
         direction = directions[batch, receiver, i]
@@ -118,8 +124,8 @@ def _interpolate_cells_adjoint(
     adj_through_cells = scratch[slot, 2]
     adj_above_cells = scratch[slot, 3]
     for chunk in range(cells.shape[1]):
-        t = _heights(normal, cells[0, chunk], cells[1, chunk], cells[2, chunk], per_radius)
-        above[chunk] = wp.cw_mul(wp.cw_mul(t, t), Chunk(3.0) - 2.0 * t) + Chunk(_MIN_HORIZON_WEIGHT)
+        heights = _heights(normal, cells[0, chunk], cells[1, chunk], cells[2, chunk], per_radius)
+        above[chunk] = _horizon_weights(heights)
         through[chunk] = wp.min(transmittance[batch, receiver, chunk], above[chunk])
         adj_through_cells[chunk] = Chunk(0.0)
         adj_above_cells[chunk] = Chunk(0.0)
