@@ -21,7 +21,6 @@ from warpshadow.pipeline.node import Call, Input, Node, field_of
 from warpshadow.pipeline.receivers.groups import CellCoverages, Group, GroupVisibility
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
-from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.self_visibility import SelfVisibilityLookup
 from warpshadow.pipeline.shell import PATCHES, ShellPatches, project_on_shell
 from warpshadow.pipeline.sphere_method import PortionedShading, SphereMethod
@@ -178,7 +177,7 @@ class Directional(SphereMethod):
         if points.size and group.convex_parts_around is not None:
             cover = functools.partial(group.convex_parts_around.coverage, points, horizon_normals)
             parts = self._coverages(cover, projected_light)
-        if group.is_before_planes and self.bounces is None:  # nobody asks for transmittance past all else
+        if group.is_before_planes and not self.merged_scene.scene.bounces:  # which need transmittance past all else
             return GroupVisibility(
                 None, transmittance_self, transmittance_self_and_spheres=past_spheres, part_coverages=parts
             )
@@ -418,40 +417,34 @@ class Directional(SphereMethod):
         direct, openness = shade(transfer, light, maximum=LARGEST_COEFFICIENT), shade(of_cells, even)
         return blocked_radiance(diffuse, direct, openness)
 
-    def known_shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
-        """Shading of points in known light, which bounces from the materials."""
+    def known_shading(self, points: LitPoints, light: LightInput) -> Node:
+        """Direct known light on points."""
         if not self._shades_with_cells(points):
-            return super().known_shading(points, light, materials)
+            return super().known_shading(points, light)
         return field_of(self._shading_with_cells(points, light), "shading")
 
     def _shades_with_cells(self, points: LitPoints) -> bool:
         """Whether the transmittance of cells at bodies that shine comes with the shading of a view."""
-        return self.bounces is None and points.materials.roughness is not None
+        return not self.merged_scene.scene.bounces and points.materials.roughness is not None
 
     def _shading_with_cells(self, view: LitPoints, light: LightInput) -> Node:
         """Node of the shading of a view in known light, and of the transmittance of its glossy receivers' cells."""
-        name = "shading of the scene with cells" if light is self.light else "shading with cells"
-        make = functools.partial(ShadingWithCells, self, view, self.projected(light), light, _joined_with_cells)
-        return view.cached(name, light, make)
+        make = functools.partial(ShadingWithCells, self, view, self.projected(view, light), light, _joined_with_cells)
+        return self.cached_for_light("direct with cells", view, light, make)
 
     def _lobe_cells(self, points: LitPoints, light: LightInput, view: LitPoints) -> tuple[Node, Any]:
         """Node of the transmittance of cells, in portions, and the projected light that says which.
 
         In known light that does not bounce the shading of the view has found it.
         """
+        projection = self.projection(points, light)
         if not light.is_free and self._shades_with_cells(view):
-            return field_of(self._shading_with_cells(view, light), "cells"), self.projected(light)
-        if light.is_free:
-            projected_light = self.free_projection_of(points, light)
-        else:
-            projected_light = points.cached("projected", light, functools.partial(self.projected, light))
+            return field_of(self._shading_with_cells(view, light), "cells"), projection
 
         def in_cells() -> Node:
-            return PortionedCellTransmittance(
-                self, points, projected_light, None, list, where=" of gloss", is_shaded=False
-            )
+            return PortionedCellTransmittance(self, points, projection, None, list, suffix=" of gloss", is_shaded=False)
 
-        return points.cached("cells", light.shell if light.is_free else light, in_cells), projected_light
+        return points.cached("cells", light.visibility_key, in_cells), projection
 
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """Rows of the light of each cell that static bodies let through.
