@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 import warp as wp
@@ -17,7 +17,7 @@ from warpshadow.pipeline.geometry import Geometry
 from warpshadow.pipeline.method import LightInput, Method
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached
 from warpshadow.pipeline.planes import ScenePlanes
-from warpshadow.pipeline.receivers.groups import Blockers, Group, GroupVisibility, find_groups
+from warpshadow.pipeline.receivers.groups import Blockers, CellVisibility, Group, HarmonicVisibility, find_groups
 from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.reflectance import Materials
@@ -26,29 +26,48 @@ from warpshadow.pipeline.transfers import LARGEST_COEFFICIENT, change_basis, joi
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.shading import shade
 
+Projected = TypeVar("Projected", bound="ProjectedLight")
+FoundVisibility = TypeVar("FoundVisibility", CellVisibility, HarmonicVisibility)
 
-class SphereMethod(Method):
+
+class ProjectedLight(Protocol):
+    """Light in the basis in which a method finds visibility: cells of directions, or bands of spherical harmonics.
+
+    Without coefficients it is the basis alone, by which visibility is found for any free light.
+    """
+
+    @property
+    def coefficients(self) -> wp.array | None:
+        """Of known or given light, vec3 of shape [batch, coefficient]; of light from a shell, those of its patches."""
+
+    def with_coefficients(self: Projected, coefficients: wp.array) -> Projected:
+        """Light of the same basis."""
+
+
+class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     """A method in which spheres stand in for the bodies: visibility, transfer vectors, and shading.
+
+    Its two types say in which basis it has light, and visibility.
 
     Attributes:
         free_projection: The basis in which the method projects any free light, of the scene's shell if it has one.
         why_no_shadows: Why the method has no shadows, in words; empty if it has.
         joins_cached: Whether visibility combines cached rows with moving blockers.
         traces_self_visibility: Whether bodies' shadows on themselves may come from rays, not spheres.
-        sees_cells: Whether visibility is transmittance in cells: those towards ``directions`` of projected light.
         shades_transmittance: Whether known light is shaded without transfer vectors, by :meth:`shade_transmittance`.
-        emitter_projection: Even light in the cells in which self-visibility towards emitters is looked up; None where
-            nothing is.
     """
 
-    free_projection: Any
+    free_projection: Projected
     why_no_shadows = ""
     joins_cached = False
     traces_self_visibility = False
-    sees_cells = False
     shades_transmittance = False
-    emitter_projection: Any = None
     has_proxies = True
+
+    @property
+    def emitter_projection(self) -> Projected | None:
+        """Even light in the cells in which self-visibility towards emitters is looked up; None where nothing is."""
+        return None
 
     @functools.cached_property
     def plane_blockers(self) -> tuple[int, ...]:
@@ -117,12 +136,12 @@ class SphereMethod(Method):
         return Blockers(self.merged_scene, blocker_kinds, *owners, positions, spheres, frames, placed)
 
     def find_visibility_past_planes(
-        self, group: Group, visibility: GroupVisibility, projected_light: Any
-    ) -> GroupVisibility:
+        self, group: Group, visibility: FoundVisibility, projected_light: Projected
+    ) -> FoundVisibility:
         """Visibility of a group past the flat bodies around it, given its visibility past all other blockers."""
         raise NotImplementedError
 
-    def project_light(self, light: KnownLight, shell: wp.array | None = None) -> Any:
+    def project_light(self, light: KnownLight, shell: wp.array | None = None) -> Projected:
         """Project known light for the method: its coefficients, and the cells or bands they belong to.
 
         Args:
@@ -132,7 +151,7 @@ class SphereMethod(Method):
         """
         raise NotImplementedError
 
-    def project_free_light(self, shell: wp.array) -> Any:
+    def project_free_light(self, shell: wp.array) -> Projected:
         """The basis in which the method projects free light of another shell than the scene's."""
         raise NotImplementedError
 
@@ -149,42 +168,42 @@ class SphereMethod(Method):
         make = functools.partial(Node, "", self.project_light, light, self.shell_of(light))
         return points.cached_of_bodies("projected", light, make)
 
-    def projection(self, points: LitPoints, light: LightInput) -> Any:
+    def projection(self, points: LitPoints, light: LightInput) -> Node | Projected:
         """The light by which visibility is found, projected: known light, or any free light of the same shell."""
         return self.free_projection_of(points, light.shell) if light.is_free else self.projected(points, light)
 
-    def free_projection_of(self, points: LitPoints, shell: Input | None) -> Any:
+    def free_projection_of(self, points: LitPoints, shell: Input | None) -> Node | Projected:
         """The basis in which the method projects free light, or a node of it, the same for the same shell."""
         if shell is None:
             return self.free_projection
         make = functools.partial(Node, "", self.project_free_light, shell)
         return points.cached_of_bodies("free projection", shell, make)
 
-    def _projected_if_given(self, light: wp.array, free_projection: Any) -> Any:
+    def _projected_if_given(self, light: wp.array, free_projection: Projected) -> Projected:
         """Project given free light for the method. Differentiable: light."""
-        return free_projection._replace(coefficients=change_basis(light, self.native_from_basis))
+        return free_projection.with_coefficients(change_basis(light, self.native_from_basis))
 
     def coefficient_count(self, light: Input | None) -> int:
         """Number of light coefficients that shading uses; all of them where the light is None, not known yet."""
         raise NotImplementedError
 
-    def self_lookups(self, bodies: tuple[int, ...], rotations: wp.array, projected_light: Any) -> dict[int, Any]:
+    def self_lookups(self, bodies: tuple[int, ...], rotations: wp.array, projected_light: Projected) -> dict[int, Any]:
         """Self-visibility of receivers of some bodies, :attr:`Group.self_lookup` by body. Differentiable: rotations."""
         raise NotImplementedError
 
-    def find_visibility(self, group: Group, projected_light: Any) -> GroupVisibility:
+    def find_visibility(self, group: Group, projected_light: Projected) -> FoundVisibility:
         """Visibility, or transmittance, past a group's spheres and its own body."""
         raise NotImplementedError
 
-    def transfer(self, visibility: GroupVisibility, group: Group, projected_light: Any) -> wp.array:
+    def transfer(self, visibility: FoundVisibility, group: Group, projected_light: Projected) -> wp.array:
         """Transfer vectors of a group."""
         raise NotImplementedError
 
-    def shade_transfer(self, transfer: wp.array, group: Group, projected_light: Any) -> wp.array:
+    def shade_transfer(self, transfer: wp.array, group: Group, projected_light: Projected) -> wp.array:
         """Shading of a group in known light."""
         return shade(transfer, projected_light.coefficients, maximum=LARGEST_COEFFICIENT)
 
-    def shade_transmittance(self, visibility: GroupVisibility, group: Group, projected_light: Any) -> wp.array:
+    def shade_transmittance(self, visibility: FoundVisibility, group: Group, projected_light: Projected) -> wp.array:
         """Shading of a group in known light."""
         raise NotImplementedError
 
@@ -283,7 +302,7 @@ class PortionedShading(Node):
         self,
         method: SphereMethod,
         points: LitPoints,
-        projected_light: Any,
+        projected_light: Node | ProjectedLight,
         light: Input | None,
         finish: Callable[[list[wp.array]], Any],
         *,
@@ -347,12 +366,14 @@ class PortionedShading(Node):
                     yield self.find(call, portion, projected_light, blockers.spheres)
                     bar.update(portion.points.shape[1])
 
-    def find(self, call: Call, portion: Group, projected_light: Any, spheres: tuple[wp.array, wp.array]) -> Any:
+    def find(
+        self, call: Call, portion: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
+    ) -> Any:
         """Compute a portion's visibility, given the projected light and all spheres."""
         return self.light(call, portion, self.find_visibility(call, portion, projected_light), projected_light)
 
-    def find_visibility(self, call: Call, portion: Group, projected_light: Any) -> GroupVisibility:
-        """Find the visibility of a portion."""
+    def find_visibility(self, call: Call, portion: Group, projected_light: ProjectedLight) -> Any:
+        """Find the visibility of a portion, of the method's type."""
         with self.timed(call, self._visibility):
             visibility = self.method.find_visibility(portion, projected_light)
         if portion.planes is None:
@@ -360,7 +381,13 @@ class PortionedShading(Node):
         with self.timed(call, self._planes):
             return self.method.find_visibility_past_planes(portion, visibility, projected_light)
 
-    def light(self, call: Call, portion: Group, visibility: GroupVisibility, projected_light: Any) -> wp.array:
+    def light(
+        self,
+        call: Call,
+        portion: Group,
+        visibility: CellVisibility | HarmonicVisibility,
+        projected_light: ProjectedLight,
+    ) -> wp.array:
         """Transfer vectors of a portion, or its shading."""
         if not self._is_transferred:
             with self.timed(call, self._shading):
@@ -423,13 +450,13 @@ def placed_blockers(method: SphereMethod, points: LitPoints) -> Node:
     return points.cached_of_bodies("blockers", None, lambda: Node("", place, points.vertices, points.spheres))
 
 
-def self_visibility_node(method: SphereMethod, points: LitPoints, projected_light: Any) -> Node:
+def self_visibility_node(method: SphereMethod, points: LitPoints, projected_light: Node | ProjectedLight) -> Node:
     """Node of the receivers' self-visibility lookups, by body; the same for any receivers among the same bodies."""
     make = functools.partial(_self_visibility, method, points.blocker_kinds, projected_light)
     return points.cached_of_bodies("self-visibility", id(projected_light), make)
 
 
-def _self_visibility(method: SphereMethod, blocker_kinds: BlockerKinds, projected_light: Any) -> Node:
+def _self_visibility(method: SphereMethod, blocker_kinds: BlockerKinds, projected_light: Node | ProjectedLight) -> Node:
     bodies, rotations = blocker_kinds.self_traced, blocker_kinds.rotations
     curved_bodies = [body for body in bodies if not method.merged_scene.is_flat[body]]
     if not curved_bodies or rotations is None:

@@ -32,7 +32,7 @@ from warpshadow.pipeline.node import Call, Node, NodeStage
 from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
-from warpshadow.pipeline.sphere_method import PortionedShading, SphereMethod
+from warpshadow.pipeline.sphere_method import PortionedShading, ProjectedLight, SphereMethod
 from warpshadow.pipeline.transfers import joined
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.patch_weights import PatchWeights, find_mean_transmittance, find_patch_weights
@@ -61,14 +61,14 @@ class PortionedVisibility(PortionedShading):
     """Visibility of receivers for direct and bounced light, in portions."""
 
     def find(
-        self, call: Call, portion: Group, projected_light: Any, spheres: tuple[wp.array, wp.array]
+        self, call: Call, portion: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
     ) -> PortionVisibility:
         """Find the visibility of a portion."""
         visibility = self.find_visibility(call, portion, projected_light)
         return PortionVisibility(
             self.light(call, portion, visibility, projected_light),
             portion,
-            find_cell_transmittance(self.method, portion, visibility, projected_light, spheres),
+            find_cell_transmittance(self.method, portion, visibility, spheres),
         )
 
 
@@ -103,7 +103,7 @@ class PortionedDirectLight(Node):
         (projected_light,) = self.values(call)
         return [self._light(call, portion, projected_light) for portion in self._visibility.value(call)]
 
-    def _light(self, call: Call, portion: PortionVisibility, projected_light: Any) -> PortionDirectLight:
+    def _light(self, call: Call, portion: PortionVisibility, projected_light: ProjectedLight) -> PortionDirectLight:
         with self.timed(call, self._shading):
             direct = self._visibility.method.shade_transfer(portion.transfer, portion.group, projected_light)
         return PortionDirectLight(direct, portion.group, portion.cells)
