@@ -62,8 +62,9 @@ _OF_CAMERAS = ("_scene_view", "_catchers_alone")  # cached values of a renderer'
 class SceneRenderer:
     """Renders a scene, or instances of it with other geometry, cameras, light and reflectance.
 
-    Geometry and cameras of the scene itself do not move, so that an image costs a dot product and a gather. All methods
-    are differentiable under Warp's tape in their array arguments, as far as these require gradients.
+    Results that depend on the scene's own geometry and cameras alone are cached: of direct light on diffuse bodies,
+    another image by other light or reflectance then costs a dot product for each receiver, and a gather. Methods that
+    return arrays are differentiable under Warp's tape, in the arguments that their docstrings name.
 
     Args:
         cameras: In place of the scene's camera any number of them, of one size and near plane, whose images are a

@@ -54,7 +54,8 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         why_no_shadows: Why the method has no shadows, in words; empty if it has.
         joins_cached: Whether visibility combines cached rows with moving blockers.
         traces_self_visibility: Whether bodies' shadows on themselves may come from rays, not spheres.
-        shades_transmittance: Whether known light is shaded without transfer vectors, by :meth:`shade_transmittance`.
+        shades_transmittance: Whether transmittance is shaded in known light at once, by :meth:`shade_transmittance`,
+            which finds transfer vectors itself where it takes them: of cached rows, and for light from a shell.
     """
 
     free_projection: Projected
@@ -285,7 +286,8 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
 class PortionedShading(Node):
     """Shading or transfer vectors of receivers, found group by group and portion by portion.
 
-    So without a gradient transfer vectors of all receivers are in memory at once only where light is free.
+    So without a gradient transfer vectors of all receivers are in memory at once only where they are the result: for
+    free light, and in the visibility that bounces cache while colors vary. Receivers with cached rows are one portion.
 
     Args:
         points: The receivers.
@@ -333,7 +335,7 @@ class PortionedShading(Node):
         self._transfer = NodeStage(
             f"transfer{suffix}",
             lambda: f"{item_text()} × {method.coefficient_count(light)} coefficients",
-            "" if self._is_transferred else "known light is shaded without transfer vectors",
+            "" if self._is_transferred else "shading takes transmittance at once",
         )
         self._shading = NodeStage(f"shading{suffix}", item_text)
         own_stages = self._visibility, self._planes, self._transfer, self._shading
