@@ -179,9 +179,8 @@ def test_iterations_are_those_of_a_twin_in_float64(given, method, monkeypatch):
     patches = ScenePatches(engine.merged_scene)
     senders = patches.senders(view.materials)
     albedo = patches.albedo(view.materials, senders.bodies).value(view.call).numpy()[0].astype(np.float64)
-    (transfers,) = (
-        node for name, (_, node) in view._cached.items() if name in ("transfer", "transfer of patch samples")
-    )
+    (patch_samples,) = (points for name, (_, points) in view._cached.items() if name == "patch samples")
+    transfers = view.method.cached_transfers(patch_samples)
     transfer = np.concatenate([each.numpy()[0] for each in transfers.value(view.call)]).astype(np.float64)
 
     def dense(matrix) -> np.ndarray:
