@@ -118,12 +118,15 @@ def test_every_file_of_a_folder_stands_on_its_page(folder, files):
     assert not [name_of(file) for file in files if file.stem != "__init__" and f"`{file.name}`" not in page]
 
 
+CACHING = ("cached", "cached_of_bodies", "cached_for_light")  # methods that take the node's name first
+
+
 def test_every_cached_node_stands_on_the_page_that_says_when_it_is_made_anew():
     pipeline = ROOT / "warpshadow" / "pipeline"
     text, names = (pipeline / "README.md").read_text("utf-8"), set()
     for path in pipeline.rglob("*.py"):
         for call in ast.walk(ast.parse(path.read_text("utf-8"))):
-            if isinstance(call, ast.Call) and getattr(call.func, "attr", "") == "cached":
+            if isinstance(call, ast.Call) and getattr(call.func, "attr", "") in CACHING:
                 literals = [part for part in ast.walk(call.args[0]) if isinstance(part, ast.Constant)]
                 names |= {literals[0].value.strip()} if literals else set()
     assert len(names) > 20

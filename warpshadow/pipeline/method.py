@@ -216,7 +216,8 @@ class Method:
 
     def cached_for_light(self, name: str, points: LitPoints, light: LightInput, make: Callable[[], Node]) -> Node:
         """A node of points in known light, cached for the scene's light and for the last other one."""
-        return points.cached(f"{name} of the scene" if light is self.light else name, light, make)
+        name = f"{name} of the scene" if light is self.light else name
+        return points.cached(name, light, make)
 
     def direct_shading(self, points: LitPoints, light: LightInput) -> Node:
         """Direct light that points reflect as white surfaces, without that of emitters, vec3 [batch, receiver].
