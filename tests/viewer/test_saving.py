@@ -68,7 +68,7 @@ def changed(scene):
 
 
 def assert_same(read, shown):
-    assert vars(read.visibility.with_method()) == vars(shown.visibility.with_method())
+    assert vars(read.with_method().visibility) == vars(shown.with_method().visibility)
     assert (read.bounces, read.supersampling) == (shown.bounces, shown.supersampling)
     np.testing.assert_allclose(read.light.radiance, shown.light.radiance, atol=ROUNDING)
     np.testing.assert_allclose(read.camera.clip_matrix(), shown.camera.clip_matrix(), atol=ROUNDING)

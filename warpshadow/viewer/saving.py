@@ -40,7 +40,7 @@ def as_toml(path: Path, scene: Scene, viewer_state: ViewerState, camera: Camera)
     light["scale"] = light.get("scale", 1.0) * viewer_state.scale
     settings = viewer_state.settings(scene)
     light["bounces"] = settings.bounces
-    visibility, given_visibility = tables.setdefault("visibility", {}), scene.visibility.with_method()
+    visibility, given_visibility = tables.setdefault("visibility", {}), scene.with_method().visibility
     for name in ("method", *METHODS_OF_SETTING):
         value = getattr(settings.visibility, name)
         if value != getattr(given_visibility, name):
