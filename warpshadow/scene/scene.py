@@ -264,18 +264,18 @@ class Scene:
 
     @property
     def direction_count(self) -> int:
-        """Cells of "directional": as many as are asked for, or 256 where a body's smallest roughness is below 0.3."""
+        """Cells of "directional": as many as are asked for, or 256 where a body's smallest roughness is below 0.3.
+
+        Roughness that calls of a renderer pass does not count, nor that a fit finds.
+        """
         if self.visibility.directions is not None:
             return self.visibility.directions
         roughness = [body.roughness.min() for body in self.bodies if body.roughness is not None]
         return DIRECTIONS_OF_GLOSS if min(roughness, default=1.0) < NARROW_ROUGHNESS else DIRECTIONS
 
     def with_method(self) -> Scene:
-        """The scene as renderers have it: "directional" where no method is named, and its number of cells."""
-        visibility = self.visibility.with_method()
-        if visibility.method == DEFAULT_METHOD:
-            visibility = replace(visibility, directions=self.direction_count)
-        return self if visibility == self.visibility else replace(self, visibility=visibility)
+        """The scene as renderers have it: "directional" where no method is named."""
+        return self if self.visibility.method else replace(self, visibility=self.visibility.with_method())
 
     def background(self) -> np.ndarray:
         """The light as the camera sees it where no body is, linear RGB, float32 of shape [height, width, 3]."""

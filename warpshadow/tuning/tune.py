@@ -442,7 +442,7 @@ def _variants(scene: Scene, method: str) -> Iterator[Visibility]:
     fewest = 0
     if any(body.is_glossy for body in scene.bodies):  # of whose gloss errors know nothing
         fewest = replace(scene, visibility=Visibility()).direction_count
-    directions = [count for count in DIRECTION_COUNTS if count >= fewest]
+    directions = sorted({max(count, fewest) for count in DIRECTION_COUNTS})
     candidates: dict[str, Sequence[Any]] = {"directions": directions, "log": LOGS, "order": ORDERS}
     names = METHOD_TRAITS[method].tuned
     for values in itertools.product(*(candidates[name] for name in names)):

@@ -455,4 +455,4 @@ def sample_lobes(
         launch(sample_adjoint, rows, inputs=[*sampled, *gradients], outputs=outputs, cost=2 * cost)
 
     record_adjoint(adjoint, [*lobes, *results])
-    return LobeSamples(*results, cosines)
+    return LobeSamples(results[0], results[1], cosines)
