@@ -152,7 +152,8 @@ class Rays(Method):
 
         arguments = ScenePatches(self.merged_scene), self.merged_scene.scene.bounces, self.openness
         rays = STILL_RAYS if self.shares_directions else RAYS
-        return StaticBounces(*arguments, rays=rays, progress=self.progress)
+        options = {"follows_light": self.shares_directions, "progress": self.progress}
+        return StaticBounces(*arguments, rays=rays, **options)
 
     def lobe_transmittance(self, points: LitPoints, directions: Node, light: LightInput, view: LitPoints) -> Node:
         """Transmittance towards the samples of lobes: rays, each of its own."""
