@@ -226,8 +226,7 @@ class StaticBounces:
             def trace(points: np.ndarray, normals: np.ndarray, sky: np.ndarray | None) -> PatchFormFactors:
                 count = len(senders.areas)
                 arguments = mesh, of_faces, count + len(BLACK_ENTRIES), points, normals
-                options = {"rays": self._rays, "bright": bright, "progress": self._progress}
-                form_factors = trace_form_factors(*arguments, **options)
+                form_factors = trace_form_factors(*arguments, rays=self._rays, bright=bright, progress=self._progress)
                 return scale_to_sky(
                     form_factors, np.append(casts[senders.body_of_patch], [True] * len(BLACK_ENTRIES)), sky
                 )
