@@ -135,7 +135,9 @@ def test_gradients_to_gloss_agree_with_differences(name):
     def loss(value):
         return (renderer(**{name: {"ball": value}}) * image).sum()
 
-    gradient, difference = twins.slopes(loss, torch.tensor([0.45]), 3e-3)
+    # 0.6: at other roughness differences of this sum, which has terms of either sign, have kinks of up to 8%, between
+    # texels of prefiltered light
+    gradient, difference = twins.slopes(loss, torch.tensor([0.6]), 3e-3)
     assert gradient == pytest.approx(difference, rel=SMOOTH)
 
 

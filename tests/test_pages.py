@@ -20,6 +20,7 @@ from warpshadow.inverse.fit_file import load_fit
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline import scene_views
 from warpshadow.scene import blockers
+from warpshadow.scene.visibility import DIRECTIONS
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -312,8 +313,9 @@ def test_the_scene_file_is_one(folder):
     assert ws.load_scene("inserted.toml").catchers == (1,)
     loaded = ws.load_scene("scene.toml")
     assert len(loaded.bodies) == 2
-    plain = ws.Visibility("directional")  # as it says, all are defaults; of "samples" it is the number that None means
-    assert dataclasses.asdict(loaded.visibility) == dataclasses.asdict(plain) | {"samples": plain.ray_count}
+    plain = ws.Visibility("directional")  # as it says, all are defaults, or the number that None means
+    numbers = {"samples": plain.ray_count, "directions": DIRECTIONS}
+    assert dataclasses.asdict(loaded.visibility) == dataclasses.asdict(plain) | numbers
     assert ws.Visibility(**tomllib.loads(automatic)["visibility"]).method == "auto"
 
 

@@ -503,29 +503,40 @@ def eye_of(clip_matrix):
     return -np.linalg.solve(rows[:, :3], rows[:, 3])
 
 
-def lobe_samples(points, normals, roughness, clip_matrix, count):
-    """Directions, (w, w', σ) and cosines of visible normals on a spiral over their cap (Dupuy and Benyoub 2023)."""
+def lobe_samples(points, normals, roughness, clip_matrix, count, spread=None):
+    """Directions, (w, w', σ) and cosines of visible normals on a spiral over their cap (Dupuy and Benyoub 2023).
+
+    A spread is (a, b), by which mirrors are wider.
+    """
     view = unit(eye_of(clip_matrix) - points)
     mu = (view * normals).sum(axis=-1)
     tangent = unit(view - mu[..., None] * normals)
     frame = np.stack([tangent, np.cross(normals, tangent), normals], axis=-1)
-    alpha = (roughness**2)[..., None]
+    square = (roughness**4)[..., None, None] * np.eye(2)
+    for vectors in () if spread is None else spread:
+        flat = (vectors[..., None, :] @ frame)[..., 0, :2]
+        square = square + flat[..., :, None] * flat[..., None, :] / 12
+    values, axes = np.linalg.eigh(square)
+    width = (axes * np.sqrt(values)[..., None, :]) @ axes.swapaxes(-1, -2)
+    determinant = np.sqrt(values.prod(axis=-1))
+
+    def stretched(vectors):
+        return np.concatenate([(width @ vectors[..., :2, None])[..., 0], vectors[..., 2:]], axis=-1)
+
     local = np.stack([np.sqrt(1 - mu**2), 0 * mu, mu], axis=-1)
-    slant = np.sqrt(mu**2 * (1 - alpha[..., 0] ** 2) + alpha[..., 0] ** 2)
-    stretched = unit(np.concatenate([alpha * local[..., :2], local[..., 2:]], axis=-1))
+    slant, axis = np.linalg.norm(stretched(local), axis=-1), unit(stretched(local))
     directions, weights = [], []
     for i in range(count):
         share, turn = (i + 0.5) / count, np.pi * (1 + np.sqrt(5)) * i
-        z = (1 - share) * (1 + stretched[..., 2]) - stretched[..., 2]
+        z = (1 - share) * (1 + axis[..., 2]) - axis[..., 2]
         ring = np.sqrt(1 - z**2)
-        mirror = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=-1) + stretched
-        mirror = unit(np.concatenate([alpha * mirror[..., :2], mirror[..., 2:]], axis=-1))
+        mirror = unit(stretched(np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=-1) + axis))
         facing = (mirror * local).sum(axis=-1)
         to = 2 * facing[..., None] * mirror - local
-        up, a = to[..., 2], alpha[..., 0]
-        other = np.sqrt(up**2 * (1 - a**2) + a**2)
+        up, other = to[..., 2], np.linalg.norm(stretched(to), axis=-1)
         w = np.where(up > 0, up * (mu + slant) / (up * slant + mu * other), 0) / count
-        density = a**2 / (np.pi * (mirror[..., 2] ** 2 * (a**2 - 1) + 1) ** 2) / (2 * (mu + slant))
+        flat = np.linalg.solve(width, mirror[..., :2, None])[..., 0]
+        density = 1 / (np.pi * determinant * ((flat**2).sum(axis=-1) + mirror[..., 2] ** 2) ** 2) / (2 * (mu + slant))
         directions.append((frame @ to[..., None])[..., 0])
         weights.append(np.stack([w, w * (1 - facing) ** 5, 1 / np.sqrt(2 * np.pi * count * density)], axis=-1))
     return np.stack(directions, axis=-2), np.stack(weights, axis=-2), mu

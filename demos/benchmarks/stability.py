@@ -409,7 +409,7 @@ def print_breakdown(overlap: dict[str, list[float]], thresholds: dict[str, list[
     sun = hard_lights()["a sun of one pixel"]
     radiance = twins.harmonics(8, ws.fibonacci(4096)) @ sun.sh(8)[:, 0]
     print(f"  a sun in SH of order 8: as low as {radiance.min() / radiance.max():.0%} of its peak elsewhere")
-    for visibility in (ws.Visibility("directional"), ws.Visibility(directions=1024), ws.Visibility(method="log-sh")):
+    for visibility in (ws.Visibility(directions=128), ws.Visibility(directions=1024), ws.Visibility(method="log-sh")):
         label = f"directional, {visibility.directions}" if visibility.method == "directional" else visibility.method
         print(f"  a closed room, {label}: {light_in_a_closed_room(visibility):.1%} of the sky's light")
 

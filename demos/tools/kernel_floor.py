@@ -202,7 +202,7 @@ def measure(scene: ws.Scene) -> tuple[Size, float, float]:
     geometry = renderer.geometry()
     normals = vertex_normals(geometry.positions, renderer.merged_scene.faces)
     arrays = [geometry.positions, normals, geometry.centers, geometry.radii]
-    directions = ws.fibonacci(scene.visibility.directions)
+    directions = ws.fibonacci(scene.direction_count)
     width = falloff_width(scene.visibility.softness, len(directions))
     shares = needed(*(array.numpy()[0].astype(np.float64) for array in arrays), directions, width)
     vertex_count, sphere_count = arrays[0].shape[1], arrays[3].shape[1]

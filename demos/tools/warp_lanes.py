@@ -89,7 +89,7 @@ def main() -> None:
     merged_scene, geometry = renderer.merged_scene, renderer.geometry()
     normals = vertex_normals(geometry.positions, merged_scene.faces)
     arrays = [array.numpy()[0] for array in (geometry.positions, normals, geometry.centers, geometry.radii)]
-    directions = ws.fibonacci(scene.visibility.directions)
+    directions = ws.fibonacci(scene.direction_count)
     reaches = reached(*arrays, directions, falloff_width(scene.visibility.softness, len(directions)))
     orders = {"mesh": np.arange(len(reaches)), "Z": merged_scene.vertex_order}
     print("| receivers | of a warp | spheres visited | lanes at work | atomics | after sums by warps |")

@@ -16,6 +16,24 @@ def test_a_body_without_roughness_is_diffuse():
 
 
 @pytest.mark.parametrize(
+    ("roughness", "given", "expected"),
+    [
+        (None, None, 128),
+        (0.3, None, 128),
+        (0.29, None, 256),
+        (np.linspace(0.2, 1, 42), None, 256),
+        (0.29, 64, 64),
+        (0.9, 512, 512),
+    ],
+)
+def test_narrow_lobes_have_finer_cells_unless_a_number_is_given(roughness, given, expected):
+    bodies = [ws.Body(BALL), ws.Body(BALL, roughness=roughness)]
+    scene = ws.Scene(bodies, SKY, visibility=ws.Visibility(directions=given))
+    assert scene.direction_count == expected
+    assert ws.Renderer(scene).basis.size == expected
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"roughness": 1.2}, "roughness: got 1 values out of range"),

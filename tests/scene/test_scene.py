@@ -52,7 +52,7 @@ def test_every_key_has_the_documented_default_but_camera_light_and_a_body(load):
     expected = ws.Camera.look_at((0, 1, 4), (0, 0, 0), up=(0, 1, 0), fov_y=40)
     np.testing.assert_array_equal(scene.camera.clip_matrix(), expected.clip_matrix())
     visibility = scene.visibility
-    assert (visibility.method, visibility.directions, visibility.softness) == (None, 128, 0.35)
+    assert (visibility.method, visibility.directions, visibility.softness) == (None, None, 0.35)
     assert visibility.sampling == "independent"
     assert visibility.merging == 0.75
     assert (visibility.order, visibility.log, visibility.base) == (8, "eigen", "quadratic")

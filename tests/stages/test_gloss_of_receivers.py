@@ -7,6 +7,8 @@ import warp as wp
 
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.gloss import lobes, prefilter, reflection, transmittance
+from warpshadow.stages.gloss.normal_spread import NormalSpread, find_normal_spread
+from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.textures import numbers
 
 # Numbers near 1 after some tens of operations in float32.
@@ -41,11 +43,77 @@ def arrays(device, *values, requires_grad=False):
     ]
 
 
-def test_samples_of_lobes_are_those_of_the_twin(device):
+def spreads(normals, seed=5):
+    """Two vectors across each normal."""
+    rng = np.random.default_rng(seed)
+    vectors = 0.6 * rng.uniform(-1, 1, size=(2, *normals.shape))
+    return vectors - (vectors * normals).sum(axis=-1, keepdims=True) * normals
+
+
+@pytest.mark.parametrize("varies", [False, True])
+def test_samples_of_lobes_are_those_of_the_twin(device, varies):
     points, normals, roughness = receivers()
-    got = lobes.sample_lobes(*arrays(device, points, normals, roughness, CAMERA[None]), 32)
-    for result, expected in zip(got, twins.lobe_samples(points, normals, roughness, CAMERA, 32), strict=True):
+    spread = spreads(normals) if varies else None
+    arguments = arrays(device, points, normals, roughness, CAMERA[None])
+    got = lobes.sample_lobes(*arguments, 32, NormalSpread(*arrays(device, *spread)) if varies else None)
+    for result, expected in zip(got, twins.lobe_samples(points, normals, roughness, CAMERA, 32, spread), strict=True):
         assert np.abs(result.numpy() - expected).max() < 20 * FLOAT32 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("count", [32, 7])
+def test_samples_of_lobes_have_the_gradients_of_the_twin(device, count):
+    points, normals, roughness = receivers()
+    values = [points, normals, roughness, CAMERA[None], *spreads(normals)]
+    variables = arrays(device, *values, requires_grad=True)
+    rng = np.random.default_rng(7)
+    with wp.Tape() as tape:
+        samples = lobes.sample_lobes(*variables[:4], count, NormalSpread(*variables[4:]))
+    weights = [rng.normal(size=result.shape + (3,) * (result.dtype == wp.vec3)) for result in samples]
+    tape.backward(grads=dict(zip(samples, arrays(device, *weights), strict=True)))
+
+    def loss(values):
+        results = twins.lobe_samples(*values[:3], values[3][0], count, values[4:])
+        return sum((weight * result).sum() for weight, result in zip(weights, results, strict=True))
+
+    for number, variable in enumerate(variables):
+        towards, step = rng.normal(size=values[number].shape), 1e-6
+        moved = [[*values[:number], values[number] + h * towards, *values[number + 1 :]] for h in (step, -step)]
+        gradient = variable.grad.numpy()
+        # a dot product of numbers of either sign: float32 is relative to their size
+        scale = np.linalg.norm(gradient) * np.linalg.norm(towards)
+        assert abs((gradient * towards).sum() - (loss(moved[0]) - loss(moved[1])) / (2 * step)) < 20 * FLOAT32 * scale
+
+
+def test_normals_vary_over_a_pixel_as_they_do_between_pixels(device):
+    """On one large face of a ball's curvature, seen at a slant: against differences of the interpolated normals."""
+    positions = np.array([[-1.0, -0.8, 0.1], [1.1, -0.7, -0.4], [0.1, 0.9, 0.3]])
+    corner_normals = twins.unit(positions * [0.4, 0.4, 0] + [0, 0, 1])
+    matrix, size = CAMERA, 16
+    clip = np.column_stack([positions, np.ones(3)]) @ matrix.T
+
+    def fragment(x, y):
+        """Barycentrics of a position in the image, from −1 to 1."""
+        rows = np.stack([clip[:, 0] - x * clip[:, 3], clip[:, 1] - y * clip[:, 3], np.ones(3)])
+        return np.linalg.solve(rows, [0, 0, 1])
+
+    def normal(x, y):
+        return twins.unit(fragment(x, y) @ corner_normals)
+
+    middle, step = np.array([0.1, -0.05]), 1e-4
+    variables = [
+        wp.array(np.array(value)[None].astype(np.float32), dtype=dtype, device=device)
+        for value, dtype in ((corner_normals, wp.vec3), (clip, wp.vec4))
+    ]
+    fragments = Fragments(
+        wp.zeros((1, 1), dtype=wp.int32, device=device),
+        wp.array(fragment(*middle)[None, None].astype(np.float32), dtype=wp.vec3, device=device),
+    )
+    faces = wp.array([[0, 1, 2]], dtype=wp.vec3i, device=device)
+    got = find_normal_spread(fragments, faces, *variables, (size, size), 2)
+    for result, axis in zip(got, np.eye(2), strict=True):
+        change = normal(*(middle + step * axis)) - normal(*(middle - step * axis))
+        expected = change / (2 * step) * 2 / size
+        assert np.abs(result.numpy()[0, 0] - expected).max() < 1e-3 * np.abs(expected).max()
 
 
 @pytest.mark.parametrize("roughness", [0.2, 0.5, 1.0])

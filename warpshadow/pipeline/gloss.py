@@ -20,6 +20,7 @@ from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.transfers import Light, change_basis
 from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.stages.gloss.lobes import LobeSamples, sample_lobes
+from warpshadow.stages.gloss.normal_spread import NormalSpread, find_normal_spread
 from warpshadow.stages.gloss.prefilter import look_up_light, prefilter
 from warpshadow.stages.gloss.reflection import LobeLight, mix_reflection, number_runs, sum_lobes
 from warpshadow.stages.interpolation import interpolate
@@ -77,7 +78,8 @@ class GlossyPoints(LitPoints):
         key = materials.roughness
 
         def lobes() -> Node:
-            inputs = self.receivers_node, roughness, self._cameras, self.method.lobe_samples
+            spread = Node("", self._spread, self.receivers_node, self.normals, self._clip_positions, self._fragments)
+            inputs = self.receivers_node, roughness, self._cameras, self.method.lobe_samples, spread
             return Node("lobes", _sample, *inputs, items=item_text)
 
         sampled = self.cached("lobes", key, lobes)
@@ -126,6 +128,16 @@ class GlossyPoints(LitPoints):
         )
         return rows(interpolate(fragments, self.merged_scene.side_faces, values))
 
+    def _spread(
+        self, receivers: Receivers, normals: wp.array, clip_positions: wp.array, seen: Fragments
+    ) -> NormalSpread:
+        """How normals vary over the receivers. Differentiable: all but seen."""
+        supersampling = self.merged_scene.scene.supersampling
+        _, height, width = seen.face_ids.shape
+        fragments, size = receivers.sample_fragments, (width // supersampling, height // supersampling)
+        assert fragments is not None
+        return find_normal_spread(fragments, self.merged_scene.side_faces, normals, clip_positions, size, supersampling)
+
     def _sample(self, fragments: Fragments, values: wp.array, textures: Textures, footprints: Footprints) -> wp.array:
         """Numbers of the view's samples: of textures and, on bodies without one, of vertices."""
         return as_scalars(sample_albedo(fragments, self.merged_scene.faces, as_colors(values), textures, footprints))
@@ -161,8 +173,10 @@ def _add(lobe_light: LobeLight, highlights: LobeLight) -> LobeLight:
     return LobeLight(*(add_light(*pair) for pair in zip(lobe_light, highlights, strict=True)))
 
 
-def _sample(receivers: Receivers, roughness: wp.array, cameras: wp.array, sample_count: int) -> LobeSamples:
-    return sample_lobes(receivers.points, receivers.normals, roughness, cameras, sample_count)
+def _sample(
+    receivers: Receivers, roughness: wp.array, cameras: wp.array, sample_count: int, spread: NormalSpread
+) -> LobeSamples:
+    return sample_lobes(receivers.points, receivers.normals, roughness, cameras, sample_count, spread)
 
 
 def _means(receivers: Receivers, samples: wp.array) -> wp.array:

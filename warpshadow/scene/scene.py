@@ -20,7 +20,16 @@ from warpshadow.assets.mesh import Mesh
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.scene.body import Body
-from warpshadow.scene.visibility import BOUNCE_METHODS, DEFAULT_METHOD, GLOSS_METHODS, METHODS, Visibility
+from warpshadow.scene.visibility import (
+    BOUNCE_METHODS,
+    DEFAULT_METHOD,
+    DIRECTIONS,
+    DIRECTIONS_OF_GLOSS,
+    GLOSS_METHODS,
+    METHODS,
+    NARROW_ROUGHNESS,
+    Visibility,
+)
 from warpshadow.stages.shell.beams import exits_on_host
 
 MAX_BOUNCES = 16
@@ -252,6 +261,17 @@ class Scene:
         """Methods of visibility that show all that the scene has: gloss, emission and near light."""
         is_any = self.shell is None and not any(body.is_glossy or body.is_emitter for body in self.bodies)
         return tuple(method for method in METHODS if is_any or method in GLOSS_METHODS)
+
+    @property
+    def direction_count(self) -> int:
+        """Cells of "directional": as many as are asked for, or 256 where a body's smallest roughness is below 0.3.
+
+        Roughness that calls of a renderer pass does not count, nor that a fit finds.
+        """
+        if self.visibility.directions is not None:
+            return self.visibility.directions
+        roughness = [body.roughness.min() for body in self.bodies if body.roughness is not None]
+        return DIRECTIONS_OF_GLOSS if min(roughness, default=1.0) < NARROW_ROUGHNESS else DIRECTIONS
 
     def with_method(self) -> Scene:
         """The scene as renderers have it: "directional" where no method is named."""

@@ -96,6 +96,37 @@ def ray_volumes(a: wp.vec3, b: wp.vec3, c: wp.vec3):
 
 
 @wp.func
+def volume_rates(a: wp.vec4, b: wp.vec4, c: wp.vec4, position: wp.vec2, step: wp.vec2):
+    """By how much the volumes of `ray_volumes` change with a step to the right and one down, as shares of their sum.
+
+    A value that is linear on the face, Σ v_i value_i / Σ v_i, changes by Σ rate_i (value_i − value). ``a``, ``b`` and
+    ``c`` are the vertices in clip space.
+    """
+    relative_a = relative_to_ray(a, position)
+    relative_b = relative_to_ray(b, position)
+    relative_c = relative_to_ray(c, position)
+    vertex_volumes = ray_volumes(relative_a, relative_b, relative_c)
+    volume_sum = vertex_volumes[0] + vertex_volumes[1] + vertex_volumes[2]
+    volumes_by_x = wp.vec3(
+        relative_b[1] * c[3] - b[3] * relative_c[1],
+        relative_c[1] * a[3] - c[3] * relative_a[1],
+        relative_a[1] * b[3] - a[3] * relative_b[1],
+    )
+    volumes_by_y = wp.vec3(
+        b[3] * relative_c[0] - relative_b[0] * c[3],
+        c[3] * relative_a[0] - relative_c[0] * a[3],
+        a[3] * relative_b[0] - relative_a[0] * b[3],
+    )
+    # seen edge-on the total vanishes: no less, then, than a millionth of the change of the volumes in a step
+    minimum = 1.0e-6 * (
+        step[0] * (wp.abs(volumes_by_x[0]) + wp.abs(volumes_by_x[1]) + wp.abs(volumes_by_x[2]))
+        + step[1] * (wp.abs(volumes_by_y[0]) + wp.abs(volumes_by_y[1]) + wp.abs(volumes_by_y[2]))
+    )
+    scale = wp.where(wp.abs(volume_sum) > minimum, volume_sum, minimum + 1.0e-30)
+    return (step[0] / scale) * volumes_by_x, (step[1] / scale) * volumes_by_y
+
+
+@wp.func
 def orientation(a: wp.vec4, b: wp.vec4, c: wp.vec4):
     """Volume that the eye spans with a face; its sign is the winding of the face on screen."""
     origin = wp.vec3(a[0], a[1], a[3])

@@ -205,7 +205,8 @@ def tune(
 ) -> Tuning:
     """Measure settings of a scene, and choose the cheapest that reaches an error, or the best within a time.
 
-    Tried are all methods but rays, as far as they show all that the scene has; 32 to 512 directions; orders 4, 6 and 8;
+    Tried are all methods but rays, as far as they show all that the scene has; 32 to 512 directions, where bodies shine
+    no fewer than by default; orders 4, 6 and 8;
     16 to 512 spheres for bodies that say how many; and every pixel as a receiver for bodies whose vertices miss
     shadows.
 
@@ -407,7 +408,7 @@ def _by_work(scene: Scene, sample: PointSample) -> Iterator[Scene]:
 
 
 def _all_directions(scene: Scene) -> Iterator[Scene]:
-    return (replace(scene, visibility=visibility) for visibility in _variants(scene.visibility, "directional"))
+    return (replace(scene, visibility=visibility) for visibility in _variants(scene, "directional"))
 
 
 # ---------------------------------------------------------------------------------------------- settings
@@ -421,7 +422,7 @@ def _settings(scene: Scene, fine: Sequence[str], fits: bool, device: wp.DeviceLi
             yield replace(scene_with_receivers, visibility=scene.visibility.by("none"))
         for variant in _sphere_variants(scene_with_receivers, fits, device):
             for method in SPHERE_METHODS:
-                for visibility in _variants(scene.visibility, method) if method in scene.methods else ():
+                for visibility in _variants(scene, method) if method in scene.methods else ():
                     yield replace(variant, visibility=visibility)
 
 
@@ -436,10 +437,14 @@ def _sphere_variants(scene: Scene, fits: bool, device: wp.DeviceLike) -> Iterato
             yield change_bodies(scene, "blockers", dict.fromkeys(fitted, count))
 
 
-def _variants(visibility: Visibility, method: str) -> Iterator[Visibility]:
+def _variants(scene: Scene, method: str) -> Iterator[Visibility]:
     """A method with all values that are tried of the settings that tuning varies, as far as its others allow them."""
-    candidates: dict[str, Sequence[Any]] = {"directions": DIRECTION_COUNTS, "log": LOGS, "order": ORDERS}
+    fewest = 0
+    if any(body.is_glossy for body in scene.bodies):  # of whose gloss errors know nothing
+        fewest = replace(scene, visibility=Visibility()).direction_count
+    directions = sorted({max(count, fewest) for count in DIRECTION_COUNTS})
+    candidates: dict[str, Sequence[Any]] = {"directions": directions, "log": LOGS, "order": ORDERS}
     names = METHOD_TRAITS[method].tuned
     for values in itertools.product(*(candidates[name] for name in names)):
         with contextlib.suppress(ValueError):
-            yield replace(visibility.by(method), **dict(zip(names, values, strict=True)))
+            yield replace(scene.visibility.by(method), **dict(zip(names, values, strict=True)))

@@ -40,10 +40,11 @@ def as_toml(path: Path, scene: Scene, viewer_state: ViewerState, camera: Camera)
     light["scale"] = light.get("scale", 1.0) * viewer_state.scale
     settings = viewer_state.settings(scene)
     light["bounces"] = settings.bounces
-    visibility, given_visibility = tables.setdefault("visibility", {}), scene.visibility.with_method()
+    visibility = tables.setdefault("visibility", {})
+    given_settings = vars(scene.visibility.with_method()) | {"directions": scene.direction_count}
     for name in ("method", *METHODS_OF_SETTING):
         value = getattr(settings.visibility, name)
-        if value != getattr(given_visibility, name):
+        if value is not None and value != given_settings[name]:
             visibility[name] = value
     if "method" in visibility:  # "auto" was replaced
         visibility["method"] = settings.visibility.method

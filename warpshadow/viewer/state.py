@@ -116,7 +116,7 @@ class ViewerState:
             stops=stops,
             method=scene.visibility.method or DEFAULT_METHOD,
             sampling=scene.visibility.sampling,
-            directions=min(scene.visibility.directions, MAX_CELLS),
+            directions=min(scene.direction_count, MAX_CELLS),
             softness=scene.visibility.softness,
             spheres=None,
             receivers=AS_GIVEN,
@@ -135,7 +135,7 @@ class ViewerState:
             return requested_visibility
         rays = quality.cells if requested_visibility.sampling == "shared" else quality.rays
         bounded_settings = {
-            "directions": min(requested_visibility.directions, quality.cells),
+            "directions": min(self.directions, quality.cells),
             "samples": min(requested_visibility.ray_count, rays),
         }
         return Visibility.of(vars(requested_visibility) | bounded_settings)

@@ -340,3 +340,24 @@ def test_a_few_receivers_are_all_nodes():
     assert sorted(nodes) == [0, 1, 2]
     np.testing.assert_allclose((interpolation_matrix(points, normals, nodes) @ points[nodes]), points, atol=1e-6)
     assert interpolation_matrix(points[:1], normals[:1], np.array([0])).toarray() == [[1.0]]
+
+
+def test_the_bounced_light_of_a_bulb_in_a_shade_has_no_grain_in_stills(monkeypatch):
+    """Nearly all comes from inside the shade, which few rays meet by chance: 13% of grain without others, 5% with."""
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    rings = [
+        np.stack([r * np.cos(angle), np.full(12, y), r * np.sin(angle)], axis=1) for r, y in ((0.3, 0), (0.2, 0.3))
+    ]
+    i, j = np.arange(12), (np.arange(12) + 1) % 12
+    faces = np.concatenate([np.stack([i, i + 12, j], axis=1), np.stack([j, i + 12, j + 12], axis=1)])
+    bodies = [
+        ws.Body(ws.Mesh(np.concatenate(rings), faces), albedo=(0.8,) * 3, translation=(0, 1.3, 0), name="shade"),
+        ws.Body(ws.icosphere(0.06, 1), emission=(99,) * 3, albedo=(0,) * 3, translation=(0, 1.4, 0), name="bulb"),
+        ws.Body(ws.plane(4.0), albedo=(0.6,) * 3, rotation=(90, 0, 0), translation=(0, 2, -1), name="wall"),
+    ]
+    camera = ws.Camera.look_at((0, 1.5, 4), (0, 1.6, 0), fov_y=35, size=(24, 24))
+    scene = ws.Scene(bodies, ws.EnvironmentMap.constant(0.0), camera, bounces="all")
+    still = ws.render(scene)[..., :3]
+    monkeypatch.setattr(static_bounces, "STILL_RAYS", 2048)
+    expected = ws.render(scene)[..., :3]
+    assert np.linalg.norm(still - expected) < 0.07 * np.linalg.norm(expected)

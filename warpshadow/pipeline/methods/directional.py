@@ -95,7 +95,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     shades_transmittance = True
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
-        self._directions = fibonacci(merged_scene.scene.visibility.directions)
+        self._directions = fibonacci(merged_scene.scene.direction_count)
         is_near = merged_scene.scene.shell is not None
         native_basis = PATCHES if is_near else CellBasis(self._directions)
         super().__init__(merged_scene, native_basis, basis, progress=progress)

@@ -176,7 +176,7 @@ def _has_sun(scene: Scene) -> bool:
     """Whether the directional method is to find shadows of a sun."""
     if scene.visibility.method != "directional" or scene.shell is not None:
         return False
-    cells = scene.known_light.cells(fibonacci(scene.visibility.directions))
+    cells = scene.known_light.cells(fibonacci(scene.direction_count))
     if cells.spots is None or cells.half_angles is None:
         return False
     return find_sharp_cells(cells.radiance @ LUMINANCE, cells.spots, cells.half_angles) is not None

@@ -10,13 +10,14 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import zeros
+from warpshadow.stages.bounces.bright_patches import BrightPatches, hit_weight, point_of_bright_side
 from warpshadow.stages.bounces.patches import Patches
 from warpshadow.stages.ray_tracing import RAY_COST, first_hit, progress_slices
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-_MAX_COUNTS = 1 << 22  # counts that are held at once [receivers × patches]
+_MAX_HITS = 1 << 22  # sums of hits that are held at once [receivers × patches]
 
 GOLDEN_TURN = (5**0.5 - 1) / 2  # turn from ray to ray, as a part of a full turn
 
@@ -29,20 +30,22 @@ _BURIED_SHARE = 0.5
 
 
 @wp.kernel(enable_backward=False)
-def _count_hits(
+def _sum_hits(
     first_row: int,
     worker: int,
     # in
     mesh: wp.uint64,
+    corners: wp.array(dtype=wp.vec3),
     patch_of_sides: wp.array2d(dtype=wp.int32),
+    bright: BrightPatches,
     points: wp.array(dtype=wp.vec3),
     normals: wp.array(dtype=wp.vec3),
     first_receiver: int,
     ray_count: int,
     # out
-    counts: wp.array2d(dtype=wp.int32),
+    hits: wp.array2d(dtype=wp.float32),
 ):
-    """A thread owns a receiver, whose counts are zero before."""
+    """A thread owns a receiver, whose hits are zero before."""
     receiver = first_row + wp.tid()
     point = points[receiver]
     normal = normals[receiver]
@@ -53,7 +56,8 @@ def _count_hits(
     duff_b = normal[0] * normal[1] * duff_a
     tangent = wp.vec3(1.0 + sign * normal[0] * normal[0] * duff_a, sign * duff_b, -sign * normal[0])
     bitangent = wp.vec3(duff_b, sign + normal[1] * normal[1] * duff_a, -normal[1])
-    first_turn = wp.randf(wp.rand_init(29, first_receiver + receiver))
+    state = wp.rand_init(29, first_receiver + receiver)
+    first_turn = wp.randf(state)
     for ray in range(ray_count):
         # a Fibonacci lattice on the disc below the hemisphere: so directions are as dense as their cosine is large
         radius2 = (float(ray) + 0.5) / float(ray_count)
@@ -66,7 +70,20 @@ def _count_hits(
         if hit.face >= 0:
             patch = patch_of_sides[wp.where(hit.is_back, 1, 0), hit.face]
             if patch >= 0:
-                counts[receiver, patch] = counts[receiver, patch] + 1
+                hits[receiver, patch] += hit_weight(
+                    bright, patch, corners, hit.face, point, normal, ray_direction, ray_count
+                )
+    for ray in range(bright.ray_count):
+        share = (float(ray) + wp.randf(state)) / float(bright.ray_count)
+        side, target = point_of_bright_side(bright, corners, share, wp.randf(state), wp.randf(state))
+        ray_direction = wp.normalize(target - point)
+        if wp.dot(normal, ray_direction) > 0.0:
+            hit = first_hit(mesh, point, normal, ray_direction)
+            if hit.face >= 0 and side == hit.face + wp.where(hit.is_back, patch_of_sides.shape[1], 0):
+                patch = patch_of_sides[wp.where(hit.is_back, 1, 0), hit.face]
+                hits[receiver, patch] += hit_weight(
+                    bright, patch, corners, hit.face, point, normal, ray_direction, ray_count
+                )
 
 
 def patch_mesh(patches: Patches, positions: np.ndarray, faces: np.ndarray, *, device: wp.DeviceLike) -> wp.Mesh:
@@ -93,6 +110,7 @@ def trace_form_factors(
     normals: np.ndarray,
     *,
     rays: int = 512,
+    bright: BrightPatches | None = None,
     progress: bool = False,
 ) -> csr_matrix:
     """Trace which patches receivers see.
@@ -110,6 +128,7 @@ def trace_form_factors(
         points: Receivers, which may lie on the mesh, shape [receiver, 3].
         normals: Unit normals, shape [receiver, 3]. Where one is zero nothing is seen.
         rays: Rays of each receiver.
+        bright: Patches of the mesh that more rays are sent to; None for none.
     Returns:
         F, float32 of shape [receiver, patch].
     Differentiable: no.
@@ -121,13 +140,15 @@ def trace_form_factors(
     check.shape("normals", normals.shape, points.shape)
     device = mesh.device
     patch_array = wp.array(patch_of_sides, dtype=wp.int32, device=device)
+    bright = BrightPatches() if bright is None else bright
+    ray_count = rays + bright.ray_count
     factors = []
-    for receivers in progress_slices(len(points), _MAX_COUNTS // max(count, 1), progress):
-        counts = zeros((receivers.stop - receivers.start, count), dtype=wp.int32, device=device)
+    for receivers in progress_slices(len(points), _MAX_HITS // max(count, 1), progress):
+        hits = zeros((receivers.stop - receivers.start, count), dtype=wp.float32, device=device)
         receiver_arrays = [wp.array(values[receivers], dtype=wp.vec3, device=device) for values in (points, normals)]
-        inputs = [mesh.id, patch_array, *receiver_arrays, receivers.start, rays]
-        launch(_count_hits, len(receiver_arrays[0]), inputs=inputs, outputs=[counts], cost=RAY_COST * rays)
-        factors.append(csr_matrix(counts.numpy()))
+        inputs = [mesh.id, mesh.points, patch_array, bright, *receiver_arrays, receivers.start, rays]
+        launch(_sum_hits, len(receiver_arrays[0]), inputs=inputs, outputs=[hits], cost=RAY_COST * ray_count)
+        factors.append(csr_matrix(hits.numpy()))
     if not factors:
         return csr_matrix((0, count), dtype=np.float32)
     return (vstack(factors, format="csr") / rays).astype(np.float32)

@@ -5,16 +5,22 @@ Smith says, correlated by height [glTF 2.0, appendix B]. With n·v = μ and n·l
 
     f = D V,  D = α² / (π ((n·h)² (α² − 1) + 1)²),  V = ½ / (c Λ(μ) + μ Λ(c)),  Λ(x) = √(x² (1 − α²) + α²).
 
-Samples are mirrors that the viewer sees, spread evenly over them [Dupuy and Benyoub 2023, Sampling Visible GGX Normals
-with Spherical Caps]: sample i of N has the weight
+Where normals vary over a receiver by a and b (:mod:`.normal_spread`), its mirrors are as wide as those of its surface
+and of its normals together [Kaplanyan et al. 2016, Filtering Distributions of Normals for Shading Antialiasing]: with
+a, b and h_t across the normal, and half the variance of a Gaussian, since the tails of GGX are long,
+
+    W² = α² + (a aᵀ + b bᵀ) / 12,  D = 1 / (π |W| (|W⁻¹h_t|² + (n·h)²)²),  Λ(v) = √((n·v)² + |W v_t|²),
+
+which is the above for a = b = 0. Samples are mirrors that the viewer sees, spread evenly over them [Dupuy and Benyoub
+2023, Sampling Visible GGX Normals with Spherical Caps]: sample i of N has the weight
 
     w = G₂ / G₁ / N = c (μ + Λ(μ)) / (c Λ(μ) + μ Λ(c)) / N,   w' = w (1 − v·h)⁵,
 
 so that ∫ f L c dω = Σ w L, and the light of F₀ + (1 − F₀)(1 − v·h)⁵ is F₀ Σ w L + (1 − F₀) Σ w' L. Each sample stands
-for a solid angle of 1 / (N p), p = D / (2 (μ + Λ(μ))), so it looks up light that is blurred by a Gaussian of as large
+for a solid angle of 1 / (N p), p = D / (2 (μ + Λ)), so it looks up light that is blurred by a Gaussian of as large
 a solid angle, 2π σ² [Křivánek and Colbert 2008, Real-time Shading with Filtered Importance Sampling]:
 
-    σ = (1 − (1 − α²) (n·h)²) √((μ + Λ(μ)) / N) / α.
+    σ = (|W⁻¹h_t|² + (n·h)²) √(|W| (μ + Λ) / N).
 """
 
 import functools
@@ -26,16 +32,19 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
-from warpshadow.device.lanes import lane_count, lane_type, make_lane_functions, module_options
-from warpshadow.device.launch import launch
+from warpshadow.device.lanes import lane_count, lane_type, make_lane_functions, module_options, vectors_type
+from warpshadow.device.launch import launch, varies
+from warpshadow.device.memory import empty, in_huge_pages, require_gradient
 from warpshadow.device.parallel import split_row
+from warpshadow.device.tape import record_adjoint
+from warpshadow.stages.gloss.normal_spread import NormalSpread
 
 MIN_ROUGHNESS = 0.1  # roughness of the smoothest surface; maps of 128 rows have nothing sharper
 
 MIN_COSINE = 0.02  # cosine between a receiver's normal and its viewer, of those whose interpolated normal turns away
 MAX_COSINE = 0.99999
 
-_COST = 15.0  # nanoseconds that a sample takes
+_SHAPE_COST, _COST = 50.0, 15.0  # nanoseconds that a lobe takes, and a sample
 
 wp.set_module_options({"max_unroll": 1})
 
@@ -78,67 +87,153 @@ def _axis_across(direction: wp.vec3):
     return wp.vec3(0.0, 0.0, 1.0)
 
 
+@wp.kernel
+def _shape_lobes(
+    first_row: int,
+    worker: int,
+    # in
+    points: wp.array2d(dtype=wp.vec3),
+    normals: wp.array2d(dtype=wp.vec3),
+    roughness: wp.array2d(dtype=wp.float32),
+    clip_matrices: wp.array(dtype=wp.mat44),
+    along_x: wp.array2d(dtype=wp.vec3),
+    along_y: wp.array2d(dtype=wp.vec3),
+    # out
+    lobe_normals: wp.array2d(dtype=wp.vec3),
+    tangents: wp.array2d(dtype=wp.vec3),
+    views: wp.array2d(dtype=wp.vec3),
+    caps: wp.array2d(dtype=wp.vec3),
+    widths: wp.array2d(dtype=wp.vec3),
+    cosines: wp.array2d(dtype=wp.float32),
+):
+    """A thread owns a receiver: the frame of its lobe, sine, cosine and Λ of its view, its cap's axis, and W."""
+    batch, receiver = split_row(first_row + wp.tid(), cosines.shape[1])
+    point_batch = instance_in(batch, points.shape[0])
+    normal = normals[point_batch, receiver]
+    eye = eye_position(clip_matrices[instance_in(batch, clip_matrices.shape[0])])
+    view = wp.normalize(eye - points[point_batch, receiver])
+    rough = wp.max(roughness[instance_in(batch, roughness.shape[0]), receiver], MIN_ROUGHNESS)
+    cosine = wp.clamp(wp.dot(normal, view), MIN_COSINE, MAX_COSINE)
+    sine = wp.sqrt(1.0 - cosine * cosine)
+    across_view = view - wp.dot(normal, view) * normal
+    if wp.length_sq(across_view) < 1.0e-10:
+        across_view = wp.cross(normal, _axis_across(normal))
+    tangent = wp.normalize(across_view)
+    square_xx = rough * rough * rough * rough
+    square_yy = square_xx
+    square_xy = float(0.0)
+    if along_x:
+        spread_batch = instance_in(batch, along_x.shape[0])
+        bitangent = wp.cross(normal, tangent)
+        a = along_x[spread_batch, receiver]
+        b = along_y[spread_batch, receiver]
+        a_x, a_y = wp.dot(a, tangent), wp.dot(a, bitangent)
+        b_x, b_y = wp.dot(b, tangent), wp.dot(b, bitangent)
+        square_xx += (a_x * a_x + b_x * b_x) / 12.0
+        square_xy += (a_x * a_y + b_x * b_y) / 12.0
+        square_yy += (a_y * a_y + b_y * b_y) / 12.0
+    determinant = wp.sqrt(square_xx * square_yy - square_xy * square_xy)
+    trace = wp.sqrt(square_xx + square_yy + 2.0 * determinant)  # of W
+    width = wp.vec3(square_xx + determinant, square_xy, square_yy + determinant) / trace
+    stretched_view = wp.vec3(width[0] * sine, width[1] * sine, cosine)
+    slant = wp.length(stretched_view)
+    lobe_normals[batch, receiver] = normal
+    tangents[batch, receiver] = tangent
+    views[batch, receiver] = wp.vec3(sine, cosine, slant)
+    caps[batch, receiver] = stretched_view / slant
+    widths[batch, receiver] = width
+    cosines[batch, receiver] = cosine
+
+
+class _Lobes(NamedTuple):
+    """Lobes of receivers, vec3 of shape [batch, receiver]."""
+
+    normals: wp.array
+    tangents: wp.array  # the view is in the plane of these
+    views: wp.array  # sine, cosine and Λ of the view
+    caps: wp.array  # axes of the caps of mirrors of width 1, in the frame of tangent, bitangent and normal
+    widths: wp.array  # W: xx, xy, yy
+
+
 @functools.cache
-def _make_sample_lobes(lanes: int) -> wp.Kernel:
-    """Make the kernel, which takes as many samples of a lobe at once as there are lanes."""
-    Lane, sqrt = lane_type(lanes), make_lane_functions(lanes).sqrt
+def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
+    """Make the kernel and its adjoint, which take as many samples of a lobe at once as there are lanes."""
+    Lane, Vectors, fn = lane_type(lanes), vectors_type(lanes), make_lane_functions(lanes)
+    sqrt, is_positive, dot, dot_direction = fn.sqrt, fn.is_positive, fn.dot, fn.dot_direction
 
     @wp.func
-    def root(value: Lane):
-        return sqrt(value)
+    def load(vectors: wp.array(dtype=wp.vec3), first: int):
+        """A block of vectors; zeros past the last."""
+        x = Lane()
+        y = Lane()
+        z = Lane()
+        for lane in range(wp.min(lanes, vectors.shape[0] - first)):
+            vector = vectors[first + lane]
+            x[lane] = vector[0]
+            y[lane] = vector[1]
+            z[lane] = vector[2]
+        return Vectors(x, y, z)
 
-    @wp.func_grad(root)
-    def root_adjoint(value: Lane, adj_root: Lane):
-        wp.adjoint[value] += wp.cw_div(0.5 * adj_root, sqrt(value))
+    @wp.func
+    def total(value: Lane):
+        return wp.dot(value, Lane(1.0))
 
-    @wp.kernel(module="unique", module_options=module_options(lanes))
+    @wp.func
+    def total_vector(x: Lane, y: Lane, z: Lane):
+        return wp.vec3(wp.dot(x, Lane(1.0)), wp.dot(y, Lane(1.0)), wp.dot(z, Lane(1.0)))
+
+    @wp.func
+    def find_cap(cap: wp.vec3, height_share: Lane, cosine: Lane, sine: Lane):
+        """Mirrors of width 1 that are seen, not of unit length, and the cap's radius at their heights."""
+        z = (1.0 + cap[2]) * (Lane(1.0) - height_share)
+        height = z - Lane(cap[2])
+        radius = sqrt(wp.max(Lane(1.0) - wp.cw_mul(height, height), Lane(1.0e-12)))
+        x = wp.cw_mul(radius, cosine) + Lane(cap[0])
+        y = wp.cw_mul(radius, sine) + Lane(cap[1])
+        return Vectors(x, y, z), radius
+
+    @wp.func
+    def stretch(width: wp.vec3, x: Lane, y: Lane):
+        """W (x, y)."""
+        return width[0] * x + width[1] * y, width[1] * x + width[2] * y
+
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def sample_lobes(
         first_row: int,
         worker: int,
         # in
-        points: wp.array2d(dtype=wp.vec3),
         normals: wp.array2d(dtype=wp.vec3),
-        roughness: wp.array2d(dtype=wp.float32),
-        clip_matrices: wp.array(dtype=wp.mat44),
+        tangents: wp.array2d(dtype=wp.vec3),
+        views: wp.array2d(dtype=wp.vec3),
+        caps: wp.array2d(dtype=wp.vec3),
+        widths: wp.array2d(dtype=wp.vec3),
         sample_points: wp.array2d(dtype=Lane),
         # out
         directions: wp.array3d(dtype=wp.vec3),
         filters: wp.array3d(dtype=wp.vec3),
-        cosines: wp.array2d(dtype=wp.float32),
     ):
         """A thread owns a receiver."""
-        batch, receiver = split_row(first_row + wp.tid(), cosines.shape[1])
-        point_batch = instance_in(batch, points.shape[0])
-        normal = normals[point_batch, receiver]
-        eye = eye_position(clip_matrices[instance_in(batch, clip_matrices.shape[0])])
-        view = wp.normalize(eye - points[point_batch, receiver])
-        rough = wp.max(roughness[instance_in(batch, roughness.shape[0]), receiver], MIN_ROUGHNESS)
-        width = rough * rough
-        cosine = wp.clamp(wp.dot(normal, view), MIN_COSINE, MAX_COSINE)
-        sine = wp.sqrt(1.0 - cosine * cosine)
-        across_view = view - wp.dot(normal, view) * normal
-        if wp.length_sq(across_view) < 1.0e-10:
-            across_view = wp.cross(normal, _axis_across(normal))
-        tangent = wp.normalize(across_view)
+        batch, receiver = split_row(first_row + wp.tid(), directions.shape[1])
+        normal = normals[batch, receiver]
+        tangent = tangents[batch, receiver]
         bitangent = wp.cross(normal, tangent)
-        square = width * width
-        slant = wp.sqrt(cosine * cosine * (1.0 - square) + square)
-        blur_of_flat = wp.sqrt((cosine + slant) / (float(directions.shape[2]) * square))
+        view = views[batch, receiver]
+        sine, cosine, slant = view[0], view[1], view[2]
+        width = widths[batch, receiver]
         weight_scale = (cosine + slant) / float(directions.shape[2])
-        cosines[batch, receiver] = cosine
-        # in the frame of tangent, bitangent and normal; the cap is that of mirrors of width 1
-        stretched_view = wp.normalize(wp.vec3(width * sine, 0.0, cosine))
+        blur_scale = wp.sqrt(weight_scale * (width[0] * width[2] - width[1] * width[1]))
         for block in range(sample_points.shape[1]):
-            mirror_z = (1.0 + stretched_view[2]) * (Lane(1.0) - sample_points[0, block])
-            height = mirror_z - Lane(stretched_view[2])
-            radius = root(wp.max(Lane(1.0) - wp.cw_mul(height, height), Lane(1.0e-12)))
-            mirror_x = width * (wp.cw_mul(radius, sample_points[1, block]) + Lane(stretched_view[0]))
-            mirror_y = width * wp.cw_mul(radius, sample_points[2, block])
-            horizontal = wp.cw_mul(mirror_x, mirror_x) + wp.cw_mul(mirror_y, mirror_y)
-            length = root(horizontal + wp.cw_mul(mirror_z, mirror_z))
+            cap, _radius = find_cap(
+                caps[batch, receiver], sample_points[0, block], sample_points[1, block], sample_points[2, block]
+            )
+            mirror_x, mirror_y = stretch(width, cap.x, cap.y)
+            upright = wp.cw_mul(cap.z, cap.z)
+            square = wp.cw_mul(mirror_x, mirror_x) + wp.cw_mul(mirror_y, mirror_y) + upright
+            blur = blur_scale * wp.cw_div(wp.cw_mul(cap.x, cap.x) + wp.cw_mul(cap.y, cap.y) + upright, square)
+            length = sqrt(square)
             mirror_x = wp.cw_div(mirror_x, length)
             mirror_y = wp.cw_div(mirror_y, length)
-            mirror_z = wp.cw_div(mirror_z, length)
+            mirror_z = wp.cw_div(cap.z, length)
             view_cosine = sine * mirror_x + cosine * mirror_z
             x = 2.0 * wp.cw_mul(view_cosine, mirror_x) - Lane(sine)
             y = 2.0 * wp.cw_mul(view_cosine, mirror_y)
@@ -147,12 +242,12 @@ def _make_sample_lobes(lanes: int) -> wp.Kernel:
             direction_y = tangent[1] * x + bitangent[1] * y + normal[1] * z
             direction_z = tangent[2] * x + bitangent[2] * y + normal[2] * z
             up = wp.max(z, Lane(0.0))
-            reflected_slant = root((1.0 - square) * wp.cw_mul(up, up) + Lane(square))
+            spread_x, spread_y = stretch(width, x, y)
+            reflected_slant = sqrt(wp.cw_mul(spread_x, spread_x) + wp.cw_mul(spread_y, spread_y) + wp.cw_mul(up, up))
             weight = wp.cw_div(weight_scale * up, slant * up + cosine * reflected_slant)
             grazing_base = wp.max(Lane(1.0) - view_cosine, Lane(0.0))
             grazing_square = wp.cw_mul(grazing_base, grazing_base)
             grazing = wp.cw_mul(weight, wp.cw_mul(wp.cw_mul(grazing_square, grazing_square), grazing_base))
-            blur = blur_of_flat * (Lane(1.0) - (1.0 - square) * wp.cw_mul(mirror_z, mirror_z))
             first = block * lanes
             for lane in range(wp.min(lanes, directions.shape[2] - first)):
                 directions[batch, receiver, first + lane] = wp.vec3(
@@ -160,7 +255,143 @@ def _make_sample_lobes(lanes: int) -> wp.Kernel:
                 )
                 filters[batch, receiver, first + lane] = wp.vec3(weight[lane], grazing[lane], blur[lane])
 
-    return sample_lobes
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
+    def sample_lobes_adjoint(
+        first_row: int,
+        worker: int,
+        # in
+        normals: wp.array2d(dtype=wp.vec3),
+        tangents: wp.array2d(dtype=wp.vec3),
+        views: wp.array2d(dtype=wp.vec3),
+        caps: wp.array2d(dtype=wp.vec3),
+        widths: wp.array2d(dtype=wp.vec3),
+        sample_points: wp.array2d(dtype=Lane),
+        adj_directions: wp.array3d(dtype=wp.vec3),
+        adj_filters: wp.array3d(dtype=wp.vec3),
+        # out
+        adj_normals: wp.array2d(dtype=wp.vec3),
+        adj_tangents: wp.array2d(dtype=wp.vec3),
+        adj_views: wp.array2d(dtype=wp.vec3),
+        adj_caps: wp.array2d(dtype=wp.vec3),
+        adj_widths: wp.array2d(dtype=wp.vec3),
+    ):
+        """A thread owns a receiver. Gradients are found in the reverse order of the values, by the chain rule."""
+        batch, receiver = split_row(first_row + wp.tid(), adj_directions.shape[1])
+        normal = normals[batch, receiver]
+        tangent = tangents[batch, receiver]
+        bitangent = wp.cross(normal, tangent)
+        view = views[batch, receiver]
+        sine, cosine, slant = view[0], view[1], view[2]
+        width = widths[batch, receiver]
+        weight_scale = (cosine + slant) / float(adj_directions.shape[2])
+        determinant = width[0] * width[2] - width[1] * width[1]
+        blur_scale = wp.sqrt(weight_scale * determinant)
+        adj_sine = Lane(0.0)
+        adj_cosine = Lane(0.0)
+        adj_slant = Lane(0.0)
+        adj_weight_scale = Lane(0.0)
+        adj_blur_scale = Lane(0.0)
+        adj_width_xx = Lane(0.0)
+        adj_width_xy = Lane(0.0)
+        adj_width_yy = Lane(0.0)
+        adj_axis_x = Lane(0.0)
+        adj_axis_y = Lane(0.0)
+        adj_axis_z = Lane(0.0)
+        adj_tangent = wp.vec3()
+        adj_bitangent = wp.vec3()
+        adj_normal = wp.vec3()
+        for block in range(sample_points.shape[1]):
+            height_share = sample_points[0, block]
+            azimuth_cosine = sample_points[1, block]
+            azimuth_sine = sample_points[2, block]
+            cap, radius = find_cap(caps[batch, receiver], height_share, azimuth_cosine, azimuth_sine)
+            long_x, long_y = stretch(width, cap.x, cap.y)
+            upright = wp.cw_mul(cap.z, cap.z)
+            cap_square = wp.cw_mul(cap.x, cap.x) + wp.cw_mul(cap.y, cap.y) + upright
+            square = wp.cw_mul(long_x, long_x) + wp.cw_mul(long_y, long_y) + upright
+            length = sqrt(square)
+            mirror = Vectors(wp.cw_div(long_x, length), wp.cw_div(long_y, length), wp.cw_div(cap.z, length))
+            view_cosine = sine * mirror.x + cosine * mirror.z
+            x = 2.0 * wp.cw_mul(view_cosine, mirror.x) - Lane(sine)
+            y = 2.0 * wp.cw_mul(view_cosine, mirror.y)
+            z = 2.0 * wp.cw_mul(view_cosine, mirror.z) - Lane(cosine)
+            up = wp.max(z, Lane(0.0))
+            spread_x, spread_y = stretch(width, x, y)
+            reflected_slant = sqrt(wp.cw_mul(spread_x, spread_x) + wp.cw_mul(spread_y, spread_y) + wp.cw_mul(up, up))
+            denominator = slant * up + cosine * reflected_slant
+            weight = wp.cw_div(weight_scale * up, denominator)
+            grazing_base = wp.max(Lane(1.0) - view_cosine, Lane(0.0))
+            grazing_square = wp.cw_mul(grazing_base, grazing_base)
+            grazing_fourth = wp.cw_mul(grazing_square, grazing_square)
+
+            adj_direction = load(adj_directions[batch, receiver], block * lanes)
+            adj_filter = load(adj_filters[batch, receiver], block * lanes)
+            adj_weight = adj_filter.x + wp.cw_mul(adj_filter.y, wp.cw_mul(grazing_fourth, grazing_base))
+            adj_view_cosine = -5.0 * wp.cw_mul(wp.cw_mul(adj_filter.y, weight), grazing_fourth)
+            adj_ratio = wp.cw_div(adj_weight, denominator)
+            adj_weight_scale += wp.cw_mul(adj_ratio, up)
+            adj_denominator = -1.0 * wp.cw_mul(adj_ratio, weight)
+            adj_slant += wp.cw_mul(adj_denominator, up)
+            adj_cosine += wp.cw_mul(adj_denominator, reflected_slant)
+            adj_square = wp.cw_div(cosine * adj_denominator, reflected_slant)
+            adj_spread_x = wp.cw_mul(adj_square, spread_x)
+            adj_spread_y = wp.cw_mul(adj_square, spread_y)
+            adj_up = weight_scale * adj_ratio + slant * adj_denominator + wp.cw_mul(adj_square, up)
+            adj_x, adj_y = stretch(width, adj_spread_x, adj_spread_y)
+            adj_x += dot_direction(tangent, adj_direction)
+            adj_y += dot_direction(bitangent, adj_direction)
+            adj_z = dot_direction(normal, adj_direction) + wp.cw_mul(is_positive(z), adj_up)
+            adj_tangent += wp.vec3(wp.dot(x, adj_direction.x), wp.dot(x, adj_direction.y), wp.dot(x, adj_direction.z))
+            adj_bitangent += wp.vec3(wp.dot(y, adj_direction.x), wp.dot(y, adj_direction.y), wp.dot(y, adj_direction.z))
+            adj_normal += wp.vec3(wp.dot(z, adj_direction.x), wp.dot(z, adj_direction.y), wp.dot(z, adj_direction.z))
+            adj_view_cosine += 2.0 * dot(mirror, Vectors(adj_x, adj_y, adj_z))
+            adj_sine += wp.cw_mul(adj_view_cosine, mirror.x) - adj_x
+            adj_cosine += wp.cw_mul(adj_view_cosine, mirror.z) - adj_z
+            adj_mirror = Vectors(
+                2.0 * wp.cw_mul(view_cosine, adj_x) + sine * adj_view_cosine,
+                2.0 * wp.cw_mul(view_cosine, adj_y),
+                2.0 * wp.cw_mul(view_cosine, adj_z) + cosine * adj_view_cosine,
+            )
+            # of the unit vector, and of the blur, which is |cap|² / |mirror|²
+            radial = dot(mirror, adj_mirror)
+            blur_ratio = wp.cw_div(adj_filter.z, square)
+            adj_blur_scale += wp.cw_mul(blur_ratio, cap_square)
+            adj_cap_square = 2.0 * blur_scale * blur_ratio
+            radial += wp.cw_mul(adj_cap_square, cap_square)
+            adj_long_x = wp.cw_div(adj_mirror.x - wp.cw_mul(mirror.x, radial), length)
+            adj_long_y = wp.cw_div(adj_mirror.y - wp.cw_mul(mirror.y, radial), length)
+            adj_cap_z = wp.cw_div(adj_mirror.z - wp.cw_mul(mirror.z, radial), length)
+            adj_cap_x, adj_cap_y = stretch(width, adj_long_x, adj_long_y)
+            adj_cap_x += wp.cw_mul(adj_cap_square, cap.x)
+            adj_cap_y += wp.cw_mul(adj_cap_square, cap.y)
+            adj_cap_z += wp.cw_mul(adj_cap_square, cap.z)
+            adj_width_xx += wp.cw_mul(adj_long_x, cap.x) + wp.cw_mul(adj_spread_x, x)
+            adj_width_yy += wp.cw_mul(adj_long_y, cap.y) + wp.cw_mul(adj_spread_y, y)
+            adj_width_xy += wp.cw_mul(adj_long_x, cap.y) + wp.cw_mul(adj_long_y, cap.x)
+            adj_width_xy += wp.cw_mul(adj_spread_x, y) + wp.cw_mul(adj_spread_y, x)
+            adj_axis_x += adj_cap_x
+            adj_axis_y += adj_cap_y
+            adj_radius = wp.cw_mul(azimuth_cosine, adj_cap_x) + wp.cw_mul(azimuth_sine, adj_cap_y)
+            height = cap.z - Lane(caps[batch, receiver][2])
+            adj_height = -1.0 * wp.cw_div(wp.cw_mul(adj_radius, height), radius)
+            adj_axis_z += wp.cw_mul(adj_cap_z, Lane(1.0) - height_share) - wp.cw_mul(adj_height, height_share)
+        scale_rate = total(adj_weight_scale) / float(adj_directions.shape[2])
+        blur_rate = 0.5 * blur_scale * total(adj_blur_scale)
+        scale_rate += blur_rate / (cosine + slant)
+        blur_rate = blur_rate / determinant
+        adj_normals[batch, receiver] = adj_normals[batch, receiver] + adj_normal + wp.cross(tangent, adj_bitangent)
+        adj_tangents[batch, receiver] = adj_tangents[batch, receiver] + adj_tangent + wp.cross(adj_bitangent, normal)
+        adj_views[batch, receiver] = adj_views[batch, receiver] + wp.vec3(
+            total(adj_sine), total(adj_cosine) + scale_rate, total(adj_slant) + scale_rate
+        )
+        adj_caps[batch, receiver] = adj_caps[batch, receiver] + total_vector(adj_axis_x, adj_axis_y, adj_axis_z)
+        adj_widths[batch, receiver] = (
+            adj_widths[batch, receiver]
+            + total_vector(adj_width_xx, adj_width_xy, adj_width_yy)
+            + blur_rate * wp.vec3(width[2], -2.0 * width[1], width[0])
+        )
+
+    return sample_lobes, sample_lobes_adjoint
 
 
 class LobeSamples(NamedTuple):
@@ -172,7 +403,12 @@ class LobeSamples(NamedTuple):
 
 
 def sample_lobes(
-    points: wp.array, normals: wp.array, roughness: wp.array, clip_matrices: wp.array, sample_count: int
+    points: wp.array,
+    normals: wp.array,
+    roughness: wp.array,
+    clip_matrices: wp.array,
+    sample_count: int,
+    spread: NormalSpread | None = None,
 ) -> LobeSamples:
     """Sample the lobes of receivers.
 
@@ -183,24 +419,40 @@ def sample_lobes(
         clip_matrices: Cameras, mat44 of shape [batch].
             Any batch may be 1 and then serves every instance.
         sample_count: Number of samples.
+        spread: How normals vary over the receivers; None for not at all.
 
-    Differentiable: points, normals, roughness, clip_matrices.
+    Differentiable: points, normals, roughness, clip_matrices, spread.
     """
     check.shape("normals", normals.shape, points.shape)
     check.shape("roughness", roughness.shape, ("batch", points.shape[1]))
     count = common_batch({"points": points, "roughness": roughness, "clip_matrices": clip_matrices})
-    device, shape = points.device, (count, points.shape[1], sample_count)
-    directions, filters = (wp.empty(shape, dtype=wp.vec3, device=device) for _ in range(2))
-    cosines = wp.empty(shape[:2], dtype=wp.float32, device=device)
+    device, shape = points.device, (count, points.shape[1])
+    cosines = empty(shape, dtype=wp.float32, device=device)
+    lobes = _Lobes(*(empty(shape, dtype=wp.vec3, device=device) for _ in _Lobes._fields))
+    inputs = [points, normals, roughness, clip_matrices, *(spread or (None, None))]
+    rows, cost = count * points.shape[1], _COST * sample_count
+    launch(
+        _shape_lobes,
+        rows,
+        inputs=inputs,
+        outputs=[*lobes, cosines],
+        shared=[array for array in inputs if array is not None and (array is clip_matrices or len(array) < count)],
+        cost=_SHAPE_COST,
+    )
     lanes = lane_count(device)
     sample_points = hemisphere_points(-(-sample_count // lanes) * lanes, sample_count)
-    inputs = [points, normals, roughness, clip_matrices]
-    launch(
-        _make_sample_lobes(lanes),
-        shape[0] * shape[1],
-        inputs=[*inputs, constant(sample_points.T.reshape(3, -1, lanes), lane_type(lanes), device)],
-        outputs=[directions, filters, cosines],
-        shared=[clip_matrices, *(array for array in inputs[:3] if len(array) < count)],
-        cost=_COST * sample_count,
-    )
-    return LobeSamples(directions, filters, cosines)
+    sampled = [*lobes, constant(sample_points.T.reshape(3, -1, lanes), lane_type(lanes), device)]
+    sample, sample_adjoint = _make_sample_lobes(lanes)
+    results = [wp.empty((*shape, sample_count), dtype=wp.vec3, device=device) for _ in range(2)]
+    if varies(lobes):
+        for result in results:
+            require_gradient(result)
+    launch(sample, rows, inputs=sampled, outputs=[*map(in_huge_pages, results)], cost=cost)
+
+    def adjoint() -> None:
+        gradients = [result.grad for result in results]
+        outputs = [array.grad for array in lobes]
+        launch(sample_adjoint, rows, inputs=[*sampled, *gradients], outputs=outputs, cost=2 * cost)
+
+    record_adjoint(adjoint, [*lobes, *results])
+    return LobeSamples(results[0], results[1], cosines)

@@ -24,7 +24,8 @@ from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.stages.self_visibility.trace import RAYS_PER_CELL
 
 _MIN_KERNEL_RADIUS = 2.2  # least h, in radii of the coarse cells
-_MAX_RAYS = 32  # rays that a cell looks up on average at most; a wider one looks up coarse cells
+_MAX_RAYS, _MAX_RAYS_OF_FINE_CELLS = 32, 16
+"""Rays that a cell looks up on average at most, of up to 128 cells and of more; a wider one looks up coarse cells."""
 _CELL_COST = 1600.0  # nanoseconds that a cell takes
 
 
@@ -60,7 +61,7 @@ def find_resampling_kernels(
         np.maximum(np.sqrt(2 * np.maximum(half_angles**2 - radius**2, 0)), _MIN_KERNEL_RADIUS * radius)
         for radius in map(cell_radius, (ray_count, cell_count))
     )
-    uses_rays = ray_count * (1 - np.cos(ray_radii)) / 2 <= _MAX_RAYS
+    uses_rays = ray_count * (1 - np.cos(ray_radii)) / 2 <= (_MAX_RAYS if count <= 128 else _MAX_RAYS_OF_FINE_CELLS)
     radii = np.where(uses_rays, ray_radii, cell_radii)
     cos_radii = np.cos(radii)
     counts = np.where(uses_rays, ray_count, cell_count) * (1 - cos_radii) / 2

@@ -17,7 +17,7 @@ from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
 from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.screen import center, ray_volumes, relative_to_ray
+from warpshadow.stages.screen import center, volume_rates
 from warpshadow.stages.textures.pyramid import Textures
 
 PROBE_LINE_EXCESS = 0.25
@@ -73,37 +73,12 @@ def _uv_derivatives(
     """Derivative of uv by the position of a sample [1/sample], its columns by column and row.
 
     ``a``, ``b`` and ``c`` are the vertices in clip space, ``uv_offset_a``, ``uv_offset_b`` and ``uv_offset_c`` their
-    uvs relative to that of the sample, and ``step`` is that of the ray from one sample to the next. With volumes v,
-    linear in the ray, uv = Σ v_i uv_i / Σ v_i has the derivative Σ v_i' (uv_i - uv) / Σ v_i, on the whole plane of the
-    face.
+    uvs relative to that of the sample, and ``step`` is that of the ray from one sample to the next. It is that on the
+    whole plane of the face.
     """
-    relative_a = relative_to_ray(a, ray)
-    relative_b = relative_to_ray(b, ray)
-    relative_c = relative_to_ray(c, ray)
-    vertex_volumes = ray_volumes(relative_a, relative_b, relative_c)
-    volume_sum = vertex_volumes[0] + vertex_volumes[1] + vertex_volumes[2]
-    volumes_by_x = wp.vec3(
-        relative_b[1] * c[3] - b[3] * relative_c[1],
-        relative_c[1] * a[3] - c[3] * relative_a[1],
-        relative_a[1] * b[3] - a[3] * relative_b[1],
-    )
-    volumes_by_y = wp.vec3(
-        b[3] * relative_c[0] - relative_b[0] * c[3],
-        c[3] * relative_a[0] - relative_c[0] * a[3],
-        a[3] * relative_b[0] - relative_a[0] * b[3],
-    )
-    # seen edge-on the total vanishes: no less, then, than a millionth of the change of the volumes within a sample
-    minimum = 1.0e-6 * (
-        step[0] * (wp.abs(volumes_by_x[0]) + wp.abs(volumes_by_x[1]) + wp.abs(volumes_by_x[2]))
-        + step[1] * (wp.abs(volumes_by_y[0]) + wp.abs(volumes_by_y[1]) + wp.abs(volumes_by_y[2]))
-    )
-    scale = wp.where(wp.abs(volume_sum) > minimum, volume_sum, minimum + 1.0e-30)
-    x = (step[0] / scale) * (
-        volumes_by_x[0] * uv_offset_a + volumes_by_x[1] * uv_offset_b + volumes_by_x[2] * uv_offset_c
-    )
-    y = (step[1] / scale) * (
-        volumes_by_y[0] * uv_offset_a + volumes_by_y[1] * uv_offset_b + volumes_by_y[2] * uv_offset_c
-    )
+    rates_x, rates_y = volume_rates(a, b, c, ray, step)
+    x = rates_x[0] * uv_offset_a + rates_x[1] * uv_offset_b + rates_x[2] * uv_offset_c
+    y = rates_y[0] * uv_offset_a + rates_y[1] * uv_offset_b + rates_y[2] * uv_offset_c
     return wp.mat22(x[0], y[0], x[1], y[1])
 
 
