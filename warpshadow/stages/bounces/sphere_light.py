@@ -22,33 +22,25 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
-from warpshadow.device.lanes import (
-    block_count,
-    lane_count,
-    lane_type,
-    make_lane_functions,
-    module_options,
-    span_count,
-    vectors_type,
-)
-from warpshadow.device.launch import differentiable, launch, varies
+from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, span_count, vectors_type
+from warpshadow.device.launch import launch_with_adjoint, varies
 from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_slot
 from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.bounces.proxy_weights import WeightInputs, make_weight_functions
 from warpshadow.stages.bounces.tangent_planes import TangentPlanes
-from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres
+from warpshadow.stages.visibility.cones import TINY_RADIUS
 from warpshadow.stages.visibility.culling import DirectionCells, make_cap_functions, make_cells, make_cull
 from warpshadow.stages.visibility.directional import PAIR_COST, SOFTNESS
 from warpshadow.stages.visibility.falloff import make_cap_adjoint, make_falloff
-from warpshadow.stages.visibility.merging import MERGING, NODES_PER_CLUSTER, Gradients, merged_count
+from warpshadow.stages.visibility.merging import MERGING, NODES_PER_CLUSTER, Gradients
 from warpshadow.stages.visibility.traversal import (
     ClusterTree,
     TraversalInputs,
     lane_structs,
-    make_inputs,
     make_load_receivers,
     make_traversal,
+    prepare_traversal,
     receiver_lanes_type,
     sphere_view_type,
 )
@@ -411,7 +403,9 @@ def sphere_light(
     merging, skip, clusters, tolerances.
     """
     cells = make_cells(directions, softness, points.device)
-    check_spheres(points, normals, centers, radii)
+    traversal = prepare_traversal(
+        points, normals, centers, radii, cell_radius(len(directions)), merging=merging, skip=skip, clusters=clusters
+    )
     equations, tolerances = (None, None) if tangent_planes is None else tangent_planes
     common_batch(
         {
@@ -421,74 +415,42 @@ def sphere_light(
             "tangent_planes": equations,
         }
     )
-    batch_count, vertex_count = points.shape
-    proxy_count = radii.shape[1] + merged_count(radii.shape[1], merging)
-    check.shape("proxy_radiance", proxy_radiance.shape, (proxy_radiance.shape[0], proxy_count, len(directions)))
-    check.shape("transmittance", transmittance.shape, (*points.shape, len(directions)))
+    proxy_count, directions_shape = traversal.nodes.radii.shape[1], (points.shape[1], len(directions))
+    check.shape("proxy_radiance", proxy_radiance.shape, (len(proxy_radiance), proxy_count, len(directions)))
+    check.shape("transmittance", transmittance.shape, (len(points), *directions_shape))
     if transmittance_others is not None:
-        check.shape(
-            "transmittance_others",
-            transmittance_others.shape,
-            (transmittance_others.shape[0], vertex_count, len(directions)),
-        )
+        check.shape("transmittance_others", transmittance_others.shape, (len(transmittance_others), *directions_shape))
     if equations is not None:
-        check.shape("tangent_planes", equations.shape, (equations.shape[0], proxy_count))
-    device = points.device
-    lanes = lane_count(device)
-    spans = span_count(device, len(directions))
+        check.shape("tangent_planes", equations.shape, (len(equations), proxy_count))
+    device, lanes, spans = points.device, traversal.lanes, span_count(points.device, len(directions))
     span_direction_count = len(directions) // spans
-    cell = cell_radius(len(directions))
-    proxies, traversed = make_inputs(points, normals, centers, radii, merging, cell, skip, clusters)
-    row_count = batch_count * block_count(vertex_count, lanes)
-    launch_dim = run_dimensions(device, row_count, spans)
-    variables = [points, normals, *proxies, proxy_radiance, transmittance, transmittance_others, equations]
-    stores_sums = varies(variables)
+    is_shared = transmittance_others is not None and len(transmittance_others) < len(points)
+    variables = [points, normals, transmittance, *([] if is_shared else [transmittance_others])]
+    shared = [*([transmittance_others] if is_shared else []), proxy_radiance, equations, *traversal.nodes]
+    stores_sums = varies([*variables, *shared])
     scratch = [
         Scratch((3, span_direction_count), lane_type(lanes)),
         Scratch((3, span_direction_count // BUNDLE), wp.int32),
     ]
-    sums = (span_direction_count * _SUMS,), lane_type(lanes)
-    cached = [empty((row_count * spans, *sums[0]), dtype=sums[1], device=device)] if stores_sums else []
+    sums = Scratch((span_direction_count * _SUMS,), lane_type(lanes))
+    stored = [empty((traversal.row_count * spans, *sums.shape), sums.dtype, device=device)] if stores_sums else []
     inputs = LightInputs()
-    inputs.traversed, inputs.cells = traversed, cells
-    inputs.proxy_radiance, inputs.transmittance, inputs.transmittance_others = (
-        proxy_radiance,
-        transmittance,
-        transmittance_others,
-    )
+    inputs.traversed, inputs.cells = traversal.inputs, cells
+    inputs.proxy_radiance, inputs.transmittance = proxy_radiance, transmittance
+    inputs.transmittance_others = transmittance_others
     if equations is not None:
         inputs.equations, inputs.tolerances = equations, tolerances
     inputs.factor, inputs.span_count, inputs.stores_sums = 4 / len(directions), spans, stores_sums
-    cost = PAIR_COST * lanes * radii.shape[1] * span_direction_count
-    is_shared = transmittance_others is not None and len(transmittance_others) < batch_count
-
-    def adjoint(adj_light: wp.array) -> None:
-        adj_transmittance_others = [None if transmittance_others is None else transmittance_others.grad]
-        launch(
-            _make_light_adjoint(lanes),
-            launch_dim,
-            cost=2 * cost,
-            inputs=[inputs, *cached, adj_light],
-            scratch=scratch,
-            outputs=[points.grad, normals.grad, transmittance.grad, *([] if is_shared else adj_transmittance_others)],
-            sums=[
-                *(adj_transmittance_others if is_shared else []),
-                proxy_radiance.grad,
-                None if equations is None else equations.grad,
-                *(array.grad for array in proxies),
-            ],
-        )
-
-    return differentiable(
-        lambda light: launch(
-            _make_light(lanes),
-            launch_dim,
-            cost=cost,
-            inputs=[inputs],
-            scratch=scratch if stores_sums else [*scratch, Scratch(*sums)],
-            outputs=[*cached, light],
-        ),
-        adjoint,
-        result=zeros((batch_count, vertex_count), dtype=wp.vec3, device=device),
+    return launch_with_adjoint(
+        _make_light(lanes),
+        lambda: _make_light_adjoint(lanes),
+        run_dimensions(device, traversal.row_count, spans),
+        inputs=[inputs],
+        result=zeros(points.shape, dtype=wp.vec3, device=device),
         variables=variables,
+        shared=shared,
+        outputs=stored,
+        adj_inputs=stored,
+        scratch=scratch if stores_sums else [*scratch, sums],
+        cost=PAIR_COST * lanes * radii.shape[1] * span_direction_count,
     )

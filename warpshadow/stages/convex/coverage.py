@@ -24,7 +24,7 @@ from warpshadow.device.lanes import (
     module_options,
     vectors_type,
 )
-from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.launch import launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, scratch_slot
 from warpshadow.maths.directions import BUNDLE, cell_radius
@@ -473,26 +473,22 @@ def part_coverage(
     lanes = lane_count(points.device)
     Lane, sums, edge_count = lane_type(lanes), sums_type(lanes), blockers.edge_count
     by_cell = (len(directions),)
-    scratch = [
-        *(Scratch(by_cell, dtype) for dtype in (coverage_type(lanes), wp.int32, sums)),
-        Scratch((SUM_LANES,), Lane),
-        Scratch((EDGE_LANES * edge_count,), Lane),
-        Scratch((2, edge_count), wp.int32),
-    ]
-    adj_scratch = [Scratch(by_cell, sums), Scratch((ADJOINT_LANES * edge_count,), Lane)]
-    rows = points.shape[0] * block_count(points.shape[1], lanes)
     cost = _PART_COST * lanes * placed.bounds.shape[1]
-    return differentiable(
-        lambda result: launch(_make_cover(lanes), rows, inputs=[inputs], outputs=[result], scratch=scratch, cost=cost),
-        lambda adj_result: launch(
-            _make_cover_adjoint(lanes),
-            rows,
-            inputs=[inputs, adj_result],
-            outputs=[points.grad],
-            sums=[placed.corners.grad],
-            scratch=[*scratch, *adj_scratch],
-            cost=3 * cost,
-        ),
+    return launch_with_adjoint(
+        _make_cover(lanes),
+        lambda: _make_cover_adjoint(lanes),
+        points.shape[0] * block_count(points.shape[1], lanes),
+        inputs=[inputs],
         result=empty((*points.shape, len(directions)), dtype=wp.vec4, device=points.device),
-        variables=[points, placed.corners],
+        variables=[points],
+        shared=[placed.corners],
+        scratch=[
+            *(Scratch(by_cell, dtype) for dtype in (coverage_type(lanes), wp.int32, sums)),
+            Scratch((SUM_LANES,), Lane),
+            Scratch((EDGE_LANES * edge_count,), Lane),
+            Scratch((2, edge_count), wp.int32),
+        ],
+        adj_scratch=[Scratch(by_cell, sums), Scratch((ADJOINT_LANES * edge_count,), Lane)],
+        cost=cost,
+        adj_cost=3 * cost,
     )
