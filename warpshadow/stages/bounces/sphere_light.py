@@ -30,7 +30,13 @@ from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.bounces.proxy_weights import WeightInputs, make_weight_functions
 from warpshadow.stages.bounces.tangent_planes import TangentPlanes
 from warpshadow.stages.visibility.cones import TINY_RADIUS
-from warpshadow.stages.visibility.culling import DirectionCells, make_cap_functions, make_cells, make_cull
+from warpshadow.stages.visibility.culling import (
+    DirectionCells,
+    cap_type,
+    make_cap_functions,
+    make_cells,
+    make_cull,
+)
 from warpshadow.stages.visibility.directional import PAIR_COST, SOFTNESS
 from warpshadow.stages.visibility.falloff import make_cap_adjoint, make_falloff
 from warpshadow.stages.visibility.merging import MERGING, NODES_PER_CLUSTER, Gradients
@@ -98,6 +104,25 @@ def _make_load_task(lanes: int) -> wp.Function:
     is_any_above, dot_direction, load_columns = fn.is_any_above, fn.dot_direction, fn.load_columns
     load_receivers = make_load_receivers(True, lanes)
 
+    @wp.func(inline=True)
+    def load_blocked(batch: int, block: int, bundle: int, inputs: LightInputs, task: LightTask):
+        """Load F − T of a bundle's cells; returns whether it is not 0 anywhere."""
+        first_slot = bundle * BUNDLE
+        first_direction = (task.first_bundle + bundle) * BUNDLE
+        load_columns(inputs.transmittance[batch], first_direction, BUNDLE, block, 1.0, task.blocked, first_slot)
+        if inputs.transmittance_others:
+            others = inputs.transmittance_others[instance_in(batch, inputs.transmittance_others.shape[0])]
+            load_columns(others, first_direction, BUNDLE, block, 1.0, task.adj_cells, first_slot)
+        is_any_blocked = bool(False)
+        for slot in range(first_slot, first_slot + BUNDLE):
+            cell_transmittance_others = Lane(1.0)
+            if inputs.transmittance_others:
+                cell_transmittance_others = task.adj_cells[slot]
+            blocked = cell_transmittance_others - task.blocked[slot]
+            task.blocked[slot] = blocked
+            is_any_blocked = is_any_blocked or is_any_above(wp.max(blocked, -blocked), 0.0)
+        return is_any_blocked
+
     @wp.func(inline=lanes == 1)
     def load_task(
         row: int,
@@ -135,22 +160,8 @@ def _make_load_task(lanes: int) -> wp.Function:
             if is_any_above(
                 dot_direction(task.cells.axes[direction_bundle], receivers.normals),
                 -task.cells.half_angles[direction_bundle][1],
-            ):
-                first_slot = bundle * BUNDLE
-                first_direction = direction_bundle * BUNDLE
-                load_columns(inputs.transmittance[batch], first_direction, BUNDLE, block, 1.0, task.blocked, first_slot)
-                if inputs.transmittance_others:
-                    others_batch = instance_in(batch, inputs.transmittance_others.shape[0])
-                    others = inputs.transmittance_others[others_batch]
-                    load_columns(others, first_direction, BUNDLE, block, 1.0, task.adj_cells, first_slot)
-                for i in range(BUNDLE):
-                    cell_transmittance_others = Lane(1.0)
-                    if inputs.transmittance_others:
-                        cell_transmittance_others = task.adj_cells[first_slot + i]
-                    blocked = cell_transmittance_others - task.blocked[first_slot + i]
-                    task.blocked[first_slot + i] = blocked
-                    if is_any_above(wp.max(blocked, -blocked), 0.0):
-                        task.ends[bundle] = spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
+            ) and load_blocked(batch, block, bundle, inputs, task):
+                task.ends[bundle] = spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
         return batch, block, receivers, task
 
     return load_task
@@ -158,7 +169,7 @@ def _make_load_task(lanes: int) -> wp.Function:
 
 @functools.cache
 def _make_light(lanes: int) -> wp.Kernel:
-    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
+    Lane, Vectors, Cap = lane_type(lanes), vectors_type(lanes), cap_type(lanes)
     ReceiverLanes, SphereView, LightTask = receiver_lanes_type(lanes), sphere_view_type(lanes), _task_type(lanes)
     fn = make_lane_functions(lanes)
     sqrt, is_any_above, dot_direction, add_vectors = fn.sqrt, fn.is_any_above, fn.dot_direction, fn.add_vectors
@@ -167,6 +178,22 @@ def _make_light(lanes: int) -> wp.Kernel:
     widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(True, lanes)
     SUMS = wp.constant(_SUMS)
     MIN_DENOMINATOR = wp.constant(_MIN_DENOMINATOR)
+
+    @wp.func(inline=True)
+    def add_to_bundle(cap: Cap, slope: Lane, opacity: Lane, node: int, bundle: int, task: LightTask):
+        """Add a proxy to the sums of R of a bundle's cells."""
+        first_direction = (task.first_bundle + bundle) * BUNDLE
+        for i in range(BUNDLE):
+            t, step = soft_edge(task.cells.directions[first_direction + i], cap, slope)
+            if is_any_above(t, 0.0):
+                share = wp.cw_mul(opacity, step)
+                radiance = task.proxy_radiance[node, first_direction + i]
+                slot = (bundle * BUNDLE + i) * SUMS
+                # (a loop is not unrolled, and reads the radiance from memory)
+                task.sums[slot] = task.sums[slot] + radiance[0] * share
+                task.sums[slot + 1] = task.sums[slot + 1] + radiance[1] * share
+                task.sums[slot + 2] = task.sums[slot + 2] + radiance[2] * share
+                task.sums[slot + 3] = task.sums[slot + 3] + radiance[3] * share
 
     @wp.func(inline=True)
     def visit(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: LightTask):
@@ -182,17 +209,7 @@ def _make_light(lanes: int) -> wp.Kernel:
                 bundle = task.reached_bundles[1, k]
                 direction_bundle = task.first_bundle + bundle
                 if reaches_bundle(cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle]):
-                    for i in range(BUNDLE):
-                        t, step = soft_edge(cells.directions[direction_bundle * BUNDLE + i], cap, slope)
-                        if is_any_above(t, 0.0):
-                            share = wp.cw_mul(opacity, step)
-                            radiance = task.proxy_radiance[sphere_view.node, direction_bundle * BUNDLE + i]
-                            slot = (bundle * BUNDLE + i) * SUMS
-                            # (a loop is not unrolled, and reads the radiance from memory)
-                            task.sums[slot] = task.sums[slot] + radiance[0] * share
-                            task.sums[slot + 1] = task.sums[slot + 1] + radiance[1] * share
-                            task.sums[slot + 2] = task.sums[slot + 2] + radiance[2] * share
-                            task.sums[slot + 3] = task.sums[slot + 3] + radiance[3] * share
+                    add_to_bundle(cap, slope, opacity, sphere_view.node, bundle, task)
 
     traverse = make_traversal(make_cull(True, LightTask, lanes), visit, LightTask, False, lanes)
 
@@ -274,6 +291,28 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
     cap_adjoint = make_cap_adjoint(True, find_weight, share_adjoint, True, LightTask, lanes)
 
     @wp.func(inline=True)
+    def bundle_adjoint(receivers: ReceiverLanes, bundle: int, factor: float, task: LightTask):
+        """Store T̄ and the factors of R of a bundle's cells; returns their n̄."""
+        adj_normal = Vectors()
+        for i in range(BUNDLE):
+            slot = bundle * BUNDLE + i
+            omega = task.cells.directions[(task.first_bundle + bundle) * BUNDLE + i]
+            inverse = wp.cw_div(Lane(1.0), wp.max(task.sums[slot * SUMS + 3], Lane(MIN_DENOMINATOR)))
+            mean = Vectors(task.sums[slot * SUMS], task.sums[slot * SUMS + 1], task.sums[slot * SUMS + 2])
+            adj_cell = wp.cw_mul(inverse, dot(task.adj_light, mean))
+            cosine = dot_direction(omega, receivers.normals)
+            is_facing = wp.min(wp.max(1.0e30 * cosine, Lane(0.0)), Lane(1.0))
+            adj_cosine = factor * wp.cw_mul(is_facing, wp.cw_mul(task.blocked[slot], adj_cell))
+            adj_normal.x += omega[0] * adj_cosine
+            adj_normal.y += omega[1] * adj_cosine
+            adj_normal.z += omega[2] * adj_cosine
+            factored_cosine = factor * wp.max(cosine, Lane(0.0))
+            task.adj_blocked[slot] = wp.cw_mul(factored_cosine, adj_cell)
+            task.blocked[slot] = wp.cw_mul(wp.cw_mul(factored_cosine, task.blocked[slot]), inverse)
+            task.adj_cells[slot] = adj_cell
+        return adj_normal
+
+    @wp.func(inline=True)
     def visit(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: LightTask):
         """Of the cone, and of the weight w, whose w̄ w is Σ ā a."""
         adj_sphere, relative_adjoint = cap_adjoint(receivers, sphere_view, count, task)
@@ -326,24 +365,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         adj_normal = Vectors()
         for bundle in range(task.ends.shape[0]):
             if task.ends[bundle] > 0:
-                for i in range(BUNDLE):
-                    slot = bundle * BUNDLE + i
-                    direction = (task.first_bundle + bundle) * BUNDLE + i
-                    omega = task.cells.directions[direction]
-                    inverse = wp.cw_div(Lane(1.0), wp.max(task.sums[slot * SUMS + 3], Lane(MIN_DENOMINATOR)))
-                    mean = Vectors(task.sums[slot * SUMS], task.sums[slot * SUMS + 1], task.sums[slot * SUMS + 2])
-                    adj_cell = wp.cw_mul(inverse, dot(task.adj_light, mean))
-                    cosine = dot_direction(omega, receivers.normals)
-                    is_facing = wp.min(wp.max(1.0e30 * cosine, Lane(0.0)), Lane(1.0))
-                    adj_cosine = inputs.factor * wp.cw_mul(is_facing, wp.cw_mul(task.blocked[slot], adj_cell))
-                    adj_normal.x += omega[0] * adj_cosine
-                    adj_normal.y += omega[1] * adj_cosine
-                    adj_normal.z += omega[2] * adj_cosine
-                    factored_cosine = inputs.factor * wp.max(cosine, Lane(0.0))
-                    adj_blocked = wp.cw_mul(factored_cosine, adj_cell)
-                    task.adj_blocked[slot] = adj_blocked
-                    task.blocked[slot] = wp.cw_mul(wp.cw_mul(factored_cosine, task.blocked[slot]), inverse)
-                    task.adj_cells[slot] = adj_cell
+                adj_normal = add(adj_normal, bundle_adjoint(receivers, bundle, inputs.factor, task))
                 first_slot = bundle * BUNDLE
                 first_direction = (task.first_bundle + bundle) * BUNDLE
                 if adj_transmittance:
