@@ -340,10 +340,12 @@ def test_receivers_at_pixels_and_backs_of_open_bodies_are_lit(receivers):
 
 
 @pytest.mark.parametrize("method", [*METHODS, "ray-traced"])
-def test_it_says_how_often_light_bounces(method):
+def test_it_says_how_often_and_how_light_bounces(method):
     scene = bounced(method, ON_BOTH)
-    for bounces, notes in ((0, []), (1, ["Light bounces 1 time."]), (2, ["Light bounces 2 times."])):
+    way = "along paths" if method == "ray-traced" else "between patches that may move"
+    for bounces, times in ((0, None), (1, "1 time"), (2, "2 times")):
         explained = ws.Renderer(dataclasses.replace(scene, bounces=bounces)).explain()
+        notes = [f"Light bounces {times}, {way}."] if times else []
         assert [note for note in explained.notes if "bounces" in note] == notes
 
 

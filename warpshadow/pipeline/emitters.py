@@ -118,7 +118,7 @@ class SceneEmitters:
 
     def placed(self, points: LitPoints) -> Node:
         """Node of the samples among the bodies around points."""
-        return points.cached("emitters", None, lambda: Node("", place_samples, points.vertices, self.samples))
+        return points.cached_of_bodies("emitters", None, lambda: Node("", place_samples, points.vertices, self.samples))
 
     def radiance(self, materials: Materials) -> Node:
         """Node of the samples' radiance, vec3 of shape [batch, sample]."""

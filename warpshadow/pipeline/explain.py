@@ -101,14 +101,6 @@ class Explanation:
         return "\n".join([*lines, *self.notes])
 
 
-def bounce_notes(count: int | str) -> list[str]:
-    """Say how often light bounces, where it does."""
-    if not count:
-        return []
-    times = "until none is left" if count == "all" else f"{count} time{'s' * (count != 1)}"
-    return [f"Light bounces {times}."]
-
-
 def shell_notes(shell: np.ndarray | None) -> list[str]:
     """Say how far light is, where it is near."""
     if shell is None:

@@ -52,7 +52,11 @@ class GlossyPoints(LitPoints):
         self.method = method
         arguments = view.merged_scene, view.materials, view.vertices, view.spheres, receivers, view.call
         super().__init__(
-            *arguments, normals=view.normals, blocker_kinds=view.blocker_kinds, is_scene_view=view.is_scene_view
+            *arguments,
+            normals=view.normals,
+            blocker_kinds=view.blocker_kinds,
+            is_scene_view=view.is_scene_view,
+            neighbors=view,
         )
         self._numbers = Node("", functools.partial(_numbers, glossy), detached(view.receivers_node))
 
@@ -64,7 +68,7 @@ class GlossyPoints(LitPoints):
         Args:
             view: The view, or its preview.
             diffuse: Node of the view's shading.
-            light: As for :meth:`.Method.shading`.
+            light: As for :meth:`.LightTransport.shading`.
             materials: Of the bodies.
             bounced: Node of the view's shading without direct light of emitters.
         """

@@ -15,6 +15,7 @@ import warp as wp
 
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.pipeline.geometry import Geometry
+from warpshadow.scene.material import INPUTS_OF_BODIES
 from warpshadow.scene.scene import PerBody
 
 Array = TypeVar("Array")  # Warp's arrays, or tensors
@@ -65,13 +66,10 @@ class ImageInputs(Generic[Array, Placed]):
     @property
     def of_bodies(self) -> dict[str, PerBody[Array] | None]:
         """The materials of bodies, by name."""
-        return {name: getattr(self, name) for name in OF_BODIES}
+        return {name: getattr(self, name) for name in INPUTS_OF_BODIES}
 
 
 ImageArrays = ImageInputs[wp.array, Geometry[wp.array]]
-
-OF_BODIES = ("albedo", "textures", "emission", "roughness", "metallic", "specular")
-"""Inputs that bodies have each."""
 
 P = ParamSpec("P")
 Inputs_co = TypeVar("Inputs_co", covariant=True)

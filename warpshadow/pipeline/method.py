@@ -41,6 +41,14 @@ class LightInput(Input):
         super().__init__("light", value, news=news)
         self.shell = shell
 
+    @property
+    def visibility_key(self) -> Input | None:
+        """The input of visibility beside points and blockers: known light itself, of free light its shell alone.
+
+        Known light says where in cells it comes from.
+        """
+        return self.shell if self.is_free else self
+
 
 class Method:
     """How light is blocked: a method of visibility.
@@ -52,6 +60,8 @@ class Method:
     """
 
     lights_samples = False  # whether every sample is a receiver, overriding the bodies
+
+    has_proxies = False  # whether spheres stand in for bodies, by which light bounces where these move
 
     shares_directions = False
     """Whether all receivers look for light in the same directions, so that one is enough for a surface in a pixel."""
@@ -133,28 +143,12 @@ class Method:
             self._numberings[key] = [number_receivers(item, is_static, bodies=bodies, device=device) for item in sides]
         return self._numberings[key][has_backs]
 
-    def shading(self, points: LitPoints, light: Light | None, materials: Materials | None = None) -> Node:
-        """Light reflected by points as white surfaces, vec3 of shape [batch, receiver]; None: the scene's.
-
-        Results for the scene's light and the last other known light are cached. Materials, by default the scene's,
-        matter where light bounces, and where bodies emit.
-        """
-        without_emitters = self.shading_without_emitters(points, light, materials)
-        return self.with_emitters(without_emitters, points, materials or points.materials)
-
     @functools.cached_property
     def emitters(self) -> SceneEmitters:
         """The bodies that emit."""
         from warpshadow.pipeline.emitters import SceneEmitters
 
         return SceneEmitters(self.merged_scene)
-
-    def with_emitters(self, direct: Node, points: LitPoints, materials: Materials) -> Node:
-        """Add direct light of emitters to other direct light on points; nothing where no body emits."""
-        if not materials.emission:
-            return direct
-        emitted = self.light_of_emitters(points, materials)
-        return points.cached("direct with emitters", (direct, emitted), lambda: Node("", add_light, direct, emitted))
 
     def light_of_emitters(self, points: LitPoints, materials: Materials) -> Node:
         """Direct light of emitters on points, vec3 of shape [batch, receiver], cached for the last emission."""
@@ -175,23 +169,9 @@ class Method:
         """
         raise NotImplementedError
 
-    def shading_without_emitters(
-        self, points: LitPoints, light: Light | None, materials: Materials | None = None
-    ) -> Node:
-        """The same without direct light of emitters, but with that which bounces."""
-        check_light(light)
-        if materials is None or not self.merged_scene.scene.bounces:
-            materials = points.materials
-        light_input = self.light_input(points, light)
-        if light_input.is_free:
-            return self.free_shading(points, light_input, materials)
-        shade = functools.partial(self.known_shading, points, light_input, materials)
-        if materials is not points.materials:
-            return shade()
-        return points.cached("shading of the scene" if light_input is self.light else "shading", light_input, shade)
-
     def light_input(self, points: LitPoints, light: Light | None) -> LightInput:
         """The light of points as an input; the same for the same known light of the same shell."""
+        check_light(light)
         own_shell = None
         if isinstance(light, ShellLight):
             light, own_shell = light
@@ -226,25 +206,38 @@ class Method:
         """Center and radius of the sphere that sends light, vec4 of shape [batch]; None for light infinitely far."""
         return self.shell if light.shell is None else light.shell
 
-    def cached_transfers(self, points: LitPoints, light: LightInput | None = None) -> Node:
+    def cached_transfers(self, points: LitPoints, shell: Input | None = None) -> Node:
         """Transfer vectors of points to :attr:`basis`, an array [batch, receiver, coefficient] for each group.
 
         Args:
-            light: Free light, whose shell they are for; None for that of the scene.
+            shell: Of the light; None for that of the scene's.
         """
-        shell = None if light is None else light.shell
-        return points.cached("transfers", shell, lambda: self.transfers(points, light or self.light))
+        return points.cached("transfers", shell, lambda: self.transfers(points, shell))
 
-    def known_shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
-        """Shading of points in known light, which bounces from the materials."""
+    def cached_for_light(self, name: str, points: LitPoints, light: LightInput, make: Callable[[], Node]) -> Node:
+        """A node of points in known light, cached for the scene's light and for the last other one."""
+        return points.cached(f"{name} of the scene" if light is self.light else name, light, make)
+
+    def direct_shading(self, points: LitPoints, light: LightInput) -> Node:
+        """Direct light that points reflect as white surfaces, without that of emitters, vec3 [batch, receiver].
+
+        Known light is shaded at once; free light meets transfer vectors, which are cached.
+        """
+        if light.is_free:
+            return self._free_shading(points, light)
+        return self.cached_for_light("direct", points, light, lambda: self.known_shading(points, light))
+
+    def known_shading(self, points: LitPoints, light: LightInput) -> Node:
+        """Direct known light on points."""
         raise NotImplementedError
 
-    def free_shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
-        """Shading of points in free light, which is converted where the transfer vectors are not."""
-        transfers = self.cached_transfers(points, light)
+    def _free_shading(self, points: LitPoints, light: LightInput) -> Node:
+        """Direct free light on points, which is converted where the transfer vectors are not."""
+        transfers = self.cached_transfers(points, light.shell)
         matrix = self.native_from_basis if transfers.requires_grad else None
         items = functools.partial(receiver_text, points.in_words)
-        return Node("shading", functools.partial(shade_free, matrix=matrix), transfers, light, items=items)
+        name, shade = f"shading{points.suffix}", functools.partial(shade_free, matrix=matrix)
+        return Node(name, shade, transfers, light, items=items)
 
     @functools.cached_property
     def native_from_basis(self) -> np.ndarray | None:
@@ -254,8 +247,8 @@ class Method:
             return None
         return conversion(basis, native)
 
-    def transfers(self, points: LitPoints, light: LightInput) -> Node:
-        """Transfer vectors of points to :attr:`basis`, an array for each group; of light, its shell matters."""
+    def transfers(self, points: LitPoints, shell: Input | None) -> Node:
+        """Transfer vectors of points to :attr:`basis`, an array for each group, for light from a shell."""
         raise NotImplementedError
 
     @functools.cached_property
@@ -293,6 +286,10 @@ class Method:
             view: As for :meth:`lobe_transmittance`.
             choose: Makes a node of light on the view's receivers one of light on these.
         """
+        raise NotImplementedError
+
+    def along_paths(self, direct: Node, points: LitPoints, light: LightInput, materials: Materials) -> Node:
+        """Shading of points in known light that bounces along paths, added to direct light."""
         raise NotImplementedError
 
     def openness(self, points: LitPoints) -> Node | None:

@@ -1,9 +1,10 @@
 """Nodes: a computed value, its inputs, whether it is cached, and why.
 
 An :class:`Input` is a value from the caller, such as vertices or a light; a :class:`Node` computes one from inputs and
-nodes, when its value is asked for. Both are immutable: another value is another input, with other nodes after it. So a
-node's value stays right for as long as the node exists. It is cached, and a node with a cached value asks nothing that
-comes before it. Only values with a gradient are not cached: a tape is good for one playback.
+nodes, when its value is asked for. An input's value never changes: another value is another input, with other nodes
+after it. So a node's value stays right for as long as the node exists. It is cached, and a node with a cached value
+asks nothing that comes before it. Not cached are values with a gradient, since a tape is good for one playback, those
+of nodes that say so (``caches``), such as samples, and all of a call that does not cache, as in the capture of a graph.
 """
 
 import contextlib

@@ -15,7 +15,7 @@ from warpshadow.device.constants import constant
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node, detached
-from warpshadow.scene.material import GLOSS_ARGUMENTS, GLOSS_DEFAULTS
+from warpshadow.scene.material import GLOSS_ARGUMENTS, GLOSS_DEFAULTS, INPUTS_OF_BODIES
 from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.textures.footprint import find_footprints
 from warpshadow.stages.textures.numbers import as_colors
@@ -24,9 +24,6 @@ from warpshadow.stages.textures.sample import sample_albedo
 
 BodyArrays = Sequence[wp.array | None] | None
 """For each body an array, or None for the scene's own; None for all bodies' own."""
-
-
-_COLORS = ("albedo", "emission")  # inputs that are never textures
 
 
 class SampleReflectance(NamedTuple):
@@ -116,7 +113,9 @@ class Materials:
         if "albedo" in changed:
             self.vertex_albedo = self.of_vertices("albedo")
         textures = {
-            name: BodyTextures(self.merged_scene, self._inputs[name]) for name in changed if name not in _COLORS
+            name: BodyTextures(self.merged_scene, self._inputs[name])
+            for name in changed
+            if INPUTS_OF_BODIES[name].has_images
         }
         self.textures_of = self.textures_of | textures
 
@@ -175,13 +174,13 @@ class Materials:
 
     def _check(self, name: str, number: int, array: wp.array) -> None:
         """Raise ValueError for an array that is not one of a body."""
-        body, where = self.merged_scene.scene.bodies[number], f"{name}[{number}]"
+        body, where, body_input = self.merged_scene.scene.bodies[number], f"{name}[{number}]", INPUTS_OF_BODIES[name]
         if name in GLOSS_ARGUMENTS and not body.is_glossy:
             expected = "one for bodies that have roughness in the scene"
             raise ValueError(f"{where}: got some for {body.name!r}, expected {expected}")
         if name == "emission" and body.emission is None:
             raise ValueError(f"{where}: got some for {body.name!r}, expected one for bodies that have it in the scene")
-        if name == "textures" or (name in GLOSS_ARGUMENTS and array.ndim == 3):
+        if body_input.has_images and (array.ndim == 3 or not body_input.has_rows):
             check.shape(where, array.shape, ("batch", "height", "width"))
             if body.mesh.uvs is None:
                 raise ValueError(

@@ -22,7 +22,7 @@ from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import announced, one_at_a_time
 from warpshadow.pipeline.catchers import CatchersAlone
 from warpshadow.pipeline.delegation import delegated
-from warpshadow.pipeline.explain import Explanation, bounce_notes, decide, shell_notes
+from warpshadow.pipeline.explain import Explanation, decide, shell_notes
 from warpshadow.pipeline.geometry import Geometry, as_geometry
 from warpshadow.pipeline.image_inputs import ImageArrays, takes
 from warpshadow.pipeline.layers import LayerArrays, Layers, find_layer_arrays, find_layers
@@ -35,6 +35,7 @@ from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.scene_views import SceneViews, camera_batch
 from warpshadow.pipeline.shading_ratio import shading_ratio
 from warpshadow.pipeline.transfers import Light, ShellLight, one_transfer
+from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.view import View
 from warpshadow.pipeline.view_warnings import warn_of_vertex_receivers, warn_of_view
 from warpshadow.scene.scene import BodyLike, PerBody, Scene, check_scene
@@ -61,8 +62,9 @@ _OF_CAMERAS = ("_scene_view", "_catchers_alone")  # cached values of a renderer'
 class SceneRenderer:
     """Renders a scene, or instances of it with other geometry, cameras, light and reflectance.
 
-    Geometry and cameras of the scene itself do not move, so that an image costs a dot product and a gather. All methods
-    are differentiable under Warp's tape in their array arguments, as far as these require gradients.
+    Results that depend on the scene's own geometry and cameras alone are cached: of direct light on diffuse bodies,
+    another image by other light or reflectance then costs a dot product for each receiver, and a gather. Methods that
+    return arrays are differentiable under Warp's tape, in the arguments that their docstrings name.
 
     Args:
         cameras: In place of the scene's camera any number of them, of one size and near plane, whose images are a
@@ -109,7 +111,8 @@ class SceneRenderer:
         self._method = make_method(self.merged_scene, basis, progress=progress)
         self._materials = Materials.of_scene(self.merged_scene)
         self.basis = self._method.basis
-        self._views = SceneViews(self._method, self._materials, self.cameras, self.clock)
+        self._transport = LightTransport(self._method)
+        self._views = SceneViews(self._transport, self._materials, self.cameras, self.clock)
         self._has_warned = False
 
     def __repr__(self) -> str:
@@ -261,7 +264,7 @@ class SceneRenderer:
         Differentiable: light, view.
         """
         view = self._checked(view)
-        return self._method.shading(view, light).value(self._views.call(view))
+        return self._transport.shading(view, light).value(self._views.call(view))
 
     @announced
     def reflect(
@@ -460,10 +463,12 @@ class SceneRenderer:
             geometry = None if inputs.geometry is None else as_geometry("geometry", inputs.geometry)
             view = self._views.view(geometry, inputs.clip_matrices)
         preview = view.preview()  # which the nodes' words ask, so it stays meanwhile
-        image = preview.image(_light_of(inputs), self.materials(inputs.of_bodies))
+        light, materials = _light_of(inputs), self.materials(inputs.of_bodies)
+        image = preview.image(light, materials)
         is_host = self.device.is_cpu or self.clock.waits
         of_receivers = receiver_notes(self._given_scene, self._choices, view.blocker_kinds.bulging)
-        notes = [*of_receivers, *bounce_notes(self.scene.bounces), *shell_notes(self.scene.shell)]
+        of_bounces = self._transport.notes(preview, light, materials)
+        notes = [*of_receivers, *of_bounces, *shell_notes(self.scene.shell)]
         return Explanation(
             image, self._views.call(view), self.clock.timings, is_host=is_host, hidden=hidden, notes=notes
         )

@@ -12,11 +12,11 @@ from warpshadow.assets.camera import Camera
 from warpshadow.device.batch import common_batch
 from warpshadow.device.constants import use
 from warpshadow.pipeline.geometry import PLACED, Geometry
-from warpshadow.pipeline.method import Method
 from warpshadow.pipeline.node import Call, Clock, Input, Node, identity
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.reflectance import Materials
+from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.view import View
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.project import check_clip_space
@@ -27,7 +27,7 @@ class SceneViews:
     """Views of a scene, and points in it that are lit.
 
     Args:
-        method: How light is blocked.
+        transport: Light on receivers, by a method of visibility.
         materials: Reflectance of the bodies.
         cameras: The cameras that see the scene, of one size and near plane.
         clock: Where times are noted.
@@ -36,8 +36,9 @@ class SceneViews:
         last: The last views that were cached: of the scene itself, and of another geometry or by other cameras.
     """
 
-    def __init__(self, method: Method, materials: Materials, cameras: Sequence[Camera], clock: Clock):
-        self._method, self._materials, self._clock, self._merged_scene = method, materials, clock, method.merged_scene
+    def __init__(self, transport: LightTransport, materials: Materials, cameras: Sequence[Camera], clock: Clock):
+        self._transport, self._method = transport, transport.method
+        self._materials, self._clock, self._merged_scene = materials, clock, self._method.merged_scene
         scene = self._merged_scene
         self.vertices = Input("vertices", lambda: scene.scene_geometry.positions)
         self._spheres = Input("spheres", lambda: (scene.scene_geometry.centers, scene.scene_geometry.radii))
@@ -106,7 +107,7 @@ class SceneViews:
         if clip_matrices is not None:
             check_clip_space(clip_matrices)
         return View(
-            self._method,
+            self._transport,
             self._materials,
             *arguments,
             call=self.call(),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 import warp as wp
@@ -17,7 +17,7 @@ from warpshadow.pipeline.geometry import Geometry
 from warpshadow.pipeline.method import LightInput, Method
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached
 from warpshadow.pipeline.planes import ScenePlanes
-from warpshadow.pipeline.receivers.groups import Blockers, Group, GroupVisibility, find_groups
+from warpshadow.pipeline.receivers.groups import Blockers, CellVisibility, Group, HarmonicVisibility, find_groups
 from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.reflectance import Materials
@@ -26,30 +26,49 @@ from warpshadow.pipeline.transfers import LARGEST_COEFFICIENT, change_basis, joi
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.shading import shade
 
+Projected = TypeVar("Projected", bound="ProjectedLight")
+FoundVisibility = TypeVar("FoundVisibility", CellVisibility, HarmonicVisibility)
 
-class SphereMethod(Method):
+
+class ProjectedLight(Protocol):
+    """Light in the basis in which a method finds visibility: cells of directions, or bands of spherical harmonics.
+
+    Without coefficients it is the basis alone, by which visibility is found for any free light.
+    """
+
+    @property
+    def coefficients(self) -> wp.array | None:
+        """Of known or given light, vec3 of shape [batch, coefficient]; of light from a shell, those of its patches."""
+
+    def with_coefficients(self: Projected, coefficients: wp.array) -> Projected:
+        """Light of the same basis."""
+
+
+class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     """A method in which spheres stand in for the bodies: visibility, transfer vectors, and shading.
+
+    Its two types say in which basis it has light, and visibility.
 
     Attributes:
         free_projection: The basis in which the method projects any free light, of the scene's shell if it has one.
         why_no_shadows: Why the method has no shadows, in words; empty if it has.
         joins_cached: Whether visibility combines cached rows with moving blockers.
         traces_self_visibility: Whether bodies' shadows on themselves may come from rays, not spheres.
-        sees_cells: Whether visibility is transmittance in cells: those towards ``directions`` of projected light.
-        shades_transmittance: Whether known light is shaded without transfer vectors, by :meth:`shade_transmittance`.
-        bounces: The ``SphereBounces`` by which light bounces; None where it does not.
-        emitter_projection: Even light in the cells in which self-visibility towards emitters is looked up; None where
-            nothing is.
+        shades_transmittance: Whether transmittance is shaded in known light at once, by :meth:`shade_transmittance`,
+            which finds transfer vectors itself where it takes them: of cached rows, and for light from a shell.
     """
 
-    free_projection: Any
+    free_projection: Projected
     why_no_shadows = ""
     joins_cached = False
     traces_self_visibility = False
-    sees_cells = False
     shades_transmittance = False
-    bounces: Any = None
-    emitter_projection: Any = None
+    has_proxies = True
+
+    @property
+    def emitter_projection(self) -> Projected | None:
+        """Even light in the cells in which self-visibility towards emitters is looked up; None where nothing is."""
+        return None
 
     @functools.cached_property
     def plane_blockers(self) -> tuple[int, ...]:
@@ -118,12 +137,12 @@ class SphereMethod(Method):
         return Blockers(self.merged_scene, blocker_kinds, *owners, positions, spheres, frames, placed)
 
     def find_visibility_past_planes(
-        self, group: Group, visibility: GroupVisibility, projected_light: Any
-    ) -> GroupVisibility:
+        self, group: Group, visibility: FoundVisibility, projected_light: Projected
+    ) -> FoundVisibility:
         """Visibility of a group past the flat bodies around it, given its visibility past all other blockers."""
         raise NotImplementedError
 
-    def project_light(self, light: KnownLight, shell: wp.array | None = None) -> Any:
+    def project_light(self, light: KnownLight, shell: wp.array | None = None) -> Projected:
         """Project known light for the method: its coefficients, and the cells or bands they belong to.
 
         Args:
@@ -133,38 +152,59 @@ class SphereMethod(Method):
         """
         raise NotImplementedError
 
-    def project_free_light(self, shell: wp.array) -> Any:
+    def project_free_light(self, shell: wp.array) -> Projected:
         """The basis in which the method projects free light of another shell than the scene's."""
         raise NotImplementedError
 
-    def free_projection_of(self, points: LitPoints, light: LightInput) -> Any:
+    @functools.cached_property
+    def _projected_from_scene(self) -> Node:
+        return Node("", self.project_light, self.light, self.shell)
+
+    def projected(self, points: LitPoints, light: LightInput) -> Node:
+        """Node of light on points, projected for the method; the same for the same known light."""
+        if light.is_free:
+            return Node("", self._projected_if_given, light, self.projection(points, light))
+        if light is self.light:
+            return self._projected_from_scene
+        make = functools.partial(Node, "", self.project_light, light, self.shell_of(light))
+        return points.cached_of_bodies("projected", light, make)
+
+    def projection(self, points: LitPoints, light: LightInput) -> Node | Projected:
+        """The light by which visibility is found, projected: known light, or any free light of the same shell."""
+        return self.free_projection_of(points, light.shell) if light.is_free else self.projected(points, light)
+
+    def free_projection_of(self, points: LitPoints, shell: Input | None) -> Node | Projected:
         """The basis in which the method projects free light, or a node of it, the same for the same shell."""
-        if light.shell is None:
+        if shell is None:
             return self.free_projection
-        make = functools.partial(Node, "", self.project_free_light, light.shell)
-        return points.cached("free projection", light.shell, make)
+        make = functools.partial(Node, "", self.project_free_light, shell)
+        return points.cached_of_bodies("free projection", shell, make)
+
+    def _projected_if_given(self, light: wp.array, free_projection: Projected) -> Projected:
+        """Project given free light for the method. Differentiable: light."""
+        return free_projection.with_coefficients(change_basis(light, self.native_from_basis))
 
     def coefficient_count(self, light: Input | None) -> int:
         """Number of light coefficients that shading uses; all of them where the light is None, not known yet."""
         raise NotImplementedError
 
-    def self_lookups(self, bodies: tuple[int, ...], rotations: wp.array, projected_light: Any) -> dict[int, Any]:
+    def self_lookups(self, bodies: tuple[int, ...], rotations: wp.array, projected_light: Projected) -> dict[int, Any]:
         """Self-visibility of receivers of some bodies, :attr:`Group.self_lookup` by body. Differentiable: rotations."""
         raise NotImplementedError
 
-    def find_visibility(self, group: Group, projected_light: Any) -> GroupVisibility:
+    def find_visibility(self, group: Group, projected_light: Projected) -> FoundVisibility:
         """Visibility, or transmittance, past a group's spheres and its own body."""
         raise NotImplementedError
 
-    def transfer(self, visibility: GroupVisibility, group: Group, projected_light: Any) -> wp.array:
+    def transfer(self, visibility: FoundVisibility, group: Group, projected_light: Projected) -> wp.array:
         """Transfer vectors of a group."""
         raise NotImplementedError
 
-    def shade_transfer(self, transfer: wp.array, group: Group, projected_light: Any) -> wp.array:
+    def shade_transfer(self, transfer: wp.array, group: Group, projected_light: Projected) -> wp.array:
         """Shading of a group in known light."""
         return shade(transfer, projected_light.coefficients, maximum=LARGEST_COEFFICIENT)
 
-    def shade_transmittance(self, visibility: GroupVisibility, group: Group, projected_light: Any) -> wp.array:
+    def shade_transmittance(self, visibility: FoundVisibility, group: Group, projected_light: Projected) -> wp.array:
         """Shading of a group in known light."""
         raise NotImplementedError
 
@@ -179,16 +219,6 @@ class SphereMethod(Method):
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """Rows of transmittance past static bodies, for known light or for any."""
         raise NotImplementedError
-
-    @functools.cached_property
-    def _projected_from_scene(self) -> Node:
-        return Node("", self.project_light, self.light, self.shell)
-
-    def projected(self, light: LightInput) -> Node:
-        """Node of known light, projected; the scene's is cached."""
-        if light is self.light:
-            return self._projected_from_scene
-        return Node("", self.project_light, light, self.shell_of(light))
 
     def emitted_light(self, points: LitPoints, materials: Materials) -> Node:
         """Direct light of emitters on points, by the same blockers."""
@@ -217,52 +247,33 @@ class SphereMethod(Method):
         def lookups() -> Node:
             if self.emitter_projection is None:
                 return Node("", None)
-            return _self_visibility(self, points, self.emitter_projection)
+            return _self_visibility(self, points.blocker_kinds, self.emitter_projection)
 
         return Node(
             name,
             find_in_groups,
             points.receivers_node,
             placed_blockers(self, points),
-            points.cached("self-visibility towards emitters", None, lookups),
+            points.cached_of_bodies("self-visibility towards emitters", None, lookups),
             self.emitters.placed(points),
             self.emitters.radiance(materials),
             *others,
             items=lambda: f"{receiver_text(words)} × {emitters[0].first[-1]} samples",
         )
 
-    def known_shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
-        """Shading of points in known light, which bounces from the materials."""
-        projected_light = self.projected(light)
-        if self.bounces is not None:
-            is_cached = points.is_scene_view and materials is not points.materials
-            shade_all = self.bounces.cached_bounced_shading if is_cached else self.bounces.bounced_shading
-            return shade_all(points, projected_light, light, materials)
-        return PortionedShading(self, points, projected_light, light, joined)
-
-    def free_shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
-        """Shading of points in free light; where it bounces between moving bodies, computed as for known light."""
-        if self.bounces is None:
-            return super().free_shading(points, light, materials)
-        if not points.is_scene_view:
-            projected_light = Node("", self._projected_if_given, light, self.free_projection_of(points, light))
-            return self.bounces.bounced_free_shading(points, projected_light, light, materials)
-        direct = super().free_shading(points, light, materials)
-        return self.bounces.cached_bounced_free_shading(direct, points, light, materials)
+    def known_shading(self, points: LitPoints, light: LightInput) -> Node:
+        """Direct known light on points."""
+        return PortionedShading(self, points, self.projected(points, light), light, joined)
 
     def openness(self, points: LitPoints) -> Node:
         """Light that points reflect as white surfaces under an even sky of 1, vec3 of shape [batch, receiver]."""
         sky = LightInput(EnvironmentMap.constant(1.0))
-        return PortionedShading(self, points, Node("", self.project_light, sky), sky, joined, where=" in an even sky")
+        return PortionedShading(self, points, Node("", self.project_light, sky), sky, joined, suffix=" in an even sky")
 
-    def _projected_if_given(self, light: wp.array, free_projection: Any) -> Any:
-        """Project given free light for the method. Differentiable: light."""
-        return free_projection._replace(coefficients=change_basis(light, self.native_from_basis))
-
-    def transfers(self, points: LitPoints, light: LightInput, where: str = "") -> Node:
+    def transfers(self, points: LitPoints, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`; where they vary, to the method's native basis."""
-        matrix, free_projection = self.native_from_basis, self.free_projection_of(points, light)
-        transfers = PortionedShading(self, points, free_projection, None, list, caches=matrix is None, where=where)
+        matrix, projection = self.native_from_basis, self.free_projection_of(points, shell)
+        transfers = PortionedShading(self, points, projection, None, list, caches=matrix is None)
         if matrix is None or transfers.requires_grad:
             return transfers
 
@@ -275,7 +286,8 @@ class SphereMethod(Method):
 class PortionedShading(Node):
     """Shading or transfer vectors of receivers, found group by group and portion by portion.
 
-    So without a gradient transfer vectors of all receivers are in memory at once only where light is free.
+    So without a gradient transfer vectors of all receivers are in memory at once only where they are the result: for
+    free light, and in the visibility that bounces cache while colors vary. Receivers with cached rows are one portion.
 
     Args:
         points: The receivers.
@@ -283,7 +295,7 @@ class PortionedShading(Node):
         light: Known or free light; None where it is not given yet: portions end with transfer vectors.
         finish: Combines the list of results of all portions.
         caches: As for :class:`Node`.
-        where: Suffix of the names of its stages, to tell them from others.
+        suffix: Put after the names of its stages in place of that of the points.
         is_shaded: Whether portions are shaded in known light; else they end with transfer vectors, too.
         stages: Further ones, as for :class:`Node`.
     """
@@ -292,18 +304,19 @@ class PortionedShading(Node):
         self,
         method: SphereMethod,
         points: LitPoints,
-        projected_light: Any,
+        projected_light: Node | ProjectedLight,
         light: Input | None,
         finish: Callable[[list[wp.array]], Any],
         *,
         caches: bool = True,
-        where: str = "",
+        suffix: str | None = None,
         is_shaded: bool = True,
         stages: tuple[NodeStage, ...] = (),
     ):
         self.method, self._bodies_and_spheres = method, (points.static_bodies, points.nearest_spheres)
         self._finish, self._progress = finish, method.progress and light is not None
         receivers, words = points.receivers_node, points.in_words
+        suffix = points.suffix if suffix is None else suffix
         item_text = functools.partial(receiver_text, words)
         self_visibility = self_visibility_node(method, points, projected_light)
         shadows = _static_shadows(method, points, light)
@@ -312,19 +325,19 @@ class PortionedShading(Node):
         self._is_shaded = light is not None and is_shaded
         self._is_transferred = not (self._is_shaded and method.shades_transmittance)
         self._visibility = NodeStage(
-            f"visibility{where}", lambda: _pairs(method, words), lambda: _why_unblocked(method, words)
+            f"visibility{suffix}", lambda: _pairs(method, words), lambda: _why_unblocked(method, words)
         )
         self._planes = NodeStage(
-            f"planes{where}",
+            f"planes{suffix}",
             lambda: f"{item_text()} × {len(planes)} flat {'body' if len(planes) == 1 else 'bodies'}",
             "" if planes else "spheres stand in for the bodies that cast shadows",
         )
         self._transfer = NodeStage(
-            f"transfer{where}",
+            f"transfer{suffix}",
             lambda: f"{item_text()} × {method.coefficient_count(light)} coefficients",
-            "" if self._is_transferred else "known light is shaded without transfer vectors",
+            "" if self._is_transferred else "shading takes transmittance at once",
         )
-        self._shading = NodeStage(f"shading{where}", item_text)
+        self._shading = NodeStage(f"shading{suffix}", item_text)
         own_stages = self._visibility, self._planes, self._transfer, self._shading
         static_normals = None if points.static_bodies is None else points.static_bodies.normals
         super().__init__(
@@ -355,12 +368,14 @@ class PortionedShading(Node):
                     yield self.find(call, portion, projected_light, blockers.spheres)
                     bar.update(portion.points.shape[1])
 
-    def find(self, call: Call, portion: Group, projected_light: Any, spheres: tuple[wp.array, wp.array]) -> Any:
+    def find(
+        self, call: Call, portion: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
+    ) -> Any:
         """Compute a portion's visibility, given the projected light and all spheres."""
         return self.light(call, portion, self.find_visibility(call, portion, projected_light), projected_light)
 
-    def find_visibility(self, call: Call, portion: Group, projected_light: Any) -> GroupVisibility:
-        """Find the visibility of a portion."""
+    def find_visibility(self, call: Call, portion: Group, projected_light: ProjectedLight) -> Any:
+        """Find the visibility of a portion, of the method's type."""
         with self.timed(call, self._visibility):
             visibility = self.method.find_visibility(portion, projected_light)
         if portion.planes is None:
@@ -368,7 +383,13 @@ class PortionedShading(Node):
         with self.timed(call, self._planes):
             return self.method.find_visibility_past_planes(portion, visibility, projected_light)
 
-    def light(self, call: Call, portion: Group, visibility: GroupVisibility, projected_light: Any) -> wp.array:
+    def light(
+        self,
+        call: Call,
+        portion: Group,
+        visibility: CellVisibility | HarmonicVisibility,
+        projected_light: ProjectedLight,
+    ) -> wp.array:
         """Transfer vectors of a portion, or its shading."""
         if not self._is_transferred:
             with self.timed(call, self._shading):
@@ -428,20 +449,20 @@ def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
 def placed_blockers(method: SphereMethod, points: LitPoints) -> Node:
     """Node of the blockers around points, where they are in the world."""
     place = functools.partial(method.blockers, points.blocker_kinds)
-    return points.cached("blockers", None, lambda: Node("", place, points.vertices, points.spheres))
+    return points.cached_of_bodies("blockers", None, lambda: Node("", place, points.vertices, points.spheres))
 
 
-def self_visibility_node(method: SphereMethod, points: LitPoints, projected_light: Any) -> Node:
+def self_visibility_node(method: SphereMethod, points: LitPoints, projected_light: Node | ProjectedLight) -> Node:
     """Node of the receivers' self-visibility lookups, by body; the same for any receivers among the same bodies."""
-    make = functools.partial(_self_visibility, method, points, projected_light)
-    return points.cached("self-visibility", id(projected_light), make)
+    make = functools.partial(_self_visibility, method, points.blocker_kinds, projected_light)
+    return points.cached_of_bodies("self-visibility", id(projected_light), make)
 
 
-def _self_visibility(method: SphereMethod, points: LitPoints, projected_light: Any) -> Node:
-    bodies, rotations, words = points.blocker_kinds.self_traced, points.blocker_kinds.rotations, points.in_words
+def _self_visibility(method: SphereMethod, blocker_kinds: BlockerKinds, projected_light: Node | ProjectedLight) -> Node:
+    bodies, rotations = blocker_kinds.self_traced, blocker_kinds.rotations
     curved_bodies = [body for body in bodies if not method.merged_scene.is_flat[body]]
     if not curved_bodies or rotations is None:
-        return Node("self-shadows", None, idle=lambda: _why_no_self_visibility(method, words))
+        return Node("self-shadows", None, idle=lambda: _why_no_self_visibility(method, blocker_kinds))
 
     def state() -> str:
         missing = method.self_visibility.missing(bodies)
@@ -451,13 +472,13 @@ def _self_visibility(method: SphereMethod, points: LitPoints, projected_light: A
     return Node("self-shadows", functools.partial(method.self_lookups, bodies), rotations, projected_light, items=state)
 
 
-def _why_no_self_visibility(method: SphereMethod, points: LitPoints) -> str:
+def _why_no_self_visibility(method: SphereMethod, blocker_kinds: BlockerKinds) -> str:
     """Why no body's shadow on itself is looked up."""
     if not method.traces_self_visibility:
         return "the method takes those of spheres"
     names = [body.name for body in method.merged_scene.scene.bodies]
-    whys = {name: why for name, why in zip(names, points.blocker_kinds.why_spheres, strict=False) if why}
-    whys |= {names[body]: "its convex parts block its own light" for body in points.blocker_kinds.solids}
+    whys = {name: why for name, why in zip(names, blocker_kinds.why_spheres, strict=False) if why}
+    whys |= {names[body]: "its convex parts block its own light" for body in blocker_kinds.solids}
     return "; ".join(f"{name}: {why}" for name, why in whys.items()) or "bodies are flat"
 
 

@@ -14,6 +14,7 @@ from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached, fie
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials, SampleReflectance
 from warpshadow.pipeline.transfers import Light
+from warpshadow.pipeline.transport import LightTransport
 from warpshadow.stages.film import average, sample_radiance, sum_radiance
 from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.normals import vertex_normals
@@ -41,7 +42,7 @@ class View(LitPoints):
     """A geometry seen by cameras: all inputs of an image except light and reflectance.
 
     Args:
-        method: How light is blocked.
+        transport: Light on receivers, by a method of visibility.
         materials: Reflectance of the scene's bodies.
         vertices: Positions of all vertices.
         spheres: Centers and radii of the spheres.
@@ -59,7 +60,7 @@ class View(LitPoints):
 
     def __init__(
         self,
-        method: Method,
+        transport: LightTransport,
         materials: Materials,
         vertices: Input,
         spheres: Input,
@@ -73,7 +74,8 @@ class View(LitPoints):
         is_scene_view: bool = False,
     ):
         self.dependencies = vertices, spheres, cameras, static_bodies, blocker_kinds
-        self.method = method
+        self.transport, self.method = transport, transport.method
+        method = self.method
         self._samples_receive = method.samples_receive(blocker_kinds)
         self.cameras = cameras
         self._camera, self._supersampling, self._pose_count = camera, method.merged_scene.scene.supersampling, counts[0]
@@ -140,8 +142,8 @@ class View(LitPoints):
         return normals, receivers
 
     def shading(self, light: Light | None, materials: Materials | None = None) -> Node:
-        """Light on the receivers: :meth:`.Method.shading`."""
-        return self.method.shading(self, light, materials)
+        """Light on the receivers: :meth:`.LightTransport.shading`."""
+        return self.transport.shading(self, light, materials)
 
     @property
     def transfers(self) -> Node:
@@ -152,9 +154,8 @@ class View(LitPoints):
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""
         item_text, clip, fragments = self._samples, self.clip_positions, self.fragments_node
         shading, reflectance = self.shading(light, materials), self.reflectance(materials)
-        if materials.roughness or materials.emission:
-            samples = self._shining(shading, light, materials, reflectance.samples)
-        elif reflectance.pyramids.requires_grad and not (shading.requires_grad or clip.requires_grad):
+        shines = materials.roughness or materials.emission
+        if not shines and reflectance.pyramids.requires_grad and not (shading.requires_grad or clip.requires_grad):
             replaced_stages = (NodeStage("reflectance", idle="found with the radiance"),)
             reflectance_inputs = reflectance.vertex_albedo, reflectance.pyramids, reflectance.footprints
             arguments = fragments, self.merged_scene.faces, *reflectance_inputs, self._white_radiance_of(shading)
@@ -162,7 +163,7 @@ class View(LitPoints):
                 "radiance", textured_radiance, *arguments, items=item_text, caches=False, stages=replaced_stages
             )
         else:
-            samples = self._radiance(shading, reflectance.samples)
+            samples = self._shining(shading, light, materials, reflectance.samples)
         return self._averaged(samples, is_moving=self._is_moving)
 
     def reflectance(self, materials: Materials) -> SampleReflectance:
@@ -199,7 +200,7 @@ class View(LitPoints):
         return seen_texels(textures, footprints)[sum(has_texture[:number])].sum(axis=0)
 
     def _shining(self, shading: Node, light: Light | None, materials: Materials, reflectance: Node) -> Node:
-        """Node of the samples where bodies shine or emit."""
+        """Node of the samples, of bodies that may shine and emit."""
         if materials.roughness:
             reflected = self._glossy(shading, light, materials, reflectance)
         else:
@@ -224,7 +225,7 @@ class View(LitPoints):
         points = self.cached("gloss", None, lambda: GlossyPoints(self.method, self, *arguments))
         blockers_light = shading
         if materials.emission:
-            blockers_light = self.method.shading_without_emitters(self, light, materials)
+            blockers_light = self.transport.shading_without_emitters(self, light, materials)
         colored, white = points.mixed(self, shading, light, materials, blockers_light)
         return self._sum_of(self._radiance(colored, reflectance), self._radiance(white, self._white_reflectance))
 
@@ -262,12 +263,7 @@ class View(LitPoints):
         body_light, inverse_light, base_factor = (
             field_of(ratio, name, caches=False) for name in ("body_light", "inverse_light", "base_factor")
         )
-        parts = (
-            self._shining(shading, light, materials, body_light)
-            if materials.roughness or materials.emission
-            else self._radiance(shading, body_light)
-        )
-        surfaces = parts, self._radiance(shading, inverse_light)
+        surfaces = self._shining(shading, light, materials, body_light), self._radiance(shading, inverse_light)
         films = [self._averaged(samples, is_moving=self._is_moving) for samples in surfaces]
         films.append(self._averaged(base_factor))
         if photograph is None:

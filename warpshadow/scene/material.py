@@ -1,7 +1,8 @@
-"""Material of bodies beside their color: numbers that say how a surface shines, in one table.
+"""Materials of bodies in two tables: the numbers that say how a surface shines, and all that images take of bodies.
 
-Bodies, scene files, arrays and tensors of renderers, and materials of meshes' files follow the table. A new number is a
-row here, a field and an argument of :class:`.Body`, and its part in :mod:`.pipeline.gloss`.
+Checks of bodies and scene files follow the first table; arrays and tensors of renderers follow the second, of which the
+first is a part. A new number is a row here, a field of :class:`.Body` and one of :class:`.ImageInputs`; then
+:mod:`.pipeline.gloss` asks for it. Color, texture and emission are fields of a body with code of their own.
 """
 
 from typing import NamedTuple
@@ -32,3 +33,32 @@ MATERIAL_FIELDS = (
 
 GLOSS_ARGUMENTS = tuple(field.name for field in MATERIAL_FIELDS)
 GLOSS_DEFAULTS = {field.name: field.default for field in MATERIAL_FIELDS}
+
+
+class BodyInput(NamedTuple):
+    """An input of images that bodies have each, as an array or a tensor.
+
+    Args:
+        is_color: Whether its items are linear RGB; else they are numbers.
+        has_rows: Whether it may be one item, or one for each vertex.
+        has_images: Whether it may be an image, [height, width].
+    """
+
+    is_color: bool = True
+    has_rows: bool = True
+    has_images: bool = False
+
+    def is_image(self, shape: tuple[int, ...], vertex_count: int) -> bool:
+        """Whether a value of a shape, with a batch or without, is an image, for a mesh of so many vertices."""
+        if not (self.has_rows and self.has_images):
+            return self.has_images
+        return len(shape) > 2 or (len(shape) == 2 and shape[1] not in (1, vertex_count))
+
+
+INPUTS_OF_BODIES = {
+    "albedo": BodyInput(),
+    "textures": BodyInput(has_rows=False, has_images=True),
+    "emission": BodyInput(),
+    **dict.fromkeys(GLOSS_ARGUMENTS, BodyInput(is_color=False, has_images=True)),
+}
+"""By the names of their arguments."""

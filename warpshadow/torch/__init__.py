@@ -1,7 +1,7 @@
 """Rendering with torch tensors: images that are differentiable in light, reflectance, geometry and cameras.
 
-While geometry and camera stand still, visibility and rasterization are computed once, by any method, the ray-traced
-mesh included; an iteration is then a matrix product and a gather.
+While geometry and cameras stay the same, visibility and rasterization are computed once, by any method, the ray-traced
+mesh included. With direct light on diffuse bodies an iteration is then a matrix product and a gather.
 """
 
 from warpshadow.torch.autograd import apply

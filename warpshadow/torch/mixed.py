@@ -16,7 +16,7 @@ from warpshadow import check
 from warpshadow.assets.basis import Basis, CellBasis
 from warpshadow.pipeline.geometry import Geometry, as_geometry
 from warpshadow.pipeline.image_inputs import ImageInputs, takes
-from warpshadow.scene.material import GLOSS_ARGUMENTS
+from warpshadow.scene.material import INPUTS_OF_BODIES
 from warpshadow.scene.scene import BodyLike, PerBody
 from warpshadow.torch.autograd import check_float32, uncompiled
 from warpshadow.torch.renderer import TorchRenderer
@@ -229,12 +229,12 @@ class MixedRenderer(torch.nn.Module):
     def _split_item(self, batch: "_Batch", argument: str, body: BodyLike, tensor: Any) -> Callable[[int], Any]:
         """An input of a body for the images of a scene, checked; without padding where it is of vertices."""
         name, maximum = f"{argument}[{body!r}]", self._maximum_vertices[body]
-        if argument == "textures":
-            return batch.split(name, tensor, 3)
-        check_float32(name, tensor)
-        if argument in GLOSS_ARGUMENTS:
-            if tensor.ndim > 2 or (tensor.ndim == 2 and tensor.shape[1] not in (1, maximum)):
-                return batch.split(name, tensor, 2)  # an image
+        body_input = INPUTS_OF_BODIES[argument]
+        if body_input.has_rows:
+            check_float32(name, tensor)
+        if body_input.is_image(np.shape(tensor), maximum):
+            return batch.split(name, tensor, 3 if body_input.is_color else 2)
+        if not body_input.is_color:
             if tensor.ndim == 1 and len(tensor) != 1:
                 check.shape(name, tuple(tensor.shape), (maximum,), "or one number, or an image")
             ndim = 1

@@ -16,7 +16,7 @@ from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.explain import Explanation
 from warpshadow.pipeline.geometry import GEOMETRY_DTYPES, Geometry
 from warpshadow.pipeline.image_inputs import ImageInputs, takes
-from warpshadow.scene.material import GLOSS_ARGUMENTS
+from warpshadow.scene.material import INPUTS_OF_BODIES
 from warpshadow.scene.scene import BodyLike, PerBody, Scene
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.poses import Poses
@@ -286,15 +286,13 @@ class TorchRenderer(torch.nn.Module):
     def _body_rows(
         self, name: str, number: int, tensor: torch.Tensor
     ) -> tuple[torch.Tensor, type, tuple[int | str, ...], str]:
-        """A tensor of a body as rows of items, their dtype, the shape to expect, and a remedy."""
-        if name == "textures":
-            return tensor, wp.vec3, ("height", "width"), check.channels_last(np.shape(tensor))
-        dtype = wp.vec3 if name in ("albedo", "emission") else wp.float32
-        item, mesh = item_shape(dtype), self.scene.bodies[number].mesh
-        if name in GLOSS_ARGUMENTS and mesh.uvs is not None:
-            is_texture = np.ndim(tensor) == 2 and np.shape(tensor)[1] not in (1, mesh.vertex_count)
-            if is_texture or np.ndim(tensor) == 3:
-                return tensor, dtype, ("height", "width"), ""
+        """A tensor of a body as rows or images of items, their dtype, the shape to expect, and a remedy."""
+        body_input, mesh = INPUTS_OF_BODIES[name], self.scene.bodies[number].mesh
+        dtype = wp.vec3 if body_input.is_color else wp.float32
+        item, can_be_image = item_shape(dtype), mesh.uvs is not None or not body_input.has_rows
+        if can_be_image and body_input.is_image(np.shape(tensor), mesh.vertex_count):
+            remedy = check.channels_last(np.shape(tensor)) if body_input.is_color else ""
+            return tensor, dtype, ("height", "width"), remedy
         if isinstance(tensor, torch.Tensor) and tuple(tensor.shape) == item:  # one for the whole body
             tensor = tensor[None]
         shape = np.shape(tensor)

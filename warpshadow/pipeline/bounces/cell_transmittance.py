@@ -5,14 +5,14 @@ Where the method of visibility has no cells, it is found here, past spheres.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import common_batch, expand
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.receivers.groups import Group, GroupVisibility, nonplanar_bodies
+from warpshadow.pipeline.receivers.groups import CellVisibility, Group, HarmonicVisibility, nonplanar_bodies
 from warpshadow.pipeline.sphere_method import SphereMethod
 from warpshadow.stages.visibility.directional import transmittance
 
@@ -31,8 +31,7 @@ class CellTransmittance(NamedTuple):
 def find_cell_transmittance(
     method: SphereMethod,
     group: Group,
-    visibility: GroupVisibility,
-    projected_light: Any,
+    visibility: CellVisibility | HarmonicVisibility,
     spheres: tuple[wp.array, wp.array],
 ) -> CellTransmittance:
     """Transmittance of a group in cells of directions.
@@ -41,12 +40,13 @@ def find_cell_transmittance(
         method: How light is blocked.
         group: The receivers.
         visibility: Visibility of direct light.
-        projected_light: Projected direct light.
         spheres: Centers and radii of all spheres.
     """
     merged_scene = method.merged_scene
-    if method.sees_cells:
-        directions, transmittance_self = projected_light.directions, visibility.transmittance_self
+    parts = None
+    if isinstance(visibility, CellVisibility):
+        directions, transmittance_self = visibility.directions, visibility.transmittance_self
+        parts = None if visibility.part_coverages is None else visibility.part_coverages.cells
         transmittance_nonplanar = (
             visibility.transmittance_total
             if visibility.transmittance_nonplanar is None
@@ -62,7 +62,6 @@ def find_cell_transmittance(
         transmittance_nonplanar = wp.full(
             (*group.points.shape, len(directions)), 1.0, wp.float32, device=group.points.device
         )
-    parts = None if visibility.part_coverages is None else visibility.part_coverages.cells
     return CellTransmittance(transmittance_self, transmittance_nonplanar, directions, parts)
 
 

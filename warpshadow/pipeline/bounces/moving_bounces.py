@@ -23,7 +23,7 @@ import warp as wp
 from warpshadow.device.batch import cut
 from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance, find_cell_transmittance
 from warpshadow.pipeline.bounces.gathering import ALL_FLAT, Gathering, OutgoingRadiance
-from warpshadow.pipeline.bounces.patches import ScenePatches, Senders, lit_patch_samples
+from warpshadow.pipeline.bounces.patches import OF_PATCH_SAMPLES, ScenePatches, Senders, lit_patch_samples
 from warpshadow.pipeline.bounces.proxies import ProjectedPatches, Proxies
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
@@ -32,20 +32,13 @@ from warpshadow.pipeline.node import Call, Node, NodeStage
 from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
-from warpshadow.pipeline.sphere_method import PortionedShading, SphereMethod, self_visibility_node
+from warpshadow.pipeline.sphere_method import PortionedShading, ProjectedLight, SphereMethod
 from warpshadow.pipeline.transfers import joined
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.patch_weights import PatchWeights, find_mean_transmittance, find_patch_weights
 from warpshadow.stages.bounces.radiosity import patch_radiosity
 from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.receivers import Receivers
-
-OF_PATCH_SAMPLES = " of patch samples"  # suffix of the names of stages
-
-
-def _patch_sample_text(senders: Senders) -> str:
-    """Number of patch samples, in words."""
-    return f"{len(senders.sides):,} patch samples"
 
 
 class PortionVisibility(NamedTuple):
@@ -68,14 +61,14 @@ class PortionedVisibility(PortionedShading):
     """Visibility of receivers for direct and bounced light, in portions."""
 
     def find(
-        self, call: Call, portion: Group, projected_light: Any, spheres: tuple[wp.array, wp.array]
+        self, call: Call, portion: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
     ) -> PortionVisibility:
         """Find the visibility of a portion."""
         visibility = self.find_visibility(call, portion, projected_light)
         return PortionVisibility(
             self.light(call, portion, visibility, projected_light),
             portion,
-            find_cell_transmittance(self.method, portion, visibility, projected_light, spheres),
+            find_cell_transmittance(self.method, portion, visibility, spheres),
         )
 
 
@@ -110,7 +103,7 @@ class PortionedDirectLight(Node):
         (projected_light,) = self.values(call)
         return [self._light(call, portion, projected_light) for portion in self._visibility.value(call)]
 
-    def _light(self, call: Call, portion: PortionVisibility, projected_light: Any) -> PortionDirectLight:
+    def _light(self, call: Call, portion: PortionVisibility, projected_light: ProjectedLight) -> PortionDirectLight:
         with self.timed(call, self._shading):
             direct = self._visibility.method.shade_transfer(portion.transfer, portion.group, projected_light)
         return PortionDirectLight(direct, portion.group, portion.cells)
@@ -266,40 +259,29 @@ class MovingBounces:
         self._self_form_factors = SelfFormFactors(method.self_visibility, patches, progress=method.progress)
         self._proxies: dict[Senders, Proxies] = {}
 
-    def shading(
-        self,
-        points: LitPoints,
-        projected_light: Node,
-        visibility_light: Any,
-        light: LightInput,
-        materials: Materials,
-        *,
-        is_free: bool,
-    ) -> Node:
+    def shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
         """Node of the shading of points, direct and bounced, vec3 of shape [batch, receiver].
+
+        Their visibility is cached where it holds for other calls: in free light, and where colors vary.
 
         Args:
             points: The receivers.
-            projected_light: The light projected for the method.
-            visibility_light: That by which their visibility is found: the basis of free light.
             light: The light.
             materials: Reflectance of the bodies.
-            is_free: Whether the light is free.
         """
         method, senders = self._method, self._patches.senders(materials)
+        projected_light, projection = method.projected(points, light), method.projection(points, light)
         if not senders.bodies:
             idle = NodeStage("bounces", idle="every body is black")
             return PortionedShading(method, points, projected_light, light, joined, stages=(idle,))
         proxies = self._proxies.setdefault(senders, Proxies(senders, method.visibility.merging))
         make_visibility = functools.partial(
-            PortionedVisibility, method, projected_light=visibility_light, light=light, finish=list, is_shaded=False
+            PortionedVisibility, method, projected_light=projection, light=light, finish=list, is_shaded=False
         )
-        key, is_cached = light.shell if is_free else light, is_free or materials is not points.materials
+        key, is_cached = light.visibility_key, light.is_free or materials is not points.materials
         visibility = points.cached("visibility", (key, is_cached), lambda: make_visibility(points, caches=is_cached))
         of_patch_samples = points.cached(
-            "of patch samples",
-            (key, senders),
-            lambda: self._patch_samples(make_visibility, visibility_light, proxies, points),
+            "of patch samples", (key, senders), lambda: self._patch_samples(make_visibility, proxies, points)
         )
         radiosity = self._radiosity(of_patch_samples, projected_light, proxies, materials)
         item_text = functools.partial(receiver_text, points.in_words)
@@ -307,11 +289,7 @@ class MovingBounces:
         return BouncedShading(visibility, projected_light, item_text, radiosity, at_points)
 
     def _patch_samples(
-        self,
-        make_visibility: Callable[..., PortionedVisibility],
-        visibility_light: Any,
-        proxies: Proxies,
-        points: LitPoints,
+        self, make_visibility: Callable[..., PortionedVisibility], proxies: Proxies, points: LitPoints
     ) -> PatchSampleNodes:
         """Nodes of the patch samples of the bodies around points."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
@@ -319,15 +297,11 @@ class MovingBounces:
         def project(patch_samples: Receivers, visibility: list[PortionVisibility], *arguments: Any) -> ProjectedPatches:
             return proxies.projected_patches(patch_samples, [portion.cells for portion in visibility], *arguments)
 
-        make = functools.partial(Node, "patch samples", senders.patch_samples, points.vertices, points.normals)
-        patch_samples = points.cached("patch samples", senders, lambda: make(items=_patch_sample_text(senders)))
-        arguments = patch_samples, points, points.materials, proxies.nearest_spheres
-        lit_samples = points.cached("lit samples", proxies, lambda: lit_patch_samples(*arguments))
-        lookups = self_visibility_node(self._method, points, visibility_light)
-        lit_samples.cached("self-visibility", id(visibility_light), lambda: lookups)
-        visibility = make_visibility(lit_samples, where=OF_PATCH_SAMPLES)
+        arguments = senders, points, proxies.nearest_spheres
+        lit_samples = points.cached("patch samples beside proxies", proxies, lambda: lit_patch_samples(*arguments))
+        visibility = make_visibility(lit_samples)
         frames = Node("", planes.all.frames if planes else lambda _: None, points.vertices)
-        projected_patches = Node("", project, patch_samples, visibility, spheres, frames)
+        projected_patches = Node("", project, lit_samples.receivers_node, visibility, spheres, frames)
         weights = Node("", functools.partial(_patch_weights, senders), visibility)
         return PatchSampleNodes(lit_samples, visibility, frames, projected_patches, weights)
 
@@ -336,15 +310,12 @@ class MovingBounces:
     ) -> Radiosity:
         """Radiosity of the patches, given the light at their patch samples."""
         senders, why_not = proxies.senders, "light bounces once" if self._count == 1 else ""
-        lit: Node = PortionedDirectLight(
-            patch_samples.visibility, projected_light, _patch_sample_text(senders), OF_PATCH_SAMPLES
-        )
+        arguments = f"{len(senders.sides):,} patch samples", OF_PATCH_SAMPLES
+        lit: Node = PortionedDirectLight(patch_samples.visibility, projected_light, *arguments)
         if materials.emission:
             lit = Node("", _add_emitted, lit, self._method.light_of_emitters(patch_samples.points, materials))
         albedo = self._patches.albedo(materials, senders.bodies)
-        among_senders = self._gathering(
-            senders, _patch_sample_text(senders), OF_PATCH_SAMPLES, why_not, only_others=True
-        )
+        among_senders = self._gathering(senders, *arguments, why_not, only_others=True)
         return Radiosity(self._count, proxies, self._self_form_factors, among_senders, lit, albedo, patch_samples)
 
     def _gathering(self, senders: Senders, *arguments: Any, **options: Any) -> Gathering:

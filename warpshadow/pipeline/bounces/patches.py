@@ -31,6 +31,8 @@ _PATCHES_OF_SIDE = 3
 
 _FACES_OF_PATCH = 8
 
+OF_PATCH_SAMPLES = " of patch samples"  # suffix of the names of stages
+
 _SCENE_PATCHES = 2048  # patches of a scene of more than 8 bodies, but no fewer than _MIN_BODY_PATCHES of each
 _MIN_BODY_PATCHES = 32  # patches of each of many bodies, at least: a side of a box has some
 _SCENE_PATCH_SAMPLES = 4096  # patch samples of the patches of a scene, but at least one of each
@@ -232,11 +234,20 @@ def _joined(parts: list[np.ndarray], dtype: type) -> np.ndarray:
     return np.concatenate(parts).astype(dtype) if parts else np.empty(0, dtype)
 
 
-def lit_patch_samples(
-    patch_samples: Node, points: LitPoints, materials: Materials, nearest_spheres: np.ndarray | None = None
-) -> LitPoints:
-    """Make lit points of patch samples, among the same bodies as other points."""
-    arguments = points.merged_scene, materials, points.vertices, points.spheres, patch_samples, points.call
+def lit_patch_samples(senders: Senders, points: LitPoints, nearest_spheres: np.ndarray | None = None) -> LitPoints:
+    """Make lit points of the patch samples of bodies around other points."""
+    items, find = f"{len(senders.sides):,} patch samples", senders.patch_samples
+    receivers = Node("patch samples", find, points.vertices, points.normals, items=items)
     return LitPoints(
-        *arguments, normals=points.normals, blocker_kinds=points.blocker_kinds, nearest_spheres=nearest_spheres
+        points.merged_scene,
+        points.materials,
+        points.vertices,
+        points.spheres,
+        receivers,
+        points.call,
+        normals=points.normals,
+        blocker_kinds=points.blocker_kinds,
+        nearest_spheres=nearest_spheres,
+        neighbors=points,
+        suffix=OF_PATCH_SAMPLES,
     )

@@ -28,10 +28,10 @@ import warp as wp
 
 from warpshadow.pipeline.bounces.patches import ScenePatches, Senders, lit_patch_samples
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
+from warpshadow.pipeline.method import Method
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
-from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.colored import ColoredTransfer, colored_light
 from warpshadow.stages.bounces.form_factors import (
     BLACK_ENTRIES,
@@ -86,30 +86,19 @@ class StaticBounces:
     """Light that bounces between the bodies of a scene that do not move.
 
     Args:
+        method: How light is blocked.
         patches: Of the scene.
-        bounces: How often, 1 or more; "all" until nothing is left.
-        openness: Node of the light of points under an even sky, :meth:`.Method.openness`.
-        rays: Of a cache point or patch sample.
     """
 
-    def __init__(
-        self,
-        patches: ScenePatches,
-        bounces: Bounces,
-        openness: Callable[[LitPoints], Node | None],
-        *,
-        rays: int = RAYS,
-        progress: bool = False,
-    ):
-        self._patches, self._progress, self._bounces, self._rays = patches, progress, bounces, rays
-        self._openness = openness
+    def __init__(self, method: Method, patches: ScenePatches):
+        self._patches, self._progress, self._openness = patches, method.progress, method.openness
+        self._bounces = method.merged_scene.scene.bounces  # 1 or more, or "all" until nothing is left
+        self._rays = STILL_RAYS if method.shares_directions else RAYS
 
-    def patch_samples(self, points: LitPoints, materials: Materials) -> Node:
-        """Node of the points of patches that are lit, of one instance."""
+    def patch_samples(self, points: LitPoints, materials: Materials) -> LitPoints:
+        """The points of patches that are lit, of one instance."""
         senders = self._patches.senders(materials)
-        return points.cached(
-            "patch samples", senders, lambda: Node("", senders.patch_samples, points.vertices, points.normals)
-        )
+        return points.cached("patch samples", senders, lambda: lit_patch_samples(senders, points))
 
     def add_bounces(self, direct: Node, at_patch_samples: Node, points: LitPoints, materials: Materials) -> Node:
         """Add bounces to direct shading.
@@ -269,16 +258,12 @@ class StaticBounces:
 
         def make() -> Node:
             patch_samples = self.patch_samples(points, materials)
-            arguments = patch_samples, points, materials
-            lit_samples = points.cached(
-                "patch samples under the sky", patch_samples, lambda: lit_patch_samples(*arguments)
-            )
-            skies = [self._openness(item) for item in (lit_samples, points)]
+            skies = [self._openness(item) for item in (patch_samples, points)]
             return Node(
                 "form factors",
                 find,
                 points.vertices,
-                patch_samples,
+                patch_samples.receivers_node,
                 points.receivers_node,
                 *skies,
                 items=lambda: f"{len(senders.sides):,} patch samples × {len(senders.areas):,} patches",

@@ -9,23 +9,17 @@ from warpshadow.assets.basis import Basis
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.method import Method
-from warpshadow.scene.visibility import DEFAULT_METHOD, SPHERE_METHODS
+from warpshadow.scene.visibility import DEFAULT_METHOD
 
 
 @one_at_a_time  # kernels must not be made while another thread loads some
 def make_method(merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False) -> Method:
-    """Make the method of a scene, with light that bounces if the scene asks for it.
+    """Make the method of a scene.
 
     Args:
         merged_scene: The bodies.
         basis: Basis of free light; None for the method's own.
     """
-    scene = merged_scene.scene
-    name = scene.visibility.method or DEFAULT_METHOD
+    name = merged_scene.scene.visibility.method or DEFAULT_METHOD
     module = importlib.import_module(f"{__package__}.{name.replace('-', '_')}")
-    method = module.METHOD(merged_scene, basis, progress=progress)
-    if scene.bounces and name in SPHERE_METHODS:
-        from warpshadow.pipeline.bounces.sphere_bounces import SphereBounces
-
-        method.bounces = SphereBounces(method)
-    return method  # type: ignore[no-any-return]
+    return module.METHOD(merged_scene, basis, progress=progress)  # type: ignore[no-any-return]

@@ -18,13 +18,12 @@ from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.method import LightInput
 from warpshadow.pipeline.node import Call, Input, Node, field_of
-from warpshadow.pipeline.receivers.groups import CellCoverages, Group, GroupVisibility
+from warpshadow.pipeline.receivers.groups import CellCoverages, CellVisibility, Group
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
-from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.self_visibility import SelfVisibilityLookup
 from warpshadow.pipeline.shell import PATCHES, ShellPatches, project_on_shell
-from warpshadow.pipeline.sphere_method import PortionedShading, SphereMethod
+from warpshadow.pipeline.sphere_method import PortionedShading, ProjectedLight, SphereMethod
 from warpshadow.pipeline.transfers import LARGEST_COEFFICIENT, change_basis, joined
 from warpshadow.scene.blockers import blocking_planes
 from warpshadow.stages.cached_cells import CachedRows, cell_transfer, shade_cached_cells
@@ -74,6 +73,10 @@ class ProjectedCells(NamedTuple):
         """Directions by whose cosine light falls in, [direction, 3]."""
         return self.directions if self.mean_directions is None else self.mean_directions
 
+    def with_coefficients(self, coefficients: wp.array) -> "ProjectedCells":
+        """Light of the same basis."""
+        return self._replace(coefficients=coefficients)
+
 
 class SharpestCells(NamedTuple):
     """Sixteen cells of the scene's light whose shadows are sharpest."""
@@ -85,11 +88,10 @@ class SharpestCells(NamedTuple):
     power: np.ndarray  # luminance of all cells [direction]
 
 
-class Directional(SphereMethod):
+class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     """Visibility for each cell of directions by itself."""
 
     traces_self_visibility = True
-    sees_cells = True
     shades_transmittance = True
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
@@ -165,9 +167,10 @@ class Directional(SphereMethod):
         has_sun = projected_light.sun is not None
         return self.self_visibility.lookups(bodies, rotations, towards, projected_light.half_angles, has_sun=has_sun)
 
-    def find_visibility(self, group: Group, projected_light: ProjectedCells) -> GroupVisibility:
+    def find_visibility(self, group: Group, projected_light: ProjectedCells) -> CellVisibility:
         """Transmittance of a group past its own body, spheres and convex parts."""
         points, normals, radii, cached_rows = group.points, group.normals, group.radii, group.cached_rows
+        directions = projected_light.directions
         transmittance_self = self._transmittance_self(group, projected_light)
         # cached cells have light although their middles are below the horizon
         horizon_normals = normals if cached_rows is None else None
@@ -178,16 +181,16 @@ class Directional(SphereMethod):
         if points.size and group.convex_parts_around is not None:
             cover = functools.partial(group.convex_parts_around.coverage, points, horizon_normals)
             parts = self._coverages(cover, projected_light)
-        if group.is_before_planes and self.bounces is None:  # nobody asks for transmittance past all else
-            return GroupVisibility(
-                None, transmittance_self, transmittance_self_and_spheres=past_spheres, part_coverages=parts
+        if group.is_before_planes and not self.merged_scene.scene.bounces:  # which need transmittance past all else
+            return CellVisibility(
+                directions, None, transmittance_self, transmittance_self_and_spheres=past_spheres, part_coverages=parts
             )
         total = past_spheres if parts is None else self._past_coverages(past_spheres, parts, None, projected_light)
         if total is None:
-            total = empty((*points.shape, len(projected_light.directions)), dtype=wp.float32, device=points.device)
+            total = empty((*points.shape, len(directions)), dtype=wp.float32, device=points.device)
             total.fill_(1.0)
-        return GroupVisibility(
-            total, transmittance_self, transmittance_self_and_spheres=past_spheres, part_coverages=parts
+        return CellVisibility(
+            directions, total, transmittance_self, transmittance_self_and_spheres=past_spheres, part_coverages=parts
         )
 
     def _coverages(self, cover: Callable[..., wp.array], projected_light: ProjectedCells) -> CellCoverages:
@@ -257,8 +260,8 @@ class Directional(SphereMethod):
         return tuple(body for body in rigid if body in self.parts.parts)
 
     def find_visibility_past_planes(
-        self, group: Group, visibility: GroupVisibility, projected_light: ProjectedCells
-    ) -> GroupVisibility:
+        self, group: Group, visibility: CellVisibility, projected_light: ProjectedCells
+    ) -> CellVisibility:
         """Transmittance past the flat bodies around a group, too."""
         planes = group.planes
         if planes is None or not group.is_before_planes:
@@ -300,7 +303,7 @@ class Directional(SphereMethod):
         of_sun = trace_sun_cells(rays[0], group.probe_weights, rays[1], group.body, projected_light.sun)
         return blend_sharp_cells(transmittance_self, of_sun, projected_light.sun.slots)
 
-    def transfer(self, visibility: GroupVisibility, group: Group, projected_light: ProjectedCells) -> wp.array:
+    def transfer(self, visibility: CellVisibility, group: Group, projected_light: ProjectedCells) -> wp.array:
         """Transfer vectors; the transmittance as it is where cached cells hold known light."""
         assert visibility.transmittance_total is not None
         if projected_light.patches is not None:
@@ -319,7 +322,7 @@ class Directional(SphereMethod):
         return super().shade_transfer(transfer, group, projected_light)
 
     def shade_transmittance(
-        self, visibility: GroupVisibility, group: Group, projected_light: ProjectedCells
+        self, visibility: CellVisibility, group: Group, projected_light: ProjectedCells
     ) -> wp.array:
         """Shading of a group in known light."""
         if group.cached_rows is not None or projected_light.patches is not None:
@@ -418,40 +421,34 @@ class Directional(SphereMethod):
         direct, openness = shade(transfer, light, maximum=LARGEST_COEFFICIENT), shade(of_cells, even)
         return blocked_radiance(diffuse, direct, openness)
 
-    def known_shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
-        """Shading of points in known light, which bounces from the materials."""
+    def known_shading(self, points: LitPoints, light: LightInput) -> Node:
+        """Direct known light on points."""
         if not self._shades_with_cells(points):
-            return super().known_shading(points, light, materials)
+            return super().known_shading(points, light)
         return field_of(self._shading_with_cells(points, light), "shading")
 
     def _shades_with_cells(self, points: LitPoints) -> bool:
         """Whether the transmittance of cells at bodies that shine comes with the shading of a view."""
-        return self.bounces is None and points.materials.roughness is not None
+        return not self.merged_scene.scene.bounces and points.materials.roughness is not None
 
     def _shading_with_cells(self, view: LitPoints, light: LightInput) -> Node:
         """Node of the shading of a view in known light, and of the transmittance of its glossy receivers' cells."""
-        name = "shading of the scene with cells" if light is self.light else "shading with cells"
-        make = functools.partial(ShadingWithCells, self, view, self.projected(light), light, _joined_with_cells)
-        return view.cached(name, light, make)
+        make = functools.partial(ShadingWithCells, self, view, self.projected(view, light), light, _joined_with_cells)
+        return self.cached_for_light("direct with cells", view, light, make)
 
-    def _lobe_cells(self, points: LitPoints, light: LightInput, view: LitPoints) -> tuple[Node, Any]:
+    def _lobe_cells(self, points: LitPoints, light: LightInput, view: LitPoints) -> tuple[Node, Node | ProjectedCells]:
         """Node of the transmittance of cells, in portions, and the projected light that says which.
 
         In known light that does not bounce the shading of the view has found it.
         """
+        projection = self.projection(points, light)
         if not light.is_free and self._shades_with_cells(view):
-            return field_of(self._shading_with_cells(view, light), "cells"), self.projected(light)
-        if light.is_free:
-            projected_light = self.free_projection_of(points, light)
-        else:
-            projected_light = points.cached("projected", light, functools.partial(self.projected, light))
+            return field_of(self._shading_with_cells(view, light), "cells"), projection
 
         def in_cells() -> Node:
-            return PortionedCellTransmittance(
-                self, points, projected_light, None, list, where=" of gloss", is_shaded=False
-            )
+            return PortionedCellTransmittance(self, points, projection, None, list, suffix=" of gloss", is_shaded=False)
 
-        return points.cached("cells", light.shell if light.is_free else light, in_cells), projected_light
+        return points.cached("cells", light.visibility_key, in_cells), projection
 
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """Rows of the light of each cell that static bodies let through.
@@ -488,7 +485,7 @@ class PortionedCellTransmittance(PortionedShading):
     """Transmittance of receivers past all bodies, in portions, float32 of shape [batch, receiver, direction]."""
 
     def find(
-        self, call: Call, portion: Group, projected_light: ProjectedCells, spheres: tuple[wp.array, wp.array]
+        self, call: Call, portion: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
     ) -> wp.array:
         """Find the transmittance of a portion."""
         return self.find_visibility(call, portion, projected_light).transmittance_total
@@ -498,7 +495,7 @@ class ShadingWithCells(PortionedShading):
     """Shading of receivers, in portions, and their transmittance towards cells if their body shines."""
 
     def find(
-        self, call: Call, portion: Group, projected_light: ProjectedCells, spheres: tuple[wp.array, wp.array]
+        self, call: Call, portion: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
     ) -> tuple[wp.array, wp.array | None]:
         """Shade a portion."""
         visibility = self.find_visibility(call, portion, projected_light)

@@ -13,10 +13,11 @@ from warpshadow.device.constants import constant
 from warpshadow.device.memory import zeros
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input
-from warpshadow.pipeline.receivers.groups import Group, GroupVisibility
+from warpshadow.pipeline.receivers.groups import Group, HarmonicVisibility
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.self_visibility import SelfVisibilityLobes
+from warpshadow.pipeline.shell import ShellPatches
 from warpshadow.pipeline.sphere_method import SphereMethod
 from warpshadow.stages.cached_cells import add_rows
 from warpshadow.stages.self_visibility.lobes import self_visibility_lobes
@@ -25,13 +26,18 @@ from warpshadow.stages.visibility import exponential, log_sh
 
 
 class ProjectedBands(NamedTuple):
-    """Light in bands of spherical harmonics."""
+    """Light in bands of spherical harmonics; or in patches of a shell, which the method "none" has."""
 
-    bands: int
-    coefficients: wp.array | None = None  # of known light, vec3 of shape [1, bands²]
+    bands: int  # 0 of patches
+    coefficients: wp.array | None = None  # of known light, vec3 of shape [1, bands²], or [1, patch]
+    patches: ShellPatches | None = None  # that send the light, whose coefficients are theirs; None where it is far
+
+    def with_coefficients(self, coefficients: wp.array) -> "ProjectedBands":
+        """Light of the same basis."""
+        return self._replace(coefficients=coefficients)
 
 
-class LogSH(SphereMethod):
+class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
     """Visibility of low frequencies. Where no body has spheres there are no shadows."""
 
     joins_cached = True
@@ -63,50 +69,46 @@ class LogSH(SphereMethod):
         """The lobes of some bodies, turned. Differentiable: rotations."""
         return self.self_visibility.turned_lobes(bodies, rotations, self._order)
 
-    def find_visibility(self, group: Group, projected_light: ProjectedBands) -> GroupVisibility:
+    def find_visibility(self, group: Group, projected_light: ProjectedBands) -> HarmonicVisibility:
         """Visibility, float32 of shape [batch, receiver, order²]; None where nothing blocks."""
         points, _, _, radii, cached_rows = group[:5]
         if not points.size or (cached_rows is None and not radii.shape[1]):
-            return GroupVisibility(None)
+            return HarmonicVisibility(None)
         if radii.shape[1]:
             log = self._logs(*group[:4], skip=group.skip, clusters=group.clusters)
         else:
             log = zeros((*points.shape, self._order**2), dtype=wp.float32, device=points.device)
         if cached_rows is not None:
             add_rows(cached_rows, log)
-        return GroupVisibility(exponential.exponentiate(log, base=self.visibility.base))
+        return HarmonicVisibility(exponential.exponentiate(log, base=self.visibility.base))
 
-    def transfer(self, visibility: GroupVisibility, group: Group, projected_light: ProjectedBands) -> wp.array:
+    def transfer(self, visibility: HarmonicVisibility, group: Group, projected_light: ProjectedBands) -> wp.array:
         """Transfer vectors, float32 of shape [batch, receiver, bands²]."""
         lobes = self._self_visibility_lobes(visibility, group, projected_light)
         if lobes is None:
-            return sh_transfer(
-                visibility.transmittance_total, group.normals, order=self._order, bands=projected_light.bands
-            )
-        if visibility.transmittance_total is None:
+            return sh_transfer(visibility.coefficients, group.normals, order=self._order, bands=projected_light.bands)
+        if visibility.coefficients is None:
             return lobes
         # where cameras share the rotations, but not the receivers
-        lobes = expand_rows(lobes, len(visibility.transmittance_total))
-        return sh_product(visibility.transmittance_total, lobes, order=self._order, bands=projected_light.bands)
+        lobes = expand_rows(lobes, len(visibility.coefficients))
+        return sh_product(visibility.coefficients, lobes, order=self._order, bands=projected_light.bands)
 
     def _self_visibility_lobes(
-        self, visibility: GroupVisibility, group: Group, projected_light: ProjectedBands
+        self, visibility: HarmonicVisibility, group: Group, projected_light: ProjectedBands
     ) -> wp.array | None:
         """Lobes that receivers' own bodies leave, [batch, receiver, order²]; only the light's bands if nothing blocks.
 
         None where they are clamped cosines.
         """
         if group.cached_rows is not None and group.cached_rows.rows.shape[1] == 2:
-            assert visibility.transmittance_total is not None
-            lobes = zeros(
-                visibility.transmittance_total.shape, dtype=wp.float32, device=visibility.transmittance_total.device
-            )
+            assert visibility.coefficients is not None
+            lobes = zeros(visibility.coefficients.shape, dtype=wp.float32, device=visibility.coefficients.device)
             add_rows(group.cached_rows, lobes, channel=1)
             return lobes
         if group.self_lookup is None or not group.points.size:
             return None
         assert group.probe_weights is not None and isinstance(group.self_lookup, SelfVisibilityLobes)
-        bands = projected_light.bands if visibility.transmittance_total is None else self._order
+        bands = projected_light.bands if visibility.coefficients is None else self._order
         return self_visibility_lobes(
             group.self_lookup.lobes, group.probe_weights, group.self_lookup.turn, order=self._order, bands=bands
         )

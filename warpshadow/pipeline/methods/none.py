@@ -1,26 +1,17 @@
 """The method "none": no shadows, in harmonics as by log-SH; light of a shell by its patches."""
 
-from typing import Any, NamedTuple
-
 import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import Basis
 from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.methods.log_sh import LogSH
+from warpshadow.pipeline.methods.log_sh import LogSH, ProjectedBands
 from warpshadow.pipeline.node import Input
-from warpshadow.pipeline.receivers.groups import Group, GroupVisibility
+from warpshadow.pipeline.receivers.groups import Group, HarmonicVisibility
 from warpshadow.pipeline.shell import PATCHES, ShellPatches, project_on_shell
 
 _NO_CELLS = np.empty((0, 3))
-
-
-class ProjectedShell(NamedTuple):
-    """Light of a shell."""
-
-    patches: ShellPatches
-    coefficients: wp.array | None = None  # of known light, vec3 of shape [1, patch]
 
 
 class NoShadows(LogSH):
@@ -35,21 +26,24 @@ class NoShadows(LogSH):
             self.native_basis, self.basis = PATCHES, PATCHES if basis is None else basis
             self.free_projection = self.project_free_light(self.shell)
 
-    def project_light(self, light: KnownLight, shell: wp.array | None = None) -> Any:
+    def project_light(self, light: KnownLight, shell: wp.array | None = None) -> ProjectedBands:
         """The bands that the light has, or its patches."""
-        return super().project_light(light) if shell is None else ProjectedShell(*project_on_shell(light, shell))
+        if shell is None:
+            return super().project_light(light)
+        patches, radiance = project_on_shell(light, shell)
+        return ProjectedBands(0, radiance, patches)
 
-    def project_free_light(self, shell: wp.array) -> ProjectedShell:
+    def project_free_light(self, shell: wp.array) -> ProjectedBands:
         """The basis of free light of a shell. Differentiable: shell."""
-        return ProjectedShell(ShellPatches(shell))
+        return ProjectedBands(0, patches=ShellPatches(shell))
 
     def coefficient_count(self, light: Input | None) -> int:
         """Number of coefficients that take part."""
         return super().coefficient_count(light) if self.shell is None else PATCHES.size
 
-    def transfer(self, visibility: GroupVisibility, group: Group, projected_light: Any) -> wp.array:
+    def transfer(self, visibility: HarmonicVisibility, group: Group, projected_light: ProjectedBands) -> wp.array:
         """Transfer vectors, float32 of shape [batch, receiver, coefficient]."""
-        if not isinstance(projected_light, ProjectedShell):
+        if projected_light.patches is None:
             return super().transfer(visibility, group, projected_light)
         return projected_light.patches.transfer(group.points, group.normals, None, _NO_CELLS)
 

@@ -11,7 +11,7 @@ from warpshadow.assets.basis import Basis, HarmonicBasis
 from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.device.batch import common_batch
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.method import LightInput, Method, add_light
+from warpshadow.pipeline.method import LightInput, Method
 from warpshadow.pipeline.node import Input, Node, NodeStage, detached
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.reflectance import Materials
@@ -25,8 +25,7 @@ from warpshadow.stages.shared_rays import find_corners, find_shares, trace_share
 from warpshadow.stages.shell.beams import FAR, check_within
 from warpshadow.stages.traced_transfer import trace_transfer
 
-if TYPE_CHECKING:  # they are imported where light bounces, and where bodies emit
-    from warpshadow.pipeline.bounces.static_bounces import StaticBounces
+if TYPE_CHECKING:  # it is imported where bodies emit
     from warpshadow.stages.emitters.samples import PlacedSamples
 
 Meshes = list[wp.Mesh | None]  # mesh that blocks the light of each instance of receivers; None for no blocker
@@ -43,79 +42,46 @@ class Rays(Method):
         super().__init__(merged_scene, HarmonicBasis(merged_scene.scene.visibility.order), basis, progress=progress)
         self.shares_directions = self.visibility.sampling == "shared"
 
-    def known_shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
-        """Shading of points in known light, towards which rays are drawn.
+    def known_shading(self, points: LitPoints, light: LightInput) -> Node:
+        """Direct known light on points, towards which rays are drawn."""
+        return Node(
+            f"shading{points.suffix}",
+            self._shade_shared if self.shares_directions else self._shade,
+            self._trees_around(points) if self.shares_directions else self._meshes(points),
+            points.receivers_node,
+            light,
+            self.shell_of(light),
+            items=functools.partial(receiver_text, points.in_words),
+            stages=(NodeStage("transfer", idle="rays shade known light at once"),),
+        )
 
-        By the reflectance of the scene's bodies light bounces along paths, without a gradient; by reflectance that a
-        call gives, and where receivers share directions, since few paths have grain, it bounces between patches, whose
-        form factors rays find once.
-        """
-        meshes = self._blockers(points, points.receivers_node)
-        if not self.merged_scene.scene.bounces:
-            return self._direct_shading(points, meshes, light)
-        direct = points.cached("direct", light, lambda: self._direct_shading(points, meshes, light))
-        if materials is points.materials and not self.shares_directions:
-            from warpshadow.pipeline.bounces.paths import path_traced
+    def along_paths(self, direct: Node, points: LitPoints, light: LightInput, materials: Materials) -> Node:
+        """Shading of points in known light that bounces along paths, which have no gradient."""
+        from warpshadow.pipeline.bounces.paths import path_traced
 
-            arguments = direct, meshes, points, light, self.shell_of(light), materials
-            return path_traced(*arguments, samples=self._sample_count, progress=self.progress)
-        patch_samples = self._bounces.patch_samples(points, materials)
-
-        def shaded_patch_samples() -> Node:
-            shade = self._shade_shared if self.shares_directions else self._shade
-            return Node("", shade, self._blockers(points, patch_samples), patch_samples, light, self.shell_of(light))
-
-        at_patch_samples = points.cached("direct at patch samples", (light, patch_samples), shaded_patch_samples)
-        if materials.emission:
-            emitted = self._light_of_emitters_at(points, patch_samples, materials)
-            at_patch_samples = points.cached(
-                "emitters at patch samples",
-                (at_patch_samples, materials.emission),
-                lambda: Node("", add_light, at_patch_samples, emitted),
-            )
-        return self._bounces.add_bounces(direct, at_patch_samples, points, materials)
-
-    def free_shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
-        """Shading of points in free light."""
-        direct = super().free_shading(points, light, materials)
-        if not self.merged_scene.scene.bounces:
-            return direct
-        patch_samples = self._bounces.patch_samples(points, materials)
-
-        def transfers() -> Node:
-            meshes = self._meshes_for(points, patch_samples)
-            return Node("", self._transfer, meshes, patch_samples, self.shell_of(light))
-
-        if materials.emission:
-            emitted = self._light_of_emitters_at(points, patch_samples, materials)
-            direct = self._bounces.add_bounces(direct, emitted, points, materials)
-        at_patch_samples = points.cached("transfer of patch samples", (patch_samples, light.shell), transfers)
-        return self._bounces.add_free_bounces(direct, at_patch_samples, light, points, materials)
+        arguments = direct, self._meshes(points), points, light, self.shell_of(light), materials
+        return path_traced(*arguments, samples=self._sample_count, progress=self.progress)
 
     def emitted_light(self, points: LitPoints, materials: Materials) -> Node:
-        """Direct light of emitters on points, by rays to their samples."""
-        return self._light_of_emitters_at(points, points.receivers_node, materials, "light of emitters")
+        """Direct light of emitters on points, by rays to their samples. Differentiable: emission."""
+        return self.emitters.traced_light(
+            *self._rays_to_emitters(points, materials), f"light of emitters{points.suffix}"
+        )
 
     def highlights(self, points: LitPoints, materials: Materials, roughness: Node, cameras: Input) -> Node:
         """Direct light of emitters in the lobes of points, by rays to their samples."""
-        arguments = self._rays_to_emitters(points, points.receivers_node, materials, "highlights")
-        return self.emitters.traced_highlights(*arguments, roughness, cameras)
+        return self.emitters.traced_highlights(*self._rays_to_emitters(points, materials), roughness, cameras)
 
-    def _light_of_emitters_at(self, points: LitPoints, receivers: Node, materials: Materials, name: str = "") -> Node:
-        """Direct light of emitters on other receivers among the same bodies. Differentiable: emission."""
-        return self.emitters.traced_light(*self._rays_to_emitters(points, receivers, materials, name), name)
-
-    def _rays_to_emitters(
-        self, points: LitPoints, receivers: Node, materials: Materials, name: str
-    ) -> tuple[Node, Node, Node, Node]:
+    def _rays_to_emitters(self, points: LitPoints, materials: Materials) -> tuple[Node, Node, Node, Node]:
         """Receivers, samples, their radiance, and the transmittance between."""
-        placed, items = self.emitters.placed(points), functools.partial(receiver_text, points.in_words)
+        receivers, placed = points.receivers_node, self.emitters.placed(points)
 
         def traced() -> Node:
+            name, items = f"rays to emitters{points.suffix}", functools.partial(receiver_text, points.in_words)
             arguments = points.vertices, receivers, placed
-            return Node(name and "rays to emitters", self._trace_emitters, *arguments, items=items, has_adjoint=False)
+            return Node(name, self._trace_emitters, *arguments, items=items, has_adjoint=False)
 
-        transmittance = points.cached(f"rays to emitters {name}", receivers, traced)
+        transmittance = points.cached("rays to emitters", None, traced)
         return receivers, placed, self.emitters.radiance(materials), transmittance
 
     def _trace_emitters(
@@ -145,15 +111,6 @@ class Rays(Method):
             result.append(traced)
         return result
 
-    @functools.cached_property
-    def _bounces(self) -> "StaticBounces":
-        from warpshadow.pipeline.bounces.patches import ScenePatches
-        from warpshadow.pipeline.bounces.static_bounces import RAYS, STILL_RAYS, StaticBounces
-
-        arguments = ScenePatches(self.merged_scene), self.merged_scene.scene.bounces, self.openness
-        rays = STILL_RAYS if self.shares_directions else RAYS
-        return StaticBounces(*arguments, rays=rays, progress=self.progress)
-
     def lobe_transmittance(self, points: LitPoints, directions: Node, light: LightInput, view: LitPoints) -> Node:
         """Transmittance towards the samples of lobes: rays, each of its own."""
         item_text = functools.partial(receiver_text, points.in_words)
@@ -170,53 +127,30 @@ class Rays(Method):
         self, points: LitPoints, diffuse: Node, light: LightInput, view: LitPoints, choose: Callable[[Node], Node]
     ) -> Node:
         """Mean radiance of the blockers of points, by their light with bounces and without."""
-        if light.is_free:
-            direct = super().free_shading(view, light, view.materials)
-        else:
-            meshes = self._blockers(view, view.receivers_node)
-            direct = view.cached("direct", light, lambda: self._direct_shading(view, meshes, light))
-        trees = self._trees_around(points)
+        direct, trees = self.direct_shading(view, light), self._trees_around(points)
         openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
         return Node("light of blockers", blocked_radiance, diffuse, choose(direct), openness)
 
-    def transfers(self, points: LitPoints, light: LightInput) -> Node:
+    def transfers(self, points: LitPoints, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""
         words = points.in_words
         node = Node(
-            "transfer",
+            f"transfer{points.suffix}",
             self._transfer,
             self._meshes(points),
             points.receivers_node,
-            self.shell_of(light),
+            self.shell if shell is None else shell,
             items=lambda: f"{receiver_text(words)} × {self.basis.size} coefficients",
         )
         if node.requires_grad:
             node.function = _refuse
         return node
 
-    def _direct_shading(self, points: LitPoints, meshes: Node, light: LightInput) -> Node:
-        """Node of the direct shading of points in known light, given the meshes, or trees, that block it."""
-        return Node(
-            "shading",
-            self._shade_shared if self.shares_directions else self._shade,
-            meshes,
-            points.receivers_node,
-            light,
-            self.shell_of(light),
-            items=functools.partial(receiver_text, points.in_words),
-            stages=(NodeStage("transfer", idle="rays shade known light at once"),),
-        )
-
-    def _blockers(self, points: LitPoints, receivers: Node) -> Node:
-        """Node of the blockers of rays in known light: trees of all vertices, or meshes of the receivers' instances."""
-        if self.shares_directions:
-            return self._trees_around(points, "visibility")
-        return self._meshes(points) if receivers is points.receivers_node else self._meshes_for(points, receivers)
-
-    def _trees_around(self, points: LitPoints, name: str = "") -> Node:
+    def _trees_around(self, points: LitPoints) -> Node:
         """Node of the trees of all vertices around points."""
-        items = functools.partial(receiver_text, points.in_words)
-        return points.cached("trees", points.vertices, lambda: Node(name, self._trees, points.vertices, items=items))
+        name, vertices = "visibility" if self.shares_directions else "", points.vertices
+        items = f"{len(self.merged_scene.body_of_face):,} faces"
+        return points.cached_of_bodies("trees", None, lambda: Node(name, self._trees, vertices, items=items))
 
     def _trees(self, positions: wp.array) -> list[FaceTree]:
         """Hierarchies of the blockers, for packets of rays."""
@@ -225,22 +159,22 @@ class Rays(Method):
         return [build_face_tree(item, faces, merged_scene.device) for item in positions.numpy()]
 
     def _meshes(self, points: LitPoints) -> Node:
-        """Node of the meshes that rays meet."""
-        words = points.in_words
-        return Node(
-            "visibility",
-            self._casting_meshes,
-            points.vertices,
-            detached(points.receivers_node),
-            items=lambda: f"{receiver_text(words)} by rays",
-            idle="" if self.merged_scene.casting else "no body has blockers",
-            caches=False,
-            stages=(NodeStage("static shadows", idle="rays treat all receivers alike"),),
-        )
+        """Node of the meshes that rays from points meet."""
 
-    def _meshes_for(self, points: LitPoints, receivers: Node) -> Node:
-        """Node of the meshes that rays of other receivers among the same bodies meet."""
-        return Node("", self._casting_meshes, points.vertices, detached(receivers), caches=False)
+        def meshes() -> Node:
+            words = points.in_words
+            return Node(
+                f"visibility{points.suffix}",
+                self._casting_meshes,
+                points.vertices,
+                detached(points.receivers_node),
+                items=lambda: f"{receiver_text(words)} by rays",
+                idle="" if self.merged_scene.casting else "no body has blockers",
+                caches=False,
+                stages=(NodeStage("static shadows", idle="rays treat all receivers alike"),),
+            )
+
+        return points.cached("meshes", None, meshes)
 
     @property
     def _sample_count(self) -> int:

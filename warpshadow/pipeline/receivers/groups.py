@@ -135,11 +135,17 @@ class CellCoverages(NamedTuple):
     sharp_cells: wp.array | None = None  # [batch, receiver, 16]; None where no cell is sharp
 
 
-class GroupVisibility(NamedTuple):
-    """Visibility of a group."""
+class HarmonicVisibility(NamedTuple):
+    """Visibility of a group in bands of spherical harmonics, past its spheres."""
 
-    # visibility or transmittance past all bodies; None before those of planes, where light does not bounce
-    transmittance_total: wp.array | None
+    coefficients: wp.array | None  # float32 of shape [batch, receiver, order²]; None where nothing blocks
+
+
+class CellVisibility(NamedTuple):
+    """Visibility of a group in cells of directions: transmittances, float32 of shape [batch, receiver, cell]."""
+
+    directions: np.ndarray  # of the cells, [cell, 3]
+    transmittance_total: wp.array | None  # past all bodies; None before those of planes, where light does not bounce
     transmittance_self: wp.array | None = None  # a factor of it: transmittance past its own body; None where that is 1
     transmittance_nonplanar: wp.array | None = None  # past all but planes; None where no planes block
     # transmittance past its own body and spheres, without convex parts and planes; None where that is 1

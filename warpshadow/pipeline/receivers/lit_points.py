@@ -58,6 +58,8 @@ class LitPoints:
         is_scene_view: Whether bodies and points are where the scene and its camera have them, for good.
         nearest_spheres: Where the points are patch samples, the sphere nearest to the patch of each: its index among
             the spheres of bodies that are not flat, −1 for none; NumPy of shape [receiver]. None for other points.
+        neighbors: Other points among the same bodies, with which values of these are shared.
+        suffix: Put after the names of stages, to tell them from those of other points.
     """
 
     def __init__(
@@ -73,7 +75,10 @@ class LitPoints:
         blocker_kinds: BlockerKinds = ONLY_SPHERES,
         is_scene_view: bool = False,
         nearest_spheres: np.ndarray | None = None,
+        neighbors: LitPoints | None = None,
+        suffix: str = "",
     ):
+        self.suffix = suffix
         self.blocker_kinds, self.is_scene_view, self.nearest_spheres = blocker_kinds, is_scene_view, nearest_spheres
         self.materials, self.merged_scene = materials, merged_scene
         self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
@@ -82,12 +87,17 @@ class LitPoints:
         self.last_light: Any = None  # that was known, but for the scene's: a ``LightInput``
         self.last_shell: Input | None = None  # of light, but for the scene's
         self._cached: dict[str, tuple[Hashable, Any]] = {}
+        self._cached_of_bodies: dict[str, tuple[Hashable, Any]] = {}
+        if neighbors is not None:
+            self._cached_of_bodies = neighbors._cached_of_bodies
 
     def cached(self, name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:
         """A value for the points, such as a node, cached under a name while its inputs stay the same."""
-        if name not in self._cached or self._cached[name][0] != key:
-            self._cached[name] = key, make()
-        return self._cached[name][1]
+        return _cached(self._cached, name, key, make)
+
+    def cached_of_bodies(self, name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:
+        """The same of a value that is equal for all points among the same bodies."""
+        return _cached(self._cached_of_bodies, name, key, make)
 
     def with_receivers(self: Points, receivers: Node) -> Points:
         """Other receivers, of which nothing is cached, among the same blockers, any of which may move."""
@@ -99,6 +109,7 @@ class LitPoints:
     def preview(self: Points) -> Points:
         """The points with the values cached so far, which does not add its own to them."""
         points = copy.copy(self)
+        points._cached_of_bodies = dict(self._cached_of_bodies)
         points._cached = {
             name: (key, value.preview() if isinstance(value, LitPoints) else value)
             for name, (key, value) in self._cached.items()
@@ -122,6 +133,12 @@ class LitPoints:
         """How many receivers may move and how many are static; "up to " where they are not found yet."""
         receivers = self.receivers
         return "", receivers.points.size, len(receivers.on_static)
+
+
+def _cached(values: dict[str, tuple[Hashable, Any]], name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:
+    if name not in values or values[name][0] != key:
+        values[name] = key, make()
+    return values[name][1]  # type: ignore[no-any-return]
 
 
 def receiver_text(points: LitPoints, *, moving: bool = True, static: bool = True) -> str:

@@ -1,0 +1,31 @@
+"""The choice of how light bounces, row by row of its table; the nodes that follow it are tested by their images."""
+
+import itertools
+
+import pytest
+
+from warpshadow.pipeline.transport import Bouncing, choose_bouncing
+
+PATHS, STATIC, MOVING = Bouncing.PATHS, Bouncing.STATIC, Bouncing.MOVING
+
+# light is free, reflectance is given, bodies and cameras are the scene's: by spheres, by rays
+TABLE = {
+    (False, False, True): (MOVING, PATHS),
+    (False, False, False): (MOVING, PATHS),
+    (False, True, True): (STATIC, STATIC),
+    (False, True, False): (MOVING, STATIC),
+    (True, False, True): (STATIC, STATIC),
+    (True, False, False): (MOVING, STATIC),
+    (True, True, True): (STATIC, STATIC),
+    (True, True, False): (MOVING, STATIC),
+}
+
+
+@pytest.mark.parametrize("facts", list(itertools.product((False, True), repeat=3)))
+def test_each_combination_of_inputs_has_the_bounces_of_its_row(facts):
+    inputs = dict(zip(("is_free", "is_given", "is_of_scene"), facts, strict=True))
+    by_spheres, by_rays = (
+        choose_bouncing(**inputs, has_proxies=has_proxies, shares_directions=False) for has_proxies in (True, False)
+    )
+    assert (by_spheres, by_rays) == TABLE[facts]
+    assert choose_bouncing(**inputs, has_proxies=False, shares_directions=True) is STATIC

@@ -1,0 +1,162 @@
+"""Light transport: which nodes make the light on receivers. This is the one place where they are chosen.
+
+Light on receivers is direct light, light that bounces, and direct light of emitters. By light, bounces, reflectance,
+and where bodies and cameras are:
+
+| light | bounces | reflectance | bodies, cameras | spheres stand in for bodies | rays meet bodies |
+| --- | --- | --- | --- | --- | --- |
+| known | none | any | any | shaded at once | shaded at once |
+| free | none | any | any | transfer vectors | transfer vectors |
+| known | some | the scene's | any | moving patches | paths; where they are shared, static patches |
+| known | some | given | the scene's | static patches | static patches |
+| known | some | given | given | moving patches | static patches |
+| free | some | any | the scene's | static patches | static patches |
+| free | some | any | given | moving patches | static patches |
+
+The first two rows are :meth:`.Method.direct_shading`, the others :func:`choose_bouncing`. Static patches cache form
+factors, after which an iteration is small matrices; moving ones find all anew in each call, also where the shading is
+cached as a whole. A shell is part of the light. Bodies that shine and emit come on top, in :meth:`.View.image`.
+"""
+
+from __future__ import annotations
+
+import enum
+import functools
+from typing import TYPE_CHECKING
+
+from warpshadow.pipeline.method import LightInput, Method, add_light
+from warpshadow.pipeline.node import Node
+from warpshadow.pipeline.receivers.lit_points import LitPoints
+from warpshadow.pipeline.reflectance import Materials
+from warpshadow.pipeline.transfers import Light
+
+if TYPE_CHECKING:  # they are imported where light bounces
+    from warpshadow.pipeline.bounces.moving_bounces import MovingBounces
+    from warpshadow.pipeline.bounces.patches import ScenePatches
+    from warpshadow.pipeline.bounces.static_bounces import StaticBounces
+
+
+class Bouncing(enum.Enum):
+    """How light bounces, in words."""
+
+    PATHS = "along paths"
+    STATIC = "between static patches"
+    MOVING = "between patches that may move"
+
+
+def choose_bouncing(
+    *, is_free: bool, is_given: bool, is_of_scene: bool, has_proxies: bool, shares_directions: bool
+) -> Bouncing:
+    """Choose how light bounces: the lower rows of the table above.
+
+    Args:
+        is_free: Whether the light is free.
+        is_given: Whether some reflectance is given in place of the scene's.
+        is_of_scene: Whether bodies and cameras are where the scene has them, for good.
+        has_proxies, shares_directions: Of the method.
+    """
+    if has_proxies:
+        return Bouncing.STATIC if is_of_scene and (is_free or is_given) else Bouncing.MOVING
+    return Bouncing.STATIC if is_free or is_given or shares_directions else Bouncing.PATHS
+
+
+class LightTransport:
+    """Light on the receivers of a scene.
+
+    Args:
+        method: How light is blocked.
+    """
+
+    def __init__(self, method: Method):
+        self.method = method
+
+    def shading(self, points: LitPoints, light: Light | None, materials: Materials | None = None) -> Node:
+        """Light reflected by points as white surfaces, vec3 of shape [batch, receiver].
+
+        Results for the scene's light and the last other known light are cached.
+
+        Args:
+            points: The receivers.
+            light: None for the scene's.
+            materials: They matter where light bounces, and where bodies emit; None for the scene's.
+        """
+        without_emitters = self.shading_without_emitters(points, light, materials)
+        return self._with_emitters(without_emitters, points, materials or points.materials)
+
+    def shading_without_emitters(
+        self, points: LitPoints, light: Light | None, materials: Materials | None = None
+    ) -> Node:
+        """The same without direct light of emitters, but with that which bounces."""
+        light_input = self.method.light_input(points, light)
+        if not self.method.merged_scene.scene.bounces:
+            return self.method.direct_shading(points, light_input)
+        materials = materials or points.materials
+        bounce = functools.partial(self._bounced, points, light_input, materials)
+        if light_input.is_free or materials is not points.materials:
+            return bounce()
+        return self.method.cached_for_light("shading", points, light_input, bounce)
+
+    def bouncing(self, points: LitPoints, light: LightInput, materials: Materials) -> Bouncing:
+        """How light bounces onto points."""
+        return choose_bouncing(
+            is_free=light.is_free,
+            is_given=materials is not points.materials,
+            is_of_scene=points.is_scene_view,
+            has_proxies=self.method.has_proxies,
+            shares_directions=self.method.shares_directions,
+        )
+
+    def notes(self, points: LitPoints, light: Light | None, materials: Materials) -> list[str]:
+        """Say how often light bounces, and how, where it does."""
+        count = self.method.merged_scene.scene.bounces
+        if not count:
+            return []
+        times = "until none is left" if count == "all" else f"{count} time{'s' * (count != 1)}"
+        bouncing = self.bouncing(points, self.method.light_input(points, light), materials)
+        return [f"Light bounces {times}, {bouncing.value}."]
+
+    def _bounced(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
+        """Shading of points, direct and bounced."""
+        bouncing = self.bouncing(points, light, materials)
+        if bouncing is Bouncing.MOVING:
+            return self._moving_bounces.shading(points, light, materials)
+        direct = self.method.direct_shading(points, light)
+        if bouncing is Bouncing.PATHS:
+            return self.method.along_paths(direct, points, light, materials)
+        static, samples = self._static_bounces, self._static_bounces.patch_samples(points, materials)
+        if not light.is_free:
+            lit = self._with_emitters(self.method.direct_shading(samples, light), samples, materials)
+            return static.add_bounces(direct, lit, points, materials)
+        if materials.emission:
+            emitted = self.method.light_of_emitters(samples, materials)
+            direct = static.add_bounces(direct, emitted, points, materials)
+        return static.add_free_bounces(
+            direct, self.method.cached_transfers(samples, light.shell), light, points, materials
+        )
+
+    def _with_emitters(self, light: Node, points: LitPoints, materials: Materials) -> Node:
+        """Add direct light of emitters to other light on points; nothing where no body emits."""
+        if not materials.emission:
+            return light
+        emitted = self.method.light_of_emitters(points, materials)
+        return points.cached("light with emitters", (light, emitted), lambda: Node("", add_light, light, emitted))
+
+    @functools.cached_property
+    def _patches(self) -> ScenePatches:
+        from warpshadow.pipeline.bounces.patches import ScenePatches
+
+        return ScenePatches(self.method.merged_scene)
+
+    @functools.cached_property
+    def _static_bounces(self) -> StaticBounces:
+        from warpshadow.pipeline.bounces.static_bounces import StaticBounces
+
+        return StaticBounces(self.method, self._patches)
+
+    @functools.cached_property
+    def _moving_bounces(self) -> MovingBounces:
+        from warpshadow.pipeline.bounces.moving_bounces import MovingBounces
+        from warpshadow.pipeline.sphere_method import SphereMethod
+
+        assert isinstance(self.method, SphereMethod)
+        return MovingBounces(self.method, self._patches)
