@@ -150,19 +150,19 @@ def _trace_transmittance(
     normal = normals[receiver]
     for i in range(transmittance.shape[1]):
         sample = first_sample + i
+        is_sending = is_lit(sample_points[sample] - point, sample_areas[sample], normal, is_two_sided)
+        open_weight = float(0.0)
+        total_weight = float(0.0)
+        for _ray in range(wp.where(is_sending, ray_count, 0)):
+            start = wp.randi(state, 0, surface.point_faces.shape[1])
+            beam, facing = _beam_to_facing_point(surface, sample, start, point, is_two_sided)
+            if facing > 0.0:
+                total_weight += facing
+                if sees_point(mesh, point, normal, wp.normalize(beam), wp.length(beam)):
+                    open_weight += facing
         share = float(0.0)
-        if is_lit(sample_points[sample] - point, sample_areas[sample], normal, is_two_sided):
-            open_weight = float(0.0)
-            total_weight = float(0.0)
-            for _ray in range(ray_count):
-                start = wp.randi(state, 0, surface.point_faces.shape[1])
-                beam, facing = _beam_to_facing_point(surface, sample, start, point, is_two_sided)
-                if facing > 0.0:
-                    total_weight += facing
-                    if sees_point(mesh, point, normal, wp.normalize(beam), wp.length(beam)):
-                        open_weight += facing
-            if total_weight > 0.0:
-                share = open_weight / total_weight
+        if total_weight > 0.0:
+            share = open_weight / total_weight
         transmittance[receiver, i] = share
 
 
