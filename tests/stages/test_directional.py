@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from warpshadow.maths import directions as cells
-from warpshadow.stages.visibility import directional
+from warpshadow.stages.visibility import directional, traversal
 
 # The step's slope in the dot product is 1/(hi − lo), up to 1/(1 − cos w) ≈ Q/0.245 for small caps: that much float32
 # dot products are magnified. Measured 2e-6, 8e-6, 1.3e-5, 2.7e-5 and 1.9e-4.
@@ -137,7 +137,7 @@ def test_one_lane_gives_what_sixteen_give(monkeypatch, device):
     points, normals, centers, radii = twins.random_scene(6)
     directions = cells.fibonacci(128)
     many = transmittance(points, normals, centers, radii, directions, device)
-    monkeypatch.setattr(directional, "lane_count", lambda _: 1)
+    monkeypatch.setattr(traversal, "lane_count", lambda _: 1)
     one = transmittance(points, normals, centers, radii, directions, device)
     above = normals @ directions.T > 0
     assert np.abs(one - many)[above].max() < OPAQUE

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from warpshadow.maths import sh
-from warpshadow.stages.visibility import exponential, log_sh, zonal_logs
+from warpshadow.stages.visibility import exponential, log_sh, traversal, zonal_logs
 
 # A sphere's coefficients reach 10 and carry some roundings each; sums of a dozen; relative to the row's norm. Where a
 # receiver is within 1% of a sphere's surface, cos θ is good to 5e-6 only (see test_cones.py).
@@ -177,7 +177,7 @@ def test_one_lane_gives_what_sixteen_give(log, monkeypatch, device):
     """A GPU runs one lane a thread; so a CPU can check that code."""
     scene = twins.random_scene(3)
     many = accumulate(*scene, device, order=8, log=log)
-    monkeypatch.setattr(log_sh, "lane_count", lambda _: 1)
+    monkeypatch.setattr(traversal, "lane_count", lambda _: 1)
     one = accumulate(*scene, device, order=8, log=log)
     assert row_errors(one, many.astype(float)).max() < ACCUMULATE
     visibility = exponentiate(many, device)

@@ -11,7 +11,7 @@ from warpshadow.device.tape import recorded
 from warpshadow.stages.convex.prepared import ConvexBlockers, ConvexBody
 from warpshadow.stages.emitters import convex, light, planes, spheres, traced
 from warpshadow.stages.emitters.samples import (
-    BUNDLE,
+    SAMPLE_BUNDLE,
     EmitterSamples,
     EmitterSpan,
     find_sample_weights,
@@ -64,11 +64,11 @@ def numbers(array):
 def test_samples_have_the_whole_area_in_bundles_close_to_each_other(mesh, device):
     samples = samples_of(mesh, device)
     points, areas, bundles, balls = (numbers(item) for item in placed(samples, mesh.positions, device))
-    assert len(points) % BUNDLE == 0 and len(points) >= 64
+    assert len(points) % SAMPLE_BUNDLE == 0 and len(points) >= 64
     a, b, c = np.moveaxis(mesh.positions[mesh.surface.faces].astype(float), 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
     assert np.linalg.norm(areas, axis=1).sum() == pytest.approx(area, rel=1e-3)
-    gaps = np.linalg.norm(points.reshape(-1, BUNDLE, 3) - bundles[:, None, :3], axis=-1)
+    gaps = np.linalg.norm(points.reshape(-1, SAMPLE_BUNDLE, 3) - bundles[:, None, :3], axis=-1)
     assert (gaps < bundles[:, None, 3]).all() and bundles[:, 3].mean() < 0.6
     assert (np.linalg.norm(points - balls[0, :3], axis=1) < balls[0, 3]).all() and balls[0, 3] < 1
 

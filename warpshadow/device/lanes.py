@@ -2,8 +2,9 @@
 
 Warp runs a CPU kernel one thread after another. A thread that owns one receiver leaves the vector units idle; so here
 a thread owns a *block* of receivers and holds each quantity as one vector with a lane for every receiver: as many as a
-vector register has floats on a CPU, 1 on a GPU, where threads play that part. Arrays in memory stay [batch, vertex, …];
-only scratch is [batch, block, …] of lanes. A block that runs past the last receiver repeats it and writes it once.
+vector register has floats on a CPU, 1 on a GPU, where threads play that part. Arrays that stages hand on stay
+[batch, vertex, …]; vectors of lanes fill scratch memory, and arrays that one stage stores for its adjoint. A block that
+runs past the last receiver repeats it, and writes it once.
 
 Small functions on structs are inlined by force. Otherwise LLVM calls them, and copies the structs through memory.
 

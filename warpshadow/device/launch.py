@@ -1,8 +1,9 @@
 """Launching: run kernels, and record their adjoints on the tape.
 
 A kernel has either Warp's own adjoint, which the tape plays back, in slices where the kernel runs in slices; or one
-written by hand as another kernel (``enable_backward=False``), which :func:`differentiable` pairs with it. Either way a
-result requires a gradient if an array that it depends on does, and nothing is recorded if none does.
+written by hand as another kernel (``enable_backward=False``). :func:`launch_with_adjoint` launches such a pair; where
+more than a launch is needed, :func:`differentiable` pairs functions. Either way a result requires a gradient if an
+array that it depends on does, and nothing is recorded if none does.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -88,6 +89,65 @@ def differentiable(
     forward(in_huge_pages(result))
     record_adjoint(lambda: adjoint(result.grad), [*variables, result])
     return result
+
+
+def launch_with_adjoint(
+    kernel: wp.Kernel,
+    adjoint_kernel: wp.Kernel | Callable[[], wp.Kernel],
+    dim: int | Sequence[int],
+    *,
+    inputs: Sequence[Any],
+    result: wp.array,
+    variables: Sequence[wp.array | None],
+    shared: Sequence[wp.array | None] = (),
+    outputs: Sequence[wp.array] = (),
+    adj_inputs: Sequence[wp.array] = (),
+    scratch: Sequence[Scratch] = (),
+    adj_scratch: Sequence[Scratch] = (),
+    cost: float,
+    adj_cost: float | None = None,
+) -> wp.array:
+    """Launch a kernel whose adjoint is another kernel, written by hand, and put that on the tape.
+
+    Arguments of the kernel are inputs, scratch memory, outputs and the result. Those of its adjoint are inputs,
+    ``adj_inputs`` and the gradient of the result; scratch memory; and the gradients of the variables and of those that
+    are shared, to which it adds, None for a variable that has none.
+
+    Args:
+        kernel, dim, scratch, cost: As for :func:`launch`.
+        adjoint_kernel: The adjoint, or a function that makes it, which is called where there is a gradient.
+        inputs: Arguments of both kernels.
+        result: Memory for the result, as for :func:`differentiable`.
+        variables: Arrays that the result depends on differentiably, to a place of whose gradients one row adds.
+        shared: Likewise, arrays to whose gradients all rows add.
+        outputs: Arrays that the kernel writes beside the result.
+        adj_inputs: Arrays that only the adjoint reads, such as outputs.
+        adj_scratch: Scratch memory that only the adjoint has.
+        adj_cost: Cost of the adjoint; by default twice that of the kernel.
+    Returns:
+        The result.
+    """
+
+    def gradients(arrays: Sequence[wp.array | None]) -> list[wp.array | None]:
+        return [None if array is None else array.grad for array in arrays]
+
+    def adjoint(adj_result: wp.array) -> None:
+        launch(
+            adjoint_kernel if isinstance(adjoint_kernel, wp.Kernel) else adjoint_kernel(),
+            dim,
+            inputs=[*inputs, *adj_inputs, adj_result],
+            outputs=gradients(variables),
+            sums=gradients(shared),
+            scratch=[*scratch, *adj_scratch],
+            cost=2 * cost if adj_cost is None else adj_cost,
+        )
+
+    return differentiable(
+        lambda result: launch(kernel, dim, inputs=inputs, outputs=[*outputs, result], scratch=scratch, cost=cost),
+        adjoint,
+        result=result,
+        variables=[*variables, *shared],
+    )
 
 
 def varies(values: Iterable[Any]) -> bool:

@@ -123,8 +123,8 @@ def _pieces(triangles: np.ndarray) -> np.ndarray:
     """Number of the piece of each triangle; where pieces share an edge, triangles next to each other go together."""
     edges, count = np.sort(edges_of(triangles), axis=1), len(triangles)
     _, edge, counts = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
-    order = np.lexsort((np.arange(len(edges)) % count, edge.reshape(-1)))
-    pairs = order[np.repeat(counts % 2 == 0, counts)].reshape(-1, 2) % count
+    permutation = np.lexsort((np.arange(len(edges)) % count, edge.reshape(-1)))
+    pairs = permutation[np.repeat(counts % 2 == 0, counts)].reshape(-1, 2) % count
     return connected_components(pairs[:, 0], pairs[:, 1], count)
 
 
@@ -202,8 +202,8 @@ def _prisms(points: np.ndarray, triangles: np.ndarray) -> list[ConvexPart] | Non
     corners = points[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)
-    order = np.argsort(-lengths)[: np.count_nonzero(lengths)]
-    axes = normals[order] / lengths[order, None]
+    permutation = np.argsort(-lengths)[: np.count_nonzero(lengths)]
+    axes = normals[permutation] / lengths[permutation, None]
     for _ in range(_MAX_AXES):
         if not len(axes):
             return None

@@ -19,7 +19,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch, expand_rows
-from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.launch import launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 
@@ -233,16 +233,12 @@ def transmittance_past(transmittance: wp.array | None, coverages: wp.array, othe
     count = common_batch({"transmittance": transmittance, "coverages": coverages, "others": others})
     inputs = [None if array is None else expand_rows(array, count) for array in (transmittance, coverages, others)]
     shape = count, *coverages.shape[1:]
-    rows, cost = shape[0] * shape[1], _PASS_COST * shape[2]
-    return differentiable(
-        lambda attenuated: launch(_attenuate, rows, inputs=inputs, outputs=[attenuated], cost=cost),
-        lambda adj_attenuated: launch(
-            _attenuate_adjoint,
-            rows,
-            inputs=[*inputs, adj_attenuated],
-            outputs=[None if array is None else array.grad for array in inputs],
-            cost=2 * cost,
-        ),
+    return launch_with_adjoint(
+        _attenuate,
+        _attenuate_adjoint,
+        shape[0] * shape[1],
+        inputs=inputs,
         result=empty(shape, dtype=wp.float32, device=coverages.device),
         variables=inputs,
+        cost=_PASS_COST * shape[2],
     )

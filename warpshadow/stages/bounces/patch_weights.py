@@ -19,7 +19,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, expand_rows
 from warpshadow.device.constants import constant
-from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.launch import launch, launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 from warpshadow.stages.sparse import SparseMatrix, multiply
@@ -124,17 +124,15 @@ def find_mean_transmittance(
     variables = [normals, transmittance_self, transmittance_nonplanar]
     inputs = [*variables, constant(np.asarray(directions, np.float32), wp.vec3, device)]
     cost = _CELL_COST * len(directions)
-    return differentiable(
-        lambda mean: launch(_average_transmittance, normals.size, inputs=inputs, outputs=[mean], cost=cost),
-        lambda adj_mean: launch(
-            _average_transmittance_adjoint,
-            normals.size,
-            inputs=[*inputs, adj_mean],
-            outputs=[None if array is None else array.grad for array in variables],
-            cost=cost,
-        ),
+    return launch_with_adjoint(
+        _average_transmittance,
+        _average_transmittance_adjoint,
+        normals.size,
+        inputs=inputs,
         result=empty(normals.shape, dtype=wp.vec3, device=device),
         variables=variables,
+        cost=cost,
+        adj_cost=cost,
     )
 
 

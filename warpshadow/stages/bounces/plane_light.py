@@ -17,7 +17,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, expand_rows, instance_in
 from warpshadow.device.constants import constant
-from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.launch import launch_with_adjoint
 from warpshadow.device.memory import empty, zeros
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.bounces.plane_hits import (
@@ -207,30 +207,19 @@ def plane_light(
     points, normals = (expand(array, batch_count) for array in (points, normals))
     transmittance = expand_rows(transmittance, batch_count)
     coverages, fronts = (None if array is None else expand_rows(array, batch_count) for array in (coverages, fronts))
-    variables = [points, normals, transmittance, coverages, fronts, frames, texels]
     arrays = plane_arrays(planes, cell_radius(len(directions)), skip)
     cell_directions = constant(directions, wp.vec3, points.device)
     planes_seen = plane_inputs(points, frames, fronts, arrays)
     inputs = [planes_seen, normals, transmittance, coverages, texels, cell_directions]
-    scratch, hits = receiver_scratch(planes), hit_scratch(planes)
-    return differentiable(
-        lambda light: launch(
-            _light_receivers,
-            points.size,
-            inputs=inputs,
-            scratch=[*scratch, hits],
-            outputs=[light],
-            cost=_CELL_COST * len(directions),
-        ),
-        lambda adj_light: launch(
-            _light_receivers_adjoint,
-            points.size,
-            inputs=[*inputs, adj_light],
-            scratch=[*scratch, hits, hits],
-            outputs=[None if array is None else array.grad for array in variables[:5]],
-            sums=[frames.grad, texels.grad],
-            cost=2 * _CELL_COST * len(directions),
-        ),
+    return launch_with_adjoint(
+        _light_receivers,
+        _light_receivers_adjoint,
+        points.size,
+        inputs=inputs,
         result=empty(points.shape, dtype=wp.vec3, device=points.device),
-        variables=variables,
+        variables=[points, normals, transmittance, coverages, fronts],
+        shared=[frames, texels],
+        scratch=[*receiver_scratch(planes), hit_scratch(planes)],
+        adj_scratch=[hit_scratch(planes)],
+        cost=_CELL_COST * len(directions),
     )

@@ -22,33 +22,31 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
-from warpshadow.device.lanes import (
-    block_count,
-    lane_count,
-    lane_type,
-    make_lane_functions,
-    module_options,
-    span_count,
-    vectors_type,
-)
-from warpshadow.device.launch import differentiable, launch, varies
+from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, span_count, vectors_type
+from warpshadow.device.launch import launch_with_adjoint, varies
 from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_slot
 from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.bounces.proxy_weights import WeightInputs, make_weight_functions
 from warpshadow.stages.bounces.tangent_planes import TangentPlanes
-from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres
-from warpshadow.stages.visibility.culling import DirectionCells, make_cap_functions, make_cells, make_cull
+from warpshadow.stages.visibility.cones import TINY_RADIUS
+from warpshadow.stages.visibility.culling import (
+    DirectionCells,
+    cap_type,
+    make_cap_functions,
+    make_cells,
+    make_cull,
+)
 from warpshadow.stages.visibility.directional import PAIR_COST, SOFTNESS
 from warpshadow.stages.visibility.falloff import make_cap_adjoint, make_falloff
-from warpshadow.stages.visibility.merging import MERGING, NODES_PER_CLUSTER, Gradients, merged_count
+from warpshadow.stages.visibility.merging import MERGING, NODES_PER_CLUSTER, Gradients
 from warpshadow.stages.visibility.traversal import (
     ClusterTree,
     TraversalInputs,
     lane_structs,
-    make_inputs,
     make_load_receivers,
     make_traversal,
+    prepare_traversal,
     receiver_lanes_type,
     sphere_view_type,
 )
@@ -106,6 +104,25 @@ def _make_load_task(lanes: int) -> wp.Function:
     is_any_above, dot_direction, load_columns = fn.is_any_above, fn.dot_direction, fn.load_columns
     load_receivers = make_load_receivers(True, lanes)
 
+    @wp.func(inline=True)
+    def load_blocked(batch: int, block: int, bundle: int, inputs: LightInputs, task: LightTask):
+        """Load F − T of a bundle's cells; returns whether it is not 0 anywhere."""
+        first_slot = bundle * BUNDLE
+        first_direction = (task.first_bundle + bundle) * BUNDLE
+        load_columns(inputs.transmittance[batch], first_direction, BUNDLE, block, 1.0, task.blocked, first_slot)
+        if inputs.transmittance_others:
+            others = inputs.transmittance_others[instance_in(batch, inputs.transmittance_others.shape[0])]
+            load_columns(others, first_direction, BUNDLE, block, 1.0, task.adj_cells, first_slot)
+        is_any_blocked = bool(False)
+        for slot in range(first_slot, first_slot + BUNDLE):
+            cell_transmittance_others = Lane(1.0)
+            if inputs.transmittance_others:
+                cell_transmittance_others = task.adj_cells[slot]
+            blocked = cell_transmittance_others - task.blocked[slot]
+            task.blocked[slot] = blocked
+            is_any_blocked = is_any_blocked or is_any_above(wp.max(blocked, -blocked), 0.0)
+        return is_any_blocked
+
     @wp.func(inline=lanes == 1)
     def load_task(
         row: int,
@@ -143,22 +160,8 @@ def _make_load_task(lanes: int) -> wp.Function:
             if is_any_above(
                 dot_direction(task.cells.axes[direction_bundle], receivers.normals),
                 -task.cells.half_angles[direction_bundle][1],
-            ):
-                first_slot = bundle * BUNDLE
-                first_direction = direction_bundle * BUNDLE
-                load_columns(inputs.transmittance[batch], first_direction, BUNDLE, block, 1.0, task.blocked, first_slot)
-                if inputs.transmittance_others:
-                    others_batch = instance_in(batch, inputs.transmittance_others.shape[0])
-                    others = inputs.transmittance_others[others_batch]
-                    load_columns(others, first_direction, BUNDLE, block, 1.0, task.adj_cells, first_slot)
-                for i in range(BUNDLE):
-                    cell_transmittance_others = Lane(1.0)
-                    if inputs.transmittance_others:
-                        cell_transmittance_others = task.adj_cells[first_slot + i]
-                    blocked = cell_transmittance_others - task.blocked[first_slot + i]
-                    task.blocked[first_slot + i] = blocked
-                    if is_any_above(wp.max(blocked, -blocked), 0.0):
-                        task.ends[bundle] = spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
+            ) and load_blocked(batch, block, bundle, inputs, task):
+                task.ends[bundle] = spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
         return batch, block, receivers, task
 
     return load_task
@@ -166,7 +169,7 @@ def _make_load_task(lanes: int) -> wp.Function:
 
 @functools.cache
 def _make_light(lanes: int) -> wp.Kernel:
-    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
+    Lane, Vectors, Cap = lane_type(lanes), vectors_type(lanes), cap_type(lanes)
     ReceiverLanes, SphereView, LightTask = receiver_lanes_type(lanes), sphere_view_type(lanes), _task_type(lanes)
     fn = make_lane_functions(lanes)
     sqrt, is_any_above, dot_direction, add_vectors = fn.sqrt, fn.is_any_above, fn.dot_direction, fn.add_vectors
@@ -175,6 +178,22 @@ def _make_light(lanes: int) -> wp.Kernel:
     widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(True, lanes)
     SUMS = wp.constant(_SUMS)
     MIN_DENOMINATOR = wp.constant(_MIN_DENOMINATOR)
+
+    @wp.func(inline=True)
+    def add_to_bundle(cap: Cap, slope: Lane, opacity: Lane, node: int, bundle: int, task: LightTask):
+        """Add a proxy to the sums of R of a bundle's cells."""
+        first_direction = (task.first_bundle + bundle) * BUNDLE
+        for i in range(BUNDLE):
+            t, step = soft_edge(task.cells.directions[first_direction + i], cap, slope)
+            if is_any_above(t, 0.0):
+                share = wp.cw_mul(opacity, step)
+                radiance = task.proxy_radiance[node, first_direction + i]
+                slot = (bundle * BUNDLE + i) * SUMS
+                # (a loop is not unrolled, and reads the radiance from memory)
+                task.sums[slot] = task.sums[slot] + radiance[0] * share
+                task.sums[slot + 1] = task.sums[slot + 1] + radiance[1] * share
+                task.sums[slot + 2] = task.sums[slot + 2] + radiance[2] * share
+                task.sums[slot + 3] = task.sums[slot + 3] + radiance[3] * share
 
     @wp.func(inline=True)
     def visit(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: LightTask):
@@ -190,17 +209,7 @@ def _make_light(lanes: int) -> wp.Kernel:
                 bundle = task.reached_bundles[1, k]
                 direction_bundle = task.first_bundle + bundle
                 if reaches_bundle(cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle]):
-                    for i in range(BUNDLE):
-                        t, step = soft_edge(cells.directions[direction_bundle * BUNDLE + i], cap, slope)
-                        if is_any_above(t, 0.0):
-                            share = wp.cw_mul(opacity, step)
-                            radiance = task.proxy_radiance[sphere_view.node, direction_bundle * BUNDLE + i]
-                            slot = (bundle * BUNDLE + i) * SUMS
-                            # (a loop is not unrolled, and reads the radiance from memory)
-                            task.sums[slot] = task.sums[slot] + radiance[0] * share
-                            task.sums[slot + 1] = task.sums[slot + 1] + radiance[1] * share
-                            task.sums[slot + 2] = task.sums[slot + 2] + radiance[2] * share
-                            task.sums[slot + 3] = task.sums[slot + 3] + radiance[3] * share
+                    add_to_bundle(cap, slope, opacity, sphere_view.node, bundle, task)
 
     traverse = make_traversal(make_cull(True, LightTask, lanes), visit, LightTask, False, lanes)
 
@@ -282,6 +291,28 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
     cap_adjoint = make_cap_adjoint(True, find_weight, share_adjoint, True, LightTask, lanes)
 
     @wp.func(inline=True)
+    def bundle_adjoint(receivers: ReceiverLanes, bundle: int, factor: float, task: LightTask):
+        """Store T̄ and the factors of R of a bundle's cells; returns their n̄."""
+        adj_normal = Vectors()
+        for i in range(BUNDLE):
+            slot = bundle * BUNDLE + i
+            omega = task.cells.directions[(task.first_bundle + bundle) * BUNDLE + i]
+            inverse = wp.cw_div(Lane(1.0), wp.max(task.sums[slot * SUMS + 3], Lane(MIN_DENOMINATOR)))
+            mean = Vectors(task.sums[slot * SUMS], task.sums[slot * SUMS + 1], task.sums[slot * SUMS + 2])
+            adj_cell = wp.cw_mul(inverse, dot(task.adj_light, mean))
+            cosine = dot_direction(omega, receivers.normals)
+            is_facing = wp.min(wp.max(1.0e30 * cosine, Lane(0.0)), Lane(1.0))
+            adj_cosine = factor * wp.cw_mul(is_facing, wp.cw_mul(task.blocked[slot], adj_cell))
+            adj_normal.x += omega[0] * adj_cosine
+            adj_normal.y += omega[1] * adj_cosine
+            adj_normal.z += omega[2] * adj_cosine
+            factored_cosine = factor * wp.max(cosine, Lane(0.0))
+            task.adj_blocked[slot] = wp.cw_mul(factored_cosine, adj_cell)
+            task.blocked[slot] = wp.cw_mul(wp.cw_mul(factored_cosine, task.blocked[slot]), inverse)
+            task.adj_cells[slot] = adj_cell
+        return adj_normal
+
+    @wp.func(inline=True)
     def visit(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: LightTask):
         """Of the cone, and of the weight w, whose w̄ w is Σ ā a."""
         adj_sphere, relative_adjoint = cap_adjoint(receivers, sphere_view, count, task)
@@ -334,24 +365,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         adj_normal = Vectors()
         for bundle in range(task.ends.shape[0]):
             if task.ends[bundle] > 0:
-                for i in range(BUNDLE):
-                    slot = bundle * BUNDLE + i
-                    direction = (task.first_bundle + bundle) * BUNDLE + i
-                    omega = task.cells.directions[direction]
-                    inverse = wp.cw_div(Lane(1.0), wp.max(task.sums[slot * SUMS + 3], Lane(MIN_DENOMINATOR)))
-                    mean = Vectors(task.sums[slot * SUMS], task.sums[slot * SUMS + 1], task.sums[slot * SUMS + 2])
-                    adj_cell = wp.cw_mul(inverse, dot(task.adj_light, mean))
-                    cosine = dot_direction(omega, receivers.normals)
-                    is_facing = wp.min(wp.max(1.0e30 * cosine, Lane(0.0)), Lane(1.0))
-                    adj_cosine = inputs.factor * wp.cw_mul(is_facing, wp.cw_mul(task.blocked[slot], adj_cell))
-                    adj_normal.x += omega[0] * adj_cosine
-                    adj_normal.y += omega[1] * adj_cosine
-                    adj_normal.z += omega[2] * adj_cosine
-                    factored_cosine = inputs.factor * wp.max(cosine, Lane(0.0))
-                    adj_blocked = wp.cw_mul(factored_cosine, adj_cell)
-                    task.adj_blocked[slot] = adj_blocked
-                    task.blocked[slot] = wp.cw_mul(wp.cw_mul(factored_cosine, task.blocked[slot]), inverse)
-                    task.adj_cells[slot] = adj_cell
+                adj_normal = add(adj_normal, bundle_adjoint(receivers, bundle, inputs.factor, task))
                 first_slot = bundle * BUNDLE
                 first_direction = (task.first_bundle + bundle) * BUNDLE
                 if adj_transmittance:
@@ -411,7 +425,9 @@ def sphere_light(
     merging, skip, clusters, tolerances.
     """
     cells = make_cells(directions, softness, points.device)
-    check_spheres(points, normals, centers, radii)
+    traversal = prepare_traversal(
+        points, normals, centers, radii, cell_radius(len(directions)), merging=merging, skip=skip, clusters=clusters
+    )
     equations, tolerances = (None, None) if tangent_planes is None else tangent_planes
     common_batch(
         {
@@ -421,74 +437,42 @@ def sphere_light(
             "tangent_planes": equations,
         }
     )
-    batch_count, vertex_count = points.shape
-    proxy_count = radii.shape[1] + merged_count(radii.shape[1], merging)
-    check.shape("proxy_radiance", proxy_radiance.shape, (proxy_radiance.shape[0], proxy_count, len(directions)))
-    check.shape("transmittance", transmittance.shape, (*points.shape, len(directions)))
+    proxy_count, directions_shape = traversal.nodes.radii.shape[1], (points.shape[1], len(directions))
+    check.shape("proxy_radiance", proxy_radiance.shape, (len(proxy_radiance), proxy_count, len(directions)))
+    check.shape("transmittance", transmittance.shape, (len(points), *directions_shape))
     if transmittance_others is not None:
-        check.shape(
-            "transmittance_others",
-            transmittance_others.shape,
-            (transmittance_others.shape[0], vertex_count, len(directions)),
-        )
+        check.shape("transmittance_others", transmittance_others.shape, (len(transmittance_others), *directions_shape))
     if equations is not None:
-        check.shape("tangent_planes", equations.shape, (equations.shape[0], proxy_count))
-    device = points.device
-    lanes = lane_count(device)
-    spans = span_count(device, len(directions))
+        check.shape("tangent_planes", equations.shape, (len(equations), proxy_count))
+    device, lanes, spans = points.device, traversal.lanes, span_count(points.device, len(directions))
     span_direction_count = len(directions) // spans
-    cell = cell_radius(len(directions))
-    proxies, traversed = make_inputs(points, normals, centers, radii, merging, cell, skip, clusters)
-    row_count = batch_count * block_count(vertex_count, lanes)
-    launch_dim = run_dimensions(device, row_count, spans)
-    variables = [points, normals, *proxies, proxy_radiance, transmittance, transmittance_others, equations]
-    stores_sums = varies(variables)
+    is_shared = transmittance_others is not None and len(transmittance_others) < len(points)
+    variables = [points, normals, transmittance, *([] if is_shared else [transmittance_others])]
+    shared = [*([transmittance_others] if is_shared else []), proxy_radiance, equations, *traversal.nodes]
+    stores_sums = varies([*variables, *shared])
     scratch = [
         Scratch((3, span_direction_count), lane_type(lanes)),
         Scratch((3, span_direction_count // BUNDLE), wp.int32),
     ]
-    sums = (span_direction_count * _SUMS,), lane_type(lanes)
-    cached = [empty((row_count * spans, *sums[0]), dtype=sums[1], device=device)] if stores_sums else []
+    sums = Scratch((span_direction_count * _SUMS,), lane_type(lanes))
+    stored = [empty((traversal.row_count * spans, *sums.shape), sums.dtype, device=device)] if stores_sums else []
     inputs = LightInputs()
-    inputs.traversed, inputs.cells = traversed, cells
-    inputs.proxy_radiance, inputs.transmittance, inputs.transmittance_others = (
-        proxy_radiance,
-        transmittance,
-        transmittance_others,
-    )
+    inputs.traversed, inputs.cells = traversal.inputs, cells
+    inputs.proxy_radiance, inputs.transmittance = proxy_radiance, transmittance
+    inputs.transmittance_others = transmittance_others
     if equations is not None:
         inputs.equations, inputs.tolerances = equations, tolerances
     inputs.factor, inputs.span_count, inputs.stores_sums = 4 / len(directions), spans, stores_sums
-    cost = PAIR_COST * lanes * radii.shape[1] * span_direction_count
-    is_shared = transmittance_others is not None and len(transmittance_others) < batch_count
-
-    def adjoint(adj_light: wp.array) -> None:
-        adj_transmittance_others = [None if transmittance_others is None else transmittance_others.grad]
-        launch(
-            _make_light_adjoint(lanes),
-            launch_dim,
-            cost=2 * cost,
-            inputs=[inputs, *cached, adj_light],
-            scratch=scratch,
-            outputs=[points.grad, normals.grad, transmittance.grad, *([] if is_shared else adj_transmittance_others)],
-            sums=[
-                *(adj_transmittance_others if is_shared else []),
-                proxy_radiance.grad,
-                None if equations is None else equations.grad,
-                *(array.grad for array in proxies),
-            ],
-        )
-
-    return differentiable(
-        lambda light: launch(
-            _make_light(lanes),
-            launch_dim,
-            cost=cost,
-            inputs=[inputs],
-            scratch=scratch if stores_sums else [*scratch, Scratch(*sums)],
-            outputs=[*cached, light],
-        ),
-        adjoint,
-        result=zeros((batch_count, vertex_count), dtype=wp.vec3, device=device),
+    return launch_with_adjoint(
+        _make_light(lanes),
+        lambda: _make_light_adjoint(lanes),
+        run_dimensions(device, traversal.row_count, spans),
+        inputs=[inputs],
+        result=zeros(points.shape, dtype=wp.vec3, device=device),
         variables=variables,
+        shared=shared,
+        outputs=stored,
+        adj_inputs=stored,
+        scratch=scratch if stores_sums else [*scratch, sums],
+        cost=PAIR_COST * lanes * radii.shape[1] * span_direction_count,
     )

@@ -24,7 +24,7 @@ from warpshadow.device.lanes import (
     module_options,
     vectors_type,
 )
-from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.launch import launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, scratch_slot
 from warpshadow.maths.directions import BUNDLE, cell_radius
@@ -112,11 +112,11 @@ def _bound_type(lanes: int) -> Any:
 class _PartFunctions(NamedTuple):
     """Kernel functions on the parts of a piece."""
 
-    begin: wp.Function
+    prepare_block: wp.Function
     find_bound: wp.Function
     find_reach: wp.Function
-    cover: wp.Function
-    cover_all: wp.Function
+    cover_by_piece: wp.Function
+    cover_by_all_pieces: wp.Function
 
 
 @functools.cache
@@ -128,12 +128,12 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
     fn, silhouettes, joint = make_lane_functions(lanes), make_silhouette_functions(lanes), make_joint_functions(lanes)
     is_any_above, dot, dot_direction, offset, scale = fn.is_any_above, fn.dot, fn.dot_direction, fn.offset, fn.scale
     find_block, load, sqrt, add, is_positive = fn.find_block, fn.load, fn.sqrt, fn.add, fn.is_positive
-    find, find_coverage = silhouettes.find, silhouettes.find_coverage
+    find_silhouette, find_coverage = silhouettes.find_silhouette, silhouettes.find_coverage
     no_blockers, with_blocker = joint.no_blockers, joint.with_blocker
     MARGIN, ON_SURFACE, ROUNDING = wp.constant(_BOUND_MARGIN), wp.constant(_ON_SURFACE), wp.constant(_ROUNDING)
 
     @wp.func
-    def begin(
+    def prepare_block(
         row: int,
         worker: int,
         inputs: PartInputs,
@@ -241,7 +241,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         return wp.min(dot_direction(direction, bound.axis) - bound.cosine, is_above)
 
     @wp.func
-    def cover(inputs: PartInputs, piece: int, task: PartsTask):
+    def cover_by_piece(inputs: PartInputs, piece: int, task: PartsTask):
         """Coverage by a piece of cells that no other covers wholly; returns how many it covers, and lists them."""
         parts, cells, radius = inputs.parts, inputs.cells, inputs.radius
         covered_count = int(0)
@@ -263,7 +263,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
                             effect = wp.min(find_reach(task, bound, direction), room)
                             if is_any_above(effect, 0.0):
                                 if not is_found:
-                                    count, is_solid = find(parts, part, silhouette)
+                                    count, is_solid = find_silhouette(parts, part, silhouette)
                                     silhouette.count = count
                                     silhouette.is_solid = is_solid
                                     is_found = True
@@ -281,24 +281,28 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         return covered_count
 
     @wp.func
-    def cover_all(inputs: PartInputs, task: PartsTask):
+    def cover_by_all_pieces(inputs: PartInputs, task: PartsTask):
         """Store sums over all pieces for each cell."""
         for piece in range(inputs.parts.first_part.shape[0] - 1):
             if inputs.parts.bodies[piece] != inputs.skip and inputs.parts.blocks[piece] == 1:
-                covered_count = cover(inputs, piece, task)
+                covered_count = cover_by_piece(inputs, piece, task)
                 for k in range(covered_count):
                     q = task.covered[k]
                     task.sums[q] = with_blocker(task.sums[q], task.coverage[q])
                     task.coverage[q] = Coverages()
 
-    return _PartFunctions(begin, find_bound, find_reach, cover, cover_all)
+    return _PartFunctions(prepare_block, find_bound, find_reach, cover_by_piece, cover_by_all_pieces)
 
 
 @functools.cache
 def _make_cover(lanes: int) -> wp.Kernel:
     Lane, Coverages, SumsOfBlockers = lane_type(lanes), coverage_type(lanes), sums_type(lanes)
     fn, functions, joint = make_lane_functions(lanes), _make_part_functions(lanes), make_joint_functions(lanes)
-    is_any_above, begin, cover_all = fn.is_any_above, functions.begin, functions.cover_all
+    is_any_above, prepare_block, cover_by_all_pieces = (
+        fn.is_any_above,
+        functions.prepare_block,
+        functions.cover_by_all_pieces,
+    )
     joint_coverage, store_columns = joint.joint_coverage, joint.store_columns
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
@@ -319,8 +323,8 @@ def _make_cover(lanes: int) -> wp.Kernel:
     ):
         """A thread owns a block of receivers."""
         row = first_row + wp.tid()
-        task = begin(row, worker, inputs, coverage, covered, sums, chord_sums, edges, numbers)
-        cover_all(inputs, task)
+        task = prepare_block(row, worker, inputs, coverage, covered, sums, chord_sums, edges, numbers)
+        cover_by_all_pieces(inputs, task)
         for q in range(task.coverage.shape[0]):
             if is_any_above(task.sums[q].total, 0.0):
                 task.coverage[q] = joint_coverage(task.sums[q])
@@ -338,8 +342,8 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
     add, add_vectors = fn.add, fn.add_vectors
     joint_coverage_adjoint, blocker_adjoint = joint.joint_coverage_adjoint, joint.blocker_adjoint
     load_columns = joint.load_columns
-    begin, find_bound, find_reach, cover, cover_all = functions
-    find, _find_coverage, coverage_adjoint, silhouette_adjoint = make_silhouette_functions(lanes)
+    prepare_block, find_bound, find_reach, cover_by_piece, cover_by_all_pieces = functions
+    find_silhouette, _find_coverage, coverage_adjoint, silhouette_adjoint = make_silhouette_functions(lanes)
     ADJOINT_STRIDE = wp.constant(ADJOINT_LANES)
 
     @wp.func(inline=True)
@@ -373,10 +377,10 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
     ):
         """A thread owns a block of receivers; cells that are covered wholly have no gradient."""
         row = first_row + wp.tid()
-        task = begin(row, worker, inputs, coverage, covered, sums, chord_sums, edges, numbers)
+        task = prepare_block(row, worker, inputs, coverage, covered, sums, chord_sums, edges, numbers)
         task.silhouette.adj_edges = adj_edges[task.slot]
         parts, radius = inputs.parts, inputs.radius
-        cover_all(inputs, task)
+        cover_by_all_pieces(inputs, task)
         load_columns(adj_result[task.batch], task.block, task.coverage)
         for q in range(task.coverage.shape[0]):
             adj_sums[task.slot, q] = SumsOfBlockers()
@@ -388,7 +392,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
         for piece in range(parts.first_part.shape[0] - 1):
             covered_count = int(0)
             if parts.bodies[piece] != inputs.skip and parts.blocks[piece] == 1:
-                covered_count = cover(inputs, piece, task)
+                covered_count = cover_by_piece(inputs, piece, task)
             affected_count = int(0)
             for k in range(covered_count):
                 q = task.covered[k]
@@ -407,7 +411,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
                         reach = find_reach(task, bound, direction)
                         if is_any_above(reach, 0.0):
                             if not is_found:
-                                count, is_solid = find(parts, part, silhouette)
+                                count, is_solid = find_silhouette(parts, part, silhouette)
                                 silhouette.count = count
                                 silhouette.is_solid = is_solid
                                 is_found = True
@@ -473,26 +477,22 @@ def part_coverage(
     lanes = lane_count(points.device)
     Lane, sums, edge_count = lane_type(lanes), sums_type(lanes), blockers.edge_count
     by_cell = (len(directions),)
-    scratch = [
-        *(Scratch(by_cell, dtype) for dtype in (coverage_type(lanes), wp.int32, sums)),
-        Scratch((SUM_LANES,), Lane),
-        Scratch((EDGE_LANES * edge_count,), Lane),
-        Scratch((2, edge_count), wp.int32),
-    ]
-    adj_scratch = [Scratch(by_cell, sums), Scratch((ADJOINT_LANES * edge_count,), Lane)]
-    rows = points.shape[0] * block_count(points.shape[1], lanes)
     cost = _PART_COST * lanes * placed.bounds.shape[1]
-    return differentiable(
-        lambda result: launch(_make_cover(lanes), rows, inputs=[inputs], outputs=[result], scratch=scratch, cost=cost),
-        lambda adj_result: launch(
-            _make_cover_adjoint(lanes),
-            rows,
-            inputs=[inputs, adj_result],
-            outputs=[points.grad],
-            sums=[placed.corners.grad],
-            scratch=[*scratch, *adj_scratch],
-            cost=3 * cost,
-        ),
+    return launch_with_adjoint(
+        _make_cover(lanes),
+        lambda: _make_cover_adjoint(lanes),
+        points.shape[0] * block_count(points.shape[1], lanes),
+        inputs=[inputs],
         result=empty((*points.shape, len(directions)), dtype=wp.vec4, device=points.device),
-        variables=[points, placed.corners],
+        variables=[points],
+        shared=[placed.corners],
+        scratch=[
+            *(Scratch(by_cell, dtype) for dtype in (coverage_type(lanes), wp.int32, sums)),
+            Scratch((SUM_LANES,), Lane),
+            Scratch((EDGE_LANES * edge_count,), Lane),
+            Scratch((2, edge_count), wp.int32),
+        ],
+        adj_scratch=[Scratch(by_cell, sums), Scratch((ADJOINT_LANES * edge_count,), Lane)],
+        cost=cost,
+        adj_cost=3 * cost,
     )

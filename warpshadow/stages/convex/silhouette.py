@@ -95,7 +95,7 @@ def silhouette_type(lanes: int) -> Any:
 class SilhouetteFunctions(NamedTuple):
     """Kernel functions on silhouettes."""
 
-    find: wp.Function
+    find_silhouette: wp.Function
     find_coverage: wp.Function
     coverage_adjoint: wp.Function
     silhouette_adjoint: wp.Function
@@ -290,7 +290,7 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
         return dot_direction(direction, normal) + silhouette.edges[row + 4]
 
     @wp.func
-    def find(parts: ConvexArrays, part: int, silhouette: Silhouette):
+    def find_silhouette(parts: ConvexArrays, part: int, silhouette: Silhouette):
         """Store a part's silhouette; returns how many edges it has, and where it is solid: see the struct."""
         first_face = parts.first_face[part]
         face_count = parts.first_face[part + 1] - first_face
@@ -380,4 +380,4 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
                     wp.atomic_add(adj_corners, instance, edge[end], wp.vec3(total(x), total(y), total(z)))
         return adj_points
 
-    return SilhouetteFunctions(find, find_coverage, coverage_adjoint, silhouette_adjoint)
+    return SilhouetteFunctions(find_silhouette, find_coverage, coverage_adjoint, silhouette_adjoint)

@@ -151,27 +151,23 @@ def _block_by_parts(
     ball_axis = wp.vec3(ball[0], ball[1], ball[2]) - point
     for piece in range(parts.blocks.shape[0]):
         body = parts.bodies[piece]
-        if body != skipped[0] and body != skipped[1] and parts.blocks[piece] == 1:
-            for part in range(parts.first_part[piece], parts.first_part[piece + 1]):
-                bound = bounds[part_batch, part]
-                offset = wp.vec3(bound[0], bound[1], bound[2]) - point
-                if parts.signs[part] > 0.0 and reaches_ball(offset, bound[3], ball_axis, ball[3]):
-                    for i in range(log_transmittances.shape[2]):
-                        area = sample_areas[sample_batch, first_sample + i]
-                        beam = sample_points[sample_batch, first_sample + i] - point
-                        if is_lit(beam, area, normal, is_two_sided):
-                            share = _hidden_share(
-                                parts,
-                                corners[part_batch],
-                                planes[part_batch],
-                                part,
-                                bound,
-                                point,
-                                beam,
-                                sample_radius(area),
-                            )
-                            if share > 0.0:
-                                wp.atomic_add(log_transmittances, batch, receiver, i, log_transmittance(share))
+        is_blocker = body != skipped[0] and body != skipped[1] and parts.blocks[piece] == 1
+        first_part = parts.first_part[piece]
+        for part in range(first_part, wp.where(is_blocker, parts.first_part[piece + 1], first_part)):
+            bound = bounds[part_batch, part]
+            offset = wp.vec3(bound[0], bound[1], bound[2]) - point
+            if parts.signs[part] > 0.0 and reaches_ball(offset, bound[3], ball_axis, ball[3]):
+                for i in range(log_transmittances.shape[2]):
+                    area = sample_areas[sample_batch, first_sample + i]
+                    beam = sample_points[sample_batch, first_sample + i] - point
+                    share = float(0.0)
+                    if is_lit(beam, area, normal, is_two_sided):
+                        disc_radius = sample_radius(area)
+                        share = _hidden_share(
+                            parts, corners[part_batch], planes[part_batch], part, bound, point, beam, disc_radius
+                        )
+                    if share > 0.0:
+                        wp.atomic_add(log_transmittances, batch, receiver, i, log_transmittance(share))
 
 
 def find_log_transmittance_of_parts(

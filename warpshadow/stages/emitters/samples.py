@@ -28,7 +28,7 @@ from warpshadow.stages.sparse import SparseMatrix, multiply
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-BUNDLE = 8
+SAMPLE_BUNDLE = 8
 """Samples next to each other that blockers are culled for together; an emitter has a multiple of them."""
 
 SAMPLES = 64  # samples of an emitter
@@ -46,7 +46,7 @@ class SurfacePoints(NamedTuple):
 
 
 class SampleWeights(NamedTuple):
-    """Weights of the samples of a body, whose count is a multiple of BUNDLE."""
+    """Weights of the samples of a body, whose count is a multiple of SAMPLE_BUNDLE."""
 
     vertices: csr_matrix  # of its vertices in the samples' middles, [sample, vertex]
     faces: csr_matrix  # of its faces' area vectors in those of samples, [sample, face]
@@ -82,8 +82,8 @@ def find_sample_weights(
         (middles.ravel(), (np.repeat(labels, 3), faces[owners].ravel())), shape=(patch_count, len(positions))
     )
     of_faces = diags(stretch) @ csr_matrix((shares, (labels, owners)), shape=(patch_count, len(faces)))
-    permutation = compact_order(of_vertices @ positions.astype(np.float64), runs=(BUNDLE,))
-    padding = np.full(-patch_count % BUNDLE, permutation[-1] if patch_count else 0)
+    permutation = compact_order(of_vertices @ positions.astype(np.float64), runs=(SAMPLE_BUNDLE,))
+    padding = np.full(-patch_count % SAMPLE_BUNDLE, permutation[-1] if patch_count else 0)
     is_real = np.repeat([1.0, 0.0], [patch_count, len(padding)])
     chosen = np.concatenate([permutation, padding]).astype(int)
     surface_points = _find_surface_points(owners, pieces.corners[is_used], labels, areas)
@@ -98,12 +98,12 @@ def _find_surface_points(
     faces: np.ndarray, corners: np.ndarray, labels: np.ndarray, areas: np.ndarray
 ) -> SurfacePoints:
     """Spread points over samples, given the pieces: their faces, corners, samples and areas."""
-    order = np.argsort(labels, kind="stable")
-    sums = np.cumsum(areas[order])
-    ends = sums[np.searchsorted(labels[order], np.arange(labels.max(initial=-1) + 1), side="right") - 1]
+    permutation = np.argsort(labels, kind="stable")
+    sums = np.cumsum(areas[permutation])
+    ends = sums[np.searchsorted(labels[permutation], np.arange(labels.max(initial=-1) + 1), side="right") - 1]
     starts = np.concatenate([[0.0], ends[:-1]])
     shares = (np.arange(SURFACE_POINTS) + 0.5) / SURFACE_POINTS
-    pieces = order[
+    pieces = permutation[
         np.minimum(np.searchsorted(sums, starts[:, None] + shares * (ends - starts)[:, None]), len(sums) - 1)
     ]
     u, v = np.random.default_rng(0).uniform(size=(2, *pieces.shape, 1))
@@ -195,11 +195,11 @@ def _find_bundles(
     """A thread owns a bundle of an instance."""
     batch, bundle = wp.tid()
     middle = wp.vec3()
-    for i in range(BUNDLE):
-        middle += points[batch, bundle * BUNDLE + i] / float(BUNDLE)
+    for i in range(SAMPLE_BUNDLE):
+        middle += points[batch, bundle * SAMPLE_BUNDLE + i] / float(SAMPLE_BUNDLE)
     radius = float(0.0)
-    for i in range(BUNDLE):
-        sample = bundle * BUNDLE + i
+    for i in range(SAMPLE_BUNDLE):
+        sample = bundle * SAMPLE_BUNDLE + i
         radius = wp.max(radius, wp.length(points[batch, sample] - middle) + sample_radius(areas[batch, sample]))
     bundles[batch, bundle] = wp.vec4(middle[0], middle[1], middle[2], radius)
 
@@ -214,8 +214,8 @@ def _find_balls(
 ):
     """A thread owns an emitter of an instance."""
     batch, emitter = wp.tid()
-    first = first_samples[emitter] // BUNDLE
-    end = first_samples[emitter + 1] // BUNDLE
+    first = first_samples[emitter] // SAMPLE_BUNDLE
+    end = first_samples[emitter + 1] // SAMPLE_BUNDLE
     middle = wp.vec3()
     for bundle in range(first, end):
         middle += wp.vec3(bundles[batch, bundle][0], bundles[batch, bundle][1], bundles[batch, bundle][2])
@@ -251,7 +251,7 @@ def place_samples(positions: wp.array, samples: EmitterSamples) -> PlacedSamples
     vectors = empty((count, len(samples.faces)), dtype=wp.vec3, device=device)
     launch(_find_area_vectors, vectors.shape, inputs=[positions, samples.faces], outputs=[vectors])
     points, areas = multiply(samples.vertices, positions), multiply(samples.face_shares, vectors)
-    bundles = empty((count, points.shape[1] // BUNDLE), dtype=wp.vec4, device=device)
+    bundles = empty((count, points.shape[1] // SAMPLE_BUNDLE), dtype=wp.vec4, device=device)
     launch(_find_bundles, bundles.shape, inputs=[points, areas], outputs=[bundles])
     balls = empty((count, len(samples.bodies)), dtype=wp.vec4, device=device)
     launch(_find_balls, balls.shape, inputs=[bundles, constant(samples.first, wp.int32, device)], outputs=[balls])

@@ -18,7 +18,7 @@ from warpshadow.device.batch import common_batch, expand, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import zeros
 from warpshadow.device.parallel import split_row
-from warpshadow.stages.emitters.samples import BUNDLE, EmitterSpan, PlacedSamples, is_lit, sample_radius
+from warpshadow.stages.emitters.samples import SAMPLE_BUNDLE, EmitterSpan, PlacedSamples, is_lit, sample_radius
 
 _SOFTNESS = 0.05  # κ: least half-width of the edge of a sphere's shadow, in its radii
 _MIN_TRANSMITTANCE = 1.0e-4  # of a sphere
@@ -66,8 +66,14 @@ def reaches_ball(offset: wp.vec3, radius: float, axis: wp.vec3, ball_radius: flo
     return height * wp.sqrt(1.0 - sine * sine) - wp.max(depth, 0.0) * sine < _REACH * radius
 
 
+@wp.func
+def _is_skipped(sphere: int, skipped: wp.vec4i):
+    """Whether a sphere is in one of two spans."""
+    return (sphere >= skipped[0] and sphere < skipped[1]) or (sphere >= skipped[2] and sphere < skipped[3])
+
+
 @wp.kernel
-def _block(
+def _block_by_spheres(
     first_row: int,
     worker: int,
     # in
@@ -94,32 +100,27 @@ def _block(
     sphere_batch = instance_in(batch, radii.shape[0])
     ball = balls[sample_batch, emitter]
     ball_axis = wp.vec3(ball[0], ball[1], ball[2]) - point
-    if wp.dot(ball_axis, normal) > -ball[3]:
-        for sphere in range(radii.shape[1]):
-            is_skipped = (sphere >= skipped[0] and sphere < skipped[1]) or (
-                sphere >= skipped[2] and sphere < skipped[3]
-            )
-            radius = radii[sphere_batch, sphere]
-            offset = centers[sphere_batch, sphere] - point
-            if not is_skipped and radius > 0.0 and reaches_ball(offset, radius, ball_axis, ball[3]):
-                for bundle in range(log_transmittances.shape[2] // BUNDLE):
-                    first = first_sample + bundle * BUNDLE
-                    bundle_ball = bundles[sample_batch, first // BUNDLE]
-                    bundle_axis = wp.vec3(bundle_ball[0], bundle_ball[1], bundle_ball[2]) - point
-                    if reaches_ball(offset, radius, bundle_axis, bundle_ball[3]):
-                        for i in range(BUNDLE):
-                            area = sample_areas[sample_batch, first + i]
-                            beam = sample_points[sample_batch, first + i] - point
-                            if is_lit(beam, area, normal, is_two_sided):
-                                share = _blocked_share(offset, beam, sample_radius(area), radius)
-                                if share > 0.0:
-                                    wp.atomic_add(
-                                        log_transmittances,
-                                        batch,
-                                        receiver,
-                                        bundle * BUNDLE + i,
-                                        log_transmittance(share),
-                                    )
+    if wp.dot(ball_axis, normal) <= -ball[3]:
+        return
+    for sphere in range(radii.shape[1]):
+        radius = radii[sphere_batch, sphere]
+        offset = centers[sphere_batch, sphere] - point
+        is_blocker = radius > 0.0 and not _is_skipped(sphere, skipped)
+        if is_blocker and reaches_ball(offset, radius, ball_axis, ball[3]):
+            for bundle in range(log_transmittances.shape[2] // SAMPLE_BUNDLE):
+                first = first_sample + bundle * SAMPLE_BUNDLE
+                bundle_ball = bundles[sample_batch, first // SAMPLE_BUNDLE]
+                bundle_axis = wp.vec3(bundle_ball[0], bundle_ball[1], bundle_ball[2]) - point
+                if reaches_ball(offset, radius, bundle_axis, bundle_ball[3]):
+                    for i in range(SAMPLE_BUNDLE):
+                        area = sample_areas[sample_batch, first + i]
+                        beam = sample_points[sample_batch, first + i] - point
+                        share = float(0.0)
+                        if is_lit(beam, area, normal, is_two_sided):
+                            share = _blocked_share(offset, beam, sample_radius(area), radius)
+                        if share > 0.0:
+                            index = bundle * SAMPLE_BUNDLE + i
+                            wp.atomic_add(log_transmittances, batch, receiver, index, log_transmittance(share))
 
 
 def find_log_transmittance(
@@ -153,7 +154,7 @@ def find_log_transmittance(
         return result
     skip_values = wp.vec4i(*skipped[0], *skipped[1])
     launch(
-        _block,
+        _block_by_spheres,
         count * points.shape[1],
         inputs=[
             *(points, normals, *samples, span.emitter, span.first, int(span.is_two_sided)),

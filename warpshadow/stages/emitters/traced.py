@@ -90,6 +90,41 @@ def light_of_point(
     return light
 
 
+@wp.struct
+class EmitterSurface:
+    """The points of the samples of emitters to which rays go, one instance."""
+
+    positions: wp.array(dtype=wp.vec3)  # of all vertices
+    faces: wp.array(dtype=wp.vec3i)  # [emitting face]
+    point_faces: wp.array2d(dtype=wp.int32)  # [sample, point]
+    point_weights: wp.array2d(dtype=wp.vec3)
+
+
+@wp.func
+def _beam_to_point(surface: EmitterSurface, sample: int, index: int, point: wp.vec3, is_two_sided: int):
+    """The way from a receiver to a point of a sample, and how much the point faces the receiver, above 0 if it does."""
+    corners = surface.faces[surface.point_faces[sample, index]]
+    a = surface.positions[corners[0]]
+    face_normal = wp.normalize(wp.cross(surface.positions[corners[1]] - a, surface.positions[corners[2]] - a))
+    beam = interpolate_at(surface.positions, corners, surface.point_weights[sample, index]) - point
+    facing = -wp.dot(wp.normalize(beam), face_normal)
+    if is_two_sided == 1:
+        facing = wp.abs(facing)
+    return beam, facing
+
+
+@wp.func
+def _beam_to_facing_point(surface: EmitterSurface, sample: int, start: int, point: wp.vec3, is_two_sided: int):
+    """Likewise, of the first point from a start on that faces the receiver."""
+    point_count = surface.point_faces.shape[1]
+    beam = wp.vec3()
+    facing = float(0.0)
+    for k in range(point_count):
+        if facing <= 0.0:
+            beam, facing = _beam_to_point(surface, sample, (start + k) % point_count, point, is_two_sided)
+    return beam, facing
+
+
 @wp.kernel(enable_backward=False)
 def _trace_transmittance(
     first_row: int,
@@ -101,10 +136,7 @@ def _trace_transmittance(
     first_receiver: int,
     sample_points: wp.array(dtype=wp.vec3),
     sample_areas: wp.array(dtype=wp.vec3),
-    positions: wp.array(dtype=wp.vec3),
-    faces: wp.array(dtype=wp.vec3i),
-    surface_faces: wp.array2d(dtype=wp.int32),
-    surface_weights: wp.array2d(dtype=wp.vec3),
+    surface: EmitterSurface,
     first_sample: int,
     is_two_sided: int,
     ray_count: int,
@@ -116,33 +148,21 @@ def _trace_transmittance(
     state = wp.rand_init(_SEED, first_receiver + receiver)
     point = points[receiver]
     normal = normals[receiver]
-    point_count = surface_faces.shape[1]
     for i in range(transmittance.shape[1]):
         sample = first_sample + i
+        is_sending = is_lit(sample_points[sample] - point, sample_areas[sample], normal, is_two_sided)
+        open_weight = float(0.0)
+        total_weight = float(0.0)
+        for _ray in range(wp.where(is_sending, ray_count, 0)):
+            start = wp.randi(state, 0, surface.point_faces.shape[1])
+            beam, facing = _beam_to_facing_point(surface, sample, start, point, is_two_sided)
+            if facing > 0.0:
+                total_weight += facing
+                if sees_point(mesh, point, normal, wp.normalize(beam), wp.length(beam)):
+                    open_weight += facing
         share = float(0.0)
-        if is_lit(sample_points[sample] - point, sample_areas[sample], normal, is_two_sided):
-            open_weight = float(0.0)
-            total_weight = float(0.0)
-            for _ray in range(ray_count):
-                start = wp.randi(state, 0, point_count)
-                beam = wp.vec3()
-                facing = float(0.0)
-                for j in range(point_count):  # to the first point from there that faces the receiver
-                    if facing <= 0.0:
-                        at = (start + j) % point_count
-                        corners = faces[surface_faces[sample, at]]
-                        a = positions[corners[0]]
-                        face_normal = wp.normalize(wp.cross(positions[corners[1]] - a, positions[corners[2]] - a))
-                        beam = interpolate_at(positions, corners, surface_weights[sample, at]) - point
-                        facing = -wp.dot(wp.normalize(beam), face_normal)
-                        if is_two_sided == 1:
-                            facing = wp.abs(facing)
-                if facing > 0.0:
-                    total_weight += facing
-                    if sees_point(mesh, point, normal, wp.normalize(beam), wp.length(beam)):
-                        open_weight += facing
-            if total_weight > 0.0:
-                share = open_weight / total_weight
+        if total_weight > 0.0:
+            share = open_weight / total_weight
         transmittance[receiver, i] = share
 
 
@@ -176,15 +196,17 @@ def trace_transmittance(
     """
     device = points.device
     transmittance = empty((len(points), span.size), dtype=wp.float32, device=device)
-    surface_faces = constant(samples.surface_points.faces, wp.int32, device)
-    surface_weights = constant(samples.surface_points.weights, wp.vec3, device)
+    surface = EmitterSurface()
+    surface.positions, surface.faces = positions, samples.faces
+    surface.point_faces = constant(samples.surface_points.faces, wp.int32, device)
+    surface.point_weights = constant(samples.surface_points.weights, wp.vec3, device)
     for receivers in progress_slices(len(points), 2**20 // (rays * span.size), progress):
         launch(
             _trace_transmittance,
             receivers.stop - receivers.start,
             inputs=[
                 *(mesh_id(mesh), points[receivers], normals[receivers], receivers.start, sample_points, sample_areas),
-                *(positions, samples.faces, surface_faces, surface_weights, span.first, int(span.is_two_sided), rays),
+                *(surface, span.first, int(span.is_two_sided), rays),
             ],
             outputs=[transmittance[receivers]],
             cost=RAY_COST * rays * span.size,

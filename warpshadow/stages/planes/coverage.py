@@ -11,7 +11,7 @@ import warp as wp
 
 from warpshadow.device.batch import common_batch, expand, expand_rows, instance_in
 from warpshadow.device.constants import constant
-from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.launch import launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.cell_coverage import ViewedEdge, coverage_adjoint
@@ -207,21 +207,14 @@ def plane_coverage(
         return None
     cells = constant(directions, wp.vec3, points.device)
     inputs = [plane_inputs(points, frames, fronts, arrays), horizon_normals, cells]
-    cost = _CELL_COST * cells.size * planes.count
-    scratch = receiver_scratch(planes)
-    return differentiable(
-        lambda coverages: launch(
-            _find_coverage, points.size, inputs=inputs, scratch=scratch, outputs=[coverages], cost=cost
-        ),
-        lambda adj_coverages: launch(
-            _find_coverage_adjoint,
-            points.size,
-            inputs=[*inputs, adj_coverages],
-            scratch=scratch,
-            outputs=[points.grad, None if fronts is None else fronts.grad],
-            sums=[frames.grad],
-            cost=2 * cost,
-        ),
+    return launch_with_adjoint(
+        _find_coverage,
+        _find_coverage_adjoint,
+        points.size,
+        inputs=inputs,
         result=empty((*points.shape, cells.size), dtype=wp.vec4, device=points.device),
-        variables=[points, frames, fronts],
+        variables=[points, fronts],
+        shared=[frames],
+        scratch=receiver_scratch(planes),
+        cost=_CELL_COST * cells.size * planes.count,
     )

@@ -15,7 +15,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, expand_rows
 from warpshadow.device.constants import constant
-from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.launch import launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.cell_coverage import ViewedEdge
@@ -216,20 +216,14 @@ def coverage_of_light(
     arrays = plane_arrays(planes, cell_radius(SAMPLES * len(directions)), skip)
     samples_on_device = constant(np.asarray(samples, np.float32), wp.vec3, points.device)
     inputs = [plane_inputs(points, frames, fronts, arrays), horizon_normals, covered, samples_on_device]
-    scratch, cost = receiver_scratch(planes), _CELL_COST * len(directions)
-    return differentiable(
-        lambda refined: launch(
-            _refine_coverage, points.size, inputs=inputs, scratch=scratch, outputs=[refined], cost=cost
-        ),
-        lambda adj_refined: launch(
-            _refine_coverage_adjoint,
-            points.size,
-            inputs=[*inputs, adj_refined],
-            scratch=scratch,
-            outputs=[points.grad, *(None if array is None else array.grad for array in (covered, fronts))],
-            sums=[frames.grad],
-            cost=2 * cost,
-        ),
+    return launch_with_adjoint(
+        _refine_coverage,
+        _refine_coverage_adjoint,
+        points.size,
+        inputs=inputs,
         result=empty(covered.shape, dtype=wp.vec4, device=points.device),
-        variables=[points, covered, frames, fronts],
+        variables=[points, covered, fronts],
+        shared=[frames],
+        scratch=receiver_scratch(planes),
+        cost=_CELL_COST * len(directions),
     )

@@ -25,7 +25,7 @@ from warpshadow.device.lanes import (
     module_options,
     use_vector_registers,
 )
-from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.launch import launch, launch_with_adjoint
 from warpshadow.device.memory import as_items, empty, require_gradient
 from warpshadow.device.parallel import Scratch, scratch_slot
 from warpshadow.device.warp_sums import sum_over_warp
@@ -320,25 +320,17 @@ def gather_self_transmittance(
     inputs.directions, inputs.uses_rays = kernels.directions, kernels.uses_rays
     inputs.counts, inputs.indices, inputs.weights = resampling_weights
     inputs.bits, inputs.words = rows.bits, words
-    row_count = batch_count * block_count(shape[1], lanes)
     cell_count = max(_CELLS_PER_WORD * words.shape[1], direction_count) if lanes > 1 else 1
-    scratch = [Scratch((2, cell_count), lane_type(lanes))]
-    cost = _LOOKUP_COST * _MEAN_LOOKUPS * direction_count * lanes
-    return differentiable(
-        lambda transmittance_self: launch(
-            _make_gather(lanes), row_count, inputs=[inputs], scratch=scratch, outputs=[transmittance_self], cost=cost
-        ),
-        lambda adj_transmittance: launch(
-            _make_gather_adjoint(lanes),
-            row_count,
-            inputs=[inputs, adj_transmittance],
-            scratch=scratch,
-            outputs=[probe_weights.weights.grad],
-            sums=[resampling_weights.weights.grad],
-            cost=2 * cost,
-        ),
+    return launch_with_adjoint(
+        _make_gather(lanes),
+        lambda: _make_gather_adjoint(lanes),
+        batch_count * block_count(shape[1], lanes),
+        inputs=[inputs],
         result=empty(shape, dtype=wp.float32, device=normals.device),
-        variables=[probe_weights.weights, resampling_weights.weights],
+        variables=[probe_weights.weights],
+        shared=[resampling_weights.weights],
+        scratch=[Scratch((2, cell_count), lane_type(lanes))],
+        cost=_LOOKUP_COST * _MEAN_LOOKUPS * direction_count * lanes,
     )
 
 

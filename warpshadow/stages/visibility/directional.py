@@ -16,19 +16,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpshadow.device.lanes import (
-    block_count,
-    lane_count,
-    lane_type,
-    make_lane_functions,
-    module_options,
-    span_count,
-)
-from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, span_count
+from warpshadow.device.launch import launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_slot
 from warpshadow.maths.directions import BUNDLE, cell_radius
-from warpshadow.stages.visibility.cones import check_spheres
 from warpshadow.stages.visibility.culling import DirectionCells, cap_type, make_cap_functions, make_cells, make_cull
 from warpshadow.stages.visibility.falloff import make_cap_adjoint, make_falloff
 from warpshadow.stages.visibility.merging import MERGING, NODES_PER_CLUSTER, Gradients
@@ -36,9 +28,9 @@ from warpshadow.stages.visibility.traversal import (
     ClusterTree,
     TraversalInputs,
     lane_structs,
-    make_inputs,
     make_load_receivers,
     make_traversal,
+    prepare_traversal,
     receiver_lanes_type,
     sphere_view_type,
 )
@@ -275,37 +267,24 @@ def transmittance(
     clusters.
     """
     cells = make_cells(directions, softness, points.device)
-    check_spheres(points, normals, centers, radii)
-    device = points.device
-    lanes = lane_count(device)
-    batch_count, vertex_count = points.shape
+    inputs, nodes, lanes, row_count = prepare_traversal(
+        points, normals, centers, radii, cell_radius(len(directions)), merging=merging, skip=skip, clusters=clusters
+    )
+    device, traits = points.device, (normals is not None, lanes)
     spans = span_count(device, len(directions))
     bundle_count = len(directions) // (BUNDLE * spans)
-    nodes, inputs = make_inputs(points, normals, centers, radii, merging, cell_radius(len(directions)), skip, clusters)
-    row_count = batch_count * block_count(vertex_count, lanes)
-    launch_dim = run_dimensions(device, row_count, spans)
-    scratch = [Scratch((bundle_count * BUNDLE,), lane_type(lanes)), Scratch((2, bundle_count), wp.int32)]
     ends = empty((row_count, spans, bundle_count), dtype=wp.int32, device=device)
-    result = empty((batch_count, vertex_count, len(directions)), dtype=wp.float32, device=device)
-    cost = PAIR_COST * lanes * radii.shape[1] * bundle_count * BUNDLE
-    return differentiable(
-        lambda result: launch(
-            _make_transmit(normals is not None, lanes),
-            launch_dim,
-            cost=cost,
-            inputs=[inputs, cells],
-            scratch=scratch,
-            outputs=[ends, result],
-        ),
-        lambda adj_result: launch(
-            _make_transmit_adjoint(normals is not None, lanes),
-            launch_dim,
-            cost=2 * cost,
-            inputs=[inputs, cells, ends, result, adj_result],
-            scratch=scratch,
-            outputs=[points.grad],
-            sums=[array.grad for array in nodes],
-        ),
+    result = empty((*points.shape, len(directions)), dtype=wp.float32, device=device)
+    return launch_with_adjoint(
+        _make_transmit(*traits),
+        lambda: _make_transmit_adjoint(*traits),
+        run_dimensions(device, row_count, spans),
+        inputs=[inputs, cells],
         result=result,
-        variables=[points, *nodes],
+        variables=[points],
+        shared=nodes,
+        outputs=[ends],
+        adj_inputs=[ends, result],
+        scratch=[Scratch((bundle_count * BUNDLE,), lane_type(lanes)), Scratch((2, bundle_count), wp.int32)],
+        cost=PAIR_COST * lanes * radii.shape[1] * bundle_count * BUNDLE,
     )

@@ -7,7 +7,7 @@ import warp as wp
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 from warpshadow.maths.directions import BUNDLE
 from warpshadow.stages.visibility.cones import cone_type, make_cone_adjoint
-from warpshadow.stages.visibility.culling import make_cap_functions
+from warpshadow.stages.visibility.culling import cap_type, make_cap_functions
 from warpshadow.stages.visibility.traversal import lane_structs, sphere_view_type
 
 
@@ -137,7 +137,7 @@ def make_cap_adjoint(
     Returns:
         The function (receivers, sphere_view, count, task) → SphereAdjoint, and Σ ā a.
     """
-    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
+    Lane, Vectors, Cap = lane_type(lanes), vectors_type(lanes), cap_type(lanes)
     ReceiverLanes, SphereView, SphereAdjoint = lane_structs(lanes)
     fn = make_lane_functions(lanes)
     sqrt, is_any_above = fn.sqrt, fn.is_any_above
@@ -152,6 +152,43 @@ def make_cap_adjoint(
         return is_reached
 
     @wp.func(inline=True)
+    def sum_over_cells(
+        sphere_view: SphereView, cap: Cap, slope: Lane, opacity: Lane, weight: Lane, count: int, task: Task
+    ):
+        """Returns whether any cell is blocked; Σ ā step, Σ t̄, Σ t̄ t and Σ t̄ ω."""
+        cells = task.cells
+        is_any_blocked = bool(False)
+        sum_adj_t = Lane(0.0)
+        sum_t = Lane(0.0)
+        sum_x = Lane(0.0)
+        sum_y = Lane(0.0)
+        sum_z = Lane(0.0)
+        adj_opacity = Lane(0.0)
+        for k in range(count):
+            bundle = task.reached_bundles[1, k]
+            direction_bundle = task.first_bundle + bundle
+            if task.ends[bundle] > sphere_view.traversal_index and reaches_bundle(
+                cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle]
+            ):
+                for i in range(BUNDLE):
+                    direction = direction_bundle * BUNDLE + i
+                    omega = cells.directions[direction]
+                    t, step = soft_edge(omega, cap, slope)
+                    if is_looked_at(t):
+                        is_any_blocked = True
+                        share = wp.cw_mul(opacity, step)
+                        adj_share = share_adjoint(sphere_view, weight, share, bundle * BUNDLE + i, direction, task)
+                        adj_opacity += wp.cw_mul(adj_share, step)
+                        step_slope = wp.cw_mul(t, Lane(1.0) - t)
+                        adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_share, opacity), step_slope)
+                        sum_adj_t += adj_t
+                        sum_t += wp.cw_mul(adj_t, t)
+                        sum_x += omega[0] * adj_t
+                        sum_y += omega[1] * adj_t
+                        sum_z += omega[2] * adj_t
+        return is_any_blocked, adj_opacity, sum_adj_t, sum_t, Vectors(sum_x, sum_y, sum_z)
+
+    @wp.func(inline=True)
     def cap_adjoint(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: Task):
         adj_sphere = SphereAdjoint()
         cone = sphere_view.cone
@@ -162,35 +199,9 @@ def make_cap_adjoint(
         if is_above_horizon(cap, receivers.normals):
             slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
             weight = find_weight(sphere_view, task)
-            is_any_blocked = bool(False)
-            sum_adj_t = Lane(0.0)
-            sum_t = Lane(0.0)
-            sum_x = Lane(0.0)
-            sum_y = Lane(0.0)
-            sum_z = Lane(0.0)
-            adj_opacity = Lane(0.0)
-            for k in range(count):
-                bundle = task.reached_bundles[1, k]
-                direction_bundle = task.first_bundle + bundle
-                if task.ends[bundle] > sphere_view.traversal_index and reaches_bundle(
-                    cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle]
-                ):
-                    for i in range(BUNDLE):
-                        direction = direction_bundle * BUNDLE + i
-                        omega = cells.directions[direction]
-                        t, step = soft_edge(omega, cap, slope)
-                        if is_looked_at(t):
-                            is_any_blocked = True
-                            share = wp.cw_mul(opacity, step)
-                            adj_share = share_adjoint(sphere_view, weight, share, bundle * BUNDLE + i, direction, task)
-                            adj_opacity += wp.cw_mul(adj_share, step)
-                            step_slope = wp.cw_mul(t, Lane(1.0) - t)
-                            adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_share, opacity), step_slope)
-                            sum_adj_t += adj_t
-                            sum_t += wp.cw_mul(adj_t, t)
-                            sum_x += omega[0] * adj_t
-                            sum_y += omega[1] * adj_t
-                            sum_z += omega[2] * adj_t
+            is_any_blocked, adj_opacity, sum_adj_t, sum_t, sum_omega = sum_over_cells(
+                sphere_view, cap, slope, opacity, weight, count, task
+            )
             if is_any_blocked:
                 adj_offset, adj_radius, adj_weight = sphere_adjoint(
                     sphere_view,
@@ -202,7 +213,7 @@ def make_cap_adjoint(
                     adj_opacity,
                     sum_adj_t,
                     sum_t,
-                    Vectors(sum_x, sum_y, sum_z),
+                    sum_omega,
                 )
                 adj_sphere.is_any = True
                 adj_sphere.offset = adj_offset

@@ -9,22 +9,22 @@ from typing import Any
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.lanes import block_count, lane_count, lane_type, make_lane_functions, module_options
-from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.lanes import lane_type, make_lane_functions, module_options
+from warpshadow.device.launch import launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, scratch_slot
 from warpshadow.maths import sh
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.sh_kernels import make_add_rotated_zonal, make_rotated_zonal_adjoint, zonal_type
-from warpshadow.stages.visibility.cones import check_spheres, cone_type, make_cone_adjoint
+from warpshadow.stages.visibility.cones import cone_type, make_cone_adjoint
 from warpshadow.stages.visibility.merging import MERGING, Gradients
 from warpshadow.stages.visibility.traversal import (
     ClusterTree,
     TraversalInputs,
     lane_structs,
-    make_inputs,
     make_load_receivers,
     make_traversal,
+    prepare_traversal,
     receiver_lanes_type,
     sphere_view_type,
 )
@@ -266,33 +266,18 @@ def accumulate(
     """
     sh.check_order(order)
     check.choice("log", log, LOGS)
-    check_spheres(points, normals, centers, radii)
-    device = points.device
-    lanes = lane_count(device)
-    batch_count, vertex_count = points.shape
-    row_count = batch_count * block_count(vertex_count, lanes)
-    nodes, traversed = make_inputs(points, normals, centers, radii, merging, cell_radius(order**2), skip, clusters)
-    inputs = [traversed, zonal_table(order, log, str(device))]
-    scratch = [Scratch((order**2,), lane_type(lanes))]
-    cost = _PAIR_COST * lanes * radii.shape[1] * order**2
-    return differentiable(
-        lambda log_sh: launch(
-            _make_accumulate(order, normals is not None, lanes),
-            row_count,
-            cost=cost,
-            inputs=inputs,
-            scratch=scratch,
-            outputs=[log_sh],
-        ),
-        lambda adj_log_sh: launch(
-            _make_accumulate_adjoint(order, normals is not None, lanes),
-            row_count,
-            cost=2 * cost,
-            inputs=[*inputs, adj_log_sh],
-            scratch=scratch,
-            outputs=[points.grad, None if normals is None else normals.grad],
-            sums=[array.grad for array in nodes],
-        ),
-        result=empty((batch_count, vertex_count, order**2), dtype=wp.float32, device=device),
-        variables=[points, normals, *nodes],
+    inputs, nodes, lanes, row_count = prepare_traversal(
+        points, normals, centers, radii, cell_radius(order**2), merging=merging, skip=skip, clusters=clusters
+    )
+    traits = order, normals is not None, lanes
+    return launch_with_adjoint(
+        _make_accumulate(*traits),
+        lambda: _make_accumulate_adjoint(*traits),
+        row_count,
+        inputs=[inputs, zonal_table(order, log, str(points.device))],
+        result=empty((*points.shape, order**2), dtype=wp.float32, device=points.device),
+        variables=[points, normals],
+        shared=nodes,
+        scratch=[Scratch((order**2,), lane_type(lanes))],
+        cost=_PAIR_COST * lanes * radii.shape[1] * order**2,
     )

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
+from warpshadow.device.lanes import block_count, lane_count, lane_type, make_lane_functions, vectors_type
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.stages.visibility.cones import TINY_RADIUS, cone_type, make_cone
+from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres, cone_type, make_cone
 from warpshadow.stages.visibility.merging import (
     CLUSTER_SIZE,
     NODES_PER_CLUSTER,
@@ -108,30 +108,41 @@ class TraversalInputs:
     spheres: SphereClusters
 
 
-def make_inputs(
+class SphereTraversal(NamedTuple):
+    """A launch in which each block of receivers traverses spheres."""
+
+    inputs: TraversalInputs
+    nodes: ClusterNodes  # the spheres as arrays, to whose gradients all rows add
+    lanes: int  # receivers of a block
+    row_count: int  # blocks of all instances
+
+
+def prepare_traversal(
     points: wp.array,
     normals: wp.array | None,
     centers: wp.array,
     radii: wp.array,
-    merging: float,
     cell_radius: float,
+    *,
+    merging: float,
     skip: tuple[int, int] = (0, 0),
     clusters: ClusterTree | None = None,
-) -> tuple[ClusterNodes, TraversalInputs]:
+) -> SphereTraversal:
     """Put receivers together with spheres and their clusters.
 
     Args:
         points, normals: Receivers, [batch, receiver].
         centers, radii: Spheres, [batch, sphere].
-        merging: τ in cell radii, 0 for never.
         cell_radius: Radius of a cell [rad].
+        merging: τ in cell radii, 0 for never.
         skip: Spheres that are left out: the first, and the one after the last.
         clusters: Of these spheres, where they are found already.
-    Returns:
-        The spheres as arrays; and all as kernels see it.
+    Raises:
+        ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii.
     Differentiable: centers, radii to the nodes.
     """
-    count = radii.shape[1]
+    check_spheres(points, normals, centers, radii)
+    count, lanes = radii.shape[1], lane_count(points.device)
     if not 0 <= skip[0] <= skip[1] <= count:
         raise ValueError(f"skip: got {skip!r}, expected a first and an end of {count} spheres")
     nodes, *bounds = find_clusters(centers, radii, merging) if clusters is None else clusters
@@ -142,7 +153,7 @@ def make_inputs(
     spheres.cluster_bounds, spheres.run_bounds = bounds
     inputs = TraversalInputs()
     inputs.points, inputs.normals, inputs.spheres = points, normals, spheres
-    return nodes, inputs
+    return SphereTraversal(inputs, nodes, lanes, points.shape[0] * block_count(points.shape[1], lanes))
 
 
 def _find_bounds(nodes: ClusterNodes, sphere_count: int, cluster_count: int) -> wp.array:
