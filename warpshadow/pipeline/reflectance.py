@@ -15,7 +15,7 @@ from warpshadow.device.constants import constant
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node, detached
-from warpshadow.scene.material import GLOSS_ARGUMENTS, GLOSS_DEFAULTS
+from warpshadow.scene.material import GLOSS_ARGUMENTS, GLOSS_DEFAULTS, MATERIAL_FIELDS
 from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.textures.footprint import find_footprints
 from warpshadow.stages.textures.numbers import as_colors
@@ -27,6 +27,7 @@ BodyArrays = Sequence[wp.array | None] | None
 
 
 _COLORS = ("albedo", "emission")  # inputs that are never textures
+_LIMITS = {field.name: {"minimum": field.minimum, "maximum": field.maximum} for field in MATERIAL_FIELDS}
 
 
 class SampleReflectance(NamedTuple):
@@ -192,7 +193,7 @@ class Materials:
                 raise ValueError(f"{where}: got a strided array, expected a contiguous one")
         else:
             check.shape(where, array.shape, ("batch", 1 if array.shape[1:] == (1,) else body.mesh.vertex_count))
-        finite_arrays({where: array})
+        finite_arrays({where: array}, **_LIMITS.get(name, {}))
         if name in ("albedo", "textures"):
             self._warn_of_growth(where, array)
 
