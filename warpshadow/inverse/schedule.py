@@ -98,9 +98,8 @@ def stages_for(stages: object, problem: Problem) -> tuple[Stage, ...]:
     """The stages of a problem: the given ones, or ready-made ones by name."""
     if isinstance(stages, str):
         check.choice("stages", stages, READY_STAGES)
-        stage_tuple = READY_STAGES[stages](problem)
-    else:
-        stage_tuple = tuple(stages) if isinstance(stages, Iterable) else (stages,)
+        stages = READY_STAGES[stages](problem)
+    stage_tuple = tuple(stages) if isinstance(stages, Iterable) else (stages,)
     check_stages(stage_tuple, problem)
     return stage_tuple
 

@@ -220,7 +220,7 @@ class NormalMatrix:
             residual_pair.append(self._residuals())
             number_pair.append([float(values[name][key].view(-1)[n]) for name, key, n in self.parameter_entries])
         self.values = start
-        length = np.subtract(*number_pair) @ direction / (direction @ direction)
+        length = np.subtract(number_pair[0], number_pair[1]) @ direction / (direction @ direction)
         return (residual_pair[0] - residual_pair[1]) / length
 
     def _project_light(self) -> float:

@@ -27,7 +27,7 @@ BodyArrays = Sequence[wp.array | None] | None
 
 
 _COLORS = ("albedo", "emission")  # inputs that are never textures
-_LIMITS = {field.name: {"minimum": field.minimum, "maximum": field.maximum} for field in MATERIAL_FIELDS}
+_LIMITS = {field.name: (field.minimum, field.maximum) for field in MATERIAL_FIELDS}
 
 
 class SampleReflectance(NamedTuple):
@@ -193,7 +193,8 @@ class Materials:
                 raise ValueError(f"{where}: got a strided array, expected a contiguous one")
         else:
             check.shape(where, array.shape, ("batch", 1 if array.shape[1:] == (1,) else body.mesh.vertex_count))
-        finite_arrays({where: array}, **_LIMITS.get(name, {}))
+        minimum, maximum = _LIMITS.get(name, (-check.LARGEST, check.LARGEST))
+        finite_arrays({where: array}, minimum=minimum, maximum=maximum)
         if name in ("albedo", "textures"):
             self._warn_of_growth(where, array)
 
