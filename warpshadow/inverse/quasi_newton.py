@@ -19,6 +19,7 @@ _BOUND_GROWTH = 2.0  # of the bound, where a step that reached it was kept
 _MIN_BOUND_FACTOR, _MAX_BOUND_FACTOR = 0.1, 0.5  # factors of the bound after a rejected step, relative to the step
 _MAX_BOUND = 5.0  # the bound at most, in learning rates
 _MIN_CURVATURE_COSINE = 1e-3  # least cosine of a step and the change of the gradient that tell the curvature
+_ALIKE = 10.0  # ratio of scales up to which a tensor has that of all: 1 made losses of poses leap between stages
 _MAX_SCALE_RATIO = 1e4  # of a tensor's scale to that of all, and back
 
 
@@ -187,6 +188,7 @@ class QuasiNewton(torch.optim.Optimizer):
         of_all = (moved.sum() / changed.sum()).sqrt()
         is_known = (moved > 0) & (changed > 0)
         ratios = torch.where(is_known, (moved / changed).sqrt() / of_all, 1.0)
+        ratios = ratios / ratios.clamp(1 / _ALIKE, _ALIKE)
         scales = (of_all * ratios.clamp(1 / _MAX_SCALE_RATIO, _MAX_SCALE_RATIO)).sqrt()
         return torch.cat([scale.expand(size) for scale, size in zip(scales, sizes, strict=True)])
 
