@@ -8,11 +8,13 @@ import pytest
 import torch
 
 import warpshadow as ws
-from warpshadow.torch import TorchRenderer, rotation_matrices
+from warpshadow import inverse
+from warpshadow.torch import MixedRenderer, TorchRenderer, rotation_matrices
 
 BALL = ws.Body(ws.icosphere(1.0, 0))
 SKY = ws.EnvironmentMap.constant(1.0)
 SCENE = ws.Scene([BALL], SKY, ws.Camera.framing(BALL, size=(8, 8)), ws.Visibility("none"))
+MIXED = MixedRenderer([TorchRenderer(SCENE)])
 
 
 @pytest.mark.parametrize(
@@ -43,6 +45,12 @@ SCENE = ws.Scene([BALL], SKY, ws.Camera.framing(BALL, size=(8, 8)), ws.Visibilit
             r"\(write Scene\(…, visibility=Visibility\('ray-traced', samples=…\)\)\)",
         ),
         (lambda: ws.Renderer(SCENE, softness=1.0), r"\(write Scene\(…, visibility=Visibility\(…\)\)\)"),
+        (lambda: TorchRenderer(SCENE)(emision=None), r"unknown argument 'emision' \(did you mean 'emission'\?\)"),
+        (lambda: MIXED([0], emision=None), r"MixedRenderer.forward: unknown .* \(did you mean 'emission'\?\)"),
+        (lambda: MIXED([0], cameras=None), r"unknown argument 'cameras' \(write clip_matrices=renderer.clip_matrices"),
+        (lambda: ws.Renderer(SCENE).draw(emision=None), r"draw: unknown .* \(did you mean 'emission'\?\)"),
+        (lambda: inverse.fit(None, stage="pose"), r"fit: unknown argument 'stage' \(did you mean 'stages'\?\)"),
+        (lambda: inverse.Problem(SCENE, target=None), r"Problem: .* 'target' \(did you mean 'targets'\?\)"),
         (lambda: ws.Body(), "Body: missing a required argument: 'mesh'"),
     ],
 )
@@ -75,6 +83,7 @@ def test_what_is_no_scene_gets_the_way_to_one(value, message):
     ("call", "message"),
     [
         (lambda: ws.Body(BALL.mesh, albedo=0.5), r"albedo: got 0.5, .*; that gray is \(0.5, 0.5, 0.5\)"),
+        (lambda: ws.Body(BALL.mesh, emission=4.5), r"emission: got 4.5, .* such as .*; that gray is \(4.5, 4.5, 4.5\)"),
         (lambda: ws.Body(BALL.mesh, rotation=45), r"rotation: got 45, .* about the vertical \(0, 45, 0\)"),
         (lambda: ws.Scene([BALL], SKY, visibility="ray-traced"), r"got 'ray-traced', .* Visibility\('ray-traced'\)$"),
         (lambda: ws.Scene([BALL], SKY, visibility="rays"), r"got 'rays', .* Visibility\('directional'\)$"),
@@ -135,6 +144,19 @@ def test_names_that_arrays_of_a_mesh_have_elsewhere_get_theirs():
         BALL.mesh.vertices  # noqa: B018
     assert not hasattr(BALL.mesh, "color")
     assert (copy.deepcopy(BALL.mesh).positions == BALL.mesh.positions).all()
+
+
+def test_functions_that_are_looked_for_in_the_wrong_place_are_named():
+    for name in ("render", "explain", "tune", "view", "fit"):
+        with pytest.raises(AttributeError, match=rf"a Scene has no '{name}' \(write .*scene"):
+            getattr(SCENE, name)
+    with pytest.raises(AttributeError, match="'warpshadow' has no attribute 'fit' \\(write warpshadow.inverse.fit\\)"):
+        ws.fit  # noqa: B018
+    with pytest.raises(AttributeError, match=r"has no attribute 'TorchRenderer' \(write warpshadow.torch.TorchR"):
+        ws.TorchRenderer  # noqa: B018
+    with pytest.raises(AttributeError, match=r"has no attribute 'rendr' \(did you mean 'render'\?\)"):
+        ws.rendr  # noqa: B018
+    assert not hasattr(SCENE, "__array__") and (copy.deepcopy(SCENE).bodies[0].mesh.faces == BALL.mesh.faces).all()
 
 
 def test_angles_that_look_like_degrees_draw_a_warning():

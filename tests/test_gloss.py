@@ -1,14 +1,17 @@
 """Bodies that shine, as a whole: images, and gradients of images against central differences of them."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
 import torch
 import twins
+import warp as wp
 
 import warpshadow as ws
 from warpshadow import inverse
+from warpshadow.inverse.uncertainty import NormalMatrix
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
@@ -300,6 +303,37 @@ def test_a_fit_recovers_roughness_and_tells_metal_from_plastic(metallic):
     fitted = inverse.fit(problem, inverse.Stage(30), progress=False).scene.bodies[0]
     assert fitted.roughness == pytest.approx([0.3], abs=0.03)
     assert fitted.metallic == pytest.approx([metallic], abs=0.05)
+
+
+@pytest.mark.parametrize("name", ["roughness", "metallic", "specular"])
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (1.5, r"got 1 values out of range \(first at index \(0, 0\): 1.5\), expected 0 to 1"),
+        (-0.1, r"got 1 values out of range \(first at index \(0, 0\): -0.1\), expected 0 to 1"),
+        (np.nan, "got 1 NaN or Inf values"),
+    ],
+)
+def test_gloss_that_no_surface_has_is_refused(name, value, message):
+    renderer = TorchRenderer(scene_of(), progress=False)
+    with pytest.raises(ValueError, match=rf"{name}\[.*\]: {message}"):
+        renderer(**{name: {"ball": torch.tensor([value])}})
+    with pytest.raises(ValueError, match=rf"{name}\[0\]: {message}"):
+        renderer.warp.draw(**{name: {0: wp.array([[value]], dtype=wp.float32)}})
+
+
+def test_a_line_search_may_look_beyond_the_gloss_that_there_is():
+    """Its steps of 10 leave [0, 1] by far; at the bound the uncertainty is that of a step to one side."""
+    target = inverse.Target(ws.Renderer(scene_of(dataclasses.replace(BALL, metallic=0.0), GROUND)).render())
+    problem = inverse.Problem(scene_of(BALL, GROUND), target, [inverse.Metallic("ball")])
+    optimizer = functools.partial(torch.optim.LBFGS, max_iter=6, line_search_fn="strong_wolfe")
+    result = inverse.fit(problem, inverse.Stage(2, 10.0), optimizer=optimizer, progress=False)
+    assert result.reason == "finished" and 0 <= result.scene.bodies[0].metallic[0] <= 1
+    columns = []
+    for value in (0.0, 0.02):
+        values = {"metallic[0]": {"value": torch.tensor([value])}}
+        columns.append(NormalMatrix(problem, result.setting, values).columns)
+    assert np.linalg.norm(columns[0] - columns[1]) < 0.1 * np.linalg.norm(columns[1])
 
 
 def test_gloss_of_a_diffuse_body_is_refused():

@@ -55,6 +55,9 @@ _MODULES = {
 }
 """Modules of the names that need kernels: each is imported on first use."""
 
+_ELSEWHERE = {"fit": "inverse", "TorchRenderer": "torch", "MixedRenderer": "torch"}
+"""Modules of names that are looked for here."""
+
 __all__ = [
     "Body",
     "Camera",
@@ -122,6 +125,8 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str) -> object:
     if name not in _MODULES:
-        raise AttributeError(f"module 'warpshadow' has no attribute {name!r}")
+        module = _ELSEWHERE.get(name)
+        hint = f" (write warpshadow.{module}.{name})" if module else _check.suggestion(name, __all__)
+        raise AttributeError(f"module 'warpshadow' has no attribute {name!r}{hint}")
     with _one_call:  # kernels must not be made while another thread loads some
         return getattr(_importlib.import_module(f"warpshadow.{_MODULES[name]}"), name)

@@ -46,7 +46,7 @@ def choice(name: str, value: object, choices: Iterable[object]) -> None:
     if value in choices:
         return
     accepted = ", ".join(map(repr, choices))
-    raise ValueError(f"{name}: got {value!r}, expected one of {accepted}{_suggestion(value, choices)}")
+    raise ValueError(f"{name}: got {value!r}, expected one of {accepted}{suggestion(value, choices)}")
 
 
 def known_keys(where: str, keys: Iterable[str], known: Iterable[str], *, noun: str = "key") -> None:
@@ -61,7 +61,7 @@ def known_keys(where: str, keys: Iterable[str], known: Iterable[str], *, noun: s
     for key in keys:
         if key not in known:
             raise ValueError(
-                f"{where and f'{where}: '}unknown {noun} {key!r}{_suggestion(key, known)}; "
+                f"{where and f'{where}: '}unknown {noun} {key!r}{suggestion(key, known)}; "
                 f"known {noun}s are {', '.join(known)}"
             )
 
@@ -83,7 +83,7 @@ def keywords(**instead: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
         def checked(*args: P.args, **arguments: P.kwargs) -> T:
             for key in arguments:
                 if key not in known:
-                    hint = f" (write {instead[key]})" if key in instead else _suggestion(key, known)
+                    hint = f" (write {instead[key]})" if key in instead else suggestion(key, known)
                     raise TypeError(f"{name}: unknown argument {key!r}{hint}")
             try:
                 return function(*args, **arguments)
@@ -407,6 +407,7 @@ def missing(feature: str, package: str, extra: str) -> str:
     return f'{feature} needs the package {package}: pip install "warpshadow[{extra}]"'
 
 
-def _suggestion(value: object, choices: list) -> str:
+def suggestion(value: object, choices: list) -> str:
+    """Name the nearest choice, for messages; empty where none is near."""
     near = difflib.get_close_matches(str(value), map(str, choices), n=1, cutoff=0.5)
     return f" (did you mean {near[0]!r}?)" if near else ""

@@ -10,7 +10,9 @@ import trimesh
 import warpshadow as ws
 from warpshadow import inverse
 from warpshadow.inverse.model import Model
+from warpshadow.inverse.report import found_values
 from warpshadow.maths.sh import equirectangular_directions
+from warpshadow.scene import toml_tables
 
 # Relative error of the radius that a fit finds, and degrees of the window's direction. Measured 1% and 3°.
 RADIUS, SIDE = 0.1, 8.0
@@ -66,6 +68,17 @@ def test_a_fit_finds_the_side_and_the_distance_of_a_window(tmp_path):
     inverse.write_result(result, tmp_path)
     again = ws.load_scene(tmp_path / "scene.toml").light
     assert again.radius == pytest.approx(light.radius) and np.allclose(again.center, CENTER)
+
+
+def test_the_radius_that_a_fit_finds_is_in_its_summary_and_said_after_few_steps(tmp_path):
+    """Its last steps are below the rounding of the loss; they went on for all 200 iterations."""
+    result = inverse.fit(problem_of(window(4.0), window(2.0), inverse.Shell()), progress=False)
+    assert result.reason == "converged" and sum(map(len, result.losses)) < 40
+    inverse.write_result(result, tmp_path)
+    radius = result.scene.light.radius
+    summary = toml_tables.read(tmp_path / "summary.toml", "summary")
+    assert summary["figures"] == {"light.radius": pytest.approx(radius)} and radius == pytest.approx(2.0, rel=RADIUS)
+    assert f"light: radius {radius:.4g}" in found_values(result)
 
 
 def test_light_that_a_fit_finds_keeps_its_radius():

@@ -79,6 +79,38 @@ def test_it_has_converged_where_steps_gain_nothing_and_not_before():
     assert losses[0] > losses[2]
 
 
+@pytest.mark.parametrize("ratio", [1e4, 1e5, 1e6])
+def test_a_flat_tensor_beside_a_steep_one_is_found_before_it_has_converged(ratio):
+    """As the roughness of a body that shows a sun, and of a dull one."""
+    steep, flat = (torch.tensor([value], requires_grad=True) for value in (0.6, 0.7))
+    optimizer = QuasiNewton([steep, flat], 0.02)
+    for _ in range(25):
+
+        def closure() -> float:
+            optimizer.zero_grad()
+            loss = torch.log(1 + 200 * (steep - 0.3) ** 2).sum() + (1 + 10 * (flat - 0.45) ** 2).sum() / ratio
+            loss.backward()
+            return float(loss.detach())
+
+        optimizer.step(closure)
+        if optimizer.has_converged(1e-4):
+            break
+    assert optimizer.has_converged(1e-4)
+    assert float(steep) == pytest.approx(0.3, abs=1e-3) and float(flat) == pytest.approx(0.45, abs=5e-3)
+
+
+def test_it_has_converged_where_the_loss_is_too_coarse_to_fall_further():
+    """Steps that promise nothing are taken back for ever."""
+
+    def coarse(x: torch.Tensor) -> torch.Tensor:
+        loss = ((x - 0.3) ** 2 + 0.1 * (x - 0.3) ** 4).sum() + 1
+        return loss + (torch.round(loss * 5e3) / 5e3 - loss).detach()
+
+    for start in (0.5, 1.1, 1.3, 2.0):
+        losses, _, optimizer = walked(coarse, [start], 20)
+        assert optimizer.has_converged(1e-5) and min(losses) == 1
+
+
 def test_where_nothing_changes_it_stays():
     losses, places, optimizer = walked(lambda x: (0 * x).sum() + 3, [0.5, 0.5], 3)
     assert losses == [3, 3, 3] and (np.array(places) == 0.5).all() and optimizer.has_converged(0.0)

@@ -126,8 +126,11 @@ def test_a_pose_is_found_beside_a_light_and_a_color_that_are_unknown():
     assert best <= min(result.losses[-1]) * 1.001
 
 
-def test_a_stage_that_solves_for_light_needs_a_free_one():
+def test_a_stage_that_solves_for_light_needs_a_free_one_and_another_parameter():
     with pytest.raises(ValueError, match=r"stages\[0\]: got solves_light where light is not free"):
         fit(Problem(scene(), Target(np.ones((30, 40, 3))), Pose(0)), [SOLVED])
+    for stages in ([SOLVED], "photograph"):
+        with pytest.raises(ValueError, match=r"stages\[0\]: got solves_light where light alone is free, exp"):
+            fit(Problem(scene(), Target(np.ones((30, 40, 3))), CELLS), stages)
     problem, setting, _ = prepared()
     assert isinstance(make_model(problem, setting, SOLVED), ProjectedModel)

@@ -1,5 +1,6 @@
 """Where bodies stand: on a ground, and what is remarked on where they do not."""
 
+import dataclasses
 import re
 import warnings
 
@@ -96,6 +97,16 @@ def test_a_body_that_floats_or_lies_below_by_more_than_its_size_is_remarked_on(h
 )
 def test_a_body_without_a_ground_below_or_on_another_does_not_float(others):
     assert not misplacements(ws.Scene([ball(3.6), *others], LIGHT))
+
+
+@pytest.mark.parametrize("blockers", [0, 8])
+def test_a_lamp_and_its_shade_do_not_float(blockers):
+    """But a body beside them does."""
+    lamp = ws.Body(ws.icosphere(0.1, 1), translation=(0, 5.2, 0), emission=(9, 9, 9), blockers=blockers)
+    shade = ball(5.0, blockers=blockers)
+    assert not misplacements(ws.Scene([GROUND, lamp, shade], LIGHT))
+    (remark,) = misplacements(ws.Scene([GROUND, lamp, dataclasses.replace(shade, translation=(2, 5, 0))], LIGHT))
+    assert "floats" in remark
 
 
 def test_a_body_that_is_broader_than_the_ground_is_remarked_on():

@@ -157,7 +157,11 @@ def _is_awaited(device: wp.Device) -> bool:
 
 
 def finite_arrays(
-    arrays: Mapping[str, wp.array | None], *, maximum: float = check.LARGEST, nonnegative: Collection[str] = ()
+    arrays: Mapping[str, wp.array | None],
+    *,
+    minimum: float | None = None,
+    maximum: float = check.LARGEST,
+    nonnegative: Collection[str] = (),
 ) -> None:
     """Raise ValueError when float32 arrays on a device, of any dtype, hold NaN, Inf or numbers out of range.
 
@@ -166,14 +170,16 @@ def finite_arrays(
 
     Args:
         arrays: By the names of their arguments; None is passed over.
-        maximum: Largest magnitude that is accepted.
+        minimum: Smallest number that is accepted, by default minus the largest.
+        maximum: Largest number that is accepted.
         nonnegative: Names of the arrays that must hold nothing below 0.
     """
     present = {name: array for name, array in arrays.items() if array is not None and array.size}
     devices = [array.device for array in present.values()]
     if not devices or any(device.is_capturing for device in devices):
         return
-    ranges = {name: (0.0 if name in nonnegative else -maximum, maximum) for name in present}
+    smallest = -maximum if minimum is None else minimum
+    ranges = {name: (0.0 if name in nonnegative else smallest, maximum) for name in present}
     if not any(map(_is_awaited, devices)):
         for name in _outside_on_host(present, ranges):
             check.finite(name, present[name].numpy(), minimum=ranges[name][0], maximum=maximum)

@@ -363,6 +363,7 @@ def default_optimizer(parameters: list[torch.Tensor], lr: float) -> torch.optim.
     return QuasiNewton(parameters, lr) if few else short_adam(parameters, lr)
 
 
+@check.keywords(**dict.fromkeys(("lr", "learning_rate", "iterations"), "stages=[Stage(iterations, learning_rate)]"))
 @torch_on_one_thread()
 def fit(
     problem: Problem,

@@ -52,6 +52,7 @@ class Problem:
     loss: Loss
     still: Visibility | None
 
+    @check.keywords(parameters="free", visibility="Scene(…, visibility=…), or still=")
     def __init__(
         self,
         scene: Scene,

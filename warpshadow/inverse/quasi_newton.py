@@ -19,14 +19,20 @@ _BOUND_GROWTH = 2.0  # of the bound, where a step that reached it was kept
 _MIN_BOUND_FACTOR, _MAX_BOUND_FACTOR = 0.1, 0.5  # factors of the bound after a rejected step, relative to the step
 _MAX_BOUND = 5.0  # the bound at most, in learning rates
 _MIN_CURVATURE_COSINE = 1e-3  # least cosine of a step and the change of the gradient that tell the curvature
+_ALIKE = 10.0  # ratio of scales up to which a tensor has that of all: 1 made losses of poses leap between stages
+_MAX_SCALE_RATIO = 1e4  # of a tensor's scale to that of all, and back
 
 
 class QuasiNewton(torch.optim.Optimizer):
     """L-BFGS with bounded steps, one evaluation each.
 
-    The direction is that of Nocedal and Wright 2006, algorithm 7.4. No value changes by more than a bound. A step that
-    lowers the loss is kept, and the bound grows if it was reached. Another one is taken back and makes the bound
-    shorter; the gradient at its end tells of curvature nonetheless.
+    The direction is that of Nocedal and Wright 2006, algorithm 7.4, but that curvature which no step has told of is
+    taken to be each tensor's own. Taken to be that of all, it would be the steepest one's: a flat tensor would not
+    move, and promise nothing, so that the fit would count as converged. (The roughness of a shiny ball had 1e4 times
+    the curvature of a dull bunny's.)
+
+    No value changes by more than a bound. A step that lowers the loss is kept, and the bound grows if it was reached.
+    Another one is taken back and makes the bound shorter; the gradient at its end tells of curvature nonetheless.
 
     Values may be clamped after a step. One that was stays where it is as long as the loss would fall beyond, and the
     direction is that of the others [Nocedal and Wright 2006, section 16.7, gradient projection].
@@ -58,7 +64,10 @@ class QuasiNewton(torch.optim.Optimizer):
         self._memory.update({n: [item.to(place) for item in part] for n, part in zip(names, curvature, strict=True)})
 
     def has_converged(self, tolerance: float) -> bool:
-        """Whether the last step that was kept gained, and the next may gain, at most this part of the loss."""
+        """Whether the last step gained, and the next may gain, at most this part of the loss.
+
+        A step that was taken back tells if it had promised no more: then the loss is as low as it is exact.
+        """
         memory = self._memory
         return max(memory.get("gained", math.inf), memory["hoped"]) <= tolerance * abs(memory["loss"])
 
@@ -121,6 +130,7 @@ class QuasiNewton(torch.optim.Optimizer):
             # of the parabola through both
             lower_bound = -slope / (2 * (loss_increase - slope)) if loss_increase > slope else _MAX_BOUND_FACTOR
             memory["bound"] = length * min(max(lower_bound, _MIN_BOUND_FACTOR), _MAX_BOUND_FACTOR)
+            memory["gained"] = min(memory.get("gained", math.inf), memory["hoped"])
             return
         if length > 0.8 * memory["bound"]:
             memory["bound"] = min(_BOUND_GROWTH * memory["bound"], _MAX_BOUND * self._rate)
@@ -137,14 +147,17 @@ class QuasiNewton(torch.optim.Optimizer):
         """Quasi-Newton direction: minus the gradient times the inverse curvature estimated from the steps.
 
         All vectors of the recursion are sums of steps, changes and the gradient. So it works on the factors of these
-        [Chen et al. 2014, Large-scale L-BFGS using MapReduce], whose dot products are read all at once.
+        [Chen et al. 2014, Large-scale L-BFGS using MapReduce], whose dot products are read all at once. Values are in
+        units of their tensor's scale meanwhile.
         """
         memory, (steps, changes) = self._memory, self.curvature
         is_movable = (memory["sides"] * memory["gradient"] >= 0).to(memory["gradient"])
         downhill = -memory["gradient"] * is_movable
         if not steps:
             return downhill
-        vectors = torch.stack([*steps, *changes, downhill]).double() * is_movable
+        step_rows, change_rows = torch.stack(steps).double(), torch.stack([*changes, downhill]).double()
+        scales = self._scales(step_rows, change_rows[:-1])
+        vectors = torch.cat([step_rows / scales, change_rows * scales]) * is_movable
         products = np.array(_read(*(vectors @ vectors.T)))
         count = len(steps)
         pairs = [(k, count + k) for k in range(count)]
@@ -159,7 +172,25 @@ class QuasiNewton(torch.optim.Optimizer):
             factors *= products[step, change] / products[change, change]
         for (step, change), part in zip(pairs, reversed(parts), strict=True):
             factors[step] += part - products[change] @ factors / products[step, change]
-        return (torch.from_numpy(factors).to(vectors) @ vectors).to(downhill)
+        return (torch.from_numpy(factors).to(vectors) @ vectors * scales).to(downhill)
+
+    def _scales(self, steps: torch.Tensor, changes: torch.Tensor) -> torch.Tensor:
+        """Square root of how far a value's tensor moved for how much its gradient changed, [value].
+
+        A root mean square of steps [step, value], each of which counts by its curvature, so long ones as short ones.
+        """
+        curvatures = _row_dots(steps, changes).clamp_min(torch.finfo(steps.dtype).tiny)
+        sizes = [tensor.numel() for tensor in self._tensors]
+        moved, changed = (
+            torch.stack([_row_dots(part, part) for part in rows.split(sizes, dim=1)]) @ (1 / curvatures)
+            for rows in (steps, changes)
+        )
+        of_all = (moved.sum() / changed.sum()).sqrt()
+        is_known = (moved > 0) & (changed > 0)
+        ratios = torch.where(is_known, (moved / changed).sqrt() / of_all, 1.0)
+        ratios = ratios / ratios.clamp(1 / _ALIKE, _ALIKE)
+        scales = (of_all * ratios.clamp(1 / _MAX_SCALE_RATIO, _MAX_SCALE_RATIO)).sqrt()
+        return torch.cat([scale.expand(size) for scale, size in zip(scales, sizes, strict=True)])
 
 
 def _products(step: T, change: T) -> tuple[tuple[T, T], ...]:
@@ -170,6 +201,10 @@ def _products(step: T, change: T) -> tuple[tuple[T, T], ...]:
 def _has_positive_curvature(mixed_product: float, step: float, change: float) -> bool:
     """Whether the loss curves upwards over a step, by its :func:`_products` with how the gradient changed."""
     return mixed_product > _MIN_CURVATURE_COSINE * math.sqrt(step * change)
+
+
+def _row_dots(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+    return (first * second).sum(dim=1)
 
 
 def _dot(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from pathlib import Path
@@ -59,10 +60,10 @@ class Report:
         Args:
             folder: Made if it is not there. It gets the scene as :func:`warpshadow.write_scene` writes it, to be
                 rendered again, with files named by the bodies where each has a name of its own; light.exr of light in
-                spherical harmonics, too; summary.toml (how the fit ended, and of each view the camera and the exposure,
-                which a scene does not have); light.png of free light, striped where the images did not determine it;
-                parameters.npz (all values, as the fit holds them); before.png and after.png beside target.png; and
-                loss.png where matplotlib is installed.
+                spherical harmonics, too; summary.toml (how the fit ended, the fitted parameters that are a few numbers,
+                and of each view the camera and the exposure, which a scene does not have); light.png of free light,
+                striped where the images did not determine it; parameters.npz (all values, as the fit holds them);
+                before.png and after.png beside target.png; and loss.png where matplotlib is installed.
         Returns:
             The files.
         """
@@ -105,7 +106,9 @@ class Report:
         light = self.result.light
         known_entries = {} if light is None else {"light": {"undetermined": round(light.undetermined_share, 4)}}
         unsure = self._uncertainty_table()
-        return {"fit": fit, **known_entries, **unsure, "view": views, "image": images}
+        figures = {json.dumps(key): item if len(item) > 1 else item[0] for key, item in self.result.figures.items()}
+        found = {"figures": figures} if figures else {}
+        return {"fit": fit, **found, **known_entries, **unsure, "view": views, "image": images}
 
     def _uncertainty_table(self) -> toml_tables.Table:
         """Standard deviations of poses, light and exposures; a warning for each body that hardly is where it is."""
@@ -164,10 +167,10 @@ def _stems(scene: Scene) -> list[str]:
 
 
 def found_values(result: Result) -> list[str]:
-    """Describe the changes of a fit, a line each: poses, colors, exposures, and where light is strongest."""
+    """Describe the changes of a fit, a line each: poses, materials, exposures, and light: whence, and how far away."""
     lines, start, scene = [], result.problem.scene, result.scene
     for before, after in zip(start.bodies, scene.bodies, strict=True):
-        for name, unit in (("translation", ""), ("rotation", "°"), ("scale", ""), ("albedo", ""), ("emission", "")):
+        for name in ("translation", "rotation", "scale", "albedo", *GLOSS_ARGUMENTS, "emission"):
             values = np.asarray(getattr(after, name))
             if (
                 getattr(after, name) is not None
@@ -175,11 +178,13 @@ def found_values(result: Result) -> list[str]:
                 and values.size <= 3
             ):
                 rounded_text = ", ".join(f"{value:.4g}" for value in values.ravel())
-                lines.append(f"{after.name}: {name} ({rounded_text}){unit}")
+                lines.append(f"{after.name}: {name} ({rounded_text}){'°' if name == 'rotation' else ''}")
     if scene.light is not start.light:
         radiance = scene.known_light.radiance
         x, y, z = EnvironmentMap(np.maximum(radiance, 0)).directions().reshape(-1, 3)[radiance.sum(axis=2).argmax()]
         lines.append(f"light: strongest from ({x:.3f}, {y:.3f}, {z:.3f})")
+    if scene.shell is not None and start.shell is not None and scene.shell[3] != start.shell[3]:
+        lines.append(f"light: radius {scene.shell[3]:.4g}")
     if any(factor != 1 for factor in result.found.exposures):
         lines.append(f"exposure: {', '.join(f'{factor:.4g}' for factor in result.found.exposures)}")
     return lines

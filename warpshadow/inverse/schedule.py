@@ -35,8 +35,8 @@ class Stage:
             that of each of six values scattered around it. 0: all are tried.
         tolerance: In place of the fit's.
         compares: "all", or "outlines" alone, for which nothing is shaded.
-        solves_light: Solve for the light at each geometry in place of descending to it; see
-            :mod:`~warpshadow.inverse.variable_projection`.
+        solves_light: Solve for the light at each geometry in place of descending to it, where something else is free,
+            too; see :mod:`~warpshadow.inverse.variable_projection`.
         scatter: How candidates differ: "turned"; "flat", moved along the direction that the images tell least of; or
             "lamps", with free lamps in other directions.
         regularization: Factor of all regularizers: coarse stages want more of them.
@@ -98,7 +98,7 @@ def stages_for(stages: object, problem: Problem) -> tuple[Stage, ...]:
     """The stages of a problem: the given ones, or ready-made ones by name."""
     if isinstance(stages, str):
         check.choice("stages", stages, READY_STAGES)
-        return READY_STAGES[stages](problem)
+        stages = READY_STAGES[stages](problem)
     stage_tuple = tuple(stages) if isinstance(stages, Iterable) else (stages,)
     check_stages(stage_tuple, problem)
     return stage_tuple
@@ -113,6 +113,11 @@ def check_stages(stages: Sequence[Stage], problem: Problem) -> None:
         check.instance(f"stages[{number}]", stage, Stage, "a Stage, such as Stage(iterations=200)")
         if stage.solves_light and problem.basis is None:
             raise ValueError(f"stages[{number}]: got solves_light where light is not free, expected Light among free")
+        if stage.solves_light and all(free.is_light for free in problem.free):
+            raise ValueError(
+                f"stages[{number}]: got solves_light where light alone is free, expected another free parameter, or "
+                "Stage(solves_light=False), which descends to the light"
+            )
         if stage.compares == "outlines" and not all(target.outlines for target in problem.targets):
             raise ValueError(f'stages[{number}]: got compares = "outlines" for a target without, expected outlines')
         try:

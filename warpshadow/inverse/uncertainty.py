@@ -211,13 +211,17 @@ class NormalMatrix:
         return torch.cat(parts, dim=-1).double().cpu().numpy()
 
     def _difference(self, direction: np.ndarray) -> np.ndarray:
-        """Derivative of the residuals along a direction of the numbers."""
-        start, residual_pair = self.values, []
+        """Derivative of the residuals along a direction of the numbers; from one side where they end at a bound."""
+        start, residual_pair, number_pair = self.values, [], []
         for values in (self.moved(_STEP * direction), self.moved(-_STEP * direction)):
+            for free in self.problem.free:
+                free.project(values[free.name])
             self.values = values
             residual_pair.append(self._residuals())
+            number_pair.append([float(values[name][key].view(-1)[n]) for name, key, n in self.parameter_entries])
         self.values = start
-        return (residual_pair[0] - residual_pair[1]) / (2 * _STEP)
+        length = np.subtract(number_pair[0], number_pair[1]) @ direction / (direction @ direction)
+        return (residual_pair[0] - residual_pair[1]) / length
 
     def _project_light(self) -> float:
         """Take the best change of the light out of the columns; the relative deviation of its total."""

@@ -13,6 +13,7 @@ from typing import Any, Concatenate, Generic, ParamSpec, Protocol, TypeVar, over
 import numpy as np
 import warp as wp
 
+from warpshadow import check
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.pipeline.geometry import Geometry
 from warpshadow.scene.material import INPUTS_OF_BODIES
@@ -39,9 +40,10 @@ class ImageInputs(Generic[Array, Placed]):
             Values above 1, which a Body refuses, are taken as they are: free ones may pass 1 on their way.
         textures: Reflectance of bodies as images, [height, width, 3], which needs uvs; a list or a mapping likewise.
         emission: Radiance that bodies emit which have emission in the scene, linear RGB, as albedo.
-        roughness: Of bodies that have roughness in the scene, in [0, 1], one number, [] or [1], one for each vertex,
-            [vertex], or an image, [height, width], of bodies with uvs: one that is as wide as there are vertices, or 1
-            wide, needs the batch. A list or a mapping, as albedo.
+        roughness: Of bodies that have roughness in the scene, one number, [] or [1], one for each vertex, [vertex], or
+            an image, [height, width], of bodies with uvs: one that is as wide as there are vertices, or 1 wide, needs
+            the batch. A list or a mapping, as albedo. Numbers beyond [0, 1] are refused: clamp them after each step of
+            an optimizer, or free the input of a sigmoid.
         metallic, specular: Likewise, of the same bodies.
         shell: Where the scene's light has a radius: center and radius of the sphere that sends the light [scene units],
             [4], in place of the scene's or a map's own; all bodies are inside.
@@ -87,13 +89,14 @@ class _Taking(Protocol[P, Inputs_co]):
     def __call__(self, method: Callable[[Owner, First, Inputs_co], R]) -> Callable[Concatenate[Owner, First, P], R]: ...
 
 
-def takes(record: Callable[P, Inputs_co]) -> _Taking[P, Inputs_co]:
+def takes(record: Callable[P, Inputs_co], **instead: str) -> _Taking[P, Inputs_co]:
     """Let users give the fields of a record as arguments to a method whose last argument is the record, ``inputs``.
 
     The method's signature, types and documentation then say them one by one.
 
     Args:
         record: A dataclass such as :class:`ImageInputs`, of some type of arrays.
+        instead: Remedies for other keywords, as of :func:`.check.keywords`.
     """
     kind: Any = typing.get_origin(record) or record
     types = _field_types(record)
@@ -116,7 +119,7 @@ def takes(record: Callable[P, Inputs_co]) -> _Taking[P, Inputs_co]:
         hints = {name: hint for name, hint in method.__annotations__.items() if name != "inputs"}
         taking.__annotations__ = hints | types
         taking.__doc__ = re.sub(r"^ +inputs: .*$", lambda _: entries, method.__doc__ or "", flags=re.MULTILINE)
-        return taking
+        return check.keywords(**instead)(taking)
 
     return decorate  # type: ignore[return-value]
 

@@ -15,7 +15,7 @@ from warpshadow.device.constants import constant
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node, detached
-from warpshadow.scene.material import GLOSS_ARGUMENTS, GLOSS_DEFAULTS, INPUTS_OF_BODIES
+from warpshadow.scene.material import GLOSS_ARGUMENTS, GLOSS_DEFAULTS, INPUTS_OF_BODIES, MATERIAL_FIELDS
 from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.textures.footprint import find_footprints
 from warpshadow.stages.textures.numbers import as_colors
@@ -24,6 +24,9 @@ from warpshadow.stages.textures.sample import sample_albedo
 
 BodyArrays = Sequence[wp.array | None] | None
 """For each body an array, or None for the scene's own; None for all bodies' own."""
+
+
+_LIMITS = {field.name: (field.minimum, field.maximum) for field in MATERIAL_FIELDS}
 
 
 class SampleReflectance(NamedTuple):
@@ -191,7 +194,8 @@ class Materials:
                 raise ValueError(f"{where}: got a strided array, expected a contiguous one")
         else:
             check.shape(where, array.shape, ("batch", 1 if array.shape[1:] == (1,) else body.mesh.vertex_count))
-        finite_arrays({where: array})
+        minimum, maximum = _LIMITS.get(name, (-check.LARGEST, check.LARGEST))
+        finite_arrays({where: array}, minimum=minimum, maximum=maximum)
         if name in ("albedo", "textures"):
             self._warn_of_growth(where, array)
 

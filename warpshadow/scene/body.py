@@ -239,9 +239,7 @@ class Body:
         expected = "a linear color such as (0.8, 0.1, 0.1), one for each vertex, [vertex, 3], or an .npy file of them"
         if isinstance(self.albedo, str):
             raise ValueError(f"albedo: got {self.albedo!r}, expected {expected}{_css_color_hint(self.albedo)}")
-        albedo = check.numbers("albedo", self.albedo, expected=expected)
-        if albedo.ndim == 0:
-            raise ValueError(f"albedo: got {albedo:g}, expected {expected}; that gray is {(float(albedo),) * 3}")
+        albedo = _checked_colors("albedo", self.albedo, expected)
         if albedo.shape not in ((3,), (count, 3)):
             raise ValueError(f"albedo: got shape {albedo.shape}, expected [3] or [{count}, 3] (one for each vertex)")
         check.reflectance("albedo", albedo)
@@ -253,7 +251,7 @@ class Body:
     def _checked_emission(self, radiance: npt.ArrayLike) -> np.ndarray:
         count = self.mesh.vertex_count
         expected = "a linear color of 0 or more such as (5, 4, 3), one for each vertex, [vertex, 3], or an .npy file"
-        emission = check.numbers("emission", radiance, expected=expected)
+        emission = _checked_colors("emission", radiance, expected)
         if emission.shape not in ((3,), (count, 3)):
             raise ValueError(
                 f"emission: got shape {emission.shape}, expected [3] or [{count}, 3] (one for each vertex)"
@@ -394,6 +392,14 @@ def _colors(mesh: Mesh | MeshSource) -> npt.ArrayLike:
     if colors is None:
         return GRAY
     return colors if np.ptp(colors, axis=0).any() else colors[0]
+
+
+def _checked_colors(name: str, colors: npt.ArrayLike, expected: str) -> np.ndarray:
+    """Colors as an array; ValueError, which has the color, for a number that stands for a gray."""
+    result = check.numbers(name, colors, expected=expected)
+    if result.ndim == 0:
+        raise ValueError(f"{name}: got {result:g}, expected {expected}; that gray is {(result.item(),) * 3}")
+    return result
 
 
 def _read_colors(path: Path, shape: str = "[vertex, 3]") -> np.ndarray:

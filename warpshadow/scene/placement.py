@@ -36,15 +36,20 @@ class _Box(NamedTuple):
         """Whether it shares a place of the plane y = 0 with another."""
         return bool((self.low <= other.high)[[0, 2]].all() and (other.low <= self.high)[[0, 2]].all())
 
+    def meets(self, other: "_Box") -> bool:
+        """Whether it shares a point with another."""
+        return bool((self.low <= other.high).all() and (other.low <= self.high).all())
+
 
 def misplacements(scene: Scene) -> list[str]:
     """Say which bodies are broader than any ground below, or above or below it by more than their size.
 
     Grounds are flat and face +y; the size is the longest edge of the bounds. A body over another that is near enough, a
-    cup on a table, does not float; nor does a lamp.
+    cup on a table, does not float; nor does a lamp, or a body whose bounds meet those of a lamp, such as its shade.
     """
     boxes = [_Box(points.min(axis=0), points.max(axis=0)) for points in (b.world_points() for b in scene.bodies)]
     grounds = {number for number, body in enumerate(scene.bodies) if _is_ground(body, boxes[number])}
+    lamps = [box for body, box in zip(scene.bodies, boxes, strict=True) if body.is_emitter]
     remarks = []
     for number, (body, box) in enumerate(zip(scene.bodies, boxes, strict=True)):
         below = [other for other in grounds - {number} if box.is_over(boxes[other])]
@@ -65,7 +70,7 @@ def misplacements(scene: Scene) -> list[str]:
         depth = boxes[ground].low[1] - box.low[1]
         where = f"body {number} ({body.name!r}), which is {size:.3g} large,"
         which = f"body {ground} ({scene.bodies[ground].name!r}); on_ground() stands it there"
-        if gap > size:
+        if gap > size and not any(map(box.meets, lamps)):
             remarks.append(f"{where} floats {gap:.3g} above {which}")
         elif depth > size:
             remarks.append(f"{where} lies {depth:.3g} below {which}")

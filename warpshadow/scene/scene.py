@@ -6,7 +6,7 @@ import functools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -42,6 +42,16 @@ Item = TypeVar("Item")
 PerBody = Sequence[Item | None] | Mapping[int, Item | None] | Mapping[str, Item | None]
 """Something for each body of a scene, a list of them all; or for some, by their numbers or names."""
 
+
+FUNCTIONS_OF_SCENES = {
+    "render": "warpshadow.render(scene)",
+    "explain": "warpshadow.Renderer(scene).explain()",
+    "tune": "warpshadow.tune(scene)",
+    "view": "warpshadow.view(scene)",
+    "insert": "warpshadow.insert(scene, photograph)",
+    "fit": "warpshadow.inverse.fit(warpshadow.inverse.Problem(scene, targets, free))",
+}
+"""Functions that are looked for among a scene's methods."""
 
 _DEFAULT_VISIBILITY = Visibility()
 
@@ -239,6 +249,13 @@ class Scene:
                 f"bounces: got {self.bounces}, which {self.visibility.method!r} does not find, expected 0, or "
                 f"method = one of {finders}"
             )
+
+    if not TYPE_CHECKING:  # to which it would hide names that there are not
+
+        def __getattr__(self, name: str) -> Any:
+            """Say which function of a scene is meant."""
+            hint = FUNCTIONS_OF_SCENES.get(name)
+            raise AttributeError(f"a Scene has no {name!r}{f' (write {hint})' if hint else ''}")
 
     def __repr__(self) -> str:
         bounces = f", {self.bounces} bounces" if self.bounces else ""

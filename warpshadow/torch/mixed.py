@@ -21,6 +21,15 @@ from warpshadow.scene.scene import BodyLike, PerBody
 from warpshadow.torch.autograd import check_float32, uncompiled
 from warpshadow.torch.renderer import TorchRenderer
 
+_CAMERAS = "clip_matrices=renderer.clip_matrices(R, t, K), R, t and K of renderer.scene_cameras(), one for each image"
+_PLACED = "geometry=renderer.placed(which, rotations, translations)"
+_ELSEWHERE = {
+    **dict.fromkeys(("camera", "cameras"), _CAMERAS),
+    **dict.fromkeys(("poses", "rotations", "translations"), _PLACED),
+    "envmap": "light=",
+}
+"""Remedies for keywords that a call does not have."""
+
 MixedTensors = ImageInputs[torch.Tensor, Sequence[Geometry[torch.Tensor] | None]]
 
 
@@ -71,7 +80,7 @@ class MixedRenderer(torch.nn.Module):
         return self._renderer(0).device
 
     @uncompiled
-    @takes(MixedTensors)
+    @takes(MixedTensors, **_ELSEWHERE)
     def forward(self, which: torch.Tensor | Sequence[int], inputs: MixedTensors) -> torch.Tensor:
         """Render a batch of images.
 

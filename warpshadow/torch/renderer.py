@@ -161,8 +161,7 @@ class TorchRenderer(torch.nn.Module):
             raise ValueError(f"state_dict: got that of a TorchRenderer with {stored_meaning}, expected {expected}")
 
     @uncompiled
-    @check.keywords(**_ELSEWHERE)
-    @takes(ImageTensors)
+    @takes(ImageTensors, **_ELSEWHERE)
     @one_at_a_time
     def forward(self, inputs: ImageTensors) -> torch.Tensor:
         """Render images.
@@ -216,8 +215,7 @@ class TorchRenderer(torch.nn.Module):
         return LayerTensors(depth, normals, bodies, masks.movedim(-1, -3))
 
     @uncompiled
-    @check.keywords(**_ELSEWHERE)
-    @takes(ImageTensors)
+    @takes(ImageTensors, **_ELSEWHERE)
     @one_at_a_time
     def insert(self, photograph: torch.Tensor, inputs: ImageTensors) -> torch.Tensor:
         """Render the bodies in a photograph whose surfaces the scene's shadow catchers model.
@@ -239,8 +237,7 @@ class TorchRenderer(torch.nn.Module):
         return arguments.apply(lambda inputs: self.warp.insert(inputs.pop("photograph"), **inputs), arrays)
 
     @uncompiled
-    @check.keywords(**_ELSEWHERE)
-    @takes(ImageTensors)
+    @takes(ImageTensors, **_ELSEWHERE)
     @one_at_a_time
     def explain(self, inputs: ImageTensors) -> Explanation:
         """List the stages that a call with the same arguments computes and skips, as :meth:`Renderer.explain` does.

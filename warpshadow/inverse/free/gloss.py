@@ -70,7 +70,7 @@ class _Gloss(FreeOfBody):
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Make the body shine so."""
-        value = values["value"]
+        value = self._bounded(values["value"])  # line searches look beyond
         world.gloss[self.key][self.number] = value if self.size is None else value[None]
 
     def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
@@ -79,7 +79,10 @@ class _Gloss(FreeOfBody):
 
     def project(self, values: Values) -> None:
         """Numbers are in [0, 1]; roughness is at least the lowest that is shown."""
-        values["value"].clamp_(MIN_ROUGHNESS if self.key == "roughness" else 0, 1)
+        values["value"].copy_(self._bounded(values["value"]))
+
+    def _bounded(self, numbers: torch.Tensor) -> torch.Tensor:
+        return numbers.clamp(MIN_ROUGHNESS if self.key == "roughness" else 0, 1)
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
         """Make the body shine so."""

@@ -8,6 +8,8 @@ the outward normals N_f and offsets o_f of the faces that x sees, it takes the s
 
 of the beam of the sample, a disc of radius R at the distance d; S is the smoothstep. Parts of a body that are seen side
 by side count as independent: along a seam between them up to a quarter of a sample's light gets through.
+(A bulb in an open shade of 16 panels: 16% off, by dots along the shadows of the seams, receivers at pixels or not. By
+spheres, 256 or 1024 of them, it is 12 to 14% off, since they bulge and leave gaps.)
 """
 
 import warp as wp
