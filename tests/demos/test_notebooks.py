@@ -20,6 +20,8 @@ FOUND = {
     "pose_from_an_image": "assert angle < 0.2 and distance < 0.005",
     "texture_and_light": "assert texture_error(with_shadows) < 0.05 < 0.2 < texture_error(without_shadows)\n"
     "assert relit_error < 0.1",
+    "relight_a_glb": "assert np.abs(found[:, 1:] - (roughness[1:], metallic[1:])).max() < 0.1\n"  # glaze and gold
+    "assert abs(found[0, 0] - roughness[0]) < 0.2 and relit_error < 0.04",
     "error_against_time": "assert results['128 directions'][0] < 0.08 < 0.15 < results['no shadows'][0]\n"
     "assert results['256 rays'][0] < results['16 rays'][0]",
 }
@@ -72,6 +74,7 @@ def test_a_notebook_says_nothing_of_a_machine(path):
     [
         ("pose", [0, 30, 0, 0.15, 0, -0.1], 0.6),  # degrees, and scene units; measured 0.3
         ("texture_and_light", [0, 0], 10),  # percent; measured 2.0 and 6.8
+        ("relight_a_glb", [1, 1], 0.1),  # measured 0.98 and 0.99
         ("error_against_time", [64, 5.5, 128, 5.2, 256, 5.1], 2),  # directions, and percent; measured
     ],
 )
@@ -86,5 +89,5 @@ def test_a_script_finds_what_it_says(name, expected, tolerance, tmp_path, monkey
 
 def test_scripts_are_short():
     scripts = list(SCRIPTS.glob("*.py"))
-    assert len(scripts) == 3
+    assert len(scripts) == 4
     assert all(len(path.read_text("utf-8").splitlines()) <= 50 for path in scripts)
