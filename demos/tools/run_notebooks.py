@@ -2,10 +2,13 @@
 
     python demos/tools/run_notebooks.py [NOTEBOOK …]
 
-Without arguments, all in `demos/notebooks`. They hold neither paths of this machine nor times of the run.
+Without arguments, all in `demos/notebooks`. They hold neither paths of this machine nor times of the run. The first
+pictures of `relight_a_glb` are written beside it as a PNG, for README.md.
 """
 
 import argparse
+import base64
+import io
 import sys
 from pathlib import Path
 
@@ -16,6 +19,7 @@ except ImportError as error:
     raise ImportError(f'{error}; in a checkout pip install -e ".[dev]" installs it') from error
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
+SHOWN = {"relight_a_glb": 2}  # how many pictures of a notebook README.md shows
 MAX_SECONDS = 600  # of a cell: the first one of a new machine compiles kernels and fits spheres
 
 
@@ -45,11 +49,27 @@ def tidied(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
     return notebook
 
 
+def write_pictures(notebook: nbformat.NotebookNode, count: int, path: Path) -> None:
+    """Write the first pictures that a notebook shows side by side."""
+    from PIL import Image
+
+    shown = [output.get("data", {}) for cell in notebook.cells for output in cell.get("outputs", [])]
+    pictures = [data["image/png"] for data in shown if "image/png" in data][:count]
+    images = [Image.open(io.BytesIO(base64.b64decode(picture))) for picture in pictures]
+    joined = Image.new("RGB", (sum(image.width for image in images), images[0].height))
+    for number, image in enumerate(images):
+        joined.paste(image, (sum(other.width for other in images[:number]), 0))
+    joined.save(path)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("notebooks", nargs="*", type=Path, default=sorted(NOTEBOOKS.glob("*.ipynb")))
     for path in parser.parse_args().notebooks:
-        nbformat.write(tidied(executed(path)), path)
+        notebook = tidied(executed(path))
+        nbformat.write(notebook, path)
+        if path.stem in SHOWN:
+            write_pictures(notebook, SHOWN[path.stem], path.with_suffix(".png"))
         sys.stdout.write(f"{path}: {path.stat().st_size / 1e3:.0f} kB\n")
 
 
