@@ -5,7 +5,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import rows
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty
+from warpshadow.device.memory import empty, reshaped
 from warpshadow.device.parallel import run_length, split_row
 from warpshadow.stages.screen import center, ray_volumes, relative_to_ray, relative_to_ray_adjoint
 
@@ -126,4 +126,4 @@ def find_barycentrics(face_ids: wp.array, faces: wp.array, clip_positions: wp.ar
         outputs=[barycentrics],
         shared=[clip_positions],
     )
-    return barycentrics.reshape(face_ids.shape)
+    return reshaped(barycentrics, face_ids.shape)

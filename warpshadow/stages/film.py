@@ -5,7 +5,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty
+from warpshadow.device.memory import empty, reshaped
 from warpshadow.device.parallel import find_run, run_dimensions, run_length
 from warpshadow.stages.interpolation import interpolate_at
 from warpshadow.stages.rasterization import Fragments
@@ -70,7 +70,7 @@ def sample_radiance(fragments: Fragments, faces: wp.array, shading: wp.array, al
         outputs=[samples],
         shared=[shading],
     )
-    return samples.reshape((count, height, width))
+    return reshaped(samples, (count, height, width))
 
 
 @wp.kernel
@@ -107,9 +107,9 @@ def sum_radiance(first: wp.array, second: wp.array) -> wp.array:
     if not first.size:
         return first
     batch_count = common_batch({"first": first, "second": second})
-    sums = wp.empty((batch_count, first[0].size), dtype=wp.vec4, device=first.device)
+    sums = empty((batch_count, first[0].size), dtype=wp.vec4, device=first.device)
     launch(_sum_radiance, sums.shape, inputs=[rows(first), rows(second)], outputs=[sums])
-    return sums.reshape((batch_count, *first.shape[1:]))
+    return reshaped(sums, (batch_count, *first.shape[1:]))
 
 
 @wp.kernel
@@ -143,6 +143,6 @@ def average(samples: wp.array, supersampling: int) -> wp.array:
         return samples
     batch_count, height, width = samples.shape[0], samples.shape[1] // supersampling, samples.shape[2] // supersampling
     pixels = empty((batch_count * height, width), dtype=wp.vec4, device=samples.device)
-    sample_grid = samples.reshape((batch_count * height, supersampling, width, supersampling))
+    sample_grid = reshaped(samples, (batch_count * height, supersampling, width, supersampling))
     launch(_average, pixels.shape, inputs=[sample_grid, supersampling], outputs=[pixels])
-    return pixels.reshape((batch_count, height, width))
+    return reshaped(pixels, (batch_count, height, width))

@@ -12,7 +12,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty
+from warpshadow.device.memory import empty, reshaped
 from warpshadow.device.parallel import find_run, run_dimensions, run_length
 from warpshadow.device.warp_internals import scalar_type
 from warpshadow.stages.rasterization import Fragments
@@ -118,4 +118,4 @@ def interpolate(fragments: Fragments, faces: wp.array, attributes: wp.array) -> 
         outputs=[image],
         shared=[attributes],
     )
-    return image.reshape((batch_count, *face_ids.shape[1:]))
+    return reshaped(image, (batch_count, *face_ids.shape[1:]))

@@ -18,7 +18,7 @@ from warpshadow import check
 from warpshadow.device.array_checks import values_of
 from warpshadow.device.batch import rows
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty, zeros
+from warpshadow.device.memory import empty, reshaped, zeros
 from warpshadow.device.parallel import run_length, split_row, strip_count, thread_count
 from warpshadow.stages.barycentrics import find_barycentrics
 
@@ -71,7 +71,7 @@ class Fragments:
     @functools.cached_property
     def flat(self) -> list[wp.array]:
         """The arrays as [sample], instance after instance."""
-        return [self.face_ids.flatten(), self.barycentrics.flatten()]
+        return [reshaped(self.face_ids, (-1,)), reshaped(self.barycentrics, (-1,))]
 
 
 @wp.kernel(enable_backward=False)
@@ -441,7 +441,7 @@ def _visible_faces(clip_positions: wp.array, faces: wp.array, width: int, height
         _resolve_layers,
         face_ids.size // run,
         cost=_SAMPLE_COST * layer_count * run,
-        inputs=[keys.reshape((batch_count, layer_count, height * width)), run],
+        inputs=[reshaped(keys, (batch_count, layer_count, height * width)), run],
         outputs=[rows(face_ids)],
     )
 

@@ -13,7 +13,7 @@ import warp as wp
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty, from_numpy, zeros
+from warpshadow.device.memory import empty, from_numpy, reshaped, zeros
 from warpshadow.device.parallel import run_length
 from warpshadow.stages.interpolation import interpolate_at
 from warpshadow.stages.quadtree import Quadtree
@@ -393,7 +393,7 @@ def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: 
         _mark_visible_corners,
         sides.size // run,
         cost=_MARK_COST * run,
-        inputs=[sides.flatten(), silhouettes.faces, run],
+        inputs=[reshaped(sides, (-1,)), silhouettes.faces, run],
         outputs=[corners],
     )
     is_visible, edges = corners.numpy(), silhouettes.edges.numpy()

@@ -16,7 +16,7 @@ import warp as wp
 from warpshadow.device.batch import rows
 from warpshadow.device.constants import cached_by_values, constant
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty, from_numpy
+from warpshadow.device.memory import empty, filled, from_numpy, reshaped
 from warpshadow.device.parallel import run_length, split_row
 from warpshadow.stages.quadtree import Quadtree, sample_at
 from warpshadow.stages.rasterization import Fragments
@@ -278,7 +278,7 @@ def find_sample_receivers(
         receiver_numbers = from_numpy(number_of_samples.reshape(sides.shape), dtype=wp.int32, device=device)
         if quadtree is not None:
             triangles = number_of_samples[quadtree.triangles]
-    samples = wp.full((view_count, int(ends[-1])), -1, dtype=wp.int32, device=device)
+    samples = filled((view_count, int(ends[-1])), -1, dtype=wp.int32, device=device)
     run = run_length(device, width)
     launch(
         _number_fragments,
@@ -289,7 +289,7 @@ def find_sample_receivers(
     )
     sample_fragments = mean_fragments(surface, fragments, owner_samples, is_corner, samples, supersampling)
     return SampleReceivers(
-        Fragments(receiver_sides.reshape(shape), weights.reshape(shape)),
+        Fragments(reshaped(receiver_sides, shape), reshaped(weights, shape)),
         sample_fragments,
         triangles,
         tuple(

@@ -4,7 +4,7 @@ import warp as wp
 
 from warpshadow.device.batch import instance_in, rows
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import zeros
+from warpshadow.device.memory import reshaped, zeros
 from warpshadow.stages.screen import (
     ends_before,
     half_size,
@@ -115,11 +115,11 @@ def find_edge_colors(
         _find_edge_colors,
         edge_colors.shape[:2],
         inputs=[
-            image.reshape(shape),
+            reshaped(image, shape),
             silhouettes.samples,
             silhouettes.edges,
             make_fragment_arrays(fragments, silhouettes.faces, clip_positions),
-            None if fragments.sides is None else fragments.sides.flatten(),
+            None if fragments.sides is None else reshaped(fragments.sides, (-1,)),
             shading,
             receivers,
             rows(albedo),

@@ -13,7 +13,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty
+from warpshadow.device.memory import empty, filled
 from warpshadow.device.parallel import run_length, split_row, strip_count
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.screen import (
@@ -330,7 +330,7 @@ def find_silhouettes(
     if sample_count > MAX_SAMPLES:
         raise ValueError(f"fragments: got {sample_count} samples in all, expected at most {MAX_SAMPLES}")
     arrays, strips = make_fragment_arrays(fragments, faces, clip_positions), strip_count(device)
-    crossing_arrays = wp.full((4, sample_count), NOTHING, dtype=wp.int32, device=device)
+    crossing_arrays = filled((4, sample_count), NOTHING, dtype=wp.int32, device=device)
     half_edges, crossings = crossing_arrays[:2], crossing_arrays[2:]  # 3 face + corner, or INTERSECTION
     if creases is not None:
         check.shape("creases", creases.shape, faces.shape)

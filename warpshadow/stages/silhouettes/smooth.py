@@ -19,7 +19,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import accumulate
 from warpshadow.device.launch import differentiable, launch
-from warpshadow.device.memory import zeros
+from warpshadow.device.memory import copied, reshaped, zeros
 from warpshadow.device.warp_internals import scalar_type
 from warpshadow.stages.interpolation import inner_product
 from warpshadow.stages.screen import neighbor, opposite
@@ -153,15 +153,15 @@ def smooth_silhouettes(
     if scalar_type(image.dtype) is not wp.float32:
         raise ValueError(f"image: got dtype {image.dtype.__name__}, expected float32 or a vector of them")
     shape, samples, shares = silhouettes.flat_shape(image), silhouettes.samples, silhouettes.shares
-    dim, inputs = (shape[0], samples.size), [image.reshape(shape), samples, shares, width]
+    dim, inputs = (shape[0], samples.size), [reshaped(image, shape), samples, shares, width]
 
     def blend(smoothed: wp.array) -> None:
-        launch(_make_blend(image.dtype), dim, inputs=inputs, outputs=[smoothed.reshape(shape)])
+        launch(_make_blend(image.dtype), dim, inputs=inputs, outputs=[reshaped(smoothed, shape)])
 
     def adjoint(adj_smoothed: wp.array) -> None:
-        adj_smoothed, adj_image, adj_areas = adj_smoothed.reshape(shape), None, None
+        adj_smoothed, adj_image, adj_areas = reshaped(adj_smoothed, shape), None, None
         if image.requires_grad:
-            adj_image = image.grad.reshape(shape)
+            adj_image = reshaped(image.grad, shape)
             accumulate(adj_smoothed, adj_image)
         if clip_positions.requires_grad:
             adj_areas = zeros(shares.shape, dtype=wp.float32, device=shares.device)
@@ -175,4 +175,4 @@ def smooth_silhouettes(
             arrays = make_fragment_arrays(fragments, silhouettes.faces, clip_positions)
             measure_areas_adjoint(samples, silhouettes.edges, arrays, adj_areas)
 
-    return differentiable(blend, adjoint, wp.clone(image, requires_grad=False), [image, clip_positions])
+    return differentiable(blend, adjoint, copied(image), [image, clip_positions])
