@@ -81,8 +81,8 @@ class HarmonicLight:
 
 
 KnownLight = EnvironmentMap | HarmonicLight
-"""Known light of any kind. It has ``radiance``, ``towards``, ``rotated``, ``scaled``, ``bands``, ``sh`` and ``cells``;
-methods of visibility ask for no more."""
+"""Known light of any kind. It has ``radiance``, ``towards``, ``rotated``, ``scaled``, ``bands``, ``sh`` and ``cells``,
+and compares by value; methods of visibility ask for no more, but for the shell of a map."""
 
 
 def as_light(light: EnvironmentMap | np.ndarray) -> KnownLight:

@@ -1,8 +1,9 @@
 """Launching: run kernels, and record their adjoints on the tape.
 
-A kernel has either Warp's own adjoint, which the tape plays back, in slices where the kernel runs in slices; or one
-written by hand as another kernel (``enable_backward=False``). :func:`launch_with_adjoint` launches such a pair; where
-more than a launch is needed, :func:`differentiable` pairs functions. Either way a result requires a gradient if an
+A kernel has either Warp's own adjoint, which the tape plays back, in slices where the kernel runs in slices, maybe of
+functions with ``wp.func_grad``; or one written by hand as another kernel (``enable_backward=False``).
+:func:`launch_with_adjoint` launches such a pair; where more than a launch is needed, :func:`differentiable` pairs
+functions, and for several results :func:`.tape.record_adjoint`. Either way a result requires a gradient if an
 array that it depends on does, and nothing is recorded if none does.
 """
 

@@ -19,17 +19,20 @@ _BOUND_GROWTH = 2.0  # of the bound, where a step that reached it was kept
 _MIN_BOUND_FACTOR, _MAX_BOUND_FACTOR = 0.1, 0.5  # factors of the bound after a rejected step, relative to the step
 _MAX_BOUND = 5.0  # the bound at most, in learning rates
 _MIN_CURVATURE_COSINE = 1e-3  # least cosine of a step and the change of the gradient that tell the curvature
-_ALIKE = 10.0  # ratio of scales up to which a tensor has that of all: 1 made losses of poses leap between stages
-_MAX_SCALE_RATIO = 1e4  # of a tensor's scale to that of all, and back
+_ALIKE = 10.0
+"""Ratio up to which a tensor has the scale of all; of a larger ratio this part is left out, so that scales do not jump.
+With 1, losses of poses leaped between stages."""
+
+_MAX_SCALE_RATIO = 1e4  # of the rest of that ratio, and of its inverse
 
 
 class QuasiNewton(torch.optim.Optimizer):
     """L-BFGS with bounded steps, one evaluation each.
 
-    The direction is that of Nocedal and Wright 2006, algorithm 7.4, but that curvature which no step has told of is
-    taken to be each tensor's own. Taken to be that of all, it would be the steepest one's: a flat tensor would not
-    move, and promise nothing, so that the fit would count as converged. (The roughness of a shiny ball had 1e4 times
-    the curvature of a dull bunny's.)
+    The direction is that of Nocedal and Wright 2006, algorithm 7.4, but curvature that no step has told of is not taken
+    to be alike in all tensors: one with a scale of its own beyond tenfold of that of all has it, but for that tenfold.
+    Else it would be the steepest one's: a flat tensor would not move, and promise nothing, so that the fit would count
+    as converged. (The roughness of a shiny ball had 1e4 times the curvature of a dull bunny's.)
 
     No value changes by more than a bound. A step that lowers the loss is kept, and the bound grows if it was reached.
     Another one is taken back and makes the bound shorter; the gradient at its end tells of curvature nonetheless.
@@ -175,9 +178,10 @@ class QuasiNewton(torch.optim.Optimizer):
         return (torch.from_numpy(factors).to(vectors) @ vectors * scales).to(downhill)
 
     def _scales(self, steps: torch.Tensor, changes: torch.Tensor) -> torch.Tensor:
-        """Square root of how far a value's tensor moved for how much its gradient changed, [value].
+        """Scale of each value, that of its tensor: √(change of the tensor over change of its gradient), [value].
 
-        A root mean square of steps [step, value], each of which counts by its curvature, so long ones as short ones.
+        Both are root mean squares over steps [step, value], each divided by its curvature, so that long steps count as
+        short ones.
         """
         curvatures = _row_dots(steps, changes).clamp_min(torch.finfo(steps.dtype).tiny)
         sizes = [tensor.numel() for tensor in self._tensors]

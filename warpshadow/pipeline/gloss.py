@@ -74,7 +74,8 @@ class GlossyPoints(LitPoints):
             bounced: Node of the view's shading without direct light of emitters.
         """
         item_text = functools.partial(receiver_text, self.in_words)
-        roughness, metallic, specular = (self._values(materials, name) for name in GLOSS_ARGUMENTS)
+        numbers = {name: self._values(materials, name) for name in GLOSS_ARGUMENTS}
+        roughness = numbers["roughness"]
         key = materials.roughness
 
         def lobes() -> Node:
@@ -98,7 +99,14 @@ class GlossyPoints(LitPoints):
         if materials.emission:
             sums = Node("", _add, sums, self.method.highlights(self, materials, roughness, self._cameras))
         lobe_light = field_of(sums, "straight"), field_of(sums, "grazing")
-        arguments = self._numbers, diffuse, *lobe_light, field_of(sampled, "cosines"), metallic, specular
+        arguments = (
+            self._numbers,
+            diffuse,
+            *lobe_light,
+            field_of(sampled, "cosines"),
+            numbers["metallic"],
+            numbers["specular"],
+        )
         mix = Node("reflection", mix_reflection, *arguments, items=item_text)
         return field_of(mix, "colored"), field_of(mix, "white")
 

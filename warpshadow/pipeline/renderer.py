@@ -176,10 +176,10 @@ class SceneRenderer:
     def view(self, geometry: Geometry[wp.array] | None = None, clip_matrices: wp.array | None = None) -> View:
         """See a geometry through cameras; the last view again if nothing that it depends on changed.
 
-        A view copies its arguments: arrays may change afterwards, unless they require a gradient. A changed tensor is
-        recognized by torch's count of the writes to it, which leaves out writes through NumPy and ``.data``; other
-        arrays by their values. On a GPU values are not compared, since the host would have to wait: hold on to the view
-        there.
+        A view copies its arguments: arrays may change afterwards, unless they require a gradient. On a CPU changes are
+        recognized by values. On a GPU these are not compared, since the host would have to wait: a changed tensor is
+        recognized by torch's count of the writes to it, which leaves out writes through NumPy and ``.data``; with other
+        arrays, hold on to the view.
 
         Args:
             geometry: Instances of vertices and spheres, by default the scene's own.
@@ -317,7 +317,7 @@ class SceneRenderer:
             inputs: All that an image takes.
         Returns:
             Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]; the background is 0.
-        Differentiable: all.
+        Differentiable: all; not by "ray-traced": geometry, shell.
         """
         view = inputs.view
         if view is None and not (inputs.geometry is None and inputs.clip_matrices is None):

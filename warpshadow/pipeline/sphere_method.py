@@ -212,7 +212,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         """Share of a group's unblocked light that comes from the cells with the sharpest shadows.
 
         Returns:
-            Shape [batch, receiver]; None where no shadow is sharp.
+            Shape [batch, receiver], the brightest cells in place of sharp ones if none is; None where nothing blocks.
         """
         return None
 

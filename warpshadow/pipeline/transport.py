@@ -1,4 +1,4 @@
-"""Light transport: which nodes make the light on receivers. This is the one place where they are chosen.
+"""Light transport: which nodes make the light on receivers, direct and bounced.
 
 Light on receivers is direct light, light that bounces, and direct light of emitters. By light, bounces, reflectance,
 and where bodies and cameras are:
@@ -7,15 +7,15 @@ and where bodies and cameras are:
 | --- | --- | --- | --- | --- | --- |
 | known | none | any | any | shaded at once | shaded at once |
 | free | none | any | any | transfer vectors | transfer vectors |
-| known | some | the scene's | any | moving patches | paths; where they are shared, static patches |
+| known | some | the scene's | any | moving patches | paths; where receivers share directions, static patches |
 | known | some | given | the scene's | static patches | static patches |
 | known | some | given | given | moving patches | static patches |
 | free | some | any | the scene's | static patches | static patches |
 | free | some | any | given | moving patches | static patches |
 
 The first two rows are :meth:`.Method.direct_shading`, the others :func:`choose_bouncing`. Static patches cache form
-factors, after which an iteration is small matrices; moving ones find all anew in each call, also where the shading is
-cached as a whole. A shell is part of the light. Bodies that shine and emit come on top, in :meth:`.View.image`.
+factors, after which an iteration is small matrices; moving ones find all but cached visibility in each call. A shell is
+part of the light. Light of emitters is added here; the radiance that they show, and gloss, in :meth:`.View.image`.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ class MaterialField(NamedTuple):
 
     Args:
         name: Of the field of a body, of the key of a scene file, and of the argument of a renderer.
-        default: Of a body that shines and does not say.
+        default: Of a body that does not say. A roughness makes a body shine; others need a number in arrays of all.
         minimum, maximum: The range that is accepted.
         is_in_files: Whether materials of meshes' files have it, as glTF's do.
     """
@@ -26,7 +26,7 @@ class MaterialField(NamedTuple):
 
 
 MATERIAL_FIELDS = (
-    MaterialField("roughness", 1.0, is_in_files=True),  # a body shines that has it; the default is for all others
+    MaterialField("roughness", 1.0, is_in_files=True),
     MaterialField("metallic", 0.0, is_in_files=True),
     MaterialField("specular", 1.0),
 )

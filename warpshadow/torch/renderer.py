@@ -172,7 +172,7 @@ class TorchRenderer(torch.nn.Module):
             Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4], or [batch, height, width, 4]
             where an argument has a batch dimension or the renderer's own cameras have; the background is 0.
         Differentiable: all; stages/README.md says how exactly. Gradients to light and emission,
-            and where no light bounces to albedo and textures, may be differentiated again, in all of these;
+            and where no light bounces to albedo and textures, may be differentiated again, in all tensors;
             others raise NotImplementedError then.
         """
         arguments, arrays = self._arrays_of(inputs)

@@ -8,8 +8,9 @@ G is applied as often as light bounces: first at the patch samples, points where
 receivers of the image. It has three parts, each a stage of its own: light from a body's own patches, from plane bodies,
 and from the proxies of other bodies. A blocked part of a cell sends light of one of the three.
 
-Between patches of one body the first part is a small matrix that does not change. After the last bounce between bodies,
-light within each body bounces ``SELF_BOUNCES`` times more, since hollow bodies keep it long.
+Between patches of one body the first part is a small matrix that does not change. Light within each body bounces
+``SELF_BOUNCES`` times more, since hollow bodies keep it long: after the last bounce between bodies, and of all bounces
+after each.
 """
 
 from __future__ import annotations

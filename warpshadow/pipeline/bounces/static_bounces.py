@@ -1,4 +1,4 @@
-"""Bounces where geometry does not move: rays once, then small matrices in each iteration, by any method that lights.
+"""Bounces between static patches: rays once for a geometry, then small matrices for each light and reflectance.
 
 Of patches p, points x on them at which they are lit (patch samples s), and receivers, rays find the form factors F
 once. With direct shading S and albedo a an iteration finds the radiosity of patches after n − 1 bounces, or after all,
@@ -60,8 +60,8 @@ STILL_RAYS = 256
 against paths with these, and of 1.93% with 1024, in 3.1 and 7.1 s of CPU time."""
 
 _BRIGHT_PART = 4
-"""One in so many rays of a still again goes to bright patches. In a room lit by a bulb in a shade bounced light of a
-still is 9.2% off without these, 3.0% with 32, 2.3% with 64 and 1.2% with 256."""
+"""Rays of a still for each one that it sends to bright patches besides. In a room lit by a bulb in a shade stills are
+9.2% off without such rays, 3.0% with 32, 2.3% with 64 and 1.2% with 256."""
 
 
 class _GeometryFactors(NamedTuple):
@@ -88,7 +88,7 @@ class _GeometryFactors(NamedTuple):
 
 
 class StaticBounces:
-    """Light that bounces between the bodies of a scene that do not move.
+    """Light that bounces between bodies whose form factors rays find once.
 
     Args:
         method: How light is blocked.

@@ -35,7 +35,7 @@ def nonplanar_bodies(merged_scene: MergedScene) -> list[int]:
 
 
 class Group(NamedTuple):
-    """Receivers whose light the same spheres block: the spheres of all bodies, or of all but the receivers' own."""
+    """Receivers whose light the same spheres block: of all bodies, all but their own, or those that move."""
 
     points: wp.array  # [batch, receiver] vec3
     normals: wp.array  # [batch, receiver] vec3
@@ -147,7 +147,7 @@ class CellVisibility(NamedTuple):
     directions: np.ndarray  # of the cells, [cell, 3]
     transmittance_total: wp.array | None  # past all bodies; None before those of planes, where light does not bounce
     transmittance_self: wp.array | None = None  # a factor of it: transmittance past its own body; None where that is 1
-    transmittance_nonplanar: wp.array | None = None  # past all but planes; None where no planes block
+    transmittance_nonplanar: wp.array | None = None  # past all but planes; None where no planes block, or nobody asks
     # transmittance past its own body and spheres, without convex parts and planes; None where that is 1
     transmittance_self_and_spheres: wp.array | None = None
     part_coverages: CellCoverages | None = None  # coverage by convex parts; None where there are none around

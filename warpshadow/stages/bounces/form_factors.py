@@ -127,8 +127,9 @@ def trace_form_factors(
         count: Number of patches.
         points: Receivers, which may lie on the mesh, shape [receiver, 3].
         normals: Unit normals, shape [receiver, 3]. Where one is zero nothing is seen.
-        rays: Rays of each receiver.
+        rays: Rays of each receiver in all directions.
         bright: Patches of the mesh that more rays are sent to; None for none.
+        progress: Print how far it is.
     Returns:
         F, float32 of shape [receiver, patch].
     Differentiable: no.
