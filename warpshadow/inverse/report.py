@@ -107,8 +107,8 @@ class Report:
         known_entries = {} if light is None else {"light": {"undetermined": round(light.undetermined_share, 4)}}
         unsure = self._uncertainty_table()
         figures = {json.dumps(key): item if len(item) > 1 else item[0] for key, item in self.result.figures.items()}
-        found = {"figures": figures} if figures else {}
-        return {"fit": fit, **found, **known_entries, **unsure, "view": views, "image": images}
+        of_fit = {"figures": figures} if figures else {}
+        return {"fit": fit, **of_fit, **known_entries, **unsure, "view": views, "image": images}
 
     def _uncertainty_table(self) -> toml_tables.Table:
         """Standard deviations of poses, light and exposures; a warning for each body that hardly is where it is."""
