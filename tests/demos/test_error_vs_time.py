@@ -38,7 +38,8 @@ def test_settings_differ_in_their_labels_and_one_of_them_is_the_default(ball):
     labels = [Measured(each.family, each.size, each.details, 1, 1).label for each in settings]
     assert len(set(labels)) == len(labels)
     default = settings[labels.index("directional 128")].scene
-    assert dataclasses.asdict(default.visibility) == dataclasses.asdict(ws.Visibility())
+    assert dataclasses.asdict(default.visibility) == dataclasses.asdict(ws.Visibility("directional", directions=128))
+    assert default.direction_count == ball.direction_count
     assert default.bodies == ball.bodies
     assert {each.family for each in settings} == set(error_vs_time.COLORS) - {"Mitsuba"}
     counts = {each.scene.bodies[0].blockers for each in settings if "16 spheres" in each.details}
