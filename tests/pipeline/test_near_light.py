@@ -122,6 +122,23 @@ def test_gradients_are_those_of_differences(name, renderer):
         assert float((value.grad * way).sum()) == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=0.03, abs=0.02)
 
 
+def test_the_shell_of_free_light_in_another_basis_has_its_gradient_with_bounces():
+    scene = scene_of(bounces=1)
+    camera = ws.Camera.look_at((1.2, 2.2, 2.0), (0.5, 0, 0.8), fov_y=16, size=(24, 24))
+    basis = ws.HarmonicBasis(3)
+    renderer = TorchRenderer(dataclasses.replace(scene, camera=camera), basis=basis)
+    light = torch.as_tensor(basis.coefficients(scene.light), dtype=torch.float32)
+    shell, way = torch.tensor([*CENTER, 2.2], requires_grad=True), torch.tensor([0.4, -0.2, 0.3, 0.5])
+
+    def loss(shell):
+        return (renderer(light, shell=shell)[..., :3].double() * torch.linspace(0.2, 1, 24)[:, None, None]).sum()
+
+    loss(shell).backward()
+    with torch.no_grad():
+        ends = [float(loss(shell + sign * 10 * STEP * way)) for sign in (1, -1)]
+    assert float(shell.grad @ way) == pytest.approx((ends[0] - ends[1]) / (20 * STEP), rel=0.03)
+
+
 def test_a_batch_of_shells_is_one_after_another(renderer):
     shells = torch.tensor([[*CENTER, 2.2], [0.1, 0.6, 0, 2.5]])
     together = renderer(shell=shells)

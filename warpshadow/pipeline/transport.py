@@ -52,7 +52,7 @@ def choose_bouncing(
     Args:
         is_free: Whether the light is free.
         is_given: Whether some reflectance is given in place of the scene's.
-        is_of_scene: Whether bodies and cameras are where the scene has them, for good.
+        is_of_scene: Whether bodies and cameras are where the scene has them, for good, and no shell moves.
         has_proxies, shares_directions: Of the method.
     """
     if has_proxies:
@@ -98,10 +98,11 @@ class LightTransport:
 
     def bouncing(self, points: LitPoints, light: LightInput, materials: Materials) -> Bouncing:
         """How light bounces onto points."""
+        shell_moves = light.shell is not None and light.shell.requires_grad
         return choose_bouncing(
             is_free=light.is_free,
             is_given=materials is not points.materials,
-            is_of_scene=points.is_scene_view,
+            is_of_scene=points.is_scene_view and not shell_moves,
             has_proxies=self.method.has_proxies,
             shares_directions=self.method.shares_directions,
         )
