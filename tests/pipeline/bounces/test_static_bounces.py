@@ -361,3 +361,13 @@ def test_the_bounced_light_of_a_bulb_in_a_shade_has_no_grain_in_stills(monkeypat
     monkeypatch.setattr(static_bounces, "STILL_RAYS", 2048)
     expected = ws.render(scene)[..., :3]
     assert np.linalg.norm(still - expected) < 0.07 * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("light", ["known", "free"])
+def test_an_image_that_shows_no_body_is_empty(light):
+    away = ws.Camera.look_at((0, 2, 5), (0, 4, 12), size=(8, 8))
+    scene = replace(ball_on_ground(), camera=away, visibility=ws.Visibility("ray-traced", samples=16, sampling="shared"))
+    basis = ws.HarmonicBasis(3) if light == "free" else None
+    with pytest.warns(UserWarning, match="no"):
+        image = TorchRenderer(scene, basis=basis)(None if basis is None else torch.ones(9, 3))
+    assert not image.any()

@@ -48,7 +48,9 @@ def interpolation_matrix(points: np.ndarray, normals: np.ndarray, cache_points: 
     from scipy.sparse import csr_matrix
     from scipy.spatial import cKDTree
 
-    extent = float(np.ptp(points, axis=0).max(initial=0.0)) or 1.0
+    if not len(points):
+        return csr_matrix((0, len(cache_points)), dtype=np.float32)
+    extent = float(np.ptp(points, axis=0).max()) or 1.0
     features = np.concatenate([points / extent, _NORMAL_DISTANCE * normals], axis=1).astype(np.float64)
     neighbor_count = min(_NEIGHBORS + 1, len(cache_points))
     distances, neighbors = cKDTree(features[cache_points]).query(features, k=neighbor_count)
