@@ -37,6 +37,7 @@ for _ in range(60):
     optimizer.zero_grad()
     torch.nn.functional.mse_loss((image + 0.1).log(), (target + 0.1).log()).backward()
     optimizer.step()
+    free.data.clamp_(0, 1)  # no number of a surface is above 1
     schedule.step()
 print("factors of roughness and metallic:", free.detach().numpy().round(2))
 ws.Picture(np.concatenate([target, image.detach()], axis=1), exposure=0.5, tone="filmic").write("relit.png")

@@ -366,7 +366,8 @@ def test_the_bounced_light_of_a_bulb_in_a_shade_has_no_grain_in_stills(monkeypat
 @pytest.mark.parametrize("light", ["known", "free"])
 def test_an_image_that_shows_no_body_is_empty(light):
     away = ws.Camera.look_at((0, 2, 5), (0, 4, 12), size=(8, 8))
-    scene = replace(ball_on_ground(), camera=away, visibility=ws.Visibility("ray-traced", samples=16, sampling="shared"))
+    rays = ws.Visibility("ray-traced", samples=16, sampling="shared")
+    scene = replace(ball_on_ground(), camera=away, visibility=rays)
     basis = ws.HarmonicBasis(3) if light == "free" else None
     with pytest.warns(UserWarning, match="no"):
         image = TorchRenderer(scene, basis=basis)(None if basis is None else torch.ones(9, 3))
