@@ -33,6 +33,7 @@ class QuasiNewton(torch.optim.Optimizer):
     to be alike in all tensors: one with a scale of its own beyond tenfold of that of all has it, but for that tenfold.
     Else it would be the steepest one's: a flat tensor would not move, and promise nothing, so that the fit would count
     as converged. (The roughness of a shiny ball had 1e4 times the curvature of a dull bunny's.)
+    A flat tensor that the loss couples to a steep one may still be left behind.
 
     No value changes by more than a bound. A step that lowers the loss is kept, and the bound grows if it was reached.
     Another one is taken back and makes the bound shorter; the gradient at its end tells of curvature nonetheless.
