@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 import warpshadow as ws
-from warpshadow.pipeline import view as view_module
+from warpshadow.pipeline.views import view as view_module
 from warpshadow.stages import film
 from warpshadow.stages.textures import pyramid, sample
 from warpshadow.torch import TorchRenderer, apply, rotation_matrices

@@ -12,7 +12,7 @@ import warp as wp
 import warpshadow as ws
 from warpshadow import inverse
 from warpshadow.inverse.uncertainty import NormalMatrix
-from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
 # Interpolation between texels is linear piece by piece, and steps of differences go over some. Measured 0.1 to 1.2%.

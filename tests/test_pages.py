@@ -18,7 +18,7 @@ from warpshadow.cli import app
 from warpshadow.dataset import Recipe, load_recipe
 from warpshadow.inverse.fit_file import load_fit
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline import scene_views
+from warpshadow.pipeline.views import scene_views
 from warpshadow.scene import blockers
 from warpshadow.scene.visibility import DIRECTIONS
 

@@ -9,7 +9,7 @@ import warp as wp
 
 import warpshadow as ws
 from warpshadow.device import cuda_graph
-from warpshadow.pipeline import view as view_module
+from warpshadow.pipeline.views import view as view_module
 from warpshadow.torch import TorchRenderer
 from warpshadow.torch.replay import Capture
 

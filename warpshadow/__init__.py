@@ -26,7 +26,7 @@ from warpshadow.device.progress import show_bars as _show_bars
 from warpshadow.device.startup import start_quietly as _start_quietly
 from warpshadow.device.threads import one_call as _one_call
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.geometry import Geometry
+from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.scene.body import Body
 from warpshadow.scene.camera_path import CameraPath, Keyframe
 from warpshadow.scene.files import SceneError, load_scene, write_scene
@@ -36,7 +36,7 @@ from warpshadow.scene.visibility import Visibility
 from warpshadow.spheres import Spheres, fit_spheres
 
 if _TYPE_CHECKING:
-    from warpshadow.pipeline.layers import Layers
+    from warpshadow.pipeline.views.layers import Layers
     from warpshadow.tuning.insert import insert
     from warpshadow.tuning.renderer import Renderer, render
     from warpshadow.tuning.tune import Tuning, tune

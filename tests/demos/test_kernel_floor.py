@@ -10,7 +10,7 @@ from demos.tools import kernel_floor
 from demos.tools.kernel_floor import Size, Work
 from warpshadow.device.cuda_graph import with_gradients
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline import view as view_module
+from warpshadow.pipeline.views import view as view_module
 
 SIZE = Size(vertices=1000, faces=1900, spheres=20, directions=64, samples=4096)
 

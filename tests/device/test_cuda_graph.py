@@ -17,9 +17,9 @@ from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import collected
 from warpshadow.device.cuda_graph import Captured, with_gradients
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline import method as method_module
 from warpshadow.pipeline import node
-from warpshadow.pipeline import view as view_module
+from warpshadow.pipeline.shading import method as method_module
+from warpshadow.pipeline.views import view as view_module
 from warpshadow.stages import Poses
 from warpshadow.stages.textures.pyramid import mip_pyramids
 

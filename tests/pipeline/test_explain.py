@@ -14,11 +14,12 @@ from warpshadow.assets.basis import HarmonicBasis
 from warpshadow.device import warp_internals
 from warpshadow.device.batch import expand
 from warpshadow.maths.directions import CHUNK, fibonacci
-from warpshadow.pipeline import merged_scene, node
-from warpshadow.pipeline.geometry import Geometry
+from warpshadow.pipeline import node
+from warpshadow.pipeline.bodies import merged_scene
+from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.methods import directional as directional_method
 from warpshadow.pipeline.renderer import SceneRenderer
-from warpshadow.pipeline.view import View
+from warpshadow.pipeline.views.view import View
 from warpshadow.stages.light_samples import sample_map
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.poses import Poses

@@ -13,7 +13,7 @@ from warpshadow.assets.basis import CellBasis, HarmonicBasis
 from warpshadow.device import array_checks
 from warpshadow.maths import sh
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.geometry import Geometry
+from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.methods import directional
 from warpshadow.pipeline.receivers import groups
 from warpshadow.pipeline.receivers.choice_of_receivers import for_picture

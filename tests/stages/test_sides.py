@@ -11,9 +11,9 @@ import warp as wp
 import warpshadow as ws
 from warpshadow.assets.basis import HarmonicBasis
 from warpshadow.device import warp_internals
-from warpshadow.pipeline import view as view_module
-from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.renderer import SceneRenderer
+from warpshadow.pipeline.views import view as view_module
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.project import to_clip
 from warpshadow.stages.rasterization import rasterize

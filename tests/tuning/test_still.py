@@ -167,7 +167,7 @@ def test_a_still_fits_no_spheres_and_traces_no_tables(monkeypatch):
         raise AssertionError("a still asked for it")
 
     monkeypatch.setattr("warpshadow.scene.blockers.fit_spheres", refuse)
-    monkeypatch.setattr("warpshadow.pipeline.self_visibility.SelfVisibility.rows", refuse)
+    monkeypatch.setattr("warpshadow.pipeline.bodies.self_visibility.SelfVisibility.rows", refuse)
     assert np.isfinite(ws.render(scene(16))).all()
 
 

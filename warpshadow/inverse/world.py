@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from warpshadow.assets.camera import Camera
-from warpshadow.pipeline.geometry import Geometry
+from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.scene.blockers import scene_blockers
 from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.scene.scene import Scene

@@ -15,7 +15,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.assets.light import EnvironmentMap
-from warpshadow.pipeline.geometry import Geometry
+from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.scene.material import INPUTS_OF_BODIES
 from warpshadow.scene.scene import PerBody
 

@@ -20,24 +20,24 @@ from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.progress import waiting
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import announced, one_at_a_time
-from warpshadow.pipeline.catchers import CatchersAlone
+from warpshadow.pipeline.bodies.geometry import Geometry, as_geometry
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.delegation import delegated
 from warpshadow.pipeline.explain import Explanation, decide, shell_notes
-from warpshadow.pipeline.geometry import Geometry, as_geometry
 from warpshadow.pipeline.image_inputs import ImageArrays, takes
-from warpshadow.pipeline.layers import LayerArrays, Layers, find_layer_arrays, find_layers
-from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.methods.by_name import make_method
 from warpshadow.pipeline.node import Clock, Input, Node
 from warpshadow.pipeline.receivers.choice_of_receivers import choose_receivers, receiver_notes, with_receivers
 from warpshadow.pipeline.receivers.lit_points import LitPoints
-from warpshadow.pipeline.reflectance import Materials
-from warpshadow.pipeline.scene_views import SceneViews, camera_batch
-from warpshadow.pipeline.shading_ratio import shading_ratio
-from warpshadow.pipeline.transfers import Light, ShellLight, one_transfer
+from warpshadow.pipeline.shading.transfers import Light, ShellLight, one_transfer
 from warpshadow.pipeline.transport import LightTransport
-from warpshadow.pipeline.view import View
-from warpshadow.pipeline.view_warnings import warn_of_vertex_receivers, warn_of_view
+from warpshadow.pipeline.views.catchers import CatchersAlone
+from warpshadow.pipeline.views.layers import LayerArrays, Layers, find_layer_arrays, find_layers
+from warpshadow.pipeline.views.scene_views import SceneViews, camera_batch
+from warpshadow.pipeline.views.shading_ratio import shading_ratio
+from warpshadow.pipeline.views.view import View
+from warpshadow.pipeline.views.view_warnings import warn_of_vertex_receivers, warn_of_view
 from warpshadow.scene.scene import BodyLike, PerBody, Scene, check_scene
 from warpshadow.scene.visibility import METHODS
 
@@ -419,7 +419,7 @@ class SceneRenderer:
     def layer_arrays(self, view: View | None = None) -> LayerArrays:
         """Find the same as :meth:`layers` in arrays on the device.
 
-        Differentiable: view, as :func:`warpshadow.pipeline.layers.find_layer_arrays` says.
+        Differentiable: view, as :func:`warpshadow.pipeline.views.layers.find_layer_arrays` says.
         """
         height, width = self._size
         return find_layer_arrays(self._checked(view), (width, height), supersampling=self.scene.supersampling)

@@ -24,11 +24,11 @@ import enum
 import functools
 from typing import TYPE_CHECKING
 
-from warpshadow.pipeline.method import LightInput, Method, add_light
+from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints
-from warpshadow.pipeline.reflectance import Materials
-from warpshadow.pipeline.transfers import Light
+from warpshadow.pipeline.shading.method import LightInput, Method, add_light
+from warpshadow.pipeline.shading.transfers import Light
 
 if TYPE_CHECKING:  # they are imported where light bounces
     from warpshadow.pipeline.bounces.moving_bounces import MovingBounces
@@ -157,7 +157,7 @@ class LightTransport:
     @functools.cached_property
     def _moving_bounces(self) -> MovingBounces:
         from warpshadow.pipeline.bounces.moving_bounces import MovingBounces
-        from warpshadow.pipeline.sphere_method import SphereMethod
+        from warpshadow.pipeline.shading.sphere_method import SphereMethod
 
         assert isinstance(self.method, SphereMethod)
         return MovingBounces(self.method, self._patches)

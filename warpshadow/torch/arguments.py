@@ -13,7 +13,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.batch import common_batch
 from warpshadow.device.warp_internals import item_shape
-from warpshadow.pipeline.geometry import GEOMETRY_DTYPES, PLACED, Geometry, as_geometry
+from warpshadow.pipeline.bodies.geometry import GEOMETRY_DTYPES, PLACED, Geometry, as_geometry
 from warpshadow.torch.autograd import apply, as_array, check_float32, is_capturing
 from warpshadow.torch.replay import Replays
 

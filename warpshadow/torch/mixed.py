@@ -14,7 +14,7 @@ import torch
 
 from warpshadow import check
 from warpshadow.assets.basis import Basis, CellBasis
-from warpshadow.pipeline.geometry import Geometry, as_geometry
+from warpshadow.pipeline.bodies.geometry import Geometry, as_geometry
 from warpshadow.pipeline.image_inputs import ImageInputs, takes
 from warpshadow.scene.material import INPUTS_OF_BODIES
 from warpshadow.scene.scene import BodyLike, PerBody

@@ -13,8 +13,8 @@ from warpshadow.assets.basis import Basis, describe_coefficients
 from warpshadow.assets.camera import Camera
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.device.warp_internals import item_shape
+from warpshadow.pipeline.bodies.geometry import GEOMETRY_DTYPES, Geometry
 from warpshadow.pipeline.explain import Explanation
-from warpshadow.pipeline.geometry import GEOMETRY_DTYPES, Geometry
 from warpshadow.pipeline.image_inputs import ImageInputs, takes
 from warpshadow.scene.material import INPUTS_OF_BODIES
 from warpshadow.scene.scene import BodyLike, PerBody, Scene

@@ -10,7 +10,7 @@ import warp as wp
 
 from warpshadow.maths.spatial_sort import z_order_of_cells
 from warpshadow.pipeline.renderer import SceneRenderer
-from warpshadow.pipeline.view import View
+from warpshadow.pipeline.views.view import View
 from warpshadow.scene.scene import Bounces, Scene, change_bodies
 from warpshadow.scene.visibility import AUTO, Visibility
 from warpshadow.stages.normals import vertex_normals

@@ -17,10 +17,10 @@ from warpshadow.assets.camera import Camera, framed_points
 from warpshadow.assets.color import auto_exposure, linear_to_srgb
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.threads import one_at_a_time
-from warpshadow.pipeline.geometry import Geometry
+from warpshadow.pipeline.bodies.geometry import Geometry
+from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
-from warpshadow.pipeline.self_visibility import SelfVisibility
-from warpshadow.pipeline.view import View
+from warpshadow.pipeline.views.view import View
 from warpshadow.scene.scene import Scene
 from warpshadow.stages.poses import Poses
 from warpshadow.tuning.renderer import Renderer

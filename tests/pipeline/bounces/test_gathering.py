@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import warpshadow as ws
-from warpshadow.pipeline.self_visibility import SelfVisibility
+from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.torch import TorchRenderer
 from warpshadow.tuning.timing import whole_image
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import warpshadow as ws
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.bounces.overlays import find_overlays
 from warpshadow.pipeline.bounces.patches import ScenePatches
-from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.reflectance import Materials
 
 WHITE = (0.8, 0.8, 0.8)
 

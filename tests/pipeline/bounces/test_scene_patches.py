@@ -6,10 +6,10 @@ import warp as wp
 
 import warpshadow as ws
 from warpshadow.device.tape import recorded
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.bounces.patches import ScenePatches
-from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Call, Clock
-from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.proxy_radiance import find_proxy_radiance
 
 RANDOM = np.random.default_rng(0)

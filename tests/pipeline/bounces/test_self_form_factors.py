@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import warpshadow as ws
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.pipeline.bounces import self_form_factors
 from warpshadow.pipeline.bounces.patches import ScenePatches
-from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.self_visibility import SelfVisibility
 from warpshadow.stages.sparse import SparseMatrix
 
 

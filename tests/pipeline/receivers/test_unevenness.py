@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 import warpshadow as ws
-from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.receivers.choice_of_receivers import UNEVEN, choose_receivers
 from warpshadow.scene.scene import change_bodies
 

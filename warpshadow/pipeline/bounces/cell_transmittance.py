@@ -13,7 +13,7 @@ import warp as wp
 from warpshadow.device.batch import common_batch, expand
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.receivers.groups import CellVisibility, Group, HarmonicVisibility, nonplanar_bodies
-from warpshadow.pipeline.sphere_method import SphereMethod
+from warpshadow.pipeline.shading.sphere_method import SphereMethod
 from warpshadow.stages.visibility.directional import transmittance
 
 HARMONIC_GATHER_CELLS = fibonacci(64)  # where receivers look for bounced light if direct light is found in harmonics

@@ -22,19 +22,19 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from warpshadow.device.batch import cut
+from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance, find_cell_transmittance
 from warpshadow.pipeline.bounces.gathering import ALL_FLAT, Gathering, OutgoingRadiance
 from warpshadow.pipeline.bounces.patches import OF_PATCH_SAMPLES, ScenePatches, Senders, lit_patch_samples
 from warpshadow.pipeline.bounces.proxies import ProjectedPatches, Proxies
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
-from warpshadow.pipeline.method import LightInput
 from warpshadow.pipeline.node import Call, Node, NodeStage
 from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
-from warpshadow.pipeline.reflectance import Materials
-from warpshadow.pipeline.sphere_method import PortionedShading, ProjectedLight, SphereMethod
-from warpshadow.pipeline.transfers import joined
+from warpshadow.pipeline.shading.method import LightInput
+from warpshadow.pipeline.shading.sphere_method import PortionedShading, ProjectedLight, SphereMethod
+from warpshadow.pipeline.shading.transfers import joined
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.patch_weights import PatchWeights, find_mean_transmittance, find_patch_weights
 from warpshadow.stages.bounces.radiosity import patch_radiosity

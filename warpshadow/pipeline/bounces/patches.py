@@ -11,11 +11,11 @@ import warp as wp
 from warpshadow.assets.mesh import Mesh
 from warpshadow.device.batch import rows
 from warpshadow.maths.plane import plane_normal
-from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.planes import ScenePlanes
+from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Node
-from warpshadow.pipeline.planes import ScenePlanes
 from warpshadow.pipeline.receivers.lit_points import LitPoints
-from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.albedo import mean_over_texels, mean_over_vertices
 from warpshadow.stages.bounces.patches import MAX_PATCHES, SAMPLES_PER_PATCH, Patches, find_patches, find_plane_patches
 from warpshadow.stages.bounces.radiosity import mean_over_patch_samples

@@ -17,7 +17,7 @@ from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance
 from warpshadow.pipeline.bounces.overlays import find_overlays
 from warpshadow.pipeline.bounces.patches import Senders
 from warpshadow.pipeline.receivers.groups import nonplanar_bodies
-from warpshadow.pipeline.transfers import joined
+from warpshadow.pipeline.shading.transfers import joined
 from warpshadow.stages.bounces.projected_areas import find_projected_areas, tilt_normals_off_planes
 from warpshadow.stages.bounces.proxies import find_depths, place_proxies
 from warpshadow.stages.bounces.proxy_radiance import patches_of_clusters

@@ -11,9 +11,9 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.cache import Unfinished, cache_path, load_or_compute
+from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
 from warpshadow.pipeline.receivers.groups import Group
-from warpshadow.pipeline.self_visibility import SelfVisibility
 from warpshadow.stages.bounces.form_factors import patch_mesh, trace_form_factors
 from warpshadow.stages.bounces.patches import Patches
 from warpshadow.stages.sparse import SparseMatrix

@@ -26,12 +26,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import warp as wp
 
+from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.bounces.patches import ScenePatches, Senders, lit_patch_samples
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
-from warpshadow.pipeline.method import Method
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
-from warpshadow.pipeline.reflectance import Materials
+from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.bounces.bright_patches import BrightPatches, find_bright_patches
 from warpshadow.stages.bounces.colored import ColoredTransfer, colored_light
 from warpshadow.stages.bounces.form_factors import (

@@ -7,8 +7,8 @@ import importlib
 
 from warpshadow.assets.basis import Basis
 from warpshadow.device.threads import one_at_a_time
-from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.method import Method
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
+from warpshadow.pipeline.shading.method import Method
 from warpshadow.scene.visibility import DEFAULT_METHOD
 
 

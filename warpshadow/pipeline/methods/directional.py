@@ -15,16 +15,16 @@ from warpshadow.device.constants import constant
 from warpshadow.device.memory import empty
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
-from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.method import LightInput
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.self_visibility import SelfVisibilityLookup
 from warpshadow.pipeline.node import Call, Input, Node, field_of
 from warpshadow.pipeline.receivers.groups import CellCoverages, CellVisibility, Group
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
-from warpshadow.pipeline.self_visibility import SelfVisibilityLookup
-from warpshadow.pipeline.shell import PATCHES, ShellPatches, project_on_shell
-from warpshadow.pipeline.sphere_method import PortionedShading, ProjectedLight, SphereMethod
-from warpshadow.pipeline.transfers import LARGEST_COEFFICIENT, change_basis, joined
+from warpshadow.pipeline.shading.method import LightInput
+from warpshadow.pipeline.shading.shell import PATCHES, ShellPatches, project_on_shell
+from warpshadow.pipeline.shading.sphere_method import PortionedShading, ProjectedLight, SphereMethod
+from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, joined
 from warpshadow.scene.blockers import blocking_planes
 from warpshadow.stages.cached_cells import CachedRows, cell_transfer, shade_cached_cells
 from warpshadow.stages.gloss.reflection import blocked_radiance
@@ -246,7 +246,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     @functools.cached_property
     def emitter_projection(self) -> ProjectedCells:
         """Even light in cells that are finer than those of the map: emitters are small."""
-        from warpshadow.pipeline.emitters import EMITTER_CELLS
+        from warpshadow.pipeline.shading.emitters import EMITTER_CELLS
 
         return ProjectedCells(EMITTER_CELLS)
 

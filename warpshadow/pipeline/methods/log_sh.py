@@ -11,14 +11,14 @@ from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.device.batch import expand_rows
 from warpshadow.device.constants import constant
 from warpshadow.device.memory import zeros
-from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.self_visibility import SelfVisibilityLobes
 from warpshadow.pipeline.node import Input
 from warpshadow.pipeline.receivers.groups import Group, HarmonicVisibility
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
-from warpshadow.pipeline.self_visibility import SelfVisibilityLobes
-from warpshadow.pipeline.shell import ShellPatches
-from warpshadow.pipeline.sphere_method import SphereMethod
+from warpshadow.pipeline.shading.shell import ShellPatches
+from warpshadow.pipeline.shading.sphere_method import SphereMethod
 from warpshadow.stages.cached_cells import add_rows
 from warpshadow.stages.self_visibility.lobes import self_visibility_lobes
 from warpshadow.stages.transfer import sh_product, sh_transfer

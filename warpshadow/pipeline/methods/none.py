@@ -5,11 +5,11 @@ import warp as wp
 
 from warpshadow.assets.basis import Basis
 from warpshadow.assets.harmonic_light import KnownLight
-from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.methods.log_sh import LogSH, ProjectedBands
 from warpshadow.pipeline.node import Input
 from warpshadow.pipeline.receivers.groups import Group, HarmonicVisibility
-from warpshadow.pipeline.shell import PATCHES, ShellPatches, project_on_shell
+from warpshadow.pipeline.shading.shell import PATCHES, ShellPatches, project_on_shell
 
 _NO_CELLS = np.empty((0, 3))
 

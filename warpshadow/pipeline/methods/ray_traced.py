@@ -10,11 +10,11 @@ import warp as wp
 from warpshadow.assets.basis import Basis, HarmonicBasis
 from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.device.batch import common_batch
-from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.method import LightInput, Method
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node, NodeStage, detached
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
-from warpshadow.pipeline.reflectance import Materials
+from warpshadow.pipeline.shading.method import LightInput, Method
 from warpshadow.stages.gloss.reflection import blocked_radiance
 from warpshadow.stages.gloss.traced import trace_lobes
 from warpshadow.stages.light_samples import cut_map, sample_map
@@ -57,7 +57,7 @@ class Rays(Method):
 
     def along_paths(self, direct: Node, points: LitPoints, light: LightInput, materials: Materials) -> Node:
         """Shading of points in known light that bounces along paths, which have no gradient."""
-        from warpshadow.pipeline.bounces.paths import path_traced
+        from warpshadow.pipeline.methods.paths import path_traced
 
         arguments = direct, self._meshes(points), points, light, self.shell_of(light), materials
         return path_traced(*arguments, samples=self._sample_count, progress=self.progress)

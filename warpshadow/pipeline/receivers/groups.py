@@ -11,12 +11,12 @@ import warp as wp
 from warpshadow.device.batch import common_batch, cut, expand
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import varies
-from warpshadow.pipeline.convex import GroupConvexParts, SceneConvexParts
-from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.planes import GroupPlanes, ScenePlanes
+from warpshadow.pipeline.bodies.convex import GroupConvexParts, SceneConvexParts
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.planes import GroupPlanes, ScenePlanes
+from warpshadow.pipeline.bodies.self_visibility import SelfVisibility, SelfVisibilityLobes, SelfVisibilityLookup
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
-from warpshadow.pipeline.self_visibility import SelfVisibility, SelfVisibilityLobes, SelfVisibilityLookup
 from warpshadow.stages.cached_cells import CachedRows
 from warpshadow.stages.convex.prepared import PlacedParts
 from warpshadow.stages.planes.fronts import NearestBlockers, find_fronts, lifted_points

@@ -17,8 +17,8 @@ import warp as wp
 from warpshadow.device.constants import use
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.memory import empty, from_numpy
-from warpshadow.pipeline.geometry import Geometry, splice
-from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.geometry import Geometry, splice
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.stages.cached_cells import CachedRows
 from warpshadow.stages.normals import vertex_normals

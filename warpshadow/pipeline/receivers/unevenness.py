@@ -14,7 +14,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.ray_tracing import trace_visibility_on_host
 

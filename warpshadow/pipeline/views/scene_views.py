@@ -11,13 +11,13 @@ from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.device.batch import common_batch
 from warpshadow.device.constants import use
-from warpshadow.pipeline.geometry import PLACED, Geometry
+from warpshadow.pipeline.bodies.geometry import PLACED, Geometry
+from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Call, Clock, Input, Node, identity
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints
 from warpshadow.pipeline.receivers.static import StaticBodies
-from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.transport import LightTransport
-from warpshadow.pipeline.view import View
+from warpshadow.pipeline.views.view import View
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.project import check_clip_space
 from warpshadow.stages.receivers import Receivers, receivers_on_faces

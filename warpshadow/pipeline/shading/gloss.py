@@ -13,11 +13,11 @@ import warp as wp
 
 from warpshadow.device.batch import concatenate, cut, rows
 from warpshadow.device.constants import constant
-from warpshadow.pipeline.method import LightInput, Method, add_light
+from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node, detached, field_of
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
-from warpshadow.pipeline.reflectance import Materials
-from warpshadow.pipeline.transfers import Light, change_basis
+from warpshadow.pipeline.shading.method import LightInput, Method, add_light
+from warpshadow.pipeline.shading.transfers import Light, change_basis
 from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.stages.gloss.lobes import LobeSamples, sample_lobes
 from warpshadow.stages.gloss.normal_spread import NormalSpread, find_normal_spread

@@ -6,11 +6,11 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.memory import empty
-from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.methods.by_name import make_method
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints
-from warpshadow.pipeline.view import View
+from warpshadow.pipeline.views.view import View
 from warpshadow.stages.receivers import Receivers
 
 

@@ -17,12 +17,12 @@ import warp as wp
 from warpshadow.device.batch import cut
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.receivers.groups import Blockers, Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints
-from warpshadow.pipeline.reflectance import Materials
-from warpshadow.pipeline.transfers import joined
+from warpshadow.pipeline.shading.transfers import joined
 from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.emitters.convex import find_log_transmittance_of_parts
 from warpshadow.stages.emitters.light import directions_to_samples, sum_light

@@ -8,12 +8,12 @@ import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.method import Method
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.reflectance import Materials, SampleReflectance
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached, field_of, identity
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
-from warpshadow.pipeline.reflectance import Materials, SampleReflectance
-from warpshadow.pipeline.transfers import Light
+from warpshadow.pipeline.shading.method import Method
+from warpshadow.pipeline.shading.transfers import Light
 from warpshadow.pipeline.transport import LightTransport
 from warpshadow.stages.film import average, sample_radiance, sum_radiance
 from warpshadow.stages.interpolation import interpolate
@@ -219,7 +219,7 @@ class View(LitPoints):
 
     def _glossy(self, shading: Node, light: Light | None, materials: Materials, reflectance: Node) -> Node:
         """Node of the samples where bodies shine: of light in the surface's color, and of light that has its own."""
-        from warpshadow.pipeline.gloss import GlossyPoints
+        from warpshadow.pipeline.shading.gloss import GlossyPoints
 
         arguments = self.cameras, self.fragments_node, self.clip_positions
         points = self.cached("gloss", None, lambda: GlossyPoints(self.method, self, *arguments))
@@ -413,7 +413,7 @@ def _receive(
         )
         if spheres is not None and (is_adaptive := method.is_adaptive & wants_samples).any():
             from warpshadow.pipeline.receivers.adaptive import find_squares
-            from warpshadow.pipeline.sphere_method import SphereMethod
+            from warpshadow.pipeline.shading.sphere_method import SphereMethod
 
             assert isinstance(method, SphereMethod)
             place = functools.partial(method.blockers, blocker_kinds)

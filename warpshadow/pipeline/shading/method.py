@@ -13,19 +13,19 @@ from warpshadow.assets.basis import Basis, HarmonicBasis, conversion
 from warpshadow.assets.harmonic_light import KnownLight, as_light
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.constants import constant
-from warpshadow.pipeline.geometry import Geometry
-from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.geometry import Geometry
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies
-from warpshadow.pipeline.reflectance import Materials
-from warpshadow.pipeline.transfers import Light, ShellLight, check_light, shade_free
+from warpshadow.pipeline.shading.transfers import Light, ShellLight, check_light, shade_free
 from warpshadow.stages.gloss.prefilter import prefilter
 from warpshadow.stages.receivers import Numbering, number_receivers
 from warpshadow.stages.shell.beams import check_shell, shell_array
 
 if TYPE_CHECKING:  # it is imported where a body emits
-    from warpshadow.pipeline.emitters import SceneEmitters
+    from warpshadow.pipeline.shading.emitters import SceneEmitters
 
 
 class LightInput(Input):
@@ -146,7 +146,7 @@ class Method:
     @functools.cached_property
     def emitters(self) -> SceneEmitters:
         """The bodies that emit."""
-        from warpshadow.pipeline.emitters import SceneEmitters
+        from warpshadow.pipeline.shading.emitters import SceneEmitters
 
         return SceneEmitters(self.merged_scene)
 

@@ -9,8 +9,8 @@ import warp as wp
 
 import warpshadow as ws
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.planes import ScenePlanes
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.planes import ScenePlanes
 from warpshadow.scene.blockers import scene_blockers
 from warpshadow.stages.planes import prepared
 from warpshadow.torch import TorchRenderer

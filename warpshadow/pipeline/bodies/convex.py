@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.maths.convex import ConvexPart
-from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.scene.blockers import blocking_parts, solid_bodies
 from warpshadow.stages.convex.coverage import part_coverage
 from warpshadow.stages.convex.prepared import ConvexBlockers, ConvexBody, PlacedParts

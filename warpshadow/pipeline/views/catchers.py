@@ -11,11 +11,11 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.camera import Camera
-from warpshadow.pipeline.geometry import Geometry
+from warpshadow.pipeline.bodies.geometry import Geometry
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.image_inputs import ImageArrays
-from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.transfers import Light
-from warpshadow.pipeline.view import View
+from warpshadow.pipeline.shading.transfers import Light
+from warpshadow.pipeline.views.view import View
 
 
 class CatchersAlone:

@@ -11,8 +11,8 @@ import warp as wp
 import warpshadow as ws
 from warpshadow.assets.cache import cache_path, cached_files, load_or_compute
 from warpshadow.device import progress
-from warpshadow.pipeline import self_visibility
-from warpshadow.pipeline.geometry import Geometry
+from warpshadow.pipeline.bodies import self_visibility
+from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.stages.poses import Poses
 from warpshadow.stages.self_visibility import trace

@@ -12,17 +12,17 @@ import warp as wp
 from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.progress import progress_bar
-from warpshadow.pipeline.convex import SceneConvexParts
-from warpshadow.pipeline.geometry import Geometry
-from warpshadow.pipeline.method import LightInput, Method
+from warpshadow.pipeline.bodies.convex import SceneConvexParts
+from warpshadow.pipeline.bodies.geometry import Geometry
+from warpshadow.pipeline.bodies.planes import ScenePlanes
+from warpshadow.pipeline.bodies.reflectance import Materials
+from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached
-from warpshadow.pipeline.planes import ScenePlanes
 from warpshadow.pipeline.receivers.groups import Blockers, CellVisibility, Group, HarmonicVisibility, find_groups
 from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
-from warpshadow.pipeline.reflectance import Materials
-from warpshadow.pipeline.self_visibility import SelfVisibility
-from warpshadow.pipeline.transfers import LARGEST_COEFFICIENT, change_basis, joined
+from warpshadow.pipeline.shading.method import LightInput, Method
+from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, joined
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.shading import shade
 
@@ -222,13 +222,13 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
 
     def emitted_light(self, points: LitPoints, materials: Materials) -> Node:
         """Direct light of emitters on points, by the same blockers."""
-        from warpshadow.pipeline.emitters import find_emitted_light
+        from warpshadow.pipeline.shading.emitters import find_emitted_light
 
         return self._sum_over_emitters("light of emitters", find_emitted_light, points, materials)
 
     def highlights(self, points: LitPoints, materials: Materials, roughness: Node, cameras: Input) -> Node:
         """Direct light of emitters in the lobes of points, by the same blockers."""
-        from warpshadow.pipeline.emitters import find_highlights
+        from warpshadow.pipeline.shading.emitters import find_highlights
 
         return self._sum_over_emitters("highlights", find_highlights, points, materials, roughness, cameras)
 

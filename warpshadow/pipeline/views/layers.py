@@ -9,8 +9,8 @@ import warp as wp
 
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.view import View
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
+from warpshadow.pipeline.views.view import View
 from warpshadow.stages.film import average
 from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.rasterization import rasterize

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.stages.planes.grid import find_grid
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneBody
 from warpshadow.stages.sparse import SparseMatrix, multiply

@@ -13,7 +13,7 @@ from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node, detached
 from warpshadow.scene.material import GLOSS_ARGUMENTS, GLOSS_DEFAULTS, INPUTS_OF_BODIES, MATERIAL_FIELDS
 from warpshadow.stages.interpolation import interpolate

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.receivers.choice_of_receivers import face_sizes, warn_of_coarse_faces
-from warpshadow.pipeline.view import View
+from warpshadow.pipeline.views.view import View
 from warpshadow.scene.body import Body
 from warpshadow.scene.creases import lined_surfaces, rounded_edges
 from warpshadow.scene.placement import enclosures, misplacements

@@ -15,7 +15,7 @@ from warpshadow.device.constants import constant
 from warpshadow.device.memory import empty
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.maths.spatial_sort import z_order
-from warpshadow.pipeline.geometry import CENTER, Geometry, Pivot, as_geometry, splice
+from warpshadow.pipeline.bodies.geometry import CENTER, Geometry, Pivot, as_geometry, splice
 from warpshadow.scene.blockers import free_shape_remark, scene_blockers
 from warpshadow.scene.scene import BodyLike, Scene
 from warpshadow.scene.visibility import AUTO, SPHERE_METHODS

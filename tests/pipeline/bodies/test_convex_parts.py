@@ -8,7 +8,7 @@ import torch
 import trimesh
 
 import warpshadow as ws
-from warpshadow.pipeline.self_visibility import SelfVisibility
+from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
 STEP = 1e-3

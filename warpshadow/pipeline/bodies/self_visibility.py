@@ -22,8 +22,8 @@ from warpshadow.device.batch import cut
 from warpshadow.device.memory import from_numpy
 from warpshadow.device.progress import announce
 from warpshadow.device.tape import unrecorded
-from warpshadow.pipeline.geometry import Geometry
-from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.geometry import Geometry
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.scene.blockers import blocking_parts, solid_bodies
 from warpshadow.spheres.normalized_mesh import normalize
 from warpshadow.stages.normals import vertex_normals

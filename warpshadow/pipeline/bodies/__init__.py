@@ -1,0 +1,1 @@
+"""Bodies: all of a scene as one mesh, their reflectance, and the blockers that they are."""

@@ -1,0 +1,1 @@
+"""Shading: the light that receivers reflect directly, past blockers."""

@@ -1,0 +1,1 @@
+"""Views: geometries seen by cameras, and the images that are made of them."""
