@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from warpshadow import check
 from warpshadow.assets.basis import CellBasis
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.inverse import constraints
@@ -146,7 +145,7 @@ class Sun(Free):
 
 
 def _weights(direction: torch.Tensor, variance: torch.Tensor, cells: torch.Tensor) -> torch.Tensor:
-    """Weights of cells [cell] of a given variance, whose mean is along a direction. Differentiable: direction, variance.
+    """Weights of cells [cell] of a variance, whose mean is along a direction. Differentiable: direction, variance.
 
     Newton's method finds λ without a record; one more step from there has its derivatives.
     """
