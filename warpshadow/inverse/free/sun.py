@@ -19,10 +19,11 @@ from warpshadow.inverse.world import FittedScene, Setting, World
 from warpshadow.maths.directions import check_count, fibonacci
 from warpshadow.scene.scene import Scene
 
-_REACH = 4.0  # turn [radians], and logarithms of strength and size, for a value of 1: as of a lamp
-_WEIGHT_WIDTH = 0.4  # standard deviation of the weights of a point's cells, in distances between cells
+_REACH = 4.0  # turn [radians], and logarithm of strength, for a value of 1: as of a lamp
+_LARGEST = 30.0  # angular radius [degrees]: one of twelve suns that started 20° to 30° off became as wide as a sky
+_WEIGHT_WIDTH = 0.4  # least standard deviation of the weights of cells, in distances between cells
 _NEWTON_STEPS = 12
-_UNRESOLVED = 1.2  # times the resolution, up to which a fitted size is none
+_UNRESOLVED = 1.5  # times the resolution, up to which no size is told: a sun of 3° was found as 7° where that is 5.1°
 
 
 @dataclass(frozen=True)
@@ -34,14 +35,14 @@ class Sun(Free):
 
         w_q ∝ exp((d·d_q − 1) / σ² + λ·d_q),  Σ w_q d_q ∥ d,
 
-    which are smooth in d, and light that comes from d on average. So images have a gradient to the direction. No sun is
-    smaller meanwhile than :attr:`resolution`, and a fit tells the size of larger ones alone. The scene that it finds
-    has the sun as :meth:`.EnvironmentMap.with_sun` adds it.
+    with σ² the variance of a disc along each axis. They are smooth in d, so images have a gradient to it. No sun is
+    smaller meanwhile than :attr:`resolution`, and a fit tells the size of suns alone that are larger by half. The scene
+    that it finds has the sun as :meth:`.EnvironmentMap.with_sun` adds it.
 
     Args:
         direction: Towards the sun, of any length, shape [3].
         irradiance: Of a surface that faces it, one number or RGB, positive.
-        angular_radius: Of the disc [degrees]; kept where it is below the resolution and so is the fitted one.
+        angular_radius: Of the disc [degrees]; kept where a fit does not tell it.
         directions: Number of cells.
     """
 
@@ -78,22 +79,26 @@ class Sun(Free):
         return CellBasis(fibonacci(self.directions))
 
     @property
-    def _spacing(self) -> float:
-        """Distance between cells [radians]."""
-        return float(np.sqrt(4 * np.pi / self.directions))
-
-    @property
     def resolution(self) -> float:
-        """Angular radius [degrees] of the disc that spreads as a point's cells do: 8.8° of 512 cells."""
-        return float(np.degrees(2 * self._spacing * np.sqrt(_WEIGHT_WIDTH**2 + 1 / (4 * np.pi))))
+        """Smallest angular radius [degrees] while a fit runs: 7.2° of 512 cells, 5.1° of 1024."""
+        return float(np.degrees(2 * _WEIGHT_WIDTH * np.sqrt(4 * np.pi / self.directions)))
 
     def start(self, setting: Setting) -> Values:
         """The given sun, or one of one and a half times the resolution if that is larger."""
         return {
             "turn": setting.tensor(np.zeros(2)),
             "log_irradiance": setting.tensor(np.zeros(3)),
-            "log_size": setting.tensor(0.0),
+            "log_radius": setting.tensor(0.0),
         }
+
+    @property
+    def _first_radius(self) -> float:
+        return max(self.angular_radius, _UNRESOLVED * self.resolution)
+
+    def project(self, values: Values) -> None:
+        """Keep its radius between the resolution and 30°, or the given one if that is larger."""
+        largest = max(_LARGEST, self._first_radius)
+        values["log_radius"].clamp_(*(float(np.log(size / self._first_radius)) for size in (self.resolution, largest)))
 
     def _sun(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Direction [3], irradiance [3], and angular radius [radians], at least the resolution. Differentiable:
@@ -105,18 +110,14 @@ class Sun(Free):
         tangents = torch.tensor(constraints.remaining([towards])).to(turn)
         direction = angle.cos() * torch.tensor(towards).to(turn) + angle.sin() / angle * (turn @ tangents)
         strength = torch.tensor(self.irradiance).to(turn) * (_REACH * values["log_irradiance"].double()).exp()
-        smallest = np.radians(self.resolution)
-        first_size = np.sqrt(max(np.radians(self.angular_radius), 1.5 * smallest) ** 2 - smallest**2)
-        size = first_size * (_REACH * values["log_size"].double()).exp()
-        radius = (size**2 + smallest**2).sqrt().clamp_max(np.pi / 2)
+        radius = np.radians(self._first_radius) * values["log_radius"].double().exp()
         return direction / direction.norm(), strength, radius
 
     def coefficients(self, values: Values, setting: Setting) -> torch.Tensor:
         """Its light in cells, linear RGB, [cell, 3]. Differentiable: values."""
         direction, strength, radius = self._sun(values, setting)
         cells = torch.tensor(self.basis.directions).to(direction)
-        variance = radius**2 / 4 - self._spacing**2 / (4 * np.pi)  # of the weights: cells are wide themselves
-        weights = _weights(direction, variance, cells)
+        weights = _weights(direction, radius**2 / 4, cells)
         share = weights @ (cells @ direction).clamp_min(0)
         light = self.directions / (4 * np.pi) * (weights / share)[:, None] * strength
         return light.to(values["turn"])
@@ -133,7 +134,7 @@ class Sun(Free):
         direction, strength, radius = (part.cpu().numpy() for part in self._sun(values, setting))
         degrees = float(np.degrees(radius))
         if degrees < _UNRESOLVED * self.resolution:
-            degrees = min(self.angular_radius, self.resolution)
+            degrees = min(self.angular_radius, degrees)
         assert isinstance(fitted.scene.light, EnvironmentMap)
         light = fitted.scene.light.with_sun(direction, strength, angular_radius=degrees)
         fitted.scene = replace(fitted.scene, light=light)
