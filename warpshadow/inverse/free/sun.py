@@ -124,10 +124,10 @@ class Sun(Free):
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Light the world with it, beside the map."""
-        around = setting.cached(
+        map_light = setting.cached(
             (self.name, "map"), lambda: setting.tensor(self.basis.coefficients(setting.scene.light))
         )
-        world.light = around + self.coefficients(values, setting)
+        world.light = map_light + self.coefficients(values, setting)
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
         """Add it to the map."""
