@@ -194,12 +194,12 @@ def test_methods_and_constants_that_a_page_names_exist(page):
 # ------------------------------------------------------------------------------------------------ figures
 
 
-DEMOS = (ROOT / "demos" / "README.md").read_text("utf-8")
+MEASUREMENTS = (ROOT / "demos" / "benchmarks" / "README.md").read_text("utf-8")
 
 
 def table_rows(heading):
-    """Cells of the tables below a heading of the demos' page, by row; a mark of boldness is left out."""
-    text = re.search(rf"^## {heading}\n(.*?)(?=^## |\Z)", DEMOS, re.DOTALL | re.MULTILINE)[1]
+    """Cells of the tables below a heading of the page of measurements, by row; a mark of boldness is left out."""
+    text = re.search(rf"^## {heading}\n(.*?)(?=^## |\Z)", MEASUREMENTS, re.DOTALL | re.MULTILINE)[1]
     return [[cell.strip(" *") for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
 
 
@@ -220,7 +220,7 @@ def summaries(heading, label_count):
     return len(rows), means, worst
 
 
-def test_figures_of_the_first_page_are_those_of_the_demos_tables():
+def test_figures_of_the_first_page_are_those_that_were_measured():
     stated = re.sub(r"\]\([^)]*\)|[\[*]", "", (ROOT / "README.md").read_text("utf-8")).replace("\n ", "")
     count, means, worst = summaries("Accuracy", 2)
     assert count == 9 and f"off by {means[4]}% on average, {worst[4]}% at worst, on nine meshes" in stated
