@@ -9,7 +9,7 @@ has a basis, light is free, and nobody knows where edges will be.
 
 Between vertices light is interpolated, which shows where a face is large, or small and long, as spokes and rails are;
 so faces count by their pixels and by their longest edges. A picture that is made once can afford per-pixel receivers on
-its grounds and walls, where shadows' edges show most. pipeline/README.md has the figures.
+its grounds and walls, where shadows' edges show most. this folder's README.md has the figures.
 """
 
 import dataclasses
