@@ -99,9 +99,10 @@ class Recipe:
         shows_all = self.visibility.method in (*GLOSS_METHODS, AUTO)
         for name in ("glossy", "radius"):
             if getattr(self.ranges, name) and not shows_all:
+                methods = ", ".join(map(repr, GLOSS_METHODS))
                 raise ValueError(
-                    f"{name}: got {getattr(self.ranges, name)}, which {self.visibility.method!r} does not show, expected "
-                    f"none, or method = one of {', '.join(map(repr, GLOSS_METHODS))}"
+                    f"{name}: got {getattr(self.ranges, name)}, which {self.visibility.method!r} does not show, "
+                    f"expected none, or method = one of {methods}"
                 )
         object.__setattr__(self, "size", check.image_size(self.size))
         check_supersampling(self.supersampling)

@@ -1,7 +1,8 @@
 """Random scenes: a data set whose scenes come from a seed and a number, each by itself.
 
-Some bodies stand or lie on a ground of neutral gray, in colors of their own, some of which may shine, under a sky with a
-sun or under a few soft lights, or under given maps, that may be near; a camera looks at them from above. :class:`Ranges` has the ranges of all random numbers.
+Some bodies stand or lie on a ground of neutral gray, in colors of their own, and may shine, under a sky with a sun or
+under a few soft lights, or under given maps, which may be near; a camera looks at them from above. :class:`Ranges` has
+the ranges of all random numbers.
 Scenes are drawn when they are asked for, in any order, in any process: the same seed, number, bodies, maps and ranges
 give the same scene.
 """
@@ -281,8 +282,8 @@ def _random_body(rng: np.random.Generator, prototypes: Sequence[Body], ranges: R
         scale=_drawn(rng, ranges.size) / (high - low).max(),
     )
     if ranges.glossy and not body.is_glossy and rng.random() < ranges.glossy:
-        metallic = float(rng.random() < ranges.metal)
-        body = replace(body, roughness=_drawn(rng, ranges.roughness), metallic=metallic)
+        metallic = np.full(1, rng.random() < ranges.metal, np.float32)
+        body = replace(body, roughness=np.full(1, _drawn(rng, ranges.roughness)), metallic=metallic)
     low, high = body.world_mesh().bounds
     foot = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
     return replace(body, translation=-foot), chosen

@@ -40,6 +40,9 @@ class Emission(FreeOfBody):
     def check_scene(self, scene: Scene) -> None:
         """Raise ValueError for a body that does not emit."""
         check_emits(scene, self.number)
+        emission = scene.bodies[self.number].emission
+        if self.per_vertex and emission is not None and emission.ndim == 3:
+            raise ValueError("per_vertex: got it of a body whose emission is a texture, expected one color")
 
     def _unit(self, setting: Setting) -> float:
         """Radiance that counts as 1: a lamp is far brighter than its image."""
@@ -48,12 +51,12 @@ class Emission(FreeOfBody):
         return float(start.mean()) or setting.unit
 
     def start(self, setting: Setting) -> Values:
-        """The body's radiance; the mean of its vertices', where one is free."""
+        """The body's radiance; the mean of its vertices' or texels', where one is free."""
         body = setting.scene.bodies[self.number]
         radiance = np.atleast_2d(np.asarray(body.emission)) / self._unit(setting)
         if self.per_vertex:
             return {"radiance": setting.tensor(np.broadcast_to(radiance, (body.mesh.vertex_count, 3)))}
-        return {"radiance": setting.tensor(radiance.mean(axis=0)[None])}
+        return {"radiance": setting.tensor(radiance.reshape(-1, 3).mean(axis=0)[None])}
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Let the body emit it."""
