@@ -92,9 +92,9 @@ class Body:
         specular: Likewise, strength of the reflection of all but metal, of which 1, the default, is 4% straight on.
         emission: Radiance that its surface emits, linear RGB, 0 or more, for the body [3] or for each vertex
             [vertex, 3], or a texture [height, width, 3], which needs uvs, or an .npy file of it: a lamp, which lights
-            the other bodies past all that is between, from where it is. None, the default, is no emission, or that of the mesh's file, if that is glTF and neither
-            ``albedo`` nor ``texture`` is given. Open bodies emit to both sides. A body gets none of its own emission
-            directly. All methods but "log-sh" have it.
+            the other bodies past all that is between, from where it is, and itself if it is not convex. None, the
+            default, is no emission, or that of the mesh's file, if that is glTF and neither ``albedo`` nor ``texture``
+            is given. Open bodies emit to both sides. All methods but "log-sh" have it.
     """
 
     mesh: Mesh
