@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from warpshadow.assets.color import srgb_to_linear
-from warpshadow.assets.mesh import Emission, Gloss, MeshPart
+from warpshadow.assets.mesh import EmissiveColor, Gloss, MeshPart
 
 Factors = Mapping[tuple[int, ...], tuple[float, ...]]
 """Linear factors of materials, by the codes that trimesh rounds them to."""
@@ -51,16 +51,16 @@ def base_color_factor(material, factors: Factors) -> tuple[float, ...] | None:
     return factors.get(codes, tuple(code / 255 for code in codes))
 
 
-def emission_of(material) -> Emission | None:
+def emission_of(material) -> EmissiveColor | None:
     """The emission of a material of trimesh; None for none."""
     factor = getattr(material, "emissiveFactor", None)
     if factor is None or not np.any(factor):
         return None
     red, green, blue = np.array(factor, np.float64).tolist()
-    return Emission((red, green, blue), getattr(material, "emissiveTexture", None))
+    return EmissiveColor((red, green, blue), getattr(material, "emissiveTexture", None))
 
 
-def emission_texels(emission: Emission) -> np.ndarray:
+def emission_texels(emission: EmissiveColor) -> np.ndarray:
     """Radiance of a surface, float32 of shape [3], or [height, width, 3] where it varies."""
     if emission.image is None:
         return np.array(emission.factor, np.float32)

@@ -332,7 +332,7 @@ class Gloss(NamedTuple):
     image: Any = None
 
 
-class Emission(NamedTuple):
+class EmissiveColor(NamedTuple):
     """The radiance of a glTF surface: a linear factor, of an image of Pillow's in sRGB, if any."""
 
     factor: tuple[float, float, float]
@@ -359,7 +359,7 @@ class MeshPart(NamedTuple):
     colorless: str = ""
     pictures: tuple[BaseColor | None, ...] = (None,)
     gloss: Gloss | None = None
-    emission: Emission | None = None
+    emission: EmissiveColor | None = None
 
 
 def moved_part(part: MeshPart, linear: np.ndarray, translation: np.ndarray) -> MeshPart:

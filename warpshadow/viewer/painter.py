@@ -7,7 +7,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import warp as wp
@@ -171,9 +171,9 @@ class Painter:
         key = (*vars(settings[0]).values(), *settings[1:])
         return key, self._renderers.get(key, lambda: Renderer(scene, device=self._device, progress=self._progress))
 
-    def _gloss(self, viewer_state: ViewerState, device: wp.Device) -> dict[str, dict[int, wp.array]]:
+    def _gloss(self, viewer_state: ViewerState, device: wp.Device) -> dict[str, Any]:
         """Roughness and metallic of the bodies that have others than in the scene, as arguments of an image."""
-        arguments: dict[str, dict[int, wp.array]] = {}
+        arguments: dict[str, Any] = {}
         for number, body in enumerate(self.scene.bodies):
             for name, value in viewer_state.changed_gloss(body, number).items():
                 key = name, value, str(device)

@@ -222,8 +222,10 @@ class ViewerState:
 
     def changed_gloss(self, body: Body, number: int) -> dict[str, float]:
         """Roughness and metallic of a body that are not as it has them, by name."""
-        given = BodyGloss.of(body).arguments()
-        return {name: value for name, value in self.gloss[number].arguments().items() if value != given.get(name)}
+        scene_numbers = BodyGloss.of(body).arguments()
+        return {
+            name: value for name, value in self.gloss[number].arguments().items() if value != scene_numbers.get(name)
+        }
 
     def has_moved(self, scene: Scene) -> bool:
         """Whether a body is not where the scene has it."""
