@@ -319,7 +319,7 @@ def test_what_was_traced_at_an_interrupt_is_not_traced_again(tmp_path, monkeypat
 
     def rows() -> list[np.ndarray]:
         renderer = SceneRenderer(scene_of())  # a mesh of its own: nothing is in memory
-        return [array.numpy() for array in renderer._method.self_visibility.rows(0)]
+        return [array.numpy() for array in renderer._method.scene_blockers.self_visibility.rows(0)]
 
     monkeypatch.setattr(trace, "launch", counting)
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path / "whole"))

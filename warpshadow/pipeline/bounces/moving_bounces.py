@@ -257,7 +257,9 @@ class MovingBounces:
 
     def __init__(self, method: SphereMethod, patches: ScenePatches):
         self._method, self._count, self._patches = method, method.merged_scene.scene.bounces, patches
-        self._self_form_factors = SelfFormFactors(method.self_visibility, patches, progress=method.progress)
+        self._self_form_factors = SelfFormFactors(
+            method.scene_blockers.self_visibility, patches, progress=method.progress
+        )
         self._proxies: dict[Senders, Proxies] = {}
 
     def shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:

@@ -8,7 +8,6 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import Basis, CellBasis
-from warpshadow.assets.cells import draw_in_cells, gather_cells, without_spots
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.device.constants import constant
@@ -22,6 +21,8 @@ from warpshadow.pipeline.receivers.groups import CellCoverages, CellVisibility, 
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.shading.method import LightInput
+from warpshadow.pipeline.shading.projected_cells import ProjectedCells, project_on_cells
+from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
 from warpshadow.pipeline.shading.shell import PATCHES, ShellPatches, project_on_shell
 from warpshadow.pipeline.shading.sphere_method import PortionedShading, ProjectedLight, SphereMethod
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, joined
@@ -32,50 +33,21 @@ from warpshadow.stages.gloss.transmittance import transmittance_of_directions
 from warpshadow.stages.joint_coverage import transmittance_past
 from warpshadow.stages.light_samples import CellSamples, cell_samples, even_samples, sample_map
 from warpshadow.stages.planes.coverage import plane_coverage
-from warpshadow.stages.planes.partial_cells import SAMPLES, coverage_of_light
+from warpshadow.stages.planes.partial_cells import coverage_of_light
 from warpshadow.stages.ray_tracing import trace_cells
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.self_visibility.gather import multiply_transmittances
-from warpshadow.stages.self_visibility.sun_cells import SunCells, find_sun_cells, trace_sun_cells
+from warpshadow.stages.self_visibility.sun_cells import trace_sun_cells
 from warpshadow.stages.shading import shade, shade_cells
 from warpshadow.stages.sides import split_sides
 from warpshadow.stages.transfer import directional_transfer
 from warpshadow.stages.visibility import directional
 from warpshadow.stages.visibility.directional import SOFTNESS
 from warpshadow.stages.visibility.sharp_cells import (
-    MAX_RADIUS_PAST_PLANES,
     RADII_PER_HALF_ANGLE,
     SharpCells,
     blend_sharp_cells,
-    find_sharp_cells,
 )
-
-_NEAR_SPOT = 2.0  # half-angles of a spot within which light is its own: of the pixels at a sun's edge, too
-
-
-class ProjectedCells(NamedTuple):
-    """Light in cells."""
-
-    directions: np.ndarray  # [direction, 3]: to light of the cells, past the spots of sharp ones
-    coefficients: wp.array | None = None  # of known light, vec3 of shape [1, direction]
-    mean_directions: np.ndarray | None = None  # to all known light of the cells, by which it falls in [direction, 3]
-    spots: np.ndarray | None = None  # where the brightest part of known light is in its cells [direction, 3]
-    half_angles: np.ndarray | None = None  # half-angles of where known light comes from in its cells [direction]
-    sharp_cells: SharpCells | None = None  # cells that a sun is in, where spheres block it
-    sharp_cells_past_planes: SharpCells | None = None  # and where planes do
-    spot_shares: np.ndarray | None = None  # share of the light of sharp cells that their spot has [direction]
-    samples: np.ndarray | None = None  # directions drawn from known light in its cells, and even ones [direction, 8, 3]
-    sun: SunCells | None = None  # the brightest cells, where bodies want rays to them
-    patches: ShellPatches | None = None  # that send the light, whose coefficients are theirs; None where it is far
-
-    @property
-    def facing(self) -> np.ndarray:
-        """Directions by whose cosine light falls in, [direction, 3]."""
-        return self.directions if self.mean_directions is None else self.mean_directions
-
-    def with_coefficients(self, coefficients: wp.array) -> "ProjectedCells":
-        """Light of the same basis."""
-        return self._replace(coefficients=coefficients)
 
 
 class SharpestCells(NamedTuple):
@@ -91,7 +63,6 @@ class SharpestCells(NamedTuple):
 class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     """Visibility for each cell of directions by itself."""
 
-    traces_self_visibility = True
     shades_transmittance = True
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
@@ -111,42 +82,15 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         if shell is not None:
             patches, radiance = project_on_shell(light, shell)
             return self.free_projection._replace(patches=patches, coefficients=radiance)
-        cells = light.cells(self._directions)
-        if cells.spots is None or cells.half_angles is None:
-            return ProjectedCells(cells.directions, self._on_device(cells.radiance), cells.directions)
-        power, softness = cells.radiance @ LUMINANCE, self.visibility.softness
-        find = functools.partial(find_sharp_cells, power, cells.spots, cells.half_angles, softness)
-        draw = functools.partial(draw_in_cells, light.radiance, self._directions)
-        sun = find_sun_cells(power, draw) if self.self_visibility.wants_rays else None
-        sharp_cells = find(), find(MAX_RADIUS_PAST_PLANES)
-        rest, rest_light, directions, spot_shares = light.radiance, cells, cells.directions, np.ones(len(power))
-        if sharp_cells[0] is not None and sharp_cells[1] is not None:
-            is_sharp = (sharp_cells[0].slots >= 0) & (sharp_cells[1].slots >= 0)
-            rest = without_spots(light.radiance, cells.spots[is_sharp], _NEAR_SPOT * cells.half_angles[is_sharp])
-            rest_light = gather_cells(rest, self._directions)
-            directions = np.where(is_sharp[:, None], rest_light.directions, directions)
-            spot_shares[is_sharp] = 1 - (rest_light.radiance @ LUMINANCE)[is_sharp] / power[is_sharp]
-        samples = self._samples(rest, rest_light.radiance) if self.plane_blockers else None
-        coefficients = self._on_device(cells.radiance)
-        return ProjectedCells(
-            directions,
-            coefficients,
-            cells.directions,
-            cells.spots,
-            cells.half_angles,
-            *sharp_cells,
-            spot_shares=spot_shares,
-            samples=samples,
-            sun=sun,
+        blockers = self.scene_blockers
+        return project_on_cells(
+            light,
+            self._directions,
+            softness=self.visibility.softness,
+            has_planes=bool(blockers.plane_blockers),
+            wants_sun=blockers.self_visibility.wants_rays,
+            device=self.merged_scene.device,
         )
-
-    def _samples(self, radiance: np.ndarray, of_cells: np.ndarray) -> np.ndarray:
-        """Directions drawn from the light of a map in each cell, [direction, 8, 3]; even ones in a dark cell."""
-        numbers = np.arange(len(self._directions))
-        drawn = draw_in_cells(np.ones_like(radiance), self._directions, numbers, SAMPLES)
-        lit = np.flatnonzero(of_cells @ LUMINANCE > 0)
-        drawn[lit] = draw_in_cells(radiance, self._directions, lit, SAMPLES)
-        return drawn
 
     def _on_device(self, coefficients: np.ndarray) -> wp.array:
         return constant(coefficients[None], wp.vec3, self.merged_scene.device)
@@ -165,7 +109,8 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         """Lookups of the receivers of some bodies. Differentiable: rotations."""
         towards = projected_light.directions if projected_light.spots is None else projected_light.spots
         has_sun = projected_light.sun is not None
-        return self.self_visibility.lookups(bodies, rotations, towards, projected_light.half_angles, has_sun=has_sun)
+        lookups = self.scene_blockers.self_visibility.lookups
+        return lookups(bodies, rotations, towards, projected_light.half_angles, has_sun=has_sun)
 
     def find_visibility(self, group: Group, projected_light: ProjectedCells) -> CellVisibility:
         """Transmittance of a group past its own body, spheres and convex parts."""
@@ -251,13 +196,13 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         return ProjectedCells(EMITTER_CELLS)
 
     @functools.cached_property
-    def plane_blockers(self) -> tuple[int, ...]:
-        """Bodies of the scene that block light as planes."""
-        return blocking_planes(self.merged_scene.scene)
-
-    def convex_blockers(self, rigid: tuple[int, ...]) -> tuple[int, ...]:
-        """Bodies that consist of convex parts."""
-        return tuple(body for body in rigid if body in self.parts.parts)
+    def scene_blockers(self) -> SceneBlockers:
+        """The blockers that the bodies are: planes, too, and convex parts."""
+        scene, samples_receive = self.merged_scene.scene, self.samples_receive()
+        planes, progress = blocking_planes(scene), self.progress
+        return SceneBlockers(
+            self.merged_scene, samples_receive, plane_blockers=planes, has_convex_parts=True, progress=progress
+        )
 
     def find_visibility_past_planes(
         self, group: Group, visibility: CellVisibility, projected_light: ProjectedCells

@@ -41,7 +41,6 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
     """Visibility of low frequencies. Where no body has spheres there are no shadows."""
 
     joins_cached = True
-    traces_self_visibility = True
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
         self._order = order = merged_scene.scene.visibility.order
@@ -67,7 +66,7 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
         self, bodies: tuple[int, ...], rotations: wp.array, projected_light: ProjectedBands
     ) -> dict[int, SelfVisibilityLobes]:
         """The lobes of some bodies, turned. Differentiable: rotations."""
-        return self.self_visibility.turned_lobes(bodies, rotations, self._order)
+        return self.scene_blockers.self_visibility.turned_lobes(bodies, rotations, self._order)
 
     def find_visibility(self, group: Group, projected_light: ProjectedBands) -> HarmonicVisibility:
         """Visibility, float32 of shape [batch, receiver, order²]; None where nothing blocks."""
@@ -133,7 +132,8 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
         rows = np.empty((len(vertices), 2, self._order**2), np.float32)
         bodies = body_of_vertex[vertices % len(body_of_vertex)]
         traced_bodies = tuple(np.intersect1d(traced, bodies).tolist())
-        turned = self.self_visibility.turned_lobes(traced_bodies, static_bodies.rotations, self._order)
+        self_visibility = self.scene_blockers.self_visibility
+        turned = self_visibility.turned_lobes(traced_bodies, static_bodies.rotations, self._order)
         for body in np.unique(bodies).tolist():
             of_body = np.flatnonzero(bodies == body)
             arguments = static_bodies.gathered(vertices[of_body], normals)
@@ -142,7 +142,10 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
             if body in turned:
                 lobes, turn = turned[body]
                 result = self_visibility_lobes(
-                    lobes, self.self_visibility.probe_weights_of(body, vertices[of_body]), turn, order=self._order
+                    lobes,
+                    self_visibility.probe_weights_of(body, vertices[of_body]),
+                    turn,
+                    order=self._order,
                 )
             else:
                 result = sh_transfer(None, arguments[1], order=self._order)

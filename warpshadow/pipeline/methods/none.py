@@ -1,5 +1,7 @@
 """The method "none": no shadows, in harmonics as by log-SH; light of a shell by its patches."""
 
+import functools
+
 import numpy as np
 import warp as wp
 
@@ -9,6 +11,7 @@ from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.methods.log_sh import LogSH, ProjectedBands
 from warpshadow.pipeline.node import Input
 from warpshadow.pipeline.receivers.groups import Group, HarmonicVisibility
+from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
 from warpshadow.pipeline.shading.shell import PATCHES, ShellPatches, project_on_shell
 
 _NO_CELLS = np.empty((0, 3))
@@ -17,7 +20,6 @@ _NO_CELLS = np.empty((0, 3))
 class NoShadows(LogSH):
     """Light without visibility; no body has spheres."""
 
-    traces_self_visibility = False
     why_no_shadows = "the method is to have no shadows"
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
@@ -25,6 +27,11 @@ class NoShadows(LogSH):
         if self.shell is not None:
             self.native_basis, self.basis = PATCHES, PATCHES if basis is None else basis
             self.free_projection = self.project_free_light(self.shell)
+
+    @functools.cached_property
+    def scene_blockers(self) -> SceneBlockers:
+        """Bodies that block nothing."""
+        return SceneBlockers(self.merged_scene, self.samples_receive(), traces_self_visibility=False)
 
     def project_light(self, light: KnownLight, shell: wp.array | None = None) -> ProjectedBands:
         """The bands that the light has, or its patches."""

@@ -12,16 +12,14 @@ import warp as wp
 from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.progress import progress_bar
-from warpshadow.pipeline.bodies.convex import SceneConvexParts
 from warpshadow.pipeline.bodies.geometry import Geometry
-from warpshadow.pipeline.bodies.planes import ScenePlanes
 from warpshadow.pipeline.bodies.reflectance import Materials
-from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached
 from warpshadow.pipeline.receivers.groups import Blockers, CellVisibility, Group, HarmonicVisibility, find_groups
-from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds, LitPoints, receiver_text
+from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.shading.method import LightInput, Method
+from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, joined
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.shading import shade
@@ -53,7 +51,6 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         free_projection: The basis in which the method projects any free light, of the scene's shell if it has one.
         why_no_shadows: Why the method has no shadows, in words; empty if it has.
         joins_cached: Whether visibility combines cached rows with moving blockers.
-        traces_self_visibility: Whether bodies' shadows on themselves may come from rays, not spheres.
         shades_transmittance: Whether transmittance is shaded in known light at once, by :meth:`shade_transmittance`,
             which finds transfer vectors itself where it takes them: of cached rows, and for light from a shell.
     """
@@ -61,7 +58,6 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     free_projection: Projected
     why_no_shadows = ""
     joins_cached = False
-    traces_self_visibility = False
     shades_transmittance = False
     has_proxies = True
 
@@ -71,70 +67,13 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         return None
 
     @functools.cached_property
-    def plane_blockers(self) -> tuple[int, ...]:
-        """Bodies that block as the planes in which they lie, in place of their spheres."""
-        return ()
-
-    @functools.cached_property
-    def planes(self) -> ScenePlanes:
-        """The bodies that lie in planes."""
-        return ScenePlanes(self.merged_scene)
-
-    @functools.cached_property
-    def parts(self) -> SceneConvexParts:
-        """The bodies that consist of convex parts."""
-        return SceneConvexParts(self.merged_scene)
-
-    @functools.cached_property
-    def self_visibility(self) -> SelfVisibility:
-        """The bodies' shadows on themselves, from rays."""
-        return SelfVisibility(self.merged_scene, self.samples_receive(), progress=self.progress)
+    def scene_blockers(self) -> SceneBlockers:
+        """The blockers that the bodies are."""
+        return SceneBlockers(self.merged_scene, self.samples_receive(), progress=self.progress)
 
     def blocker_kinds(self, geometry: Geometry | None, rotations: Input | None) -> BlockerKinds:
-        """Choose the kind of blocker that each body of a geometry is; the scene's geometry by default.
-
-        Bodies block as planes and convex parts where the method knows such; where light does not bounce, no deformed
-        body is a plane.
-        """
-        deformed = () if geometry is None or self.merged_scene.scene.bounces else geometry.deformed
-        planes = tuple(body for body in self.plane_blockers if body not in deformed)
-        if rotations is None or not self.traces_self_visibility:
-            return ONLY_SPHERES._replace(planes=planes)
-        count = len(self.merged_scene.scene.bodies)
-        why = tuple(self.self_visibility.why_spheres(body, geometry) for body in range(count))
-        rigid = tuple(body for body, reason in enumerate(why) if not reason)
-        convex = self.convex_blockers(rigid)
-        solids = tuple(body for body in convex if body in self.parts.solids)
-        traced = tuple(body for body in rigid if body not in solids)
-        bulging = tuple(body for body, reason in enumerate(why) if reason and self._can_bulge[body])
-        return BlockerKinds(traced, rotations, why, planes, convex, solids, bulging)
-
-    @functools.cached_property
-    def _can_bulge(self) -> list[bool]:
-        """Whether each body is thin, so that its spheres bulge out of it, and its receivers were chosen, not asked for.
-
-        They are at vertices where its spheres block its own light: pipeline/README.md has figures. Images of others
-        are nearer to rays by pixel.
-        """
-        return [
-            is_chosen and body.casts_shadow and not body.is_glossy and body.is_thin
-            for is_chosen, body in zip(
-                self.merged_scene.has_chosen_receivers.tolist(), self.merged_scene.scene.bodies, strict=True
-            )
-        ]
-
-    def convex_blockers(self, rigid: tuple[int, ...]) -> tuple[int, ...]:
-        """Choose the bodies, of some whose shape is known, that block other bodies' light as convex parts."""
-        return ()
-
-    def blockers(
-        self, blocker_kinds: BlockerKinds, positions: wp.array, spheres: tuple[wp.array, wp.array]
-    ) -> Blockers:
-        """Place the blockers among bodies, by their vertices and spheres. Differentiable: these."""
-        owners = self.planes, self.parts, self.self_visibility, self.visibility.merging
-        frames = self.planes.frames(blocker_kinds.planes, positions) if blocker_kinds.planes else None
-        placed = self.parts.placed(blocker_kinds.convex, positions) if blocker_kinds.convex else None
-        return Blockers(self.merged_scene, blocker_kinds, *owners, positions, spheres, frames, placed)
+        """Choose the kind of blocker that each body of a geometry is; the scene's geometry by default."""
+        return self.scene_blockers.kinds(geometry, rotations)
 
     def find_visibility_past_planes(
         self, group: Group, visibility: FoundVisibility, projected_light: Projected
@@ -325,7 +264,9 @@ class PortionedShading(Node):
         self._is_shaded = light is not None and is_shaded
         self._is_transferred = not (self._is_shaded and method.shades_transmittance)
         self._visibility = NodeStage(
-            f"visibility{suffix}", lambda: _pairs(method, words), lambda: _why_unblocked(method, words)
+            f"visibility{suffix}",
+            lambda: method.scene_blockers.pairs_with(words),
+            lambda: _why_unblocked(method, words),
         )
         self._planes = NodeStage(
             f"planes{suffix}",
@@ -402,53 +343,22 @@ class PortionedShading(Node):
             return self.method.shade_transfer(transfer, portion, projected_light)
 
 
-def _sphere_counts(method: SphereMethod, points: LitPoints) -> np.ndarray:
-    """Number of spheres by which each body blocks the light of others."""
-    counts = method.merged_scene.sphere_counts.copy()
-    counts[[*points.blocker_kinds.planes, *points.blocker_kinds.convex]] = 0
-    return counts
-
-
-def _part_counts(method: SphereMethod, points: LitPoints) -> np.ndarray:
-    """Number of convex parts by which each body blocks the light of others."""
-    counts = np.zeros(len(method.merged_scene.scene.bodies), int)
-    for body in points.blocker_kinds.convex:
-        counts[body] = len(method.parts.parts[body])
-    return counts
-
-
-def _pairs(method: SphereMethod, points: LitPoints) -> str:
-    """Receivers and the spheres and convex parts that block them, in words."""
-    spheres, parts = _sphere_counts(method, points), _part_counts(method, points)
-
-    def blockers(bodies: list[int]) -> str:
-        part_text = f" and {parts[bodies].sum():,} convex parts" if parts[bodies].sum() else ""
-        return f"up to {spheres[bodies].sum():,} spheres{part_text}"  # some are culled, or merged
-
-    item_text = f"{receiver_text(points, static=False)} × {blockers(list(range(len(spheres))))}"
-    if points.static_bodies is None:
-        return item_text
-    moving = list(points.static_bodies.moving)
-    return f"{item_text}, {receiver_text(points, moving=False)} on static bodies × {blockers(moving)}"
-
-
 def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
     """Reason why no visibility is computed; empty if it is."""
-    counts = _sphere_counts(method, points) + _part_counts(method, points)
+    if method.why_no_shadows:
+        return method.why_no_shadows
+    blockers, kinds, static_bodies = method.scene_blockers, points.blocker_kinds, points.static_bodies
+    if not blockers.has_any(kinds):
+        return f"no body {'but flat ones ' if kinds.planes else ''}has blockers"
     _, moving, static = points.counts()
-    if method.why_no_shadows or not counts.sum():
-        rest = "but flat ones " if points.blocker_kinds.planes else ""
-        return method.why_no_shadows or f"no body {rest}has blockers"
-    if moving or (
-        points.static_bodies and static and (method.joins_cached or counts[list(points.static_bodies.moving)].sum())
-    ):
+    if moving or (static_bodies and static and (method.joins_cached or blockers.has_any(kinds, static_bodies.moving))):
         return ""
     return "no moving body has blockers" if static else "nothing is seen"
 
 
 def placed_blockers(method: SphereMethod, points: LitPoints) -> Node:
     """Node of the blockers around points, where they are in the world."""
-    place = functools.partial(method.blockers, points.blocker_kinds)
+    place = functools.partial(method.scene_blockers.placed, points.blocker_kinds)
     return points.cached_of_bodies("blockers", None, lambda: Node("", place, points.vertices, points.spheres))
 
 
@@ -459,27 +369,17 @@ def self_visibility_node(method: SphereMethod, points: LitPoints, projected_ligh
 
 
 def _self_visibility(method: SphereMethod, blocker_kinds: BlockerKinds, projected_light: Node | ProjectedLight) -> Node:
-    bodies, rotations = blocker_kinds.self_traced, blocker_kinds.rotations
+    bodies, rotations, blockers = blocker_kinds.self_traced, blocker_kinds.rotations, method.scene_blockers
     curved_bodies = [body for body in bodies if not method.merged_scene.is_flat[body]]
     if not curved_bodies or rotations is None:
-        return Node("self-shadows", None, idle=lambda: _why_no_self_visibility(method, blocker_kinds))
+        return Node("self-shadows", None, idle=lambda: blockers.why_none_is_traced(blocker_kinds))
 
     def state() -> str:
-        missing = method.self_visibility.missing(bodies)
+        missing = blockers.self_visibility.missing(bodies)
         known = f"{missing} to be traced, or read from the cache" if missing else "traced once, cached"
         return f"{len(curved_bodies)} {'body' if len(curved_bodies) == 1 else 'bodies'}: {known}"
 
     return Node("self-shadows", functools.partial(method.self_lookups, bodies), rotations, projected_light, items=state)
-
-
-def _why_no_self_visibility(method: SphereMethod, blocker_kinds: BlockerKinds) -> str:
-    """Why no body's shadow on itself is looked up."""
-    if not method.traces_self_visibility:
-        return "the method takes those of spheres"
-    names = [body.name for body in method.merged_scene.scene.bodies]
-    whys = {name: why for name, why in zip(names, blocker_kinds.why_spheres, strict=False) if why}
-    whys |= {names[body]: "its convex parts block its own light" for body in blocker_kinds.solids}
-    return "; ".join(f"{name}: {why}" for name, why in whys.items()) or "bodies are flat"
 
 
 def _static_shadows(method: SphereMethod, points: LitPoints, light: Input | None) -> Node:

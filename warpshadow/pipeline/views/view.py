@@ -425,7 +425,7 @@ def _receive(
             from warpshadow.pipeline.shading.sphere_method import SphereMethod
 
             assert isinstance(method, SphereMethod)
-            place = functools.partial(method.blockers, blocker_kinds)
+            place = functools.partial(method.scene_blockers.placed, blocker_kinds)
             seen = positions, normals, fragments, spheres
             quadtree = find_squares(place, method.sharp_share, *seen, is_adaptive, supersampling)
     else:

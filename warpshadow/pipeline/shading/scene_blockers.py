@@ -1,0 +1,132 @@
+"""The blockers of a scene: which bodies are planes, or convex parts, or have traced self-visibility, and the rest."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable
+
+import numpy as np
+import warp as wp
+
+from warpshadow.pipeline.bodies.convex import SceneConvexParts
+from warpshadow.pipeline.bodies.geometry import Geometry
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
+from warpshadow.pipeline.bodies.planes import ScenePlanes
+from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
+from warpshadow.pipeline.node import Input
+from warpshadow.pipeline.receivers.groups import Blockers
+from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds, LitPoints, receiver_text
+
+
+class SceneBlockers:
+    """The blockers that the bodies of a scene are, by a method of visibility.
+
+    Args:
+        merged_scene: The bodies.
+        samples_receive: Bodies on which samples are receivers, bool of shape [body].
+        plane_blockers: Bodies that block as the planes in which they lie, where they are not deformed.
+        has_convex_parts: Whether bodies that consist of convex parts block by these.
+        traces_self_visibility: Whether bodies' shadows on themselves may come from rays, not spheres.
+        progress: Whether to show the progress of rays.
+    Attributes:
+        planes: The bodies that lie in planes.
+        parts: The bodies that consist of convex parts.
+        self_visibility: The bodies' shadows on themselves, from rays.
+    """
+
+    def __init__(
+        self,
+        merged_scene: MergedScene,
+        samples_receive: np.ndarray,
+        *,
+        plane_blockers: tuple[int, ...] = (),
+        has_convex_parts: bool = False,
+        traces_self_visibility: bool = True,
+        progress: bool = False,
+    ):
+        self._merged_scene, self.plane_blockers = merged_scene, plane_blockers
+        self._has_convex_parts, self._traces_self_visibility = has_convex_parts, traces_self_visibility
+        self.planes, self.parts = ScenePlanes(merged_scene), SceneConvexParts(merged_scene)
+        self.self_visibility = SelfVisibility(merged_scene, samples_receive, progress=progress)
+
+    def kinds(self, geometry: Geometry | None, rotations: Input | None) -> BlockerKinds:
+        """Choose the kind of blocker that each body of a geometry is; the scene's geometry by default.
+
+        Where light does not bounce, no deformed body is a plane.
+
+        Args:
+            rotations: Of its bodies; None where nobody knows on which body a receiver is.
+        """
+        scene = self._merged_scene.scene
+        deformed = () if geometry is None or scene.bounces else geometry.deformed
+        planes = tuple(body for body in self.plane_blockers if body not in deformed)
+        if rotations is None or not self._traces_self_visibility:
+            return ONLY_SPHERES._replace(planes=planes)
+        why = tuple(self.self_visibility.why_spheres(body, geometry) for body in range(len(scene.bodies)))
+        rigid = tuple(body for body, reason in enumerate(why) if not reason)
+        convex = tuple(body for body in rigid if body in self.parts.parts) if self._has_convex_parts else ()
+        solids = tuple(body for body in convex if body in self.parts.solids)
+        traced = tuple(body for body in rigid if body not in solids)
+        bulging = tuple(body for body, reason in enumerate(why) if reason and self._can_bulge[body])
+        return BlockerKinds(traced, rotations, why, planes, convex, solids, bulging)
+
+    @functools.cached_property
+    def _can_bulge(self) -> list[bool]:
+        """Whether each body is thin, so that its spheres bulge out of it, and its receivers were chosen, not asked for.
+
+        They are at vertices where its spheres block its own light: pipeline/README.md has figures. Images of others
+        are nearer to rays by pixel.
+        """
+        are_chosen = self._merged_scene.has_chosen_receivers.tolist()
+        return [
+            is_chosen and body.casts_shadow and not body.is_glossy and body.is_thin
+            for is_chosen, body in zip(are_chosen, self._merged_scene.scene.bodies, strict=True)
+        ]
+
+    def placed(self, kinds: BlockerKinds, positions: wp.array, spheres: tuple[wp.array, wp.array]) -> Blockers:
+        """Place the blockers among bodies, by their vertices and spheres. Differentiable: these."""
+        owners = self.planes, self.parts, self.self_visibility, self._merged_scene.scene.visibility.merging
+        frames = self.planes.frames(kinds.planes, positions) if kinds.planes else None
+        placed = self.parts.placed(kinds.convex, positions) if kinds.convex else None
+        return Blockers(self._merged_scene, kinds, *owners, positions, spheres, frames, placed)
+
+    def has_any(self, kinds: BlockerKinds, bodies: Iterable[int] | None = None) -> bool:
+        """Whether some bodies, by default all, block light by spheres or convex parts."""
+        counts = self._sphere_counts(kinds) + self._part_counts(kinds)
+        return bool((counts if bodies is None else counts[list(bodies)]).sum())
+
+    def _sphere_counts(self, kinds: BlockerKinds) -> np.ndarray:
+        """Number of spheres by which each body blocks the light of others."""
+        counts = self._merged_scene.sphere_counts.copy()
+        counts[[*kinds.planes, *kinds.convex]] = 0
+        return counts
+
+    def _part_counts(self, kinds: BlockerKinds) -> np.ndarray:
+        """Number of convex parts by which each body blocks the light of others."""
+        counts = np.zeros(len(self._merged_scene.scene.bodies), int)
+        for body in kinds.convex:
+            counts[body] = len(self.parts.parts[body])
+        return counts
+
+    def pairs_with(self, points: LitPoints) -> str:
+        """Receivers and the spheres and convex parts that block them, in words."""
+        spheres, parts = self._sphere_counts(points.blocker_kinds), self._part_counts(points.blocker_kinds)
+
+        def blockers(bodies: list[int]) -> str:
+            part_text = f" and {parts[bodies].sum():,} convex parts" if parts[bodies].sum() else ""
+            return f"up to {spheres[bodies].sum():,} spheres{part_text}"  # some are culled, or merged
+
+        item_text = f"{receiver_text(points, static=False)} × {blockers(list(range(len(spheres))))}"
+        if points.static_bodies is None:
+            return item_text
+        moving = list(points.static_bodies.moving)
+        return f"{item_text}, {receiver_text(points, moving=False)} on static bodies × {blockers(moving)}"
+
+    def why_none_is_traced(self, kinds: BlockerKinds) -> str:
+        """Why no body's shadow on itself is looked up."""
+        if not self._traces_self_visibility:
+            return "the method takes those of spheres"
+        names = [body.name for body in self._merged_scene.scene.bodies]
+        whys = {name: why for name, why in zip(names, kinds.why_spheres, strict=False) if why}
+        whys |= {names[body]: "its convex parts block its own light" for body in kinds.solids}
+        return "; ".join(f"{name}: {why}" for name, why in whys.items()) or "bodies are flat"
