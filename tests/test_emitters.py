@@ -220,6 +220,25 @@ def test_gradients_to_a_texture_of_emission_are_exact_since_images_are_linear_in
     torch.testing.assert_close(gray, renderer(emission={"screen": torch.ones(4, 3)}).detach(), atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("start", [np.float32([2, 2, 2]), np.full((2, 3, 3), 2.0)], ids=["color", "texture"])
+def test_a_fit_finds_a_texture_of_emission(start):
+    truth = SCREEN.reshape(4, 8, 6, 8, 3).mean(axis=(1, 3))
+    camera = ws.Camera.look_at((-1.5, 1.8, 0.5), (0, 0.6, -0.9), fov_y=40, size=(32, 32))  # past the ball
+    scene, plain = (
+        dataclasses.replace(with_screen(ws.plane((1.2, 0.8), 1), emission), camera=camera)
+        for emission in (truth, start)
+    )
+    target = inverse.Target(ws.Renderer(scene).render())
+    problem = inverse.Problem(
+        plain, target, [inverse.Emission("screen", size=(4, 6))], still=ws.Visibility("directional")
+    )
+    result = inverse.fit(problem, [inverse.Stage(150)], progress=False)
+    found = result.scene.bodies[0].emission
+    assert found.shape == (4, 6, 3) and result.figures == {}
+    assert unlike(found, truth) < 0.05
+
+
 def test_a_texture_of_emission_that_cannot_be_is_refused():
     with pytest.raises(ValueError, match="emission: got a texture, .* but mesh .* has no uvs"):
         ws.Body(SMALL, emission=SCREEN)
@@ -228,7 +247,11 @@ def test_a_texture_of_emission_that_cannot_be_is_refused():
     with pytest.raises(ValueError, match="emission.*: got shape"):
         TorchRenderer(scene_of(), progress=False)(emission={"lamp": torch.tensor(SCREEN)})
     scene = with_screen(ws.plane((1.2, 0.8), 1), SCREEN)
-    with pytest.raises(ValueError, match="per_vertex: got it of a body whose emission is a texture"):
+    with pytest.raises(ValueError, match="body: got 0, whose mesh has no uvs"):
+        inverse.Problem(scene_of(), inverse.Target(np.zeros((32, 32, 3))), [inverse.Emission("lamp", size=(2, 2))])
+    with pytest.raises(ValueError, match="smoothness: got it without size"):
+        inverse.Emission("screen", smoothness=0.1)
+    with pytest.raises(ValueError, match="per_vertex: got it of a body whose emission is a texture, expected size"):
         inverse.Problem(scene, inverse.Target(np.zeros((32, 32, 3))), [inverse.Emission("screen", per_vertex=True)])
 
 
