@@ -57,12 +57,12 @@ def walls_of_light(
 
 def _wall(light: EnvironmentMap, side: str, edges: np.ndarray, center: np.ndarray, texels: int) -> Body:
     axis, sign = "xyz".index(side[1]), 1.0 if side[0] == "+" else -1.0
-    across, along = (axis + 1) % 3, (axis + 2) % 3
+    axis_u, axis_v = (axis + 1) % 3, (axis + 2) % 3
 
     def on_wall(places: np.ndarray) -> np.ndarray:
         """Points of the wall, from the middle of the box, of places from -0.5 to 0.5, [..., 2]."""
         points = np.full((*places.shape[:-1], 3), 0.5 * sign * edges[axis])
-        points[..., across], points[..., along] = np.moveaxis(places * edges[[across, along]], -1, 0)
+        points[..., axis_u], points[..., axis_v] = np.moveaxis(places * edges[[axis_u, axis_v]], -1, 0)
         return points
 
     u, v = np.meshgrid((np.arange(texels) + 0.5) / texels, 1 - (np.arange(texels) + 0.5) / texels)
