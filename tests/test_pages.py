@@ -361,7 +361,7 @@ def test_the_node_that_a_page_adds_is_one_of_the_image(tmp_path, monkeypatch):
     (snippet,) = blocks(ROOT / "warpshadow" / "README.md", "python")
     (lines,) = re.findall(r"^    (averaged = .*\n    return .*)$", page, re.MULTILINE)
     replaced = "return" + lines.partition("\n")[0].removeprefix("averaged =")
-    source = (ROOT / "warpshadow" / "pipeline" / "view.py").read_text("utf-8")
+    source = (ROOT / "warpshadow" / "pipeline" / "views" / "view.py").read_text("utf-8")
     assert source.count(replaced) == 1
     (tmp_path / "vignette.py").write_text(snippet, "utf-8")
     pasted = source.replace(replaced, lines.replace("\n", "\n    "))

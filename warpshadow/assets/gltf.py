@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from warpshadow.assets.color import srgb_to_linear
-from warpshadow.assets.mesh import Gloss, MeshPart
+from warpshadow.assets.mesh import EmissiveColor, Gloss, MeshPart
 
 Factors = Mapping[tuple[int, ...], tuple[float, ...]]
 """Linear factors of materials, by the codes that trimesh rounds them to."""
@@ -51,16 +51,21 @@ def base_color_factor(material, factors: Factors) -> tuple[float, ...] | None:
     return factors.get(codes, tuple(code / 255 for code in codes))
 
 
-def emission_of(material) -> tuple[float, float, float] | None:
-    """The radiance of a material of trimesh: its emissive factor, times the mean of a texture; None for no emission."""
-    factor, image = getattr(material, "emissiveFactor", None), getattr(material, "emissiveTexture", None)
+def emission_of(material) -> EmissiveColor | None:
+    """The emission of a material of trimesh; None for none."""
+    factor = getattr(material, "emissiveFactor", None)
     if factor is None or not np.any(factor):
         return None
-    radiance = np.array(factor, np.float64)
-    if image is not None:
-        radiance = radiance * srgb_to_linear(np.asarray(image.convert("RGB")) / 255).mean(axis=(0, 1))
-    red, green, blue = radiance.tolist()
-    return red, green, blue
+    red, green, blue = np.array(factor, np.float64).tolist()
+    return EmissiveColor((red, green, blue), getattr(material, "emissiveTexture", None))
+
+
+def emission_texels(emission: EmissiveColor) -> np.ndarray:
+    """Radiance of a surface, float32 of shape [3], or [height, width, 3] where it varies."""
+    if emission.image is None:
+        return np.array(emission.factor, np.float32)
+    texels = srgb_to_linear(np.asarray(emission.image.convert("RGB")) / 255) * np.array(emission.factor)
+    return (texels if np.ptp(texels, axis=(0, 1)).any() else texels[0, 0]).astype(np.float32)
 
 
 def emissive_strengths(tree: dict) -> Mapping[tuple[float, ...], float]:
@@ -81,9 +86,9 @@ def stronger(part: MeshPart, strengths: Mapping[tuple[float, ...], float]) -> Me
     """A part that emits as much stronger as the strength of its material says."""
     if part.emission is None:
         return part
-    strength = strengths.get(_rounded(part.emission), 1.0)
-    red, green, blue = (strength * color for color in part.emission)
-    return part._replace(emission=(red, green, blue))
+    strength = strengths.get(_rounded(part.emission.factor), 1.0)
+    red, green, blue = (strength * color for color in part.emission.factor)
+    return part._replace(emission=part.emission._replace(factor=(red, green, blue)))
 
 
 def gloss_of(material) -> Gloss | None:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpshadow.device.batch import cut
+from warpshadow.device.batch import cut, rows
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
@@ -23,6 +23,7 @@ from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.receivers.groups import Blockers, Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.shading.transfers import joined
+from warpshadow.stages.bounces.albedo import mean_over_texels
 from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.emitters.convex import find_log_transmittance_of_parts
 from warpshadow.stages.emitters.light import directions_to_samples, sum_light
@@ -63,6 +64,7 @@ class SceneEmitters:
 
     def __init__(self, merged_scene: MergedScene):
         self._merged_scene = merged_scene
+        self._texel_matrices: dict[tuple[int, tuple[int, int]], SparseMatrix] = {}
 
     @functools.cached_property
     def samples(self) -> EmitterSamples:
@@ -122,7 +124,35 @@ class SceneEmitters:
 
     def radiance(self, materials: Materials) -> Node:
         """Node of the samples' radiance, vec3 of shape [batch, sample]."""
-        return Node("", lambda emission: multiply(self.samples.vertices, emission), materials.of_vertices("emission"))
+        of_vertices = materials.of_vertices("emission")
+        if not materials.textures_of["emission"].images:
+            return Node("", lambda emission: multiply(self.samples.vertices, emission), of_vertices)
+
+        def radiance(emission: wp.array, of_bodies: list[wp.array]) -> wp.array:
+            total = multiply(self.samples.vertices, emission)
+            for number, body in enumerate(self.samples.bodies):
+                image = of_bodies[body]
+                if image.ndim == 3:
+                    total = multiply(self._texel_weights(number, image.shape[1:]), rows(image), addend=total)
+            return total
+
+        return Node("", radiance, of_vertices, materials.emission)
+
+    def _texel_weights(self, number: int, size: tuple[int, int]) -> SparseMatrix:
+        """Weights of the texels of an emitter's texture in the radiance of all samples, [sample, texel]."""
+        if (number, size) not in self._texel_matrices:
+            from scipy.sparse import csr_matrix, vstack
+
+            mesh = self._merged_scene.scene.bodies[self.samples.bodies[number]].mesh
+            counts = [item.vertices.shape[0] for item in self._sample_weights]
+            blocks = [csr_matrix((count, size[0] * size[1])) for count in counts]
+            assert mesh.uvs is not None and mesh.surface.uv_faces is not None
+            texture_space = mesh.positions, mesh.surface.faces, mesh.uvs, mesh.surface.uv_faces
+            weights = self._sample_weights[number]
+            blocks[number] = mean_over_texels(weights.patches, *texture_space, size)[weights.patch_of_samples]
+            matrix = SparseMatrix.from_matrix(vstack(blocks), device=self._merged_scene.device)
+            self._texel_matrices[number, size] = matrix
+        return self._texel_matrices[number, size]
 
     def traced_light(self, receivers: Node, placed: Node, radiance: Node, transmittance: Node, name: str) -> Node:
         """Node of their light on receivers, given the transmittance to the samples of each, a list."""

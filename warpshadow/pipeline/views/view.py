@@ -26,7 +26,7 @@ from warpshadow.stages.silhouettes.find import Silhouettes, find_silhouettes
 from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
 from warpshadow.stages.slopes import moving_radiance
 from warpshadow.stages.textures.footprint import Footprints
-from warpshadow.stages.textures.sample import textured_radiance
+from warpshadow.stages.textures.sample import sample_albedo, textured_radiance
 from warpshadow.stages.textures.seen import seen_texels
 
 if TYPE_CHECKING:
@@ -207,10 +207,19 @@ class View(LitPoints):
             reflected = self._radiance(shading, reflectance)
         if not materials.emission:
             return reflected
-        of_vertices = materials.of_vertices("emission")
-        emission = Node("emission", interpolate, self.fragments_node, self.merged_scene.faces, of_vertices)
-        emitted = self._radiance(Node("", _white_shading, self.receivers_node), emission)
+        emitted = self._radiance(Node("", _white_shading, self.receivers_node), self._emission(materials))
         return self._sum_of(reflected, emitted)
+
+    def _emission(self, materials: Materials) -> Node:
+        """Node of the radiance that the samples emit, vec3 of shape [batch, height, width]."""
+        textures = materials.textures_of["emission"]
+        seen = self.fragments_node, self.merged_scene.faces, materials.of_vertices("emission")
+        if not textures.images:
+            return Node("emission", interpolate, *seen)
+        arguments = self.fragments_node, self.clip_positions, textures.pyramids, ""
+        wire = functools.partial(textures.footprints, *arguments)
+        footprints = self.cached("footprints in emission", textures.sizes, wire)
+        return Node("emission", sample_albedo, *seen, textures.pyramids, footprints)
 
     def _sum_of(self, first: Node, second: Node) -> Node:
         """Node of the samples, of light of two kinds."""
