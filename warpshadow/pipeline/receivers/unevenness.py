@@ -21,6 +21,7 @@ from warpshadow.stages.ray_tracing import trace_visibility_on_host
 _CELLS = 128  # of directions; the default of "directional", which has them already
 _RAYS = 64  # from a point, to cells by their light
 _FACES = 256  # of a body that are looked at, at most
+_INSET = 1e-3  # of the way from the corners of faces to their middles
 
 
 def light_unevenness(
@@ -71,8 +72,12 @@ def light_unevenness(
 
 
 def _with_middles(corners: np.ndarray) -> np.ndarray:
-    """Values at the corners of faces, [face, 3, 3], and at their middles, [face, 4, 3]."""
-    return np.concatenate([corners, corners.mean(axis=1, keepdims=True)], axis=1)
+    """Values at the corners of faces, [face, 3, 3], and at their middles, [face, 4, 3].
+
+    The corners are a little inside, so that none is in the plane of another face, on either side of it.
+    """
+    middles = corners.mean(axis=1, keepdims=True)
+    return np.concatenate([corners + _INSET * (middles - corners), middles], axis=1)
 
 
 def _irradiance(
