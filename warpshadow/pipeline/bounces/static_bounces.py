@@ -293,7 +293,7 @@ class StaticBounces:
         return points.cached("form factors", (senders, at_patch_samples), make)
 
     def _ray_origins(self, receivers: Receivers, positions: wp.array) -> np.ndarray:
-        """Points from which rays of receivers leave, [view, receiver, 3]: of vertices where walls meet, within these."""
+        """Points from which rays of receivers leave, [view, receiver, 3]: where walls meet, within that of a vertex."""
         points, vertices = receivers.points.numpy().copy(), positions.numpy()[0]
         if receivers.of_vertices is None:  # of points that are given
             return points
