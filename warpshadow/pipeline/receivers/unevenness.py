@@ -14,6 +14,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.maths.directions import fibonacci
+from warpshadow.maths.inset import inset_vertices
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.ray_tracing import trace_visibility_on_host
@@ -21,7 +22,6 @@ from warpshadow.stages.ray_tracing import trace_visibility_on_host
 _CELLS = 128  # of directions; the default of "directional", which has them already
 _RAYS = 64  # from a point, to cells by their light
 _FACES = 256  # of a body that are looked at, at most
-_INSET = 1e-3  # of the way from the corners of faces to their middles
 
 
 def light_unevenness(
@@ -54,8 +54,9 @@ def light_unevenness(
     vertices = wp.array(positions, dtype=wp.vec3, device=device)
     mesh = merged_scene.casting_mesh(vertices)
     normals = vertex_normals(vertices.reshape((1, -1)), merged_scene.faces).numpy()[0]
-    corners = merged_scene.faces.numpy()[seen[rows]]
-    points, point_normals = (_with_middles(values[corners]) for values in (positions, normals))
+    faces = merged_scene.faces.numpy()
+    origins, corners = inset_vertices(positions, faces), faces[seen[rows]]
+    points, point_normals = (_with_middles(values[corners]) for values in (origins, normals))
     is_behind = ((eyes[rows] - points[:, 3]) * point_normals[:, 3]).sum(axis=1) < 0
     is_behind &= merged_scene.is_two_sided[merged_scene.body_of_face[seen[rows]]]
     lengths = np.linalg.norm(point_normals, axis=2, keepdims=True)
@@ -72,12 +73,8 @@ def light_unevenness(
 
 
 def _with_middles(corners: np.ndarray) -> np.ndarray:
-    """Values at the corners of faces, [face, 3, 3], and at their middles, [face, 4, 3].
-
-    The corners are a little inside, so that none is in the plane of another face, on either side of it.
-    """
-    middles = corners.mean(axis=1, keepdims=True)
-    return np.concatenate([corners + _INSET * (middles - corners), middles], axis=1)
+    """Values at the corners of faces, [face, 3, 3], and at their middles, [face, 4, 3]."""
+    return np.concatenate([corners, corners.mean(axis=1, keepdims=True)], axis=1)
 
 
 def _irradiance(
