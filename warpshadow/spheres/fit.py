@@ -154,9 +154,9 @@ def _warn_of_holes(mesh: Mesh, count: int | str, report: FitReport) -> None:
     )
 
 
-def is_fitted(mesh: Mesh, count: int | str, *, device: wp.DeviceLike = "cpu") -> bool:
-    """Whether the cache has the fit of :func:`fit_spheres` for a mesh and a count."""
-    fit_key, *_ = _find_fit_key(mesh, 0, STEPS, wp.get_device(device))
+def is_fitted(mesh: Mesh, count: int | str, steps: int = STEPS, *, device: wp.DeviceLike = "cpu") -> bool:
+    """Whether the cache has the fit of :func:`fit_spheres` for a mesh, a count and a number of steps."""
+    fit_key, *_ = _find_fit_key(mesh, 0, steps, wp.get_device(device))
     return _cache_path(fit_key, count).exists()
 
 
