@@ -31,7 +31,7 @@ class FitRequest(NamedTuple):
     """A fit of spheres that a body asks for."""
 
     mesh: Mesh
-    count: int | str
+    sphere_count: int | str
     steps: int = STEPS
 
 
@@ -48,7 +48,7 @@ def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: boo
     return [
         fit_spheres(
             fits[number].mesh,
-            fits[number].count,
+            fits[number].sphere_count,
             steps=fits[number].steps,
             device=device,
             progress=progress,
@@ -170,9 +170,9 @@ def free_shape_remark(scene: Scene, number: int) -> str:
 def _announce(fits: Iterable[FitRequest], device: wp.DeviceLike, progress: bool) -> None:
     """Say how long fits that are to be made take, if that is long."""
     requested = set(fits)
-    if sum(fit_seconds(request.count) for request in requested) <= ANNOUNCED_SECONDS:
+    if sum(fit_seconds(request.sphere_count) for request in requested) <= ANNOUNCED_SECONDS:
         return
-    missing = [request.count for request in requested if not is_fitted(*request, device=device)]
+    missing = [request.sphere_count for request in requested if not is_fitted(*request, device=device)]
     announce(
         f"fitting spheres to {len(missing)} mesh{'es' * (len(missing) != 1)}",
         sum(map(fit_seconds, missing)),

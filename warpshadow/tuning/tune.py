@@ -397,7 +397,9 @@ def _by_work(scene: Scene, sample: PointSample) -> Iterator[Scene]:
         yield replace(scene, visibility=scene.visibility.by("none"))
     yield from _all_directions(scene)
     counts = {
-        number: len(fit_spheres(fit.mesh, device=sample.device).spheres) if fit.count == AUTO else int(fit.count)
+        number: len(fit_spheres(fit.mesh, device=sample.device).spheres)
+        if fit.sphere_count == AUTO
+        else int(fit.sphere_count)
         for number, fit in fitted_meshes(scene).items()
     }
     factor, maximum = 2, max(counts.values(), default=SPHERE_COUNTS[-1])

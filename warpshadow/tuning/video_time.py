@@ -27,7 +27,7 @@ def setup_seconds(scene: Scene, *, device: wp.DeviceLike = "cpu") -> float:
     seconds = 0.0
     for fit in set(fitted_meshes(scene).values()):
         if not is_fitted(*fit, device=device):
-            seconds += fit_seconds(fit.count) + trace_seconds(fit.mesh.vertex_count, fit.mesh.face_count)
+            seconds += fit_seconds(fit.sphere_count) + trace_seconds(fit.mesh.vertex_count, fit.mesh.face_count)
     return seconds
 
 
