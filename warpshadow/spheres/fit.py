@@ -84,7 +84,7 @@ def fit_spheres(
         mesh: The mesh [scene units], y up; open and multi-part meshes, too.
         count: Number of spheres; 0 gives none. "auto" takes as many as the body needs, 8 to 1024: until the error of
             its shadows around it is some 3%, or no longer falls by 15% where they are doubled. It is 8 for a ball, 64
-            for a cow and a box, 256 for a bunny, 1024 for a chair.
+            for a cow, 256 for a bunny and a box, 1024 for a chair.
         error: Instead of a count, the visibility error to reach (see FitReport), for example 0.05: the number
             of spheres is doubled from 16 until it is met, then bisected. If 1024 do not meet it, their fit
             comes with a warning.
