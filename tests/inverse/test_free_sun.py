@@ -141,7 +141,9 @@ def test_a_fit_file_frees_it(tmp_path):
     ws.write_scene(scene_of(), tmp_path)
     ws.write_image(tmp_path / "target.exr", np.zeros((48, 48, 4), np.float32))
     lines = 'scene = "scene.toml"\n[[target]]\nimage = "target.exr"\n[free]\nsun = {}\n'
-    (tmp_path / "fit.toml").write_text(lines.format("{direction = [0.2, 1, 0], irradiance = [3, 3, 2], directions = 256}"))
+    (tmp_path / "fit.toml").write_text(
+        lines.format("{direction = [0.2, 1, 0], irradiance = [3, 3, 2], directions = 256}")
+    )
     (sun,) = inverse.load_fit(tmp_path / "fit.toml").problem.free
     assert sun == inverse.Sun((0.2, 1, 0), (3, 3, 2), directions=256)
     (tmp_path / "fit.toml").write_text(lines.format("true"))

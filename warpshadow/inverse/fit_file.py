@@ -44,7 +44,9 @@ from warpshadow.scene.visibility import Visibility
 _KEYS = ("scene", "tolerance", "seed", "stages", "target", "free", "loss", "still", "optimizer", "stage")
 _PHOTOGRAPH_KEYS = ("encoding", "exposure", "white_balance", "saturation", "moves_outlines", "distortion")
 _TARGET_KEYS = ("image", "mask", "camera", "outlines", *_PHOTOGRAPH_KEYS)
-_FREE_OF_SCENE: dict[str, type[Free]] = {kind.key: kind for kind in (Light, Sun, Shell, Exposure, CameraPose, OutlineOffset)}
+_FREE_OF_SCENE: dict[str, type[Free]] = {
+    kind.key: kind for kind in (Light, Sun, Shell, Exposure, CameraPose, OutlineOffset)
+}
 _FREE_OF_BODIES: dict[str, type[Free]] = {
     kind.key: kind for kind in (Albedo, Texture, Roughness, Metallic, Emission, Lamp, Pose, Plane, Deformation, Radii)
 }

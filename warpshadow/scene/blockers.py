@@ -12,7 +12,7 @@ from warpshadow.maths.convex import ConvexPart, is_panel
 from warpshadow.maths.plane import plane_normal
 from warpshadow.maths.solid_angle import solid_angles
 from warpshadow.scene.body import Body, into_own_space
-from warpshadow.scene.height_fields import solid_behind
+from warpshadow.scene.height_fields import is_bowl, solid_behind
 from warpshadow.scene.scene import Scene
 from warpshadow.scene.visibility import SPHERE_METHODS
 from warpshadow.spheres import Spheres, fit_spheres
@@ -81,8 +81,8 @@ def blocking_parts(scene: Scene) -> dict[int, list[ConvexPart]]:
 
     By method "directional" these are those of all bodies that consist of some, unless how many spheres they have, or
     that these block their own light, was asked for. Panels are chords of bent sheets. Over land they would shade the
-    air behind them; so a body with a solid behind it (:mod:`.scene.height_fields`) has panels only
-    where it is flat, such as the walls of a room.
+    air behind them; so a body with a solid behind it (:mod:`.scene.height_fields`) that is no bowl
+    has panels only where it is flat, such as the walls of a room.
     """
     visibility = scene.visibility.with_method()
     if visibility.method != "directional":
@@ -90,8 +90,8 @@ def blocking_parts(scene: Scene) -> dict[int, list[ConvexPart]]:
     result = {}
     for number, body in enumerate(scene.bodies):
         if isinstance(body.blockers, str) and body.self_shadows_in(visibility) != "spheres":
-            mesh = body.mesh
-            result[number] = mesh.convex_parts if _solid_behind(scene, number) is None else mesh.flat_parts
+            is_land = _solid_behind(scene, number) is not None and not is_bowl(body)
+            result[number] = body.mesh.flat_parts if is_land else body.mesh.convex_parts
     return {number: parts for number, parts in result.items() if parts}
 
 

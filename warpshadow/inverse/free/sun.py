@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from warpshadow import check
 from warpshadow.assets.basis import CellBasis
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.inverse import constraints
