@@ -275,8 +275,9 @@ def find_receivers(
         wp.copy(receiver_faces[count:], from_numpy(receiver_count + triangles, dtype=wp.vec3i, device=device))
     vertices = of_vertices if vertices is None else vertices
     points = _gather_receiver_points(batch_count, positions, normals, faces, vertices, sample_fragments, rises=rises)
-    arguments = *points, receiver_faces, of_vertices, receiver_fragments, on_static
-    receivers = Receivers(*arguments, has_mean_slope=has_mean_slope)
+    receivers = Receivers(
+        *points, receiver_faces, of_vertices, receiver_fragments, on_static, has_mean_slope=has_mean_slope
+    )
     if bodies is None:
         return receivers
     if sample_fragments and not sample_fragments.face_ids.size:

@@ -2,14 +2,16 @@
 
 A surface of color c that moves over the screen by v changes a sample by −∇c · v. Were faces large, ∇c could be that of
 the face at the sample's point. But where they are as small as samples, it is one of many; and towards a limb, where
-shading changes faster and faster, it is far from the mean. So the mean over the sample is taken. Its right half gives
+shading changes faster and faster, it is far from the mean. So the mean over the sample is taken. To its right color
+changes by
 
-    ½ (c_right − c)                 if the neighbor's center is on the surface,
-    min(t, ½) / t · (c_edge − c)    if the surface has an edge before, of color c_edge at distance t [samples],
+    ½ (c_right − c) over ½ sample    if the neighbor's center is on the surface,
+    c_edge − c over t samples        if the surface has an edge before, of color c_edge at distance t,
 
-and likewise the other halves. Where something else comes in front before the neighbor's center, or the image ends,
-there is nothing to be known, and the opposite half counts alone. Where all neighbors see the same face, the slope is
-the face's own.
+and likewise to the other sides. Beyond ½ sample that is the part of the neighbor which has this sample's color: so the
+steps of color along a row add up to that from edge to edge, which moving edges take back. Where something else comes in
+front before the neighbor's center, or the image ends, there is nothing to be known, and the opposite half counts alone.
+Where all neighbors see the same face, the slope is the face's own.
 
 A sample that is a receiver itself has the exact derivative at its point instead, except beside the outline of its
 surface. There the exact slope is often tiny and rarely huge, as it grows without bound towards a limb, and does not
@@ -108,10 +110,10 @@ def _find_mean_slopes(
     # out
     has_mean_slope: wp.array(dtype=wp.bool),
 ):
-    """A thread owns a sample: whether its surface, or that of a neighbor on it, ends beside it and it has both slopes."""
+    """A thread owns a sample: whether its surface ends beside it, or beside a neighbor, and both slopes are known."""
     sample = wp.tid()
     side = sides[sample]
-    is_beside = bool(False)
+    is_at_outline = bool(False)
     has_slopes = side >= 0
     if keys and side >= 0:
         has_slopes = keys[side] < 0
@@ -121,14 +123,14 @@ def _find_mean_slopes(
             for k in range(2 * axis, 2 * axis + 2):
                 distance = _distance_to_end(fragments, entries, edges, sample, k)
                 is_known = is_known or distance > -2.0
-                is_beside = is_beside or distance > 0.0
+                is_at_outline = is_at_outline or distance > 0.0
                 if distance == -1.0:
                     neighbor_sample = neighbor(sample, k, fragments.width)
                     for j in range(4):
-                        beside = _distance_to_end(fragments, entries, edges, neighbor_sample, j)
-                        is_beside = is_beside or beside > 0.0
+                        neighbor_distance = _distance_to_end(fragments, entries, edges, neighbor_sample, j)
+                        is_at_outline = is_at_outline or neighbor_distance > 0.0
             has_slopes = has_slopes and is_known
-    has_mean_slope[sample] = has_slopes and is_beside
+    has_mean_slope[sample] = has_slopes and is_at_outline
 
 
 def find_mean_slopes(silhouettes: Silhouettes, clip_positions: wp.array, quadtree: Quadtree | None = None) -> wp.array:
@@ -222,10 +224,9 @@ def _add_shading_gradients(
                                 # entries are of all views; where one view serves all images, each has its
                                 # own colors
                                 color_step = edge_colors[batch - fragment_batch, entry, direction] - color
-                                distance = wp.min(t, 0.5)
                                 adj_step = wp.dot(adj_color, wp.vec3(color_step[0], color_step[1], color_step[2]))
-                                weighted_slopes[direction / 2] += direction_sign(direction) * distance / t * adj_step
-                                distances[direction / 2] += distance
+                                weighted_slopes[direction / 2] += direction_sign(direction) * adj_step
+                                distances[direction / 2] += t
                         elif edge[0] == NOTHING and has_neighbor(fragment, direction, width, fragments.height):
                             neighbor_sample = neighbor(sample, direction, width)
                             if receiver_face_ids[fragment_batch, neighbor_sample] >= 0:
