@@ -28,8 +28,8 @@ _STUCK = 0.1
 So do rocks and water in land; a ground that a tent stands on does not."""
 
 _DEEP = 0.25
-"""Depth of bowls, over the longest side of their bounds. A ball in half a shell (0.5) is 18% too bright past the solid's
-spheres under an even sky, 2% too dark past panels; in a shell of 0.29 4% and 1%. That land has 0.1."""
+"""Depth of bowls, over the longest side of their bounds. A ball in half a shell (0.5) is 18% too bright past spheres of
+the solid under an even sky, 2% too dark past panels; in a shell of 0.29 4% and 1%. That land has 0.1."""
 
 _UPWARD = 0.5  # cosine of the angle to +y up to which land leans
 
