@@ -145,9 +145,11 @@ class Sun(Free):
 
 
 def _weights(direction: torch.Tensor, variance: torch.Tensor, cells: torch.Tensor) -> torch.Tensor:
-    """Weights of cells [cell] of a given variance, whose mean is along a direction. Differentiable: direction, variance.
+    """Weights of cells [cell] of a given variance, whose mean is along a direction.
 
     Newton's method finds λ without a record; one more step from there has its derivatives.
+
+    Differentiable: direction, variance.
     """
     helper = torch.eye(3).to(direction)[int(direction.detach().abs().argmin())]
     first = torch.linalg.cross(helper, direction)
