@@ -61,7 +61,7 @@ def test_a_fit_finds_the_direction_and_the_strength_of_a_sun_that_started_25_deg
     np.testing.assert_allclose(added, IRRADIANCE, rtol=STRENGTH)
     assert degrees_off(light.directions().reshape(-1, 3)[light.radiance.sum(axis=-1).argmax()]) < SIDE + 1
     summary = toml_tables.read(tmp_path / "summary.toml", "summary")["figures"]
-    assert summary["sun.direction"] == pytest.approx(result.figures["sun.direction"].tolist(), abs=1e-5)
+    assert summary["sun.direction"] == pytest.approx(list(result.figures["sun.direction"]), abs=1e-5)
 
 
 def test_a_fit_tells_the_size_of_a_sun_that_is_larger_than_its_cells_resolve():
