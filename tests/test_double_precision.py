@@ -665,7 +665,7 @@ def test_gradients_of_a_ground_in_moving_shadows_are_exact(method, receivers, do
     """
     sample_radiance = double("stages.film").sample_radiance
     monkeypatch.setattr(
-        double("pipeline.view"), "moving_radiance", lambda *inputs: (sample_radiance(*inputs[:4]), None)
+        double("pipeline.views.view"), "moving_radiance", lambda *inputs: (sample_radiance(*inputs[:4]), None)
     )
     renderer, rotation_matrices = make_renderer(method, receivers), double("torch").rotation_matrices
     camera = renderer.scene.camera

@@ -271,6 +271,22 @@ def test_a_lamp_hides_its_far_side(method):
     assert light_on_wall(inward, method) == pytest.approx(light_on_wall(ball, method), rel=0.02)
 
 
+def test_a_bulb_lights_the_inside_of_its_shade_past_which_the_other_side_is():
+    """The far side of a shade is behind the bulb, and hides none of it."""
+    tube = trimesh.creation.cylinder(0.4, 0.5, sections=24)
+    shade = ws.Mesh(tube.vertices, tube.faces[np.abs(tube.face_normals[:, 2]) < 0.5]).transformed(
+        rotation=np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    )
+    bulb = ws.Body(ws.icosphere(0.08, 2), (0, 0, 0), emission=(6, 5, 4), name="bulb")
+    camera = ws.Camera.look_at((0.2, -1.5, 0.1), (0, 0, 0), fov_y=35, size=(32, 32))
+    bodies = ws.Body(shade, (0.7, 0.6, 0.5), name="shade"), bulb
+    scene = scene_of(*bodies, light=DARK, camera=camera)
+    renderer = ws.Renderer(scene)
+    shows_shade = renderer.layers().bodies == 0
+    light, expected = (image[shows_shade][:, :3].mean() for image in (renderer.render(), ws.render(scene)))
+    assert light == pytest.approx(expected, rel=0.05)  # 0.5% off; by self-visibility to infinity 70% darker
+
+
 def test_light_of_a_shade_is_that_of_rays():
     tube = trimesh.creation.cylinder(0.2, 0.4, sections=32)
     shade = ws.Mesh(tube.vertices, tube.faces[np.abs(tube.face_normals[:, 2]) < 0.5])

@@ -57,7 +57,8 @@ def write(path, *factors, texture=None):
     scene = trimesh.Scene()
     for number, factor in enumerate(factors):
         ball = trimesh.creation.icosphere(subdivisions=1)
-        material = trimesh.visual.material.PBRMaterial(emissiveFactor=factor, emissiveTexture=texture)
+        name = f"material {number}"
+        material = trimesh.visual.material.PBRMaterial(name, emissiveFactor=factor, emissiveTexture=texture)
         ball.visual = trimesh.visual.TextureVisuals(uv=np.zeros((42, 2)), material=material)
         scene.add_geometry(ball, transform=trimesh.transformations.translation_matrix((3 * number, 0, 0)))
     scene.export(path)
@@ -85,6 +86,20 @@ def test_the_strength_of_an_emissive_material_counts(tmp_path):
     tree["materials"][0]["extensions"] = {"KHR_materials_emissive_strength": {"emissiveStrength": 20.0}}
     path.write_text(json.dumps(tree))
     np.testing.assert_allclose(ws.Body(path).emission, (10, 5, 2.5))
+
+
+def test_materials_of_one_factor_have_strengths_of_their_own(tmp_path):
+    path = write(tmp_path / "a.gltf", (1, 1, 1), (1, 1, 1))
+    tree = json.loads(path.read_text())
+    assert len(tree["materials"]) == 2 and tree["materials"][0]["name"] != tree["materials"][1]["name"]
+    tree["materials"][0]["extensions"] = {"KHR_materials_emissive_strength": {"emissiveStrength": 20.0}}
+    path.write_text(json.dumps(tree))
+    assert sorted(set(ws.Body(path).emission[:, 0].tolist())) == [1, 20]
+
+
+def test_codes_of_a_picture_are_no_radiance():
+    with pytest.raises(ValueError, match="emission: got codes from 0 to 255"):
+        ws.Body(ws.plane(1.0), emission=np.full((4, 6, 3), 200, np.uint8))
 
 
 def test_the_texture_of_an_emissive_material_counts_times_factor_and_strength(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -57,7 +58,8 @@ def emission_of(material) -> EmissiveColor | None:
     if factor is None or not np.any(factor):
         return None
     red, green, blue = np.array(factor, np.float64).tolist()
-    return EmissiveColor((red, green, blue), getattr(material, "emissiveTexture", None))
+    image, name = (getattr(material, attribute, None) for attribute in ("emissiveTexture", "name"))
+    return EmissiveColor((red, green, blue), image, name)
 
 
 def emission_texels(emission: EmissiveColor) -> np.ndarray:
@@ -68,10 +70,10 @@ def emission_texels(emission: EmissiveColor) -> np.ndarray:
     return (texels if np.ptp(texels, axis=(0, 1)).any() else texels[0, 0]).astype(np.float32)
 
 
-def emissive_strengths(tree: dict) -> Mapping[tuple[float, ...], float]:
-    """Strengths of KHR_materials_emissive_strength, which trimesh does not read, by the factors of their materials."""
+def emissive_strengths(tree: dict) -> Mapping[tuple[Any, ...], float]:
+    """Strengths of KHR_materials_emissive_strength, which trimesh does not read, by names and factors of materials."""
     return {
-        _rounded(material.get("emissiveFactor", (0, 0, 0))): extension["emissiveStrength"]
+        (material.get("name"), *_rounded(material.get("emissiveFactor", (0, 0, 0)))): extension["emissiveStrength"]
         for material in tree.get("materials", [])
         if "emissiveStrength"
         in (extension := material.get("extensions", {}).get("KHR_materials_emissive_strength", {}))
@@ -82,13 +84,14 @@ def _rounded(factor: Sequence[float]) -> tuple[float, ...]:
     return tuple(np.array(factor, np.float32).tolist())
 
 
-def stronger(part: MeshPart, strengths: Mapping[tuple[float, ...], float]) -> MeshPart:
+def stronger(part: MeshPart, strengths: Mapping[tuple[Any, ...], float]) -> MeshPart:
     """A part that emits as much stronger as the strength of its material says."""
     if part.emission is None:
         return part
-    strength = strengths.get(_rounded(part.emission.factor), 1.0)
-    red, green, blue = (strength * color for color in part.emission.factor)
-    return part._replace(emission=part.emission._replace(factor=(red, green, blue)))
+    factor, image, material = part.emission
+    strength = strengths.get((material, *_rounded(factor)), 1.0)
+    red, green, blue = (strength * color for color in factor)
+    return part._replace(emission=EmissiveColor((red, green, blue), image))
 
 
 def gloss_of(material) -> Gloss | None:

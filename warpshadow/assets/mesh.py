@@ -333,10 +333,11 @@ class Gloss(NamedTuple):
 
 
 class EmissiveColor(NamedTuple):
-    """The radiance of a glTF surface: a linear factor, of an image of Pillow's in sRGB, if any."""
+    """The radiance of a glTF surface: a linear factor, of an image of Pillow's in sRGB, if any; and its material."""
 
     factor: tuple[float, float, float]
     image: Any = None
+    material: str | None = None
 
 
 DIFFUSE = Gloss(1.0, 0.0)  # a surface that does not shine

@@ -251,6 +251,11 @@ class Body:
     def _checked_emission(self, radiance: npt.ArrayLike) -> np.ndarray:
         count = self.mesh.vertex_count
         expected = "a linear color of 0 or more such as (5, 4, 3), one for each vertex, [vertex, 3], or an .npy file"
+        if getattr(radiance, "dtype", None) == np.uint8:
+            raise ValueError(
+                "emission: got codes from 0 to 255 (uint8), expected linear radiance: ws.srgb_to_linear(image / 255), "
+                "times the radiance of white"
+            )
         emission = _checked_colors("emission", radiance, expected)
         if emission.ndim == 3 and self.mesh.uvs is None:
             raise ValueError(

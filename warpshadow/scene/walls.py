@@ -14,6 +14,8 @@ from warpshadow.scene.body import Body
 
 SIDES = ("+x", "-x", "+y", "-y", "+z", "-z")
 
+_POINTS_PER_PIXEL = 1.5  # of the map, straight ahead of a wall, at which the wall takes its mean radiance
+
 _CORNERS = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
 _FACES = np.array([[0, 1, 2], [0, 2, 3]])
 
@@ -52,6 +54,8 @@ def walls_of_light(
     names = list(sides)
     for side in names:
         check.choice("sides", side, SIDES)
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"sides: got {names}, expected some of {', '.join(SIDES)}, each once")
     return [_wall(light, side, np.broadcast_to(edges, (3,)), middle, texels) for side in names]
 
 
@@ -65,8 +69,19 @@ def _wall(light: EnvironmentMap, side: str, edges: np.ndarray, center: np.ndarra
         points[..., axis_u], points[..., axis_v] = np.moveaxis(places * edges[[axis_u, axis_v]], -1, 0)
         return points
 
-    u, v = np.meshgrid((np.arange(texels) + 0.5) / texels, 1 - (np.arange(texels) + 0.5) / texels)
-    beams = on_wall(np.stack([u, v], axis=-1) - 0.5)
-    emission = light.towards(beams / np.linalg.norm(beams, axis=-1, keepdims=True))
+    def radiance(row: int) -> np.ndarray:
+        """Mean radiance of a row of texels, from finer points than the map's pixels: a sun is smaller than a texel."""
+        places = (np.arange(texels * across) + 0.5) / (texels * across)
+        u, v = np.meshgrid(places, 1 - (row + (np.arange(across) + 0.5) / across) / texels)
+        beams = on_wall(np.stack([u, v], axis=-1) - 0.5)
+        distances = np.linalg.norm(beams, axis=-1, keepdims=True)
+        weights = distances**-3.0  # solid angle of a point's part of the wall, but for a factor
+        weighted = weights * light.towards(beams / distances)
+        sums = [item.reshape(across, texels, across, -1).sum(axis=(0, 2)) for item in (weighted, weights)]
+        return sums[0] / sums[1]
+
+    pixel = np.pi / len(light.radiance)
+    across = int(np.ceil(_POINTS_PER_PIXEL * edges[[axis_u, axis_v]].max() / texels / (0.5 * edges[axis] * pixel)))
+    emission = np.stack([radiance(row) for row in range(texels)])
     mesh = Mesh(center + on_wall(_CORNERS), _FACES, _CORNERS + 0.5, _FACES, f"wall {side}")
     return Body(mesh, albedo=(0.0, 0.0, 0.0), emission=emission, blockers=0)

@@ -54,11 +54,12 @@ class Sun(Free):
 
     def __post_init__(self) -> None:
         check_count("directions", self.directions)
-        EnvironmentMap.constant(0.0).with_sun(self.direction, self.irradiance, angular_radius=self.angular_radius)
-        strength = np.broadcast_to(np.asarray(self.irradiance, np.float64), 3)
-        if not (strength > 0).all():
+        strength = np.asarray(self.irradiance, np.float64)
+        if not ((strength > 0) & np.isfinite(strength)).all():
             got = strength.tolist()
             raise ValueError(f"irradiance: got {got}, expected positive numbers, as its logarithm is fitted")
+        EnvironmentMap.constant(0.0).with_sun(self.direction, self.irradiance, angular_radius=self.angular_radius)
+        strength = np.broadcast_to(strength, 3)
         direction = np.asarray(self.direction, np.float64)
         # tuples, which compare and print
         vars(self).update(direction=tuple(direction.tolist()), irradiance=tuple(strength.tolist()))
@@ -123,10 +124,10 @@ class Sun(Free):
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Light the world with it, beside the map."""
-        around = setting.cached(
+        of_map = setting.cached(
             (self.name, "map"), lambda: setting.tensor(self.basis.coefficients(setting.scene.light))
         )
-        world.light = around + self.coefficients(values, setting)
+        world.light = of_map + self.coefficients(values, setting)
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
         """Add it to the map."""
