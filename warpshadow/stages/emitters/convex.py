@@ -306,12 +306,12 @@ def _block_by_pieces(
     for i in range(logs.shape[0]):
         logs[i] = 0.0
     receiver = _find_receiver(inputs, batch, index)
-    shares_of_row = shares[scratch_slot(worker, row)]
+    share_sums = shares[scratch_slot(worker, row)]
     for piece in range(inputs.arrays.blocks.shape[0]):
-        if _is_blocker(inputs, piece) and _sum_shares(receiver, piece, shares_of_row):
+        if _is_blocker(inputs, piece) and _sum_shares(receiver, piece, share_sums):
             for i in range(logs.shape[0]):
-                if shares_of_row[i] > 0.0:
-                    logs[i] = logs[i] + log_transmittance(shares_of_row[i])
+                if share_sums[i] > 0.0:
+                    logs[i] = logs[i] + log_transmittance(share_sums[i])
 
 
 @wp.kernel(enable_backward=False)
@@ -334,16 +334,16 @@ def _block_by_pieces_adjoint(
     row = first_row + wp.tid()
     batch, index = split_row(row, adj_log_transmittances.shape[1])
     receiver = _find_receiver(inputs, batch, index)
-    shares_of_row = shares[scratch_slot(worker, row)]
+    share_sums = shares[scratch_slot(worker, row)]
     sample_batch = instance_in(batch, inputs.sample_points.shape[0])
     part_batch = instance_in(batch, inputs.corners.shape[0])
     adj_point = wp.vec3()
     for piece in range(inputs.arrays.blocks.shape[0]):
-        if _is_blocker(inputs, piece) and _sum_shares(receiver, piece, shares_of_row):
+        if _is_blocker(inputs, piece) and _sum_shares(receiver, piece, share_sums):
             for part in range(inputs.arrays.first_part[piece], inputs.arrays.first_part[piece + 1]):
                 if _may_hide(receiver, part):
-                    for i in range(shares_of_row.shape[0]):
-                        share = shares_of_row[i]
+                    for i in range(share_sums.shape[0]):
+                        share = share_sums[i]
                         if share > 0.0 and share < 1.0 - MIN_TRANSMITTANCE:
                             beam = _find_beam(receiver, i)
                             adj_share = -adj_log_transmittances[batch, index, i] / (1.0 - share)
