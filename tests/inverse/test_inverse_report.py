@@ -14,6 +14,7 @@ from warpshadow.inverse import (
     Deformation,
     Exposure,
     Light,
+    Loss,
     Pose,
     Problem,
     Radii,
@@ -87,6 +88,30 @@ def test_what_is_written_of_a_fit_renders_as_its_result(tmp_path, free, toleranc
     got = rendered_again(tmp_path / "out", result)
     error, change, size = (np.linalg.norm(image) for image in (got - expected, expected - before, expected))
     assert error < tolerance * size < change  # so that what was not written would show
+
+
+def test_weights_show_an_occluder_that_a_redescending_loss_forgot(tmp_path):
+    scene = make_scene()
+    image = ws.Renderer(scene).render()[..., :3]
+    mask = np.ones(image.shape[:2], np.float32)
+    mask[:, :2] = 0.5
+    image[4:8, 6:10] += 8 * image.mean()  # where the scene has no body
+    problems = [
+        Problem(scene, Target(image, mask), Albedo(0), Loss(kind), still=DIRECTIONAL)
+        for kind in ("geman-mcclure", "l2")
+    ]
+    robust, squares = (fit(problem, [Stage(5)], progress=False) for problem in problems)
+    weights = robust.pixel_weights[0].copy()
+    assert weights[4:8, 6:10].max() < 0.01
+    weights[4:8, 6:10] = mask[4:8, 6:10]
+    np.testing.assert_allclose(weights, mask, atol=0.05)
+    np.testing.assert_array_equal(squares.pixel_weights[0], mask)
+    names = [file.name for file in write_result(squares, tmp_path / "squares")]
+    assert "weights.png" not in names
+    files = write_result(robust, tmp_path / "robust")
+    assert tmp_path / "robust" / "weights.png" in files
+    as_mask = Target(image, tmp_path / "robust" / "weights.png").mask
+    np.testing.assert_allclose(as_mask, robust.pixel_weights[0], atol=1 / 255)
 
 
 def test_files_are_called_as_the_bodies_where_nothing_else_is():
