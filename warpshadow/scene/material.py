@@ -2,7 +2,7 @@
 
 Checks of bodies and scene files follow the first table; arrays and tensors of renderers follow the second, of which the
 first is a part. A new number is a row here, a field of :class:`.Body` and one of :class:`.ImageInputs`; then
-:mod:`.pipeline.gloss` asks for it. Color, texture and emission are fields of a body with code of their own.
+:mod:`.pipeline.shading.gloss` asks for it. Color, texture and emission are fields of a body with code of their own.
 """
 
 from typing import NamedTuple
