@@ -93,7 +93,8 @@ def choose_receivers(
 ) -> list[ReceiverChoice]:
     """Choose the receivers of the bodies that leave it open, as cameras see the scene.
 
-    The same scene, cameras and device make the same choice, for known light or for free light, and later motion does not change it.
+    The same scene, cameras and device make the same choice, for known light or for free light; later motion does not
+    change it.
 
     Args:
         merged_scene: The bodies.
