@@ -71,17 +71,17 @@ def _wall(light: EnvironmentMap, side: str, edges: np.ndarray, center: np.ndarra
 
     def radiance(row: int) -> np.ndarray:
         """Mean radiance of a row of texels, from finer points than the map's pixels: a sun is smaller than a texel."""
-        places = (np.arange(texels * across) + 0.5) / (texels * across)
-        u, v = np.meshgrid(places, 1 - (row + (np.arange(across) + 0.5) / across) / texels)
+        places = (np.arange(texels * point_count) + 0.5) / (texels * point_count)
+        u, v = np.meshgrid(places, 1 - (row + (np.arange(point_count) + 0.5) / point_count) / texels)
         beams = on_wall(np.stack([u, v], axis=-1) - 0.5)
         distances = np.linalg.norm(beams, axis=-1, keepdims=True)
         weights = distances**-3.0  # solid angle of a point's part of the wall, but for a factor
         weighted = weights * light.towards(beams / distances)
-        sums = [item.reshape(across, texels, across, -1).sum(axis=(0, 2)) for item in (weighted, weights)]
+        sums = [item.reshape(point_count, texels, point_count, -1).sum(axis=(0, 2)) for item in (weighted, weights)]
         return sums[0] / sums[1]
 
     pixel = np.pi / len(light.radiance)
-    across = int(np.ceil(_POINTS_PER_PIXEL * edges[[axis_u, axis_v]].max() / texels / (0.5 * edges[axis] * pixel)))
+    point_count = int(np.ceil(_POINTS_PER_PIXEL * edges[[axis_u, axis_v]].max() / texels / (0.5 * edges[axis] * pixel)))
     emission = np.stack([radiance(row) for row in range(texels)])
     mesh = Mesh(center + on_wall(_CORNERS), _FACES, _CORNERS + 0.5, _FACES, f"wall {side}")
     return Body(mesh, albedo=(0.0, 0.0, 0.0), emission=emission, blockers=0)
