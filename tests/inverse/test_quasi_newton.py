@@ -99,6 +99,43 @@ def test_a_flat_tensor_beside_a_steep_one_is_found_before_it_has_converged(ratio
     assert float(steep) == pytest.approx(0.3, abs=1e-3) and float(flat) == pytest.approx(0.45, abs=5e-3)
 
 
+def coupled(rng: np.random.Generator, ratio: float) -> torch.Tensor:
+    """Curvature of a steep tensor of 3 values and one of 6 that is so much flatter, coupled by 0.9 at most."""
+    axes = [np.linalg.qr(rng.normal(size=(size, size)))[0] for size in (3, 6)]
+    steep, flat = (a @ np.diag(4 ** rng.uniform(0, 1, len(a))) @ a.T for a in axes)
+    coupling = rng.normal(size=(3, 6))
+    mixed = np.linalg.cholesky(steep) @ (0.9 / np.linalg.norm(coupling, 2) * coupling) @ np.linalg.cholesky(flat).T
+    scale = np.r_[np.ones(3), np.full(6, ratio**-0.5)]
+    return torch.from_numpy(scale[:, None] * np.block([[steep, mixed], [mixed.T, flat]]) * scale).float()
+
+
+@pytest.mark.parametrize("ratio", [5, 20, 200, 1e4])
+def test_a_flat_tensor_that_is_coupled_to_a_steep_one_is_found_before_it_has_converged(ratio):
+    counts, gaps = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        curvature = coupled(rng, ratio)
+        start, lowest = (torch.from_numpy(rng.uniform(-0.3, 0.3, 9)).float() for _ in range(2))
+        floor = 0.5 * (start - lowest)[3:] @ curvature[3:, 3:] @ (start - lowest)[3:]
+        tensors = [part.clone().requires_grad_() for part in start.split([3, 6])]
+        optimizer = QuasiNewton(tensors, 0.02)
+        for count in range(1, 101):  # noqa: B007 (read after the loop)
+
+            def closure(tensors=tensors, optimizer=optimizer, lowest=lowest, curvature=curvature, floor=floor):
+                optimizer.zero_grad()
+                offset = torch.cat(tensors) - lowest
+                loss = 0.5 * offset @ curvature @ offset + floor
+                loss.backward()
+                return float(loss.detach())
+
+            loss = optimizer.step(closure)
+            if optimizer.has_converged(1e-4):
+                break
+        counts.append(count)
+        gaps.append(loss / float(floor) - 1)
+    assert max(gaps) < 10 * 1e-4 and np.median(counts) <= 25
+
+
 def test_it_has_converged_where_the_loss_is_too_coarse_to_fall_further():
     """Steps that promise nothing are taken back for ever."""
 

@@ -19,6 +19,7 @@ from warpshadow.inverse.free.pose import Pose
 from warpshadow.inverse.free.reflectance import Albedo, Texture
 from warpshadow.inverse.free.shape import Deformation, Radii
 from warpshadow.inverse.free.shell import Shell
+from warpshadow.inverse.free.sun import Sun
 from warpshadow.inverse.free.views import CameraPose, Exposure, OutlineOffset
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.many import Ending, find_fits, fit_many
@@ -61,6 +62,7 @@ __all__ = [
     "Roughness",
     "Shell",
     "Stage",
+    "Sun",
     "Target",
     "Texture",
     "Uncertainty",

@@ -27,6 +27,7 @@ from warpshadow.inverse.free.pose import Pose
 from warpshadow.inverse.free.reflectance import Albedo, Texture
 from warpshadow.inverse.free.shape import Deformation, Radii
 from warpshadow.inverse.free.shell import Shell
+from warpshadow.inverse.free.sun import Sun
 from warpshadow.inverse.free.views import CameraPose, Exposure, OutlineOffset
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.problem import Problem
@@ -43,7 +44,9 @@ from warpshadow.scene.visibility import Visibility
 _KEYS = ("scene", "tolerance", "seed", "stages", "target", "free", "loss", "still", "optimizer", "stage")
 _PHOTOGRAPH_KEYS = ("encoding", "exposure", "white_balance", "saturation", "moves_outlines", "distortion")
 _TARGET_KEYS = ("image", "mask", "camera", "outlines", *_PHOTOGRAPH_KEYS)
-_FREE_OF_SCENE: dict[str, type[Free]] = {kind.key: kind for kind in (Light, Shell, Exposure, CameraPose, OutlineOffset)}
+_FREE_OF_SCENE: dict[str, type[Free]] = {
+    kind.key: kind for kind in (Light, Sun, Shell, Exposure, CameraPose, OutlineOffset)
+}
 _FREE_OF_BODIES: dict[str, type[Free]] = {
     kind.key: kind for kind in (Albedo, Texture, Roughness, Metallic, Emission, Lamp, Pose, Plane, Deformation, Radii)
 }

@@ -9,6 +9,7 @@ import torch
 
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.free.light import Light
+from warpshadow.inverse.free.sun import Sun
 from warpshadow.inverse.loss import bounded
 from warpshadow.inverse.outlines import outlines_of
 from warpshadow.inverse.problem import Problem
@@ -51,7 +52,8 @@ class Model:
         is_coarse = stage.scale < 1 and sample_count < _SEEN_VERTICES * vertex_count
         if self.problem.moves and is_coarse:  # of samples and vertices, the fewer are shaded
             scene = replace(scene, bodies=tuple(replace(body, receivers="pixel") for body in scene.bodies))
-        return TorchRenderer(scene, device=self.setting.device, basis=self.problem.basis, cameras=self.cameras)
+        basis = next((free.basis for free in self.problem.free if isinstance(free, (Light, Sun))), None)
+        return TorchRenderer(scene, device=self.setting.device, basis=basis, cameras=self.cameras)
 
     def world(self, values: Mapping[str, Values]) -> World:
         """The world with values in it."""

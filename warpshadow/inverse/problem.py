@@ -21,6 +21,7 @@ from warpshadow.inverse.free.plane import with_planes_last
 from warpshadow.inverse.free.pose import Pose
 from warpshadow.inverse.free.reflectance import Albedo, Texture
 from warpshadow.inverse.free.shape import Deformation, Radii
+from warpshadow.inverse.free.sun import Sun
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.target import Target
 from warpshadow.inverse.world import FittedScene, Setting
@@ -85,6 +86,8 @@ class Problem:
         twice = [name for name in names if names.count(name) > 1]
         if twice:
             raise ValueError(f"free: got {twice[0]} twice, expected it once")
+        if {Light.key, Sun.key} <= set(names):
+            raise ValueError("free: got Light and Sun, expected one of them: free light has any sun in it")
         for body in range(len(self.scene.bodies)):
             if {Albedo(body).name, Texture(body).name} <= set(names):
                 raise ValueError(f"free: got Albedo({body}) and Texture({body}), expected one of them for a body")
@@ -130,7 +133,12 @@ class Problem:
     @property
     def visibility(self) -> Visibility:
         """Visibility settings of the fit."""
-        return self.scene.visibility if self.moves or self.still is None else self.still
+        visibility = self.scene.visibility if self.moves or self.still is None else self.still
+        sun = next((free for free in self.free if isinstance(free, Sun)), None)
+        if sun is None or visibility.method != "directional":
+            return visibility
+        # fewer cells than the sun has would move it: by 3° of 128
+        return replace(visibility, directions=max(self.scene.direction_count, sun.directions))
 
     @property
     def basis(self) -> Basis | None:

@@ -23,7 +23,7 @@ _ALIKE = 10.0
 """Ratio up to which a tensor has the scale of all; of a larger ratio this part is left out, so that scales do not jump.
 With 1, losses of poses leaped between stages."""
 
-_MAX_SCALE_RATIO = 1e4  # of the rest of that ratio, and of its inverse
+_MAX_SCALE_RATIO = 1e4  # of the rest of that ratio
 
 
 class QuasiNewton(torch.optim.Optimizer):
@@ -33,7 +33,8 @@ class QuasiNewton(torch.optim.Optimizer):
     to be alike in all tensors: one with a scale of its own beyond tenfold of that of all has it, but for that tenfold.
     Else it would be the steepest one's: a flat tensor would not move, and promise nothing, so that the fit would count
     as converged. (The roughness of a shiny ball had 1e4 times the curvature of a dull bunny's.)
-    A flat tensor that the loss couples to a steep one may still be left behind.
+    Curvature of a tensor is told by the change of its gradient over a step, not by how far it went itself: so a flat
+    tensor whose gradient changes since the loss couples it to a steep one is not taken to be steep.
 
     No value changes by more than a bound. A step that lowers the loss is kept, and the bound grows if it was reached.
     Another one is taken back and makes the bound shorter; the gradient at its end tells of curvature nonetheless.
@@ -179,22 +180,22 @@ class QuasiNewton(torch.optim.Optimizer):
         return (torch.from_numpy(factors).to(vectors) @ vectors * scales).to(downhill)
 
     def _scales(self, steps: torch.Tensor, changes: torch.Tensor) -> torch.Tensor:
-        """Scale of each value, that of its tensor: √(change of the tensor over change of its gradient), [value].
+        """Scale of each value, that of its tensor: 1/√(curvature of the tensor), [value].
 
-        Both are root mean squares over steps [step, value], each divided by its curvature, so that long steps count as
-        short ones.
+        For a curvature matrix H, whose diagonal block of the tensor is H_t, a step s and a change y = H s,
+
+            |y_t|² ≤ λ_max(H_t) s·y,
+
+        by the inequality of Cauchy and Schwarz, however the loss couples tensors. So the largest |y_t|² / s·y over
+        steps [step, value] is no more than the tensor's curvature, and reaches it by a step along that tensor alone.
         """
         curvatures = _row_dots(steps, changes).clamp_min(torch.finfo(steps.dtype).tiny)
         sizes = [tensor.numel() for tensor in self._tensors]
-        moved, changed = (
-            torch.stack([_row_dots(part, part) for part in rows.split(sizes, dim=1)]) @ (1 / curvatures)
-            for rows in (steps, changes)
-        )
-        of_all = (moved.sum() / changed.sum()).sqrt()
-        is_known = (moved > 0) & (changed > 0)
-        ratios = torch.where(is_known, (moved / changed).sqrt() / of_all, 1.0)
-        ratios = ratios / ratios.clamp(1 / _ALIKE, _ALIKE)
-        scales = (of_all * ratios.clamp(1 / _MAX_SCALE_RATIO, _MAX_SCALE_RATIO)).sqrt()
+        parts = torch.stack([_row_dots(part, part) for part in changes.split(sizes, dim=1)]) / curvatures
+        of_all, of_tensors = parts.sum(dim=0).max(), parts.max(dim=1).values
+        ratios = torch.where(of_tensors > 0, of_all / of_tensors, 1.0)
+        ratios = (ratios / _ALIKE).clamp(1.0, _MAX_SCALE_RATIO)
+        scales = (ratios / of_all).sqrt()
         return torch.cat([scale.expand(size) for scale, size in zip(scales, sizes, strict=True)])
 
 

@@ -191,6 +191,9 @@ def found_values(result: Result) -> list[str]:
         radiance = scene.known_light.radiance
         x, y, z = EnvironmentMap(np.maximum(radiance, 0)).directions().reshape(-1, 3)[radiance.sum(axis=2).argmax()]
         lines.append(f"light: strongest from ({x:.3f}, {y:.3f}, {z:.3f})")
+    for name, value in result.found.sun.items():
+        rounded_text = ", ".join(f"{number:.4g}" for number in np.ravel(value))
+        lines.append(f"sun: {name} ({rounded_text}){'°' if name == 'angular_radius' else ''}")
     if scene.shell is not None and start.shell is not None and scene.shell[3] != start.shell[3]:
         lines.append(f"light: radius {scene.shell[3]:.4g}")
     if any(factor != 1 for factor in result.found.exposures):

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.bodies.geometry import Geometry
@@ -178,6 +179,7 @@ class FittedScene:
         exposures: Factors of the views' colors.
         white_balances: Gains of red, green and blue in each view, beside its exposure; green has 1.
         outline_offsets: Of the views' painted outlines [pixels].
+        sun: Direction, irradiance and angular radius [degrees] of a free sun, which the scene's light has.
     """
 
     scene: Scene
@@ -185,6 +187,7 @@ class FittedScene:
     exposures: list[float]
     white_balances: list[tuple[float, float, float]] = field(default_factory=list)
     outline_offsets: list[float] = field(default_factory=list)
+    sun: dict[str, ArrayLike] = field(default_factory=dict)
 
     def spheres(self, body: int) -> Spheres:
         """Spheres of a body in its own space."""

@@ -96,11 +96,11 @@ def _make_attenuate(lanes: int) -> wp.Function:
         max_transmittance = Lane(0.0)
         direction = (task.first_bundle + bundle) * BUNDLE
         slot = bundle * BUNDLE
-        for i in range(BUNDLE):
-            _t, step = soft_edge(task.cells.directions[direction + i], cap, slope)
-            transmitted = wp.cw_mul(task.transmittances[slot + i], Lane(1.0) - wp.cw_mul(opacity, step))
+        for cell in range(BUNDLE):
+            _t, step = soft_edge(task.cells.directions[direction + cell], cap, slope)
+            transmitted = wp.cw_mul(task.transmittances[slot + cell], Lane(1.0) - wp.cw_mul(opacity, step))
             max_transmittance = wp.max(max_transmittance, transmitted)
-            task.transmittances[slot + i] = transmitted
+            task.transmittances[slot + cell] = transmitted
         return is_any_above(max_transmittance, _OPAQUE_BELOW)
 
     return attenuate
@@ -153,8 +153,8 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
         span, row = find_run(worker, first_row + i, j)
         batch, block, receivers, task = load_task(row, span, worker, inputs, cells, all_ends, scratch, reached_bundles)
         for bundle in range(task.ends.shape[0]):
-            for i in range(BUNDLE):
-                task.transmittances[bundle * BUNDLE + i] = Lane(1.0)
+            for cell in range(BUNDLE):
+                task.transmittances[bundle * BUNDLE + cell] = Lane(1.0)
             task.ends[bundle] = inputs.spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
             if wp.static(has_horizon):
                 direction_bundle = task.first_bundle + bundle

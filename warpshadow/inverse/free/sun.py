@@ -1,0 +1,173 @@
+"""A free sun: where it is, how strong, and how large."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+
+from warpshadow.assets.basis import CellBasis
+from warpshadow.assets.light import EnvironmentMap
+from warpshadow.inverse import constraints
+from warpshadow.inverse.free.base import Free, Values
+from warpshadow.inverse.world import FittedScene, Setting, World
+from warpshadow.maths.directions import check_count, fibonacci
+from warpshadow.scene.scene import Scene
+
+_REACH = 4.0  # turn [radians], and logarithms of strength and size, for a value of 1: as of a lamp
+_WEIGHT_WIDTH = 0.4  # standard deviation of the weights of a point's cells, in distances between cells
+_NEWTON_STEPS = 12
+_UNRESOLVED = 1.2  # times the resolution, up to which a fitted size is none
+
+
+@dataclass(frozen=True)
+class Sun(Free):
+    """A sun beside the scene's map: its direction, irradiance and angular radius, which a fit starts from.
+
+    While a fit runs its light is spread over cells around its direction d, with local maximum-entropy weights
+    [Arroyo and Ortiz 2006],
+
+        w_q ∝ exp((d·d_q − 1) / σ² + λ·d_q),  Σ w_q d_q ∥ d,
+
+    which are smooth in d, and light that comes from d on average. So images have a gradient to the direction. No sun is
+    smaller meanwhile than :attr:`resolution`, and a fit tells the size of larger ones alone. The scene that it finds
+    has the sun as :meth:`.EnvironmentMap.with_sun` adds it.
+
+    Args:
+        direction: Towards the sun, of any length, shape [3].
+        irradiance: Of a surface that faces it, one number or RGB, positive.
+        angular_radius: Of the disc [degrees]; kept where it is below the resolution and so is the fitted one.
+        directions: Number of cells.
+    """
+
+    key: ClassVar[str] = "sun"
+
+    direction: ArrayLike
+    irradiance: ArrayLike
+    angular_radius: float = 0.27
+    directions: int = 512
+
+    def __post_init__(self) -> None:
+        check_count("directions", self.directions)
+        strength = np.asarray(self.irradiance, np.float64)
+        if not ((strength > 0) & np.isfinite(strength)).all():
+            got = strength.tolist()
+            raise ValueError(f"irradiance: got {got}, expected positive numbers, as its logarithm is fitted")
+        EnvironmentMap.constant(0.0).with_sun(self.direction, self.irradiance, angular_radius=self.angular_radius)
+        strength = np.broadcast_to(strength, 3)
+        direction = np.asarray(self.direction, np.float64)
+        # tuples, which compare and print
+        vars(self).update(direction=tuple(direction.tolist()), irradiance=tuple(strength.tolist()))
+
+    def check_scene(self, scene: Scene) -> None:
+        """Raise ValueError for light that no sun can be added to."""
+        if not isinstance(scene.light, EnvironmentMap):
+            raise ValueError(
+                "sun: got it for light in spherical harmonics, expected a map, to which it is added: "
+                "HarmonicBasis(order).to_map(coefficients)"
+            )
+        scene.light.with_sun(self.direction, self.irradiance, angular_radius=self.angular_radius)
+
+    @functools.cached_property
+    def basis(self) -> CellBasis:
+        """The cells."""
+        return CellBasis(fibonacci(self.directions))
+
+    @property
+    def _spacing(self) -> float:
+        """Distance between cells [radians]."""
+        return float(np.sqrt(4 * np.pi / self.directions))
+
+    @property
+    def resolution(self) -> float:
+        """Angular radius [degrees] of the disc that spreads as a point's cells do: 8.8° of 512 cells."""
+        return float(np.degrees(2 * self._spacing * np.sqrt(_WEIGHT_WIDTH**2 + 1 / (4 * np.pi))))
+
+    def start(self, setting: Setting) -> Values:
+        """The given sun, or one of one and a half times the resolution if that is larger."""
+        return {
+            "turn": setting.tensor(np.zeros(2)),
+            "log_irradiance": setting.tensor(np.zeros(3)),
+            "log_size": setting.tensor(0.0),
+        }
+
+    def _sun(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Direction [3], irradiance [3], and angular radius [radians], at least the resolution. Differentiable:
+        values.
+        """
+        towards = np.array(self.direction) / np.linalg.norm(self.direction)
+        turn = _REACH * values["turn"].double()
+        angle = (turn.square().sum() + 1e-12).sqrt()
+        tangents = torch.tensor(constraints.remaining([towards])).to(turn)
+        direction = angle.cos() * torch.tensor(towards).to(turn) + angle.sin() / angle * (turn @ tangents)
+        strength = torch.tensor(self.irradiance).to(turn) * (_REACH * values["log_irradiance"].double()).exp()
+        smallest = np.radians(self.resolution)
+        first_size = np.sqrt(max(np.radians(self.angular_radius), 1.5 * smallest) ** 2 - smallest**2)
+        size = first_size * (_REACH * values["log_size"].double()).exp()
+        radius = (size**2 + smallest**2).sqrt().clamp_max(np.pi / 2)
+        return direction / direction.norm(), strength, radius
+
+    def coefficients(self, values: Values, setting: Setting) -> torch.Tensor:
+        """Its light in cells, linear RGB, [cell, 3]. Differentiable: values."""
+        direction, strength, radius = self._sun(values, setting)
+        cells = torch.tensor(self.basis.directions).to(direction)
+        variance = radius**2 / 4 - self._spacing**2 / (4 * np.pi)  # of the weights: cells are wide themselves
+        weights = _weights(direction, variance, cells)
+        share = weights @ (cells @ direction).clamp_min(0)
+        light = self.directions / (4 * np.pi) * (weights / share)[:, None] * strength
+        return light.to(values["turn"])
+
+    def apply(self, values: Values, setting: Setting, world: World) -> None:
+        """Light the world with it, beside the map."""
+        of_map = setting.cached(
+            (self.name, "map"), lambda: setting.tensor(self.basis.coefficients(setting.scene.light))
+        )
+        world.light = of_map + self.coefficients(values, setting)
+
+    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
+        """Add it to the map."""
+        direction, strength, radius = (part.cpu().numpy() for part in self._sun(values, setting))
+        degrees = float(np.degrees(radius))
+        if degrees < _UNRESOLVED * self.resolution:
+            degrees = min(self.angular_radius, self.resolution)
+        assert isinstance(fitted.scene.light, EnvironmentMap)
+        light = fitted.scene.light.with_sun(direction, strength, angular_radius=degrees)
+        fitted.scene = replace(fitted.scene, light=light)
+        fitted.sun = {"direction": direction, "irradiance": strength, "angular_radius": degrees}
+
+    def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
+        """Its direction, irradiance and angular radius."""
+        return {f"sun.{name}": value for name, value in fitted.sun.items()}
+
+
+def _weights(direction: torch.Tensor, variance: torch.Tensor, cells: torch.Tensor) -> torch.Tensor:
+    """Weights of cells [cell] of a given variance, whose mean is along a direction.
+
+    Newton's method finds λ without a record; one more step from there has its derivatives.
+
+    Differentiable: direction, variance.
+    """
+    helper = torch.eye(3).to(direction)[int(direction.detach().abs().argmin())]
+    first = torch.linalg.cross(helper, direction)
+    first = first / first.norm()
+    sideways = cells @ torch.stack([first, torch.linalg.cross(direction, first)], dim=1)  # [cell, 2]
+    logits = (cells @ direction - 1) / variance
+
+    def weighted(tilt: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        weights = torch.softmax(logits + sideways @ tilt, dim=0)
+        mean = weights @ sideways
+        return weights, mean, (sideways * weights[:, None]).T @ sideways - torch.outer(mean, mean)
+
+    with torch.no_grad():
+        tilt = torch.zeros(2).to(direction)
+        for _ in range(_NEWTON_STEPS):
+            _, mean, covariance = weighted(tilt)
+            tilt = tilt - torch.linalg.solve(covariance, mean)
+        covariance = weighted(tilt)[2]
+    tilt = tilt - torch.linalg.solve(covariance, weighted(tilt)[1])
+    return weighted(tilt)[0]
