@@ -359,6 +359,36 @@ def test_gradients_of_coverage_by_convex_parts_are_exact(double, check, device):
     check(lambda p, v: cover(p, blockers.placed(v), blockers, directions), *given)
 
 
+def test_gradients_of_transmittance_past_parts_to_samples_are_exact(double, check, device):
+    """Two walls of a tube of four panels, past whose edges and seams receivers see a lamp, and a tetrahedron."""
+    module, find = double("stages.convex.prepared"), double("maths.convex").find_convex_parts
+    emitters, past = double("stages.emitters.samples"), double("stages.emitters.convex")
+    angles = np.pi / 2 * np.arange(4)
+    ring = np.stack([np.cos(angles), 0 * angles, np.sin(angles)], axis=1)
+    tube = np.concatenate([ring, 1.2 * ring + [0, 0.8, 0]])
+    faces = np.int32([face for i, j in ((0, 1), (1, 2), (2, 3), (3, 0)) for face in ((i, j, i + 4), (j, j + 4, i + 4))])
+    positions = np.concatenate([tube, 0.3 * VERTICES + [1.6, 0.4, 0.2]])[None]
+    bodies = [module.ConvexBody(find(tube, faces), 0), module.ConvexBody(find(VERTICES, FACES), 8)]
+    assert [len(body.parts) for body in bodies] == [4, 1]
+    blockers = module.ConvexBlockers.from_bodies(bodies, 12, device=device)
+    points = np.array([[[2.6, 0.3, 0.1], [0.2, 1.7, 1.9], [-2.1, 1.1, 0.4], [2.2, 1.5, 0.9]]])
+    middles = np.stack([0.25 * np.cos(np.arange(16)), 0.3 + 0.05 * np.arange(16), 0.25 * np.sin(np.arange(16))], axis=1)
+    areas = 0.3 * unit(middles - [0, 0.6, 0])
+    given = (wp.vec3d, points), (wp.vec3d, middles[None]), (wp.vec3d, areas[None]), (wp.vec3d, positions)
+    constants = (wp.vec3d, unit(-points)), (wp.vec4d, np.zeros((1, 1, 4))), (wp.vec4d, [[[0, 0.6, 0, 1]]])
+    normals, bundles, balls = (put(values, dtype, device) for dtype, values in constants)
+    span = emitters.EmitterSpan(0, 0, 16, True)
+
+    def transmittance(points, middles, areas, positions):
+        samples = emitters.PlacedSamples(middles, areas, bundles, balls)
+        around = blockers.placed(positions), blockers, (-1, -1)
+        return past.find_log_transmittance_of_parts(points, normals, samples, span, *around)
+
+    found = np.exp(transmittance(*(put(values, dtype, device) for dtype, values in given)).numpy())
+    assert ((found > 0.01) & (found < 0.99)).mean() > 0.2
+    check(transmittance, *given)
+
+
 def test_gradients_of_transmittance_past_two_blockers_are_exact(double, check):
     """Coverages whose moments are as long as such may be, and as short, at any angle."""
     rng, past = np.random.default_rng(2), double("stages.joint_coverage").transmittance_past
@@ -635,7 +665,7 @@ def test_gradients_of_a_ground_in_moving_shadows_are_exact(method, receivers, do
     """
     sample_radiance = double("stages.film").sample_radiance
     monkeypatch.setattr(
-        double("pipeline.view"), "moving_radiance", lambda *inputs: (sample_radiance(*inputs[:4]), None)
+        double("pipeline.views.view"), "moving_radiance", lambda *inputs: (sample_radiance(*inputs[:4]), None)
     )
     renderer, rotation_matrices = make_renderer(method, receivers), double("torch").rotation_matrices
     camera = renderer.scene.camera

@@ -161,6 +161,100 @@ def test_emission_takes_a_batch_and_vertices_and_rays_have_its_gradient():
         torch.testing.assert_close(of_vertices, images[0].detach(), atol=1e-5, rtol=1e-4)
 
 
+SCREEN = np.zeros((32, 48, 3), np.float32)
+SCREEN[4:12, 5:20], SCREEN[20:30, 30:45] = (9, 3, 1), (1, 4, 12)
+
+
+def with_screen(mesh, emission, **options):
+    """A ball before a screen that stands on the ground."""
+    screen = ws.Body(mesh, (0, 0, 0), emission=emission, rotation=(90, 0, 0), translation=(0, 0.7, -1), name="screen")
+    camera = ws.Camera.look_at((0.3, 3.0, 1.6), (0, 0.2, -0.2), fov_y=40, size=(32, 32))
+    return scene_of(screen, BALL, GROUND, light=DARK, camera=camera, **options)
+
+
+@pytest.mark.parametrize("settings", [{"method": "directional"}, {}, {"method": "ray-traced", "samples": 8192}])
+def test_a_texture_of_emission_lights_and_bounces_as_colors_of_many_vertices_do(settings):
+    """In stills and paths grain differs; light that bounces is compared by its mean."""
+    fine = ws.plane((1.2, 0.8), (48, 32))
+    padded = np.pad(SCREEN, ((1, 1), (1, 1), (0, 0)))
+    corners = (padded[1:, 1:] + padded[1:, :-1] + padded[:-1, 1:] + padded[:-1, :-1]) / 4  # between texels
+    colors = corners[::-1].reshape(-1, 3)
+    lights = []
+    for mesh, emission in ((ws.plane((1.2, 0.8), 1), SCREEN), (fine, colors)):
+        images = []
+        for bounces in (0, 2):
+            scene = with_screen(mesh, emission, bounces=bounces, visibility=ws.Visibility(**settings))
+            render = ws.render if settings.get("method") != "directional" else lambda item: ws.Renderer(item).render()
+            images.append(render(scene)[12:, :, :3])  # without the screen
+        lights.append(images)
+    (direct, full), (expected, all_expected) = lights
+    assert unlike(direct, expected) < (0.03 if settings.get("method") == "directional" else 0.08)
+    np.testing.assert_allclose(direct.mean(axis=(0, 1)), expected.mean(axis=(0, 1)), rtol=0.02)
+    bounced, bounced_expected = (full - direct).mean(axis=(0, 1)), (all_expected - expected).mean(axis=(0, 1))
+    np.testing.assert_allclose(bounced, bounced_expected, rtol=0.05)
+
+
+def test_a_screen_shows_its_texture():
+    facing = ws.Camera.look_at((0, 0.7, 0.2), (0, 0.7, -1), up=(0, 1, 0), fov_y=36.87, size=(32, 32))  # its height
+    for visibility in (ws.Visibility("directional"), ws.Visibility()):
+        scene = with_screen(ws.plane((1.2, 0.8), 1), SCREEN, visibility=visibility)
+        image = ws.render(dataclasses.replace(scene, bodies=scene.bodies[:1], camera=facing))[..., :3]
+        np.testing.assert_allclose(image[3:13, 2:14], np.broadcast_to(image[8, 8], (10, 12, 3)), atol=9)
+        np.testing.assert_allclose(image[8, 4], (9, 3, 1), rtol=0.01)
+        np.testing.assert_allclose(image[24, 27], (1, 4, 12), rtol=0.01)
+        np.testing.assert_allclose(image[24, 4], 0, atol=0.01)
+
+
+def test_gradients_to_a_texture_of_emission_are_exact_since_images_are_linear_in_it():
+    renderer = TorchRenderer(with_screen(ws.plane((1.2, 0.8), 1), SCREEN), progress=False)
+    image = torch.tensor(SCREEN, requires_grad=True)
+    change = torch.tensor(np.random.default_rng(0).normal(size=SCREEN.shape).astype(np.float32))
+    (renderer(emission={"screen": image}) * weights()).sum().backward()
+    with torch.no_grad():
+        up, down = (renderer(emission={"screen": image + sign * change}) for sign in (1, -1))
+        batch = renderer(emission={"screen": torch.stack([image + change, image])})
+        gray = renderer(emission={"screen": torch.ones(3)})
+    expected = ((up - down) * weights()).sum().item() / 2
+    assert (image.grad * change).sum().item() == pytest.approx(expected, rel=1e-3)
+    torch.testing.assert_close(batch[0], up, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(gray, renderer(emission={"screen": torch.ones(4, 3)}).detach(), atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", [np.float32([2, 2, 2]), np.full((2, 3, 3), 2.0)], ids=["color", "texture"])
+def test_a_fit_finds_a_texture_of_emission(start):
+    truth = SCREEN.reshape(4, 8, 6, 8, 3).mean(axis=(1, 3))
+    camera = ws.Camera.look_at((-1.5, 1.8, 0.5), (0, 0.6, -0.9), fov_y=40, size=(32, 32))  # past the ball
+    scene, plain = (
+        dataclasses.replace(with_screen(ws.plane((1.2, 0.8), 1), emission), camera=camera)
+        for emission in (truth, start)
+    )
+    target = inverse.Target(ws.Renderer(scene).render())
+    problem = inverse.Problem(
+        plain, target, [inverse.Emission("screen", size=(4, 6))], still=ws.Visibility("directional")
+    )
+    result = inverse.fit(problem, [inverse.Stage(150)], progress=False)
+    found = result.scene.bodies[0].emission
+    assert found.shape == (4, 6, 3) and result.figures == {}
+    assert unlike(found, truth) < 0.05
+
+
+def test_a_texture_of_emission_that_cannot_be_is_refused():
+    with pytest.raises(ValueError, match="emission: got a texture, .* but mesh .* has no uvs"):
+        ws.Body(SMALL, emission=SCREEN)
+    with pytest.raises(ValueError, match=r"emission: got shape \(32, 48, 2\), expected \[3\], .* or a texture"):
+        ws.Body(ws.plane(1.0, 1), emission=SCREEN[..., :2])
+    with pytest.raises(ValueError, match="emission.*: got shape"):
+        TorchRenderer(scene_of(), progress=False)(emission={"lamp": torch.tensor(SCREEN)})
+    scene = with_screen(ws.plane((1.2, 0.8), 1), SCREEN)
+    with pytest.raises(ValueError, match="body: got 0, whose mesh has no uvs"):
+        inverse.Problem(scene_of(), inverse.Target(np.zeros((32, 32, 3))), [inverse.Emission("lamp", size=(2, 2))])
+    with pytest.raises(ValueError, match="smoothness: got it without size"):
+        inverse.Emission("screen", smoothness=0.1)
+    with pytest.raises(ValueError, match="per_vertex: got it of a body whose emission is a texture, expected size"):
+        inverse.Problem(scene, inverse.Target(np.zeros((32, 32, 3))), [inverse.Emission("screen", per_vertex=True)])
+
+
 def light_on_wall(mesh, method, **options):
     """Mean light of a lamp that a wall receives."""
     wall = ws.Body(ws.plane(1.0, 4), (1, 1, 1), rotation=(90, 0, 0), translation=(0, 0, -1), name="wall")
@@ -175,6 +269,22 @@ def test_a_lamp_hides_its_far_side(method):
     ball = ws.icosphere(0.2, 3)
     inward = ws.Mesh(ball.positions, ball.faces[:, ::-1])
     assert light_on_wall(inward, method) == pytest.approx(light_on_wall(ball, method), rel=0.02)
+
+
+def test_a_bulb_lights_the_inside_of_its_shade_past_which_the_other_side_is():
+    """The far side of a shade is behind the bulb, and hides none of it."""
+    tube = trimesh.creation.cylinder(0.4, 0.5, sections=24)
+    shade = ws.Mesh(tube.vertices, tube.faces[np.abs(tube.face_normals[:, 2]) < 0.5]).transformed(
+        rotation=np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    )
+    bulb = ws.Body(ws.icosphere(0.08, 2), (0, 0, 0), emission=(6, 5, 4), name="bulb")
+    camera = ws.Camera.look_at((0.2, -1.5, 0.1), (0, 0, 0), fov_y=35, size=(32, 32))
+    bodies = ws.Body(shade, (0.7, 0.6, 0.5), name="shade"), bulb
+    scene = scene_of(*bodies, light=DARK, camera=camera)
+    renderer = ws.Renderer(scene)
+    shows_shade = renderer.layers().bodies == 0
+    light, expected = (image[shows_shade][:, :3].mean() for image in (renderer.render(), ws.render(scene)))
+    assert light == pytest.approx(expected, rel=0.05)  # 0.5% off; by self-visibility to infinity 70% darker
 
 
 def test_light_of_a_shade_is_that_of_rays():

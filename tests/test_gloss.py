@@ -18,6 +18,9 @@ from warpshadow.torch import TorchRenderer, rotation_matrices
 # Interpolation between texels is linear piece by piece, and steps of differences go over some. Measured 0.1 to 1.2%.
 SMOOTH = 2e-2
 
+# Gradients of an image of 32² pixels along a path. Measured 2.5 to 6.4%, and 19 to 69% with slopes at points alone.
+OUTLINES = 0.12
+
 SKY = ws.synthetic_sky((-0.7, 0.5, 0.2), sun_radius=12, sun_strength=3, height=32)
 BALL = ws.Body(
     ws.icosphere(1.0, 3),
@@ -142,6 +145,34 @@ def test_gradients_to_gloss_agree_with_differences(name):
     # texels of prefiltered light
     gradient, difference = twins.slopes(loss, torch.tensor([0.6]), 3e-3)
     assert gradient == pytest.approx(difference, rel=SMOOTH)
+
+
+@pytest.mark.parametrize("options", [{"roughness": 0.2}, {"roughness": 0.2, "metallic": 0.0}, {"roughness": None}])
+def test_gradients_along_a_path_are_the_change_of_the_image_although_outlines_are_in_view(options):
+    """Sums over eighths of an image, whose change is that of an image of 8 × 8 samples a pixel."""
+    if options["roughness"] is None:
+        options = {"roughness": None, "metallic": None, "receivers": "pixel"}
+    height, azimuth = np.mgrid[0.2:1.5:32j, 0 : 2 * np.pi * 63 / 64 : 64j]
+    light = ws.EnvironmentMap(np.repeat((height * (1 + 0.8 * np.cos(azimuth)))[..., None], 3, axis=2))
+    visibility = ws.Visibility("none")
+    scene = dataclasses.replace(scene_of(dataclasses.replace(BALL, **options), visibility=visibility), light=light)
+    row, column = np.mgrid[-14:18, -16:16]
+    eighths = torch.tensor((np.arctan2(row, column) // (np.pi / 4))[None] == np.arange(-4, 4)[:, None, None]).float()
+
+    def sums(renderer, shifts):
+        rotations, translations, scales = renderer.scene_poses()
+        moved = translations + shifts[:, None, None] * torch.tensor([0.958, 0.287, 0.0])
+        image = renderer(geometry=renderer.placed(rotations, moved, scales))
+        return torch.einsum("ehw,bhw->eb", eighths, image[..., 0])
+
+    shifts = (0.3 * (torch.arange(64) + 0.5) / 64).requires_grad_(True)
+    values = sums(TorchRenderer(scene, progress=False), shifts)
+    gradients = [torch.autograd.grad(value.sum(), shifts, retain_graph=True)[0].mean() * 0.3 for value in values]
+    with torch.no_grad():
+        fine = TorchRenderer(dataclasses.replace(scene, supersampling=8), progress=False)
+        start, end = sums(fine, torch.tensor([0.0, 0.3])).T
+    error = torch.linalg.norm(torch.stack(gradients) - (end - start)) / torch.linalg.norm(end - start)
+    assert error < OUTLINES
 
 
 @pytest.mark.parametrize("render", [ws.render, lambda scene: ws.Renderer(scene).render()])

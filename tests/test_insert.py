@@ -343,3 +343,19 @@ def test_a_photograph_of_the_same_proportions_may_have_any_size(size):
 def test_what_is_no_photograph_of_the_camera_is_refused(photograph, message):
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         ws.insert(scene_of("none"), photograph, progress=False)
+
+
+@pytest.mark.parametrize("feature", ["gloss", "near light"])
+def test_a_photograph_of_the_catchers_becomes_that_of_all_with_gloss_and_near_light(feature):
+    """The photograph is the image of the ground alone; its light is near, or the ball on it a metal."""
+    shiny = {"roughness": 0.3, "metallic": 1.0} if feature == "gloss" else {}
+    radius = 7.0 if feature == "near light" else None
+    light = ws.EnvironmentMap(SKY.radiance, radius=radius)
+    scene = dataclasses.replace(scene_of(bounces=1, bodies=[ball(**shiny), ground()]), light=light)
+    alone = drawn(dataclasses.replace(scene, bodies=scene.bodies[1:]))[..., :3]
+    expected = drawn(scene)
+    inside = expected[..., 3] == 1
+    other = dataclasses.replace(scene, bodies=[ball(), ground()], light=SKY)  # without the feature
+    images = [ws.insert(item, alone, progress=False) for item in (scene, other)]
+    error, error_without = (relative_error(image[inside], expected[inside][:, :3]) for image in images)
+    assert error < 0.02 and error_without > 0.04

@@ -124,7 +124,7 @@ CACHING = ("cached", "cached_of_bodies", "cached_for_light")  # methods that tak
 
 def test_every_cached_node_stands_on_the_page_that_says_when_it_is_made_anew():
     pipeline = ROOT / "warpshadow" / "pipeline"
-    text, names = (pipeline / "README.md").read_text("utf-8"), set()
+    text, names = (pipeline / "views" / "README.md").read_text("utf-8"), set()
     for path in pipeline.rglob("*.py"):
         for call in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(call, ast.Call) and getattr(call.func, "attr", "") in CACHING:
@@ -194,12 +194,12 @@ def test_methods_and_constants_that_a_page_names_exist(page):
 # ------------------------------------------------------------------------------------------------ figures
 
 
-DEMOS = (ROOT / "demos" / "README.md").read_text("utf-8")
+MEASUREMENTS = (ROOT / "demos" / "benchmarks" / "README.md").read_text("utf-8")
 
 
 def table_rows(heading):
-    """Cells of the tables below a heading of the demos' page, by row; a mark of boldness is left out."""
-    text = re.search(rf"^## {heading}\n(.*?)(?=^## |\Z)", DEMOS, re.DOTALL | re.MULTILINE)[1]
+    """Cells of the tables below a heading of the page of measurements, by row; a mark of boldness is left out."""
+    text = re.search(rf"^## {heading}\n(.*?)(?=^## |\Z)", MEASUREMENTS, re.DOTALL | re.MULTILINE)[1]
     return [[cell.strip(" *") for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
 
 
@@ -220,7 +220,7 @@ def summaries(heading, label_count):
     return len(rows), means, worst
 
 
-def test_figures_of_the_first_page_are_those_of_the_demos_tables():
+def test_figures_of_the_first_page_are_those_that_were_measured():
     stated = re.sub(r"\]\([^)]*\)|[\[*]", "", (ROOT / "README.md").read_text("utf-8")).replace("\n ", "")
     count, means, worst = summaries("Accuracy", 2)
     assert count == 9 and f"off by {means[4]}% on average, {worst[4]}% at worst, on nine meshes" in stated
@@ -361,7 +361,7 @@ def test_the_node_that_a_page_adds_is_one_of_the_image(tmp_path, monkeypatch):
     (snippet,) = blocks(ROOT / "warpshadow" / "README.md", "python")
     (lines,) = re.findall(r"^    (averaged = .*\n    return .*)$", page, re.MULTILINE)
     replaced = "return" + lines.partition("\n")[0].removeprefix("averaged =")
-    source = (ROOT / "warpshadow" / "pipeline" / "view.py").read_text("utf-8")
+    source = (ROOT / "warpshadow" / "pipeline" / "views" / "view.py").read_text("utf-8")
     assert source.count(replaced) == 1
     (tmp_path / "vignette.py").write_text(snippet, "utf-8")
     pasted = source.replace(replaced, lines.replace("\n", "\n    "))

@@ -641,6 +641,17 @@ def share_of_box(size, point, beam, disc_radius):
     return smoothstep((min(sines) / width + 1) / 2) * smoothstep((depth / disc_radius + 1) / 2)
 
 
+def share_of_panel(corners, point, beam, disc_radius):
+    """The share of the beam of a disc that a flat convex panel takes, given its corners in order."""
+    normal = unit(np.cross(corners[1] - corners[0], corners[2] - corners[0]))
+    normal *= np.sign(normal @ (point - corners[0]))
+    depth, middle, positions = normal @ (corners[0] - point - beam), corners.mean(axis=0), []
+    for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        towards = unit(np.cross(begin - point, end - point))
+        positions.append(np.sign(towards @ (middle - point)) * towards @ beam)
+    return smoothstep((min(positions) / disc_radius + 1) / 2) * smoothstep((depth / disc_radius + 1) / 2)
+
+
 def share_of_rectangle(size, point, beam, disc_radius):
     """The share of the beam of a disc that a rectangle takes, in the plane y = 0 around the origin."""
     position = -point[1] / beam[1]

@@ -33,6 +33,7 @@ from warpshadow.scene.files import SceneError, load_scene, write_scene
 from warpshadow.scene.mesh_scene import default_scene
 from warpshadow.scene.scene import Scene
 from warpshadow.scene.visibility import Visibility
+from warpshadow.scene.walls import walls_of_light
 from warpshadow.spheres import Spheres, fit_spheres
 
 if _TYPE_CHECKING:
@@ -45,7 +46,7 @@ if _TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _MODULES = {
-    "Layers": "pipeline.layers",
+    "Layers": "pipeline.views.layers",
     "Renderer": "tuning.renderer",
     "Tuning": "tuning.tune",
     "insert": "tuning.insert",
@@ -99,6 +100,7 @@ __all__ = [
     "tune",
     "unwrap",
     "view",
+    "walls_of_light",
     "write_image",
     "write_scene",
     "write_video",

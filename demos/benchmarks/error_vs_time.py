@@ -6,7 +6,9 @@
 Three scenes of 256 × 256 pixels: a body in the sun, one under an overcast sky, and three bodies under a low sun.
 ``--data`` takes meshes (FOLDER/meshes) and environment maps (FOLDER/envmaps) from a folder: the map with the brightest
 spot, the most even one and the one between. Four more are of demos/kinds.py. ``--scenes`` takes some of these, or
-others of demos/kinds.py; what an earlier run wrote of other scenes to the same folder stays in tables and pictures.
+others of demos/kinds.py, or a metal bunny, a lamp over one, and a table beside a window (``metal``, ``lamp``,
+``window``), which methods without gloss and near light leave out, and Mitsuba does the last; what an earlier run wrote
+of other scenes to the same folder stays in tables and pictures.
 
 Time is that of a warm image, forward, with the renderer made: each call places the bodies a hair's breadth elsewhere,
 so that nothing can be kept from the call before: projection, rasterization, visibility, shading and film run anew. With
@@ -26,6 +28,7 @@ error_vs_time.json and .png, and full_light_vs_time.json and .png.
 
 import argparse
 import dataclasses
+import functools
 import importlib.util
 import itertools
 import json
@@ -42,6 +45,7 @@ import warp as wp
 
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
+from demos.benchmarks.emitters import near_table, small_lamp
 from demos.kinds import SCENES, Sources
 from demos.scenes import image_error, on_ground, shipped_mesh
 from warpshadow.scene.visibility import AUTO
@@ -57,6 +61,7 @@ ORDERS = (4, 6, 8)
 SPHERE_COUNTS = (16, 32, 64, 128, 256, 512)
 THREE = ("sun", "overcast", "low_sun")
 KINDS = ("bowl", "chair_wheel_fence", "city", "open_room")
+SHINING = ("metal", "lamp", "window")  # with gloss, and with near light
 KIND_COUNTS = (64, 256)  # of spheres, for scenes of several bodies
 SIZE = 256  # pixels across
 TUNED_ERROR = 0.05  # that tune is asked for
@@ -125,7 +130,7 @@ def main(
             if light == "full":
                 results[name] = compare_full(scene, runs, true_count=true_count)
             else:
-                counts = KIND_COUNTS if name in SCENES else SPHERE_COUNTS
+                counts = KIND_COUNTS if name in (*SCENES, *SHINING) else SPHERE_COUNTS
                 results[name] = compare(scene, () if quick else counts, runs, true_count=true_count)
             path.write_text(json.dumps(results, indent=1, ensure_ascii=False))
             plot(results, path.with_suffix(".png"))
@@ -138,7 +143,7 @@ def compare(scene: ws.Scene, sphere_counts: Sequence[int], runs: int, *, true_co
     ours = [each for each in measured if each.family not in ("ray-traced", "Mitsuba")]
     front = [ours[number] for number in pareto_front([(each.milliseconds, each.error) for each in ours])]
     better = better_than(default, ours)
-    parts = error_parts(scene)
+    parts = error_parts(scene) if "log-sh" in scene.methods else {}  # others' light is not of the map alone
     tuned = ws.tune(scene, error=TUNED_ERROR, progress=False)
     print_table(measured, {default.label: ">"} | {each.label: "*" for each in front if each is not default})
     print("> default    * no other setting is both faster and more accurate")
@@ -206,7 +211,19 @@ def better_than(default: Measured, others: Sequence[Measured]) -> list[Measured]
 def load_scenes(data: Path | None, wanted: Sequence[str]) -> dict[str, ws.Scene]:
     """Scenes of THREE by their meshes and maps, and of all kinds by name."""
     three = dict(zip(THREE, three_scenes(data).items(), strict=True)) if set(wanted) & set(THREE) else {}
-    return dict(three[name] if name in three else (name, SCENES[name](Sources(data), SIZE)) for name in wanted)
+    scenes = SCENES | {name: functools.partial(shining_scene, name) for name in SHINING}
+    return dict(three[name] if name in three else (name, scenes[name](Sources(data), SIZE)) for name in wanted)
+
+
+def shining_scene(name: str, sources: Sources, size: int) -> ws.Scene:
+    """A scene of SHINING."""
+    if name == "metal":
+        scene = on_ground(shipped_mesh("bunny"), ws.synthetic_sky(sun_radius=8), blockers=AUTO)
+        metal = dataclasses.replace(scene.bodies[0], albedo=(0.9, 0.65, 0.35), roughness=0.35, metallic=1.0)
+        return dataclasses.replace(
+            scene, bodies=(metal, scene.bodies[1]), camera=scene.camera.resized(size / scene.camera.width)
+        )
+    return {"lamp": small_lamp, "window": near_table}[name](size)
 
 
 def three_scenes(data: Path | None) -> dict[str, ws.Scene]:
@@ -261,7 +278,8 @@ def settings(scene: ws.Scene, sphere_counts: Sequence[int]) -> list[Setting]:
     found = list(methods(scene, ""))
     for count in sphere_counts:
         found += methods(with_spheres(scene, count), f"{count} spheres")
-    for log, base in itertools.product(("eigen", "cap"), ("linear", "optimal_linear")):
+    is_harmonic = "log-sh" in scene.methods
+    for log, base in itertools.product(("eigen", "cap") if is_harmonic else (), ("linear", "optimal_linear")):
         found += [
             Setting(
                 f"log-SH {log}", order, base, with_visibility(scene, method="log-sh", log=log, order=order, base=base)
@@ -275,12 +293,14 @@ def settings(scene: ws.Scene, sphere_counts: Sequence[int]) -> list[Setting]:
             Setting("directional", directions, f"{spheres}pixel", with_visibility(pixels, directions=directions))
             for directions in (64, 128, 256)
         ]
-        found.append(Setting("log-SH eigen", 8, f"{spheres}pixel", with_visibility(pixels, method="log-sh")))
+        if is_harmonic:
+            found.append(Setting("log-SH eigen", 8, f"{spheres}pixel", with_visibility(pixels, method="log-sh")))
     for count in (count for count in sphere_counts if count >= MERGED_FROM):
         apart = with_spheres(scene, count)
         found += [
             Setting(f"{method}, merging 0", size, f"{count} spheres", with_visibility(apart, merging=0.0, **options))
             for method, size, options in (("directional", 128, {}), ("log-SH eigen", 8, {"method": "log-sh"}))
+            if is_harmonic or not options
         ]
     found += [
         Setting("ray-traced", count, "", with_visibility(scene, method="ray-traced", samples=count))
@@ -296,7 +316,7 @@ def methods(scene: ws.Scene, details: str) -> list[Setting]:
     ]
     harmonic = [
         Setting(f"log-SH {log}", order, details, with_visibility(scene, method="log-sh", log=log, order=order))
-        for log, order in itertools.product(("eigen", "cap"), ORDERS)
+        for log, order in itertools.product(("eigen", "cap") if "log-sh" in scene.methods else (), ORDERS)
     ]
     return directional + harmonic
 
@@ -351,7 +371,8 @@ def measure(
     truth = ws.render(reference, progress=True)
     draws = [whole_image(ws.Renderer(setting.scene)) for setting in compared]
     errors = [image_error(draw().numpy()[0], truth) for draw in draws]
-    paths = paths_of(scene, bounces) if importlib.util.find_spec("mitsuba") else None
+    knows_light = scene.shell is None and importlib.util.find_spec("mitsuba")
+    paths = paths_of(scene, bounces) if knows_light else None
     path_counts = PATH_COUNTS if paths else ()
     calls = [(lambda count=count: paths(count, seed=1)) for count in path_counts]
     times = median_times([*draws, *calls], runs, clock=clock(), progress=True)
@@ -574,7 +595,9 @@ if __name__ == "__main__":
     parser.add_argument(
         "--light", nargs="+", choices=["direct", "full"], default=["direct", "full"], help="what errors are against"
     )
-    parser.add_argument("--scenes", nargs="+", choices=[*THREE, *SCENES], default=[*THREE, *KINDS], help="which scenes")
+    parser.add_argument(
+        "--scenes", nargs="+", choices=[*THREE, *SCENES, *SHINING], default=[*THREE, *KINDS], help="which scenes"
+    )
     parser.add_argument("--quick", action="store_true", help="a ball on a ground of few pixels, to try it out")
     parser.add_argument("--one-thread", action="store_true", help="one thread for all, and its time of the processor")
     arguments = parser.parse_args()

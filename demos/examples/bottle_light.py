@@ -2,7 +2,7 @@
 
     python demos/examples/bottle_light.py --data FOLDER --output out
 
-The photograph, or what stands in for it, is that of `bottle.py`; the bottle stands where its outline says. The table
+The photograph, or what stands in for it, is that of `bottle.py`, which also finds where the bottle stands. The table
 has squares of two albedos. Of these only the light ones count, where they are seen whole, and they are one albedo: so
 no texture can explain a shadow. Light is a map of cells that are never negative. What is near the windows is brighter,
 which a light from infinitely far away cannot explain, so the albedo may change slowly across the table: bilinear
@@ -21,7 +21,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy import ndimage
 
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
@@ -30,12 +29,13 @@ from demos.examples.bottle import (
     FEW_EDGES,
     HUBER,
     PLAIN,
+    SHADOWS,
     TABLE,
     Photograph,
-    by_outline,
-    drawn_pattern,
+    by_photograph,
     first_guess,
     halved,
+    light_squares,
     open_photograph,
     painted,
     tiles,
@@ -66,19 +66,19 @@ class Squares:
     points: np.ndarray
 
 
-def light_squares(photo: Photograph, is_light: np.ndarray) -> Squares:
+def squares_around(photo: Photograph, is_light: np.ndarray) -> Squares:
     """The light squares around the body, no farther from its foot than shadows reach; of texels, [height, width, 1]."""
-    is_whole = ndimage.minimum_filter(drawn_pattern(photo, is_light), size=5) > 0.95
     middle, _ = foot(photo.scene.bodies[BODY])
-    points = table_points(photo.scene.camera) - middle
+    points = table_points(photo.scene) - middle
     is_near = np.linalg.norm(points, axis=-1) < REACH * height(photo.scene.bodies[BODY])
-    return Squares(is_whole & is_near & (photo.outline == 0) & (photo.mask() == 1), points)
+    return Squares(light_squares(photo, is_light) & is_near & (photo.outline == 0) & (photo.mask() == 1), points)
 
 
-def table_points(camera: ws.Camera) -> np.ndarray:
+def table_points(scene: ws.Scene) -> np.ndarray:
     """Where the rays of pixels meet the table, x and z, [height, width, 2]; far away where they do not."""
-    eye, directions = camera.rays()
-    return (eye - eye[1] * directions / np.minimum(directions[..., 1:2], -1e-6))[..., [0, 2]]
+    eye, directions = scene.camera.rays()
+    above = eye[1] - scene.bodies[TABLE].translation[1]
+    return (eye - above * directions / np.minimum(directions[..., 1:2], -1e-6))[..., [0, 2]]
 
 
 def foot(body: ws.Body) -> tuple[np.ndarray, float]:
@@ -135,7 +135,7 @@ def second_body(photo: Photograph) -> ws.Body:
     middle, _ = foot(body)
     x, z = middle + np.array((0.6, 0.14)) * height(body)
     bunny = ws.Body(shipped_mesh("bunny"), albedo=(0.6, 0.6, 0.6), rotation=(0, -20, 0), name="second")
-    return bunny.on_ground((x, 0, z), size=0.57 * height(body))
+    return bunny.on_ground((x, photo.scene.bodies[TABLE].translation[1], z), size=0.57 * height(body))
 
 
 def inserted(scene: ws.Scene, body: ws.Body) -> ws.Scene:
@@ -162,7 +162,7 @@ def by_sector(kept: np.ndarray, photo: Photograph, body: ws.Body) -> np.ndarray:
         body: Around which there is a ring of its own size.
     """
     middle, radius = foot(body)
-    points = table_points(photo.scene.camera) - middle
+    points = table_points(photo.scene) - middle
     distances = (np.linalg.norm(points, axis=-1) - radius) / height(body)
     numbers = np.floor(np.degrees(np.arctan2(points[..., 1], points[..., 0])) / SECTOR)
     counts = np.isfinite(kept) & (distances > RING[0]) & (distances < RING[1])
@@ -224,11 +224,12 @@ def main(data: Path | None, output: Path) -> None:
     output.mkdir(parents=True, exist_ok=True)
     photo = open_photograph(data)
     truth = photo.scene.bodies[BODY]
-    body = by_outline(photo, first_guess(photo, seed=0))
-    photo = dataclasses.replace(photo, scene=changed(photo.scene, BODY, **placement(body)))
-    error = distance_error(body, truth)
-    print(f"pose by outline: MDE {error:.2f}%", flush=True)
-    squares = light_squares(photo, tiles(photo))
+    placed = by_photograph(photo, first_guess(photo, seed=0), SHADOWS).scene.bodies
+    for number in (BODY, TABLE):
+        photo = dataclasses.replace(photo, scene=changed(photo.scene, number, **placement(placed[number])))
+    error = distance_error(placed[BODY], truth)
+    print(f"pose: MDE {error:.2f}%", flush=True)
+    squares = squares_around(photo, tiles(photo))
     parts = halves(squares)
     for known, other in (("behind", "in front"), ("in front", "behind"), ("left", "right"), ("right", "left")):
         gaps = []

@@ -10,6 +10,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import warpshadow as ws
 from warpshadow.assets.mesh import Mesh, MeshError
 from warpshadow.assets.mesh_files import load_mesh
 from warpshadow.assets.primitives import icosphere, infinite_ground, plane
@@ -156,6 +157,24 @@ def test_an_infinite_ground_faces_up_without_holes_in_faces_of_good_shape(segmen
     distances = np.linalg.norm(corners, axis=2).max(axis=1)
     assert (lengths < 1.5 * 2 * np.pi / segments * np.maximum(distances, 1.5)).all()
     assert mesh.face_count < 6 * segments**2
+
+
+def test_the_texture_of_an_infinite_ground_is_that_of_a_plane_and_repeats():
+    texture = np.random.default_rng(0).uniform(size=(16, 16, 3)).astype(np.float32)
+    camera = ws.Camera.look_at((0, 3, 0.01), (0, 0, 0), size=(32, 32), fov_y=40)
+    images = [
+        ws.Renderer(
+            ws.Scene([ws.Body(mesh, texture=image)], ws.EnvironmentMap.constant(), camera, ws.Visibility("none"))
+        ).render()[..., :3]
+        for mesh, image in (
+            (infinite_ground(4.0, texture_size=1.5), texture),
+            (plane(4.5, 9), np.tile(texture, (3, 3, 1))),
+        )
+    ]
+    np.testing.assert_allclose(*images, atol=0.01)
+    assert images[0].std() > 0.1
+    with pytest.raises(MeshError, match="texture_size: got 0, expected a positive number"):
+        infinite_ground(texture_size=0)
 
 
 @pytest.mark.parametrize("subdivisions", [0, 1, 3])

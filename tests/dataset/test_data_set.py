@@ -144,6 +144,22 @@ def test_a_sample_is_the_scene_s_image_and_layers(recipe):
     np.testing.assert_array_equal(scene.camera.rotation, camera["rotation"])
 
 
+def test_a_sample_says_how_bodies_shine_and_how_near_light_is(recipe):
+    ranges = Ranges(glossy=1.0, radius=(2.0, 2.0))
+    data_set = DataSet(replace(recipe, ranges=ranges, layers=("color",)))
+    files, scene = render_sample(data_set, 0), data_set.draw(0).scene
+    about, channels = json.loads(files["json"]), exr_channels(files["exr"])
+    *bodies, ground = about["bodies"]
+    for body, said in zip(scene.bodies, bodies, strict=False):
+        assert np.float32(said["roughness"]) == body.roughness and said["metallic"] == body.metallic
+    assert "roughness" not in ground and about["light"]["radius"] == pytest.approx(scene.light.radius)
+    diffuse = DataSet(replace(recipe, layers=("color",)))
+    assert not np.array_equal(channels["R"], exr_channels(render_sample(diffuse, 0)["exr"])["R"])
+    for name in ("glossy", "radius"):
+        with pytest.raises(ValueError, match=f"{name}: got .*, which 'log-sh' does not show, expected none, or method"):
+            replace(recipe, visibility=ws.Visibility("log-sh"), ranges=Ranges(**{name: getattr(ranges, name)}))
+
+
 def test_only_the_layers_that_are_asked_for_are_written(recipe):
     files = render_sample(DataSet(replace(recipe, layers=("bodies", "depth"))), 0)
     assert set(files) == {"exr", "json"}
@@ -209,18 +225,22 @@ count = [2, 2]
 size = [0.5, 1]
 upright = 1
 albedo = [0.5, 0.6]
+glossy = 0.5
+roughness = [0.3, 0.5]
+metal = 0.1
 [light]
 maps = "maps"
 rotation = [0, 90]
 scale = [1, 1]
+radius = [1.5, 2]
 bounces = 1
 [camera]
 size = [64, 32]
 supersampling = 1
 fov_y = [30, 50]
 [visibility]
-method = "log-sh"
-order = 5
+method = "directional"
+directions = 64
 [splits]
 train = 0.75
 test = 0.25
@@ -234,10 +254,11 @@ def test_a_recipe_is_read(folder):
     assert (recipe.meshes, recipe.maps, recipe.blockers) == (folder / "meshes", folder / "maps", 16)
     assert recipe.creased == 30
     drawn = {"count": (2, 2), "size": (0.5, 1), "upright": 1, "albedo": (0.5, 0.6)}
-    ranges = Ranges(**drawn, rotation=(0, 90), scale=(1, 1), fov_y=(30, 50))
+    drawn |= {"glossy": 0.5, "roughness": (0.3, 0.5), "metal": 0.1}
+    ranges = Ranges(**drawn, rotation=(0, 90), scale=(1, 1), radius=(1.5, 2), fov_y=(30, 50))
     assert recipe.ranges == ranges
     assert (recipe.size, recipe.supersampling, recipe.bounces) == ((64, 32), 1, 1)
-    assert vars(recipe.visibility) == vars(ws.Visibility("log-sh", order=5))
+    assert vars(recipe.visibility) == vars(ws.Visibility("directional", directions=64))
     assert recipe.splits == {"train": 0.75, "test": 0.25}
 
 
@@ -275,7 +296,9 @@ def test_a_recipe_is_read(folder):
         ('maps = "maps"', "", "[light]: rotation: got it without maps, which it turns"),
         ("bounces = 1", "bounces = 17", "[light]: bounces: got 17, expected a whole number from 0 to 16"),
         ("size = [64, 32]", "size = [64]", "[camera]: size: got [64], expected width and height"),
-        ("order = 5", "order = 9", "[visibility]: order: got 9"),
+        ("directions = 64", "directions = 9", "[visibility]: directions: got 9"),
+        ("glossy = 0.5", "glossy = 2", "[bodies]: glossy: got 2, expected a part of all, from 0 to 1"),
+        ("radius = [1.5, 2]", "radius = [0.5, 2]", "[light]: radius: got [0.5, 2], expected two numbers from 1.01"),
         ("test = 0.25", "test = 0.5", "[splits]: splits: got parts with the sum 1.25, expected 1"),
         ("test = 0.25", "test = 0", "[splits]: test: got 0, expected a part of all images, above 0 up to 1"),
         ("test = 0.25", '"a b" = 0.25', "[splits]: splits: got the name 'a b', expected letters, digits and _ alone"),

@@ -15,19 +15,20 @@ IS_LIGHT = (np.indices((4, 4)).sum(axis=0)[..., None] % 2 == 1).repeat(16, axis=
 
 
 def lump() -> ws.Mesh:
-    """A ball, longer than wide, wider than deep, and thicker on top."""
+    """A ball, longer than wide, wider than deep, thicker below, and with a foot that it stands on."""
     ball = ws.icosphere(1.0, 3)
     x, y, z = ball.positions.T
-    return dataclasses.replace(ball, positions=np.stack([x * (0.6 + 0.2 * y), y, 0.4 * z], axis=1).astype(np.float32))
+    positions = np.stack([x * (0.5 - 0.2 * y), np.maximum(y, -0.93), 0.4 * z], axis=1)
+    return dataclasses.replace(ball, positions=positions.astype(np.float32))
 
 
 @pytest.fixture(scope="module")
 def photo() -> demo.Photograph:
     """An image of the lump on tiles in a sky with a sun, 144 × 96 pixels."""
     spheres = ws.Spheres(
-        [[0, 0.5, 0], [0.15, 0.3, 0], [-0.15, 0.3, 0], [0, -0.1, 0], [0, -0.6, 0]], [0.42] * 4 + [0.36]
+        [[0, -0.5, 0], [0.15, -0.3, 0], [-0.15, -0.3, 0], [0, 0.1, 0], [0, 0.6, 0]], [0.4] * 4 + [0.36]
     )
-    body = ws.Body(lump(), (0.7, 0.3, 0.1), blockers=spheres, translation=(0, 1, 0), rotation=(0, 30, 0))
+    body = ws.Body(lump(), (0.7, 0.3, 0.1), blockers=spheres, translation=(0, 0.93, 0), rotation=(0, 30, 0))
     texture = np.where(IS_LIGHT, np.full(3, 0.8), 0.1).astype(np.float32)
     sky = ws.synthetic_sky((0.8, 0.7, -0.1), sun_strength=3.0, sun_radius=30.0, height=64)
     camera = ws.Camera.look_at((1.2, 4.2, 3.6), (0.3, 0.4, -0.2), fov_y=40, size=(WIDTH, HEIGHT))
@@ -56,15 +57,11 @@ def test_a_start_is_15_degrees_and_a_tenth_of_the_diagonal_away(photo):
     assert np.linalg.norm(shift) == pytest.approx(0.1 * np.linalg.norm(high - low), rel=1e-4)
 
 
-def test_masks_leave_out_what_saturates_and_the_inside_of_the_body(photo):
+def test_masks_leave_out_what_saturates(photo):
     burnt = photo.image.copy()
     row, column = np.argwhere(photo.mask() == 1)[5]
     burnt[row, column] = (0.2, 1.0, 0.2)
     assert dataclasses.replace(photo, image=burnt).mask()[row, column] == 0
-    whole, rim = photo.mask(), photo.mask(inside=False)
-    left_out = (whole > 0) & (rim == 0)
-    assert 0.3 * photo.outline.sum() < left_out.sum() < photo.outline.sum()
-    assert (photo.outline[left_out] == 1).all()
     assert not photo.around()[photo.outline > 0].any() and photo.around().any()
 
 
@@ -92,23 +89,21 @@ def test_the_bottle_is_seen_where_its_given_pose_projects_it(tmp_path):
     assert 2e4 < photo.outline.sum() < 3e4
 
 
-def test_the_outline_finds_the_body(photo):
-    start, truth = away(photo), photo.scene.bodies[demo.BODY]
-    assert distance_error(demo.by_outline(photo, start), truth) < 0.35 * distance_error(start, truth)
-
-
 @pytest.mark.slow
-def test_the_image_keeps_the_body_nearer_with_shadows_than_without(photo):
-    truth = photo.scene.bodies[demo.BODY]
-    near = displaced(truth, np.random.default_rng(1), degrees=(3, 3), part=(0.02, 0.02))
-    with_shadows, without = (
-        distance_error(demo.by_image(photo, near, by).bodies[demo.BODY], truth) for by in (demo.SHADOWS, demo.DIRECT)
-    )
-    assert with_shadows < 0.85 * without
+def test_the_body_is_found_on_the_table_by_its_outline_and_its_shadow(photo):
+    start, truth = away(photo), photo.scene.bodies[demo.BODY]
+    result = demo.by_photograph(photo, start, demo.SHADOWS)
+    assert distance_error(start, truth) > 10
+    assert distance_error(result.scene.bodies[demo.BODY], truth) < 1.5
+    table = photo.scene.bodies[demo.TABLE]
+    assert distance_error(result.scene.bodies[demo.TABLE], table) < 1
+    counts = result.problem.targets[0].mask
+    assert counts.any() and not counts[photo.outline > 0].any()
+    assert not counts[~demo.light_squares(photo, demo.tiles(photo))].any()
 
 
 def test_light_squares_are_light_whole_and_on_the_table(photo):
-    squares = bottle_light.light_squares(photo, IS_LIGHT)
+    squares = bottle_light.squares_around(photo, IS_LIGHT)
     colors = photo.image[squares.seen].mean(axis=1)
     assert squares.seen.sum() > 300
     assert np.percentile(colors, 5) > 3 * np.percentile(photo.image[photo.mask() == 1].mean(axis=1), 10)
@@ -116,9 +111,11 @@ def test_light_squares_are_light_whole_and_on_the_table(photo):
 
 
 def test_points_of_the_table_are_what_pixels_see_of_it(photo):
-    points = bottle_light.table_points(photo.scene.camera)
-    x, z = points[60, 70]
-    np.testing.assert_allclose(photo.scene.camera.project(np.array([x, 0.0, z])), (70.5, 60.5), atol=1e-3)
+    for level in (0.3, 0.0):
+        table = dataclasses.replace(photo.scene.bodies[demo.TABLE], translation=(0.0, level, 0.0))
+        points = bottle_light.table_points(dataclasses.replace(photo.scene, bodies=(photo.scene.bodies[0], table)))
+        x, z = points[60, 70]
+        np.testing.assert_allclose(photo.scene.camera.project(np.array([x, level, z])), (70.5, 60.5), atol=1e-3)
     middle, radius = bottle_light.foot(photo.scene.bodies[demo.BODY])
     np.testing.assert_allclose(middle, 0, atol=0.1)
     assert 0.1 < radius < 0.4
@@ -126,7 +123,7 @@ def test_points_of_the_table_are_what_pixels_see_of_it(photo):
 
 @pytest.mark.slow
 def test_light_is_found_that_casts_the_shadow_of_the_photograph(photo):
-    seen = bottle_light.light_squares(photo, IS_LIGHT).seen
+    seen = bottle_light.squares_around(photo, IS_LIGHT).seen
     visibility = ws.Visibility(directions=64)
     found = bottle_light.explained(photo, seen, visibility, iterations=100).scene
     without = bottle_light.explained(photo, seen, bottle_light.DIRECT, iterations=100).scene
@@ -134,7 +131,7 @@ def test_light_is_found_that_casts_the_shadow_of_the_photograph(photo):
     assert bottle_light.gap(photo, found, seen, visibility) < 0.6 * unshadowed_gap
     found = dataclasses.replace(found, visibility=visibility)
     kept = bottle_light.darkening(found, bottle_light.second_body(photo))
-    assert 0.3 < np.nanmin(kept) < 0.8 and np.nanmedian(kept) > 0.9
+    assert 0.25 < np.nanmin(kept) < 0.8 and np.nanmedian(kept) > 0.9
     shadow = bottle_light.shadow(bottle_light.by_sector(kept, photo, bottle_light.second_body(photo)))
     assert abs(abs(shadow.direction) - 180) < 45  # the sun is on the right
 

@@ -48,6 +48,16 @@ def test_settings_differ_in_their_labels_and_one_of_them_is_the_default(ball):
     assert receivers == {"pixel"}
 
 
+@pytest.mark.parametrize("name", error_vs_time.SHINING)
+def test_scenes_with_gloss_and_near_light_have_settings_that_show_them(name):
+    (scene,) = error_vs_time.load_scenes(None, [name]).values()
+    settings = error_vs_time.settings(scene, error_vs_time.KIND_COUNTS)
+    families = {each.family for each in settings}
+    assert families == {"directional", "none", "ray-traced"}
+    assert scene.shell is not None or any(body.is_glossy or body.is_emitter for body in scene.bodies)
+    assert scene.camera.width == scene.camera.height == error_vs_time.SIZE
+
+
 def test_full_light_is_compared_with_none_direct_light_and_bounces(ball):
     settings = error_vs_time.full_settings(ball)
     assert [each.scene.bounces for each in settings] == [0, 0, *error_vs_time.BOUNCES]

@@ -6,11 +6,12 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 import warpshadow as ws
 from warpshadow.inverse import Pose, Problem, Stage, Target, fit, load_fit
-from warpshadow.inverse.constraints import hull_points, plane_below, stable_rotation
+from warpshadow.inverse.constraints import hull_points, plane_below, stable_rotation, turn_onto
 from warpshadow.inverse.free.base import PRIOR
 
 # Float32 of positions of a few units.
@@ -116,6 +117,68 @@ def test_a_body_does_not_rest_where_it_would_tip_over():
     assert np.degrees(Rotation.from_matrix(resting).magnitude()) > 15
 
 
+def hull_mesh(points: np.ndarray) -> ws.Mesh:
+    return ws.Mesh(points.astype(np.float32), ConvexHull(points).simplices)
+
+
+def test_a_tall_body_does_not_rest_on_its_chamfer():
+    """The centroid projects into a narrow facet beside the base, from which half a degree tips the body over."""
+    profile = np.array([(-0.40, 0.0084), (-0.34, 0.0), (0.5, 0.0), (0.5, 6.0), (-0.40, 6.0)])
+    post = hull_mesh(np.array([(x, y, z) for x, y in profile for z in (-0.5, 0.5)]))
+    up, chamfer = np.array([0.0, 1.0, 0.0]), np.array([-0.0084, -0.06, 0.0]) / np.hypot(0.0084, 0.06)
+    start = turn_onto(chamfer, -up)
+    resting = stable_rotation(post, start, up)
+    np.testing.assert_allclose(resting @ up, up, atol=1e-6)
+    sphere = ws.icosphere(1.0, 2)  # returns to no facet, and rests on the nearest that it can
+    assert np.degrees(Rotation.from_matrix(stable_rotation(sphere, start, up) @ start.T).magnitude()) < 15
+
+
+def test_the_base_of_a_scan_is_the_plane_nearest_to_all_of_it():
+    """Of a base of 9 × 9 vertices, two grains below the middle: the post leans on them and on an edge."""
+    rows = np.linspace(-0.5, 0.5, 9)
+    base = np.array([(x, 0.0, z) for x in rows for z in rows])
+    base[np.isclose(base[:, 2], 0.125) & np.isclose(np.abs(base[:, 0]), 0.25), 1] = -0.008
+    top = np.array([(x, 2.0, z) for x in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    scan, up = hull_mesh(np.concatenate([base, top])), np.array([0.0, 1.0, 0.0])
+    start = Rotation.from_euler("X", 9.0, degrees=True).as_matrix()
+    tilts = []
+    for uneven in (False, True):
+        resting = stable_rotation(scan, start, up, base_is_uneven=uneven)
+        tilts.append(np.degrees(np.arccos(np.clip((resting @ up) @ up, -1, 1))))
+    assert tilts[1] < 0.1 < 0.5 < tilts[0]
+
+
+@pytest.mark.parametrize("resting", ["stable", "given"])
+def test_a_prior_of_the_tilt_counts_in_standard_deviations_at_any_turn(resting):
+    where = scene(box(TILT, (0.3, 2.0, -0.2)), ground_turn=(10, 0, 5), height=0.4)
+    free, setting, values = prepared(where, Pose("box", stands_on="table", resting=resting, tilt=0.01))
+    assert values["turn"].numel() == 3 and values["shift"].numel() == 2
+    for turn, cost in (([1.3, 0.0, 0.0], 0.0), ([0.0, 0.02, 0.0], 4.0), ([0.0, -0.01, 0.02], 5.0)):
+        turned = values | {"turn": torch.tensor(turn)}
+        assert abs(float(free.regularizer(turned, setting)) - cost * PRIOR) < 1e-2 * PRIOR
+        body = moved_body(free, setting, turned)
+        plane = plane_below(where.bodies[1], np.array([0.0, 5.0, 0.0]))
+        lowest = (body.world_mesh().positions.astype(np.float64) @ plane.normal).min() - plane.offset
+        assert abs(lowest) < 4 * FLOAT32
+    scattered = [free.scattered(values, number, torch.Generator())["turn"] for number in range(2)]
+    np.testing.assert_allclose(scattered, [[0.55, 0, 0], [-0.55, 0, 0]], atol=1e-6)
+    assert not values["turn"].any()
+
+
+def test_a_scan_that_stands_a_little_tilted_is_found():
+    leaning = box((2.5, TRUE_TURN, 0))
+    leaning = dataclasses.replace(leaning, translation=(0, 1.0 - float(leaning.world_points()[:, 1].min()), 0))
+    truth = scene(leaning)
+    start = dataclasses.replace(truth, bodies=(box(TILT, (0.15, 1.4, -0.1)), truth.bodies[1]))
+    errors = []
+    for tilt in (None, 0.1):
+        problem = Problem(start, Target(ws.render(truth)[..., :3]), Pose("box", stands_on="table", tilt=tilt))
+        found = fit(problem, [Stage(60, 0.1)], progress=False).scene.bodies[0]
+        gaps = found.world_mesh().positions - leaning.world_mesh().positions
+        errors.append(np.linalg.norm(gaps, axis=1).max())
+    assert errors[1] < 0.02 < 0.06 < errors[0]
+
+
 @pytest.mark.parametrize(
     ("options", "turns", "stays"),
     [({"upright": True}, [0, 1, 0], []), ({"axis": (0, 0, -3)}, [0, 0, 1], []), ({"fixed": ["y", "z"]}, None, [1, 2])],
@@ -196,6 +259,9 @@ def test_priors_count_in_standard_deviations():
         ({"axis": (0, 0, 0)}, "axis: got"),
         ({"upright": True, "axis": (1, 0, 0)}, "expected one axis"),
         ({"stands_on": 1, "rotation": "6d"}, "rotation: got '6d' beside stands_on"),
+        ({"tilt": 0.1}, "tilt: got a prior of a tilt from no support"),
+        ({"tilt": 0.1, "stands_on": 1, "resting": "free"}, "tilt: got a prior of a tilt from no support"),
+        ({"tilt": 0.0, "stands_on": 1}, "tilt: got 0.0, expected a positive number"),
         ({"size": (1, 0.1)}, "size: got a prior of a size that is not free"),
         ({"distance": (1, 0)}, "distance"),
         ({"covariance": np.zeros((6, 6))}, "covariance: got a matrix"),
@@ -219,10 +285,10 @@ def test_a_fit_file_has_the_same_keys(tmp_path):
     ws.write_image(tmp_path / "photo.exr", np.full((36, 48, 3), 0.3))
     (tmp_path / "fit.toml").write_text(
         'scene = "scene.toml"\n[[target]]\nimage = "photo.exr"\n[[free.pose]]\nbody = "box"\nstands_on = "table"\n'
-        'scale = true\nfixed = ["x"]\nsize = [2.6, 0.1]\ndistance = [5.0, 0.2]\n'
+        'scale = true\ntilt = 0.03\nfixed = ["x"]\nsize = [2.6, 0.1]\ndistance = [5.0, 0.2]\n'
     )
     (pose,) = load_fit(tmp_path / "fit.toml").problem.free
-    wanted = Pose(0, scale=True, stands_on=1, fixed=("x",), size=(2.6, 0.1), distance=(5.0, 0.2))
+    wanted = Pose(0, scale=True, stands_on=1, tilt=0.03, fixed=("x",), size=(2.6, 0.1), distance=(5.0, 0.2))
     assert pose == wanted
 
 

@@ -14,6 +14,7 @@ from warpshadow.inverse import (
     Deformation,
     Exposure,
     Light,
+    Loss,
     Pose,
     Problem,
     Radii,
@@ -26,6 +27,7 @@ from warpshadow.inverse.report import Report, _stems, write_result
 from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import parse_camera
+from warpshadow.torch import TorchRenderer
 
 # Bodies are placed in float32 in the fit, and by their written rotation vectors when rendered again.
 PLACED = 2e-4
@@ -55,14 +57,16 @@ def run(*free, views=1, scene=None, **options):
 
 
 def rendered_again(folder, result):
-    """Images of the scene that was written, by the views' cameras and exposures that were written."""
+    """Images of the scene that was written, by the views' cameras and exposures that were written.
+
+    All cameras at once, as of the fit: receivers are chosen for them together.
+    """
     scene, summary = ws.load_scene(folder / "scene.toml"), toml_tables.read(folder / "summary.toml", "summary")
-    images = []
-    for view in summary["view"]:
-        exposure = np.float32([view["exposure"]] * 3 + [1])
-        camera = parse_camera({key: value for key, value in view.items() if key != "exposure"})
-        images.append(exposure * ws.Renderer(replace(scene, camera=camera)).render())
-    return np.stack(images)
+    views = summary["view"]
+    cameras = [parse_camera({key: value for key, value in view.items() if key != "exposure"}) for view in views]
+    images = TorchRenderer(scene, cameras=cameras)().numpy().reshape(len(views), cameras[0].height, cameras[0].width, 4)
+    exposures = np.float32([[view["exposure"]] * 3 + [1] for view in views])
+    return exposures[:, None, None] * images
 
 
 @pytest.mark.slow
@@ -87,6 +91,30 @@ def test_what_is_written_of_a_fit_renders_as_its_result(tmp_path, free, toleranc
     got = rendered_again(tmp_path / "out", result)
     error, change, size = (np.linalg.norm(image) for image in (got - expected, expected - before, expected))
     assert error < tolerance * size < change  # so that what was not written would show
+
+
+def test_weights_show_an_occluder_that_a_redescending_loss_forgot(tmp_path):
+    scene = make_scene()
+    image = ws.Renderer(scene).render()[..., :3]
+    mask = np.ones(image.shape[:2], np.float32)
+    mask[:, :2] = 0.5
+    image[4:8, 6:10] += 8 * image.mean()  # where the scene has no body
+    problems = [
+        Problem(scene, Target(image, mask), Albedo(0), Loss(kind), still=DIRECTIONAL)
+        for kind in ("geman-mcclure", "l2")
+    ]
+    robust, squares = (fit(problem, [Stage(5)], progress=False) for problem in problems)
+    weights = robust.pixel_weights[0].copy()
+    assert weights[4:8, 6:10].max() < 0.01
+    weights[4:8, 6:10] = mask[4:8, 6:10]
+    np.testing.assert_allclose(weights, mask, atol=0.05)
+    np.testing.assert_array_equal(squares.pixel_weights[0], mask)
+    names = [file.name for file in write_result(squares, tmp_path / "squares")]
+    assert "weights.png" not in names
+    files = write_result(robust, tmp_path / "robust")
+    assert tmp_path / "robust" / "weights.png" in files
+    as_mask = Target(image, tmp_path / "robust" / "weights.png").mask
+    np.testing.assert_allclose(as_mask, robust.pixel_weights[0], atol=1 / 255)
 
 
 def test_files_are_called_as_the_bodies_where_nothing_else_is():

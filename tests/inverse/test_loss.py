@@ -51,6 +51,19 @@ def test_a_redescending_loss_forgets_an_occluder():
     assert float(loss(got, target, torch.ones(1, 1, 2), 1.0)) < 0.2**2
 
 
+@pytest.mark.parametrize("loss", KINDS, ids=lambda loss: f"{loss.kind} {loss.alpha}")
+def test_confidence_is_the_weight_relative_to_that_of_a_pixel_that_is_explained(loss):
+    x = torch.tensor([[0.0, 0.0, 0.0], [0.05, 0.1, -0.02], [2.0, 1.0, -3.0]], dtype=torch.float64)
+    confidence = loss.confidence(x)
+    assert confidence[0] == 1 and (confidence >= 0).all() and (confidence <= 1).all()
+    if loss.is_robust:
+        ratio = (loss.pixel_weights(x) / loss.pixel_weights(x * 0)).mean(dim=-1)
+        np.testing.assert_allclose(confidence, ratio)
+        assert confidence[2] < 0.2 < confidence[1]
+    else:
+        assert (confidence == 1).all()
+
+
 def test_a_saturated_target_is_a_lower_bound():
     target = Target(np.array([[[1.0, 0.5, 0.2], [0.3, 0.3, 0.3]]]), saturation=1.0)
     assert target.saturated.tolist() == [[[True, False, False], [False] * 3]]

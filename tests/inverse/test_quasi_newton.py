@@ -119,9 +119,7 @@ def test_a_flat_tensor_that_is_coupled_to_a_steep_one_is_found_before_it_has_con
         floor = 0.5 * (start - lowest)[3:] @ curvature[3:, 3:] @ (start - lowest)[3:]
         tensors = [part.clone().requires_grad_() for part in start.split([3, 6])]
         optimizer = QuasiNewton(tensors, 0.02)
-        counts.append(0)
-        while counts[-1] < 100 and (not counts[-1] or not optimizer.has_converged(1e-4)):
-            counts[-1] += 1
+        for count in range(1, 101):  # noqa: B007 (read after the loop)
 
             def closure(tensors=tensors, optimizer=optimizer, lowest=lowest, curvature=curvature, floor=floor):
                 optimizer.zero_grad()
@@ -131,6 +129,9 @@ def test_a_flat_tensor_that_is_coupled_to_a_steep_one_is_found_before_it_has_con
                 return float(loss.detach())
 
             loss = optimizer.step(closure)
+            if optimizer.has_converged(1e-4):
+                break
+        counts.append(count)
         gaps.append(loss / float(floor) - 1)
     assert max(gaps) < 10 * 1e-4 and np.median(counts) <= 25
 

@@ -47,6 +47,14 @@ def test_slivers_and_triangles_without_area_do_not_tear_an_outline():
     assert sum(area(np.array([[0, 0], *edge])) for edge in torn) == pytest.approx(1)
 
 
+@pytest.mark.parametrize("repeated", [(0, 0, 1), (1, 0, 0), (2, 2, 2)])
+def test_a_triangle_that_has_a_corner_twice_adds_no_edge(repeated):
+    points, square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float), [(0, 1, 2), (0, 2, 3)]
+    np.testing.assert_array_equal(
+        find_outline(points, np.array([*square, repeated])), find_outline(points, np.array(square))
+    )
+
+
 @pytest.mark.parametrize("turn", [0.0, 0.3, 2.0])
 def test_a_square_with_a_window_is_four_polygons(turn):
     points, triangles = triangles_of(SQUARES)

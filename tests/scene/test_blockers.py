@@ -214,6 +214,23 @@ def test_a_body_that_blocks_as_convex_parts_takes_few_spheres(method, body_optio
 
     scene = scene_of(ws.Body(trimesh.creation.box(), **body_options), method=method)
     assert blockers.fitted_counts(scene) == {0: expected}
+    steps = blockers.STEPS_BESIDE_PARTS if not body_options and method == "directional" else blockers.STEPS
+    assert blockers.fitted_meshes(scene)[0].steps == steps
+
+
+def test_short_fits_beside_convex_parts_send_the_same_light(tmp_path, monkeypatch):
+    """An image of a box on a ground with all bounces: measured 1e-6."""
+    import trimesh
+
+    monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
+    images = []
+    for steps in (blockers.STEPS_BESIDE_PARTS, blockers.STEPS):
+        monkeypatch.setattr(blockers, "STEPS_BESIDE_PARTS", steps)
+        box = ws.Body(trimesh.creation.box((1, 0.6, 0.8)), (0.8, 0.4, 0.3), name="box").creased().on_ground()
+        camera = ws.Camera.look_at((1, 2, 3), (0, 0.3, 0), size=(32, 32))
+        scene = ws.Scene([box, ws.Body(ws.plane(4.0, 8))], ws.synthetic_sky(height=32), camera, bounces="all")
+        images.append(ws.Renderer(scene, progress=False).render())
+    assert 0 < np.linalg.norm(images[0] - images[1]) < 1e-3 * np.linalg.norm(images[1])
 
 
 @pytest.mark.parametrize(("method", "warns"), [("directional", False), ("log-sh", True)])

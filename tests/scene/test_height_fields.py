@@ -103,14 +103,21 @@ def trench() -> ws.Mesh:
     return ws.Mesh(grid.positions + np.outer(np.abs(grid.positions[:, 0]) <= 1, (0, -0.5, 0)), grid.faces).creased()
 
 
+def bowl() -> ws.Mesh:
+    """Half a shell."""
+    ball = ws.icosphere(1.0, 4)
+    return ws.Mesh(ball.positions, ball.faces[ball.positions[ball.faces][..., 1].mean(axis=1) < 0], name="bowl")
+
+
 @pytest.mark.parametrize(
     ("mesh", "at", "expected"),
     [
         (plain(), (0.3, 1, 0.2), False),
         (plain(), (0.3, -1, 0.2), True),
         (trench(), (0.3, 1, 0.2), True),
+        (bowl(), (0.1, -0.65, 0), True),
     ],
-    ids=["land", "roof", "flat pieces"],
+    ids=["land", "roof", "flat pieces", "bowl"],
 )
 def test_panels_do_not_stand_over_land(mesh, at, expected):
     scene = ws.Scene([ws.Body(mesh), ball(at)], ws.EnvironmentMap.constant(), CAMERA)
@@ -118,6 +125,18 @@ def test_panels_do_not_stand_over_land(mesh, at, expected):
     assert (0 in blocking_parts(scene)) is expected
     assert fitted_meshes(scene)[0][0].surface.is_closed is not expected
     assert (fitted_counts(scene)[0] == SPHERES_BESIDE_PARTS) is expected
+
+
+@pytest.mark.slow
+def test_a_ball_in_a_bowl_of_one_layer_is_as_dark_as_by_rays():
+    in_bowl = ws.Body(ws.icosphere(0.3, 3), translation=(0.1, -0.65, 0))
+    camera = ws.Camera.look_at((0, 2.6, 2.2), (0, -0.4, 0), size=(48, 48))
+    scene = ws.Scene([ws.Body(bowl()), in_bowl], ws.EnvironmentMap.constant(), camera)
+    renderer = ws.Renderer(scene)
+    traced = ws.Renderer(dataclasses.replace(scene, visibility=ws.Visibility("ray-traced", samples=256)))
+    shows_ball = renderer.layers().bodies == 1
+    light, expected = (each.render()[shows_ball][:, :3].mean() for each in (renderer, traced))
+    assert light == pytest.approx(expected, rel=0.05)  # 2.2% darker; by spheres of the land below 18% brighter
 
 
 def test_water_and_rocks_stick_in_land():

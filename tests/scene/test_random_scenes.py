@@ -131,6 +131,28 @@ def test_bodies_keep_the_one_color_of_their_mesh():
         np.testing.assert_array_equal(body.albedo, (1, 0, 0))
 
 
+def test_some_bodies_shine_others_are_as_without_gloss_and_those_that_shine_as_given_stay_so():
+    ranges = Ranges(glossy=0.5, roughness=(0.3, 0.4), metal=0.25)
+    bodies = [body for scene in RandomScenes(0, 60, ranges=ranges) for body in scene.bodies[:-1]]
+    shining = [body for body in bodies if body.is_glossy]
+    roughness = np.concatenate([body.roughness for body in shining])
+    assert 0.4 < len(shining) / len(bodies) < 0.6 and 0.3 <= roughness.min() < 0.32 and 0.38 < roughness.max() <= 0.4
+    assert 0.15 < np.mean([body.metallic for body in shining]) < 0.35
+    assert {float(body.metallic[0]) for body in shining} == {0.0, 1.0}
+    assert not any(body.is_glossy for scene in RandomScenes(0, 9) for body in scene.bodies)
+    dull = ws.Body(ws.plane(1.0, 1), roughness=0.9, blockers=0)
+    assert RandomScenes(0, bodies=[dull], ranges=ranges)[0].bodies[0].roughness == pytest.approx(0.9)
+
+
+def test_near_light_is_that_of_infinitely_far_away_on_a_sphere_around_the_ground():
+    near, far = (RandomScenes(0, 4, ranges=Ranges(radius=radius)) for radius in ((1.5, 1.5), None))
+    for here, there in zip(near, far, strict=True):
+        corner = np.linalg.norm(here.bodies[-1].mesh.positions[0])
+        assert here.light.radius == pytest.approx(1.5 * corner, rel=1e-6) and there.light.radius is None
+        np.testing.assert_array_equal(here.light.radiance, there.light.radiance)
+    assert RandomScenes(0, 1, ranges=Ranges(radius=(1.01, 1.01)))[0].shell is not None  # all is within
+
+
 def test_primitives_are_closed_face_outward_and_are_made_once():
     assert primitives() is primitives()
     for body in primitives():

@@ -5,8 +5,10 @@ import pytest
 import warp as wp
 
 import warpshadow as ws
+from tests.stages.test_self_light import of_square_above
 from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.primitives import icosphere, plane
+from warpshadow.stages import path_tracing
 from warpshadow.stages.light_samples import sample_map
 from warpshadow.stages.path_tracing import PathSurfaces, trace_bounces
 from warpshadow.stages.textures.pyramid import mip_pyramids
@@ -109,6 +111,54 @@ def test_nothing_bounces_from_black_bodies_or_in_the_dark(device):
     assert not bounced(black, points, normals, UNIFORM, bounces=3, paths=64).any()
     closed = make_surfaces(ball, 0.5, device)
     assert not bounced(closed, 0.999 * points, normals, UNIFORM, bounces=3, paths=64).any()
+
+
+# ---------------------------------------------------------------------------------------------- bright faces
+
+
+def joined(*meshes: Mesh) -> Mesh:
+    starts = np.cumsum([0, *(mesh.vertex_count for mesh in meshes)])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
+    return Mesh(np.concatenate([mesh.positions for mesh in meshes]), np.concatenate(faces))
+
+
+def test_light_of_a_small_bright_face_is_right_on_average_and_varies_less(device, monkeypatch):
+    """A square over receivers, lit from below, and black ones beside it, which rays meet more often."""
+    square = plane(2.0, 1).transformed(rotation=np.diag([1.0, -1, -1]), translation=[0, 8.0, 0])
+    black = plane(100.0, 1).transformed(rotation=np.diag([1.0, -1, -1]), translation=[0, 20.0, 0])
+    colors = np.repeat([0.5, 0.0], [square.vertex_count, black.vertex_count])[:, None] * np.ones(3)
+    surfaces = make_surfaces(joined(square, black), colors, device)
+    below = np.repeat([0.0, 1.0], 8)[:, None, None] * np.ones((32, 3))
+    receivers = np.zeros((512, 3)), np.tile([0.0, 1, 0], (512, 1))
+    light = bounced(surfaces, *receivers, below, bounces=1, paths=256)
+    noise = light.std() / np.sqrt(512)
+    assert light.mean() == pytest.approx(0.5 * of_square_above(8.0), abs=4 * noise + 1e-4)
+    monkeypatch.setattr(path_tracing, "_MIN_BRIGHT_SHARE", 2)
+    assert light.std() < 0.4 * bounced(surfaces, *receivers, below, bounces=1, paths=256).std()
+
+
+@pytest.mark.parametrize("bounces", [1, 4])
+def test_light_of_a_bright_spot_in_a_ball_is_the_geometric_series(bounces, device, monkeypatch):
+    """The sun shines through the hole of a ball onto its floor: each bounce brings a (1 − f) of the one before."""
+    ball, ground = icosphere(1.0, 4), plane(40.0, 1).transformed(translation=[0, -5.0, 0])
+    corners = ball.positions[ball.faces].astype(np.float64)
+    area_vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    areas, is_hole = np.linalg.norm(area_vectors, axis=1), corners.mean(axis=1)[:, 1] > 0.7
+    holed = Mesh(ball.positions, ball.faces[~is_hole])
+    colors = np.repeat([0.8, 0.0], [ball.vertex_count, ground.vertex_count])[:, None] * np.ones(3)
+    surfaces = make_surfaces(joined(holed, ground), colors, device)
+    sun = np.zeros((64, 128, 3))
+    sun[0] = 1000.0
+    flux = 1000 * 2 * (1 - np.cos(np.pi / 64)) * area_vectors[is_hole, 1].sum()  # over π
+    chosen = np.random.default_rng(SEED).choice(len(holed.faces), 200, replace=False)
+    points = holed.positions[holed.faces[chosen]].mean(axis=1)
+    normals = -points / np.linalg.norm(points, axis=1, keepdims=True)
+    light = bounced(surfaces, points, normals, sun, bounces=bounces)
+    kept = 0.8 * (1 - areas[is_hole].sum() / areas.sum())
+    expected = 0.8 * flux / areas.sum() * (kept ** np.arange(bounces)).sum()
+    assert np.abs(light.mean(axis=0) / expected - 1).max() < NOISE
+    monkeypatch.setattr(path_tracing, "_MIN_BRIGHT_SHARE", 2)
+    assert not np.array_equal(light, bounced(surfaces, points, normals, sun, bounces=bounces))
 
 
 # ---------------------------------------------------------------------------------------------- against a twin
@@ -259,8 +309,6 @@ def test_a_receiver_gets_the_same_paths_each_time_and_its_neighbor_others(device
 
 
 def test_parts_of_receivers_are_those_of_the_whole(device, monkeypatch):
-    from warpshadow.stages import path_tracing
-
     mesh, colors, texture, textured = room()
     surfaces = make_surfaces(mesh, colors, device, texture=texture, textured=textured)
     points, normals = np.tile([0.3, 0, 0.2], (20, 1)), np.tile([0.0, 1, 0], (20, 1))

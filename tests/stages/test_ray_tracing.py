@@ -9,7 +9,8 @@ from warpshadow.assets.basis import CellBasis, HarmonicBasis
 from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.primitives import icosphere, plane
 from warpshadow.maths import sh
-from warpshadow.maths.directions import fibonacci
+from warpshadow.maths.directions import cell_radius, fibonacci
+from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.stages import ray_tracing
 from warpshadow.stages.light_samples import SET_COUNT, cell_samples, even_samples, sample_map
 from warpshadow.stages.ray_tracing import first_hit, trace_cells, trace_shading, trace_visibility
@@ -411,6 +412,22 @@ def test_transfer_times_light_is_the_shading_of_that_light(device, basis):
     samples = sample_map(image.reshape(height, 2 * height, 3).astype(np.float32), 8192)
     shading = trace_shading(mesh, points, normals, samples).numpy()
     assert np.abs(transfer @ coefficients - shading).max() < ROUGH * shading.max()
+
+
+@pytest.mark.parametrize("count", [64, 512, 1024])
+def test_cells_count_alike_however_few_rays_there_are(count):
+    """Without blockers a cell lights as a light of its size towards its middle, whichever rays happen to be in it."""
+    ground = ws.Body(ws.plane(2.0, 1), albedo=(1, 1, 1))
+    camera = ws.Camera.look_at((0, 2, 0.1), (0, 0, 0), size=(8, 8), fov_y=20)
+    scene = ws.Scene([ground], ws.EnvironmentMap.constant(), camera, ws.Visibility("ray-traced", samples=256))
+    basis = CellBasis(fibonacci(count))
+    renderer = SceneRenderer(scene, basis=basis)
+    view = renderer.view()
+    (transfer,) = renderer._method.cached_transfers(view).value(view.call)
+    cosines = basis.directions[:, 1]
+    chosen = cosines > 3 * cell_radius(count)  # not cut by the horizon
+    shares = transfer.numpy()[0, 0, chosen] / (4 / count * cosines[chosen])
+    assert np.abs(shares - 1).max() < 0.2  # 13%: rays are not in the middle of a cell; by counts alone 79%
 
 
 def test_receivers_in_several_launches_get_what_they_get_in_one(device, monkeypatch):

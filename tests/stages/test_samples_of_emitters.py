@@ -219,6 +219,61 @@ def test_convex_parts_block_as_the_twin_does(device):
     assert not none.numpy().any()
 
 
+def cone(sections, radii=(1.4, 0.9), heights=(-0.7, 0.7)):
+    """The wall of a cone around the y axis, of one layer, open above and below."""
+    angles = 2 * np.pi * np.arange(sections) / sections
+    rings = [
+        np.stack([r * np.cos(angles), np.full(sections, y), r * np.sin(angles)], axis=1)
+        for r, y in zip(radii, heights, strict=True)
+    ]
+    begin, end = np.arange(sections), np.roll(np.arange(sections), -1)
+    halves = np.stack([begin, begin + sections, end], axis=1), np.stack([end, begin + sections, end + sections], axis=1)
+    return ws.Mesh(np.concatenate(rings), np.concatenate(halves))
+
+
+def log_past(mesh, points, normals, device):
+    """Logarithm of the transmittance past a mesh from receivers to a ball of radius 0.25 in it."""
+    blockers = ConvexBlockers.from_bodies([ConvexBody(mesh.convex_parts, 0)], mesh.vertex_count, device=device)
+    samples = samples_of(BALL, device)
+    own = placed(samples, 0.5 * BALL.positions, device)
+    arrays = [wp.array(item[None], dtype=wp.vec3, device=device) for item in (points, normals)]
+    parts = blockers.placed(wp.array(mesh.positions[None], dtype=wp.vec3, device=device))
+    got = convex.find_log_transmittance_of_parts(*arrays, own, next(samples.spans()), parts, blockers, (-1, -1))
+    return own, numbers(got)
+
+
+def test_shares_of_panels_beside_each_other_add_up_as_those_of_the_twin(device):
+    """Nothing passes where two panels touch."""
+    mesh = cone(6)
+    assert len(mesh.convex_parts) == 6
+    points = np.random.default_rng(7).normal(size=(80, 3)) * (3, 1.5, 3)
+    points = points[np.hypot(points[:, 0], points[:, 2]) > 1.6]
+    own, got = log_past(mesh, points, twins.unit(-points), device)
+    sample_points, areas = numbers(own.points), numbers(own.areas)
+    expected = np.zeros(got.shape)
+    for receiver, sample in np.ndindex(*got.shape):
+        beam, area = sample_points[sample] - points[receiver], areas[sample]
+        if beam @ -points[receiver] > 0 and beam @ area < 0:
+            disc = beam, np.sqrt(np.linalg.norm(area) / np.pi)
+            panels = (mesh.positions[part.corners].astype(float) for part in mesh.convex_parts)
+            shares = [twins.share_of_panel(corners, points[receiver], *disc) for corners in panels]
+            expected[receiver, sample] = np.log(max(1 - sum(shares), 1e-4))
+    assert (expected == np.log(1e-4)).sum() > 500 and (expected == 0).sum() > 500
+    np.testing.assert_allclose(np.exp(got), np.exp(expected), atol=100 * FLOAT32)
+    around = 3 * cone(200).positions[:200] * (1, 0, 1)
+    assert set(log_past(mesh, around, twins.unit(-around), device)[1].ravel().round(3)) == {0, np.log(1e-4).round(3)}
+
+
+def test_a_panel_that_is_not_quite_flat_hides_nothing_beside_it(device):
+    """Panels that stand in for two quads of a cone each, from receivers in their planes that see all of the lamp."""
+    mesh = cone(24)
+    assert len(mesh.convex_parts) < 24
+    rng = np.random.default_rng(8)
+    radius, angle = 3.0 * np.sqrt(rng.uniform(size=2000)), rng.uniform(0, 2 * np.pi, size=2000)
+    points = np.stack([radius * np.cos(angle), np.full(2000, -4.0), radius * np.sin(angle)], axis=1)
+    assert not log_past(mesh, points, np.tile([[0, 1.0, 0]], (2000, 1)), device)[1].any()
+
+
 def test_rays_meet_what_is_between_and_not_what_is_behind(device):
     mesh = ws.plane(3.0, 2)
     at = np.array([[0, -2.0, 0]]), np.array([[0, 1.0, 0]])
@@ -236,7 +291,7 @@ def test_rays_meet_what_is_between_and_not_what_is_behind(device):
         assert far.numpy()[0, 0, 0] == (height < -2)
 
 
-@pytest.mark.parametrize("between", ["nothing", "spheres", "planes", "parts"])
+@pytest.mark.parametrize("between", ["nothing", "spheres", "planes", "parts", "panels"])
 def test_gradients_of_light_agree_with_differences(between, device):
     """To receivers, the emitter's vertices and radiance, and to the blockers."""
     rng = np.random.default_rng(5)
@@ -246,10 +301,13 @@ def test_gradients_of_light_agree_with_differences(between, device):
     points = rng.uniform(-1, 1, size=(1, 30, 3)) * (1.0, 0.2, 0.8) - (0, 1.5, 0)
     normals = twins.unit(np.array([0, 1.0, 0]) + 0.2 * rng.normal(size=points.shape))
     inputs = [points, normals, BALL.positions[None] + np.float32([0.2, 1.5, 0.1]), rng.uniform(size=(1, 64, 3))]
-    box_blockers, box_vertices = box((0.8, 0.3, 0.6), device)
+    shade = cone(6)
+    panels = ConvexBlockers.from_bodies([ConvexBody(shade.convex_parts, 0)], shade.vertex_count, device=device)
+    box_blockers, box_vertices = (panels, shade.positions) if between == "panels" else box((0.8, 0.3, 0.6), device)
     inputs += {
         "nothing": [],
         "parts": [box_vertices[None]],
+        "panels": [box_vertices[None]],
         "spheres": [rng.normal(size=(1, 6, 3)) * 0.5],
         "planes": [frames.numpy()],
     }[between]
@@ -264,7 +322,7 @@ def test_gradients_of_light_agree_with_differences(between, device):
         if between == "planes":
             found = planes.find_log_transmittance_of_planes(*seen, arrays[4], blockers, (-1, -1))
             logs = {"log_of_planes": found}
-        if between == "parts":
+        if between in ("parts", "panels"):
             parts = box_blockers.placed(arrays[4])
             found = convex.find_log_transmittance_of_parts(*seen, parts, box_blockers, (-1, -1))
             logs = {"log_of_parts": found}
@@ -281,7 +339,7 @@ def test_gradients_of_light_agree_with_differences(between, device):
         return (weights * made.numpy()).sum()
 
     for number, (array, values) in enumerate(zip(arrays, inputs, strict=True)):
-        is_box = between == "parts" and number == 4  # whose sides stay flat
+        is_box = between in ("parts", "panels") and number == 4  # whose sides stay flat
         shift = STEP * np.broadcast_to(rng.normal(size=(1, 1, 3) if is_box else values.shape), values.shape)
         sides = [[*inputs[:number], values + sign * shift, *inputs[number + 1 :]] for sign in (1, -1)]
         difference, gradient = (loss(sides[0]) - loss(sides[1])) / 2, array.grad.numpy()

@@ -109,10 +109,8 @@ def twin(drawn):
                             np.stack([*clip[edge][:, [0, 1, 3]], [*(2 * here / [width, height] - 1), 1]])
                         )
                         if is_own > 0 and t > MIN_DISTANCE:
-                            rises += (
-                                sign * min(t, 0.5) / t * (edge_colors[batch, entries[sample], side] - color[sample])
-                            )
-                            spans += min(t, 0.5)
+                            rises += sign * (edge_colors[batch, entries[sample], side] - color[sample])
+                            spans += t
                     elif edge[0] == -1 and face_ids[other] >= 0:
                         rises += sign * 0.5 * albedo[sample] * (received[other] - received[sample])
                         spans += 0.5

@@ -14,7 +14,7 @@ SCENE = ws.Scene([BALL, ws.Body(ws.infinite_ground(6.0))], ws.synthetic_sky(heig
 
 @pytest.fixture(autouse=True)
 def nothing_is_fitted(monkeypatch):
-    monkeypatch.setattr(video_time, "is_fitted", lambda mesh, count, device: False)
+    monkeypatch.setattr(video_time, "is_fitted", lambda *_, **__: False)
 
 
 def test_a_few_frames_are_said_to_be_done_sooner_as_stills():
@@ -29,5 +29,5 @@ def test_nothing_is_said_where_stills_would_be_by_another_method_or_bounce():
 
 
 def test_nothing_is_said_where_the_set_up_is_on_disk(monkeypatch):
-    monkeypatch.setattr(video_time, "is_fitted", lambda mesh, count, device: True)
+    monkeypatch.setattr(video_time, "is_fitted", lambda *_, **__: True)
     assert setup_seconds(SCENE) == 0 and not remark_on_stills(SCENE, 2)

@@ -17,12 +17,13 @@ from websockets.exceptions import ConnectionClosed  # noqa: E402
 
 from warpshadow.viewer.app import ViewerApp  # noqa: E402
 from warpshadow.viewer.server import is_own  # noqa: E402
+from warpshadow.viewer.state import BodyGloss  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")  # a site says so to all but pytest
 
 
 def scene():
-    ball = ws.Body(ws.icosphere(subdivisions=2), blockers=ws.Spheres([[0, 0, 0]], [1.0]), name="ball")
+    ball = ws.Body(ws.icosphere(subdivisions=2), blockers=ws.Spheres([[0, 0, 0]], [1.0]), name="ball", roughness=0.6)
     camera = ws.Camera.look_at((0, 0, 5), (0, 0, 0), size=(160, 120))
     return ws.Scene([ball], ws.synthetic_sky(), camera)
 
@@ -95,6 +96,19 @@ def test_inputs_change_the_light_unless_they_make_no_sense(site, page):
     page.until(lambda message: "method: got 'magic'" in str(message))
     page.enter("Turn [°]", 0.0)
     eventually(lambda: site.loop.viewer_state.turn == 0.0)
+
+
+def test_a_slider_changes_the_gloss_of_a_body(site, page):
+    page.look_from(position=(0, 0, -8.0))
+    before = shown(site, page)
+    since = len(page.heard)
+    page.enter("ball: metallic", 1.0)
+    assert np.abs(shown(site, page, since) - before).mean() > 1
+    assert site.loop.viewer_state.gloss == (BodyGloss(0.6, 1.0),)
+    page.enter("ball: roughness", 7.0)
+    page.until(lambda message: "roughness: got 7.0" in str(message))
+    page.enter("ball: metallic", 0.0)
+    eventually(lambda: site.loop.viewer_state.gloss == (BodyGloss(0.6, 0.0),))
 
 
 def test_a_body_is_dragged_by_handles_and_put_back(site, page):

@@ -19,7 +19,7 @@ from warpshadow.viewer.painter import (
     relative_error,
 )
 from warpshadow.viewer.quality import Quality
-from warpshadow.viewer.state import ERROR, BodyPose, ViewerState
+from warpshadow.viewer.state import ERROR, BodyGloss, BodyPose, ViewerState
 
 # float32 sums in another order, and a camera that went through a quaternion
 SAME_IMAGE = 2e-4
@@ -172,6 +172,32 @@ def test_light_is_behind_the_bodies_as_the_scene_has_it(scene, painter):
     expected = ws.Picture(ws.render(turned), exposure=0.0, background=turned.background()).pixels.astype(int)
     got = painter.paint(viewer_state, page, dataclasses.replace(FULL, supersampling=1)).rgb
     assert np.abs(got - expected).max() <= 2 and len(np.unique(got[:5])) > 3  # codes
+
+
+def test_light_that_is_near_is_behind_the_bodies_where_rays_leave_it(scene):
+    near = ws.EnvironmentMap(scene.light.radiance, radius=8.0, center=(0, 1, 0))
+    scene = dataclasses.replace(scene, light=near, supersampling=1)
+    painter = Painter(scene)
+    viewer_state = dataclasses.replace(ViewerState.of(scene), shows_light=True)
+    page = dataclasses.replace(own_page(scene, painter.page_scale), position=(0, 0.5, 4), wxyz=(0, 1, 0, 0))  # level
+    camera = page.camera((64, 48), page_scale=painter.page_scale, near=scene.camera.near)
+    expected = dataclasses.replace(scene, camera=camera).background()
+    behind = painter._behind(viewer_state, camera, FULL)
+    np.testing.assert_allclose(behind, expected, rtol=1e-4, atol=1e-4)
+    assert difference(scene.light.towards(camera.rays()[1]), expected) > 0.01  # of the same map far away
+
+
+def test_gloss_that_is_changed_is_that_of_the_scene_so_changed(scene):
+    shiny = dataclasses.replace(scene.bodies[0], roughness=0.5)
+    scene = dataclasses.replace(scene, bodies=(shiny, scene.bodies[1]))
+    painter = Painter(scene)
+    page, start = own_page(scene, painter.page_scale), ViewerState.of(scene)
+    assert start.gloss == (BodyGloss(0.5, 0.0), BodyGloss())
+    plain = painter.image(start, page, FULL)
+    viewer_state = dataclasses.replace(start, gloss=(BodyGloss(0.35, 1.0), BodyGloss()))
+    image = painter.image(viewer_state, page, FULL)
+    assert difference(image, ws.render(viewer_state.scene(scene))) < SAME_IMAGE
+    assert difference(image, plain) > 0.1 and len(painter._renderers._cached) == 1
 
 
 def test_a_light_in_harmonics_and_a_scene_of_one_point_are_painted():

@@ -91,6 +91,14 @@ class CellBasis:
         """Evaluate the basis functions at unit vectors [direction, 3]: shape [direction, coefficient], 0 or 1."""
         return np.eye(self.size)[self.cells(directions)]
 
+    def balanced_functions(self, directions: np.ndarray) -> np.ndarray:
+        """Evaluate the functions at samples of the sphere, weighted so that all cells with a sample count alike.
+
+        Cells hold more or fewer than their share of a few samples: of 2 on average, 1 to 4.
+        """
+        functions = self.functions(directions)
+        return functions * (len(directions) / self.size / np.maximum(functions.sum(axis=0), 1))
+
     def cells(self, directions: np.ndarray) -> np.ndarray:
         """Number of the cell that each unit vector [direction, 3] is in, shape [direction]."""
         from scipy.spatial import cKDTree

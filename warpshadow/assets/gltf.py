@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from warpshadow.assets.color import srgb_to_linear
-from warpshadow.assets.mesh import Gloss, MeshPart
+from warpshadow.assets.mesh import EmissiveColor, Gloss, MeshPart
 
 Factors = Mapping[tuple[int, ...], tuple[float, ...]]
 """Linear factors of materials, by the codes that trimesh rounds them to."""
@@ -51,22 +52,28 @@ def base_color_factor(material, factors: Factors) -> tuple[float, ...] | None:
     return factors.get(codes, tuple(code / 255 for code in codes))
 
 
-def emission_of(material) -> tuple[float, float, float] | None:
-    """The radiance of a material of trimesh: its emissive factor, times the mean of a texture; None for no emission."""
-    factor, image = getattr(material, "emissiveFactor", None), getattr(material, "emissiveTexture", None)
+def emission_of(material) -> EmissiveColor | None:
+    """The emission of a material of trimesh; None for none."""
+    factor = getattr(material, "emissiveFactor", None)
     if factor is None or not np.any(factor):
         return None
-    radiance = np.array(factor, np.float64)
-    if image is not None:
-        radiance = radiance * srgb_to_linear(np.asarray(image.convert("RGB")) / 255).mean(axis=(0, 1))
-    red, green, blue = radiance.tolist()
-    return red, green, blue
+    red, green, blue = np.array(factor, np.float64).tolist()
+    image, name = (getattr(material, attribute, None) for attribute in ("emissiveTexture", "name"))
+    return EmissiveColor((red, green, blue), image, name)
 
 
-def emissive_strengths(tree: dict) -> Mapping[tuple[float, ...], float]:
-    """Strengths of KHR_materials_emissive_strength, which trimesh does not read, by the factors of their materials."""
+def emission_texels(emission: EmissiveColor) -> np.ndarray:
+    """Radiance of a surface, float32 of shape [3], or [height, width, 3] where it varies."""
+    if emission.image is None:
+        return np.array(emission.factor, np.float32)
+    texels = srgb_to_linear(np.asarray(emission.image.convert("RGB")) / 255) * np.array(emission.factor)
+    return (texels if np.ptp(texels, axis=(0, 1)).any() else texels[0, 0]).astype(np.float32)
+
+
+def emissive_strengths(tree: dict) -> Mapping[tuple[Any, ...], float]:
+    """Strengths of KHR_materials_emissive_strength, which trimesh does not read, by names and factors of materials."""
     return {
-        _rounded(material.get("emissiveFactor", (0, 0, 0))): extension["emissiveStrength"]
+        (material.get("name"), *_rounded(material.get("emissiveFactor", (0, 0, 0)))): extension["emissiveStrength"]
         for material in tree.get("materials", [])
         if "emissiveStrength"
         in (extension := material.get("extensions", {}).get("KHR_materials_emissive_strength", {}))
@@ -77,13 +84,14 @@ def _rounded(factor: Sequence[float]) -> tuple[float, ...]:
     return tuple(np.array(factor, np.float32).tolist())
 
 
-def stronger(part: MeshPart, strengths: Mapping[tuple[float, ...], float]) -> MeshPart:
+def stronger(part: MeshPart, strengths: Mapping[tuple[Any, ...], float]) -> MeshPart:
     """A part that emits as much stronger as the strength of its material says."""
     if part.emission is None:
         return part
-    strength = strengths.get(_rounded(part.emission), 1.0)
-    red, green, blue = (strength * color for color in part.emission)
-    return part._replace(emission=(red, green, blue))
+    factor, image, material = part.emission
+    strength = strengths.get((material, *_rounded(factor)), 1.0)
+    red, green, blue = (strength * color for color in factor)
+    return part._replace(emission=EmissiveColor((red, green, blue), image))
 
 
 def gloss_of(material) -> Gloss | None:

@@ -332,6 +332,14 @@ class Gloss(NamedTuple):
     image: Any = None
 
 
+class EmissiveColor(NamedTuple):
+    """The radiance of a glTF surface: a linear factor, of an image of Pillow's in sRGB, if any; and its material."""
+
+    factor: tuple[float, float, float]
+    image: Any = None
+    material: str | None = None
+
+
 DIFFUSE = Gloss(1.0, 0.0)  # a surface that does not shine
 
 
@@ -339,8 +347,7 @@ class MeshPart(NamedTuple):
     """One piece of a file; ``welded`` vertices lost their faces to the first of their duplicates.
 
     ``colors`` are linear, [vertex, 3]; ``colorless`` says why colors that it has are not. ``pictures`` has one for each
-    material, None for a material without one. ``gloss`` and ``emission``, linear RGB, are None where the file
-    says none.
+    material, None for a material without one. ``gloss`` and ``emission`` are None where the file says none.
     """
 
     positions: np.ndarray
@@ -353,7 +360,7 @@ class MeshPart(NamedTuple):
     colorless: str = ""
     pictures: tuple[BaseColor | None, ...] = (None,)
     gloss: Gloss | None = None
-    emission: tuple[float, float, float] | None = None
+    emission: EmissiveColor | None = None
 
 
 def moved_part(part: MeshPart, linear: np.ndarray, translation: np.ndarray) -> MeshPart:

@@ -65,7 +65,8 @@ class Material(NamedTuple):
     Attributes:
         texture: Linear RGB, shape [height, width, 3].
         roughness, metallic: glTF's, one number [1], one for each vertex [vertex], or a texture [height, width].
-        emission: Radiance, linear RGB, of the whole mesh [3] or of each vertex [vertex, 3].
+        emission: Radiance, linear RGB, of the whole mesh [3], of each vertex [vertex, 3], or a texture
+            [height, width, 3].
     """
 
     texture: np.ndarray | None = None
@@ -117,13 +118,13 @@ def load_material(path: MeshSource) -> tuple[Mesh, Material]:
     A texture is the base color of glTF (times its factor), the ``map_Kd`` of OBJ, or the image of PLY, where all faces
     have the same one, and uvs. USD colors are not read. glTF's materials have roughness and metallic: factors, times
     the green and the blue of a texture, which are linear, likewise if all faces have the same; else its means count.
-    They emit by their emissive factor and strength, times the mean of a texture.
+    They emit by their emissive factor and strength, times a texture, likewise.
 
     Args:
         path: As there.
     Warns:
-        As there; of a texture that cannot be read, or that counts in place of colors; and of textures of roughness of
-        which the means count.
+        As there; of a texture that cannot be read, or that counts in place of colors; and of textures of roughness or
+        emission of which the means count.
     """
     mesh, picture, gloss, emission, remarks, of_colors, of_gloss = _read(path)
     texture = None

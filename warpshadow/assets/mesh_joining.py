@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from warpshadow.assets.color import GRAY, srgb_to_linear
-from warpshadow.assets.gltf import gloss_texels
+from warpshadow.assets.gltf import emission_texels, gloss_texels
 from warpshadow.assets.mesh import DIFFUSE, BaseColor, Gloss, Mesh, MeshError, MeshPart, checked_indices
 from warpshadow.assets.topology import CREASE, first_at_positions, is_listed_first
 
@@ -17,7 +17,7 @@ class JoinedMesh(NamedTuple):
     """A mesh, the picture that all its faces share, its gloss, and remarks on surprises: on shape, colors and gloss.
 
     ``gloss`` has roughness and metallic of the body, each [1], of each vertex, [vertex], or a texture [height, width];
-    ``emission`` radiance of the body, [3], or of each vertex, [vertex, 3].
+    ``emission`` radiance of the body, [3], of each vertex, [vertex, 3], or a texture [height, width, 3].
     """
 
     mesh: Mesh
@@ -66,13 +66,22 @@ def join_parts(parts: list[MeshPart], name: str) -> JoinedMesh:
         reason = "which need uvs" if mesh.uvs is None else "since a body takes one that all its faces have"
         of_gloss.append(f"of textures of roughness and metallic the means count, {reason}")
     gloss = _joined_gloss(glosses, [len(part.positions) for part in parts], has_textures=not of_gloss)
-    picture, emission = pictures[0] if is_one else None, _joined_emission(parts)
+    emissions = [part.emission for part in parts]
+    has_images = any(emission and emission.image for emission in emissions)
+    is_shared = mesh.uvs is not None and all(emission == emissions[0] for emission in emissions)
+    if has_images and not is_shared:
+        reason = "which need uvs" if mesh.uvs is None else "since a body takes one that all its faces have"
+        of_gloss.append(f"of textures of emission the means count, {reason}")
+    picture, emission = pictures[0] if is_one else None, _joined_emission(parts, has_textures=is_shared)
     return JoinedMesh(mesh, picture, gloss, emission, remarks, of_colors, of_gloss)
 
 
-def _joined_emission(parts: list[MeshPart]) -> np.ndarray | None:
+def _joined_emission(parts: list[MeshPart], *, has_textures: bool) -> np.ndarray | None:
     """Radiance of all parts, of each vertex where they differ; None if no part emits."""
-    radiance = np.array([part.emission or (0.0, 0.0, 0.0) for part in parts], np.float32)
+    texels = [np.zeros(3, np.float32) if part.emission is None else emission_texels(part.emission) for part in parts]
+    if has_textures and texels[0].ndim == 3:
+        return texels[0]
+    radiance = np.array([item.reshape(-1, 3).mean(axis=0) for item in texels], np.float32)
     if not radiance.any():
         return None
     is_one = (radiance == radiance[0]).all()

@@ -41,8 +41,8 @@ _INFINITE_EXTENT = 1e4
 """Extent of an infinite ground, in sizes: seen from one size above, it ends 0.006 degrees below the horizon."""
 
 
-def infinite_ground(size: float = 2.0, segments: int = 64) -> Mesh:
-    """Make a ground in the plane y = 0 that goes to the horizon, around the origin, facing +y, without uvs.
+def infinite_ground(size: float = 2.0, segments: int = 64, texture_size: float | None = None) -> Mesh:
+    """Make a ground in the plane y = 0 that goes to the horizon, around the origin, facing +y.
 
     Its faces are fine where bodies stand, and yet few: of one size within a disc, and further out longer in proportion
     to their distance. It ends 10⁴ sizes away. Framings leave it out, as they do all flat bodies.
@@ -50,11 +50,16 @@ def infinite_ground(size: float = 2.0, segments: int = 64) -> Mesh:
     Args:
         size: Diameter of the disc [scene units], such as the extent of the bodies on it with their shadows.
         segments: Faces around the origin, 8 to 4096: in the disc they are π size / segments long.
+        texture_size: Edge length of a texture, which repeats [scene units]; None for no uvs.
+    Returns:
+        The mesh; a texture's middle is at the origin, u runs along +x, v along -z.
     """
     if not (check.is_number(size) and 0 < size <= check.LARGEST / _INFINITE_EXTENT):
         raise MeshError(f"size: got {check.described(size)}, expected a positive number of scene units")
     if not check.is_integer(segments) or not 8 <= segments <= 4096:
         raise MeshError(f"segments: got {check.described(segments)}, expected a whole number from 8 to 4096")
+    if texture_size is not None and not (check.is_number(texture_size) and texture_size > 0):
+        raise MeshError(f"texture_size: got {check.described(texture_size)}, expected a positive number of scene units")
     step = 2 * np.pi / segments
     inner = np.linspace(0, 0.5, round(1 / step) + 1)[1:]
     outer = np.geomspace(0.5, _INFINITE_EXTENT, int(np.ceil(np.log(2 * _INFINITE_EXTENT) / np.log1p(step))) + 1)[1:]
@@ -68,7 +73,10 @@ def infinite_ground(size: float = 2.0, segments: int = 64) -> Mesh:
     a, b = first[:-1, None] + indices, first[:-1, None] + next_indices
     c, d = first[1:, None] + indices, first[1:, None] + next_indices
     rings = np.stack([a, c, d, a, d, b], axis=-1).reshape(-1, 3)
-    return Mesh(positions, np.concatenate([fan, rings]), name="infinite_ground")
+    faces = np.concatenate([fan, rings])
+    if texture_size is None:
+        return Mesh(positions, faces, name="infinite_ground")
+    return Mesh(positions, faces, positions[:, [0, 2]] / (texture_size, -texture_size) + 0.5, faces, "infinite_ground")
 
 
 def _pair(value: Any) -> tuple[Any, Any]:

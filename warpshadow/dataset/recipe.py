@@ -16,7 +16,7 @@ from warpshadow.scene import toml_tables
 from warpshadow.scene.random_scenes import Ranges
 from warpshadow.scene.scene import Bounces, Scene, check_bounces, check_supersampling
 from warpshadow.scene.toml_tables import Table
-from warpshadow.scene.visibility import AUTO, Visibility
+from warpshadow.scene.visibility import AUTO, GLOSS_METHODS, Visibility
 
 Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | int | float | None"  # values that JSON has
 
@@ -25,8 +25,11 @@ _LAYERS = (*LAYERS, "spheres", "light")  # parts of each scene that may be writt
 FORMATS = ("exr", "png")  # file formats of layers
 
 _KEYS = {
-    "bodies": ("meshes", "blockers", "creased", "count", "size", "upright", "gap", "albedo", "ground_albedo"),
-    "light": ("maps", "rotation", "scale", "bounces"),
+    "bodies": (
+        *("meshes", "blockers", "creased", "count", "size", "upright", "gap", "albedo", "ground_albedo"),
+        *("glossy", "roughness", "metal"),
+    ),
+    "light": ("maps", "rotation", "scale", "radius", "bounces"),
     "camera": ("size", "supersampling", "fov_y", "elevation", "distance"),
     "visibility": None,
     "splits": None,
@@ -93,6 +96,14 @@ class Recipe:
         if self.creased is not None and not (check.is_number(self.creased) and 0 <= self.creased <= 180):
             raise ValueError(f"creased: got {check.described(self.creased)}, expected degrees from 0 to 180")
         object.__setattr__(self, "visibility", self.visibility.with_method())
+        shows_all = self.visibility.method in (*GLOSS_METHODS, AUTO)
+        for name in ("glossy", "radius"):
+            if getattr(self.ranges, name) and not shows_all:
+                methods = ", ".join(map(repr, GLOSS_METHODS))
+                raise ValueError(
+                    f"{name}: got {getattr(self.ranges, name)}, which {self.visibility.method!r} does not show, "
+                    f"expected none, or method = one of {methods}"
+                )
         object.__setattr__(self, "size", check.image_size(self.size))
         check_supersampling(self.supersampling)
         check_bounces(self.bounces)

@@ -28,6 +28,7 @@ from warpshadow.dataset.png import Channels, as_png, from_png
 from warpshadow.dataset.recipe import Plain
 from warpshadow.scene.body import Body
 from warpshadow.scene.files import camera_table
+from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.scene.random_scenes import DrawnScene
 from warpshadow.scene.scene import Scene
 from warpshadow.spheres import Spheres
@@ -115,6 +116,8 @@ def _about(data_set: DataSet, number: int, drawn_scene: DrawnScene) -> dict[str,
     if drawn_scene.light is not None and stock.maps is not None:
         light_placement = {"rotation": drawn_scene.light.rotation, "scale": drawn_scene.light.scale}
         light |= {"map": stock.maps[drawn_scene.light.number], **light_placement}
+    if scene.shell is not None:
+        light["radius"] = float(scene.shell[3])
     if "light" in recipe.layers and isinstance(scene.light, EnvironmentMap):
         light["sh"] = _numbers(scene.light.sh(LIGHT_ORDER))
     return {
@@ -133,7 +136,9 @@ def _placed(body: Body, mesh: str) -> dict[str, Plain]:
         "translation": body.translation.tolist(),
         "scale": float(body.scale),
     }
-    return {"mesh": mesh, "albedo": albedo, **pose_record}
+    gloss = {name: getattr(body, name) for name in GLOSS_ARGUMENTS if getattr(body, name) is not None}
+    numbers = {name: _numbers(values[0]) if values.size == 1 else None for name, values in gloss.items()}
+    return {"mesh": mesh, "albedo": albedo, **numbers, **pose_record}
 
 
 def _numbers(values: np.ndarray) -> Plain:

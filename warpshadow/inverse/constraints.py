@@ -24,6 +24,10 @@ UP = (0.0, 1.0, 0.0)
 RESTING = ("stable", "given", "free")
 _MIN_SLOPE = 0.01  # of a plane along the coordinates that are not fixed
 _INSIDE = 1e-6  # how far outside a triangle its centroid may project, in barycentric coordinates
+_DISTURBANCE = np.radians(1.0)  # tilt from which a body returns to a support
+_BASE = 0.005  # of a mesh's diagonal: unevenness of a scan's base
+_BASE_ITERATIONS = 10
+_AZIMUTHS = np.arange(24) * (np.pi / 12)  # directions in which it is tilted
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,16 +138,22 @@ def hull_points(mesh: Mesh) -> np.ndarray:
     return points[ConvexHull(points).vertices]
 
 
-def stable_rotation(mesh: Mesh, rotation: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def stable_rotation(
+    mesh: Mesh, rotation: np.ndarray, normal: np.ndarray, *, base_is_uneven: bool = False
+) -> np.ndarray:
     """The rotation nearest to one in which a body rests on a plane without tipping over.
 
     A body rests on a triangle of its convex hull if the hull's centroid projects into it [Goldberg et al. 1999, "Part
-    pose statistics"]. The body is turned onto the triangle that needs the least turn.
+    pose statistics"], and if it returns when it is tilted by 1° any way: the rounded edges of a scan have triangles on
+    which it would rest to the letter. The body is turned onto the triangle that needs the least turn. Where it returns
+    to none, as a ball, the first condition is enough.
 
     Args:
         mesh: Of the body.
         rotation: Of the body, shape [3, 3].
         normal: Of the plane, upwards, shape [3].
+        base_is_uneven: Rest on the plane nearest to all vertices around that triangle, up to 0.5% of the diagonal above
+            it, not on its three corners.
     """
     from scipy.spatial import ConvexHull
 
@@ -153,10 +163,39 @@ def stable_rotation(mesh: Mesh, rotation: np.ndarray, normal: np.ndarray) -> np.
     apex = points[hull.vertices].mean(axis=0)
     tetrahedra = np.abs(np.linalg.det(corners - apex))
     centroid = (tetrahedra[:, None] * (corners.sum(axis=1) + apex) / 4).sum(axis=0) / tetrahedra.sum()
-    is_stable = _project_into(corners, centroid)
-    local_down = -rotation.T @ normal
-    best = downwards[is_stable][np.argmax(downwards[is_stable] @ local_down)]
+    supports = downwards[_project_into(corners, centroid)]
+    arms = points[hull.vertices] - centroid
+    returns = np.array([_returns_after_tilt(arms, down) for down in supports])
+    supports = supports[returns] if returns.any() else supports
+    best = supports[np.argmax(supports @ (-rotation.T @ normal))]
+    if base_is_uneven:
+        best = _base_normal(points, best)
     return turn_onto(rotation @ best, -normal) @ rotation
+
+
+def _base_normal(points: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """The normal, outwards, of the plane nearest to the vertices of a base, from about that normal."""
+    reach = _BASE * float(np.linalg.norm(np.ptp(points, axis=0)))
+    for _ in range(_BASE_ITERATIONS):
+        depths = points @ down
+        base = points[depths > depths.max() - reach]
+        normal = np.linalg.svd(base - base.mean(axis=0))[2][-1]
+        down = normal * np.sign(normal @ down)
+    return down
+
+
+def _returns_after_tilt(arms: np.ndarray, down: np.ndarray) -> bool:
+    """Whether a body on a support, tilted a little, is turned back by its weight: its contact is beyond its centroid.
+
+    Args:
+        arms: Vertices of the hull, from the centroid, [vertex, 3].
+        down: Normal of the support, outwards, shape [3].
+    """
+    first, second = remaining([down])
+    level = np.cos(_AZIMUTHS)[:, None] * first + np.sin(_AZIMUTHS)[:, None] * second
+    cosine, sine = np.cos(_DISTURBANCE), np.sin(_DISTURBANCE)
+    contacts = arms[np.argmax((cosine * down + sine * level) @ arms.T, axis=1)]
+    return bool(((contacts * (cosine * level - sine * down)).sum(axis=1) > 0).all())
 
 
 def _project_into(corners: np.ndarray, point: np.ndarray) -> np.ndarray:

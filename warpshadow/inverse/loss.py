@@ -109,6 +109,28 @@ class Loss:
             return (1 + squares) ** -2
         return torch.ones_like(x) if self.alpha == 2 else (squares / (2 - self.alpha) + 1) ** (self.alpha / 2 - 1)
 
+    @property
+    def is_robust(self) -> bool:
+        """Whether it counts pixels of large differences less than others, relative to their squares."""
+        return self.kind in ("huber", "geman-mcclure") or (self.kind == "barron" and self.alpha < 2)
+
+    def confidence(self, x: torch.Tensor) -> torch.Tensor:
+        """How much a pixel counts in the fit beside one that is explained: 1 without a difference, about 0 for an
+        occluder or a highlight where the loss is redescending.
+
+        It is the weight of :meth:`pixel_weights`, relative to that of no difference, the mean over channels; 1 for
+        "l2", and for "l1", which has no such scale.
+
+        Args:
+            x: Differences of colors in units of radiance, [..., channel].
+
+        Returns:
+            [...], 0 to 1.
+        """
+        if not self.is_robust:
+            return torch.ones_like(x[..., 0])
+        return (self.pixel_weights(x) / self.pixel_weights(torch.zeros_like(x))).mean(dim=-1)
+
 
 def bounded(images: torch.Tensor, targets: torch.Tensor, saturated: torch.Tensor | None) -> torch.Tensor:
     """Images to compare with targets: no brighter than these where they are saturated, and so lower bounds.

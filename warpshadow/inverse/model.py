@@ -66,6 +66,13 @@ class Model:
         """Images of the views, [view, height, width, 4]. Differentiable: values."""
         return self.world(values).images()
 
+    def pixel_weights(self, images: torch.Tensor) -> torch.Tensor:
+        """How much each pixel counts at images of the views: its mask times the loss's confidence, [view, height,
+        width].
+        """
+        differences = bounded(images, self.targets, self.saturated)[..., :3] - self.targets[..., :3]
+        return self.weights * self.problem.loss.confidence(differences / self.setting.unit)
+
     def loss(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor | None]:
         """The loss with its regularizers, and the images, if it took any. Differentiable: values."""
         total, images = self._data_loss(values)

@@ -135,14 +135,10 @@ class Problem:
         """Visibility settings of the fit."""
         visibility = self.scene.visibility if self.moves or self.still is None else self.still
         sun = next((free for free in self.free if isinstance(free, Sun)), None)
-        if sun is None:
+        if sun is None or visibility.method != "directional":
             return visibility
-        if visibility.method == "directional":  # fewer cells than the sun has would move it: by 3° of 128
-            return replace(visibility, directions=max(self.scene.direction_count, sun.directions))
-        if visibility.method == "ray-traced" and visibility.samples is None:
-            # a ray for each cell; of 1024 for 512 some have one and some three, and irradiance was up to 59% off
-            return replace(visibility, samples=sun.directions)
-        return visibility
+        # fewer cells than the sun has would move it: by 3° of 128
+        return replace(visibility, directions=max(self.scene.direction_count, sun.directions))
 
     @property
     def basis(self) -> Basis | None:

@@ -13,7 +13,7 @@ import torch
 
 from warpshadow import check
 from warpshadow.assets import files
-from warpshadow.assets.color import auto_exposure
+from warpshadow.assets.color import auto_exposure, srgb_to_linear
 from warpshadow.assets.image import write_image
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.picture import Picture
@@ -45,6 +45,7 @@ class Report:
     Attributes:
         before, after: Images of the views, [view, height, width, 4].
         loss_before, loss_after: With regularizers.
+        pixel_weights: How much each pixel counts in the end, see :attr:`Result.pixel_weights`.
     """
 
     @torch_on_one_thread()
@@ -53,6 +54,8 @@ class Report:
         model = Model(result.problem, result.setting, Stage())
         self.loss_before, self.before = _evaluated(model, result.problem.start(result.setting))
         self.loss_after, self.after = _evaluated(model, result.values)
+        images = torch.from_numpy(self.after).to(model.targets)
+        self.pixel_weights = model.pixel_weights(images).cpu().numpy()
 
     def write(self, folder: AnyPath) -> list[Path]:
         """Write it.
@@ -63,7 +66,8 @@ class Report:
                 spherical harmonics, too; summary.toml (how the fit ended, the fitted parameters that are a few numbers,
                 and of each view the camera and the exposure, which a scene does not have); light.png of free light,
                 striped where the images did not determine it; parameters.npz (all values, as the fit holds them);
-                before.png and after.png beside target.png; and loss.png where matplotlib is installed.
+                before.png and after.png beside target.png; weights.png, of a robust loss; and loss.png where matplotlib
+                is installed.
         Returns:
             The files.
         """
@@ -140,13 +144,17 @@ class Report:
             side_by_side = np.concatenate(list(images[..., :3]), axis=1)
             Picture(side_by_side, exposure=exposure).write(folder / f"{name}.png")
         written = [folder / f"{name}.png" for name in pictures]
+        if self.result.problem.loss.is_robust:
+            gray = srgb_to_linear(np.concatenate(list(self.pixel_weights), axis=1))  # stored as masks are
+            Picture(gray, exposure=0.0).write(folder / "weights.png")
+            written.append(folder / "weights.png")
         if self.result.light is not None:
             self.result.light.picture().write(folder / "light.png")
             written.append(folder / "light.png")
         return written
 
 
-_OTHER_FILES = ("light", "target", "before", "after", "loss", "preview", "parameters")
+_OTHER_FILES = ("light", "target", "before", "after", "loss", "preview", "parameters", "weights")
 """Files of a fit whose suffixes bodies' files have, too."""
 
 

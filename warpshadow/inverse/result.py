@@ -90,6 +90,17 @@ class Result:
         with torch.no_grad():
             return model.images(self.values if values is None else values).cpu().numpy()
 
+    @functools.cached_property
+    def pixel_weights(self) -> np.ndarray:
+        """How much each pixel of the targets counts in the end, 0 to 1, [view, height, width].
+
+        The masks times the weights that a robust loss learned: about 0 where a redescending one, "geman-mcclure" or
+        "barron", took a pixel for that of an occluder or a highlight.
+        """
+        model = Model(self.problem, self.setting, Stage())
+        with torch.no_grad():
+            return model.pixel_weights(model.images(self.values)).cpu().numpy()
+
     def images_at_start(self) -> np.ndarray:
         """Images of the views before the fit, [view, height, width, 4]."""
         return self.images(self.problem.start(self.setting))

@@ -18,7 +18,8 @@ def find_outline(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
     Args:
         points: Float64 of shape [point, 2], no two at one place.
-        triangles: Of any winding, shape [triangle, 3]; slivers wind as most do.
+        triangles: Of any winding, shape [triangle, 3]; slivers wind as most do, and those with a corner twice have no
+            part in it.
     Returns:
         Points where each edge begins and ends, with the triangles to its left, int of shape [edge, 2].
     """
@@ -30,6 +31,7 @@ def find_outline(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     begins, edge_ends = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
     pairs, number = np.unique(np.sort([begins, edge_ends], axis=0), axis=1, return_inverse=True)
     excess = np.bincount(number.reshape(-1), np.where(begins < edge_ends, 1, -1), pairs.shape[1]).astype(int)
+    excess[pairs[0] == pairs[1]] = 0
     directed_edges = np.where(excess > 0, pairs, pairs[::-1])
     return _without_straight(points, np.repeat(directed_edges, np.abs(excess), axis=1).T)
 

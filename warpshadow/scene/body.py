@@ -91,10 +91,10 @@ class Body:
         metallic: Likewise, how much of it is metal, which reflects its albedo and has no diffuse light; by default 0.
         specular: Likewise, strength of the reflection of all but metal, of which 1, the default, is 4% straight on.
         emission: Radiance that its surface emits, linear RGB, 0 or more, for the body [3] or for each vertex
-            [vertex, 3], or an .npy file of it: a lamp, which lights the other bodies past all that is between, from
-            where it is. None, the default, is no emission, or that of the mesh's file, if that is glTF and neither
-            ``albedo`` nor ``texture`` is given. Open bodies emit to both sides. A body gets none of its own emission
-            directly. All methods but "log-sh" have it.
+            [vertex, 3], or a texture [height, width, 3], which needs uvs, or an .npy file of it: a lamp, which lights
+            the other bodies past all that is between, from where it is, and itself if it is not convex. None, the
+            default, is no emission, or that of the mesh's file, if that is glTF and neither ``albedo`` nor ``texture``
+            is given. Open bodies emit to both sides. All methods but "log-sh" have it.
     """
 
     mesh: Mesh
@@ -251,10 +251,21 @@ class Body:
     def _checked_emission(self, radiance: npt.ArrayLike) -> np.ndarray:
         count = self.mesh.vertex_count
         expected = "a linear color of 0 or more such as (5, 4, 3), one for each vertex, [vertex, 3], or an .npy file"
-        emission = _checked_colors("emission", radiance, expected)
-        if emission.shape not in ((3,), (count, 3)):
+        if getattr(radiance, "dtype", None) == np.uint8:
             raise ValueError(
-                f"emission: got shape {emission.shape}, expected [3] or [{count}, 3] (one for each vertex)"
+                "emission: got codes from 0 to 255 (uint8), expected linear radiance: ws.srgb_to_linear(image / 255), "
+                "times the radiance of white"
+            )
+        emission = _checked_colors("emission", radiance, expected)
+        if emission.ndim == 3 and self.mesh.uvs is None:
+            raise ValueError(
+                f"emission: got a texture, {emission.shape}, but mesh {self.mesh.name!r} has no uvs; expected colors "
+                "of vertices, [vertex, 3], or uvs, as warpshadow.unwrap makes them"
+            )
+        if not emission.size or emission.shape not in ((3,), (count, 3), (*emission.shape[:2], 3)):
+            raise ValueError(
+                f"emission: got shape {emission.shape}, expected [3], [{count}, 3] (one for each vertex), or a texture "
+                "[height, width, 3]"
             )
         check.finite("emission", emission, minimum=0)
         if self.shadow_catcher:

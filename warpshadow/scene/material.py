@@ -2,7 +2,7 @@
 
 Checks of bodies and scene files follow the first table; arrays and tensors of renderers follow the second, of which the
 first is a part. A new number is a row here, a field of :class:`.Body` and one of :class:`.ImageInputs`; then
-:mod:`.pipeline.gloss` asks for it. Color, texture and emission are fields of a body with code of their own.
+:mod:`.pipeline.shading.gloss` asks for it. Color, texture and emission are fields of a body with code of their own.
 """
 
 from typing import NamedTuple
@@ -52,13 +52,15 @@ class BodyInput(NamedTuple):
         """Whether a value of a shape, with a batch or without, is an image, for a mesh of so many vertices."""
         if not (self.has_rows and self.has_images):
             return self.has_images
+        if self.is_color:
+            return len(shape) > 3 or (len(shape) == 3 and shape[1] not in (1, vertex_count))
         return len(shape) > 2 or (len(shape) == 2 and shape[1] not in (1, vertex_count))
 
 
 INPUTS_OF_BODIES = {
     "albedo": BodyInput(),
     "textures": BodyInput(has_rows=False, has_images=True),
-    "emission": BodyInput(),
+    "emission": BodyInput(has_images=True),
     **dict.fromkeys(GLOSS_ARGUMENTS, BodyInput(is_color=False, has_images=True)),
 }
 """By the names of their arguments."""

@@ -1,14 +1,15 @@
 """Random scenes: a data set whose scenes come from a seed and a number, each by itself.
 
-Some bodies stand or lie on a ground of neutral gray, in colors of their own, under a sky with a sun or under a few soft
-lights, or under given maps; a camera looks at them from above. :class:`Ranges` has the ranges of all random numbers.
+Some bodies stand or lie on a ground of neutral gray, in colors of their own, and may shine, under a sky with a sun or
+under a few soft lights, or under given maps, which may be near; a camera looks at them from above. :class:`Ranges` has
+the ranges of all random numbers.
 Scenes are drawn when they are asked for, in any order, in any process: the same seed, number, bodies, maps and ranges
 give the same scene.
 """
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -72,8 +73,13 @@ class Ranges:
         gap: Distance between bodies, 1 where the two with the widest bounds could just touch.
         albedo: Reflectance of a body without a texture or a color for each vertex, in each of red, green and blue.
         ground_albedo: Reflectance of the ground, which is gray.
+        glossy: Part of the bodies that shine, beside those that do so as they are given, which stay as they are.
+        roughness: Of these.
+        metal: Part of these that are of metal; the others are plastic.
         rotation: How far a given map is turned about the vertical [degrees].
         scale: Factor of the light; drawn evenly in its logarithm.
+        radius: Of the sphere around the middle of the ground that the light comes from, 1 where the ground just fits
+            into it; None for light from infinitely far away.
         fov_y: Vertical field of view [degrees].
         elevation: Of the camera above the ground [degrees].
         distance: Of the camera, 1 where a ball around all bodies just fills the image.
@@ -85,18 +91,24 @@ class Ranges:
     gap: Range = (1.0, 1.3)
     albedo: Range = (0.15, 0.9)
     ground_albedo: Range = (0.4, 0.6)
+    glossy: float = 0.0
+    roughness: Range = (0.2, 0.7)
+    metal: float = 0.5
     rotation: Range = (0.0, 360.0)
     scale: Range = (0.25, 4.0)
+    radius: Range | None = None
     fov_y: Range = (40.0, 40.0)
     elevation: Range = (20.0, 55.0)
     distance: Range = (0.9, 1.2)
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            if item.name != "upright":
-                object.__setattr__(self, item.name, _checked_range(item.name, getattr(self, item.name)))
-        if not (check.is_number(self.upright) and 0 <= self.upright <= 1):
-            raise ValueError(f"upright: got {check.described(self.upright)}, expected a part of all, from 0 to 1")
+        for name in _LIMITS:
+            if getattr(self, name) is not None or name != "radius":
+                object.__setattr__(self, name, _checked_range(name, getattr(self, name)))
+        for name in ("upright", "glossy", "metal"):
+            part = getattr(self, name)
+            if not (check.is_number(part) and 0 <= part <= 1):
+                raise ValueError(f"{name}: got {check.described(part)}, expected a part of all, from 0 to 1")
 
 
 _LIMITS: dict[str, tuple[float, float]] = {
@@ -105,8 +117,10 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "gap": (1.0, 1.5),
     "albedo": (0.0, 1.0),
     "ground_albedo": (0.0, 1.0),
+    "roughness": (0.0, 1.0),
     "rotation": (-check.LARGEST, check.LARGEST),
     "scale": (1e-9, 1e9),
+    "radius": (1.01, 1e3),
     "fov_y": (1.0, 120.0),
     "elevation": (1.0, 89.0),
     "distance": (0.5, 100.0),
@@ -205,11 +219,14 @@ class RandomScenes:
         ranges = self.ranges
         bodies, prototypes = _random_bodies(rng, self.bodies, ranges)
         gray = np.full(3, _drawn(rng, ranges.ground_albedo))
-        ground = Body(_ground_mesh(_ground_size(bodies)), albedo=gray, blockers=1, receivers="pixel")
+        ground_size = _ground_size(bodies)
+        ground = Body(_ground_mesh(ground_size), albedo=gray, blockers=1, receivers="pixel")
         if self.maps is None:
             light, drawn = random_light(rng, ranges.scale), None
         else:
             light, drawn = _turned_map(rng, self.maps, ranges)
+        if ranges.radius is not None:
+            light = replace(light, radius=_drawn(rng, ranges.radius) * ground_size / np.sqrt(2))
         camera = _random_camera(rng, bodies, self.size, ranges)
         scene = Scene((*bodies, ground), light, camera, self.visibility, self.supersampling, self.bounces)
         return DrawnScene(scene, prototypes, drawn)
@@ -264,6 +281,9 @@ def _random_body(rng: np.random.Generator, prototypes: Sequence[Body], ranges: R
         translation=np.zeros(3),
         scale=_drawn(rng, ranges.size) / (high - low).max(),
     )
+    if ranges.glossy and not body.is_glossy and rng.random() < ranges.glossy:
+        metallic = np.full(1, rng.random() < ranges.metal, np.float32)
+        body = replace(body, roughness=np.full(1, _drawn(rng, ranges.roughness)), metallic=metallic)
     low, high = body.world_mesh().bounds
     foot = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
     return replace(body, translation=-foot), chosen

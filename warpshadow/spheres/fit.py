@@ -84,7 +84,7 @@ def fit_spheres(
         mesh: The mesh [scene units], y up; open and multi-part meshes, too.
         count: Number of spheres; 0 gives none. "auto" takes as many as the body needs, 8 to 1024: until the error of
             its shadows around it is some 3%, or no longer falls by 15% where they are doubled. It is 8 for a ball, 64
-            for a cow and a box, 256 for a bunny, 1024 for a chair.
+            for a cow, 256 for a bunny and a box, 1024 for a chair.
         error: Instead of a count, the visibility error to reach (see FitReport), for example 0.05: the number
             of spheres is doubled from 16 until it is met, then bisected. If 1024 do not meet it, their fit
             comes with a warning.
@@ -154,9 +154,9 @@ def _warn_of_holes(mesh: Mesh, count: int | str, report: FitReport) -> None:
     )
 
 
-def is_fitted(mesh: Mesh, count: int | str, *, device: wp.DeviceLike = "cpu") -> bool:
-    """Whether the cache has the fit of :func:`fit_spheres` for a mesh and a count."""
-    fit_key, *_ = _find_fit_key(mesh, 0, STEPS, wp.get_device(device))
+def is_fitted(mesh: Mesh, count: int | str, steps: int = STEPS, *, device: wp.DeviceLike = "cpu") -> bool:
+    """Whether the cache has the fit of :func:`fit_spheres` for a mesh, a count and a number of steps."""
+    fit_key, *_ = _find_fit_key(mesh, 0, steps, wp.get_device(device))
     return _cache_path(fit_key, count).exists()
 
 

@@ -146,13 +146,14 @@ def _find_means_adjoint(
     is_corner: wp.array2d(dtype=wp.bool),
     samples: wp.array2d(dtype=wp.int32),
     counts: wp.array2d(dtype=wp.int32),
+    has_mean_slope: wp.array2d(dtype=wp.bool),
     width: int,
     supersampling: int,
     adj_means: wp.array2d(dtype=wp.vec3),
     # out
     adj_barycentrics: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a receiver: each of n samples that share it gets an n-th of its gradient."""
+    """A thread owns a receiver: each of n samples that share it gets an n-th of its gradient, or has a mean slope."""
     view, receiver = wp.tid()
     sample = samples[view, receiver]
     if sample >= 0:
@@ -162,7 +163,11 @@ def _find_means_adjoint(
         for i in range(supersampling * supersampling):
             other = sample_of_pixel(first, i, width, supersampling)
             if _shares_receiver(owner_samples[view], sides[view], is_at_corner, sample, other):
-                wp.atomic_add(adj_barycentrics, view, other, adj)
+                is_pointwise = bool(True)
+                if has_mean_slope:
+                    is_pointwise = not has_mean_slope[view, other]
+                if is_pointwise:
+                    wp.atomic_add(adj_barycentrics, view, other, adj)
 
 
 def mean_fragments(
@@ -172,6 +177,7 @@ def mean_fragments(
     is_corner: wp.array | None,
     samples: wp.array,
     supersampling: int,
+    has_mean_slope: wp.array | None = None,
 ) -> Fragments:
     """Find the fragments of receivers.
 
@@ -182,9 +188,10 @@ def mean_fragments(
         is_corner: Whether each is at the corner of a square, bool of the same shape; None without squares.
         samples: The sample that owns each receiver, −1 for none, int32 of shape [view, receiver].
         supersampling: Samples of a pixel across and down.
+        has_mean_slope: As for :func:`.sample_receivers.find_sample_receivers`.
     Returns:
         Sides and barycentrics, of shape [view, receiver].
-    Differentiable: barycentrics.
+    Differentiable: barycentrics, but for those of samples that have mean slopes.
     """
     sides, barycentrics = fragments.rows
     width, device = fragments.face_ids.shape[2], samples.device
@@ -196,7 +203,17 @@ def mean_fragments(
         lambda adj_means: launch(
             _find_means_adjoint,
             samples.shape,
-            inputs=[sides, owner_samples, is_corner, samples, counts, width, supersampling, adj_means],
+            inputs=[
+                sides,
+                owner_samples,
+                is_corner,
+                samples,
+                counts,
+                has_mean_slope,
+                width,
+                supersampling,
+                adj_means,
+            ],
             outputs=[barycentrics.grad],
         ),
         result=empty(samples.shape, dtype=wp.vec3, device=device),

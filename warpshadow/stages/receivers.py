@@ -44,6 +44,7 @@ class Receivers(NamedTuple):
     spans: tuple[Span, ...] = ()  # of the others, where bodies are told apart; () for one group
     vertices: wp.array | None = None  # int32, the vertex or back of each vertex receiver, [vertex receiver]
     sample_fragments: Fragments | None = None  # side and barycentrics of each sample receiver, [batch, sample receiver]
+    has_mean_slope: wp.array | None = None  # [view, sample] bool, samples whose receivers do not move over the screen
 
     def without_bodies(self) -> "Receivers":
         """Drop the bodies of receivers."""
@@ -217,6 +218,7 @@ def find_receivers(
     quadtree: Quadtree | None = None,
     smooth_pieces: wp.array | None = None,
     rises: bool = False,
+    has_mean_slope: wp.array | None = None,
 ) -> Receivers:
     """Gather the points at which light is evaluated.
 
@@ -235,6 +237,7 @@ def find_receivers(
         smooth_pieces: Smooth piece of each face, int32 of shape [face], where samples that see different faces of one
             share a receiver, too; None where they do not.
         rises: Whether samples' receivers rise from their faces towards the surface that normals round, for rays.
+        has_mean_slope: As for :func:`.sample_receivers.find_sample_receivers`.
     Returns:
         Receivers; where no face wants samples, many views of one geometry share them. While a graph is captured every
         sample has room for one.
@@ -255,7 +258,7 @@ def find_receivers(
             visible_points = points_of_fragments(positions, normals, faces, Fragments(*receiver_fragments.rows))
             surface = VisibleSurface(*visible_points, positions[0], faces, smooth_pieces)
         arguments = receiver_fragments, side_count, wants_samples, body_keys, supersampling, quadtree, surface
-        sample_receivers = find_sample_receivers(*arguments)
+        sample_receivers = find_sample_receivers(*arguments, has_mean_slope)
         receiver_fragments, sample_fragments = sample_receivers.fragments, sample_receivers.sample_fragments
         moving_count = numbering.moving_count
         spans += tuple(
@@ -272,7 +275,9 @@ def find_receivers(
         wp.copy(receiver_faces[count:], from_numpy(receiver_count + triangles, dtype=wp.vec3i, device=device))
     vertices = of_vertices if vertices is None else vertices
     points = _gather_receiver_points(batch_count, positions, normals, faces, vertices, sample_fragments, rises=rises)
-    receivers = Receivers(*points, receiver_faces, of_vertices, receiver_fragments, on_static)
+    receivers = Receivers(
+        *points, receiver_faces, of_vertices, receiver_fragments, on_static, has_mean_slope=has_mean_slope
+    )
     if bodies is None:
         return receivers
     if sample_fragments and not sample_fragments.face_ids.size:

@@ -214,6 +214,7 @@ def find_sample_receivers(
     supersampling: int,
     quadtree: Quadtree | None = None,
     surface: VisibleSurface | None = None,
+    has_mean_slope: wp.array | None = None,
 ) -> SampleReceivers:
     """Find the receivers of samples.
 
@@ -229,6 +230,8 @@ def find_sample_receivers(
         quadtree: Squares at whose corners there are receivers; None for none.
         surface: Visible surface of one instance, where samples of a pixel share a receiver if they see different faces
             of one smooth surface, too; None where they do not.
+        has_mean_slope: Samples whose motion over the screen :mod:`.slopes` follows, bool of shape [view, sample]; None
+            for none. Their receivers do not move with it.
     Differentiable: barycentrics, where receivers see them.
     """
     shape, device = fragments.face_ids.shape, fragments.face_ids.device
@@ -287,7 +290,8 @@ def find_sample_receivers(
         inputs=[sides, owner_samples, is_owner, receiver_numbers, ranks_on_device, side_count, run],
         outputs=[receiver_sides, samples],
     )
-    sample_fragments = mean_fragments(surface, fragments, owner_samples, is_corner, samples, supersampling)
+    arguments = surface, fragments, owner_samples, is_corner, samples, supersampling, has_mean_slope
+    sample_fragments = mean_fragments(*arguments)
     return SampleReceivers(
         Fragments(reshaped(receiver_sides, shape), reshaped(weights, shape)),
         sample_fragments,

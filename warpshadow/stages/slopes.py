@@ -2,14 +2,21 @@
 
 A surface of color c that moves over the screen by v changes a sample by −∇c · v. Were faces large, ∇c could be that of
 the face at the sample's point. But where they are as small as samples, it is one of many; and towards a limb, where
-shading changes faster and faster, it is far from the mean. So the mean over the sample is taken. Its right half gives
+shading changes faster and faster, it is far from the mean. So the mean over the sample is taken. To its right color
+changes by
 
-    ½ (c_right − c)                 if the neighbor's center is on the surface,
-    min(t, ½) / t · (c_edge − c)    if the surface has an edge before, of color c_edge at distance t [samples],
+    ½ (c_right − c) over ½ sample    if the neighbor's center is on the surface,
+    c_edge − c over t samples        if the surface has an edge before, of color c_edge at distance t,
 
-and likewise the other halves. Where something else comes in front before the neighbor's center, or the image ends,
-there is nothing to be known, and the opposite half counts alone. Where all neighbors see the same face, the slope is
-the face's own.
+and likewise to the other sides. Beyond ½ sample that is the part of the neighbor which has this sample's color: so the
+steps of color along a row add up to that from edge to edge, which moving edges take back. Where something else comes in
+front before the neighbor's center, or the image ends, there is nothing to be known, and the opposite half counts alone.
+Where all neighbors see the same face, the slope is the face's own.
+
+A sample that is a receiver itself has the exact derivative at its point instead, except beside the outline of its
+surface. There the exact slope is often tiny and rarely huge, as it grows without bound towards a limb, and does not
+match the colors at the edges: gradients of a mirroring ball are half of the differences of images. By mean slopes, of
+the samples along an outline and of their neighbors, the colors of edges cancel.
 """
 
 from dataclasses import replace
@@ -18,10 +25,12 @@ import warp as wp
 
 from warpshadow.device.batch import instance_in, rows
 from warpshadow.device.launch import launch, without_gradient
+from warpshadow.device.memory import empty, reshaped
 from warpshadow.device.parallel import run_length
 from warpshadow.device.tape import record_adjoint
 from warpshadow.stages.film import sample_radiance
 from warpshadow.stages.interpolation import interpolate, interpolate_values_adjoint, interpolate_weights_adjoint
+from warpshadow.stages.quadtree import Quadtree
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.screen import (
     direction_sign,
@@ -36,7 +45,13 @@ from warpshadow.stages.screen import (
 )
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
 from warpshadow.stages.silhouettes.find import Silhouettes
-from warpshadow.stages.silhouettes.lines import NOTHING, FragmentArrays, edge_line, make_fragment_arrays
+from warpshadow.stages.silhouettes.lines import (
+    NOTHING,
+    FragmentArrays,
+    edge_line,
+    line_between,
+    make_fragment_arrays,
+)
 
 MIN_DISTANCE = 0.02  # distance of an edge [samples] below which rounding outweighs how color changes on the way to it
 
@@ -61,6 +76,85 @@ def _face_slope(values: wp.vec3, corners: wp.vec3i, center: wp.vec2, clip_positi
     return wp.vec2(slope[0], slope[1])
 
 
+@wp.func
+def _distance_to_end(
+    fragments: FragmentArrays, entries: wp.array(dtype=wp.int32), edges: wp.array2d(dtype=wp.vec2i), sample: int, k: int
+):
+    """How far before a sample's neighbor in direction k its surface ends [samples]; −1 if it does not, as one can tell.
+
+    −2 where the neighbor sees another surface, or there is none.
+    """
+    if not has_neighbor(sample, k, fragments.width, fragments.height):
+        return -2.0
+    entry = entries[sample]
+    if entry >= 0:
+        edge = edges[entry, k]
+        if edge[0] != NOTHING:
+            if edge[0] >= 0:
+                line = line_between(fragments, sample, k, edge)
+                t = line_distance(line, k, half_size(fragments.width, fragments.height))
+                if ends_before(line, k) and t > MIN_DISTANCE and t <= 1.0:
+                    return t
+            return -2.0
+    return wp.where(fragments.face_ids[neighbor(sample, k, fragments.width)] >= 0, -1.0, -2.0)
+
+
+@wp.kernel(enable_backward=False)
+def _find_mean_slopes(
+    # in
+    fragments: FragmentArrays,
+    entries: wp.array(dtype=wp.int32),
+    edges: wp.array2d(dtype=wp.vec2i),
+    sides: wp.array(dtype=wp.int32),
+    keys: wp.array(dtype=wp.int32),
+    # out
+    has_mean_slope: wp.array(dtype=wp.bool),
+):
+    """A thread owns a sample: whether its surface ends beside it, or beside a neighbor, and both slopes are known."""
+    sample = wp.tid()
+    side = sides[sample]
+    is_at_outline = bool(False)
+    has_slopes = side >= 0
+    if keys and side >= 0:
+        has_slopes = keys[side] < 0
+    if has_slopes:
+        for axis in range(2):
+            is_known = bool(False)
+            for k in range(2 * axis, 2 * axis + 2):
+                distance = _distance_to_end(fragments, entries, edges, sample, k)
+                is_known = is_known or distance > -2.0
+                is_at_outline = is_at_outline or distance > 0.0
+                if distance == -1.0:
+                    neighbor_sample = neighbor(sample, k, fragments.width)
+                    for j in range(4):
+                        neighbor_distance = _distance_to_end(fragments, entries, edges, neighbor_sample, j)
+                        is_at_outline = is_at_outline or neighbor_distance > 0.0
+            has_slopes = has_slopes and is_known
+    has_mean_slope[sample] = has_slopes and is_at_outline
+
+
+def find_mean_slopes(silhouettes: Silhouettes, clip_positions: wp.array, quadtree: Quadtree | None = None) -> wp.array:
+    """Find the samples that follow their surface by mean slopes although they are receivers.
+
+    Args:
+        silhouettes: Of :func:`warpshadow.stages.silhouettes.find.find_silhouettes`.
+        clip_positions: The vertices that the silhouettes were found for, vec4 of shape [batch, vertex].
+        quadtree: Squares in which samples interpolate, which none of these does; None for none.
+    Returns:
+        bool of shape [view, sample].
+
+    Not differentiable.
+    """
+    fragments = silhouettes.fragments
+    sides = fragments.face_ids if fragments.sides is None else fragments.sides
+    has_mean_slope = empty(rows(sides).shape, dtype=wp.bool, device=sides.device)
+    arrays = make_fragment_arrays(fragments, silhouettes.faces, clip_positions)
+    keys = None if quadtree is None else quadtree.keys
+    inputs = [arrays, silhouettes.entries, silhouettes.edges, reshaped(sides, (-1,)), keys]
+    launch(_find_mean_slopes, sides.size, inputs=inputs, outputs=[reshaped(has_mean_slope, (-1,))])
+    return has_mean_slope
+
+
 @wp.kernel(enable_backward=False)
 def _add_shading_gradients(
     first_row: int,
@@ -76,6 +170,7 @@ def _add_shading_gradients(
     entries: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
     edge_colors: wp.array3d(dtype=wp.vec4),
+    has_mean_slope: wp.array2d(dtype=wp.bool),
     first_sample_face: int,
     run: int,
     adj_samples: wp.array2d(dtype=wp.vec4),
@@ -100,18 +195,18 @@ def _add_shading_gradients(
             receivers = wp.vec3i()
             if face >= 0:
                 receivers = receiver_faces[receiver_face_ids[fragment_batch, sample]]
-            # A sample with a sample receiver has the gradient of the receiver's point instead.
-            if (
-                face >= 0
-                and receiver_face_ids[fragment_batch, sample] < first_sample_face
-                and wp.length_sq(adj_color) > 0.0
-            ):
+            is_receiver = receiver_face_ids[fragment_batch, sample] >= first_sample_face
+            is_moving = not is_receiver
+            if has_mean_slope:
+                is_moving = is_moving or has_mean_slope[fragment_batch, sample]
+            # A sample that is a receiver has the gradient of the receiver's point instead.
+            if face >= 0 and is_moving and wp.length_sq(adj_color) > 0.0:
                 adj_light = wp.cw_mul(adj_color, albedo[albedo_batch, sample])
                 sample_light = light[light_batch, sample]
                 color = samples[batch, sample]
                 center = sample_center(fragment, width, fragments.height)
                 entry = entries[fragment]
-                is_flat = entry < 0
+                is_flat = entry < 0 and not is_receiver
                 for direction in range(4):
                     if has_neighbor(fragment, direction, width, fragments.height):
                         is_flat = is_flat and fragments.face_ids[neighbor(fragment, direction, width)] == face
@@ -129,10 +224,9 @@ def _add_shading_gradients(
                                 # entries are of all views; where one view serves all images, each has its
                                 # own colors
                                 color_step = edge_colors[batch - fragment_batch, entry, direction] - color
-                                distance = wp.min(t, 0.5)
                                 adj_step = wp.dot(adj_color, wp.vec3(color_step[0], color_step[1], color_step[2]))
-                                weighted_slopes[direction / 2] += direction_sign(direction) * distance / t * adj_step
-                                distances[direction / 2] += distance
+                                weighted_slopes[direction / 2] += direction_sign(direction) * adj_step
+                                distances[direction / 2] += t
                         elif edge[0] == NOTHING and has_neighbor(fragment, direction, width, fragments.height):
                             neighbor_sample = neighbor(sample, direction, width)
                             if receiver_face_ids[fragment_batch, neighbor_sample] >= 0:
@@ -164,6 +258,7 @@ def moving_radiance(
     silhouettes: Silhouettes,
     clip_positions: wp.array,
     receivers: wp.array,
+    has_mean_slope: wp.array | None = None,
 ) -> tuple[wp.array, wp.array]:
     """Radiance of samples of moving surfaces: :func:`warpshadow.stages.film.sample_radiance`, by mean slopes.
 
@@ -175,11 +270,13 @@ def moving_radiance(
         silhouettes: Of :func:`warpshadow.stages.silhouettes.find.find_silhouettes`.
         clip_positions: The vertices that the silhouettes were found for, vec4 of shape [batch, vertex].
         receivers: As for :func:`warpshadow.stages.silhouettes.edge_colors.find_edge_colors`.
+        has_mean_slope: Of :func:`find_mean_slopes`, if the receivers were found with it.
     Returns:
         Linear RGB and coverage, 1 or 0, vec4 of shape [batch, height, width]; and the edge colors, with which
         :func:`warpshadow.stages.silhouettes.smooth.smooth_silhouettes` is to be called.
     Differentiable: shading, albedo, clip_positions; the latter in place of barycentrics of the fragments, but for the
-    samples that are receivers themselves or interpolate between such, whose gradient is that of the receivers' points.
+    samples that are receivers themselves or interpolate between such, whose gradient is that of the receivers' points
+    unless they have mean slopes.
     """
     fragments = replace(fragments, barycentrics=without_gradient(fragments.barycentrics))
     samples = sample_radiance(fragments, faces, shading, albedo)
@@ -206,6 +303,7 @@ def moving_radiance(
                 silhouettes.entries,
                 silhouettes.edges,
                 edge_colors,
+                has_mean_slope,
                 len(silhouettes.faces) * (1 if silhouettes.fragments.sides is None else 2),
                 run,
                 rows(samples.grad),

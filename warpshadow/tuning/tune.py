@@ -397,8 +397,10 @@ def _by_work(scene: Scene, sample: PointSample) -> Iterator[Scene]:
         yield replace(scene, visibility=scene.visibility.by("none"))
     yield from _all_directions(scene)
     counts = {
-        number: len(fit_spheres(mesh, device=sample.device).spheres) if count == AUTO else int(count)
-        for number, (mesh, count) in fitted_meshes(scene).items()
+        number: len(fit_spheres(fit.mesh, device=sample.device).spheres)
+        if fit.sphere_count == AUTO
+        else int(fit.sphere_count)
+        for number, fit in fitted_meshes(scene).items()
     }
     factor, maximum = 2, max(counts.values(), default=SPHERE_COUNTS[-1])
     while factor * maximum <= SPHERE_COUNTS[-1] and _interpolation_error(scene, sample) < scene.visibility.error:
@@ -430,7 +432,7 @@ def _sphere_variants(scene: Scene, fits: bool, device: wp.DeviceLike) -> Iterato
     """The scene with its own spheres, and with other numbers of them for all bodies."""
     yield scene
     fitted = fitted_counts(scene)
-    meshes = [] if fits else [mesh for mesh, _ in fitted_meshes(scene).values()]
+    meshes = [] if fits else [fit.mesh for fit in fitted_meshes(scene).values()]
     for count in SPHERE_COUNTS if fitted else ():
         is_at_hand = fits or all(is_fitted(mesh, count, device=device) for mesh in meshes)
         if is_at_hand and set(fitted.values()) != {count}:

@@ -25,9 +25,9 @@ def setup_seconds(scene: Scene, *, device: wp.DeviceLike = "cpu") -> float:
     Both are on disk for a mesh whose spheres are.
     """
     seconds = 0.0
-    for mesh, count in set(fitted_meshes(scene).values()):
-        if not is_fitted(mesh, count, device=device):
-            seconds += fit_seconds(count) + trace_seconds(mesh.vertex_count, mesh.face_count)
+    for fit in set(fitted_meshes(scene).values()):
+        if not is_fitted(*fit, device=device):
+            seconds += fit_seconds(fit.sphere_count) + trace_seconds(fit.mesh.vertex_count, fit.mesh.face_count)
     return seconds
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import warp as wp
@@ -23,6 +24,7 @@ from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
 from warpshadow.pipeline.views.view import View
 from warpshadow.scene.scene import Scene
 from warpshadow.stages.poses import Poses
+from warpshadow.stages.shell.beams import exits_on_host
 from warpshadow.tuning.renderer import Renderer
 from warpshadow.viewer.page_camera import PageCamera, page_scale
 from warpshadow.viewer.quality import Quality
@@ -31,6 +33,7 @@ from warpshadow.viewer.state import ERROR, ViewerState
 _BACKGROUND = 0.05  # linear gray behind uncovered pixels
 _COARSE_MAP = 64  # rows of the light while something moves: it is turned in a millisecond then
 _RENDERERS, _SIZES = 6, 8  # that are cached
+_NUMBERS = 64  # of gloss that are cached: an array that stays is known to be the same
 _HORIZON = 100.0  # a flat body goes to the horizon that is so many times as large as all bodies that are not flat
 _FAR = 160.0  # depth of uncovered pixels [page units]; viser knows none beyond 167
 _RAYS = 256  # of a pixel, that an error is told against
@@ -80,6 +83,7 @@ class Painter:
         self._sized: RecentCache[Renderer] = RecentCache(_SIZES)
         self._lights: RecentCache[EnvironmentMap | np.ndarray] = RecentCache(4)
         self._geometries: RecentCache[Geometry] = RecentCache(_RENDERERS)
+        self._numbers: RecentCache[wp.array] = RecentCache(_NUMBERS)
         self.coarse_light = coarse(scene.light)
 
     def paint(self, viewer_state: ViewerState, page: PageCamera, quality: Quality, *, depth: bool = False) -> Frame:
@@ -154,7 +158,8 @@ class Painter:
         matrix = wp.array([camera.clip_matrix()], dtype=wp.mat44, device=renderer.device)
         view = sized_renderer.view(self._geometry(key, renderer, viewer_state), matrix)
         light = self._light_of(viewer_state, quality)
-        return sized_renderer, view, camera, sized_renderer.draw(light, view=view).numpy()[0]
+        gloss = self._gloss(viewer_state, renderer.device)
+        return sized_renderer, view, camera, sized_renderer.draw(light, **gloss, view=view).numpy()[0]
 
     def _renderer(self, viewer_state: ViewerState, quality: Quality) -> tuple[Hashable, Renderer]:
         """The renderer of the current state, and its key."""
@@ -165,6 +170,16 @@ class Painter:
         settings = scene.visibility, scene.bounces, scene.supersampling, *choices
         key = (*vars(settings[0]).values(), *settings[1:])
         return key, self._renderers.get(key, lambda: Renderer(scene, device=self._device, progress=self._progress))
+
+    def _gloss(self, viewer_state: ViewerState, device: wp.Device) -> dict[str, Any]:
+        """Roughness and metallic of the bodies that have others than in the scene, as arguments of an image."""
+        arguments: dict[str, Any] = {}
+        for number, body in enumerate(self.scene.bodies):
+            for name, value in viewer_state.changed_gloss(body, number).items():
+                key = name, value, str(device)
+                make = functools.partial(wp.array, [[value]], dtype=wp.float32, device=device)
+                arguments.setdefault(name, {})[number] = self._numbers.get(key, make)
+        return arguments
 
     def _geometry(self, key: Hashable, renderer: Renderer, viewer_state: ViewerState) -> Geometry | None:
         """Placed bodies; None where they are as in the scene."""
@@ -197,7 +212,10 @@ class Painter:
             return np.full(3, _BACKGROUND, np.float32)
         light = self._light_of(viewer_state, quality)
         assert isinstance(light, EnvironmentMap)
-        return light.towards(camera.rays()[1]).astype(np.float32)
+        directions = camera.rays()[1]
+        if light.shell is not None:
+            directions = exits_on_host(camera.eye, directions, light.shell)
+        return light.towards(directions).astype(np.float32)
 
 
 class RecentCache(Generic[Value]):

@@ -49,7 +49,7 @@ def is_prepared(painter: Painter, *, device: wp.DeviceLike = "cpu") -> bool:
     if scene.visibility.method not in SPHERE_METHODS:
         return True
     fits = fitted_meshes(scene).values()
-    has_spheres = all(is_fitted(mesh, count, device=device) for mesh, count in fits)
+    has_spheres = all(is_fitted(*fit, device=device) for fit in fits)
     return has_spheres and all(painter.has_tables(ViewerState.of(scene), quality) for quality in _QUALITIES)
 
 

@@ -49,7 +49,9 @@ def as_toml(path: Path, scene: Scene, viewer_state: ViewerState, camera: Camera)
     if "method" in visibility:  # "auto" was replaced
         visibility["method"] = settings.visibility.method
     start = ViewerState.of(scene)
-    for table, body, pose, old in zip(tables["body"], settings.bodies, viewer_state.poses, start.poses, strict=True):
+    pairs = zip(tables["body"], settings.bodies, viewer_state.poses, start.poses, strict=True)
+    for number, (table, body, pose, old) in enumerate(pairs):
+        table.update(viewer_state.changed_gloss(body, number))
         if pose != old:
             table["rotation"], table["translation"] = list(pose.rotation), list(pose.translation)
             if table.pop("on_ground", False):  # which may have scaled it

@@ -51,6 +51,36 @@ class BodyPose:
 
 
 @dataclass(frozen=True)
+class BodyGloss:
+    """Gloss of a body that shines, None where it has none, or one that varies over it.
+
+    Args:
+        roughness, metallic: Numbers from 0 to 1.
+    """
+
+    roughness: float | None = None
+    metallic: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check it."""
+        for name, value in vars(self).items():
+            if value is not None:
+                within(name, value, 0, 1)
+
+    @classmethod
+    def of(cls, body: Body) -> BodyGloss:
+        """That of a body; one without a metallic number has 0."""
+        if body.roughness is None:
+            return cls()
+        arrays = body.roughness, np.zeros(1) if body.metallic is None else body.metallic
+        return cls(*(float(str(array[0])) if array.size == 1 else None for array in arrays))
+
+    def arguments(self) -> dict[str, float]:
+        """The numbers that there are, by name."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+
+@dataclass(frozen=True)
 class ViewerState:
     """Viewer state.
 
@@ -68,6 +98,7 @@ class ViewerState:
         shows: :data:`PICTURE` or :data:`ERROR`.
         shows_light: Whether the light itself is behind the bodies.
         poses: Of the bodies.
+        gloss: Of the bodies.
     """
 
     turn: float
@@ -83,6 +114,7 @@ class ViewerState:
     shows: str
     shows_light: bool
     poses: tuple[BodyPose, ...]
+    gloss: tuple[BodyGloss, ...]
 
     def __post_init__(self) -> None:
         """Check it."""
@@ -106,6 +138,8 @@ class ViewerState:
         check.flag("shows_light", self.shows_light)
         for pose in self.poses:
             check.instance("poses", pose, BodyPose, "a Pose for each body")
+        for gloss in self.gloss:
+            check.instance("gloss", gloss, BodyGloss, "a BodyGloss for each body")
 
     @classmethod
     def of(cls, scene: Scene, stops: float = 0.0) -> ViewerState:
@@ -124,6 +158,7 @@ class ViewerState:
             shows=PICTURE,
             shows_light=False,
             poses=tuple(BodyPose(tuple(body.rotation), tuple(body.translation)) for body in scene.bodies),
+            gloss=tuple(map(BodyGloss.of, scene.bodies)),
         )
 
     def visibility(self, visibility: Visibility, quality: Quality | None = None) -> Visibility:
@@ -175,10 +210,22 @@ class ViewerState:
         """The scene as it is shown."""
         settings = self.settings(scene)
         bodies = tuple(
-            dataclasses.replace(body, rotation=np.array(pose.rotation), translation=np.array(pose.translation))
-            for body, pose in zip(settings.bodies, self.poses, strict=True)
+            dataclasses.replace(
+                body,
+                rotation=np.array(pose.rotation),
+                translation=np.array(pose.translation),
+                **self.changed_gloss(body, number),  # type: ignore[arg-type]
+            )
+            for number, (body, pose) in enumerate(zip(settings.bodies, self.poses, strict=True))
         )
         return dataclasses.replace(settings, bodies=bodies, light=self.light(scene.light))
+
+    def changed_gloss(self, body: Body, number: int) -> dict[str, float]:
+        """Roughness and metallic of a body that are not as it has them, by name."""
+        scene_numbers = BodyGloss.of(body).arguments()
+        return {
+            name: value for name, value in self.gloss[number].arguments().items() if value != scene_numbers.get(name)
+        }
 
     def has_moved(self, scene: Scene) -> bool:
         """Whether a body is not where the scene has it."""

@@ -218,6 +218,24 @@ def test_a_closed_room_is_dark(receivers):
     assert image.max() < 1e-4  # outlines of planes that meet share a cell without a remainder
 
 
+def test_a_face_with_a_corner_twice_leaves_the_gradient_past_a_plate_as_it_is():
+    plate = ws.plane(1.0, 1)
+    torn = ws.Mesh(plate.positions, [*plate.faces.tolist(), [0, 0, 1]])
+    ground, gradients = ws.Body(ws.plane(4.0, 4), name="ground"), []
+    camera = ws.Camera.look_at((0.5, 2.2, 4.6), (0, 0.5, 0), size=(16, 16))
+    for mesh in (plate, torn):
+        body = ws.Body(mesh, translation=(0, 1.0, 0), name="plate")
+        visibility = ws.Visibility("directional", directions=32)
+        scene = ws.Scene((body, ground), ws.synthetic_sky(), camera, supersampling=1, visibility=visibility)
+        renderer = TorchRenderer(scene, progress=False)
+        rotations, translations, scales = renderer.scene_poses()
+        translations.requires_grad_(True)
+        image = renderer(geometry=renderer.placed(rotations, translations, scales))
+        gradients.append(torch.autograd.grad(image[..., :3].square().sum(), translations)[0][0])
+    assert gradients[0].norm() > 0
+    torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-4, atol=1e-4)
+
+
 def test_vertices_of_no_face_do_not_change_the_grids_of_other_bodies():
     scene = scene_of()
     ball, floor = scene.bodies

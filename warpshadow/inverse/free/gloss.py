@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from warpshadow import check
 from warpshadow.inverse.free.base import FreeOfBody, Values
-from warpshadow.inverse.free.reflectance import check_uvs, checked_size, resized, variation
+from warpshadow.inverse.free.reflectance import check_texture_settings, check_uvs, resized, variation
 from warpshadow.inverse.world import FittedScene, Setting, World
 from warpshadow.scene.material import GLOSS_DEFAULTS
 from warpshadow.scene.scene import Scene
@@ -37,13 +37,7 @@ class _Gloss(FreeOfBody):
     def __post_init__(self) -> None:
         super().__post_init__()
         check.flag("per_vertex", self.per_vertex)
-        check.nonnegative("smoothness", self.smoothness)
-        if self.size is not None:
-            object.__setattr__(self, "size", checked_size(self.size))
-        if self.per_vertex and self.size is not None:
-            raise ValueError(f"per_vertex: got it beside size={self.size}, expected one of them")
-        if self.smoothness and self.size is None:
-            raise ValueError("smoothness: got it without size, expected size, too, as of a texture")
+        check_texture_settings(self)
 
     def check_scene(self, scene: Scene) -> None:
         """Raise ValueError for a body that is diffuse."""

@@ -43,6 +43,8 @@ class Pose(FreeOfBody):
         resting: How it stands: "stable", turned onto the support of its convex hull that needs the least turn, if by
             more than 1°; "given", as the scene has it; "free", any way, so that five degrees of freedom stay. Its
             height always follows.
+        tilt: Prior of its tilt from there about each of two axes, a standard deviation [radians]: five degrees of
+            freedom stay. For scans: their bases are uneven, so a stable one is the plane nearest to all of the base.
         upright: Whether it turns about the world's y alone.
         axis: Direction about which alone it turns, shape [3].
         fixed: Coordinates of its middle that stay: "x", "y", "z". Beside ``stands_on`` the others must be able to move
@@ -62,6 +64,7 @@ class Pose(FreeOfBody):
     spread: float = 0.55
     stands_on: BodyLike | None = None
     resting: str = "stable"
+    tilt: float | None = None
     upright: bool = False
     axis: Sequence[float] | None = None
     fixed: Sequence[str] = ()
@@ -99,6 +102,12 @@ class Pose(FreeOfBody):
             raise ValueError(f'rotation: got {self.rotation!r} beside {rotation_limits[0]}, expected "axis-angle"')
 
     def _check_priors(self) -> None:
+        if self.tilt is not None:
+            check.positive("tilt", self.tilt)
+            if self.stands_on is None or self.resting == "free":
+                raise ValueError(
+                    'tilt: got a prior of a tilt from no support, expected stands_on, not resting = "free"'
+                )
         for name in ("distance", "size"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, constraints.checked_prior(name, getattr(self, name)))
@@ -139,8 +148,10 @@ class Pose(FreeOfBody):
         plane = constraints.plane_below(ground, self._start_middle(setting))
         if self.resting != "free":
             turns = plane.normal[None]
+        if self.tilt is not None:
+            turns = np.concatenate([turns, constraints.remaining([plane.normal])])
         if self.resting == "stable":
-            rotation = _stable_rotation(body, plane)
+            rotation = _stable_rotation(body, plane, is_scan=self.tilt is not None)
         shifts = constraints.remaining([plane.normal, *fixed_axes])
         onto = constraints.onto_plane(plane.normal, self.fixed)
         return PoseConstraint(turns, shifts, rotation, plane, onto, constraints.hull_points(body.mesh))
@@ -157,8 +168,9 @@ class Pose(FreeOfBody):
         from scipy.spatial.transform import Rotation
 
         copies = super().scattered(values, number, generator)
-        if values["turn"].numel() == 1:  # either way, and farther and farther
-            return copies | {"turn": copies["turn"] + self.spread * (number // 2 + 1) * (-1) ** number}
+        if values["turn"].numel() == 1 or self.tilt is not None:  # either way, and farther and farther
+            copies["turn"][0] += self.spread * (number // 2 + 1) * (-1) ** number
+            return copies
         is_listed = number < len(_TURNS)
         axis = _TURNS[number] if is_listed else torch.randn(3, generator=generator).numpy().astype(np.float64)
         turn = Rotation.from_rotvec(self.spread * axis / np.linalg.norm(axis))
@@ -202,6 +214,11 @@ class Pose(FreeOfBody):
         if self.size is not None:
             mean, deviation = self.size
             squares.append(((2 * setting.extent(self.number) * scale - mean) / deviation).square())
+        if self.tilt is not None:
+            possible = self.constraint(setting)
+            normal, level = setting.tensor(possible.turns[0]), setting.tensor(possible.turns[1:])
+            tilt = level @ (rotation @ setting.tensor(possible.rotation).T @ normal)  # its sine
+            squares.append((tilt / self.tilt).square().sum())
         if self.covariance is not None:
             turn = _rotation_vector(rotation @ setting.tensor(body.rotation_matrix()).T)
             away = torch.cat([turn, center - setting.tensor(self._start_middle(setting))])
@@ -236,15 +253,15 @@ def _rotation_vector(matrix: torch.Tensor) -> torch.Tensor:
     return sine * (angle / length)
 
 
-def _stable_rotation(body: Body, plane: constraints.PlaneConstraint) -> np.ndarray:
+def _stable_rotation(body: Body, plane: constraints.PlaneConstraint, *, is_scan: bool) -> np.ndarray:
     """The rotation in which a body rests on a plane: its own if that nearly is one, else a warning says the turn."""
     from scipy.spatial.transform import Rotation
 
     start = body.rotation_matrix()
-    rotation = constraints.stable_rotation(body.mesh, start, plane.normal)
+    rotation = constraints.stable_rotation(body.mesh, start, plane.normal, base_is_uneven=is_scan)
     angle = np.degrees(Rotation.from_matrix(rotation @ start.T).magnitude())
     if angle <= _MAX_TILT:
-        return start
+        return rotation if is_scan else start
     check.warn(
         f"{body.name}: its stable support differs from the scene's pose by {angle:.2g}°, by which it is turned; "
         'resting = "given" keeps it'

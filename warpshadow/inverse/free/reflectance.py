@@ -37,6 +37,17 @@ def checked_size(size: Any) -> tuple[int, int]:
     return size[0], size[1]
 
 
+def check_texture_settings(free: Any) -> None:
+    """Check ``size`` and ``smoothness`` of a parameter of numbers or colors, beside ``per_vertex``."""
+    check.nonnegative("smoothness", free.smoothness)
+    if free.size is not None:
+        object.__setattr__(free, "size", checked_size(free.size))
+    if free.per_vertex and free.size is not None:
+        raise ValueError(f"per_vertex: got it beside size={free.size}, expected one of them")
+    if free.smoothness and free.size is None:
+        raise ValueError("smoothness: got it without size, expected size, too, as of a texture")
+
+
 def check_uvs(number: int, scene: Scene) -> None:
     """Raise ValueError for a body that cannot have a texture."""
     if scene.bodies[number].mesh.uvs is None:

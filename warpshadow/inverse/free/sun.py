@@ -21,9 +21,9 @@ from warpshadow.scene.scene import Scene
 
 _REACH = 4.0  # turn [radians], and logarithm of strength, for a value of 1: as of a lamp
 _LARGEST = 30.0  # angular radius [degrees]: one of twelve suns that started 20° to 30° off became as wide as a sky
-_WEIGHT_WIDTH = 0.4  # least standard deviation of the weights of cells, in distances between cells
+_WEIGHT_WIDTH = 0.4  # standard deviation of the weights of a point's cells, in distances between cells
 _NEWTON_STEPS = 12
-_UNRESOLVED = 1.5  # times the resolution, up to which no size is told: a sun of 3° was found as 7° where that is 5.1°
+_UNRESOLVED = 1.2  # times the resolution, up to which a fitted size is none
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,14 @@ class Sun(Free):
 
         w_q ∝ exp((d·d_q − 1) / σ² + λ·d_q),  Σ w_q d_q ∥ d,
 
-    with σ² the variance of a disc along each axis. They are smooth in d, so images have a gradient to it. No sun is
-    smaller meanwhile than :attr:`resolution`, and a fit tells the size of suns alone that are larger by half. The scene
-    that it finds has the sun as :meth:`.EnvironmentMap.with_sun` adds it.
+    which are smooth in d, and light that comes from d on average. So images have a gradient to the direction. No sun is
+    smaller meanwhile than :attr:`resolution`, and a fit tells the size of larger ones alone. The scene that it finds
+    has the sun as :meth:`.EnvironmentMap.with_sun` adds it.
 
     Args:
         direction: Towards the sun, of any length, shape [3].
         irradiance: Of a surface that faces it, one number or RGB, positive.
-        angular_radius: Of the disc [degrees]; kept where a fit does not tell it.
+        angular_radius: Of the disc [degrees]; kept where it is below the resolution and so is the fitted one.
         directions: Number of cells.
     """
 
@@ -56,10 +56,11 @@ class Sun(Free):
     def __post_init__(self) -> None:
         check_count("directions", self.directions)
         EnvironmentMap.constant(0.0).with_sun(self.direction, self.irradiance, angular_radius=self.angular_radius)
-        strength = np.broadcast_to(np.asarray(self.irradiance, np.float64), 3)
-        if not (strength > 0).all():
+        strength = np.asarray(self.irradiance, np.float64)
+        if not ((strength > 0) & np.isfinite(strength)).all():
             got = strength.tolist()
             raise ValueError(f"irradiance: got {got}, expected positive numbers, as its logarithm is fitted")
+        strength = np.broadcast_to(strength, 3)
         direction = np.asarray(self.direction, np.float64)
         # tuples, which compare and print
         vars(self).update(direction=tuple(direction.tolist()), irradiance=tuple(strength.tolist()))
@@ -79,9 +80,14 @@ class Sun(Free):
         return CellBasis(fibonacci(self.directions))
 
     @property
+    def _spacing(self) -> float:
+        """Distance between cells [radians]."""
+        return float(np.sqrt(4 * np.pi / self.directions))
+
+    @property
     def resolution(self) -> float:
-        """Smallest angular radius [degrees] while a fit runs: 7.2° of 512 cells, 5.1° of 1024."""
-        return float(np.degrees(2 * _WEIGHT_WIDTH * np.sqrt(4 * np.pi / self.directions)))
+        """Angular radius [degrees] of the disc that spreads as a point's cells do: 8.8° of 512 cells."""
+        return float(np.degrees(2 * self._spacing * np.sqrt(_WEIGHT_WIDTH**2 + 1 / (4 * np.pi))))
 
     def start(self, setting: Setting) -> Values:
         """The given sun, or one of one and a half times the resolution if that is larger."""
@@ -93,7 +99,7 @@ class Sun(Free):
 
     @property
     def _first_radius(self) -> float:
-        return max(self.angular_radius, _UNRESOLVED * self.resolution)
+        return max(self.angular_radius, 1.5 * self.resolution)
 
     def project(self, values: Values) -> None:
         """Keep its radius between the resolution and 30°, or the given one if that is larger."""
@@ -117,24 +123,25 @@ class Sun(Free):
         """Its light in cells, linear RGB, [cell, 3]. Differentiable: values."""
         direction, strength, radius = self._sun(values, setting)
         cells = torch.tensor(self.basis.directions).to(direction)
-        weights = _weights(direction, radius**2 / 4, cells)
+        variance = radius**2 / 4 - self._spacing**2 / (4 * np.pi)  # of the weights: cells are wide themselves
+        weights = _weights(direction, variance, cells)
         share = weights @ (cells @ direction).clamp_min(0)
         light = self.directions / (4 * np.pi) * (weights / share)[:, None] * strength
         return light.to(values["turn"])
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Light the world with it, beside the map."""
-        map_light = setting.cached(
+        of_map = setting.cached(
             (self.name, "map"), lambda: setting.tensor(self.basis.coefficients(setting.scene.light))
         )
-        world.light = map_light + self.coefficients(values, setting)
+        world.light = of_map + self.coefficients(values, setting)
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
         """Add it to the map."""
         direction, strength, radius = (part.cpu().numpy() for part in self._sun(values, setting))
         degrees = float(np.degrees(radius))
         if degrees < _UNRESOLVED * self.resolution:
-            degrees = min(self.angular_radius, degrees)
+            degrees = min(self.angular_radius, self.resolution)
         assert isinstance(fitted.scene.light, EnvironmentMap)
         light = fitted.scene.light.with_sun(direction, strength, angular_radius=degrees)
         fitted.scene = replace(fitted.scene, light=light)
@@ -146,9 +153,11 @@ class Sun(Free):
 
 
 def _weights(direction: torch.Tensor, variance: torch.Tensor, cells: torch.Tensor) -> torch.Tensor:
-    """Weights of cells [cell] of a variance, whose mean is along a direction. Differentiable: direction, variance.
+    """Weights of cells [cell] of a given variance, whose mean is along a direction.
 
     Newton's method finds λ without a record; one more step from there has its derivatives.
+
+    Differentiable: direction, variance.
     """
     helper = torch.eye(3).to(direction)[int(direction.detach().abs().argmin())]
     first = torch.linalg.cross(helper, direction)

@@ -26,6 +26,7 @@ from warpshadow.stages.poses import Poses
 
 if TYPE_CHECKING:  # it is imported where a body emits
     from warpshadow.stages.emitters.traced import EmittingFaces
+    from warpshadow.stages.textures.pyramid import Textures
 
 
 class MergedScene:
@@ -148,13 +149,26 @@ class MergedScene:
         """Bodies that emit light, bool of shape [body]."""
         return np.array([body.is_emitter for body in self.scene.bodies])
 
-    def emitting_faces(self, positions: wp.array, emission: wp.array) -> "EmittingFaces":
-        """Prepare the faces of emitters for rays, given positions and radiance of all vertices, vec3 of [vertex]."""
-        from warpshadow.stages.emitters.traced import emitting_faces
+    def emitting_faces(
+        self, positions: wp.array, emission: wp.array, textures: "Textures | None", texture_of_face: wp.array
+    ) -> "EmittingFaces":
+        """Prepare the faces of emitters for rays.
+
+        Args:
+            positions, emission: Of all vertices, the radiance 0 where textures have it, vec3 of shape [vertex].
+            textures: Of radiance, of one instance; None for none.
+            texture_of_face: The texture of each face, −1 for none, int32 of shape [face].
+        """
+        from warpshadow.stages.emitters.traced import EmissionTextures, emitting_faces
 
         is_emitting = self.is_emitter[self.body_of_face]
-        faces = self._array(self.faces.numpy()[is_emitting], wp.vec3i)
-        return emitting_faces(positions, emission, faces, self.is_two_sided[self.body_of_face[is_emitting]])
+        faces, uv_faces = (self._array(item.numpy()[is_emitting], wp.vec3i) for item in (self.faces, self.uv_faces))
+        of_textures = None
+        if textures is not None:
+            texture_ids = self._array(texture_of_face.numpy()[is_emitting], wp.int32)
+            of_textures = EmissionTextures(textures, texture_ids, self.uvs[0], uv_faces)
+        is_two_sided = self.is_two_sided[self.body_of_face[is_emitting]]
+        return emitting_faces(positions, emission, faces, is_two_sided, of_textures)
 
     @functools.cached_property
     def two_sided_faces(self) -> wp.array:

@@ -13,6 +13,7 @@ from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
 from warpshadow.device.cuda_graph import is_readable
+from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node, detached
 from warpshadow.scene.material import GLOSS_ARGUMENTS, GLOSS_DEFAULTS, INPUTS_OF_BODIES, MATERIAL_FIELDS
@@ -97,7 +98,7 @@ class Materials:
         inputs: Arrays of each body, by name: "albedo", vec3 of shape [batch, 1] or [batch, vertex]; "textures", vec3 of
             shape [batch, height, width], None without one; where a body shines, those of GLOSS_ARGUMENTS, float32
             of shape [batch, 1], [batch, vertex] or, a texture, [batch, height, width]; and where one emits, "emission",
-            as albedo.
+            as albedo, or as a texture.
     Attributes:
         albedo, textures, roughness, emission: These inputs; None where no body shines, and where none emits.
         vertex_albedo: Node of the reflectance of all vertices.
@@ -212,7 +213,8 @@ class Materials:
         counts = np.diff(self.merged_scene.first_vertex).tolist()
 
         def of_vertices(arrays: list[wp.array]) -> wp.array:
-            zero = constant(np.zeros((1, 1)), wp.float32, self.merged_scene.device)
+            dtype = arrays[0].dtype
+            zero = constant(np.zeros((1, 1, *item_shape(dtype))), dtype, self.merged_scene.device)
             return concatenate([zero if array.ndim == 3 else array for array in arrays], counts)
 
         return Node("", of_vertices, self._inputs[name])

@@ -55,7 +55,7 @@ from warpshadow.stages.self_visibility.trace import (
     trace_seconds,
 )
 
-VERSION = 4  # part of the key of cached rows: raise it whenever they would come out differently
+VERSION = 5  # part of the key of cached rows: raise it whenever they would come out differently
 
 
 Found = TypeVar("Found")
@@ -336,7 +336,7 @@ class SelfVisibility:
             points = from_numpy(probes.positions[: len(mesh.positions)], dtype=wp.vec3, device=device)
             whole = wp.Mesh(points, from_numpy(faces.ravel(), dtype=wp.int32, device=device))
             normals = self._normals(body)
-            places = np.tile(probes.positions, (len(normals) // len(probes.normals), 1))
+            places = np.tile(probes.ray_origins, (len(normals) // len(probes.normals), 1))
 
             def keep(bits: wp.array) -> None:
                 done = f"{len(bits):,} of {len(places):,} points"

@@ -42,7 +42,7 @@ class SelfFormFactors:
         """Form factors of each of a body's probes to its own patches."""
         if body not in self._of_body:
             merged_scene, probes = self._patches.merged_scene, self._self_visibility.probes(body)
-            mesh, points, normals = merged_scene.scene.bodies[body].mesh, probes.positions, probes.normals
+            mesh, points, normals = merged_scene.scene.bodies[body].mesh, probes.ray_origins, probes.normals
             if merged_scene.is_two_sided[body]:
                 points, normals = np.tile(points, (2, 1)), np.concatenate([normals, -normals])
             vertices = probes.positions[: len(mesh.positions)]

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import warp as wp
 
+from warpshadow.maths.inset import inset_vertices
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.bounces.patches import ScenePatches, Senders, lit_patch_samples
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
@@ -246,7 +247,7 @@ class StaticBounces:
                     means = scale_rows(means, scaling_factors(1 - sky, means @ (1 - sky[cache_points])))
                 return means, form_factors.factors[is_cache_point]
 
-            receiver_points, receiver_normals = receivers.points.numpy(), receivers.normals.numpy()
+            receiver_points, receiver_normals = self._ray_origins(receivers, positions), receivers.normals.numpy()
             shape, device = receiver_points.shape[:2], positions.device
             skies = [None if sky is None else sky.numpy()[..., 0] for sky in (sky_at_patch_samples, sky_at_receivers)]
             sky_of_samples = None if skies[0] is None else skies[0][0]
@@ -290,6 +291,17 @@ class StaticBounces:
             )
 
         return points.cached("form factors", (senders, at_patch_samples), make)
+
+    def _ray_origins(self, receivers: Receivers, positions: wp.array) -> np.ndarray:
+        """Points from which rays of receivers leave, [view, receiver, 3]: where walls meet, within that of a vertex."""
+        points, vertices = receivers.points.numpy().copy(), positions.numpy()[0]
+        if receivers.of_vertices is None:  # of points that are given
+            return points
+        of_sides = receivers.of_vertices.numpy()
+        sides = np.flatnonzero(of_sides >= 0)
+        origins = inset_vertices(vertices, self._patches.merged_scene.faces.numpy())
+        points[:, of_sides[sides]] = origins[sides % len(vertices)]
+        return points
 
     def _bright_patches(
         self, light: wp.array, albedo: wp.array, mesh: wp.Mesh, of_faces: np.ndarray, senders: Senders

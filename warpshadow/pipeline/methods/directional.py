@@ -11,7 +11,7 @@ from warpshadow.assets.basis import Basis, CellBasis
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.device.constants import constant
-from warpshadow.device.memory import empty
+from warpshadow.device.memory import empty, from_numpy
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
@@ -409,11 +409,11 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         self, is_scene_light: bool, static_bodies: StaticBodies, vertices: np.ndarray, normals: wp.array
     ) -> wp.array:
         points, normals = static_bodies.gathered(vertices, normals)
-        numbers = wp.array(
-            split_sides(vertices, len(static_bodies.has_vertex))[0], dtype=wp.int32, device=points.device
-        )
+        numbers = split_sides(vertices, len(static_bodies.has_vertex))[0]
+        arrays = from_numpy(static_bodies.ray_origins[numbers], dtype=wp.vec3, device=points.device), normals[0]
+        of_points = wp.array(numbers, dtype=wp.int32, device=points.device)
         samples = self._lit_samples if is_scene_light else self._even_samples
-        return trace_cells(static_bodies.mesh, points[0], normals[0], numbers, samples, progress=self.progress)
+        return trace_cells(static_bodies.mesh, *arrays, of_points, samples, progress=self.progress)
 
     @functools.cached_property
     def _lit_samples(self) -> CellSamples:

@@ -49,7 +49,7 @@ def path_traced(
         samples: Rays of direct light for each receiver.
     """
     merged_scene = points.merged_scene
-    colors = materials.textures_of["textures"]
+    colors, emission_images = materials.textures_of["textures"], materials.textures_of.get("emission")
     maximum, paths = merged_scene.scene.bounces, -(-samples // _RAYS_OF_PATH)
     bounces = _MAX_PATH_BOUNCES if maximum == "all" else maximum
 
@@ -64,19 +64,24 @@ def path_traced(
         vertex_albedo: wp.array,
         textures: Textures | None,
         emission: wp.array | None,
+        emission_textures: Textures | None,
     ) -> wp.array:
         if not receivers.points.size:
             return shading
-        texels = None if textures is None else textures.texels
+        texels, emitted = (None if item is None else item.texels for item in (textures, emission_textures))
         shells = FAR[None] if shell is None else shell.numpy()
         count = common_batch(
-            {"shell": shells, "geometry": shading, "albedo": vertex_albedo, "textures": texels, "emission": emission}
+            {"shell": shells, "geometry": shading, "albedo": vertex_albedo, "textures": texels}
+            | {"emission": emission, "textures of emission": emitted}
         )
         drawn = sample_map(known_light.radiance, _LIGHT_SAMPLES, seed=1)
         bounced = empty((count, *shading.shape[1:]), dtype=wp.vec3, device=shading.device)
 
         def of_instance(array: wp.array) -> wp.array:
             return array[min(instance, len(array) - 1)]
+
+        def textures_of_instance(textures: Textures | None) -> Textures | None:
+            return None if textures is None else replace(textures, texels=of_instance(textures.texels).reshape((1, -1)))
 
         for instance in range(count):
             surfaces = PathSurfaces(
@@ -85,13 +90,18 @@ def path_traced(
                 merged_scene.faces,
                 of_instance(normals),
                 of_instance(vertex_albedo),
-                None if textures is None else replace(textures, texels=of_instance(texels).reshape((1, -1))),
+                textures_of_instance(textures),
                 colors.texture_of_face,
                 merged_scene.uvs[0],
                 merged_scene.uv_faces,
                 None
-                if emission is None
-                else merged_scene.emitting_faces(of_instance(positions), of_instance(emission)),
+                if emission is None or emission_images is None
+                else merged_scene.emitting_faces(
+                    of_instance(positions),
+                    of_instance(emission),
+                    textures_of_instance(emission_textures),
+                    emission_images.texture_of_face,
+                ),
             )
             places = of_instance(receivers.points), of_instance(receivers.normals)
             options = {"bounces": bounces, "paths": paths, "shell": of_instance(shells), "progress": progress}
@@ -113,6 +123,7 @@ def path_traced(
         materials.vertex_albedo,
         colors.pyramids if colors.images else None,
         materials.of_vertices("emission") if materials.emission else None,
+        emission_images.pyramids if emission_images and emission_images.images else None,
         items=lambda: f"{receiver_text(words)} × {paths:,} paths of {maximum} bounces",
         has_adjoint=False,
     )

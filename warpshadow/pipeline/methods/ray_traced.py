@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from warpshadow.assets.basis import Basis, HarmonicBasis
+from warpshadow.assets.basis import Basis, CellBasis, HarmonicBasis
 from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.device.batch import common_batch
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
@@ -29,6 +29,9 @@ if TYPE_CHECKING:  # it is imported where bodies emit
     from warpshadow.stages.emitters.samples import PlacedSamples
 
 Meshes = list[wp.Mesh | None]  # mesh that blocks the light of each instance of receivers; None for no blocker
+_RAYS_OF_CELL = 4
+"""Least number of rays to a cell of free light, on average."""
+
 _EVEN_RAYS = 128  # directions in which receivers that shine look for how much of the hemisphere is open
 
 
@@ -225,13 +228,16 @@ class Rays(Method):
     def _transfer(self, meshes: Meshes, receivers: Receivers, shell: wp.array | None = None) -> list[wp.array]:
         points, normals, shells = receivers.points, receivers.normals, _shells(receivers, shell)
         transfer = wp.empty((*points.shape, self.basis.size), dtype=wp.float32, device=points.device)
+        functions, count = self.basis.functions, self.visibility.ray_count
+        if isinstance(self.basis, CellBasis):
+            functions, count = self.basis.balanced_functions, max(count, _RAYS_OF_CELL * self.basis.size)
         for instance, mesh in enumerate(meshes):
             traced = trace_transfer(
                 mesh,
                 points[instance],
                 normals[instance],
-                self.basis.functions,
-                self.visibility.ray_count,
+                functions,
+                count,
                 shell=shells[min(instance, len(shells) - 1)],
                 progress=self.progress,
             )

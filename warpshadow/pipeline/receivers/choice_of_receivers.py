@@ -9,7 +9,7 @@ has a basis, light is free, and nobody knows where edges will be.
 
 Between vertices light is interpolated, which shows where a face is large, or small and long, as spokes and rails are;
 so faces count by their pixels and by their longest edges. A picture that is made once can afford per-pixel receivers on
-its grounds and walls, where shadows' edges show most. pipeline/README.md has the figures.
+its grounds and walls, where shadows' edges show most. this folder's README.md has the figures.
 """
 
 import dataclasses
@@ -93,7 +93,8 @@ def choose_receivers(
 ) -> list[ReceiverChoice]:
     """Choose the receivers of the bodies that leave it open, as cameras see the scene.
 
-    The same scene and cameras make the same choice, and later motion does not change it.
+    The same scene, cameras and device make the same choice, for known light or for free light; later motion does not
+    change it.
 
     Args:
         merged_scene: The bodies.

@@ -35,7 +35,7 @@ def nonplanar_bodies(merged_scene: MergedScene) -> list[int]:
 
 
 class Group(NamedTuple):
-    """Receivers whose light the same spheres block: of all bodies, all but their own, or those that move."""
+    """Receivers whose light the same blockers block: of all bodies, all but their own, or those that move."""
 
     points: wp.array  # [batch, receiver] vec3
     normals: wp.array  # [batch, receiver] vec3

@@ -17,6 +17,7 @@ import warp as wp
 from warpshadow.device.constants import use
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.memory import empty, from_numpy
+from warpshadow.maths.inset import inset_vertices
 from warpshadow.pipeline.bodies.geometry import Geometry, splice
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node
@@ -128,6 +129,11 @@ class StaticBodies:
     def spheres(self) -> tuple[wp.array, wp.array]:
         """Centers and radii of their spheres."""
         return self.spheres_of(self.bodies)
+
+    @functools.cached_property
+    def ray_origins(self) -> np.ndarray:
+        """Points from which rays of all vertices leave, [vertex, 3]: within the wall of a vertex where walls meet."""
+        return inset_vertices(self._geometry.positions.numpy()[0], self._merged_scene.faces.numpy())
 
     @functools.cached_property
     def mesh(self) -> wp.Mesh | None:

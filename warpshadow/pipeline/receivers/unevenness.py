@@ -14,6 +14,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.maths.directions import fibonacci
+from warpshadow.maths.inset import inset_vertices
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.ray_tracing import trace_visibility_on_host
@@ -53,8 +54,9 @@ def light_unevenness(
     vertices = wp.array(positions, dtype=wp.vec3, device=device)
     mesh = merged_scene.casting_mesh(vertices)
     normals = vertex_normals(vertices.reshape((1, -1)), merged_scene.faces).numpy()[0]
-    corners = merged_scene.faces.numpy()[seen[rows]]
-    points, point_normals = (_with_middles(values[corners]) for values in (positions, normals))
+    faces = merged_scene.faces.numpy()
+    origins, corners = inset_vertices(positions, faces), faces[seen[rows]]
+    points, point_normals = (_with_middles(values[corners]) for values in (origins, normals))
     is_behind = ((eyes[rows] - points[:, 3]) * point_normals[:, 3]).sum(axis=1) < 0
     is_behind &= merged_scene.is_two_sided[merged_scene.body_of_face[seen[rows]]]
     lengths = np.linalg.norm(point_normals, axis=2, keepdims=True)

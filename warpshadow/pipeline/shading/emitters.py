@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpshadow.device.batch import cut
+from warpshadow.device.batch import common_batch, cut, rows
+from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
@@ -23,6 +24,7 @@ from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.receivers.groups import Blockers, Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.shading.transfers import joined
+from warpshadow.stages.bounces.albedo import mean_over_texels
 from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.emitters.convex import find_log_transmittance_of_parts
 from warpshadow.stages.emitters.light import directions_to_samples, sum_light
@@ -63,6 +65,7 @@ class SceneEmitters:
 
     def __init__(self, merged_scene: MergedScene):
         self._merged_scene = merged_scene
+        self._texel_matrices: dict[tuple[int, tuple[int, int]], SparseMatrix] = {}
 
     @functools.cached_property
     def samples(self) -> EmitterSamples:
@@ -122,7 +125,35 @@ class SceneEmitters:
 
     def radiance(self, materials: Materials) -> Node:
         """Node of the samples' radiance, vec3 of shape [batch, sample]."""
-        return Node("", lambda emission: multiply(self.samples.vertices, emission), materials.of_vertices("emission"))
+        of_vertices = materials.of_vertices("emission")
+        if not materials.textures_of["emission"].images:
+            return Node("", lambda emission: multiply(self.samples.vertices, emission), of_vertices)
+
+        def radiance(emission: wp.array, of_bodies: list[wp.array]) -> wp.array:
+            total = multiply(self.samples.vertices, emission)
+            for number, body in enumerate(self.samples.bodies):
+                image = of_bodies[body]
+                if image.ndim == 3:
+                    total = multiply(self._texel_weights(number, image.shape[1:]), rows(image), addend=total)
+            return total
+
+        return Node("", radiance, of_vertices, materials.emission)
+
+    def _texel_weights(self, number: int, size: tuple[int, int]) -> SparseMatrix:
+        """Weights of the texels of an emitter's texture in the radiance of all samples, [sample, texel]."""
+        if (number, size) not in self._texel_matrices:
+            from scipy.sparse import csr_matrix, vstack
+
+            mesh = self._merged_scene.scene.bodies[self.samples.bodies[number]].mesh
+            counts = [item.vertices.shape[0] for item in self._sample_weights]
+            blocks = [csr_matrix((count, size[0] * size[1])) for count in counts]
+            assert mesh.uvs is not None and mesh.surface.uv_faces is not None
+            texture_space = mesh.positions, mesh.surface.faces, mesh.uvs, mesh.surface.uv_faces
+            weights = self._sample_weights[number]
+            blocks[number] = mean_over_texels(weights.patches, *texture_space, size)[weights.patch_of_samples]
+            matrix = SparseMatrix.from_matrix(vstack(blocks), device=self._merged_scene.device)
+            self._texel_matrices[number, size] = matrix
+        return self._texel_matrices[number, size]
 
     def traced_light(self, receivers: Node, placed: Node, radiance: Node, transmittance: Node, name: str) -> Node:
         """Node of their light on receivers, given the transmittance to the samples of each, a list."""
@@ -251,8 +282,11 @@ def _find_transmittances(
         skipped = own_spheres, merged_scene.spheres_among(sphere_bodies, body)
         transmittance_self = None
         if cells is not None and not is_own:
-            towards = directions_to_samples(points, placed_samples, span)
-            transmittance_self = transmittance_of_directions(cells, normals, towards, EMITTER_CELLS)
+            if _is_within(blockers, body, group.body):
+                transmittance_self = _trace_past_own_body(emitters, group, blockers, placed_samples, span)
+            else:
+                towards = directions_to_samples(points, placed_samples, span)
+                transmittance_self = transmittance_of_directions(cells, normals, towards, EMITTER_CELLS)
         yield (
             span,
             {
@@ -265,6 +299,58 @@ def _find_transmittances(
                 else look_up_self_visibility(points, placed_samples, span, hidden_by_itself, is_own=is_own),
             },
         )
+
+
+def _is_within(blockers: Blockers, emitter: int, body: int | None) -> bool:
+    """Whether an emitter is within the bounds of a body, so that parts of the body may be behind it.
+
+    Where arrays cannot be read, the scene's own bodies tell.
+    """
+    if body is None:
+        return False
+    starts = blockers.merged_scene.first_vertex
+    if is_readable(blockers.positions.device):
+        positions = blockers.positions.numpy()
+        of_emitter, of_body = (positions[:, starts[number] : starts[number + 1]] for number in (emitter, body))
+    else:
+        bodies = blockers.merged_scene.scene.bodies
+        of_emitter, of_body = (bodies[number].world_points()[None] for number in (emitter, body))
+    middle = (of_emitter.min(axis=1) + of_emitter.max(axis=1)) / 2
+    return bool(((of_body.min(axis=1) < middle) & (middle < of_body.max(axis=1))).all(axis=1).any())
+
+
+def _trace_past_own_body(
+    emitters: EmitterSamples, group: Group, blockers: Blockers, placed_samples: PlacedSamples, span: EmitterSpan
+) -> wp.array:
+    """Transmittance of receivers past their own body up to the samples of an emitter, by a ray to each.
+
+    Self-visibility in cells is up to infinity: a bulb in a shade would be hidden by the shade's other side.
+
+    Returns:
+        Float32 of shape [batch, receiver, sample].
+    Differentiable: no.
+    """
+    from warpshadow.stages.emitters.traced import trace_transmittance
+
+    points, positions, body = group.points, blockers.positions, group.body
+    count = common_batch({"points": points, "geometry": positions})
+    traced = wp.empty((count, points.shape[1], span.size), dtype=wp.float32, device=points.device)
+    with unrecorded():
+        for instance in range(count):
+            position_batch, point_batch = min(instance, len(positions) - 1), min(instance, len(points) - 1)
+            rows = trace_transmittance(
+                blockers.merged_scene.casting_mesh(positions[position_batch], () if body is None else (body,)),
+                points[point_batch],
+                group.normals[point_batch],
+                emitters,
+                positions[position_batch],
+                placed_samples.points[min(instance, len(placed_samples.points) - 1)],
+                placed_samples.areas[min(instance, len(placed_samples.areas) - 1)],
+                span,
+                rays=1,
+            )
+            wp.copy(traced[instance], rows)
+    return traced
 
 
 def _log_of_planes(

@@ -99,7 +99,7 @@ class Method:
     def is_adaptive(self) -> np.ndarray:
         """Flat bodies on which samples interpolate between receivers, bool of shape [body].
 
-        None where a body emits or light is near: where shadows have edges, nobody knows.
+        No body where one emits or light is near: where shadows have edges, nobody knows.
         """
         adaptive = np.array([body.receivers == "adaptive" for body in self.merged_scene.scene.bodies])
         is_known = not (self.lights_samples or self.has_emitters or self.shell is not None)

@@ -74,7 +74,7 @@ class SceneBlockers:
     def _can_bulge(self) -> list[bool]:
         """Whether each body is thin, so that its spheres bulge out of it, and its receivers were chosen, not asked for.
 
-        They are at vertices where its spheres block its own light: pipeline/README.md has figures. Images of others
+        They are at vertices where its spheres block its own light: receivers/README.md has figures. Images of others
         are nearer to rays by pixel.
         """
         are_chosen = self._merged_scene.has_chosen_receivers.tolist()

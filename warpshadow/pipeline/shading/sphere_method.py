@@ -132,7 +132,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         raise NotImplementedError
 
     def find_visibility(self, group: Group, projected_light: Projected) -> FoundVisibility:
-        """Visibility, or transmittance, past a group's spheres and its own body."""
+        """Visibility, or transmittance, past a group's spheres, convex parts and its own body."""
         raise NotImplementedError
 
     def transfer(self, visibility: FoundVisibility, group: Group, projected_light: Projected) -> wp.array:

@@ -24,9 +24,9 @@ from warpshadow.stages.receivers import Receivers, find_receivers, number_receiv
 from warpshadow.stages.sides import find_sides
 from warpshadow.stages.silhouettes.find import Silhouettes, find_silhouettes
 from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
-from warpshadow.stages.slopes import moving_radiance
+from warpshadow.stages.slopes import find_mean_slopes, moving_radiance
 from warpshadow.stages.textures.footprint import Footprints
-from warpshadow.stages.textures.sample import textured_radiance
+from warpshadow.stages.textures.sample import sample_albedo, textured_radiance
 from warpshadow.stages.textures.seen import seen_texels
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ class View(LitPoints):
         # receivers at vertices move with these alone; receivers at samples move with the samples' fragments, too
         seen = sides if self._samples_receive.any() else detached(sides)
         item_text = functools.partial(receiver_text, self.in_words)
-        arguments = [vertices, normals, seen, detached(silhouettes)]
+        arguments = [vertices, normals, seen, detached(silhouettes), detached(clip)]
         if method.is_adaptive.any():
             arguments.append(detached(spheres))
         receive = functools.partial(_receive, method, blocker_kinds, static_bodies, self._supersampling)
@@ -207,10 +207,19 @@ class View(LitPoints):
             reflected = self._radiance(shading, reflectance)
         if not materials.emission:
             return reflected
-        of_vertices = materials.of_vertices("emission")
-        emission = Node("emission", interpolate, self.fragments_node, self.merged_scene.faces, of_vertices)
-        emitted = self._radiance(Node("", _white_shading, self.receivers_node), emission)
+        emitted = self._radiance(Node("", _white_shading, self.receivers_node), self._emission(materials))
         return self._sum_of(reflected, emitted)
+
+    def _emission(self, materials: Materials) -> Node:
+        """Node of the radiance that the samples emit, vec3 of shape [batch, height, width]."""
+        textures = materials.textures_of["emission"]
+        seen = self.fragments_node, self.merged_scene.faces, materials.of_vertices("emission")
+        if not textures.images:
+            return Node("emission", interpolate, *seen)
+        arguments = self.fragments_node, self.clip_positions, textures.pyramids, ""
+        wire = functools.partial(textures.footprints, *arguments)
+        footprints = self.cached("footprints in emission", textures.sizes, wire)
+        return Node("emission", sample_albedo, *seen, textures.pyramids, footprints)
 
     def _sum_of(self, first: Node, second: Node) -> Node:
         """Node of the samples, of light of two kinds."""
@@ -359,7 +368,7 @@ def _moving_radiance(
 ) -> tuple[wp.array, wp.array]:
     """Samples, and the colors at edges."""
     arguments = receivers.fragments, receivers.faces, shading, reflectance
-    return moving_radiance(*arguments, silhouettes, clip_positions, receivers.of_vertices)
+    return moving_radiance(*arguments, silhouettes, clip_positions, receivers.of_vertices, receivers.has_mean_slope)
 
 
 def _sum_moving(first: tuple[wp.array, wp.array], second: tuple[wp.array, wp.array]) -> tuple[wp.array, wp.array]:
@@ -394,6 +403,7 @@ def _receive(
     normals: wp.array,
     fragments: Fragments,
     silhouettes: Silhouettes,
+    clip_positions: wp.array,
     spheres: tuple[wp.array, wp.array] | None = None,
 ) -> Receivers:
     """Receivers at the vertices that are seen, or at all where that cannot be read without waiting."""
@@ -436,6 +446,9 @@ def _receive(
             supersampling = 1  # each sample is a receiver
         else:
             smooth_pieces = merged_scene.smooth_pieces
+    has_mean_slope = None
+    if wants_samples.any() and fragments.barycentrics.requires_grad:
+        has_mean_slope = find_mean_slopes(silhouettes, clip_positions, quadtree)
     return find_receivers(
         *arguments,
         bodies=bodies,
@@ -443,6 +456,7 @@ def _receive(
         quadtree=quadtree,
         rises=method.lights_samples,
         smooth_pieces=smooth_pieces,
+        has_mean_slope=has_mean_slope,
     )
 
 

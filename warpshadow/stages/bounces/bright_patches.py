@@ -28,7 +28,13 @@ class BrightPatches:
 
 
 def find_bright_patches(
-    radiosity: np.ndarray, patch_of_sides: np.ndarray, corners: np.ndarray, *, rays: int, device: wp.DeviceLike
+    radiosity: np.ndarray,
+    patch_of_sides: np.ndarray,
+    corners: np.ndarray,
+    *,
+    rays: int,
+    min_share: float = 0.0,
+    device: wp.DeviceLike,
 ) -> BrightPatches:
     """Find bright patches, and how rays are shared among them.
 
@@ -37,6 +43,7 @@ def find_bright_patches(
         patch_of_sides: Patch of the front and the back of each face, −1 for none, shape [2, face].
         corners: Of the faces [scene units], shape [face, 3, 3].
         rays: To all bright patches, from each receiver; none are sent if no patch is bright.
+        min_share: Part of all light that bright patches send at least; otherwise none is bright.
     """
     brightness = radiosity.mean(axis=-1)
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
@@ -44,6 +51,8 @@ def find_bright_patches(
     power = np.where(patches >= 0, areas * brightness[patches], 0)
     mean = power.sum() / max(areas[patches >= 0].sum(), 1e-30)
     is_bright = (patches >= 0) & (brightness[patches] > _BRIGHT * mean) & (power > 0)
+    if power[is_bright].sum() < min_share * power.sum():
+        is_bright[:] = False
     sides, probability = np.flatnonzero(is_bright), power[is_bright] / max(power[is_bright].sum(), 1e-30)
     density = np.zeros(len(brightness))
     density[patches[sides]] = rays * probability / areas[sides]  # alike on all sides of a patch

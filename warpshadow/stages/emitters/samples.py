@@ -22,7 +22,7 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.spatial_sort import compact_order
-from warpshadow.stages.bounces.patches import find_patches
+from warpshadow.stages.bounces.patches import Patches, find_patches
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
 if TYPE_CHECKING:
@@ -51,6 +51,8 @@ class SampleWeights(NamedTuple):
     vertices: csr_matrix  # of its vertices in the samples' middles, [sample, vertex]
     faces: csr_matrix  # of its faces' area vectors in those of samples, [sample, face]
     surface_points: SurfacePoints
+    patches: Patches
+    patch_of_samples: np.ndarray  # the patch that each stands for, [sample]
 
 
 def find_sample_weights(
@@ -91,6 +93,8 @@ def find_sample_weights(
         of_vertices[chosen].tocsr(),
         (diags(is_real) @ of_faces[chosen]).tocsr(),
         SurfacePoints(*(item[chosen] for item in surface_points)),
+        patches,
+        chosen,
     )
 
 

@@ -21,7 +21,7 @@ from warpshadow.device.parallel import split_row
 from warpshadow.stages.emitters.samples import SAMPLE_BUNDLE, EmitterSpan, PlacedSamples, is_lit, sample_radius
 
 _SOFTNESS = 0.05  # κ: least half-width of the edge of a sphere's shadow, in its radii
-_MIN_TRANSMITTANCE = 1.0e-4  # of a sphere
+MIN_TRANSMITTANCE = 1.0e-4  # of a sphere
 _REACH = 1.1  # radii beyond which a sphere blocks nothing of a beam that does not touch it
 _COST = 15.0  # nanoseconds that a sphere takes, most of which do not block
 
@@ -31,7 +31,7 @@ wp.set_module_options({"max_unroll": 1})
 @wp.func
 def log_transmittance(share: float):
     """Logarithm of the light that a blocker of a share leaves, of a beam."""
-    return wp.log(wp.max(1.0 - share, _MIN_TRANSMITTANCE))
+    return wp.log(wp.max(1.0 - share, MIN_TRANSMITTANCE))
 
 
 @wp.func

@@ -8,6 +8,8 @@ A point y of a face is drawn in proportion to area and mean radiance, with the d
 m the normal of the face; of an open body |m·ω| counts.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 import warp as wp
 
@@ -17,8 +19,13 @@ from warpshadow.device.memory import empty
 from warpshadow.stages.emitters.samples import EmitterSamples, EmitterSpan, is_lit
 from warpshadow.stages.interpolation import interpolate_at
 from warpshadow.stages.ray_tracing import RAY_COST, mesh_id, progress_slices, sees_point
+from warpshadow.stages.textures.pyramid import Textures
+from warpshadow.stages.textures.sample import interpolate_uv
 
 _SEED = 43
+
+_POWER_POINTS = 64  # of a face, at which its texture tells how often it is drawn
+_LEAST_POWER = 0.1  # of its texture's mean radiance, that a face counts beside: those points may miss its bright ones
 
 
 @wp.struct
@@ -30,9 +37,29 @@ class EmittingFaces:
     distribution: wp.array(dtype=wp.float32)  # sums of their probabilities, [emitting face]
     positions: wp.array(dtype=wp.vec3)  # of all vertices
     emission: wp.array(dtype=wp.vec3)  # of all vertices
+    texels: wp.array(dtype=wp.vec3)  # of all textures of emission
+    levels: wp.array2d(dtype=wp.vec3i)
+    texture_of_face: wp.array(dtype=wp.int32)  # [emitting face], -1 for none
+    uvs: wp.array(dtype=wp.vec2)
+    uv_faces: wp.array(dtype=wp.vec3i)  # [emitting face]
 
 
-def emitting_faces(positions: wp.array, emission: wp.array, faces: wp.array, is_two_sided: np.ndarray) -> EmittingFaces:
+class EmissionTextures(NamedTuple):
+    """Textures of the radiance of emitting faces, of one instance."""
+
+    textures: Textures
+    texture_of_face: wp.array  # int32 of shape [emitting face], -1 for none
+    uvs: wp.array  # vec2 of shape [uv]
+    uv_faces: wp.array  # vec3i of shape [emitting face]
+
+
+def emitting_faces(
+    positions: wp.array,
+    emission: wp.array,
+    faces: wp.array,
+    is_two_sided: np.ndarray,
+    textures: EmissionTextures | None = None,
+) -> EmittingFaces:
     """Prepare the faces of emitters.
 
     Args:
@@ -40,18 +67,40 @@ def emitting_faces(positions: wp.array, emission: wp.array, faces: wp.array, is_
         emission: Radiance of all vertices, vec3 of shape [vertex].
         faces: That emit, vec3i of shape [face].
         is_two_sided: Whether their bodies are open, bool of shape [face].
+        textures: Of radiance, in place of that of vertices; None for none.
     """
     result = EmittingFaces()
     result.positions, result.emission, result.faces = positions, emission, faces
     corner_ids, device = faces.numpy(), positions.device
     corners = positions.numpy().astype(np.float64)[corner_ids]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    power = areas * (emission.numpy()[corner_ids].mean(axis=(1, 2)))
+    radiance = emission.numpy()[corner_ids].mean(axis=(1, 2))
+    result.texture_of_face = constant(np.full(len(corner_ids), -1), wp.int32, device)
+    if textures is not None:
+        result.texels, result.levels = textures.textures.texels[0], textures.textures.levels
+        result.texture_of_face, result.uvs, result.uv_faces = textures[1:]
+        radiance = radiance + _mean_radiance(textures)
+    power = areas * radiance
     sums = np.cumsum(power)
     has_power = bool(len(sums) and sums[-1] > 0)
     result.distribution = wp.array(sums / sums[-1] if has_power else [], dtype=wp.float32, device=device)
     result.is_two_sided = wp.array(is_two_sided.astype(np.int32), dtype=wp.int32, device=device)
     return result
+
+
+def _mean_radiance(textures: EmissionTextures) -> np.ndarray:
+    """About the mean radiance of textured faces, never 0 where a texture is not: it says how often a face is drawn."""
+    texture_of_face, uvs, uv_faces = (item.numpy() for item in textures[1:])
+    texels, levels = textures.textures.texels.numpy()[0].mean(axis=1), textures.textures.levels.numpy()
+    radiance = np.zeros(len(texture_of_face))
+    draw = np.random.default_rng(0)
+    for number, (first, width, height) in enumerate(levels[:, 0].tolist()):
+        image = texels[first : first + width * height].reshape(height, width)
+        corners = uvs[uv_faces[texture_of_face == number]].astype(np.float64)
+        u, v = np.moveaxis(draw.dirichlet((1, 1, 1), _POWER_POINTS) @ corners % 1, -1, 0)
+        columns, lines = (u * width).astype(int) % width, ((1 - v) * height).astype(int) % height
+        radiance[texture_of_face == number] = image[lines, columns].mean(axis=1) + _LEAST_POWER * image.mean()
+    return radiance
 
 
 @wp.func
@@ -85,7 +134,13 @@ def light_of_point(
     light = wp.vec3()
     is_facing = facing_area > 0.0 and cosine > 0.0 and probability > 0.0
     if is_facing and sees_point(mesh, point, normal, ray_direction, distance):
-        radiance = interpolate_at(emitters.emission, corners, weights)
+        texture = emitters.texture_of_face[index]
+        radiance = wp.vec3()
+        if texture < 0:
+            radiance = interpolate_at(emitters.emission, corners, weights)
+        else:
+            uv = interpolate_at(emitters.uvs, emitters.uv_faces[index], weights)
+            radiance = interpolate_uv(emitters.texels, emitters.levels[texture, 0], uv)
         light = cosine * (facing_area / (distance * distance)) / (wp.pi * probability) * radiance
     return light
 

@@ -15,6 +15,7 @@ import warp as wp
 
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
+from warpshadow.maths.inset import inset_vertices
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.sides import split_side
 
@@ -67,10 +68,19 @@ class VisibilityProbes(NamedTuple):
     pieces: np.ndarray
 
     @property
+    def uncut_pieces(self) -> np.ndarray:
+        """Corners of the pieces that are whole, [piece, 3]."""
+        return self.pieces[self.pieces[:, 3] < 0, :3]
+
+    @property
     def edges(self) -> np.ndarray:
         """Pairs of probes that are next to each other on a face, int of shape [pair, 2]; some stand there twice."""
-        uncut_pieces = self.pieces[self.pieces[:, 3] < 0]
-        return np.concatenate([uncut_pieces[:, [k, (k + 1) % 3]] for k in range(3)])
+        return np.concatenate([self.uncut_pieces[:, [k, (k + 1) % 3]] for k in range(3)])
+
+    @property
+    def ray_origins(self) -> np.ndarray:
+        """Points from which rays of the probes leave, [probe, 3]: within the wall of a probe where walls meet."""
+        return inset_vertices(self.positions, self.uncut_pieces)
 
 
 def longest_edge(positions: np.ndarray, faces: np.ndarray, *, has_sample_receivers: bool) -> float:
