@@ -9,7 +9,6 @@ import torch
 
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.free.light import Light
-from warpshadow.inverse.free.sun import Sun
 from warpshadow.inverse.loss import bounded
 from warpshadow.inverse.outlines import outlines_of
 from warpshadow.inverse.problem import Problem
@@ -52,8 +51,7 @@ class Model:
         is_coarse = stage.scale < 1 and sample_count < _SEEN_VERTICES * vertex_count
         if self.problem.moves and is_coarse:  # of samples and vertices, the fewer are shaded
             scene = replace(scene, bodies=tuple(replace(body, receivers="pixel") for body in scene.bodies))
-        basis = next((free.basis for free in self.problem.free if isinstance(free, (Light, Sun))), None)
-        return TorchRenderer(scene, device=self.setting.device, basis=basis, cameras=self.cameras)
+        return TorchRenderer(scene, device=self.setting.device, basis=self.problem.image_basis, cameras=self.cameras)
 
     def world(self, values: Mapping[str, Values]) -> World:
         """The world with values in it."""

@@ -145,6 +145,11 @@ class Problem:
         """Basis of free light."""
         return next((free.basis for free in self.free if isinstance(free, Light)), None)
 
+    @property
+    def image_basis(self) -> Basis | None:
+        """Basis of the light of its images: of free light, or of a sun beside the map; None for the scene's own."""
+        return next((free.basis for free in self.free if isinstance(free, (Light, Sun))), None)
+
     def cameras(self) -> list[Camera]:
         """Camera of each target."""
         height, width, _ = self.targets[0].image.shape

@@ -261,7 +261,8 @@ class SceneRenderer:
             to.
         Raises:
             ValueError: where rays are asked for a gradient to geometry.
-        Differentiable: light, view.
+        Differentiable: light, view, but for the motion over the screen of receivers at samples beside outlines, which
+        images have by mean slopes of their colors (:mod:`warpshadow.stages.slopes`).
         """
         view = self._checked(view)
         return self._transport.shading(view, light).value(self._views.call(view))

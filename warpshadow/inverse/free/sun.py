@@ -107,8 +107,9 @@ class Sun(Free):
         values["log_radius"].clamp_(*(float(np.log(size / self._first_radius)) for size in (self.resolution, largest)))
 
     def _sun(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Direction [3], irradiance [3], and angular radius [radians], at least the resolution. Differentiable:
-        values.
+        """Direction [3], irradiance [3], and angular radius [radians], at least the resolution.
+
+        Differentiable: values.
         """
         towards = np.array(self.direction) / np.linalg.norm(self.direction)
         turn = _REACH * values["turn"].double()

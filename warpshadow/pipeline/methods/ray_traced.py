@@ -9,7 +9,6 @@ import warp as wp
 
 from warpshadow.assets.basis import Basis, CellBasis, HarmonicBasis
 from warpshadow.assets.harmonic_light import KnownLight
-from warpshadow.device.batch import common_batch
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node, NodeStage, detached
@@ -91,28 +90,18 @@ class Rays(Method):
         self, positions: wp.array, receivers: Receivers, placed_samples: "PlacedSamples"
     ) -> list[wp.array]:
         """Transmittance to the samples of each emitter, float32 of shape [batch, receiver, sample]."""
+        from warpshadow.pipeline.shading.emitters import trace_transmittances
         from warpshadow.stages.emitters.samples import SAMPLES
-        from warpshadow.stages.emitters.traced import trace_transmittance
 
-        points, normals, samples = _checked_points(receivers.points), receivers.normals, self.emitters.samples
-        count, result = common_batch({"points": points, "geometry": positions}), []
+        lit, samples = (_checked_points(receivers.points), receivers.normals), self.emitters.samples
         rays = max(1, (self.visibility.ray_count if self.shares_directions else self._sample_count) // (4 * SAMPLES))
         meshes = [self.merged_scene.casting_mesh(positions[instance]) for instance in range(len(positions))]
-        for span in samples.spans():
-            traced = wp.empty((count, points.shape[1], span.size), dtype=wp.float32, device=points.device)
-            for instance in range(count if points.size else 0):
-                position_number, point_number = min(instance, len(positions) - 1), min(instance, len(points) - 1)
-                rows = trace_transmittance(
-                    *(meshes[position_number], points[point_number], normals[point_number]),
-                    *(samples, positions[position_number]),
-                    *(placed_samples.points[position_number], placed_samples.areas[position_number]),
-                    span,
-                    rays=rays,
-                    progress=self.progress,
-                )
-                wp.copy(traced[instance], rows)
-            result.append(traced)
-        return result
+        return [
+            trace_transmittances(
+                meshes, *lit, samples, positions, placed_samples, span, rays=rays, progress=self.progress
+            )
+            for span in samples.spans()
+        ]
 
     def lobe_transmittance(self, points: LitPoints, directions: Node, light: LightInput, view: LitPoints) -> Node:
         """Transmittance towards the samples of lobes: rays, each of its own."""

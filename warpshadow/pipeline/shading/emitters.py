@@ -275,6 +275,14 @@ def _find_transmittances(
     spheres = merged_scene.spheres_of(sphere_bodies, blockers.spheres)
     traced_body = group.body if group.body in blockers.blocker_kinds.self_traced else None
     own_spheres = merged_scene.spheres_among(sphere_bodies, traced_body)
+
+    @functools.cache
+    def own_meshes() -> list[wp.Mesh | None]:
+        """The receivers' own body in each geometry, for all emitters within it."""
+        own = () if group.body is None else (group.body,)
+        positions = blockers.positions
+        return [merged_scene.casting_mesh(positions[geometry], own) for geometry in range(len(positions))]
+
     for body, span, hidden_by_itself in zip(emitters.bodies, emitters.spans(), self_visibility, strict=True):
         is_own = body == group.body
         if is_own and hidden_by_itself is None:
@@ -283,7 +291,10 @@ def _find_transmittances(
         transmittance_self = None
         if cells is not None and not is_own:
             if _is_within(blockers, body, group.body):
-                transmittance_self = _trace_past_own_body(emitters, group, blockers, placed_samples, span)
+                # cells look to infinity: a bulb in a shade would be hidden by the shade's other side
+                with unrecorded():
+                    arguments = own_meshes(), points, normals, emitters, blockers.positions, placed_samples, span
+                    transmittance_self = trace_transmittances(*arguments, rays=1)
             else:
                 towards = directions_to_samples(points, placed_samples, span)
                 transmittance_self = transmittance_of_directions(cells, normals, towards, EMITTER_CELLS)
@@ -319,37 +330,44 @@ def _is_within(blockers: Blockers, emitter: int, body: int | None) -> bool:
     return bool(((of_body.min(axis=1) < middle) & (middle < of_body.max(axis=1))).all(axis=1).any())
 
 
-def _trace_past_own_body(
-    emitters: EmitterSamples, group: Group, blockers: Blockers, placed_samples: PlacedSamples, span: EmitterSpan
+def trace_transmittances(
+    meshes: Sequence[wp.Mesh | None],
+    points: wp.array,
+    normals: wp.array,
+    emitters: EmitterSamples,
+    positions: wp.array,
+    placed_samples: PlacedSamples,
+    span: EmitterSpan,
+    *,
+    rays: int,
+    progress: bool = False,
 ) -> wp.array:
-    """Transmittance of receivers past their own body up to the samples of an emitter, by a ray to each.
+    """Trace the transmittance to the samples of an emitter in all instances.
 
-    Self-visibility in cells is up to infinity: a bulb in a shade would be hidden by the shade's other side.
-
+    Args:
+        meshes: The blockers of each geometry; None for none.
+        points, normals: Receivers, vec3 of shape [batch, receiver].
+        emitters, span: Samples of all emitters, and those of one.
+        positions: All vertices, vec3 of shape [geometry, vertex].
+        placed_samples: Where the samples are in each geometry.
+        rays: To each sample.
     Returns:
         Float32 of shape [batch, receiver, sample].
     Differentiable: no.
     """
     from warpshadow.stages.emitters.traced import trace_transmittance
 
-    points, positions, body = group.points, blockers.positions, group.body
     count = common_batch({"points": points, "geometry": positions})
     traced = wp.empty((count, points.shape[1], span.size), dtype=wp.float32, device=points.device)
-    with unrecorded():
-        for instance in range(count):
-            position_batch, point_batch = min(instance, len(positions) - 1), min(instance, len(points) - 1)
-            rows = trace_transmittance(
-                blockers.merged_scene.casting_mesh(positions[position_batch], () if body is None else (body,)),
-                points[point_batch],
-                group.normals[point_batch],
-                emitters,
-                positions[position_batch],
-                placed_samples.points[min(instance, len(placed_samples.points) - 1)],
-                placed_samples.areas[min(instance, len(placed_samples.areas) - 1)],
-                span,
-                rays=1,
-            )
-            wp.copy(traced[instance], rows)
+    for instance in range(count if points.size else 0):
+        geometry, view = min(instance, len(positions) - 1), min(instance, len(points) - 1)
+        rows = trace_transmittance(
+            *(meshes[geometry], points[view], normals[view], emitters, positions[geometry]),
+            *(placed_samples.points[geometry], placed_samples.areas[geometry], span),
+            rays=rays,
+            progress=progress,
+        )
+        wp.copy(traced[instance], rows)
     return traced
 
 
