@@ -130,7 +130,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         raise NotImplementedError
 
     def self_lookups(self, bodies: tuple[int, ...], rotations: wp.array, projected_light: Projected) -> dict[int, Any]:
-        """Self-visibility of receivers of some bodies, :attr:`Group.self_lookup` by body. Differentiable: rotations."""
+        """Self-visibility of receivers of some bodies, :attr:`.OwnBody.lookup` by body. Differentiable: rotations."""
         raise NotImplementedError
 
     def find_visibility(self, group: Group, projected_light: Projected) -> FoundVisibility:
