@@ -64,9 +64,9 @@ class ReceiverFinder:
         if not is_readable(merged_scene.device):
             numbering = method.numbering(self._blocker_kinds, has_backs, self._static_bodies)
         else:
-            with_rows = method.is_adaptive & self._has_cached_rows()  # cheaper than receivers at samples
-            at_samples = at_samples & ~with_rows
-            numbering = self._number_seen(seen_vertices(fragments, silhouettes, positions.shape[1]), with_rows)
+            has_cached_rows = method.is_adaptive & self._bodies_with_cached_rows()  # cheaper than receivers at samples
+            at_samples = at_samples & ~has_cached_rows
+            numbering = self._number_seen(seen_vertices(fragments, silhouettes, positions.shape[1]), has_cached_rows)
             if spheres is not None and (is_adaptive := method.is_adaptive & at_samples).any():
                 seen = positions, normals, fragments, spheres
                 quadtree = method.find_squares(self._blocker_kinds, *seen, is_adaptive, self._supersampling)
@@ -87,10 +87,10 @@ class ReceiverFinder:
             has_mean_slope=has_mean_slope,
         )
 
-    def _number_seen(self, is_seen: np.ndarray, with_rows: np.ndarray) -> Numbering:
+    def _number_seen(self, is_seen: np.ndarray, has_cached_rows: np.ndarray) -> Numbering:
         """Number the vertices that are seen, of bodies with receivers there and of bodies with cached rows."""
         merged_scene, static_bodies, separate = self._merged_scene, self._static_bodies, self._separate_bodies
-        keeps_vertex = self._method.can_receive(self._blocker_kinds) | with_rows[merged_scene.body_of_vertex]
+        keeps_vertex = self._method.can_receive(self._blocker_kinds) | has_cached_rows[merged_scene.body_of_vertex]
         return number_receivers(
             keeps_vertex[: len(is_seen)] & is_seen,
             None if static_bodies is None else static_bodies.has_vertex,
@@ -99,7 +99,7 @@ class ReceiverFinder:
             device=merged_scene.device,
         )
 
-    def _has_cached_rows(self) -> np.ndarray:
+    def _bodies_with_cached_rows(self) -> np.ndarray:
         """Static bodies on which shadows of others are cached at vertices, bool of shape [body]."""
         bodies = self._merged_scene.scene.bodies
         static = [] if self._static_bodies is None else self._static_bodies.bodies
