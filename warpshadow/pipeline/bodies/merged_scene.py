@@ -182,7 +182,7 @@ class MergedScene:
     @property
     def sphere_counts(self) -> np.ndarray:
         """Number of spheres of each body, shape [body]; until they are fitted, how many are asked for, or 64."""
-        if "_spheres" in self.__dict__:
+        if "body_spheres" in self.__dict__:
             return np.diff(self.first_sphere)
         if self.scene.visibility.method not in SPHERE_METHODS:
             return np.zeros(len(self.scene.bodies), int)
