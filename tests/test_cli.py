@@ -425,6 +425,8 @@ def test_an_unknown_device_names_the_known_ones(scene, tmp_path, command, name):
         (("explain", "scene.toml"), "No such command 'explain': in Python, Renderer(scene).explain()"),
         (("render", "scene.toml", "-o", "x.exr", "--samples", "0"), "samples"),
         (("render", "scene.toml", "-o", "x.exr", "--colour", "red"), "--colour"),
+        (("render", "cow.obj", "-o", "x.exr", "--width", "200"), "No such option: --width (write --size WIDTH HEIGHT)"),
+        (("tune", "cow.obj", "--height=200"), "No such option: --height (write --size WIDTH HEIGHT)"),
         (
             ("render", "scene.toml", "-o", "x.exr", "--bounces", "2.5"),
             "got '2.5', expected a whole number",
