@@ -40,6 +40,7 @@ class MeshError(ValueError):
     """A mesh, or a mesh file, that cannot be used; the message names the fault and its place."""
 
 
+@check.frozen()
 @dataclass(frozen=True, eq=False, init=False)
 class Mesh:
     """A triangle mesh on the host, validated; its arrays are read-only copies.

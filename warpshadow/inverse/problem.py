@@ -33,6 +33,7 @@ from warpshadow.tuning.tune import resolved
 _SQUARES, _RAYS = Loss(), Visibility("ray-traced")
 
 
+@check.frozen()
 @dataclass(frozen=True, eq=False, init=False)
 class Problem:
     """A fit's problem.

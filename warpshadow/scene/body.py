@@ -34,7 +34,7 @@ LIKELY_MISTAKES = {"color": "albedo", "colour": "albedo", "position": "translati
 """Replacements for likely mistakes in a body's arguments, and keys."""
 
 
-@check.frozen
+@check.frozen()
 @dataclass(frozen=True, eq=False, init=False)
 class Body:
     """A mesh with its reflectance, placed in the world: scale first, then rotation, then translation.

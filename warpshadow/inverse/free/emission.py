@@ -17,6 +17,7 @@ from warpshadow.inverse.world import FittedScene, Setting, World
 from warpshadow.scene.scene import Scene
 
 
+@check.frozen()
 @dataclass(frozen=True)
 class Emission(FreeOfBody):
     """The radiance of a body that emits in the scene, from where the fit starts: one color, or many.
