@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from PIL import Image
 
@@ -97,9 +98,12 @@ def test_materials_of_one_factor_have_strengths_of_their_own(tmp_path):
     assert sorted(set(ws.Body(path).emission[:, 0].tolist())) == [1, 20]
 
 
-def test_codes_of_a_picture_are_no_radiance():
-    with pytest.raises(ValueError, match="emission: got codes from 0 to 255"):
-        ws.Body(ws.plane(1.0), emission=np.full((4, 6, 3), 200, np.uint8))
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int64, torch.uint8])
+def test_codes_of_a_picture_are_no_radiance(dtype):
+    codes = torch.full((4, 6, 3), 200, dtype=dtype) if dtype is torch.uint8 else np.full((4, 6, 3), 200, dtype)
+    with pytest.raises(ValueError, match="emission: got codes of a picture .*srgb_to_linear"):
+        ws.Body(ws.plane(1.0), emission=codes)
+    np.testing.assert_array_equal(ws.Body(ws.plane(1.0), emission=(5, 4, 3)).emission, (5, 4, 3))
 
 
 def test_the_texture_of_an_emissive_material_counts_times_factor_and_strength(tmp_path):

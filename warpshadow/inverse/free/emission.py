@@ -73,7 +73,7 @@ class Emission(FreeOfBody):
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Let the body emit it."""
-        radiance = values["radiance"] * self._unit(setting)
+        radiance = values["radiance"].clamp(min=0) * self._unit(setting)  # line searches look beyond
         world.emission[self.number] = radiance if self.size is None else radiance[None]
 
     def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
