@@ -129,3 +129,16 @@ def test_where_parts_have_other_textures_of_emission_the_means_count_and_a_line_
         body = ws.Body(write(tmp_path / "a.glb", (1, 1, 1), (0.5, 0.5, 0.5), texture=Image.fromarray(codes)))
     is_first = body.mesh.positions[:, :1] < 1.5
     np.testing.assert_allclose(body.emission, np.broadcast_to(np.where(is_first, 0.5, 0.25), body.emission.shape))
+
+
+@pytest.mark.parametrize("texture", [{"texCoord": 1}, {"extensions": {"KHR_texture_transform": {"texCoord": 1}}}])
+def test_a_texture_of_emission_on_other_uvs_counts_by_its_mean_and_a_line_says_so(tmp_path, texture):
+    codes = np.zeros((4, 4, 3), np.uint8)
+    codes[:2] = 255
+    path = write(tmp_path / "a.gltf", (1, 0.5, 1), texture=Image.fromarray(codes))
+    tree = json.loads(path.read_text())
+    tree["materials"][0]["emissiveTexture"] |= texture
+    path.write_text(json.dumps(tree))
+    with pytest.warns(UserWarning, match="of textures of emission the means count, .* first uvs, of texCoord 0"):
+        body = ws.Body(path)
+    np.testing.assert_allclose(body.emission, (0.5, 0.25, 0.5))

@@ -334,11 +334,15 @@ class Gloss(NamedTuple):
 
 
 class EmissiveColor(NamedTuple):
-    """The radiance of a glTF surface: a linear factor, of an image of Pillow's in sRGB, if any; and its material."""
+    """The radiance of a glTF surface: a linear factor, of an image of Pillow's in sRGB, if any; and its material.
+
+    ``has_own_uvs`` says that the image is on other uvs than the mesh's.
+    """
 
     factor: tuple[float, float, float]
     image: Any = None
     material: str | None = None
+    has_own_uvs: bool = False
 
 
 DIFFUSE = Gloss(1.0, 0.0)  # a surface that does not shine
