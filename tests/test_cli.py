@@ -662,10 +662,11 @@ def test_an_interrupted_fit_says_how_to_go_on_and_ends_where_it_would_have(fit_f
         patched.setattr(checkpoint, "save", save_twice_and_interrupt)
         result = run("fit", fit_file, "-o", tmp_path / "out", "--checkpoint-seconds", 0, "--no-preview")
     assert result.exit_code == 130
-    last = result.stderr.strip().splitlines()[-1]
-    assert last == f"interrupted; the same command goes on from {tmp_path / 'out' / 'checkpoint'}"
+    last, state = result.stderr.strip().splitlines()[-1], tmp_path / "out" / "checkpoint"
+    assert last == f"interrupted; the same command goes on from {state}"
     assert not (tmp_path / "out" / "scene.toml").exists()
-    assert run("fit", fit_file, "-o", tmp_path / "out").exit_code == 0
+    result = run("fit", fit_file, "-o", tmp_path / "out")
+    assert result.exit_code == 0 and f"going on from iteration 2, of {state}\n" in result.stdout
     assert_same(parameters(tmp_path / "out"), parameters(tmp_path / "whole"))
 
 

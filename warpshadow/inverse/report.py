@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from warpshadow import check
 from warpshadow.assets import files
@@ -27,6 +28,7 @@ from warpshadow.inverse.result import Result
 from warpshadow.inverse.schedule import Stage
 from warpshadow.inverse.uncertainty import MAX_POSE_UNCERTAINTY
 from warpshadow.scene import toml_tables
+from warpshadow.scene.body import Body
 from warpshadow.scene.files import camera_table, write_scene
 from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.scene.scene import Scene
@@ -174,6 +176,16 @@ def _stems(scene: Scene) -> list[str]:
     ]
 
 
+def _rounded(values: ArrayLike) -> str:
+    return ", ".join(f"{value:.4g}" for value in np.ravel(values))
+
+
+def _shift(before: Body, after: Body) -> str:
+    """How far the middle of a body moved: a translation is of the origin of its mesh, maybe far from it."""
+    middle = np.mean(before.mesh.bounds, axis=0, dtype=np.float64)
+    return f": its middle moved by ({_rounded(after.to_world(middle) - before.to_world(middle))})"
+
+
 def found_values(result: Result) -> list[str]:
     """Describe the changes of a fit, a line each: poses, materials, exposures, and light: whence, and how far away."""
     lines, start, scene = [], result.problem.scene, result.scene
@@ -185,19 +197,18 @@ def found_values(result: Result) -> list[str]:
                 and not np.array_equal(values, getattr(before, name))
                 and values.size <= 3
             ):
-                rounded_text = ", ".join(f"{value:.4g}" for value in values.ravel())
-                lines.append(f"{after.name}: {name} ({rounded_text}){'°' if name == 'rotation' else ''}")
+                remark = {"rotation": "°", "translation": _shift(before, after)}.get(name, "")
+                lines.append(f"{after.name}: {name} ({_rounded(values)}){remark}")
     if scene.light is not start.light:
         radiance = scene.known_light.radiance
         x, y, z = EnvironmentMap(np.maximum(radiance, 0)).directions().reshape(-1, 3)[radiance.sum(axis=2).argmax()]
         lines.append(f"light: strongest from ({x:.3f}, {y:.3f}, {z:.3f})")
     for name, value in result.found.sun.items():
-        rounded_text = ", ".join(f"{number:.4g}" for number in np.ravel(value))
-        lines.append(f"sun: {name} ({rounded_text}){'°' if name == 'angular_radius' else ''}")
+        lines.append(f"sun: {name} ({_rounded(value)}){'°' if name == 'angular_radius' else ''}")
     if scene.shell is not None and start.shell is not None and scene.shell[3] != start.shell[3]:
         lines.append(f"light: radius {scene.shell[3]:.4g}")
     if any(factor != 1 for factor in result.found.exposures):
-        lines.append(f"exposure: {', '.join(f'{factor:.4g}' for factor in result.found.exposures)}")
+        lines.append(f"exposure: {_rounded(result.found.exposures)}")
     return lines
 
 
