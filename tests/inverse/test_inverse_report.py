@@ -24,7 +24,7 @@ from warpshadow.inverse import (
     Texture,
     fit,
 )
-from warpshadow.inverse.report import Report, _stems, found_values, write_result
+from warpshadow.inverse.report import Report, found_values, write_result
 from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import parse_camera
@@ -116,16 +116,6 @@ def test_weights_show_an_occluder_that_a_redescending_loss_forgot(tmp_path):
     assert tmp_path / "robust" / "weights.png" in files
     as_mask = Target(image, tmp_path / "robust" / "weights.png").mask
     np.testing.assert_allclose(as_mask, robust.pixel_weights[0], atol=1 / 255)
-
-
-def test_files_are_called_as_the_bodies_where_nothing_else_is():
-    def stems(*names):
-        bodies = [ws.Body(ws.icosphere(1.0, 0), name=name) for name in names]
-        return _stems(ws.Scene(bodies, ws.EnvironmentMap.constant(1.0)))
-
-    assert stems("spot", "the-ground") == ["spot", "the-ground"]
-    assert stems("Spot", "spot", "ball") == ["body_0", "body_1", "ball"]
-    assert stems("light", "body_0", "a/b", "a.b", "a_roughness") == [f"body_{number}" for number in range(5)]
 
 
 def test_a_translation_is_printed_with_the_shift_of_the_middle_from_the_start():

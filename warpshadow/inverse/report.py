@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +28,8 @@ from warpshadow.inverse.schedule import Stage
 from warpshadow.inverse.uncertainty import MAX_POSE_UNCERTAINTY
 from warpshadow.scene import toml_tables
 from warpshadow.scene.body import Body
-from warpshadow.scene.files import camera_table, write_scene
+from warpshadow.scene.files import camera_table, file_stems, write_scene
 from warpshadow.scene.material import GLOSS_ARGUMENTS
-from warpshadow.scene.scene import Scene
 
 SUMMARY = "summary.toml"  # the file of a folder of results that is written last: where it is, the others are
 
@@ -64,18 +62,17 @@ class Report:
 
         Args:
             folder: Made if it is not there. It gets the scene as :func:`warpshadow.write_scene` writes it, to be
-                rendered again, with files named by the bodies where each has a name of its own; light.exr of light in
-                spherical harmonics, too; summary.toml (how the fit ended, the fitted parameters that are a few numbers,
-                and of each view the camera and the exposure, which a scene does not have); light.png of free light,
-                striped where the images did not determine it; parameters.npz (all values, as the fit holds them);
-                before.png and after.png beside target.png; weights.png, of a robust loss; and loss.png where matplotlib
-                is installed.
+                rendered again; light.exr of light in spherical harmonics, too; summary.toml (how the fit ended, the
+                fitted parameters that are a few numbers, and of each view the camera and the exposure, which a scene
+                does not have); light.png of free light, striped where the images did not determine it; parameters.npz
+                (all values, as the fit holds them); before.png and after.png beside target.png; weights.png, of a
+                robust loss; and loss.png where matplotlib is installed.
         Returns:
             The files.
         """
         folder, result = Path(folder), self.result
         scene = result.scene
-        written = write_scene(scene, folder, stems=_stems(scene))
+        written = write_scene(scene, folder, stems=file_stems(scene, _OTHER_FILES))
         if not isinstance(scene.light, EnvironmentMap):
             write_image(folder / "light.exr", scene.known_light.radiance.astype(np.float32))
             written.append(folder / "light.exr")
@@ -158,22 +155,6 @@ class Report:
 
 _OTHER_FILES = ("light", "target", "before", "after", "loss", "preview", "parameters", "weights")
 """Files of a fit whose suffixes bodies' files have, too."""
-
-
-def _stems(scene: Scene) -> list[str]:
-    """Names of the bodies' files: the bodies' own, or body_0 and so on where other files have them."""
-    names = [body.name for body in scene.bodies]
-    lower = [name.lower() for name in names]
-    return [
-        name
-        if re.fullmatch(r"[\w-]+", name)
-        and lower.count(name.lower()) == 1
-        and name.lower() not in _OTHER_FILES
-        and not name.startswith("body_")
-        and not name.endswith(GLOSS_ARGUMENTS)
-        else f"body_{number}"
-        for number, name in enumerate(names)
-    ]
 
 
 def _rounded(values: ArrayLike) -> str:
