@@ -238,6 +238,16 @@ def test_files_that_are_neither_scenes_nor_meshes_are_refused(cone, scene, tmp_p
     fails("render", cone, "-o", tmp_path / "x.png", "--up", "x", parts=("--up",), status=2)
 
 
+@pytest.mark.parametrize(
+    ("name", "options", "is_said"),
+    [("a.jpg", (), True), ("a.png", (), False), ("a.jpg", ("--background", "environment"), False)],
+)
+def test_a_picture_without_transparency_is_said_to_be_white_behind_the_bodies(scene, tmp_path, name, options, is_said):
+    result = run("render", scene, "-o", tmp_path / name, "--method", "none", *options)
+    remark = f"{name}: white behind the bodies, as .jpg has no transparency; --background environment shows the light"
+    assert result.exit_code == 0 and (remark in result.stdout) == is_said
+
+
 @pytest.mark.parametrize("background", ["environment", "#ff8800"])
 def test_the_picture_has_a_background_and_a_tone(scene, tmp_path, background):
     options = "--png", tmp_path / "out.png", "--background", background, "--tone", "filmic"
