@@ -163,7 +163,8 @@ def _rounded(values: ArrayLike) -> str:
 
 def _shift(before: Body, after: Body) -> str:
     """How far the middle of a body moved: a translation is of the origin of its mesh, maybe far from it."""
-    middle = np.mean(before.mesh.bounds, axis=0, dtype=np.float64)
+    low, high = (corner.astype(np.float64) for corner in before.mesh.bounds)
+    middle = (low + high) / 2
     return f": its middle moved by ({_rounded(after.to_world(middle) - before.to_world(middle))})"
 
 
