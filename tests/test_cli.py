@@ -238,6 +238,16 @@ def test_files_that_are_neither_scenes_nor_meshes_are_refused(cone, scene, tmp_p
     fails("render", cone, "-o", tmp_path / "x.png", "--up", "x", parts=("--up",), status=2)
 
 
+@pytest.mark.parametrize(
+    ("name", "options", "is_said"),
+    [("a.jpg", (), True), ("a.png", (), False), ("a.jpg", ("--background", "environment"), False)],
+)
+def test_a_picture_without_transparency_is_said_to_be_white_behind_the_bodies(scene, tmp_path, name, options, is_said):
+    result = run("render", scene, "-o", tmp_path / name, "--method", "none", *options)
+    remark = f"{name}: white behind the bodies, as .jpg has no transparency; --background environment shows the light"
+    assert result.exit_code == 0 and (remark in result.stdout) == is_said
+
+
 @pytest.mark.parametrize("background", ["environment", "#ff8800"])
 def test_the_picture_has_a_background_and_a_tone(scene, tmp_path, background):
     options = "--png", tmp_path / "out.png", "--background", background, "--tone", "filmic"
@@ -425,6 +435,8 @@ def test_an_unknown_device_names_the_known_ones(scene, tmp_path, command, name):
         (("explain", "scene.toml"), "No such command 'explain': in Python, Renderer(scene).explain()"),
         (("render", "scene.toml", "-o", "x.exr", "--samples", "0"), "samples"),
         (("render", "scene.toml", "-o", "x.exr", "--colour", "red"), "--colour"),
+        (("render", "cow.obj", "-o", "x.exr", "--width", "200"), "No such option: --width (write --size WIDTH HEIGHT)"),
+        (("tune", "cow.obj", "--height=200"), "No such option: --height (write --size WIDTH HEIGHT)"),
         (
             ("render", "scene.toml", "-o", "x.exr", "--bounces", "2.5"),
             "got '2.5', expected a whole number",
@@ -660,10 +672,11 @@ def test_an_interrupted_fit_says_how_to_go_on_and_ends_where_it_would_have(fit_f
         patched.setattr(checkpoint, "save", save_twice_and_interrupt)
         result = run("fit", fit_file, "-o", tmp_path / "out", "--checkpoint-seconds", 0, "--no-preview")
     assert result.exit_code == 130
-    last = result.stderr.strip().splitlines()[-1]
-    assert last == f"interrupted; the same command goes on from {tmp_path / 'out' / 'checkpoint'}"
+    last, state = result.stderr.strip().splitlines()[-1], tmp_path / "out" / "checkpoint"
+    assert last == f"interrupted; the same command goes on from {state}"
     assert not (tmp_path / "out" / "scene.toml").exists()
-    assert run("fit", fit_file, "-o", tmp_path / "out").exit_code == 0
+    result = run("fit", fit_file, "-o", tmp_path / "out")
+    assert result.exit_code == 0 and f"going on from iteration 2, of {state}\n" in result.stdout
     assert_same(parameters(tmp_path / "out"), parameters(tmp_path / "whole"))
 
 

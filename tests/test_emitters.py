@@ -1,6 +1,7 @@
 """Bodies that emit, as a whole: images by renderers, stills and paths, and gradients of images."""
 
 import dataclasses
+import functools
 import subprocess
 import sys
 
@@ -207,8 +208,8 @@ def test_a_screen_shows_its_texture():
 
 def test_gradients_to_a_texture_of_emission_are_exact_since_images_are_linear_in_it():
     renderer = TorchRenderer(with_screen(ws.plane((1.2, 0.8), 1), SCREEN), progress=False)
-    image = torch.tensor(SCREEN, requires_grad=True)
-    change = torch.tensor(np.random.default_rng(0).normal(size=SCREEN.shape).astype(np.float32))
+    image = torch.tensor(SCREEN + 1, requires_grad=True)
+    change = torch.tensor(np.random.default_rng(0).uniform(-1, 1, SCREEN.shape).astype(np.float32))
     (renderer(emission={"screen": image}) * weights()).sum().backward()
     with torch.no_grad():
         up, down = (renderer(emission={"screen": image + sign * change}) for sign in (1, -1))
@@ -323,6 +324,24 @@ def test_emission_of_bodies_without_it_is_refused():
         renderer(emission={"ball": torch.ones(3)})
     with pytest.raises(ValueError, match="emission: got some for body 'lamp', whose light 'log-sh' lacks"):
         scene_of(visibility=ws.Visibility("log-sh"))
+
+
+@pytest.mark.parametrize(("value", "message"), [(-0.1, "got 3 values out of range"), (np.nan, "got 3 NaN or Inf")])
+def test_emission_that_no_body_has_is_refused_in_calls(value, message):
+    renderer = TorchRenderer(scene_of(), progress=False)
+    for colors in (torch.full((3,), value), torch.full((SMALL.vertex_count, 3), value)):
+        count = message.replace("3", str(colors.numel()))
+        with pytest.raises(ValueError, match=rf"emission\[.*\]: {count}"):
+            renderer(emission={"lamp": colors})
+
+
+def test_a_line_search_may_look_beyond_the_emission_that_there_is():
+    renderer = TorchRenderer(scene_of(), progress=False)
+    target = inverse.Target(renderer(emission={"lamp": torch.tensor([0.0, 5.0, 4.0])}).numpy())
+    problem = inverse.Problem(renderer.scene, target, [inverse.Emission("lamp")])
+    optimizer = functools.partial(torch.optim.LBFGS, max_iter=3, line_search_fn="strong_wolfe")
+    result = inverse.fit(problem, inverse.Stage(1, 5e4), optimizer=optimizer, progress=False)
+    assert result.reason == "finished"
 
 
 def test_a_lamp_lights_a_photograph():

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import inspect
 import warnings
 
 import pytest
@@ -52,11 +53,52 @@ MIXED = MixedRenderer([TorchRenderer(SCENE)])
         (lambda: inverse.fit(None, stage="pose"), r"fit: unknown argument 'stage' \(did you mean 'stages'\?\)"),
         (lambda: inverse.Problem(SCENE, target=None), r"Problem: .* 'target' \(did you mean 'targets'\?\)"),
         (lambda: ws.Body(), "Body: missing a required argument: 'mesh'"),
+        (lambda: inverse.Sun((0, 1, 0), intensity=3), r"Sun: unknown argument 'intensity' \(write irradiance\)"),
+        (
+            lambda: inverse.Sun((0, 1, 0), 3, radius=2),
+            r"unknown .* \(write angular_radius, in degrees\)",
+        ),
+        (lambda: inverse.Sun((0, 1, 0)), "missing a required argument: 'irradiance'; its arguments are direction, irr"),
+        (lambda: inverse.Stage(lr=0.1), r"Stage: unknown argument 'lr' \(write learning_rate\)"),
+        (
+            lambda: SKY.with_sun((0, 1, 0), 3.0, 0.27),
+            r"with_sun: too many positional arguments \(write angular_radius=0.27\); its arguments are direction, irr",
+        ),
     ],
 )
 def test_arguments_that_do_not_fit_are_told_with_those_that_do(call, message):
     with pytest.raises(TypeError, match=message):
         call()
+
+
+_RESULTS = {
+    "Ending",
+    "Fit",
+    "FoundLight",
+    "Geometry",
+    "PoseUncertainty",
+    "Recipe",
+    "Result",
+    "Tuning",
+    "Uncertainty",
+}
+"""Public dataclasses that functions return."""
+
+
+@pytest.mark.parametrize("module", [ws, inverse])
+def test_all_public_classes_say_which_arguments_they_take_and_do_not_change(module):
+    kinds = [value for value in vars(module).values() if isinstance(value, type) and dataclasses.is_dataclass(value)]
+    kinds = [kind for kind in kinds if kind.__name__ in module.__all__ and kind.__name__ not in _RESULTS]
+    assert len(kinds) >= 10
+    for kind in kinds:
+        name = kind.__name__
+        with pytest.raises(TypeError, match=rf"^{name}: unknown argument 'nonsense'"):
+            kind(nonsense=1)
+        with pytest.raises(TypeError, match=rf"^{name}: too many positional arguments.*; its arguments are "):
+            kind(*range(99))
+        with pytest.raises(dataclasses.FrozenInstanceError, match=f"nonsense: a {name} has no such field"):
+            object.__new__(kind).nonsense = 1
+        assert f"help({name})" in inspect.getdoc(kind.__init__)
 
 
 @pytest.mark.parametrize(

@@ -92,7 +92,7 @@ def keywords(**instead: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
                     signature.bind(*args, **arguments)
                 except TypeError as error:
                     key = _unmatched_argument(signature, args, error)
-                    hint = f" (write {instead[key]})" if key in instead else ""
+                    hint = f" (write {instead[key]})" if key in instead else _named_argument(signature, args)
                     raise TypeError(f"{name}: {error}{hint}; its arguments are {_listed(signature)}") from None
                 raise
 
@@ -109,24 +109,47 @@ def _unmatched_argument(signature: inspect.Signature, args: tuple[object, ...], 
     return next(iter([*names, *superfluous]), "")
 
 
+def _named_argument(signature: inspect.Signature, args: tuple[object, ...]) -> str:
+    """The value that is superfluous as the one argument that is given by name, for messages; empty without such."""
+    kinds = [one.kind for one in signature.parameters.values()]
+    by_name = [one.name for one in signature.parameters.values() if one.kind is one.KEYWORD_ONLY]
+    superfluous = args[kinds.count(inspect.Parameter.POSITIONAL_OR_KEYWORD) :]
+    if len(superfluous) != 1 or len(by_name) != 1:
+        return ""
+    return f" (write {by_name[0]}={described(superfluous[0])})"
+
+
 def _listed(signature: inspect.Signature) -> str:
     """Arguments of a function, as it is called."""
     by_name = [one for one in signature.parameters.values() if one.name not in ("self", "cls")]
     return ", ".join(f"{one.name}=…" if one.kind is one.KEYWORD_ONLY else one.name for one in by_name)
 
 
-def frozen(kind: type[T]) -> type[T]:
-    """Make a frozen dataclass say how to make a changed one, where something is assigned to a field."""
+def frozen(**instead: str) -> Callable[[type[T]], type[T]]:
+    """Make the errors of a frozen dataclass name the remedy, for its arguments, and where a field is assigned to.
 
-    def refuse(self: T, name: str, value: object) -> None:
+    Args:
+        instead: As for :func:`keywords`, for classes without an ``__init__`` that has them.
+    """
+
+    def decorate(kind: type[T]) -> type[T]:
         label = kind.__name__
-        remedy = f"a {label} has no such field, and does not change"
-        if name in getattr(kind, "__dataclass_fields__", ()):
-            remedy = f"that of a {label} does not change; dataclasses.replace({label.lower()}, {name}=…) makes another"
-        raise dataclasses.FrozenInstanceError(f"{name}: {remedy}")
 
-    setattr(kind, "__setattr__", refuse)  # noqa: B010  (to types, it is no method)
-    return kind
+        def refuse(self: T, name: str, value: object) -> None:
+            remedy = f"a {label} has no such field, and does not change"
+            if name in getattr(kind, "__dataclass_fields__", ()):
+                variable = label.lower()
+                remedy = f"that of a {label} does not change; dataclasses.replace({variable}, {name}=…) makes another"
+            raise dataclasses.FrozenInstanceError(f"{name}: {remedy}")
+
+        made = vars(kind)["__init__"]
+        checked = made if hasattr(made, "__wrapped__") else keywords(**instead)(made)
+        checked.__doc__ = f"Make one: help({label}) describes the arguments."
+        for name, function in (("__init__", checked), ("__setattr__", refuse)):
+            setattr(kind, name, function)
+        return kind
+
+    return decorate
 
 
 @contextlib.contextmanager

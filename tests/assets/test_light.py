@@ -1,5 +1,7 @@
 """Environment maps: which way is which, what is refused, and that moving light keeps its energy."""
 
+import functools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -219,6 +221,17 @@ def test_turning_between_pixels_interpolates():
     np.testing.assert_allclose(turned[[5, 6]], [0.75, 0.25], rtol=1e-6)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0, (1.0, np.nan, 1.0)])
+def test_factors_that_no_light_has_are_refused_by_their_names(value):
+    for name, call in (
+        ("factor", random_map().scaled),
+        ("rgb", EnvironmentMap.constant),
+        ("irradiance", functools.partial(random_map().with_sun, (0, 1, 0), angular_radius=30)),
+    ):
+        with pytest.raises(ImageError, match=f"^{name}: got .*, expected finite numbers of 0 or more"):
+            call(value)
+
+
 @pytest.mark.parametrize("degrees", [np.nan, np.inf])
 def test_an_angle_must_be_finite(degrees):
     with pytest.raises(ValueError, match="degrees"):
@@ -259,7 +272,7 @@ def test_scaling_is_linear_and_never_negative():
     environment = random_map()
     np.testing.assert_allclose(environment.scaled(3).radiance, 3 * environment.radiance)
     np.testing.assert_allclose(environment.scaled([1, 0, 2]).radiance, environment.radiance * np.float32([1, 0, 2]))
-    with pytest.raises(ImageError, match="negative"):
+    with pytest.raises(ImageError, match="expected finite numbers of 0 or more"):
         environment.scaled(-1)
 
 

@@ -1,5 +1,6 @@
 """Reports: what is written of a fit is what it found, and can be rendered again."""
 
+import re
 import sys
 from dataclasses import replace
 
@@ -23,7 +24,7 @@ from warpshadow.inverse import (
     Texture,
     fit,
 )
-from warpshadow.inverse.report import Report, _stems, write_result
+from warpshadow.inverse.report import Report, found_values, write_result
 from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import parse_camera
@@ -117,14 +118,18 @@ def test_weights_show_an_occluder_that_a_redescending_loss_forgot(tmp_path):
     np.testing.assert_allclose(as_mask, robust.pixel_weights[0], atol=1 / 255)
 
 
-def test_files_are_called_as_the_bodies_where_nothing_else_is():
-    def stems(*names):
-        bodies = [ws.Body(ws.icosphere(1.0, 0), name=name) for name in names]
-        return _stems(ws.Scene(bodies, ws.EnvironmentMap.constant(1.0)))
-
-    assert stems("spot", "the-ground") == ["spot", "the-ground"]
-    assert stems("Spot", "spot", "ball") == ["body_0", "body_1", "ball"]
-    assert stems("light", "body_0", "a/b", "a.b", "a_roughness") == [f"body_{number}" for number in range(5)]
+def test_a_translation_is_printed_with_the_shift_of_the_middle_from_the_start():
+    scene = make_scene()
+    far = scene.bodies[0].mesh.transformed(translation=(50, 0, 0))
+    ball = replace(scene.bodies[0], mesh=far, blockers=0, translation=(-50, 0.6, 0))
+    result = run(Pose(0), scene=replace(scene, bodies=[ball, scene.bodies[1]]))
+    (line,) = [line for line in found_values(result) if "translation" in line]
+    found, shift = re.fullmatch(r"\S+: translation \((.*)\): its middle moved by \((.*)\)", line).groups()
+    body = result.scene.bodies[0]
+    np.testing.assert_allclose([float(part) for part in found.split(", ")], body.translation, rtol=1e-3)
+    moved = [float(part) for part in shift.split(", ")]
+    np.testing.assert_allclose(moved, body.to_world(np.array([50.0, 0, 0])) - (0, 0.6, 0), atol=1e-4)
+    assert 0 < np.linalg.norm(moved) < 1
 
 
 def test_all_values_are_in_an_archive_by_their_names(tmp_path):

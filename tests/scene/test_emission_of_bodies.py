@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from PIL import Image
 
@@ -97,9 +98,12 @@ def test_materials_of_one_factor_have_strengths_of_their_own(tmp_path):
     assert sorted(set(ws.Body(path).emission[:, 0].tolist())) == [1, 20]
 
 
-def test_codes_of_a_picture_are_no_radiance():
-    with pytest.raises(ValueError, match="emission: got codes from 0 to 255"):
-        ws.Body(ws.plane(1.0), emission=np.full((4, 6, 3), 200, np.uint8))
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int64, torch.uint8])
+def test_codes_of_a_picture_are_no_radiance(dtype):
+    codes = torch.full((4, 6, 3), 200, dtype=dtype) if dtype is torch.uint8 else np.full((4, 6, 3), 200, dtype)
+    with pytest.raises(ValueError, match="emission: got codes of a picture .*srgb_to_linear"):
+        ws.Body(ws.plane(1.0), emission=codes)
+    np.testing.assert_array_equal(ws.Body(ws.plane(1.0), emission=(5, 4, 3)).emission, (5, 4, 3))
 
 
 def test_the_texture_of_an_emissive_material_counts_times_factor_and_strength(tmp_path):
@@ -125,3 +129,16 @@ def test_where_parts_have_other_textures_of_emission_the_means_count_and_a_line_
         body = ws.Body(write(tmp_path / "a.glb", (1, 1, 1), (0.5, 0.5, 0.5), texture=Image.fromarray(codes)))
     is_first = body.mesh.positions[:, :1] < 1.5
     np.testing.assert_allclose(body.emission, np.broadcast_to(np.where(is_first, 0.5, 0.25), body.emission.shape))
+
+
+@pytest.mark.parametrize("texture", [{"texCoord": 1}, {"extensions": {"KHR_texture_transform": {"texCoord": 1}}}])
+def test_a_texture_of_emission_on_other_uvs_counts_by_its_mean_and_a_line_says_so(tmp_path, texture):
+    codes = np.zeros((4, 4, 3), np.uint8)
+    codes[:2] = 255
+    path = write(tmp_path / "a.gltf", (1, 0.5, 1), texture=Image.fromarray(codes))
+    tree = json.loads(path.read_text())
+    tree["materials"][0]["emissiveTexture"] |= texture
+    path.write_text(json.dumps(tree))
+    with pytest.warns(UserWarning, match="of textures of emission the means count, .* first uvs, of texCoord 0"):
+        body = ws.Body(path)
+    np.testing.assert_allclose(body.emission, (0.5, 0.25, 0.5))

@@ -109,6 +109,21 @@ def test_a_lamp_and_its_shade_do_not_float(blockers):
     assert "floats" in remark
 
 
+@pytest.mark.parametrize(("height", "said"), [(-0.5, None), (1.0, "floats 1.5 above body 0")])
+def test_a_body_over_a_ground_does_not_lie_below_another(height, said):
+    board = ws.Body(ws.plane(4.0, 2), name="board", translation=(0, 3, 0))
+    remarks = misplacements(ws.Scene([GROUND, ball(height), board], LIGHT))
+    assert [said in remark for remark in remarks] == [True] * (said is not None)
+    (remark,) = misplacements(ws.Scene([ball(height), board], LIGHT))
+    assert "below body 1 ('board')" in remark
+
+
+@pytest.mark.parametrize("sides", ["+y -y +x", "+y", "-y"])
+def test_walls_of_light_are_no_grounds(sides):
+    walls = ws.walls_of_light(ws.EnvironmentMap.constant(1.0), 6.0, sides=sides.split(), texels=2)
+    assert not misplacements(ws.Scene([ball(0.0), *walls], LIGHT))
+
+
 def test_a_body_that_is_broader_than_the_ground_is_remarked_on():
     large = ws.Body(ws.icosphere(150.0, 1), translation=(0, 150, 0), name="cow")
     (remark,) = misplacements(ws.Scene([GROUND, large], LIGHT))

@@ -362,6 +362,7 @@ def test_a_missing_scene_file_is_named(tmp_path):
         ({"albedo": np.ones((12, 3), np.uint8)}, "albedo: got values of uint8"),
         ({"blockers": -1}, "blockers: got -1"),
         ({"rotation": (1, 2)}, r"rotation: got \(1, 2\), expected 3 finite numbers: an axis-angle"),
+        ({"rotation": (0, 0, 0, 1)}, r"rotation: got 4 numbers, .*Rotation.from_quat\(\(x, y, z, w\)\).as_matrix\(\)"),
         ({"rotation": np.eye(4)}, r"rotation: got ndarray .* shape \(4, 4\), expected 3 .*: .* or a rotation matrix"),
         ({"rotation": 2 * np.eye(3)}, r"rotation: got .*, expected a rotation \(orthonormal, determinant \+1\)"),
         ({"rotation": [[1, 0], [0]]}, r"rotation: got \[\[1, 0\], \[0\]\], expected 3 finite numbers"),

@@ -7,7 +7,7 @@ import pytest
 
 import warpshadow as ws
 from warpshadow.scene import toml_tables
-from warpshadow.scene.files import write_scene
+from warpshadow.scene.files import file_stems, write_scene
 
 RANDOM = np.random.default_rng(0)
 LIGHTS = {
@@ -103,6 +103,28 @@ def test_a_scene_that_is_written_reads_back_bit_for_bit_and_renders_the_same(tmp
     np.testing.assert_array_equal(ws.render(again), ws.render(scene))
 
 
+def named(*names):
+    return ws.Scene([ws.Body(ws.icosphere(1.0, 0), name=name) for name in names], ws.EnvironmentMap.constant(1.0))
+
+
+def test_files_are_called_as_the_bodies_where_nothing_else_is(tmp_path):
+    def stems(*names):
+        return [path.stem for path in write_scene(named(*names), tmp_path / "-".join(names)) if path.suffix == ".obj"]
+
+    assert stems("spot", "the-ground") == ["spot", "the-ground"]
+    assert stems("Spot", "spot", "ball") == ["body_0", "body_1", "ball"]
+    others = "light", "body_0", "a.b", "a b", "a_roughness", "a_emission"
+    assert stems(*others) == [f"body_{number}" for number in range(6)]
+    assert file_stems(named("a/b", "Target"), ["target"]) == ["body_0", "body_1"]
+
+
+def test_files_that_were_in_a_folder_stay_as_they_are_but_those_of_a_scene_that_was_written(tmp_path):
+    (tmp_path / "cow.obj").write_text("mine")
+    for scene in (named("cow", "ball"), named("cow", "ball")):
+        assert [path.name for path in write_scene(scene, tmp_path)[1:]] == ["body_0.obj", "ball.obj", "light.exr"]
+        assert (tmp_path / "cow.obj").read_text() == "mine"
+
+
 @pytest.mark.parametrize("bounces", [3, "all"])
 def test_bounces_are_written(bounces, tmp_path):
     camera = ws.Camera.look_at((0, 0, 4), (0, 0, 0))
@@ -124,10 +146,10 @@ def test_other_programs_find_the_texture_of_a_body_that_is_written(tmp_path):
         (ws.Body(ws.plane(1.0, 1), texture=texture),), LIGHTS["sh"], ws.Camera.look_at((0, 1, 4), (0, 0, 0))
     )
     write_scene(scene, tmp_path)
-    mesh = trimesh.load(tmp_path / "body_0.obj", force="mesh")
+    mesh = trimesh.load(tmp_path / "plane.obj", force="mesh")
     drawn = np.asarray(mesh.visual.material.image)[..., :3]
-    expected = ws.read_image(tmp_path / "body_0.png")
-    np.testing.assert_allclose(ws.read_image(tmp_path / "body_0.exr"), texture.astype(np.float32))
+    expected = ws.read_image(tmp_path / "plane.png")
+    np.testing.assert_allclose(ws.read_image(tmp_path / "plane.exr"), texture.astype(np.float32))
     assert drawn.shape == expected.shape == texture.shape
     assert np.abs(expected - texture).max() < 0.006  # half a step of 8-bit sRGB where it is steepest
 

@@ -13,6 +13,7 @@ from warpshadow.maths import sh
 from warpshadow.maths.directions import CHUNK, fibonacci
 
 
+@check.frozen()
 @dataclass(frozen=True)
 class HarmonicBasis:
     """Real spherical harmonics of an order; the coefficients [order², 3] are the light's projection.
@@ -58,6 +59,7 @@ class HarmonicBasis:
         return EnvironmentMap(np.maximum(HarmonicLight(light).radiance, 0))
 
 
+@check.frozen()
 @dataclass(frozen=True, eq=False, init=False)
 class CellBasis:
     """Cells of directions, each with the directions nearest to it; the coefficients are mean radiances.

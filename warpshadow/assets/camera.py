@@ -56,7 +56,7 @@ class HasBodies(Protocol):
         """The bodies."""
 
 
-@check.frozen
+@check.frozen()
 @dataclass(frozen=True, eq=False, init=False)
 class Camera:
     """A pinhole camera, of any focal lengths, skew and principal point.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -70,28 +70,38 @@ def emission_texels(emission: EmissiveColor) -> np.ndarray:
     return (texels if np.ptp(texels, axis=(0, 1)).any() else texels[0, 0]).astype(np.float32)
 
 
-def emissive_strengths(tree: dict) -> Mapping[tuple[Any, ...], float]:
-    """Strengths of KHR_materials_emissive_strength, which trimesh does not read, by names and factors of materials."""
-    return {
-        (material.get("name"), *_rounded(material.get("emissiveFactor", (0, 0, 0)))): extension["emissiveStrength"]
-        for material in tree.get("materials", [])
-        if "emissiveStrength"
-        in (extension := material.get("extensions", {}).get("KHR_materials_emissive_strength", {}))
-    }
+class EmissiveEntry(NamedTuple):
+    """Emission in a material's JSON that trimesh does not read."""
+
+    strength: float  # of KHR_materials_emissive_strength
+    has_own_uvs: bool  # whether its texture is on other uvs than a file's first, which are the mesh's
+
+
+def emissive_entries(tree: dict) -> Mapping[tuple[Any, ...], EmissiveEntry]:
+    """Entries of all materials, by their names and factors."""
+    result = {}
+    for material in tree.get("materials", []):
+        key = (material.get("name"), *_rounded(material.get("emissiveFactor", (0, 0, 0))))
+        extension = material.get("extensions", {}).get("KHR_materials_emissive_strength", {})
+        texture = material.get("emissiveTexture", {})
+        transform = texture.get("extensions", {}).get("KHR_texture_transform", {})
+        has_own_uvs = transform.get("texCoord", texture.get("texCoord", 0)) != 0
+        result[key] = EmissiveEntry(extension.get("emissiveStrength", 1.0), has_own_uvs)
+    return result
 
 
 def _rounded(factor: Sequence[float]) -> tuple[float, ...]:
     return tuple(np.array(factor, np.float32).tolist())
 
 
-def stronger(part: MeshPart, strengths: Mapping[tuple[Any, ...], float]) -> MeshPart:
-    """A part that emits as much stronger as the strength of its material says."""
+def with_entry(part: MeshPart, entries: Mapping[tuple[Any, ...], EmissiveEntry]) -> MeshPart:
+    """A part that emits as its material says."""
     if part.emission is None:
         return part
-    factor, image, material = part.emission
-    strength = strengths.get((material, *_rounded(factor)), 1.0)
-    red, green, blue = (strength * color for color in factor)
-    return part._replace(emission=EmissiveColor((red, green, blue), image))
+    factor, image, material, _ = part.emission
+    entry = entries.get((material, *_rounded(factor)), EmissiveEntry(1.0, False))
+    red, green, blue = (entry.strength * color for color in factor)
+    return part._replace(emission=EmissiveColor((red, green, blue), image, has_own_uvs=entry.has_own_uvs))
 
 
 def gloss_of(material) -> Gloss | None:

@@ -48,6 +48,7 @@ def check_coefficients(name: str, values: np.ndarray) -> None:
     check.finite(name, values)
 
 
+@check.frozen()
 @dataclass(frozen=True, eq=False, init=False)
 class EnvironmentMap:
     """Light from all around, as an equirectangular map, validated; arrays are read-only copies.
@@ -348,8 +349,8 @@ def _color(name: str, values: npt.ArrayLike) -> np.ndarray:
     color = check.numbers(name, values, expected=expected, error=ImageError)
     if color.shape not in ((), (3,)):
         raise ImageError(f"{name}: got shape {color.shape}, expected {expected}")
-    if (color < 0).any():
-        raise ImageError(f"{name}: got {check.described(values)}, expected nothing negative")
+    if not ((color >= 0) & (color <= check.LARGEST)).all():
+        raise ImageError(f"{name}: got {check.described(values)}, expected finite numbers of 0 or more")
     return color
 
 

@@ -40,6 +40,7 @@ class MeshError(ValueError):
     """A mesh, or a mesh file, that cannot be used; the message names the fault and its place."""
 
 
+@check.frozen()
 @dataclass(frozen=True, eq=False, init=False)
 class Mesh:
     """A triangle mesh on the host, validated; its arrays are read-only copies.
@@ -333,11 +334,15 @@ class Gloss(NamedTuple):
 
 
 class EmissiveColor(NamedTuple):
-    """The radiance of a glTF surface: a linear factor, of an image of Pillow's in sRGB, if any; and its material."""
+    """The radiance of a glTF surface: a linear factor, of an image of Pillow's in sRGB, if any; and its material.
+
+    ``has_own_uvs`` says that the image is on other uvs than the mesh's.
+    """
 
     factor: tuple[float, float, float]
     image: Any = None
     material: str | None = None
+    has_own_uvs: bool = False
 
 
 DIFFUSE = Gloss(1.0, 0.0)  # a surface that does not shine

@@ -18,10 +18,10 @@ from warpshadow.assets.gltf import (
     base_color_factors,
     cuts_colors,
     emission_of,
-    emissive_strengths,
+    emissive_entries,
     gloss_of,
     gltf_tree,
-    stronger,
+    with_entry,
 )
 from warpshadow.assets.image import read_rgb
 from warpshadow.assets.mesh import BaseColor, Mesh, MeshError, MeshPart, checked_indices, moved_part, turned_over
@@ -206,8 +206,8 @@ def _read_trimesh(path: Path) -> list[MeshPart]:
     tree = gltf_tree(path) if path.suffix.lower() in (".gltf", ".glb") else {}
     loaded_scene = trimesh.load_scene(path, process=False, maintain_order=True, fix_texture=False)
     parts = _trimesh_parts(loaded_scene, of_file=True, factors=base_color_factors(tree))
-    strengths = emissive_strengths(tree)
-    parts = [stronger(part, strengths) for part in parts]
+    entries = emissive_entries(tree)
+    parts = [with_entry(part, entries) for part in parts]
     if path.suffix.lower() == ".stl":
         if not any(len(part.faces) for part in parts):
             raise MeshError(f"faces: got none, expected at least one triangle{_stl_fault(path.read_bytes())}")

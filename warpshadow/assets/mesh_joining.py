@@ -68,9 +68,11 @@ def join_parts(parts: list[MeshPart], name: str) -> JoinedMesh:
     gloss = _joined_gloss(glosses, [len(part.positions) for part in parts], has_textures=not of_gloss)
     emissions = [part.emission for part in parts]
     has_images = any(emission and emission.image for emission in emissions)
-    is_shared = mesh.uvs is not None and all(emission == emissions[0] for emission in emissions)
+    has_own_uvs = any(emission and emission.image and emission.has_own_uvs for emission in emissions)
+    is_shared = mesh.uvs is not None and not has_own_uvs and all(emission == emissions[0] for emission in emissions)
     if has_images and not is_shared:
         reason = "which need uvs" if mesh.uvs is None else "since a body takes one that all its faces have"
+        reason = "since a body takes those on the first uvs, of texCoord 0" if has_own_uvs else reason
         of_gloss.append(f"of textures of emission the means count, {reason}")
     picture, emission = pictures[0] if is_one else None, _joined_emission(parts, has_textures=is_shared)
     return JoinedMesh(mesh, picture, gloss, emission, remarks, of_colors, of_gloss)

@@ -25,11 +25,18 @@ SceneOrMesh = Annotated[
 OF_MESHES = "Options of a mesh, which scene files have as keys"
 
 
+_SIZES = ("--width", "--height", "--resolution", "--res")
+"""Options that other programs have for the size of an image."""
+
+
 class MeshCommand(typer.core.TyperCommand):
     """A command of meshes: the size of a square image may be one number, and of others 640x480."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Read the command line."""
+        for name in (text.partition("=")[0] for text in args):
+            if name in _SIZES:
+                ctx.fail(f"No such option: {name} (write --size WIDTH HEIGHT)")
         return super().parse_args(ctx, _with_whole_size(args))
 
 

@@ -215,6 +215,9 @@ def render(
             picture = Picture(image, exposure=exposure, tone=tone, background=_behind(loaded_scene, background))
             write_image(file, picture)
             note(f"{file}: {f'{summary}, ' * (file == output)}exposure {picture.exposure:+.2f} stops", is_quiet)
+            if picture.pixels.shape[2] == 4 and picture.pixels[..., 3].min() < 255 and file.suffix.lower() != ".png":
+                remark = f"white behind the bodies, as {file.suffix} has no transparency"
+                note(f"{file}: {remark}; --background environment shows the light", is_quiet)
 
 
 def _behind(scene: Scene, background: str) -> str | np.ndarray | None:

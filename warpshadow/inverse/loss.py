@@ -11,6 +11,7 @@ _BY_PIXEL = ("geman-mcclure", "barron")
 REDUCTIONS = ("mean", "sum")
 
 
+@check.frozen()
 @dataclass(frozen=True)
 class Loss:
     """Loss of a difference between images.

@@ -36,6 +36,7 @@ Kind = TypeVar("Kind", bound=Free)
 _SQUARES, _RAYS = Loss(), Visibility("ray-traced")
 
 
+@check.frozen()
 @dataclass(frozen=True, eq=False, init=False)
 class Problem:
     """A fit's problem.

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from warpshadow import check
 from warpshadow.assets import files
@@ -27,9 +27,9 @@ from warpshadow.inverse.result import Result
 from warpshadow.inverse.schedule import Stage
 from warpshadow.inverse.uncertainty import MAX_POSE_UNCERTAINTY
 from warpshadow.scene import toml_tables
-from warpshadow.scene.files import camera_table, write_scene
+from warpshadow.scene.body import Body
+from warpshadow.scene.files import camera_table, file_stems, write_scene
 from warpshadow.scene.material import GLOSS_ARGUMENTS
-from warpshadow.scene.scene import Scene
 
 SUMMARY = "summary.toml"  # the file of a folder of results that is written last: where it is, the others are
 
@@ -62,18 +62,17 @@ class Report:
 
         Args:
             folder: Made if it is not there. It gets the scene as :func:`warpshadow.write_scene` writes it, to be
-                rendered again, with files named by the bodies where each has a name of its own; light.exr of light in
-                spherical harmonics, too; summary.toml (how the fit ended, the fitted parameters that are a few numbers,
-                and of each view the camera and the exposure, which a scene does not have); light.png of free light,
-                striped where the images did not determine it; parameters.npz (all values, as the fit holds them);
-                before.png and after.png beside target.png; weights.png, of a robust loss; and loss.png where matplotlib
-                is installed.
+                rendered again; light.exr of light in spherical harmonics, too; summary.toml (how the fit ended, the
+                fitted parameters that are a few numbers, and of each view the camera and the exposure, which a scene
+                does not have); light.png of free light, striped where the images did not determine it; parameters.npz
+                (all values, as the fit holds them); before.png and after.png beside target.png; weights.png, of a
+                robust loss; and loss.png where matplotlib is installed.
         Returns:
             The files.
         """
         folder, result = Path(folder), self.result
         scene = result.scene
-        written = write_scene(scene, folder, stems=_stems(scene))
+        written = write_scene(scene, folder, stems=file_stems(scene, _OTHER_FILES))
         if not isinstance(scene.light, EnvironmentMap):
             write_image(folder / "light.exr", scene.known_light.radiance.astype(np.float32))
             written.append(folder / "light.exr")
@@ -158,20 +157,15 @@ _OTHER_FILES = ("light", "target", "before", "after", "loss", "preview", "parame
 """Files of a fit whose suffixes bodies' files have, too."""
 
 
-def _stems(scene: Scene) -> list[str]:
-    """Names of the bodies' files: the bodies' own, or body_0 and so on where other files have them."""
-    names = [body.name for body in scene.bodies]
-    lower = [name.lower() for name in names]
-    return [
-        name
-        if re.fullmatch(r"[\w-]+", name)
-        and lower.count(name.lower()) == 1
-        and name.lower() not in _OTHER_FILES
-        and not name.startswith("body_")
-        and not name.endswith(GLOSS_ARGUMENTS)
-        else f"body_{number}"
-        for number, name in enumerate(names)
-    ]
+def _rounded(values: ArrayLike) -> str:
+    return ", ".join(f"{value:.4g}" for value in np.ravel(values))
+
+
+def _shift(before: Body, after: Body) -> str:
+    """How far the middle of a body moved: a translation is of the origin of its mesh, maybe far from it."""
+    low, high = (corner.astype(np.float64) for corner in before.mesh.bounds)
+    middle = (low + high) / 2
+    return f": its middle moved by ({_rounded(after.to_world(middle) - before.to_world(middle))})"
 
 
 def found_values(result: Result) -> list[str]:
@@ -185,19 +179,18 @@ def found_values(result: Result) -> list[str]:
                 and not np.array_equal(values, getattr(before, name))
                 and values.size <= 3
             ):
-                rounded_text = ", ".join(f"{value:.4g}" for value in values.ravel())
-                lines.append(f"{after.name}: {name} ({rounded_text}){'°' if name == 'rotation' else ''}")
+                remark = {"rotation": "°", "translation": _shift(before, after)}.get(name, "")
+                lines.append(f"{after.name}: {name} ({_rounded(values)}){remark}")
     if scene.light is not start.light:
         radiance = scene.known_light.radiance
         x, y, z = EnvironmentMap(np.maximum(radiance, 0)).directions().reshape(-1, 3)[radiance.sum(axis=2).argmax()]
         lines.append(f"light: strongest from ({x:.3f}, {y:.3f}, {z:.3f})")
     for name, value in result.found.sun.items():
-        rounded_text = ", ".join(f"{number:.4g}" for number in np.ravel(value))
-        lines.append(f"sun: {name} ({rounded_text}){'°' if name == 'angular_radius' else ''}")
+        lines.append(f"sun: {name} ({_rounded(value)}){'°' if name == 'angular_radius' else ''}")
     if scene.shell is not None and start.shell is not None and scene.shell[3] != start.shell[3]:
         lines.append(f"light: radius {scene.shell[3]:.4g}")
     if any(factor != 1 for factor in result.found.exposures):
-        lines.append(f"exposure: {', '.join(f'{factor:.4g}' for factor in result.found.exposures)}")
+        lines.append(f"exposure: {_rounded(result.found.exposures)}")
     return lines
 
 

@@ -17,6 +17,7 @@ from warpshadow.scene.visibility import Visibility
 LAST_RATE = 0.1  # share of its learning rate that a stage ends with
 
 
+@check.frozen(lr="learning_rate", steps="iterations")
 @dataclass(frozen=True)
 class Stage:
     """A part of a descent; coarse ones first.

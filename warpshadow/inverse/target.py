@@ -20,6 +20,7 @@ from warpshadow.inverse.encoding import Encoding, checked_encoding, decoded, gue
 from warpshadow.scene.scene import BodyLike
 
 
+@check.frozen()
 @dataclass(frozen=True, eq=False, init=False)
 class Target:
     """An image that a fit explains.

@@ -34,7 +34,7 @@ LIKELY_MISTAKES = {"color": "albedo", "colour": "albedo", "position": "translati
 """Replacements for likely mistakes in a body's arguments, and keys."""
 
 
-@check.frozen
+@check.frozen()
 @dataclass(frozen=True, eq=False, init=False)
 class Body:
     """A mesh with its reflectance, placed in the world: scale first, then rotation, then translation.
@@ -251,12 +251,13 @@ class Body:
     def _checked_emission(self, radiance: npt.ArrayLike) -> np.ndarray:
         count = self.mesh.vertex_count
         expected = "a linear color of 0 or more such as (5, 4, 3), one for each vertex, [vertex, 3], or an .npy file"
-        if getattr(radiance, "dtype", None) == np.uint8:
-            raise ValueError(
-                "emission: got codes from 0 to 255 (uint8), expected linear radiance: ws.srgb_to_linear(image / 255), "
-                "times the radiance of white"
-            )
         emission = _checked_colors("emission", radiance, expected)
+        dtype = np.asarray(radiance).dtype
+        if dtype.kind == "u" or (dtype.kind == "i" and emission.ndim == 3):
+            raise ValueError(
+                f"emission: got codes of a picture ({dtype}), expected linear radiance: of 8 bits "
+                "warpshadow.srgb_to_linear(image / 255), times the radiance of white"
+            )
         if emission.ndim == 3 and self.mesh.uvs is None:
             raise ValueError(
                 f"emission: got a texture, {emission.shape}, but mesh {self.mesh.name!r} has no uvs; expected colors "

@@ -35,6 +35,7 @@ _KEYS = ("fps", "loop", "keyframe")
 MAX_FRAMES = 100_000  # frames beyond which a path is taken for a mistake, such as times in milliseconds
 
 
+@check.frozen()
 @dataclass(frozen=True, eq=False, init=False)
 class Keyframe:
     """Where a camera is at a time, and where it looks.

@@ -3,6 +3,7 @@
 import difflib
 import functools
 import inspect
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -250,15 +251,20 @@ def _body(table: Table, folder: Path) -> Body:
 # ---------------------------------------------------------------------------------------------- writing
 
 
+_COMMENT = "written by warpshadow.write_scene, which replaces it and the files of its bodies"
+
+
 def write_scene(scene: Scene, folder: AnyPath, *, stems: Sequence[str] | None = None) -> list[Path]:
     """Write a scene file and all that it names; :func:`load_scene` reads back the same scene, bit for bit.
 
     Args:
-        folder: Made if it is not there. It gets scene.toml, light.exr for an environment map, and for body N (from 0)
-            body_N.obj, body_N.npz where it has spheres of its own, body_N.npy where it has a color for each vertex,
-            body_N_roughness.npy and the like where it has one for each vertex or a texture of it, and where it has a
-            texture of its color body_N.exr, with body_N.png and body_N.mtl for programs that draw OBJ files.
-        stems: In place of body_0, body_1, …: names of the bodies' files, without suffixes.
+        folder: Made if it is not there. It gets scene.toml, light.exr for an environment map, and for a body called
+            NAME NAME.obj, NAME.npz where it has spheres of its own, NAME.npy where it has a color for each vertex,
+            NAME_roughness.npy and the like where it has one for each vertex or a texture of it, and where it has a
+            texture of its color NAME.exr, with NAME.png and NAME.mtl for programs that draw OBJ files. NAME is body_N
+            for body N (from 0) where its name is more than a word, or another's, or a file of the folder has it that
+            this function did not write.
+        stems: Names of the bodies' files in place of these, without suffixes.
     Returns:
         The files.
     """
@@ -268,7 +274,9 @@ def write_scene(scene: Scene, folder: AnyPath, *, stems: Sequence[str] | None = 
     written: list[Path] = []
     bodies = []
     names = [body.name for body in scene.bodies]
-    stems = [f"body_{number}" for number in range(len(names))] if stems is None else stems
+    path = folder / "scene.toml"
+    others = {file.stem for file in folder.iterdir()} - _written_stems(path)
+    stems = file_stems(scene, {"light", *others}) if stems is None else stems
     for body, stem in zip(scene.bodies, stems, strict=True):
         table, files = _write_body(body, folder / stem)
         if body.has_own_name or names.count(body.name) == 1:
@@ -286,9 +294,31 @@ def write_scene(scene: Scene, folder: AnyPath, *, stems: Sequence[str] | None = 
     light["bounces"] = scene.bounces if scene.bounces == "all" else int(scene.bounces)
     visibility = {name: value for name, value in asdict(scene.visibility).items() if value is not None}
     camera = camera_table(scene.camera) | {"supersampling": scene.supersampling}
-    path = folder / "scene.toml"
-    toml_tables.write(path, {"camera": camera, "light": light, "visibility": visibility, "body": bodies})
+    tables = {"camera": camera, "light": light, "visibility": visibility, "body": bodies}
+    toml_tables.write(path, tables, comment=_COMMENT)
     return [path, *written]
+
+
+def _written_stems(path: Path) -> set[str]:
+    """Names of the bodies' files of a scene file that was written before; none of others' scene files."""
+    text = path.read_text("utf-8", errors="replace") if path.is_file() else ""
+    return set(re.findall(r'^mesh = "(.*)\.obj"$', text, re.MULTILINE)) if text.startswith(f"# {_COMMENT}") else set()
+
+
+def file_stems(scene: Scene, others: Iterable[str]) -> list[str]:
+    """Names of the bodies' files, without suffixes: the bodies' own, or body_0 and so on where others have them."""
+    names = [body.name for body in scene.bodies]
+    lower_names, lower_others = [name.lower() for name in names], {name.lower() for name in others}
+    return [
+        name
+        if re.fullmatch(r"[\w-]+", name)
+        and lower_names.count(name.lower()) == 1
+        and name.lower() not in lower_others
+        and not name.startswith("body_")
+        and not name.endswith((*GLOSS_ARGUMENTS, "emission"))
+        else f"body_{number}"
+        for number, name in enumerate(names)
+    ]
 
 
 def camera_table(camera: Camera) -> Table:

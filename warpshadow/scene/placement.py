@@ -44,18 +44,24 @@ class _Box(NamedTuple):
 def misplacements(scene: Scene) -> list[str]:
     """Say which bodies are broader than any ground below, or above or below it by more than their size.
 
-    Grounds are flat and face +y; the size is the longest edge of the bounds. A body over another that is near enough, a
-    cup on a table, does not float; nor does a lamp, or a body whose bounds meet those of a lamp, such as its shade.
+    Grounds are flat, face +y and emit no light; the size is the longest edge of the bounds. A body over another that is
+    near enough, a cup on a table, does not float; nor does a lamp, or a body whose bounds meet those of a lamp, such as
+    its shade. A body over one ground does not lie below another, such as the board of a table.
     """
     boxes = [_Box(points.min(axis=0), points.max(axis=0)) for points in (b.world_points() for b in scene.bodies)]
+
+    def height(number: int) -> float:
+        """Of the top of a body."""
+        return float(boxes[number].high[1])
+
     grounds = {number for number, body in enumerate(scene.bodies) if _is_ground(body, boxes[number])}
     lamps = [box for body, box in zip(scene.bodies, boxes, strict=True) if body.is_emitter]
     remarks = []
     for number, (body, box) in enumerate(zip(scene.bodies, boxes, strict=True)):
-        below = [other for other in grounds - {number} if box.is_over(boxes[other])]
-        if number in grounds or not below or body.is_emitter:
+        level = [other for other in grounds - {number} if box.is_over(boxes[other])]
+        if number in grounds or not level or body.is_emitter:
             continue
-        broadest = max(below, key=lambda other: boxes[other].breadth)
+        broadest = max(level, key=lambda other: boxes[other].breadth)
         if box.breadth > _CEILING_RATIO * boxes[broadest].breadth:
             remarks.append(
                 f"body {number} ({body.name!r}) is {box.breadth:.3g} broad, and body {broadest} "
@@ -64,13 +70,14 @@ def misplacements(scene: Scene) -> list[str]:
             )
             continue
         size = box.size
-        ground = max(below, key=lambda other: boxes[other].high[1])
+        below = [other for other in level if boxes[other].low[1] <= box.low[1]]
+        ground = max(below, key=height) if below else min(level, key=height)
         others = [other for k, other in enumerate(boxes) if k != number and box.is_over(other)]
         gap = min((box.low[1] - other.high[1] for other in others if other.low[1] <= box.low[1]), default=-np.inf)
         depth = boxes[ground].low[1] - box.low[1]
         where = f"body {number} ({body.name!r}), which is {size:.3g} large,"
         which = f"body {ground} ({scene.bodies[ground].name!r}); on_ground() stands it there"
-        if gap > size and not any(map(box.meets, lamps)):
+        if below and gap > size and not any(map(box.meets, lamps)):
             remarks.append(f"{where} floats {gap:.3g} above {which}")
         elif depth > size:
             remarks.append(f"{where} lies {depth:.3g} below {which}")
@@ -103,7 +110,7 @@ def _winding_number(mesh: Mesh, point: np.ndarray) -> float:
 
 def _is_ground(body: Body, box: _Box) -> bool:
     size, mesh = box.high - box.low, body.mesh
-    if size[1] > 0.2 * size.max():  # at once: most bodies are not flat
+    if body.is_emitter or size[1] > 0.2 * size.max():  # at once: most bodies are not flat
         return False
     normal = plane_normal(mesh.positions[mesh.faces].astype(np.float64))
     return normal is not None and bool((body.rotation_matrix() @ normal)[1] > _GROUND_COSINE)

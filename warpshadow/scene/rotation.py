@@ -19,6 +19,11 @@ def rotation_vector(value: npt.ArrayLike) -> np.ndarray:
     matrix = check.numbers("rotation", value, expected=f"3 finite numbers: {meaning}", dtype=np.float64)
     if matrix.ndim == 0:
         raise ValueError(f"rotation: got {matrix:g}, expected {meaning}: about the vertical (0, {matrix:g}, 0)")
+    if matrix.shape == (4,):
+        raise ValueError(
+            f"rotation: got 4 numbers, expected {meaning}; of a unit quaternion it is "
+            "scipy.spatial.transform.Rotation.from_quat((x, y, z, w)).as_matrix(), with the real part w last"
+        )
     if matrix.shape != (3, 3):
         return check.array("rotation", value, (3,), meaning)
     from scipy.spatial.transform import Rotation

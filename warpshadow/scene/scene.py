@@ -150,7 +150,7 @@ class Bodies(tuple[Body, ...]):
         return names.index(body)
 
 
-@check.frozen
+@check.frozen()
 @dataclass(frozen=True, eq=False, init=False)
 class Scene:
     """Bodies, their light and a camera, in a right-handed world with y up, in units of length of your choice.

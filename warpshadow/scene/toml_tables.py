@@ -76,10 +76,10 @@ def file(table: Table, key: str, folder: Path) -> Path:
 # ---------------------------------------------------------------------------------------------- writing
 
 
-def write(path: Path, tables: Mapping[str, object]) -> None:
-    """Write a TOML file of tables, as :func:`text` has them."""
+def write(path: Path, tables: Mapping[str, object], *, comment: str = "") -> None:
+    """Write a TOML file of tables, as :func:`text` has them, maybe below a line of comment."""
     with files.atomic_write(path) as unfinished:
-        unfinished.write_text(text(tables), encoding="utf-8")
+        unfinished.write_text(f"# {comment}\n\n" * bool(comment) + text(tables), encoding="utf-8")
 
 
 def text(tables: Mapping[str, object]) -> str:

@@ -14,6 +14,7 @@ from warpshadow.assets import files
 from warpshadow.check import AnyPath
 
 
+@check.frozen()
 @dataclass(frozen=True, eq=False, init=False)
 class Spheres:
     """Spheres on the host, validated; the arrays are read-only copies.

@@ -17,6 +17,7 @@ from warpshadow.inverse.world import FittedScene, Setting, World
 from warpshadow.scene.scene import Scene
 
 
+@check.frozen()
 @dataclass(frozen=True)
 class Emission(FreeOfBody):
     """The radiance of a body that emits in the scene, from where the fit starts: one color, or many.
@@ -72,7 +73,7 @@ class Emission(FreeOfBody):
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Let the body emit it."""
-        radiance = values["radiance"] * self._unit(setting)
+        radiance = values["radiance"].clamp(min=0) * self._unit(setting)  # line searches look beyond
         world.emission[self.number] = radiance if self.size is None else radiance[None]
 
     def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:

@@ -89,6 +89,7 @@ class _Gloss(FreeOfBody):
         return {f"{self.called(fitted)}.{self.key}": getattr(fitted.scene.bodies[self.number], self.key)[0]}
 
 
+@check.frozen()
 @dataclass(frozen=True)
 class Roughness(_Gloss):
     """Roughness of a glossy body."""
@@ -96,6 +97,7 @@ class Roughness(_Gloss):
     key = "roughness"
 
 
+@check.frozen()
 @dataclass(frozen=True)
 class Metallic(_Gloss):
     """Metallic share of a glossy body."""

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from warpshadow import check
 from warpshadow.inverse import constraints
 from warpshadow.inverse.free.base import FreeOfBody, Values
 from warpshadow.inverse.free.emission import check_emits
@@ -23,6 +24,7 @@ STARTS = 8
 _REACH = 4.0  # turn [radians], and logarithm of the distance, for a value of 1: a lamp moves farther than a pose
 
 
+@check.frozen()
 @dataclass(frozen=True)
 class Lamp(FreeOfBody):
     """The place of a lamp, a body that emits: its direction and distance from the middle of the others.

@@ -22,6 +22,7 @@ from warpshadow.scene.scene import Scene
 _MIN_RADIANCE = 1e-3
 
 
+@check.frozen()
 @dataclass(frozen=True)
 class Light(Free):
     """The light, in spherical harmonics or as a map of cells.

@@ -19,6 +19,7 @@ from warpshadow.scene.scene import BodyLike, Scene
 from warpshadow.torch import rotation_matrices
 
 
+@check.frozen()
 @dataclass(frozen=True)
 class Plane(FreeOfBody):
     """The height and the tilt of a flat body, such as the ground; bodies that stand on it move along.

@@ -29,6 +29,7 @@ _TURNS = np.array(
 _MAX_TILT = 1.0  # degrees from the nearest stable support up to which a body stands as the scene has it
 
 
+@check.frozen()
 @dataclass(frozen=True)
 class Pose(FreeOfBody):
     """The pose of a body: a rotation about the middle of its bounding box, a translation, and maybe a scale.

@@ -68,6 +68,7 @@ def variation(texels: torch.Tensor) -> torch.Tensor:
     return (squares[0] + squares[1]) / texels.numel()
 
 
+@check.frozen()
 @dataclass(frozen=True)
 class Albedo(FreeOfBody):
     """The reflectance of a body: one color, or one for each vertex.
@@ -116,6 +117,7 @@ class Albedo(FreeOfBody):
         return {} if self.per_vertex else {f"{self.called(fitted)}.albedo": body.albedo}
 
 
+@check.frozen()
 @dataclass(frozen=True)
 class Texture(FreeOfBody):
     """The reflectance of a body as an image, which needs uvs.

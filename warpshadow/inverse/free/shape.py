@@ -28,6 +28,7 @@ def _sphere_count(body: Body) -> int:
     return body.blockers if isinstance(body.blockers, int) else len(fit_spheres(body.mesh, progress=False).spheres)
 
 
+@check.frozen()
 @dataclass(frozen=True)
 class Deformation(FreeOfBody):
     """The shape of a body, by embedded deformation (Sumner et al. 2007); its spheres are the nodes (the paper, sec. 4).
@@ -111,6 +112,7 @@ class Deformation(FreeOfBody):
             fitted.change_body(self.number, blockers=Spheres(centers, spheres.radii))
 
 
+@check.frozen()
 @dataclass(frozen=True)
 class Radii(FreeOfBody):
     """The radii of a body's spheres, as factors.

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from warpshadow import check
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.inverse.free.base import Free, Values
 from warpshadow.inverse.world import FittedScene, Setting, World
@@ -20,6 +21,7 @@ _CLEARANCE = 0.02  # smallest gap, in distances of the farthest body from the ce
 _MIN_GAP = 1e-3  # that a fit starts with, in the same
 
 
+@check.frozen()
 @dataclass(frozen=True)
 class Shell(Free):
     """The radius of the light's shell, around the center that the scene has.

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from warpshadow import check
 from warpshadow.assets.basis import CellBasis
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.inverse import constraints
@@ -26,6 +27,10 @@ _NEWTON_STEPS = 12
 _UNRESOLVED = 1.2  # times the resolution, up to which a fitted size is none
 
 
+@check.frozen(
+    **dict.fromkeys(("intensity", "strength", "radiance", "color"), "irradiance"),
+    **dict.fromkeys(("radius", "size"), "angular_radius, in degrees"),
+)
 @dataclass(frozen=True)
 class Sun(Free):
     """A sun beside the scene's map: its direction, irradiance and angular radius, which a fit starts from.
@@ -57,7 +62,7 @@ class Sun(Free):
         check_count("directions", self.directions)
         EnvironmentMap.constant(0.0).with_sun(self.direction, self.irradiance, angular_radius=self.angular_radius)
         strength = np.asarray(self.irradiance, np.float64)
-        if not ((strength > 0) & np.isfinite(strength)).all():
+        if not (strength > 0).all():
             got = strength.tolist()
             raise ValueError(f"irradiance: got {got}, expected positive numbers, as its logarithm is fitted")
         strength = np.broadcast_to(strength, 3)

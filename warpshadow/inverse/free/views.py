@@ -17,6 +17,7 @@ from warpshadow.inverse.world import FittedScene, Setting, World
 from warpshadow.torch import rotation_matrices
 
 
+@check.frozen()
 @dataclass(frozen=True)
 class Exposure(Free):
     """The exposure of each view, a factor of its colors; known light then keeps its unit.
@@ -61,6 +62,7 @@ class Exposure(Free):
         return figures | ({"white_balance": fitted.white_balances} if self.white_balance else {})
 
 
+@check.frozen()
 @dataclass(frozen=True)
 class OutlineOffset(Free):
     """Distance by which painted outlines of each view lie inside the true ones: no mask is right to the pixel.
@@ -102,6 +104,7 @@ class OutlineOffset(Free):
         return {"outline_offset": fitted.outline_offsets}
 
 
+@check.frozen()
 @dataclass(frozen=True)
 class CameraPose(Free):
     """Camera pose of each view: eye, rotation and, if free, focal length.

@@ -27,7 +27,7 @@ BodyArrays = Sequence[wp.array | None] | None
 """For each body an array, or None for the scene's own; None for all bodies' own."""
 
 
-_LIMITS = {field.name: (field.minimum, field.maximum) for field in MATERIAL_FIELDS}
+_LIMITS = {field.name: (field.minimum, field.maximum) for field in MATERIAL_FIELDS} | {"emission": (0.0, check.LARGEST)}
 
 
 class SampleReflectance(NamedTuple):
