@@ -398,7 +398,7 @@ def test_snippets_run_as_they_stand(folder, monkeypatch, capsys):
     recovered = ws.render(ws.load_scene(Path("recovered", "scene.toml")))
     assert np.abs(recovered - image).mean() < 0.1 * image.mean()
     ws.write_image("photo.exr", image.reshape(64, 4, 64, 4, 4).mean(axis=(1, 3)))
-    for page in ("assets", "cli", "scene", "pipeline", "inverse"):
+    for page in ("assets", "cli", "scene", "torch", "pipeline", "inverse"):
         for snippet in blocks(ROOT / "warpshadow" / page / "README.md", "python"):
             exec(snippet, names)
     assert "receivers" in capsys.readouterr().out  # what explain says
