@@ -184,7 +184,9 @@ def by_photograph(photo: Photograph, start: ws.Body, visibility: ws.Visibility) 
         LIGHT,
         inverse.OutlineOffset(),
     ]
-    return inverse.fit(inverse.Problem(scene, target, free, HUBER, still=None), "photograph", progress=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a start that is turned onto its stable support
+        return inverse.fit(inverse.Problem(scene, target, free, HUBER, still=None), "photograph", progress=False)
 
 
 def light_squares(photo: Photograph, is_light: np.ndarray) -> np.ndarray:
@@ -247,7 +249,6 @@ def _scale(photo: Photograph, width: int) -> float:
 
 def main(data: Path | None, starts: int) -> None:
     ws.quiet()
-    warnings.simplefilter("ignore")  # of starts that are turned onto their stable supports
     torch.set_num_threads(1)
     photo = open_photograph(data)
     truth = photo.scene.bodies[BODY]

@@ -27,6 +27,7 @@ from warpshadow.inverse.report import Report, _stems, write_result
 from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import parse_camera
+from warpshadow.torch import TorchRenderer
 
 # Bodies are placed in float32 in the fit, and by their written rotation vectors when rendered again.
 PLACED = 2e-4
@@ -56,14 +57,16 @@ def run(*free, views=1, scene=None, **options):
 
 
 def rendered_again(folder, result):
-    """Images of the scene that was written, by the views' cameras and exposures that were written."""
+    """Images of the scene that was written, by the views' cameras and exposures that were written.
+
+    All cameras at once, as of the fit: receivers are chosen for them together.
+    """
     scene, summary = ws.load_scene(folder / "scene.toml"), toml_tables.read(folder / "summary.toml", "summary")
-    images = []
-    for view in summary["view"]:
-        exposure = np.float32([view["exposure"]] * 3 + [1])
-        camera = parse_camera({key: value for key, value in view.items() if key != "exposure"})
-        images.append(exposure * ws.Renderer(replace(scene, camera=camera)).render())
-    return np.stack(images)
+    views = summary["view"]
+    cameras = [parse_camera({key: value for key, value in view.items() if key != "exposure"}) for view in views]
+    images = TorchRenderer(scene, cameras=cameras)().numpy().reshape(len(views), cameras[0].height, cameras[0].width, 4)
+    exposures = np.float32([[view["exposure"]] * 3 + [1] for view in views])
+    return exposures[:, None, None] * images
 
 
 @pytest.mark.slow
