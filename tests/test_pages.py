@@ -303,7 +303,9 @@ def scene_file():
 
 
 def test_the_scene_file_is_one(folder):
-    short, scene, path, inserted, automatic = blocks(ROOT / "warpshadow" / "scene" / "README.md", "toml")
+    short, scene, inserted = blocks(ROOT / "warpshadow" / "scene" / "README.md", "toml")
+    (path,) = blocks(ROOT / "warpshadow" / "cli" / "README.md", "toml")
+    (automatic,) = blocks(ROOT / "warpshadow" / "tuning" / "README.md", "toml")
     Path("short.toml").write_text(short, "utf-8")
     assert [body.casts_shadow for body in ws.load_scene("short.toml").bodies] == [True, True]
     Path("scene.toml").write_text(scene, "utf-8")
@@ -396,7 +398,7 @@ def test_snippets_run_as_they_stand(folder, monkeypatch, capsys):
     recovered = ws.render(ws.load_scene(Path("recovered", "scene.toml")))
     assert np.abs(recovered - image).mean() < 0.1 * image.mean()
     ws.write_image("photo.exr", image.reshape(64, 4, 64, 4, 4).mean(axis=(1, 3)))
-    for page in ("scene", "pipeline", "inverse"):
+    for page in ("assets", "cli", "scene", "torch", "pipeline", "inverse"):
         for snippet in blocks(ROOT / "warpshadow" / page / "README.md", "python"):
             exec(snippet, names)
     assert "receivers" in capsys.readouterr().out  # what explain says
