@@ -8,6 +8,7 @@ import torch
 import warp as wp
 
 import warpshadow as ws
+from warpshadow.pipeline.views import receiver_finder
 from warpshadow.pipeline.views import view as view_module
 from warpshadow.stages import film
 from warpshadow.stages.textures import pyramid, sample
@@ -370,7 +371,7 @@ def test_what_is_not_seen_has_no_part_in_images_or_gradients(method, receivers, 
     results, counts = {}, {}
     for name in ("seen", "every"):
         if name == "every":
-            monkeypatch.setattr(view_module, "seen_vertices", lambda *arguments: np.ones(arguments[-1], bool))
+            monkeypatch.setattr(receiver_finder, "seen_vertices", lambda *arguments: np.ones(arguments[-1], bool))
         renderer = TorchRenderer(scene)
         counts[name] = renderer.warp.view().receivers.points.shape[1]
         rotations, translations, scales = renderer.scene_poses()

@@ -9,7 +9,7 @@ import warp as wp
 
 import warpshadow as ws
 from warpshadow.device import cuda_graph
-from warpshadow.pipeline.views import view as view_module
+from warpshadow.pipeline.views import receiver_finder
 from warpshadow.torch import TorchRenderer
 from warpshadow.torch.replay import Capture
 
@@ -22,7 +22,7 @@ SAME = {"rtol": 1e-5, "atol": 1e-6}
 def on_a_gpu(monkeypatch):
     """Capture on a CPU, too, and have all vertices as receivers."""
     monkeypatch.setattr(cuda_graph, "is_captured", lambda device: True)
-    monkeypatch.setattr(view_module, "is_readable", lambda device: False)
+    monkeypatch.setattr(receiver_finder, "is_readable", lambda device: False)
     monkeypatch.setattr(Capture, "_seconds_of", lambda capture, run: (run(), 0.0)[1])
 
 

@@ -10,7 +10,7 @@ from demos.tools import kernel_floor
 from demos.tools.kernel_floor import Size, Work
 from warpshadow.device.cuda_graph import with_gradients
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.views import view as view_module
+from warpshadow.pipeline.views import receiver_finder
 
 SIZE = Size(vertices=1000, faces=1900, spheres=20, directions=64, samples=4096)
 
@@ -71,7 +71,7 @@ def test_the_scene_is_measured():
 
 def test_the_launches_of_the_stages_are_those_of_a_captured_pose_iteration(monkeypatch):
     """Captured on the CPU, whose graphs count what they hold; all vertices are receivers, as on a GPU."""
-    monkeypatch.setattr(view_module, "is_readable", lambda device: False)  # as on a GPU
+    monkeypatch.setattr(receiver_finder, "is_readable", lambda device: False)  # as on a GPU
     spheres = ws.Spheres([[0, 0, 0]], [0.5])
     ball = ws.Body(ws.icosphere(0.5, 1), blockers=spheres, translation=(0, 0.5, 0), receivers="vertex")
     camera = ws.Camera.look_at((0, 2, 3), (0, 0.3, 0), size=(8, 8))

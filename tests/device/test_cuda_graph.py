@@ -19,7 +19,7 @@ from warpshadow.device.cuda_graph import Captured, with_gradients
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline import node
 from warpshadow.pipeline.shading import method as method_module
-from warpshadow.pipeline.views import view as view_module
+from warpshadow.pipeline.views import receiver_finder
 from warpshadow.stages import Poses
 from warpshadow.stages.textures.pyramid import mip_pyramids
 
@@ -146,7 +146,7 @@ def test_a_captured_pose_fit_has_the_loss_and_gradient_of_a_plain_one(
     method, receivers, bounces, scene, device, monkeypatch
 ):
     """As on a GPU, all vertices are receivers."""
-    monkeypatch.setattr(view_module, "is_readable", lambda device: False)  # as on a GPU
+    monkeypatch.setattr(receiver_finder, "is_readable", lambda device: False)  # as on a GPU
     visibility = ws.Visibility.of({"method": method, "directions": 32, "order": 3})
     bodies = [dataclasses.replace(body, receivers=receivers) for body in scene.bodies]
     scene = ws.Scene(bodies, scene.light, scene.camera, visibility, bounces=bounces)

@@ -13,6 +13,7 @@ from warpshadow.assets.basis import HarmonicBasis
 from warpshadow.device import warp_internals
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.renderer import SceneRenderer
+from warpshadow.pipeline.views import receiver_finder
 from warpshadow.pipeline.views import view as view_module
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.project import to_clip
@@ -196,7 +197,7 @@ def test_where_nothing_is_read_back_backs_are_lit_as_well(moving, monkeypatch):
     """
     scene = bowl_scene("none")
     expected = SceneRenderer(scene).render()
-    monkeypatch.setattr(view_module, "is_readable", lambda device: False)
+    monkeypatch.setattr(receiver_finder, "is_readable", lambda device: False)
     renderer = SceneRenderer(scene)
     view = renderer.view(renderer.placed(moving=moving))
     vertex_counts = [body.mesh.vertex_count for body in scene.bodies]

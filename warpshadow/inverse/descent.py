@@ -127,7 +127,7 @@ class _Descent:
 
     def _relocated(self, values: Mapping[str, Values], number: int) -> dict[str, Values]:
         """Values with free lamps elsewhere."""
-        lamps = {free.name: free for free in self.problem.free if isinstance(free, Lamp)}
+        lamps = {lamp.name: lamp for lamp in self.problem.free_of(Lamp)}
         copies = _copied(values)
         return copies | {name: lamp.relocated(copies[name], self.setting, number) for name, lamp in lamps.items()}
 

@@ -79,7 +79,7 @@ def warn_of(
         losses: Of the last descent.
         end: Why it ended.
     """
-    is_exposure_known = problem.basis is None and not any(isinstance(free, Exposure) for free in problem.free)
+    is_exposure_known = problem.basis is None and not problem.free_of(Exposure)
     has_coverage = problem.targets[0].image.shape[2] == 4
     if is_exposure_known or not has_coverage:
         model = Model(problem, setting, small_stage(problem))

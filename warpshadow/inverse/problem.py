@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -29,6 +30,8 @@ from warpshadow.scene.blockers import blocking_planes, scene_blockers
 from warpshadow.scene.scene import Scene, change_bodies, check_scene
 from warpshadow.scene.visibility import METHODS, SPHERE_METHODS, Visibility
 from warpshadow.tuning.tune import resolved
+
+Kind = TypeVar("Kind", bound=Free)
 
 _SQUARES, _RAYS = Loss(), Visibility("ray-traced")
 
@@ -125,6 +128,10 @@ class Problem:
             with check.located(f"free[{number}]"):
                 yield item.numbered(self.scene)
 
+    def free_of(self, kind: type[Kind]) -> list[Kind]:
+        """The free parameters of a kind."""
+        return [item for item in self.free if isinstance(item, kind)]
+
     @property
     def moves(self) -> bool:
         """Whether geometry or cameras are free."""
@@ -134,21 +141,22 @@ class Problem:
     def visibility(self) -> Visibility:
         """Visibility settings of the fit."""
         visibility = self.scene.visibility if self.moves or self.still is None else self.still
-        sun = next((free for free in self.free if isinstance(free, Sun)), None)
-        if sun is None or visibility.method != "directional":
+        suns = self.free_of(Sun)
+        if not suns or visibility.method != "directional":
             return visibility
         # fewer cells than the sun has would move it: by 3° of 128
-        return replace(visibility, directions=max(self.scene.direction_count, sun.directions))
+        return replace(visibility, directions=max(self.scene.direction_count, suns[0].directions))
 
     @property
     def basis(self) -> Basis | None:
         """Basis of free light."""
-        return next((free.basis for free in self.free if isinstance(free, Light)), None)
+        return next((light.basis for light in self.free_of(Light)), None)
 
     @property
     def image_basis(self) -> Basis | None:
         """Basis of the light of its images: of free light, or of a sun beside the map; None for the scene's own."""
-        return next((free.basis for free in self.free if isinstance(free, (Light, Sun))), None)
+        bases = [light.basis for light in self.free_of(Light)] + [sun.basis for sun in self.free_of(Sun)]
+        return bases[0] if bases else None
 
     def cameras(self) -> list[Camera]:
         """Camera of each target."""
@@ -170,7 +178,7 @@ class Problem:
 
     def _planes(self, scene: Scene) -> set[int]:
         """Bodies that block light as planes, not by spheres, also in the scene that is found."""
-        reshaped = {free.number for free in self.free if isinstance(free, (Deformation, Radii))}
+        reshaped = {free.number for free in (*self.free_of(Deformation), *self.free_of(Radii))}
         return set(blocking_planes(scene)) - reshaped
 
     def start(self, setting: Setting) -> dict[str, Values]:

@@ -177,7 +177,7 @@ def photograph_stages(problem: Problem) -> tuple[Stage, ...]:
             Stage(20, 0.01, side[160], **first),
         ]
     solved_settings: dict[str, Any] = {"solves_light": problem.basis is not None, "supersampling": 1}
-    if problem.basis is not None and any(isinstance(free, Lamp) for free in problem.free):
+    if problem.basis is not None and problem.free_of(Lamp):
         stages.append(
             Stage(6, 0.1, side[32], candidates=1 + STARTS, scatter="lamps", tolerance=0.01, **solved_settings)
         )

@@ -116,8 +116,7 @@ class NormalMatrix:
         self.problem, self.setting = problem, setting
         self.values = {name: {key: t.detach().clone() for key, t in parts.items()} for name, parts in values.items()}
         stage = small_stage(problem)
-        has_light = any(isinstance(free, Light) for free in problem.free)
-        self.model = (ProjectedModel if has_light else Model)(problem, setting, stage)
+        self.model = (ProjectedModel if problem.free_of(Light) else Model)(problem, setting, stage)
         self.parameter_entries = _few_number_entries(problem, self.values)
         self.directions = self._directions()
         self.roots: list[torch.Tensor] = []  # of the weights of colors, and of coverage
@@ -141,8 +140,8 @@ class NormalMatrix:
         none along which they change and it does not, such as a quaternion's length.
         """
         directions = np.eye(len(self.parameter_entries))
-        for free in self.problem.free:
-            if isinstance(free, Pose) and free.rotation != "axis-angle":
+        for free in self.problem.free_of(Pose):
+            if free.rotation != "axis-angle":
                 entries = enumerate(self.parameter_entries)
                 rows = [index for index, entry in entries if entry[:2] == (free.name, "turn")]
                 turns = np.zeros((len(directions), 3))
@@ -159,8 +158,7 @@ class NormalMatrix:
 
     def plane(self, free: Pose) -> Plane | None:
         """The free plane that a body stands on."""
-        planes = (item for item in self.problem.free if isinstance(item, Plane))
-        return next((plane for plane in planes if free.number in plane.carries), None)
+        return next((plane for plane in self.problem.free_of(Plane) if free.number in plane.carries), None)
 
     def posed(self, free: Pose) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Rotation, middle in the world, and scale of a body, its plane moved."""
@@ -299,11 +297,7 @@ def uncertainty(
     normal = NormalMatrix(problem, setting, values)
     inverse = normal.directions @ np.linalg.inv(normal.normal_matrix)
     covariance = inverse @ normal.score_covariance @ inverse.T
-    poses = {
-        free.called(fitted): _pose_uncertainty(free, normal, covariance)
-        for free in problem.free
-        if isinstance(free, Pose)
-    }
+    poses = {pose.called(fitted): _pose_uncertainty(pose, normal, covariance) for pose in problem.free_of(Pose)}
     names = [f"{name}.{key}[{number}]" for name, key, number in normal.parameter_entries]
     return Uncertainty(names, covariance, poses, normal.light)
 

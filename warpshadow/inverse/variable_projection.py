@@ -42,9 +42,9 @@ class ProjectedModel(Model):
 
     def __init__(self, problem: Problem, setting: Setting, stage: Stage):
         super().__init__(problem, setting, stage)
-        self.light = next(free for free in problem.free if isinstance(free, Light))
+        (self.light,) = problem.free_of(Light)
         self.atoms = atoms(self.light)
-        self.lamps = [free for free in problem.free if isinstance(free, Emission) and free.is_light]
+        self.lamps = [emission for emission in problem.free_of(Emission) if emission.is_light]
         self.lamp_units = np.ones(len(self.lamps))  # emission that lights an image as much as an atom does
         self.solution = np.zeros((len(self.atoms) + len(self.lamps), 3))  # radiance of atoms and lamps, found last
 

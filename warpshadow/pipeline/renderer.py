@@ -20,6 +20,7 @@ from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.progress import waiting
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import announced, one_at_a_time
+from warpshadow.pipeline.bodies.free_shapes import FreeShapes
 from warpshadow.pipeline.bodies.geometry import Geometry, as_geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
@@ -107,6 +108,7 @@ class SceneRenderer:
                 self._choices = choose_receivers(merged_scene, self.cameras, is_light_free=basis is not None)
         self._given_scene, self.scene = scene, with_receivers(scene, self._choices)
         self.merged_scene = merged_scene.with_settings(self.scene)
+        self._free_shapes = FreeShapes(self.merged_scene)
         self.clock = Clock()
         self._method = make_method(self.merged_scene, basis, progress=progress)
         self._materials = Materials.of_scene(self.merged_scene)
@@ -164,8 +166,8 @@ class SceneRenderer:
 
     scene_poses = delegated("merged_scene", MergedScene.scene_poses)
     placed = delegated("merged_scene", MergedScene.placed)
-    deformed = delegated("merged_scene", MergedScene.deformed)
-    deformation_graph = delegated("merged_scene", MergedScene.deformation_graph)
+    deformed = delegated("_free_shapes", FreeShapes.deformed)
+    deformation_graph = delegated("_free_shapes", FreeShapes.deformation_graph)
 
     @property
     def clip_matrices(self) -> wp.array:

@@ -8,6 +8,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 import warpshadow as ws
+from warpshadow.pipeline.bodies.free_shapes import FreeShapes
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.stages.poses import Poses
 
@@ -98,8 +99,10 @@ def test_what_is_handed_out_is_not_the_assemblys_own_memory(device):
         merged_scene.placed(),
         merged_scene.placed(moving=[]),
         merged_scene.placed(moving=[0]),
-        merged_scene.deformed(0),
-        merged_scene.deformed(0, centers=wp.clone(merged_scene.rest.centers[:, : merged_scene.first_sphere[1]])),
+        FreeShapes(merged_scene).deformed(0),
+        FreeShapes(merged_scene).deformed(
+            0, centers=wp.clone(merged_scene.rest.centers[:, : merged_scene.first_sphere[1]])
+        ),
     ]
     for geometry in handed_out:
         for array in geometry.arrays().values():
@@ -113,7 +116,7 @@ def test_a_body_alone_is_not_deformed_in_the_memory_of_the_argument(device):
     body = two_bodies(device).scene.bodies[0]
     scene = ws.Scene([body], ws.EnvironmentMap.constant(), ws.Camera.look_at((0, 0, 9), (0, 0, 0), size=(8, 8)))
     positions = wp.array(body.mesh.positions[None], dtype=wp.vec3, device=device)
-    MergedScene(scene, device=device).deformed(0, positions).positions.fill_(-7.0)
+    FreeShapes(MergedScene(scene, device=device)).deformed(0, positions).positions.fill_(-7.0)
     np.testing.assert_array_equal(positions.numpy()[0], body.mesh.positions)
 
 
@@ -138,7 +141,7 @@ def test_deforming_a_body_leaves_the_other_as_it_is(device, number, verified_tap
         wp.array(rng.normal(size=(*shape, 3)), dtype=wp.vec3, device=device, requires_grad=True) for shape in shapes
     )
     with wp.Tape() as tape:
-        rest = merged_scene.deformed(number, positions, centers)
+        rest = FreeShapes(merged_scene).deformed(number, positions, centers)
     np.testing.assert_array_equal(rest.radii.numpy(), merged_scene.rest.radii.numpy())
     for got, given, cached, place in (
         (rest.positions, positions, merged_scene.rest.positions, vertices),
@@ -154,11 +157,11 @@ def test_deforming_a_body_leaves_the_other_as_it_is(device, number, verified_tap
 
 def test_a_graph_that_does_not_move_leaves_its_body_as_it_is(device):
     merged_scene = two_bodies(device)
-    graph = merged_scene.deformation_graph(1, count=3)
+    graph = FreeShapes(merged_scene).deformation_graph(1, count=3)
     count = len(merged_scene.scene.bodies[1].blockers)
     still = wp.zeros((1, count), dtype=wp.vec3, device=device)
     matrices = wp.full((1, count), wp.mat33(np.eye(3)), dtype=wp.mat33, device=device)
-    rest = merged_scene.deformed(1, graph.points(matrices, still), graph.centers(still))
+    rest = FreeShapes(merged_scene).deformed(1, graph.points(matrices, still), graph.centers(still))
     expected = merged_scene.placed()
     for name, got in merged_scene.placed(rest=rest).arrays().items():
         assert np.abs(got.numpy() - getattr(expected, name).numpy()).max() < 4 * FLOAT32
@@ -167,10 +170,10 @@ def test_a_graph_that_does_not_move_leaves_its_body_as_it_is(device):
 def test_what_does_not_fit_is_refused(device):
     merged_scene = two_bodies(device)
     with pytest.raises(ValueError, match="^body: got 2, expected the number of a body, from 0 to 1"):
-        merged_scene.deformation_graph(2)
+        FreeShapes(merged_scene).deformation_graph(2)
     wrong = wp.zeros((1, 7), dtype=wp.vec3, device=device)
     with pytest.raises(ValueError, match=r"^positions: got shape \(1, 7\), expected \[batch, 12\]"):
-        merged_scene.deformed(0, wrong)
+        FreeShapes(merged_scene).deformed(0, wrong)
     one = merged_scene.poses
     poses = Poses(one.rotations[:, :1], one.translations[:, :1], one.scales[:, :1])
     with pytest.raises(ValueError, match=r"^poses: got shape \(1, 1\), expected \[batch, 2\]"):

@@ -10,18 +10,16 @@ import numpy.typing as npt
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.batch import common_batch, concatenate
+from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
 from warpshadow.device.memory import empty
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.maths.spatial_sort import z_order
 from warpshadow.pipeline.bodies.geometry import CENTER, Geometry, Pivot, as_geometry, splice
-from warpshadow.scene.blockers import free_shape_remark, scene_blockers
+from warpshadow.scene.blockers import scene_blockers
 from warpshadow.scene.scene import BodyLike, Scene
 from warpshadow.scene.visibility import AUTO, SPHERE_METHODS
 from warpshadow.spheres import MANY, Spheres
-from warpshadow.stages.bound_spheres import SphereBinding
-from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.poses import Poses
 
 if TYPE_CHECKING:  # it is imported where a body emits
@@ -49,8 +47,6 @@ class MergedScene:
         self.has_chosen_receivers = np.zeros(len(scene.bodies), bool)
         self._progress = progress
         self._faces_of: dict[tuple[int, int], wp.array] = {}
-        self._bindings: dict[int, SphereBinding] = {}  # by bodies
-        self._warned_of_shapes: set[int] = set()
         self._take_spheres: Callable[[], list[Spheres]] | None = None
         meshes = [body.mesh for body in scene.bodies]
         uvs = [np.zeros((1, 2), np.float32) if mesh.uvs is None else mesh.uvs for mesh in meshes]
@@ -177,7 +173,7 @@ class MergedScene:
 
     @functools.cached_property
     @one_at_a_time
-    def _spheres(self) -> list:
+    def body_spheres(self) -> list:
         """Spheres of each body in its own space; none where the method asks for none."""
         if self._take_spheres is not None:
             return self._take_spheres()
@@ -186,7 +182,7 @@ class MergedScene:
     @property
     def sphere_counts(self) -> np.ndarray:
         """Number of spheres of each body, shape [body]; until they are fitted, how many are asked for, or 64."""
-        if "_spheres" in self.__dict__:
+        if "body_spheres" in self.__dict__:
             return np.diff(self.first_sphere)
         if self.scene.visibility.method not in SPHERE_METHODS:
             return np.zeros(len(self.scene.bodies), int)
@@ -196,14 +192,14 @@ class MergedScene:
     @functools.cached_property
     def first_sphere(self) -> np.ndarray:
         """Where each body's spheres begin, and the end of the last, shape [body + 1]."""
-        return _starts([spheres.radii for spheres in self._spheres])
+        return _starts([spheres.radii for spheres in self.body_spheres])
 
     @functools.cached_property
     def rest(self) -> Geometry:
         """The bodies at rest, each in its own space; the batch is 1."""
         positions = np.concatenate([body.mesh.positions for body in self.scene.bodies])
-        centers = np.concatenate([spheres.centers for spheres in self._spheres])
-        radii = np.concatenate([spheres.radii for spheres in self._spheres])
+        centers = np.concatenate([spheres.centers for spheres in self.body_spheres])
+        radii = np.concatenate([spheres.radii for spheres in self.body_spheres])
         return Geometry(
             self._array(positions[None], wp.vec3),
             self._array(centers[None], wp.vec3),
@@ -307,7 +303,7 @@ class MergedScene:
 
     def take_spheres(self, other: "MergedScene", bodies: Sequence[int]) -> None:
         """Take the spheres of this scene's bodies, some of another's, from the other when they are first asked for."""
-        self._take_spheres = lambda: [other._spheres[number] for number in bodies]
+        self._take_spheres = lambda: [other.body_spheres[number] for number in bodies]
 
     def part(self, geometry: Geometry, bodies: Sequence[int]) -> Geometry:
         """Cut some bodies, in rising order, out of a geometry of all. Differentiable in it."""
@@ -362,88 +358,6 @@ class MergedScene:
             elif end > first:
                 runs.append((first, end))
         return runs
-
-    @one_at_a_time
-    def deformation_graph(self, body: BodyLike, *, count: int = 4) -> DeformationGraph:
-        """Bind the vertices of a body to its spheres, which are the nodes (the paper, section 4).
-
-        Args:
-            body: The body, its number or name.
-            count: Nodes that carry a vertex.
-        Raises:
-            ValueError: for a body with too few spheres.
-        """
-        number = self.scene.body_number(body)
-        points = self.scene.bodies[number].mesh.positions
-        return DeformationGraph.bind(points, self._spheres[number].centers, count=count, device=self.device)
-
-    @one_at_a_time
-    def deformed(
-        self,
-        body: BodyLike,
-        positions: wp.array | None = None,
-        centers: wp.array | None = None,
-        radii: wp.array | None = None,
-        *,
-        rest: Geometry[wp.array] | None = None,
-    ) -> Geometry[wp.array]:
-        """Exchange the shape of one body at rest.
-
-        Args:
-            body: The body, its number or name.
-            positions: Its vertices in its own space, vec3 of shape [batch, vertex].
-            centers: Its spheres' centers, vec3 of shape [batch, sphere].
-            radii: Its spheres' radii, float32 of shape [batch, sphere]. An item None stays as it is in ``rest``; but
-                its spheres follow its vertices, both centers and radii, unless ``centers`` are given
-                (:mod:`warpshadow.stages.bound_spheres`).
-            rest: All bodies at rest, by default as their meshes are; batches of 1 serve every instance.
-        Returns:
-            All bodies at rest, for :meth:`placed`, in arrays of their own.
-        Raises:
-            ValueError: for other vertices of a flat body where light bounces by spheres, for which it stays in its
-                plane.
-        Differentiable: positions, centers, radii, rest.
-        """
-        number = self.scene.body_number(body)
-        if positions is not None and self.is_flat[number] and self.scene.bounces:
-            self._refuse_other_vertices(number)
-        if positions is not None and number not in self._warned_of_shapes:
-            self._warned_of_shapes.add(number)
-            if remark := free_shape_remark(self.scene, number):
-                check.warn(remark)
-        rest = self.rest if rest is None else as_geometry("rest", rest)
-        first_vertex, first_sphere = self.first_vertex[number : number + 2], self.first_sphere[number : number + 2]
-        if positions is not None and centers is None and len(self._spheres[number]):
-            vertices, spheres = slice(*first_vertex.tolist()), slice(*first_sphere.tolist())
-            check.shape("positions", positions.shape, ("batch", vertices.stop - vertices.start))
-            at_rest = rest.positions[:, vertices], rest.centers[:, spheres], rest.radii[:, spheres]
-            centers, moved_radii = self._sphere_binding(number).moved(positions, *at_rest)
-            radii = moved_radii if radii is None else radii
-        return Geometry(
-            _spliced("positions", rest.positions, positions, first_vertex),
-            _spliced("centers", rest.centers, centers, first_sphere),
-            _spliced("radii", rest.radii, radii, first_sphere),
-            moving=None if rest.moving is None else (*rest.moving, number),
-            rotations=None if rest.rotations is None else splice(rest.rotations, [], lambda *_: rest.rotations),
-            deformed=(*rest.deformed, number),
-        )
-
-    def _refuse_other_vertices(self, number: int) -> None:
-        """Raise ValueError for other vertices of a flat body where light bounces by spheres."""
-        if self.scene.visibility.method in SPHERE_METHODS:
-            raise ValueError(
-                f"positions: got some for body {number} ({self.scene.bodies[number].name!r}), which is flat; "
-                f"expected None where light bounces (scene.bounces is {self.scene.bounces}), since a flat body "
-                'reflects and blocks as a part of a plane; set bounces = 0, or take method "ray-traced"'
-            )
-
-    def _sphere_binding(self, number: int) -> SphereBinding:
-        """Bind a body's spheres to the vertices of its faces."""
-        if number not in self._bindings:
-            mesh, spheres = self.scene.bodies[number].mesh, self._spheres[number]
-            arguments = mesh.positions, np.unique(mesh.faces), spheres.centers, spheres.radii
-            self._bindings[number] = SphereBinding.bind(*arguments, device=self.device)
-        return self._bindings[number]
 
     @property
     def casting(self) -> list[int]:
@@ -505,13 +419,3 @@ def _starts(parts: list[np.ndarray]) -> np.ndarray:
 
 def _stacked_faces(parts: list[np.ndarray], starts: np.ndarray) -> np.ndarray:
     return np.concatenate([part + first for part, first in zip(parts, starts[:-1], strict=True)])
-
-
-def _spliced(name: str, whole: wp.array, part: wp.array | None, place: np.ndarray) -> wp.array:
-    """Put a part [batch, item] in its place, from one item up to another, in the whole [batch, item]."""
-    if part is None:
-        return splice(whole, [], lambda *_: whole)
-    first, end = place.tolist()
-    check.shape(name, part.shape, ("batch", end - first))
-    common_batch({"rest": whole, name: part})
-    return splice(whole, [(first, end)], lambda *_: part)

@@ -31,7 +31,13 @@ from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.ray_packets import FaceTree, build_face_tree
 from warpshadow.stages.receivers import Receivers, Span
 from warpshadow.stages.self_visibility.buried import find_buried, find_dilation
-from warpshadow.stages.self_visibility.lobes import BodyRotation, find_body_rotation, project_rows
+from warpshadow.stages.self_visibility.gather import gather_self_transmittance
+from warpshadow.stages.self_visibility.lobes import (
+    BodyRotation,
+    find_body_rotation,
+    project_rows,
+    self_visibility_lobes,
+)
 from warpshadow.stages.self_visibility.lookup import (
     ResamplingKernels,
     ResamplingWeights,
@@ -77,6 +83,10 @@ class SelfVisibilityLookup(NamedTuple):
         """The part that depends on the rotations, of shape [batch, …]."""
         return self.lookup.weights
 
+    def transmittance(self, normals: wp.array, weights: ProbeWeights) -> wp.array:
+        """Transmittance of receivers past their body, [batch, receiver, cell]."""
+        return gather_self_transmittance(normals, weights, self.lookup, self.kernels, self.rows)
+
 
 class SelfVisibilityLobes(NamedTuple):
     """The same where light is in harmonics: the body's lobes, and how they are turned."""
@@ -88,6 +98,10 @@ class SelfVisibilityLobes(NamedTuple):
     def turned(self) -> wp.array:
         """The part that depends on the rotations, of shape [batch, …]."""
         return self.turn.rotations
+
+    def of_receivers(self, weights: ProbeWeights, *, order: int, bands: int | None = None) -> wp.array:
+        """Lobes that their body leaves receivers, [batch, receiver, bands²]; by default all bands of an order."""
+        return self_visibility_lobes(self.lobes, weights, self.turn, order=order, bands=bands)
 
 
 class SelfVisibility:

@@ -55,9 +55,9 @@ def find_cell_transmittance(
     else:
         directions, transmittance_self = HARMONIC_GATHER_CELLS, None
         transmittance_nonplanar = _transmittance(method, group, nonplanar_bodies(merged_scene), spheres, directions)
-    body = group.body
-    if transmittance_self is None and body is not None and not group.is_solid and not merged_scene.is_flat[body]:
-        transmittance_self = _transmittance(method, group, [body], spheres, directions)
+    own = group.own
+    if transmittance_self is None and own is not None and not (own.is_solid or merged_scene.is_flat[own.number]):
+        transmittance_self = _transmittance(method, group, [own.number], spheres, directions)
     if transmittance_nonplanar is None:
         transmittance_nonplanar = wp.full(
             (*group.points.shape, len(directions)), 1.0, wp.float32, device=group.points.device

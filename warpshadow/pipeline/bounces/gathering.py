@@ -134,10 +134,10 @@ class Gathering:
         return [light for light in result if light is not None]
 
     def _from_itself(self, group: Group, _: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
-        if group.body not in outgoing.senders.bodies or self._is_flat[group.body]:
+        own = group.own
+        if own is None or own.number not in outgoing.senders.bodies or self._is_flat[own.number]:
             return None
-        assert group.body is not None and group.probe_weights is not None
-        return self_light(self._self_form_factors.of(group.body), outgoing.of_body(group.body), *group.probe_weights)
+        return self_light(self._self_form_factors.of(own.number), outgoing.of_body(own.number), *own.probe_weights)
 
     def _from_planes(self, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array:
         planes = outgoing.proxies.planes

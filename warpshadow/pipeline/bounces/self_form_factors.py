@@ -65,14 +65,13 @@ class SelfFormFactors:
         """Form factors of each patch sample of a group to the patches of its body, among all patches."""
         from scipy.sparse import csr_matrix
 
-        shape, body = (group.points.shape[1], len(senders.areas)), group.body
-        if body not in senders.bodies or senders.merged_scene.is_flat[body]:
+        shape, own = (group.points.shape[1], len(senders.areas)), group.own
+        if own is None or own.number not in senders.bodies or senders.merged_scene.is_flat[own.number]:
             return csr_matrix(shape, dtype=np.float32)
-        assert body is not None and group.probe_weights is not None
-        factors, (probes, weights) = self.of(body).to_scipy(), (item.numpy()[0] for item in group.probe_weights)
+        factors, (probes, weights) = self.of(own.number).to_scipy(), (item.numpy()[0] for item in own.probe_weights)
         starts = np.arange(0, probes.size + 1, 3)
         of_patches = csr_matrix((weights.ravel(), probes.ravel(), starts), (shape[0], factors.shape[0])) @ factors
-        first = senders.first[senders.bodies.index(body)]
+        first = senders.first[senders.bodies.index(own.number)]
         return csr_matrix((of_patches.data, of_patches.indices + first, of_patches.indptr), shape)
 
 

@@ -20,7 +20,6 @@ from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.shading.shell import ShellPatches
 from warpshadow.pipeline.shading.sphere_method import SphereMethod
 from warpshadow.stages.cached_cells import add_rows
-from warpshadow.stages.self_visibility.lobes import self_visibility_lobes
 from warpshadow.stages.transfer import sh_product, sh_transfer
 from warpshadow.stages.visibility import exponential, log_sh
 
@@ -104,13 +103,10 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
             lobes = zeros(visibility.coefficients.shape, dtype=wp.float32, device=visibility.coefficients.device)
             add_rows(group.cached_rows, lobes, channel=1)
             return lobes
-        if group.self_lookup is None or not group.points.size:
+        if group.own is None or group.own.lookup is None or not group.points.size:
             return None
-        assert group.probe_weights is not None and isinstance(group.self_lookup, SelfVisibilityLobes)
         bands = projected_light.bands if visibility.coefficients is None else self._order
-        return self_visibility_lobes(
-            group.self_lookup.lobes, group.probe_weights, group.self_lookup.turn, order=self._order, bands=bands
-        )
+        return group.own.lookup.of_receivers(group.own.probe_weights, order=self._order, bands=bands)
 
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """The log-visibility of the static spheres, for any light, [row, 1, order²]; and lobes, if one has its own."""
@@ -140,13 +136,8 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
             others = [other for other in static_bodies.bodies if not (other == body and body in traced)]
             rows[of_body, 0] = self._logs(*arguments, *static_bodies.spheres_of(others)).numpy()[0]
             if body in turned:
-                lobes, turn = turned[body]
-                result = self_visibility_lobes(
-                    lobes,
-                    self_visibility.probe_weights_of(body, vertices[of_body]),
-                    turn,
-                    order=self._order,
-                )
+                weights = self_visibility.probe_weights_of(body, vertices[of_body])
+                result = turned[body].of_receivers(weights, order=self._order)
             else:
                 result = sh_transfer(None, arguments[1], order=self._order)
             rows[of_body, 1] = result.numpy()[0]

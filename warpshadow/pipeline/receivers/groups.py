@@ -14,7 +14,7 @@ from warpshadow.device.launch import varies
 from warpshadow.pipeline.bodies.convex import GroupConvexParts, SceneConvexParts
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.planes import GroupPlanes, ScenePlanes
-from warpshadow.pipeline.bodies.self_visibility import SelfVisibility, SelfVisibilityLobes, SelfVisibilityLookup
+from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.stages.cached_cells import CachedRows
@@ -22,7 +22,6 @@ from warpshadow.stages.convex.prepared import PlacedParts
 from warpshadow.stages.planes.fronts import NearestBlockers, find_fronts, lifted_points
 from warpshadow.stages.planes.prepared import PlaneBlockers
 from warpshadow.stages.receivers import Receivers
-from warpshadow.stages.self_visibility.gather import gather_self_transmittance
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 
@@ -34,6 +33,21 @@ def nonplanar_bodies(merged_scene: MergedScene) -> list[int]:
     return [body for body in range(len(merged_scene.scene.bodies)) if not merged_scene.is_flat[body]]
 
 
+class OwnBody(NamedTuple):
+    """The body on which the receivers of a group lie, which may block their light."""
+
+    number: int
+    probe_weights: ProbeWeights  # where on it they lie
+    lookup: Any  # traced self-visibility, of the method's kind; None where there is none, or its spheres block
+    is_solid: bool  # whether it blocks its own light as its convex parts do
+    parts: GroupConvexParts | None  # these; None where it has one, which blocks none
+    corners: wp.array | None = None  # vertices farthest out, vec3 of shape [batch, corner]; None without planes
+
+    def cut(self, receivers: slice) -> OwnBody:
+        """Select some receivers."""
+        return self._replace(probe_weights=self.probe_weights.cut(receivers))
+
+
 class Group(NamedTuple):
     """Receivers whose light the same blockers block: of all bodies, all but their own, or those that move."""
 
@@ -42,16 +56,10 @@ class Group(NamedTuple):
     centers: wp.array  # [batch, sphere] vec3
     radii: wp.array  # [batch, sphere] float32
     cached_rows: CachedRows | None = None  # of static bodies, which block their light, too
-    body: int | None = None  # whose receivers they are, where bodies are told apart
-    probe_weights: ProbeWeights | None = None  # where they lie on that body
-    # by rays; None where there is none, or its spheres block
-    self_lookup: SelfVisibilityLookup | SelfVisibilityLobes | None = None
+    own: OwnBody | None = None  # where bodies are told apart
     planes: GroupPlanes | None = None  # bodies that block as planes; None without any
     convex_parts_around: GroupConvexParts | None = None  # bodies that block as convex parts; None without any
-    is_solid: bool = False  # whether that body blocks its own light as its convex parts do
-    own_parts: GroupConvexParts | None = None  # these; None where it has one, which blocks none
     nearest_blockers: NearestBlockers | None = None  # None where receivers are not patch samples
-    corners: wp.array | None = None  # of the body, vec3 of shape [batch, corner]; None where it is not known
     skip: tuple[int, int] = (0, 0)  # spheres that do not block: the first, and the one after the last
     clusters: ClusterTree | None = None  # of the spheres, where they are found already
 
@@ -61,9 +69,14 @@ class Group(NamedTuple):
         return self.planes is not None and bool(self.points.size and self.planes.blocking)
 
     @property
-    def has_own_coverage(self) -> bool:
-        """Whether convex parts of the receivers' own body block their light."""
-        return self.own_parts is not None and bool(self.points.size)
+    def body(self) -> int | None:
+        """The body whose receivers they are, where bodies are told apart."""
+        return None if self.own is None else self.own.number
+
+    @property
+    def own_parts(self) -> GroupConvexParts | None:
+        """Convex parts of the receivers' own body that block their light; None without any."""
+        return None if self.own is None or not self.points.size else self.own.parts
 
     def own_coverage(self, directions: np.ndarray, radius: float | None = None) -> wp.array:
         """Coverage of cells by them."""
@@ -72,17 +85,16 @@ class Group(NamedTuple):
 
     def looked_up_transmittance(self) -> wp.array | None:
         """Transmittance past the receivers' own body, looked up, [batch, receiver, cell]; None without rows."""
-        if self.self_lookup is None or not self.points.size:
+        if self.own is None or self.own.lookup is None or not self.points.size:
             return None
-        assert self.probe_weights is not None and isinstance(self.self_lookup, SelfVisibilityLookup)
-        rows, lookup, kernels, _rays = self.self_lookup
-        return gather_self_transmittance(self.normals, self.probe_weights, lookup, kernels, rows)
+        return self.own.lookup.transmittance(self.normals, self.own.probe_weights)
 
     def lifted_points_and_fronts(
         self, frames: wp.array, planes: PlaneBlockers, skip: int | None
     ) -> tuple[wp.array, wp.array]:
         """Positions, lifted off planes that they lie in, and the part of each front that the receivers see."""
-        fronts = find_fronts(self.points, self.normals, self.corners, self.nearest_blockers, frames, planes)
+        corners = None if self.own is None else self.own.corners
+        fronts = find_fronts(self.points, self.normals, corners, self.nearest_blockers, frames, planes)
         return lifted_points(self.points, fronts, frames, planes, skip), fronts
 
     def portions(self) -> Iterator[Group]:
@@ -90,10 +102,11 @@ class Group(NamedTuple):
 
         For a gradient all of them come at once, and so do receivers with cached rows.
         """
-        self_lookup, planes, clusters = self.self_lookup, self.planes, self.clusters
-        rotation_data = None if self_lookup is None else self_lookup.turned
+        own, planes, clusters = self.own, self.planes, self.clusters
+        rotation_data = None if own is None or own.lookup is None else own.lookup.turned
+        body_corners = None if own is None else own.corners
         frames = None if planes is None else planes.frames
-        parts = self.convex_parts_around or self.own_parts
+        parts = self.convex_parts_around or (None if own is None else own.parts)
         part_corners = None if parts is None else parts.placed.corners
         arguments = points, normals, centers, radii = self[:4]
         if radii.shape[1] or any(array is not None for array in (rotation_data, frames, part_corners)):
@@ -104,14 +117,14 @@ class Group(NamedTuple):
                 "rotations": rotation_data,
                 "planes": frames,
             }
-            count = common_batch(arrays | {"corners": self.corners, "parts": part_corners})
+            count = common_batch(arrays | {"corners": body_corners, "parts": part_corners})
             points, normals, centers, radii = [expand(array, count) for array in arguments]
             clusters = clusters if radii is self.radii and centers is self.centers else None
         size = points.shape[1]
         if (
             self.cached_rows is not None
             or size <= RECEIVERS_AT_ONCE
-            or varies([*arguments, rotation_data, frames, part_corners, self.corners])
+            or varies([*arguments, rotation_data, frames, part_corners, body_corners])
         ):
             yield self._replace(points=points, normals=normals, centers=centers, radii=radii, clusters=clusters)
             return
@@ -122,7 +135,7 @@ class Group(NamedTuple):
                 normals=normals[:, portion].contiguous(),
                 centers=centers,
                 radii=radii,
-                probe_weights=None if self.probe_weights is None else self.probe_weights.cut(portion),
+                own=None if own is None else own.cut(portion),
                 nearest_blockers=None if self.nearest_blockers is None else self.nearest_blockers.cut(portion),
                 clusters=clusters,
             )
@@ -277,13 +290,17 @@ def _groups_that_move(
             clusters = clusters or find_clusters(*spheres, blockers.merging)
             group = group._replace(skip=skip, clusters=clusters)
         if span.body >= 0:
-            is_solid = span.body in blockers.blocker_kinds.solids
-            group = group._replace(is_solid=is_solid, own_parts=blockers.own_parts(span.body))
-            weights = blockers.self_visibility.probe_weights(receivers, span)
-            group = group._replace(body=span.body, probe_weights=weights, self_lookup=self_lookups.get(span.body))
+            own = OwnBody(
+                span.body,
+                blockers.self_visibility.probe_weights(receivers, span),
+                self_lookups.get(span.body),
+                span.body in blockers.blocker_kinds.solids,
+                blockers.own_parts(span.body),
+            )
             if corners is not None:
                 bounds = blockers.planes.first_corner[span.body : span.body + 2].tolist()
-                group = group._replace(corners=cut(corners, *bounds))
+                own = own._replace(corners=cut(corners, *bounds))
+            group = group._replace(own=own)
         if nearest_blockers is not None:
             group = group._replace(nearest_blockers=nearest_blockers.cut(slice(span.first, span.end)))
         yield group

@@ -268,7 +268,7 @@ def _find_transmittances(
         return
     cells = (
         transmittance_past(None, group.own_coverage(EMITTER_CELLS))
-        if group.has_own_coverage
+        if group.own_parts is not None
         else group.looked_up_transmittance()
     )
     sphere_bodies = blockers.sphere_blockers(blockers.bodies)

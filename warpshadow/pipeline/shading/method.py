@@ -21,6 +21,8 @@ from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds,
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.transfers import Light, ShellLight, check_light, shade_free
 from warpshadow.stages.gloss.prefilter import prefilter
+from warpshadow.stages.quadtree import Quadtree
+from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import Numbering, number_receivers
 from warpshadow.stages.shell.beams import check_shell, shell_array
 
@@ -104,6 +106,19 @@ class Method:
         adaptive = np.array([body.receivers == "adaptive" for body in self.merged_scene.scene.bodies])
         is_known = not (self.lights_samples or self.has_emitters or self.shell is not None)
         return adaptive & self.merged_scene.is_flat & is_known
+
+    def find_squares(
+        self,
+        blocker_kinds: BlockerKinds,
+        positions: wp.array,
+        normals: wp.array,
+        fragments: Fragments,
+        spheres: tuple[wp.array, wp.array],
+        is_adaptive: np.ndarray,
+        supersampling: int,
+    ) -> Quadtree | None:
+        """Find the squares in which samples of adaptive bodies interpolate (:func:`.adaptive.find_squares`)."""
+        return None
 
     def can_receive(self, blocker_kinds: BlockerKinds) -> np.ndarray:
         """Vertices that may be receivers, and vertices whose backs may be, bool of shape [2, vertex]."""

@@ -21,6 +21,8 @@ from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.shading.method import LightInput, Method
 from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, joined
+from warpshadow.stages.quadtree import Quadtree
+from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.shading import shade
 
@@ -128,7 +130,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         raise NotImplementedError
 
     def self_lookups(self, bodies: tuple[int, ...], rotations: wp.array, projected_light: Projected) -> dict[int, Any]:
-        """Self-visibility of receivers of some bodies, :attr:`Group.self_lookup` by body. Differentiable: rotations."""
+        """Self-visibility of receivers of some bodies, :attr:`.OwnBody.lookup` by body. Differentiable: rotations."""
         raise NotImplementedError
 
     def find_visibility(self, group: Group, projected_light: Projected) -> FoundVisibility:
@@ -146,6 +148,23 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     def shade_transmittance(self, visibility: FoundVisibility, group: Group, projected_light: Projected) -> wp.array:
         """Shading of a group in known light."""
         raise NotImplementedError
+
+    def find_squares(
+        self,
+        blocker_kinds: BlockerKinds,
+        positions: wp.array,
+        normals: wp.array,
+        fragments: Fragments,
+        spheres: tuple[wp.array, wp.array],
+        is_adaptive: np.ndarray,
+        supersampling: int,
+    ) -> Quadtree:
+        """Find the squares in which samples of adaptive bodies interpolate."""
+        from warpshadow.pipeline.receivers.adaptive import find_squares
+
+        place = functools.partial(self.scene_blockers.placed, blocker_kinds)
+        seen = positions, normals, fragments, spheres
+        return find_squares(place, self.sharp_share, *seen, is_adaptive, supersampling)
 
     def sharp_share(self, group: Group) -> np.ndarray | None:
         """Share of a group's unblocked light that comes from the cells with the sharpest shadows.

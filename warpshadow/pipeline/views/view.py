@@ -7,24 +7,23 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.camera import Camera
-from warpshadow.device.cuda_graph import is_readable
-from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials, SampleReflectance
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached, field_of, identity
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.pipeline.shading.transfers import Light
 from warpshadow.pipeline.transport import LightTransport
+from warpshadow.pipeline.views.receiver_finder import ReceiverFinder
 from warpshadow.stages.film import average, sample_radiance, sum_radiance
 from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.project import to_clip
 from warpshadow.stages.rasterization import Fragments, rasterize
-from warpshadow.stages.receivers import Receivers, find_receivers, number_receivers, seen_vertices
+from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sides import find_sides
 from warpshadow.stages.silhouettes.find import Silhouettes, find_silhouettes
 from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
-from warpshadow.stages.slopes import find_mean_slopes, moving_radiance
+from warpshadow.stages.slopes import moving_radiance
 from warpshadow.stages.textures.footprint import Footprints
 from warpshadow.stages.textures.sample import sample_albedo, textured_radiance
 from warpshadow.stages.textures.seen import seen_texels
@@ -32,10 +31,6 @@ from warpshadow.stages.textures.seen import seen_texels
 if TYPE_CHECKING:
     from warpshadow.pipeline.receivers.static import StaticBodies
     from warpshadow.stages.photograph import RatioImage
-
-MAX_SHARED = 2
-"""Samples of a pixel across in stills up to which those on a smooth surface share a receiver: whoever asks for more
-wants edges and bumps within pixels resolved."""
 
 
 class View(LitPoints):
@@ -136,8 +131,8 @@ class View(LitPoints):
         arguments = [vertices, normals, seen, detached(silhouettes), detached(clip)]
         if method.is_adaptive.any():
             arguments.append(detached(spheres))
-        receive = functools.partial(_receive, method, blocker_kinds, static_bodies, self._supersampling)
-        receivers = Node("receivers", receive, *arguments, items=item_text)
+        finder = ReceiverFinder(method, blocker_kinds, static_bodies, self._supersampling)
+        receivers = Node("receivers", finder.find, *arguments, items=item_text)
         self.clip_positions, self.fragments_node, self.silhouettes = clip, sides, silhouettes
         return normals, receivers
 
@@ -392,78 +387,3 @@ def _white_shading(receivers: Receivers) -> wp.array:
     """Light of 1 on all receivers, vec3 of shape [1, receiver]."""
     count = len(receivers.on_static) + receivers.points.shape[1]
     return wp.full((1, count), wp.vec3(1.0), dtype=wp.vec3, device=receivers.points.device)
-
-
-def _receive(
-    method: Method,
-    blocker_kinds: BlockerKinds,
-    static_bodies: "StaticBodies | None",
-    supersampling: int,
-    positions: wp.array,
-    normals: wp.array,
-    fragments: Fragments,
-    silhouettes: Silhouettes,
-    clip_positions: wp.array,
-    spheres: tuple[wp.array, wp.array] | None = None,
-) -> Receivers:
-    """Receivers at the vertices that are seen, or at all where that cannot be read without waiting."""
-    merged_scene, quadtree, has_backs = method.merged_scene, None, fragments.sides is not None
-    keeps_vertex = method.can_receive(blocker_kinds)[: 1 + has_backs]
-    wants_samples, separate_bodies = method.samples_receive(blocker_kinds), method.separate_bodies(blocker_kinds)
-    on_static_body = None if static_bodies is None else static_bodies.has_vertex
-    bodies = None if separate_bodies is None else separate_bodies[merged_scene.body_of_vertex]
-    if is_readable(merged_scene.device):
-        by_rows = method.is_adaptive & _has_cached_shadows(merged_scene, static_bodies)
-        if by_rows.any():
-            keeps_vertex = keeps_vertex | by_rows[merged_scene.body_of_vertex]
-            wants_samples = wants_samples & ~by_rows
-        keeps_vertex = keeps_vertex & seen_vertices(fragments, silhouettes, keeps_vertex.shape[1])
-        numbering = number_receivers(
-            keeps_vertex, on_static_body, merged_scene.vertex_order, bodies, device=merged_scene.device
-        )
-        if spheres is not None and (is_adaptive := method.is_adaptive & wants_samples).any():
-            from warpshadow.pipeline.receivers.adaptive import find_squares
-            from warpshadow.pipeline.shading.sphere_method import SphereMethod
-
-            assert isinstance(method, SphereMethod)
-            place = functools.partial(method.scene_blockers.placed, blocker_kinds)
-            seen = positions, normals, fragments, spheres
-            quadtree = find_squares(place, method.sharp_share, *seen, is_adaptive, supersampling)
-    else:
-        numbering = method.numbering(blocker_kinds, has_backs, static_bodies)
-    bodies = None if separate_bodies is None else separate_bodies[merged_scene.body_of_face]
-    arguments = (
-        positions,
-        normals,
-        merged_scene.faces,
-        fragments,
-        numbering,
-        wants_samples[merged_scene.body_of_face],
-    )
-    smooth_pieces = None
-    if method.shares_directions:
-        if supersampling > MAX_SHARED:
-            supersampling = 1  # each sample is a receiver
-        else:
-            smooth_pieces = merged_scene.smooth_pieces
-    has_mean_slope = None
-    if wants_samples.any() and fragments.barycentrics.requires_grad:
-        has_mean_slope = find_mean_slopes(silhouettes, clip_positions, quadtree)
-    return find_receivers(
-        *arguments,
-        bodies=bodies,
-        supersampling=supersampling,
-        quadtree=quadtree,
-        rises=method.lights_samples,
-        smooth_pieces=smooth_pieces,
-        has_mean_slope=has_mean_slope,
-    )
-
-
-def _has_cached_shadows(merged_scene: MergedScene, static_bodies: "StaticBodies | None") -> np.ndarray:
-    """Static bodies on which shadows of others are cached at vertices, bool of shape [body]."""
-    result = np.zeros(len(merged_scene.scene.bodies), bool)
-    if static_bodies is not None:
-        casting = [body for body in static_bodies.bodies if merged_scene.scene.bodies[body].casts_shadow]
-        result[[body for body in static_bodies.bodies if set(casting) - {body}]] = True
-    return result

@@ -1,0 +1,107 @@
+"""Receivers of a view: at the vertices that it shows, at samples, and on flat bodies at the corners of squares."""
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.cuda_graph import is_readable
+from warpshadow.pipeline.receivers.lit_points import BlockerKinds
+from warpshadow.pipeline.receivers.static import StaticBodies
+from warpshadow.pipeline.shading.method import Method
+from warpshadow.stages.rasterization import Fragments
+from warpshadow.stages.receivers import Numbering, Receivers, find_receivers, number_receivers, seen_vertices
+from warpshadow.stages.silhouettes.find import Silhouettes
+from warpshadow.stages.slopes import find_mean_slopes
+
+MAX_SHARED = 2
+"""Samples of a pixel across in stills up to which those on a smooth surface share a receiver: whoever asks for more
+wants edges and bumps within pixels resolved."""
+
+
+class ReceiverFinder:
+    """Finds the receivers of a view: which bodies have them where is known before anything is drawn.
+
+    Args:
+        method: Method of visibility.
+        blocker_kinds: Which bodies block light by something else than their spheres.
+        static_bodies: Those among moving ones; None where any may move.
+        supersampling: Samples of a pixel across and down.
+    """
+
+    def __init__(
+        self,
+        method: Method,
+        blocker_kinds: BlockerKinds,
+        static_bodies: StaticBodies | None,
+        supersampling: int,
+    ):
+        self._method, self._blocker_kinds, self._static_bodies = method, blocker_kinds, static_bodies
+        self._merged_scene = method.merged_scene
+        self._separate_bodies = method.separate_bodies(blocker_kinds)
+        self._supersampling = supersampling
+        self._shares_surfaces = method.shares_directions and supersampling <= MAX_SHARED
+
+    def find(
+        self,
+        positions: wp.array,
+        normals: wp.array,
+        fragments: Fragments,
+        silhouettes: Silhouettes,
+        clip_positions: wp.array,
+        spheres: tuple[wp.array, wp.array] | None = None,
+    ) -> Receivers:
+        """Find the receivers of all instances.
+
+        Args:
+            positions, normals: Of the vertices, vec3 of shape [batch, vertex].
+            fragments: The fragments, with sides where a body is open.
+            silhouettes: Edges behind which vertices are needed, too.
+            clip_positions: Vertices in clip space, vec4 of shape [batch, vertex].
+            spheres: Centers and radii of all spheres, where bodies are adaptive.
+        Differentiable: positions, normals, barycentrics of the fragments.
+        """
+        method, merged_scene, quadtree, has_mean_slope = self._method, self._merged_scene, None, None
+        has_backs, at_samples = fragments.sides is not None, method.samples_receive(self._blocker_kinds)
+        if not is_readable(merged_scene.device):
+            numbering = method.numbering(self._blocker_kinds, has_backs, self._static_bodies)
+        else:
+            has_cached_rows = method.is_adaptive & self._bodies_with_cached_rows()  # cheaper than receivers at samples
+            at_samples = at_samples & ~has_cached_rows
+            numbering = self._number_seen(seen_vertices(fragments, silhouettes, positions.shape[1]), has_cached_rows)
+            if spheres is not None and (is_adaptive := method.is_adaptive & at_samples).any():
+                seen = positions, normals, fragments, spheres
+                quadtree = method.find_squares(self._blocker_kinds, *seen, is_adaptive, self._supersampling)
+        if at_samples.any() and fragments.barycentrics.requires_grad:
+            has_mean_slope = find_mean_slopes(silhouettes, clip_positions, quadtree)
+        return find_receivers(
+            positions,
+            normals,
+            merged_scene.faces,
+            fragments,
+            numbering,
+            at_samples[merged_scene.body_of_face],
+            bodies=None if self._separate_bodies is None else self._separate_bodies[merged_scene.body_of_face],
+            supersampling=1 if method.shares_directions and not self._shares_surfaces else self._supersampling,
+            quadtree=quadtree,
+            rises=method.lights_samples,
+            smooth_pieces=merged_scene.smooth_pieces if self._shares_surfaces else None,
+            has_mean_slope=has_mean_slope,
+        )
+
+    def _number_seen(self, is_seen: np.ndarray, has_cached_rows: np.ndarray) -> Numbering:
+        """Number the vertices that are seen, of bodies with receivers there and of bodies with cached rows."""
+        merged_scene, static_bodies, separate = self._merged_scene, self._static_bodies, self._separate_bodies
+        keeps_vertex = self._method.can_receive(self._blocker_kinds) | has_cached_rows[merged_scene.body_of_vertex]
+        return number_receivers(
+            keeps_vertex[: len(is_seen)] & is_seen,
+            None if static_bodies is None else static_bodies.has_vertex,
+            merged_scene.vertex_order,
+            None if separate is None else separate[merged_scene.body_of_vertex],
+            device=merged_scene.device,
+        )
+
+    def _bodies_with_cached_rows(self) -> np.ndarray:
+        """Static bodies on which shadows of others are cached at vertices, bool of shape [body]."""
+        bodies = self._merged_scene.scene.bodies
+        static = [] if self._static_bodies is None else self._static_bodies.bodies
+        casting = {number for number in static if bodies[number].casts_shadow}
+        return np.array([number in static and bool(casting - {number}) for number in range(len(bodies))])
