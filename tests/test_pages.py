@@ -119,6 +119,18 @@ def test_every_file_of_a_folder_stands_on_its_page(folder, files):
     assert not [name_of(file) for file in files if file.stem != "__init__" and f"`{file.name}`" not in page]
 
 
+def test_every_room_of_the_pipeline_stands_on_its_page_with_classes_that_it_has():
+    pipeline = ROOT / "warpshadow" / "pipeline"
+    (table,) = re.findall(r"^\| room \|.*\n(?:\|.*\n)+", (pipeline / "README.md").read_text("utf-8"), re.MULTILINE)
+    rooms = {path.name + "/" * path.is_dir() for path in pipeline.iterdir() if not path.name.startswith("__")}
+    assert not [room for room in rooms - {"README.md"} if f"`{room}`" not in table]
+    for row in table.splitlines()[2:]:
+        room, *_, classes = [cell.strip(" `") for cell in row.strip("|").split("|")]
+        places = [f"/pipeline/{name}" for name in re.findall(r"[\w.]+/?", room)]
+        source = "".join(text for file, text in SOURCES.items() if any(place in file.as_posix() for place in places))
+        assert not [name for name in re.findall(r"`([A-Z]\w+)`", f"`{classes}`") if f"class {name}" not in source], room
+
+
 CACHING = ("cached", "cached_of_bodies", "cached_for_light")  # methods that take the node's name first
 
 
@@ -303,7 +315,9 @@ def scene_file():
 
 
 def test_the_scene_file_is_one(folder):
-    short, scene, path, inserted, automatic = blocks(ROOT / "warpshadow" / "scene" / "README.md", "toml")
+    short, scene, inserted = blocks(ROOT / "warpshadow" / "scene" / "README.md", "toml")
+    (path,) = blocks(ROOT / "warpshadow" / "cli" / "README.md", "toml")
+    (automatic,) = blocks(ROOT / "warpshadow" / "tuning" / "README.md", "toml")
     Path("short.toml").write_text(short, "utf-8")
     assert [body.casts_shadow for body in ws.load_scene("short.toml").bodies] == [True, True]
     Path("scene.toml").write_text(scene, "utf-8")
@@ -396,7 +410,7 @@ def test_snippets_run_as_they_stand(folder, monkeypatch, capsys):
     recovered = ws.render(ws.load_scene(Path("recovered", "scene.toml")))
     assert np.abs(recovered - image).mean() < 0.1 * image.mean()
     ws.write_image("photo.exr", image.reshape(64, 4, 64, 4, 4).mean(axis=(1, 3)))
-    for page in ("scene", "pipeline", "inverse"):
+    for page in ("assets", "cli", "scene", "torch", "pipeline", "inverse"):
         for snippet in blocks(ROOT / "warpshadow" / page / "README.md", "python"):
             exec(snippet, names)
     assert "receivers" in capsys.readouterr().out  # what explain says

@@ -96,7 +96,7 @@ def render(
     camera_path: Annotated[
         Optional[Path],
         typer.Option(
-            help="Write a video along the keyframes of a TOML file, whose keys warpshadow/scene/README.md lists.",
+            help="Write a video along the keyframes of a TOML file, whose keys warpshadow/cli/README.md lists.",
             rich_help_panel=_VIDEOS,
         ),
     ] = None,

@@ -6,10 +6,19 @@ vector register has floats on a CPU, 1 on a GPU, where threads play that part. A
 [batch, vertex, …]; vectors of lanes fill scratch memory, and arrays that one stage stores for its adjoint. A block that
 runs past the last receiver repeats it, and writes it once.
 
-Small functions on structs are inlined by force. Otherwise LLVM calls them, and copies the structs through memory.
+Small functions on structs are inlined by force. Otherwise LLVM calls them, and copies the structs through memory:
+kernels of visibility take 1.1 to 1.35 times as long.
 
 How wide registers are is asked of the LLVM that compiles the kernels. For some CPUs it prefers narrower ones than there
-are, so the width is among the flags. ``python demos/benchmarks/lane_choice.py`` times the alternatives.
+are, so the width is among the flags. ``python demos/benchmarks/lane_choice.py`` times the alternatives; forward and
+backward, one thread, AMD EPYC (Zen 4), in ms:
+
+| lanes in registers of | `directional` | log-SH, sum | log-SH, exponentiation |
+| --- | --- | --- | --- |
+| 16 in 512 bits (chosen) | 42 | 42 | 87 |
+| 16 in 256 | 65 | 68 | 78 |
+| 8 in 256 (as with AVX2) | 50 | 44 | 120 |
+| 4 in 128 (as with SSE, Neon) | 72 | 77 | 198 |
 """
 
 import contextlib

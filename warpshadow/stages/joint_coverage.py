@@ -13,6 +13,8 @@ the same direction. With ν(h) the moment of a half-plane that covers h, which i
     T = (1 − |k|) Π (1 − h) + |k| (max(0, 1 − Σ h) where k < 0, else 1 − max h)
 
 Together they cover h = 1 − T, with the moment μ = T′ Σ μ, T′ = (1 − T) / Σ h.
+
+A barn of planks under an even sky is 2% off, as if blockers were independent it would be 23% too bright.
 """
 
 import warp as wp

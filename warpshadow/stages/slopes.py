@@ -1,22 +1,21 @@
 """Slopes: how samples change as surfaces move over the screen, by the mean gradient of color over each sample.
 
-A surface of color c that moves over the screen by v changes a sample by −∇c · v. Were faces large, ∇c could be that of
-the face at the sample's point. But where they are as small as samples, it is one of many; and towards a limb, where
-shading changes faster and faster, it is far from the mean. So the mean over the sample is taken. To its right color
-changes by
+A surface of color c that moves over the screen by v changes a sample by −∇c · v. At the sample's point ∇c is that of
+one face, of many where faces are as small as samples; and towards a limb, where shading changes faster and faster, it
+is far from the mean. So the mean over the sample is taken. To the right of the sample color changes by
 
     ½ (c_right − c) over ½ sample    if the neighbor's center is on the surface,
     c_edge − c over t samples        if the surface has an edge before, of color c_edge at distance t,
 
-and likewise to the other sides. Beyond ½ sample that is the part of the neighbor which has this sample's color: so the
-steps of color along a row add up to that from edge to edge, which moving edges take back. Where something else comes in
-front before the neighbor's center, or the image ends, there is nothing to be known, and the opposite half counts alone.
-Where all neighbors see the same face, the slope is the face's own.
+and likewise to the other sides. An edge at t > ½ lies within the neighbor, whose part before the edge has this sample's
+color. With that part, steps of color along a row add up to the change from edge to edge, which the derivative of the
+moving edges subtracts. Where another surface comes in front before the neighbor's center, or the image ends, the
+opposite half counts alone. Where all neighbors see the same face, the slope is the face's own.
 
 A sample that is a receiver itself has the exact derivative at its point instead, except beside the outline of its
 surface. There the exact slope is often tiny and rarely huge, as it grows without bound towards a limb, and does not
-match the colors at the edges: gradients of a mirroring ball are half of the differences of images. By mean slopes, of
-the samples along an outline and of their neighbors, the colors of edges cancel.
+match the colors at the edges: gradients of a mirroring ball are half of the differences of images. With mean slopes of
+the samples along an outline, and of their neighbors, the colors of edges cancel.
 """
 
 from dataclasses import replace

@@ -297,7 +297,7 @@ class _WarpAdjoint(torch.autograd.Function):
     def backward(ctx, *directions: torch.Tensor | None):
         creates_graph = torch.is_grad_enabled()
         with torch.enable_grad():
-            # seen anew, so that a path from one of them to another is not followed here
+            # views, so that gradients end here where one argument was computed from another
             arguments = [tensor.view_as(tensor) for tensor in ctx.saved_tensors]
             changes = ctx.call.moved(arguments[: ctx.count], directions)
             pairs = zip(arguments[ctx.count :], changes, strict=True)

@@ -1,20 +1,23 @@
 """Bounces between static patches: rays once for a geometry, then small matrices for each light and reflectance.
 
-Of patches p, points x on them at which they are lit (patch samples s), and receivers, rays find the form factors F
-once. With direct shading S and albedo a an iteration finds the radiosity of patches after n − 1 bounces, or after all,
+Rays find the form factors F from patches to patch samples, the points at which patches are lit, and to receivers, once.
+With direct shading S and albedo a an iteration finds the radiosity of patches after n − 1 bounces, or after all,
 
     B = a (M S + M F B),  M the mean over patch samples outside of other bodies,        starting from B = a M S,
 
-and receivers gather F B. Light that a body sends to itself may go on for longer than that.
-Receivers of an image are many: F is found at some of them, and interpolated.
+and receivers gather F B. Light that a body sends to itself may go on for longer than that. Receivers of an image are
+many: F is found at some of them, and interpolated.
 
 Direct light and form factors must agree on how much of a hemisphere is open: where spheres block a part 1 − s of an
 even sky, and rays hit bodies in a part f, F is scaled by (1 − s) / f. Otherwise light is gained and lost: eighteen
-white balls in a white furnace were 0.91 to 1.06 bright. Points inside another body see its inside; they count neither
-in means over the patch samples of a patch nor as cache points. A patch that has no other patch samples sticks out
-between them, if it is seen: it has the light of the nearest patch of its body. The radiosity is linear in light: of
-free light among bodies whose colors are known all of it is one matrix, which is cached. Differentiable in light and
-albedo.
+white balls in a white furnace were 0.91 to 1.06 bright.
+
+Points inside another body see its inside; they count neither in means over patch samples nor as cache points. Where all
+patch samples of a patch are inside, a part of the patch between them may be seen: it has the light of the nearest patch
+of its body.
+
+The radiosity is linear in light: of free light among bodies whose colors are known all of it is one matrix, which is
+cached. Differentiable in light and albedo.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ has a basis, light is free, and nobody knows where edges will be.
 
 Between vertices light is interpolated, which shows where a face is large, or small and long, as spokes and rails are;
 so faces count by their pixels and by their longest edges. A picture that is made once can afford per-pixel receivers on
-its grounds and walls, where shadows' edges show most. this folder's README.md has the figures.
+its grounds and walls, where shadows' edges show most.
 """
 
 import dataclasses
@@ -35,7 +35,9 @@ from warpshadow.stages.rasterization import rasterize
 from warpshadow.stages.visibility.sharp_cells import find_sharp_cells
 
 LARGE_FACE = 16.0
-"""Pixels of an average face beyond which a body is shaded by pixel, in images of up to 256 × 256 pixels …"""
+"""Pixels of an average face beyond which a body is shaded by pixel, in images of up to 256 × 256 pixels: a ground of
+32² quads under a sky with a sun (34 pixels a face) is 5.8% off at vertices, by pixel 2.9% in 3.5 times the time; one of
+64² quads (9 pixels) 4.0%, and 2.9% in 4 times the time …"""
 
 LARGE_SHARE = 2.0**-12
 """… and in larger images its share of them, since cost grows with pixels and the error of interpolation does not …"""
@@ -58,9 +60,16 @@ and cylinders of 100 pixels each the worst one was 33% too dark at vertices, and
 
 UNEVEN = 0.06
 """Error of light that is interpolated between vertices, relative L2, from which a body is shaded by pixel, or a flat
-one adaptively."""
+one adaptively. Renderers' images of demos/kinds.py, 128² pixels, direct light, are off at vertices, and by pixel, where
+that error is 25% (a stone in a pile) by 2.9 and 1.8%; 19% (a small bear) 3.7 and 2.2%; 18% (a bracket) 2.9 and 1.9%;
+12% (a bear in a bowl) 3.1 and 2.6%; 7% (dunes) 5.5 and 4.0%; 4% (a bowl) 2.6 and 2.6%, in 1.15 to 2.2 times the time.
+Grounds that are adaptive by it: under slats 6.3 and 2.0%, of the city 6.4 and 2.3%. Smooth bodies alone on a ground
+have 2 to 4%.
+"""
 
-_LONG_SHARE = 0.05  # share of a body's pixels that its longest faces show …
+_LONG_SHARE = 0.05
+"""Share of a body's pixels that its longest faces show: in 256² pixels such faces are longer than 8 to 12 pixels on
+scans and a torus of 48 × 24 quads, but than 56 to 145 on cylinders, capsules, wheels and fences …"""
 
 _LENGTHS = 4.0
 """… and how often such a face may be as long as the side of a square of as many pixels as an average face may have."""
@@ -152,9 +161,11 @@ def for_picture(scene: Scene) -> Scene:
 
     By other methods flat bodies that leave their receivers open are shaded by pixel, unless spheres bulge out of them.
 
-    Interpolation between the vertices of a ground makes shadows' edges jagged. Under a sun so are all other bodies,
-    and where their shadows on themselves are "traced", a sun's are found by "rays", as nobody asks for a gradient:
-    edges are as clean as of ``ray-traced``.
+    Interpolation between the vertices of a ground makes shadows' edges jagged. Under a sun so are all other bodies, and
+    where their shadows on themselves are "traced", a sun's are found by "rays", as nobody asks for a gradient: edges
+    are as clean as of ``ray-traced``. At 768 × 768 pixels, under a sun of 1° radius, at vertices, by pixel, and by
+    pixel with rays, the cow of 2930 vertices is 3.4, 2.0 and 1.2% off (0.13, 0.31 and 0.35 s), a bear of 1986 vertices
+    7.3, 3.6 and 1.9% (0.11, 0.20 and 0.34 s).
     """
     if scene.visibility.method is None:
         if not any(isinstance(body.blockers, Spheres) or body.self_shadows for body in scene.bodies):

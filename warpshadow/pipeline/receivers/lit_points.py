@@ -30,8 +30,8 @@ class BlockerKinds(NamedTuple):
     why_spheres: tuple[str, ...] = ()  # of each body, why it blocks its own light by spheres; empty for others
     planes: tuple[int, ...] = ()  # bodies that block all light as the planes in which they lie
     convex: tuple[int, ...] = ()  # bodies that block the light of others by the convex parts that they consist of
-    solids: tuple[int, ...] = ()  # those that block their own by them, too; others are traced
-    bulging: tuple[int, ...] = ()  # bodies out of which spheres bulge: they receive at vertices, for any choice
+    solids: tuple[int, ...] = ()  # convex bodies whose parts block their own light, too; of others rays are traced
+    bulging: tuple[int, ...] = ()  # bodies out of which their spheres bulge: receivers are vertices, whatever is chosen
 
     @property
     def separate(self) -> set[int]:

@@ -21,13 +21,17 @@ _NEAR_SPOT = 2.0  # half-angles of a spot within which light is its own: of the 
 
 
 class ProjectedCells(NamedTuple):
-    """Light in cells."""
+    """Light in cells, and the directions that stand for a cell.
+
+    ``directions`` are those that blockers are tested in, ``mean_directions`` those of the cosine, ``spots`` the
+    brightest part of a cell, whose shadow has an edge of its own, and ``samples`` all of its light.
+    """
 
     directions: np.ndarray  # [direction, 3]: to light of the cells, past the spots of sharp ones
     coefficients: wp.array | None = None  # of known light, vec3 of shape [1, direction]
-    mean_directions: np.ndarray | None = None  # to all known light of the cells, by which it falls in [direction, 3]
+    mean_directions: np.ndarray | None = None  # to all known light of the cells, for the cosine [direction, 3]
     spots: np.ndarray | None = None  # where the brightest part of known light is in its cells [direction, 3]
-    half_angles: np.ndarray | None = None  # half-angles of where known light comes from in its cells [direction]
+    half_angles: np.ndarray | None = None  # half-angles of those spots [direction]
     sharp_cells: SharpCells | None = None  # cells that a sun is in, where spheres block it
     sharp_cells_past_planes: SharpCells | None = None  # and where planes do
     spot_shares: np.ndarray | None = None  # share of the light of sharp cells that their spot has [direction]
@@ -37,7 +41,7 @@ class ProjectedCells(NamedTuple):
 
     @property
     def facing(self) -> np.ndarray:
-        """Directions by whose cosine light falls in, [direction, 3]."""
+        """Directions for the cosine, [direction, 3]."""
         return self.directions if self.mean_directions is None else self.mean_directions
 
     def with_coefficients(self, coefficients: wp.array) -> ProjectedCells:

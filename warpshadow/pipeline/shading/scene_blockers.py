@@ -74,8 +74,9 @@ class SceneBlockers:
     def _can_bulge(self) -> list[bool]:
         """Whether each body is thin, so that its spheres bulge out of it, and its receivers were chosen, not asked for.
 
-        They are at vertices where its spheres block its own light: receivers/README.md has figures. Images of others
-        are nearer to rays by pixel.
+        They are at vertices where its spheres block its own light. By pixel, and at vertices, in 64² pixels, arched
+        cloth is 39% and 23% too dark, and gradients to its vertices are 80% and 9% off; a table of five boxes 7 and 1%,
+        162 and 15%; a wall of four boxes 6 and 1%, 40 and 19%. Images of others are nearer to rays by pixel.
         """
         are_chosen = self._merged_scene.has_chosen_receivers.tolist()
         return [

@@ -244,8 +244,8 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
 class PortionedShading(Node):
     """Shading or transfer vectors of receivers, found group by group and portion by portion.
 
-    So without a gradient transfer vectors of all receivers are in memory at once only where they are the result: for
-    free light, and in the visibility that bounces cache while colors vary. Receivers with cached rows are one portion.
+    Without a gradient, transfer vectors of all receivers are in memory at once only where they are the result: for free
+    light, and in the visibility that bounces cache while colors vary. Receivers with cached rows are one portion.
 
     Args:
         points: The receivers.
@@ -253,7 +253,7 @@ class PortionedShading(Node):
         light: Known or free light; None where it is not given yet: portions end with transfer vectors.
         finish: Combines the list of results of all portions.
         caches: As for :class:`Node`.
-        suffix: Put after the names of its stages in place of that of the points.
+        suffix: Ends the names of its stages, such as " of patch samples"; by default the suffix of the points.
         is_shaded: Whether portions are shaded in known light; else they end with transfer vectors, too.
         stages: Further ones, as for :class:`Node`.
     """

@@ -92,7 +92,8 @@ class SceneViews:
             matrices = clip_matrices
             cameras = Input.renewed("cameras", matrices, self._last_cameras)
         image_count = common_batch({"geometry": poses, "clip_matrices": matrices})
-        # rays look at all moving bodies, light goes from moving bodies to static ones, and no row knows a shell
+        # rows of static bodies are valid only where nothing of moving bodies reaches them, neither rays nor bounced
+        # light nor light of lamps; and rows are of light from infinitely far away, not from a shell
         sends_light = self._merged_scene.scene.bounces or self._method.has_emitters
         caches_rows = not (self._method.lights_samples or sends_light or self._method.shell is not None)
         if geometry is not None and geometry.moving is not None and caches_rows:

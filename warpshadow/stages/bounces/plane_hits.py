@@ -1,26 +1,34 @@
 """Plane hits: the sides of planes that a cell of a receiver meets, how they hide each other, and their radiosity.
 
-Of side k the cell's coverage h_k is known (:mod:`warpshadow.stages.cell_coverage`), the centroid y_k = μ_k / h_k of the
-covered part, in radii ρ from the middle of the cell, and the vector g_k = N_k / d_k, by which the side is 1 / (g_k·ω)
-away along a direction ω. Of the part that k and j share, which is taken to be around ω + ρ (y_k + y_j), side j is in
-front in a share
+Known of a side k, in a cell with direction ω and angular radius ρ (:mod:`warpshadow.stages.cell_coverage`):
+
+    h_k, μ_k          its coverage of the cell, and the moment of that
+    y_k = μ_k / h_k   centroid of the covered part, in radii ρ from the middle of the cell
+    g_k = N_k / d_k   inverse distances: along a direction ω the side is 1 / (g_k·ω) away
+
+Sides k and j share a part of the cell, which is taken to be around ω + ρ (y_k + y_j). Side j is in front in a share
 
     S_kj = S((g_j − g_k)·(ω + ρ (y_k + y_j)) / ρ √(h_k h_j (|P(g_j − g_k)|² + 10⁻⁶ (|g_k|² + |g_j|²))))
 
-where P projects to the plane that touches the sphere of directions and S is the smoothstep from 0 at −1 to 1 at 1: it
-cuts a disc as large as the shared part by the line in which both sides meet. Nearer sides leave open, and block with a
-moment,
+of it, where P projects to the plane that touches the sphere of directions, and S is the smoothstep from 0 at −1 to 1 at
+1: it cuts a disc as large as the shared part by the line in which both sides meet. The sides in front of k leave the
+share o_k of the cell open, and block with the moment m_k:
 
     o_k = 1 − Σ_j S_kj h_j,  m_k = Σ_j S_kj μ_j
 
-So of a side the share h_k o_k is seen, around ω + ρ z_k, away from all that blocks it, over a footprint √o as wide:
+So the share h_k o_k of the cell sees side k. Its radiosity is looked up around ω + ρ z_k, away from all that blocks it,
+over a footprint √o as wide:
 
     z_k = −m / √(o² + |m|²),  o = o_k (1 − h₀),  m = m_k + μ₀
 
-There its radiosity is looked up; the root holds it in the cell. The coverage (h₀, μ₀) is that by convex parts before
-all planes (:mod:`warpshadow.stages.convex.coverage`), which the transmittance takes off.
+The root keeps that point in the cell. Convex parts cover h₀ of the cell, with the moment μ₀, in front of all planes
+(:mod:`warpshadow.stages.convex.coverage`); the transmittance takes them off the share h_k o_k.
 
-A mean over all of a side in a cell has parts that nearer ones hide, as the sunlit ground behind a garage's front wall.
+Why: a mean over all of a side in a cell would have parts that nearer sides hide, as the sunlit ground behind a garage's
+front wall.
+
+Light of planes in a garage is 2.6% off, without o 3.5%, by sides ordered by distance 6.5%. Without h₀ the light of the
+sunlit ground on the roof of a barn was 1.4 to 1.6 times too strong.
 """
 
 from __future__ import annotations

@@ -15,6 +15,8 @@ part of a normal that points into a plane with normal N fades, smoothly where bo
 
 with S the smoothstep from 0 at −1 to 1 at 1, y where the patch sample is along the plane, and f the part of the front
 that it sees; likewise for the back, with −N.
+
+A machine part on a ground with two bounces is 5.5% off with T and n′, 7.6% with T alone, and 7.8% without both.
 """
 
 import numpy as np

@@ -4,11 +4,13 @@
 
 with d the distance to the proxy's center, r its radius, s the radius of the largest run of proxies, so that w does not
 depend on the scene's units, and f the factor of its tangent plane (:mod:`.tangent_planes`). With √w for w a white ball
-behind a black one sent a tenth of its light past it. Given w̄ w, and with y the offset to the center over s, u = √(w/f),
+behind a black one sent a tenth of its light past it.
+
+The adjoint, from the product w̄w, with y the offset to the center over s and u = √(w/f):
 
     ȳ = −4 w̄w u y + …,  r̄ = −w̄w u r / (4 s²) + …
 
-and the terms of f, of which x is the argument of the smoothstep: f′/f = (1 − ε) 6 x (1 − x) / f.
+The dots are the terms through f: f′/f = (1 − ε) 6 x (1 − x) / f, with x the argument of the smoothstep in f.
 """
 
 import functools

@@ -68,10 +68,10 @@ def _task_type(lanes: int) -> Any:
         first_bundle: int
         ends: wp.array(dtype=wp.int32)  # [bundle] 0 where nothing is blocked, else the traversal's end
         reached_bundles: wp.array2d(dtype=wp.int32)  # bundles that a run, and then a cluster, may reach
-        blocked: wp.array(dtype=Lane)  # [direction] F − T; for the adjoint its product with the factor of R
+        blocked: wp.array(dtype=Lane)  # [direction] F − T; in the adjoint f of share_adjoint, once it is known
         sums: wp.array(dtype=Lane)  # [direction · sum] of R
-        adj_cells: wp.array(dtype=Lane)  # [direction] the adjoint of the light · R
-        adj_blocked: wp.array(dtype=Lane)  # [direction] of F, and less that of T
+        adj_cells: wp.array(dtype=Lane)  # [direction] Ī·R; before that it holds F while F − T is loaded
+        adj_blocked: wp.array(dtype=Lane)  # [direction] the adjoint of F − T: added to that of F, subtracted from T's
         adj_light: Vectors
         proxy_radiance: wp.array2d(dtype=wp.vec4)  # [proxy, direction]
         adj_radiance: wp.array2d(dtype=wp.vec4)

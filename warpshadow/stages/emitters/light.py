@@ -7,6 +7,8 @@ transmittance on the way. E is over π, as all shading is. The root is π d² bu
 samples are to each other, where nothing becomes infinite. (The form factor of a disc on its axis has π d² + |A| in
 place of the root; samples are beside each other.) An open body sends light to both sides: |A_k·ω_k| is in place of the
 maximum.
+
+A ball of radius r is 0.1 and 1% off from r and r/2 above it, by the form factor 4 and 12% too dark.
 """
 
 import warp as wp

@@ -4,18 +4,22 @@ Seen from a receiver x, a cell with direction ω and angular radius ρ = 2/√Q 
 distance d below the receiver:
 
     c = −N·ω                                  cosine
-    c′ = ρ s(c/ρ),  s(z) = z,  and 1/3 + 2/3 ((z + 1)/2)³ below z = 1
-                                              mean cosine of the part of the cell that is below the plane's horizon
+    c′ = ρ s(c/ρ)                             mean cosine of the part of the cell that is below the plane's horizon:
+                                              s(z) = z from z = 1 on, 1/3 + 2/3 ((z + 1)/2)³ below
     t = d / c′                                distance
     y = x + t ω                               where, in the plane
 
-The part of the cell that the plane takes, h, is that within its outline (:mod:`warpshadow.stages.cell_coverage`); where
-edges are many, that within its rectangle, multiplied with the mesh's share of the footprint, by texels. Radiosity is
-bilinear in two mip levels of the grid, which are blended so that their texels are half as wide as the footprint is in
-the mean of both axes, t ρ / √c′. With texels as wide as it, bilinear means would reach twice as far as the cell.
+The plane covers the part h of the cell that is within its outline (:mod:`warpshadow.stages.cell_coverage`); where edges
+are many, the part within its rectangle times the mesh's share of the footprint, by texels.
 
-No receiver is nearer to a side than a margin, so that t is not 0. Which side it is on, :mod:`.fronts` says; by height
-alone the front fades away and the back appears from the plane to a margin below it.
+Radiosity is bilinear in two mip levels of the grid. They are blended so that texels are half as wide as the footprint,
+t ρ / √c′, the geometric mean of both its axes. With texels as wide as the footprint, bilinear means would reach twice
+as far as the cell.
+
+No receiver is nearer to a side than a margin, so that t is not 0. :mod:`.fronts` says which side a receiver is on; by
+height alone the weight of the front falls from 1 in the plane to 0 a margin below it, where the back has 1.
+
+Under the roof of a barn the light of the ground is then 7% too strong, with texels as wide as the footprint 17 to 23%.
 """
 
 import functools

