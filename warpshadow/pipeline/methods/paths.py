@@ -12,6 +12,7 @@ from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.stages.bounces.total import total_light
+from warpshadow.stages.emitters.samples import PlacedSamples
 from warpshadow.stages.light_samples import sample_map
 from warpshadow.stages.path_tracing import PathSurfaces, trace_bounces
 from warpshadow.stages.receivers import Receivers
@@ -33,6 +34,7 @@ def path_traced(
     light: Input,
     shell: Input | wp.array | None,
     materials: Materials,
+    emitters: Node | None,
     *,
     samples: int,
     progress: bool,
@@ -46,6 +48,7 @@ def path_traced(
         light: Known light.
         shell: Center and radius of the sphere that sends it, vec4 of shape [batch]; None for light infinitely far away.
         materials: Reflectance of the bodies.
+        emitters: Node of the samples of emitters, where one emits within a cone alone; else None.
         samples: Rays of direct light for each receiver.
     """
     merged_scene = points.merged_scene
@@ -65,9 +68,11 @@ def path_traced(
         textures: Textures | None,
         emission: wp.array | None,
         emission_textures: Textures | None,
+        placed_samples: PlacedSamples | None,
     ) -> wp.array:
         if not receivers.points.size:
             return shading
+        axes = None if placed_samples is None else placed_samples.axes
         texels, emitted = (None if item is None else item.texels for item in (textures, emission_textures))
         shells = FAR[None] if shell is None else shell.numpy()
         count = common_batch(
@@ -101,6 +106,7 @@ def path_traced(
                     of_instance(emission),
                     textures_of_instance(emission_textures),
                     emission_images.texture_of_face,
+                    None if axes is None else of_instance(axes),
                 ),
             )
             places = of_instance(receivers.points), of_instance(receivers.normals)
@@ -124,6 +130,7 @@ def path_traced(
         colors.pyramids if colors.images else None,
         materials.of_vertices("emission") if materials.emission else None,
         emission_images.pyramids if emission_images and emission_images.images else None,
+        emitters,
         items=lambda: f"{receiver_text(words)} × {paths:,} paths of {maximum} bounces",
         has_adjoint=False,
     )
