@@ -45,7 +45,8 @@ def find_axis_weights(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndar
     Returns:
         Of shape [vertex] and [face].
     """
-    a, b, c = np.moveaxis(positions[faces].astype(np.float64), 1, 0)
+    positions = positions.astype(np.float64)
+    a, b, c = np.moveaxis(positions[faces], 1, 0)
     vectors = np.cross(b - a, c - a)
     areas = np.linalg.norm(vectors, axis=1).sum()
     if np.linalg.norm(vectors.sum(axis=0)) > _MIN_FACING * areas:
