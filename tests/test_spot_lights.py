@@ -50,7 +50,8 @@ KINDS = {
 def test_renderers_stills_and_paths_show_the_same_spot_and_what_bounces_of_it(lamp):
     bodies = BALL, GROUND, WALL, lamp
     direct, full = (
-        {name: image_of(*bodies, visibility=kind, bounces=bounces) for name, kind in KINDS.items()} for bounces in (0, 2)
+        {name: image_of(*bodies, visibility=kind, bounces=bounces) for name, kind in KINDS.items()}
+        for bounces in (0, 2)
     )
     assert unlike(direct["kept"], direct["paths"]) < RENDERED
     everywhere = image_of(*bodies[:3], dataclasses.replace(lamp, beam=None), visibility=KINDS["kept"])
@@ -80,7 +81,7 @@ def test_a_camera_sees_the_radiance_that_goes_its_way(method):
         way = np.array([np.sin(np.radians(angle)), 0, -np.cos(np.radians(angle))])
         lamp = dataclasses.replace(ROUND, beam=(30, 60), translation=(0, 0, 0), rotation=(0, 0, 0))
         camera = ws.Camera.look_at(2 * way, (0, 0, 0), fov_y=2, size=(8, 8))
-        shown = image_of(lamp, camera=camera, visibility=ws.Visibility(method))[4, 4]
+        shown = image_of(lamp, camera=camera, visibility=ws.Visibility(method))[3:5, 3:5].mean(axis=(0, 1))
         if share is None:
             inner, outer, cosine = np.cos(np.radians([30, 60, 45]))
             t = (cosine - outer) / (inner - outer)

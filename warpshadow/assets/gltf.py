@@ -132,7 +132,7 @@ class PunctualLight(NamedTuple):
 def punctual_lights(tree: dict) -> list[PunctualLight]:
     """The lights of the scene in a glTF file."""
     lights = tree.get("extensions", {}).get("KHR_lights_punctual", {}).get("lights", [])
-    found = []
+    result = []
     for node, to_world in _nodes(tree):
         number = node.get("extensions", {}).get("KHR_lights_punctual", {}).get("light")
         if number is None:
@@ -140,14 +140,14 @@ def punctual_lights(tree: dict) -> list[PunctualLight]:
         light, backward = lights[number], to_world[:3, 2]
         beam = None
         if light["type"] == "spot":
-            spot = light.get("spot", {})
-            angles = spot.get("innerConeAngle", 0.0), spot.get("outerConeAngle", np.pi / 4)
+            cone = light.get("spot", {})
+            angles = cone.get("innerConeAngle", 0.0), cone.get("outerConeAngle", np.pi / 4)
             beam = tuple(np.degrees(angles).tolist())
         intensity = light.get("intensity", 1.0) * np.array(light.get("color", (1.0, 1.0, 1.0)), np.float64)
         name = node.get("name") or light.get("name") or f"{light['type']} light"
         direction = -backward / np.linalg.norm(backward)
-        found.append(PunctualLight(light["type"], name, to_world[:3, 3], direction, intensity, beam))
-    return found
+        result.append(PunctualLight(light["type"], name, to_world[:3, 3], direction, intensity, beam))
+    return result
 
 
 def _nodes(tree: dict) -> Iterator[tuple[dict, np.ndarray]]:

@@ -6,10 +6,10 @@ import numpy as np
 import numpy.typing as npt
 
 from warpshadow import check
-from warpshadow.check import AnyPath
 from warpshadow.assets.gltf import gltf_tree, punctual_lights
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.primitives import icosphere
+from warpshadow.check import AnyPath
 from warpshadow.scene.body import Body
 
 _SUBDIVISIONS = 2  # of a ball, which the light does not tell from a finer one
@@ -77,10 +77,10 @@ def load_lights(
     lamps, result = [], EnvironmentMap.constant(0.0) if light is None else light
     check.instance("light", result, EnvironmentMap, "an EnvironmentMap")
     try:
-        found = punctual_lights(gltf_tree(check.file("path", path)))
+        lights = punctual_lights(gltf_tree(check.file("path", path)))
     except (ValueError, LookupError, AttributeError, TypeError) as error:
         raise ValueError(f"path: got {path} ({error}), expected a .glb or .gltf file") from error
-    for item in found:
+    for item in lights:
         intensity = factor * np.array(item.intensity)
         if item.kind == "directional":
             result = result.with_sun(-item.direction, intensity, angular_radius=angular_radius)
@@ -88,8 +88,8 @@ def load_lights(
             lamps.append(point_light(item.position, intensity, radius=radius, name=item.name))
         else:
             target = item.position + item.direction
-            options = {"beam": item.beam, "radius": radius, "name": item.name}
-            lamps.append(spot_light(item.position, target, intensity, **options))
+            place = item.position, target, intensity
+            lamps.append(spot_light(*place, beam=item.beam, radius=radius, name=item.name))
     return lamps, result
 
 

@@ -1,6 +1,7 @@
 """Paths: light that bounces between the meshes, for the ray-traced method."""
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import warp as wp
 
@@ -12,12 +13,14 @@ from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.stages.bounces.total import total_light
-from warpshadow.stages.emitters.samples import PlacedSamples
 from warpshadow.stages.light_samples import sample_map
 from warpshadow.stages.path_tracing import PathSurfaces, trace_bounces
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.shell.beams import FAR
 from warpshadow.stages.textures.pyramid import Textures
+
+if TYPE_CHECKING:  # it is imported where bodies emit
+    from warpshadow.stages.emitters.samples import PlacedSamples
 
 _LIGHT_SAMPLES = 1024  # directions of each set from which hits draw light
 # most bounces of a path where it may have any number: in a closed room of albedo 0.9 one in 800 ends there
@@ -68,7 +71,7 @@ def path_traced(
         textures: Textures | None,
         emission: wp.array | None,
         emission_textures: Textures | None,
-        placed_samples: PlacedSamples | None,
+        placed_samples: "PlacedSamples | None",
     ) -> wp.array:
         if not receivers.points.size:
             return shading

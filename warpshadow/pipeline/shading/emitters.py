@@ -108,7 +108,9 @@ class SceneEmitters:
         if all(body.beam is None for body in bodies):
             return None
         weights = [find_axis_weights(body.mesh.positions, body.mesh.surface.faces) for body in bodies]
-        of_vertices, of_faces = (block_diag([row[None] for row in rows], format="csr") for rows in zip(*weights, strict=True))
+        of_vertices, of_faces = (
+            block_diag([row[None] for row in rows], format="csr") for rows in zip(*weights, strict=True)
+        )
         shape = len(bodies), int(scene.first_vertex[-1])
         of_vertices = csr_matrix((of_vertices.data, vertices[of_vertices.indices], of_vertices.indptr), shape)
         return EmitterBeams(
@@ -117,14 +119,10 @@ class SceneEmitters:
             SparseMatrix.from_matrix(of_faces, device=scene.device),
         )
 
-    def shown(
-        self, emission: Node, fragments: Node, vertices: Input, cameras: Input, placed: Node
-    ) -> Node:
+    def shown(self, emission: Node, fragments: Node, vertices: Input, cameras: Input, placed: Node) -> Node:
         """Node of the emission that samples of an image show, given all of it, vec3 of shape [batch, height, width]."""
-        merged_scene = self._merged_scene
-        beams = self.samples.beams
-        if beams is None:
-            return emission
+        merged_scene, beams = self._merged_scene, self.samples.beams
+        assert beams is not None
         emitter_of_face = constant(merged_scene.emitter_of_face, wp.int32, merged_scene.device)
 
         def show(
@@ -236,7 +234,7 @@ class SceneEmitters:
     def _within_beams(
         self, receivers: Receivers, placed_samples: PlacedSamples, transmittance: list[wp.array]
     ) -> Iterator[tuple[EmitterSpan, wp.array | None]]:
-        """Samples of each emitter, and what receivers get of the light of each, given the transmittance."""
+        """Samples of each emitter, and the part of their light that receivers get, given the transmittance."""
         for span, item in zip(self.samples.spans(), transmittance, strict=True):
             yield span, within_beam(receivers.points, placed_samples, span, item)
 

@@ -58,9 +58,9 @@ def find_axis_weights(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndar
 
 
 @wp.func
-def beam_share(axis: wp.vec3, way: wp.vec3, beam: wp.vec2):
-    """Part of its emission that an emitter sends along a way of any length."""
-    versine = 0.5 * wp.length_sq(wp.normalize(way) - wp.normalize(axis))
+def beam_share(axis: wp.vec3, to_receiver: wp.vec3, beam: wp.vec2):
+    """Part of its emission that an emitter sends towards a receiver, at the end of a vector of any length."""
+    versine = 0.5 * wp.length_sq(wp.normalize(to_receiver) - wp.normalize(axis))
     t = wp.clamp((beam[1] - versine) / (beam[1] - beam[0]), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
