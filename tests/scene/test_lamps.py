@@ -18,9 +18,9 @@ SAMPLES = 0.02
     ("beam", "message"),
     [
         ((30, 20), r"beam: got \(30.0, 20.0\), expected inner and outer angles \[degrees\] .* such as \(20, 30\)"),
-        ((20, 20), "0 <= inner < outer <= 180"),
-        ((-1, 20), "0 <= inner < outer <= 180"),
-        ((20, 181), "0 <= inner < outer <= 180"),
+        ((0, 0), "0 <= inner <= outer <= 180"),
+        ((-1, 20), "0 <= inner <= outer <= 180"),
+        ((20, 181), "0 <= inner <= outer <= 180"),
         (30, "beam: got 30, expected 2 finite numbers: inner and outer angles"),
         ((20, np.nan), "beam: got 1 NaN"),
         ("narrow", "beam: got 'narrow', expected 2 finite numbers"),
@@ -142,3 +142,13 @@ def test_files_without_lights_have_none_and_other_files_are_refused(tmp_path):
         ws.load_lights(tmp_path / "box.obj")
     with pytest.raises(FileNotFoundError, match="path: no such file"):
         ws.load_lights("nothing.glb")
+
+
+def test_lights_of_other_kinds_and_files_without_their_parts_are_refused(tmp_path):
+    tree = json.loads(with_lights(tmp_path / "a.gltf").read_text())
+    lights = tree["extensions"]["KHR_lights_punctual"]["lights"]
+    for broken, message in ((lights[:2], "index"), ([{"type": "area"}] * 4, "type: got 'area'"), ([{}] * 4, "'type'")):
+        tree["extensions"]["KHR_lights_punctual"]["lights"] = broken
+        (tmp_path / "b.gltf").write_text(json.dumps(tree))
+        with pytest.raises(ValueError, match=rf"path: got .*b.gltf \(.*{message}.*\), expected a .glb or .gltf file"):
+            ws.load_lights(tmp_path / "b.gltf")

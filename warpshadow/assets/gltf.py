@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from warpshadow import check
 from warpshadow.assets.color import srgb_to_linear
 from warpshadow.assets.mesh import EmissiveColor, Gloss, MeshPart
 
@@ -138,6 +139,7 @@ def punctual_lights(tree: dict) -> list[PunctualLight]:
         if number is None:
             continue
         light, backward = lights[number], to_world[:3, 2]
+        check.choice("type", light["type"], ("point", "spot", "directional"))
         beam = None
         if light["type"] == "spot":
             cone = light.get("spot", {})

@@ -96,9 +96,10 @@ class Body:
             default, is no emission, or that of the mesh's file, if that is glTF and neither ``albedo`` nor ``texture``
             is given. Open bodies emit to both sides. All methods but "log-sh" have it.
         beam: Of a body that emits, a cone in which alone it does, as a spot light: an inner and an outer angle from its
-            axis [degrees], 0 ≤ inner < outer ≤ 180, between which radiance falls smoothly to 0. The axis is the mean of
-            its normals, such as that of a disc; or, of a body that faces all ways, such as a ball, −z in its own space,
-            as in glTF. It turns with the body. None, the default, is all directions.
+            axis [degrees], 0 ≤ inner ≤ outer ≤ 180, between which radiance falls smoothly to 0; equal ones have a sharp
+            edge, without a gradient. The axis is the mean of its normals, such as that of a disc; or, of a body that
+            faces all ways, such as a ball, −z in its own space, as in glTF. It turns with the body. None, the default,
+            is all directions.
     """
 
     mesh: Mesh
@@ -283,9 +284,9 @@ class Body:
         return emission
 
     def _checked_beam(self, angles: npt.ArrayLike) -> tuple[float, float]:
-        expected = "inner and outer angles [degrees] from the axis, 0 <= inner < outer <= 180, such as (20, 30)"
+        expected = "inner and outer angles [degrees] from the axis, 0 <= inner <= outer <= 180, such as (20, 30)"
         inner, outer = check.array("beam", angles, (2,), expected).tolist()
-        if not 0 <= inner < outer <= 180:
+        if not 0 <= inner <= outer <= 180 or outer == 0:
             raise ValueError(f"beam: got {(inner, outer)}, expected {expected}")
         if self.emission is None:
             raise ValueError("beam: got one without emission, expected emission, too")

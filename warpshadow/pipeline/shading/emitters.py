@@ -123,7 +123,6 @@ class SceneEmitters:
         """Node of the emission that samples of an image show, given all of it, vec3 of shape [batch, height, width]."""
         merged_scene, beams = self._merged_scene, self.samples.beams
         assert beams is not None
-        emitter_of_face = constant(merged_scene.emitter_of_face, wp.int32, merged_scene.device)
 
         def show(
             emission: wp.array,
@@ -132,6 +131,7 @@ class SceneEmitters:
             cameras: wp.array,
             placed_samples: PlacedSamples,
         ) -> wp.array:
+            emitter_of_face = constant(merged_scene.emitter_of_face, wp.int32, merged_scene.device)
             seen = fragments, merged_scene.faces, vertices, cameras
             return show_beams(emission, *seen, placed_samples, emitter_of_face, beams.beams)
 
