@@ -59,8 +59,8 @@ def find_axis_weights(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndar
 
 @wp.func
 def beam_share(axis: wp.vec3, to_receiver: wp.vec3, beam: wp.vec2):
-    """Part of its emission that an emitter sends towards a receiver, at the end of a vector of any length."""
-    versine = 0.5 * wp.length_sq(wp.normalize(to_receiver) - wp.normalize(axis))
+    """Part of its emission that an emitter sends towards a receiver, given its axis, of length 1, and the way there."""
+    versine = 0.5 * wp.length_sq(wp.normalize(to_receiver) - axis)
     t = wp.clamp((beam[1] - versine) / (beam[1] - beam[0]), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
@@ -92,7 +92,7 @@ def _find_shares(
     batch, receiver = split_row(first_row + wp.tid(), shares.shape[1])
     point = points[batch, receiver]
     sample_batch = instance_in(batch, sample_points.shape[0])
-    axis = axes[sample_batch, emitter]
+    axis = wp.normalize(axes[sample_batch, emitter])
     for i in range(shares.shape[2]):
         share = beam_share(axis, point - sample_points[sample_batch, first_sample + i], beam)
         shares[batch, receiver, i] = share * _transmittance_at(transmittance, batch, receiver, i)

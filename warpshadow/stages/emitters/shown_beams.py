@@ -51,7 +51,7 @@ def _show_beams(
         radiance = emission[instance_in(batch, emission.shape[0]), sample]
         if emitter >= 0:
             point = interpolate_at(positions[body_batch], faces[face], barycentrics[fragment_batch, sample])
-            axis = axes[instance_in(batch, axes.shape[0]), emitter]
+            axis = wp.normalize(axes[instance_in(batch, axes.shape[0]), emitter])
             shown[batch, sample] = beam_share(axis, eye - point, beams[emitter]) * radiance
         else:
             shown[batch, sample] = radiance

@@ -158,7 +158,8 @@ def light_of_point(
             radiance = interpolate_uv(emitters.texels, emitters.levels[texture, 0], uv)
         light = cosine * (facing_area / (distance * distance)) / (wp.pi * probability) * radiance
         if emitters.axes.shape[0] > 0:
-            light = beam_share(emitters.axes[index], -ray_direction, emitters.beams[index]) * light
+            axis = wp.normalize(emitters.axes[index])
+            light = beam_share(axis, -ray_direction, emitters.beams[index]) * light
     return light
 
 
