@@ -9,10 +9,10 @@ import torch
 import warpshadow as ws
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
-# Relative L2 of renderers against rays, of direct light. Measured 1.2 and 1.3%.
-RENDERED = 0.03
-# Relative, of the mean of light that bounces, by renderers and stills against paths. Measured 1.7 and 0.4%.
-BOUNCED = 0.03
+# Relative L2 of renderers against rays, of direct light. Measured 0.8%.
+RENDERED = 0.02
+# Relative, of the mean of light that bounces, by renderers and stills against paths. Measured 2.4 and 0.8%.
+BOUNCED = 0.04
 # Relative L2 of gradients against differences, where nothing moves at a silhouette. Measured at most 9e-4, of turns.
 SMOOTH = 5e-3
 
