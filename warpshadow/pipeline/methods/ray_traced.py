@@ -61,7 +61,8 @@ class Rays(Method):
         """Shading of points in known light that bounces along paths, which have no gradient."""
         from warpshadow.pipeline.methods.paths import path_traced
 
-        arguments = direct, self._meshes(points), points, light, self.shell_of(light), materials
+        emitters = self.emitters.placed(points) if self.merged_scene.has_beams else None
+        arguments = direct, self._meshes(points), points, light, self.shell_of(light), materials, emitters
         return path_traced(*arguments, samples=self._sample_count, progress=self.progress)
 
     def emitted_light(self, points: LitPoints, materials: Materials) -> Node:

@@ -116,6 +116,24 @@ def _find_surface_points(
     return SurfacePoints(faces[pieces].astype(np.int32), weights.astype(np.float32))
 
 
+EVERYWHERE = (3.0, 4.0)
+"""The beam (:mod:`.beams`) of an emitter that has none."""
+
+
+class EmitterBeams(NamedTuple):
+    """Beams of emitters (:mod:`.beams`), some of which may have none.
+
+    Args:
+        beams: Of the emitters, EVERYWHERE for none, shape [emitter, 2].
+        vertices: Weights of all vertices in the emitters' axes, [emitter, vertex].
+        faces: Weights of the emitting faces' area vectors in them, [emitter, face].
+    """
+
+    beams: np.ndarray
+    vertices: SparseMatrix
+    faces: SparseMatrix
+
+
 class EmitterSpan(NamedTuple):
     """Samples of one emitter among those of all."""
 
@@ -123,6 +141,7 @@ class EmitterSpan(NamedTuple):
     first: int  # of the samples
     end: int
     is_two_sided: bool  # whether it is open
+    beam: tuple[float, float] | None = None
 
     @property
     def size(self) -> int:
@@ -141,6 +160,7 @@ class EmitterSamples(NamedTuple):
         bodies: The emitters, by number.
         is_two_sided: Whether each is open.
         first: Where the samples of each begin, and the end of the last, shape [emitter + 1].
+        beams: Of the emitters; None where none has one.
     """
 
     vertices: SparseMatrix
@@ -150,11 +170,13 @@ class EmitterSamples(NamedTuple):
     bodies: tuple[int, ...]
     is_two_sided: tuple[bool, ...]
     first: np.ndarray
+    beams: EmitterBeams | None = None
 
     def spans(self) -> Iterator[EmitterSpan]:
         """The samples of each emitter."""
         for number, span in enumerate(itertools.pairwise(self.first.tolist())):
-            yield EmitterSpan(number, *span, self.is_two_sided[number])
+            beam = EVERYWHERE if self.beams is None else tuple(self.beams.beams[number].tolist())
+            yield EmitterSpan(number, *span, self.is_two_sided[number], None if beam == EVERYWHERE else beam)
 
 
 class PlacedSamples(NamedTuple):
@@ -165,12 +187,14 @@ class PlacedSamples(NamedTuple):
         areas: Area vectors A [square of scene units], vec3 of shape [batch, sample].
         bundles: Middle and radius of a sphere around each bundle, vec4 of shape [batch, bundle], without a gradient.
         balls: The same of each emitter, vec4 of shape [batch, emitter].
+        axes: Of the emitters' beams, of any length, vec3 of shape [batch, emitter]; None where none has one.
     """
 
     points: wp.array
     areas: wp.array
     bundles: wp.array
     balls: wp.array
+    axes: wp.array | None = None
 
 
 @wp.kernel
@@ -259,4 +283,8 @@ def place_samples(positions: wp.array, samples: EmitterSamples) -> PlacedSamples
     launch(_find_bundles, bundles.shape, inputs=[points, areas], outputs=[bundles])
     balls = empty((count, len(samples.bodies)), dtype=wp.vec4, device=device)
     launch(_find_balls, balls.shape, inputs=[bundles, constant(samples.first, wp.int32, device)], outputs=[balls])
-    return PlacedSamples(points, areas, bundles, balls)
+    axes = None
+    if samples.beams is not None:
+        of_vertices = multiply(samples.beams.vertices, positions)
+        axes = multiply(samples.beams.faces, vectors, addend=of_vertices)
+    return PlacedSamples(points, areas, bundles, balls, axes)

@@ -16,6 +16,7 @@ import warp as wp
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
+from warpshadow.stages.emitters.beams import beam_share
 from warpshadow.stages.emitters.samples import EmitterSamples, EmitterSpan, is_lit
 from warpshadow.stages.interpolation import interpolate_at
 from warpshadow.stages.ray_tracing import RAY_COST, mesh_id, progress_slices, sees_point
@@ -42,6 +43,8 @@ class EmittingFaces:
     texture_of_face: wp.array(dtype=wp.int32)  # [emitting face], -1 for none
     uvs: wp.array(dtype=wp.vec2)
     uv_faces: wp.array(dtype=wp.vec3i)  # [emitting face]
+    axes: wp.array(dtype=wp.vec3)  # of their beams, [emitting face], or none
+    beams: wp.array(dtype=wp.vec2)
 
 
 class EmissionTextures(NamedTuple):
@@ -53,12 +56,20 @@ class EmissionTextures(NamedTuple):
     uv_faces: wp.array  # vec3i of shape [emitting face]
 
 
+class FaceBeams(NamedTuple):
+    """Beams of emitting faces, of one instance."""
+
+    axes: np.ndarray  # [emitting face, 3]
+    beams: np.ndarray  # [emitting face, 2]
+
+
 def emitting_faces(
     positions: wp.array,
     emission: wp.array,
     faces: wp.array,
     is_two_sided: np.ndarray,
     textures: EmissionTextures | None = None,
+    beams: FaceBeams | None = None,
 ) -> EmittingFaces:
     """Prepare the faces of emitters.
 
@@ -68,6 +79,7 @@ def emitting_faces(
         faces: That emit, vec3i of shape [face].
         is_two_sided: Whether their bodies are open, bool of shape [face].
         textures: Of radiance, in place of that of vertices; None for none.
+        beams: Of the faces; None where none has one.
     """
     result = EmittingFaces()
     result.positions, result.emission, result.faces = positions, emission, faces
@@ -80,6 +92,9 @@ def emitting_faces(
         result.texels, result.levels = textures.textures.texels[0], textures.textures.levels
         result.texture_of_face, result.uvs, result.uv_faces = textures[1:]
         radiance = radiance + _mean_radiance(textures)
+    if beams is not None:
+        result.axes = wp.array(beams.axes, dtype=wp.vec3, device=device)
+        result.beams = wp.array(beams.beams, dtype=wp.vec2, device=device)
     power = areas * radiance
     sums = np.cumsum(power)
     has_power = bool(len(sums) and sums[-1] > 0)
@@ -142,6 +157,9 @@ def light_of_point(
             uv = interpolate_at(emitters.uvs, emitters.uv_faces[index], weights)
             radiance = interpolate_uv(emitters.texels, emitters.levels[texture, 0], uv)
         light = cosine * (facing_area / (distance * distance)) / (wp.pi * probability) * radiance
+        if emitters.axes.shape[0] > 0:
+            axis = wp.normalize(emitters.axes[index])
+            light = beam_share(axis, -ray_direction, emitters.beams[index]) * light
     return light
 
 
