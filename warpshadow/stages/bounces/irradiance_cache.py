@@ -20,7 +20,7 @@ _NORMAL_DISTANCE = 0.1  # distance that a difference of normals by 1 counts as, 
 _MAX_EXTENT = 16.0
 """Most of that extent, in median distances of receivers from their middle: on a ground without end it is a thousand,
 and then places on a body would not count beside its normals. Grounds of a few bodies have 7 to 8. A vase on a ground
-without end is 3.9% off in place of 1.1%, and one that shines 5.1 in place of 1.0%, without it."""
+without end is 3.9% off in place of 1.1%, and one that shines 5.1 in place of 1.1%, without it."""
 
 
 def choose_cache_points(points: np.ndarray, count: int = CACHE_POINT_COUNT) -> np.ndarray:
