@@ -335,7 +335,13 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         return Node("transmittance of lobes", _towards, *arguments, items=item_text)
 
     def blocked_radiance(
-        self, points: LitPoints, diffuse: Node, light: LightInput, view: LitPoints, choose: Callable[[Node], Node]
+        self,
+        points: LitPoints,
+        diffuse: Node,
+        light: LightInput,
+        view: LitPoints,
+        choose: Callable[[Node], Node],
+        openness: Node | None,
     ) -> Node:
         """Mean radiance of the blockers of points, by their light with bounces and without."""
         cells, projected_light = self._lobe_cells(points, light, view)

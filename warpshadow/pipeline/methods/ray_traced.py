@@ -117,12 +117,21 @@ class Rays(Method):
         )
 
     def blocked_radiance(
-        self, points: LitPoints, diffuse: Node, light: LightInput, view: LitPoints, choose: Callable[[Node], Node]
+        self,
+        points: LitPoints,
+        diffuse: Node,
+        light: LightInput,
+        view: LitPoints,
+        choose: Callable[[Node], Node],
+        openness: Node | None,
     ) -> Node:
         """Mean radiance of the blockers of points, by their light with bounces and without."""
         direct, trees = self.direct_shading(view, light), self._trees_around(points)
-        openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
-        return Node("light of blockers", blocked_radiance, diffuse, choose(direct), openness)
+        if openness is None:
+            at_points = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
+        else:
+            at_points = choose(openness)
+        return Node("light of blockers", blocked_radiance, diffuse, choose(direct), at_points)
 
     def transfers(self, points: LitPoints, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""

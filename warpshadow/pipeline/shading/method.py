@@ -292,7 +292,13 @@ class Method:
         return Node("", lambda towards: wp.full(towards.shape, 1.0, wp.float32, device=towards.device), directions)
 
     def blocked_radiance(
-        self, points: LitPoints, diffuse: Node, light: LightInput, view: LitPoints, choose: Callable[[Node], Node]
+        self,
+        points: LitPoints,
+        diffuse: Node,
+        light: LightInput,
+        view: LitPoints,
+        choose: Callable[[Node], Node],
+        openness: Node | None,
     ) -> Node:
         """Mean radiance of the blockers of points, where light bounces, vec3 of shape [batch, receiver].
 
@@ -301,6 +307,7 @@ class Method:
             diffuse: Node of their shading.
             view: As for :meth:`lobe_transmittance`.
             choose: Makes a node of light on the view's receivers one of light on these.
+            openness: Of the view's receivers, as of :meth:`.LightTransport.openness`.
         """
         raise NotImplementedError
 

@@ -237,7 +237,8 @@ class View(LitPoints):
         blockers_light = shading
         if materials.emission:
             blockers_light = self.transport.shading_without_emitters(self, light, materials)
-        colored, white = points.mixed(self, shading, light, materials, blockers_light)
+        openness = self.transport.openness(self, light, materials)
+        colored, white = points.mixed(self, shading, light, materials, blockers_light, openness)
         return self._sum_of(self._radiance(colored, reflectance), self._radiance(white, self._white_reflectance))
 
     @property

@@ -21,7 +21,7 @@ import warp as wp
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.maths.spatial_sort import compact_order
+from warpshadow.maths.spatial_sort import compact_order, z_order
 from warpshadow.stages.bounces.patches import Patches, find_patches
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
@@ -39,7 +39,7 @@ _MAX_STRETCH = 4.0  # greatest s
 
 
 class SurfacePoints(NamedTuple):
-    """Points on the surface of an emitter, spread evenly over each sample."""
+    """Points on the surface of an emitter, spread evenly over each sample, on a curve: so is every nth of them."""
 
     faces: np.ndarray  # face of the emitter that each lies on, int32 of shape [sample, point]
     weights: np.ndarray  # barycentric coordinates in it, float32 of shape [sample, point, 3]
@@ -88,7 +88,7 @@ def find_sample_weights(
     padding = np.full(-patch_count % SAMPLE_BUNDLE, permutation[-1] if patch_count else 0)
     is_real = np.repeat([1.0, 0.0], [patch_count, len(padding)])
     chosen = np.concatenate([permutation, padding]).astype(int)
-    surface_points = _find_surface_points(owners, pieces.corners[is_used], labels, areas)
+    surface_points = _find_surface_points(owners, pieces.corners[is_used], corners[is_used], labels, areas)
     return SampleWeights(
         of_vertices[chosen].tocsr(),
         (diags(is_real) @ of_faces[chosen]).tocsr(),
@@ -99,9 +99,9 @@ def find_sample_weights(
 
 
 def _find_surface_points(
-    faces: np.ndarray, corners: np.ndarray, labels: np.ndarray, areas: np.ndarray
+    faces: np.ndarray, corners: np.ndarray, positions: np.ndarray, labels: np.ndarray, areas: np.ndarray
 ) -> SurfacePoints:
-    """Spread points over samples, given the pieces: their faces, corners, samples and areas."""
+    """Spread points over samples, given the pieces: their faces, corners in these and in space, samples and areas."""
     permutation = np.argsort(labels, kind="stable")
     sums = np.cumsum(areas[permutation])
     ends = sums[np.searchsorted(labels[permutation], np.arange(labels.max(initial=-1) + 1), side="right") - 1]
@@ -112,7 +112,10 @@ def _find_surface_points(
     ]
     u, v = np.random.default_rng(0).uniform(size=(2, *pieces.shape, 1))
     in_pieces = np.concatenate([1 - np.sqrt(u), np.sqrt(u) * (1 - v), np.sqrt(u) * v], axis=-1)
-    weights = np.einsum("spk,spkc->spc", in_pieces, corners[pieces])
+    points = np.einsum("spk,spkx->spx", in_pieces, positions[pieces].astype(np.float64))
+    orders = np.array([z_order(of_sample) for of_sample in points], dtype=int).reshape(pieces.shape)
+    pieces = np.take_along_axis(pieces, orders, axis=1)
+    weights = np.einsum("spk,spkc->spc", np.take_along_axis(in_pieces, orders[..., None], axis=1), corners[pieces])
     return SurfacePoints(faces[pieces].astype(np.int32), weights.astype(np.float32))
 
 
