@@ -8,8 +8,8 @@ With direct shading S and albedo a an iteration finds the radiosity of patches a
 and receivers gather F B. Light that a body sends to itself may go on for longer than that. Receivers of an image are
 many: F is found at some of them, and interpolated.
 
-Direct light and form factors must agree on how much of a hemisphere is open: where spheres block a part 1 − s of an
-even sky, and rays hit bodies in a part f, F is scaled by (1 − s) / f. Otherwise light is gained and lost: eighteen
+Direct light, past spheres, leaves the share s of an even sky open; rays hit bodies in the share f of the hemisphere. So
+that sky and bodies fill it once, F of a point is scaled by (1 − s) / f. Otherwise light is gained and lost: eighteen
 white balls in a white furnace were 0.91 to 1.06 bright.
 
 Points inside another body see its inside; they count neither in means over patch samples nor as cache points. Where all

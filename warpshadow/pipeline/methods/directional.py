@@ -126,7 +126,8 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         if points.size and group.convex_parts_around is not None:
             cover = functools.partial(group.convex_parts_around.coverage, points, horizon_normals)
             parts = self._coverages(cover, projected_light)
-        if group.is_before_planes and not self.merged_scene.scene.bounces:  # which need transmittance past all else
+        # planes multiply their share in later; only bounces need the product without them, too
+        if group.is_before_planes and not self.merged_scene.scene.bounces:
             return CellVisibility(
                 directions, None, transmittance_self, transmittance_self_and_spheres=past_spheres, part_coverages=parts
             )

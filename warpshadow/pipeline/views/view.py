@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 class View(LitPoints):
-    """A geometry seen by cameras: all inputs of an image except light and reflectance.
+    """A geometry seen by cameras: all inputs of an image except light and given reflectance.
 
     Args:
         transport: Light on receivers, by a method of visibility.
