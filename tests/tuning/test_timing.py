@@ -85,9 +85,7 @@ def test_what_shadows_add_on_a_sample_is_extrapolated_to_all_receivers(monkeypat
 
 def test_bodies_shadows_on_themselves_are_timed(monkeypatch):
     gather, bodies = self_visibility.gather_self_transmittance, []
-    monkeypatch.setattr(
-        self_visibility, "gather_self_transmittance", lambda *given: bodies.append(1) or gather(*given)
-    )
+    monkeypatch.setattr(self_visibility, "gather_self_transmittance", lambda *given: bodies.append(1) or gather(*given))
     monkeypatch.setattr(
         timing, "median_times", lambda functions, runs, **_: [function() and 1.0 for function in functions]
     )
