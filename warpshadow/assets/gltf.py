@@ -178,9 +178,9 @@ def _local_matrix(node: dict) -> np.ndarray:
     """The matrix of a node, in its parent's space."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    rotation = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    from scipy.spatial.transform import Rotation
+
+    rotation = Rotation.from_quat(node.get("rotation", (0.0, 0.0, 0.0, 1.0))).as_matrix()
     matrix = np.eye(4)
     matrix[:3, :3] = rotation * node.get("scale", (1.0, 1.0, 1.0))
     matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))

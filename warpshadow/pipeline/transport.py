@@ -124,9 +124,10 @@ class LightTransport:
         direct = self.method.direct_shading(points, light)
         if bouncing is Bouncing.PATHS:
             return self.method.along_paths(direct, points, light, materials)
-        static, samples = self._static_bounces, self._static_bounces.patch_samples(points, materials)
+        static = self._static_bounces
         if not light.is_free:
             return static.add_bounces(direct, self._lit_patch_samples(points, light, materials), points, materials)
+        samples = static.patch_samples(points, materials)
         if materials.emission:
             emitted = self.method.light_of_emitters(samples, materials)
             direct = static.add_bounces(direct, emitted, points, materials)
@@ -140,8 +141,10 @@ class LightTransport:
         return self._with_emitters(self.method.direct_shading(samples, light), samples, materials)
 
     def openness(self, points: LitPoints, light: Light | None, materials: Materials) -> Node | None:
-        """Part of the hemispheres of points that no blocker takes, by the rays along which light bounces between static
-        patches, vec3 of shape [view, receiver]; None where it bounces in another way, or not at all.
+        """Part of the hemispheres of points that no blocker takes, vec3 of shape [view, receiver].
+
+        It is found by the rays along which light bounces between static patches; None where light bounces in another
+        way, or not at all.
         """
         light_input = self.method.light_input(points, light)
         has_bounces = bool(self.method.merged_scene.scene.bounces)

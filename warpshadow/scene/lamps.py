@@ -100,9 +100,7 @@ def _ball(position: npt.ArrayLike, intensity: npt.ArrayLike, radius: float, name
         raise ValueError(f"intensity: got shape {colors.shape}, expected one number, or RGB [3]")
     check.finite("intensity", colors, minimum=0)
     mesh = icosphere(check.positive("radius", radius), _SUBDIVISIONS)
-    a, b, c = np.moveaxis(mesh.positions[mesh.faces].astype(np.float64), 1, 0)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
-    emission = np.broadcast_to(4 * colors / area, (3,))  # a convex body shows a quarter of its area on average
+    emission = np.broadcast_to(4 * colors / mesh.area, (3,))  # a convex body shows a quarter of its area on average
     return Body(mesh, (0.0, 0.0, 0.0), blockers=0, translation=place, emission=emission, name=name, **options)
 
 

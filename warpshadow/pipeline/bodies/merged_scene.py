@@ -152,9 +152,15 @@ class MergedScene:
 
     @functools.cached_property
     def emitter_of_face(self) -> np.ndarray:
-        """Number of the emitter with a beam that each face is of, −1 for none, shape [face]."""
-        has_beam = np.array([body.beam is not None for body in self.scene.bodies])
-        return np.where(has_beam, np.cumsum(self.is_emitter) - 1, -1)[self.body_of_face]
+        """Number of the emitter that each face is of, −1 for none, shape [face]."""
+        return np.where(self.is_emitter, np.cumsum(self.is_emitter) - 1, -1)[self.body_of_face]
+
+    @functools.cached_property
+    def emitter_beams(self) -> np.ndarray:
+        """Beams of the emitters (:mod:`warpshadow.stages.emitters.beams`), shape [emitter, 2]."""
+        from warpshadow.stages.emitters.beams import beam_of
+
+        return np.array([beam_of(body.beam) for body in self.scene.bodies if body.is_emitter])
 
     def emitting_faces(
         self,
@@ -172,7 +178,6 @@ class MergedScene:
             texture_of_face: The texture of each face, −1 for none, int32 of shape [face].
             axes: Of the emitters' beams, of one instance, vec3 of shape [emitter]; None where none has one.
         """
-        from warpshadow.stages.emitters.beams import beam_of
         from warpshadow.stages.emitters.traced import EmissionTextures, FaceBeams, emitting_faces
 
         is_emitting = self.is_emitter[self.body_of_face]
@@ -184,9 +189,8 @@ class MergedScene:
         is_two_sided = self.is_two_sided[self.body_of_face[is_emitting]]
         face_beams = None
         if axes is not None:
-            emitter_ids = (np.cumsum(self.is_emitter) - 1)[self.body_of_face[is_emitting]]
-            beams = np.array([beam_of(body.beam) for body in self.scene.bodies if body.is_emitter])
-            face_beams = FaceBeams(axes.numpy()[emitter_ids], beams[emitter_ids])
+            emitter_ids = self.emitter_of_face[is_emitting]
+            face_beams = FaceBeams(axes.numpy()[emitter_ids], self.emitter_beams[emitter_ids])
         return emitting_faces(positions, emission, faces, is_two_sided, of_textures, face_beams)
 
     @functools.cached_property

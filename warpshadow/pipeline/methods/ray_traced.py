@@ -128,10 +128,8 @@ class Rays(Method):
         """Mean radiance of the blockers of points, by their light with bounces and without."""
         direct, trees = self.direct_shading(view, light), self._trees_around(points)
         if openness is None:
-            at_points = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
-        else:
-            at_points = choose(openness)
-        return Node("light of blockers", blocked_radiance, diffuse, choose(direct), at_points)
+            openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
+        return Node("light of blockers", blocked_radiance, diffuse, choose(direct), openness)
 
     def transfers(self, points: LitPoints, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""

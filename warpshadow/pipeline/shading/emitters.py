@@ -27,7 +27,7 @@ from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.shading.transfers import joined
 from warpshadow.stages.bounces.albedo import mean_over_texels
 from warpshadow.stages.bounces.total import total_light
-from warpshadow.stages.emitters.beams import beam_of, find_axis_weights, within_beam
+from warpshadow.stages.emitters.beams import find_axis_weights, within_beam
 from warpshadow.stages.emitters.convex import find_log_transmittance_of_parts
 from warpshadow.stages.emitters.light import directions_to_samples, sum_light
 from warpshadow.stages.emitters.planes import find_log_transmittance_of_planes
@@ -104,9 +104,9 @@ class SceneEmitters:
         from scipy.sparse import block_diag, csr_matrix
 
         scene = self._merged_scene
-        bodies = [body for body in scene.scene.bodies if body.is_emitter]
-        if all(body.beam is None for body in bodies):
+        if not scene.has_beams:
             return None
+        bodies = [body for body in scene.scene.bodies if body.is_emitter]
         weights = [find_axis_weights(body.mesh.positions, body.mesh.surface.faces) for body in bodies]
         of_vertices, of_faces = (
             block_diag([row[None] for row in rows], format="csr") for rows in zip(*weights, strict=True)
@@ -114,7 +114,7 @@ class SceneEmitters:
         shape = len(bodies), int(scene.first_vertex[-1])
         of_vertices = csr_matrix((of_vertices.data, vertices[of_vertices.indices], of_vertices.indptr), shape)
         return EmitterBeams(
-            np.array([beam_of(body.beam) for body in bodies]),
+            scene.emitter_beams,
             SparseMatrix.from_matrix(of_vertices, device=scene.device),
             SparseMatrix.from_matrix(of_faces, device=scene.device),
         )

@@ -101,7 +101,8 @@ class GlossyPoints(LitPoints):
         through = self.method.lobe_transmittance(self, directions, source, view)
         blocked = None
         if self.merged_scene.scene.bounces:
-            blocked = self.method.blocked_radiance(self, self.chosen(bounced), source, view, self.chosen, openness)
+            opennesses = None if openness is None else self.chosen(openness)
+            blocked = self.method.blocked_radiance(self, self.chosen(bounced), source, view, self.chosen, opennesses)
         sums = Node("gloss", sum_lobes, filters, radiance, through, blocked, items=item_text)
         if materials.emission:
             sums = Node("", _add, sums, self.method.highlights(self, materials, roughness, self._cameras))

@@ -308,7 +308,7 @@ class Method:
             diffuse: Node of their shading.
             view: As for :meth:`lobe_transmittance`.
             choose: Makes a node of light on the view's receivers one of light on these.
-            openness: Of the view's receivers, as of :meth:`.LightTransport.openness`.
+            openness: Of the points, as of :meth:`.LightTransport.openness`.
         """
         raise NotImplementedError
 

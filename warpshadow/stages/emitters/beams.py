@@ -60,9 +60,7 @@ def find_axis_weights(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndar
 @wp.func
 def beam_share(axis: wp.vec3, to_receiver: wp.vec3, beam: wp.vec2):
     """Part of its emission that an emitter sends towards a receiver, given its axis, of length 1, and the way there."""
-    versine = 0.5 * wp.length_sq(wp.normalize(to_receiver) - axis)
-    t = wp.clamp((beam[1] - versine) / (beam[1] - beam[0]), 0.0, 1.0)
-    return t * t * (3.0 - 2.0 * t)
+    return wp.smoothstep(beam[1], beam[0], 0.5 * wp.length_sq(wp.normalize(to_receiver) - axis))
 
 
 @wp.func
