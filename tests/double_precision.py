@@ -36,7 +36,7 @@ _KERNEL_DECORATORS = ("wp.kernel", "wp.func", "wp.struct")  # so wp.func_native 
 def build(folder: Path) -> ModuleType:
     """Write the float64 build into a folder and import it.
 
-    Its modules are imported as ``double_warpshadow.stages.rasterization``.
+    Its modules are imported as ``double_warpshadow.stages.raster.rasterization``.
     """
     package = Path(warpshadow.__file__).parent
     for path in package.rglob("*.py"):

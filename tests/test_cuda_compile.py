@@ -37,10 +37,10 @@ def test_kernels_made_by_factories_compile_for_cuda(name, tmp_path):
 def test_kernels_of_files_compile_for_cuda(tmp_path):
     modules = file_modules()
     assert {
-        "warpshadow.stages.shading",
-        "warpshadow.stages.rasterization",
-        "warpshadow.stages.normals",
-        "warpshadow.stages.project",
+        "warpshadow.stages.light.shading",
+        "warpshadow.stages.raster.rasterization",
+        "warpshadow.stages.geometry.normals",
+        "warpshadow.stages.raster.project",
     } <= set(modules)
     for name, module in modules.items():
         folder = tmp_path / name

@@ -10,7 +10,7 @@ import warp as wp
 import warpshadow as ws
 from warpshadow.pipeline.views import receiver_finder
 from warpshadow.pipeline.views import view as view_module
-from warpshadow.stages import film
+from warpshadow.stages.image import film
 from warpshadow.stages.textures import pyramid, sample
 from warpshadow.torch import TorchRenderer, apply, rotation_matrices
 

@@ -7,7 +7,7 @@ import warp as wp
 
 from warpshadow.maths import directions as cells
 from warpshadow.maths import sh
-from warpshadow.stages.transfer import directional_transfer, sh_transfer
+from warpshadow.stages.light.transfer import directional_transfer, sh_transfer
 from warpshadow.stages.visibility import directional, exponential, log_sh
 
 # The golden log-SH has no corners rounded off (see test_log_sh.py: up to 0.6% of one cap near cos θ = 0.916), so

@@ -17,10 +17,10 @@ from hypothesis.extra.numpy import arrays
 import warpshadow as ws
 from demos.benchmarks import stability
 from warpshadow.maths.directions import fibonacci
-from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.poses import Poses
-from warpshadow.stages.shading import shade
-from warpshadow.stages.transfer import directional_transfer, sh_transfer
+from warpshadow.stages.geometry.normals import vertex_normals
+from warpshadow.stages.geometry.poses import Poses
+from warpshadow.stages.light.shading import shade
+from warpshadow.stages.light.transfer import directional_transfer, sh_transfer
 from warpshadow.stages.visibility import directional, exponential, log_sh
 
 # Visibility: float32 against float64, relative to an unblocked receiver's. Measured 3e-5, where θ is nearly 90° and the

@@ -12,12 +12,13 @@ import warpshadow
 from warpshadow.device import batch, lanes
 from warpshadow.device.warp_internals import kernel_modules
 from warpshadow.spheres import refine
-from warpshadow.stages import shared_rays, traced_transfer, transfer
 from warpshadow.stages.bounces import sphere_light
 from warpshadow.stages.convex import coverage as convex
 from warpshadow.stages.gloss import lobes as glossy_lobes
 from warpshadow.stages.gloss import prefilter, traced
-from warpshadow.stages.interpolation import _make_interpolate
+from warpshadow.stages.light import transfer
+from warpshadow.stages.raster.interpolation import _make_interpolate
+from warpshadow.stages.ray_traced import shared_rays, traced_transfer
 from warpshadow.stages.self_visibility import gather, lobes, sun_cells, trace
 from warpshadow.stages.silhouettes import smooth
 from warpshadow.stages.visibility import directional, exponential, log_sh

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import warpshadow as ws
 from warpshadow.assets.camera import Camera
-from warpshadow.stages.project import compose_clip_matrices, to_clip
+from warpshadow.stages.raster.project import compose_clip_matrices, to_clip
 
 INTRINSICS = np.array([[100.0, 0.0, 32.0], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]])
 SIZE = (96, 64)

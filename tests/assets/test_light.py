@@ -12,7 +12,7 @@ from warpshadow.assets.image import ImageError, exr_bytes, write_image
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.sky import synthetic_sky
 from warpshadow.maths import sh
-from warpshadow.stages.light_samples import sample_map
+from warpshadow.stages.light.light_samples import sample_map
 
 RANDOM = np.random.default_rng(0)
 ENERGY = 1e-4  # relative, the contract for float32 radiance

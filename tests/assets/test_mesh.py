@@ -15,7 +15,7 @@ from warpshadow.assets.mesh import Mesh, MeshError
 from warpshadow.assets.mesh_files import load_mesh
 from warpshadow.assets.primitives import icosphere, infinite_ground, plane
 from warpshadow.assets.unwrap import unwrap
-from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.geometry.normals import vertex_normals
 
 TRIANGLE = np.eye(3, dtype=np.float32)
 ROUNDING = 2e-6  # float32 sums of a few faces, then a normalization

@@ -7,7 +7,7 @@ import warp as wp
 
 from warpshadow.device import lanes
 from warpshadow.maths.directions import fibonacci
-from warpshadow.stages.transfer import sh_transfer
+from warpshadow.stages.light.transfer import sh_transfer
 from warpshadow.stages.visibility import directional, log_sh
 from warpshadow.stages.visibility.exponential import exponentiate
 

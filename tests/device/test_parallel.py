@@ -16,12 +16,12 @@ from warpshadow.device.launch import launch
 from warpshadow.device.parallel import Scratch, scratch_slot
 from warpshadow.maths.adjacency import edge_neighbors
 from warpshadow.maths.directions import fibonacci
-from warpshadow.stages.interpolation import interpolate
-from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.rasterization import rasterize
-from warpshadow.stages.shading import shade
+from warpshadow.stages.geometry.normals import vertex_normals
+from warpshadow.stages.light.shading import shade
+from warpshadow.stages.light.transfer import directional_transfer, sh_transfer
+from warpshadow.stages.raster.interpolation import interpolate
+from warpshadow.stages.raster.rasterization import rasterize
 from warpshadow.stages.silhouettes.find import find_silhouettes
-from warpshadow.stages.transfer import directional_transfer, sh_transfer
 from warpshadow.stages.visibility import directional, log_sh
 from warpshadow.stages.visibility.exponential import exponentiate
 

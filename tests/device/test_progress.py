@@ -119,13 +119,13 @@ def test_kernels_of_the_library_are_loaded_without_a_line_of_warps(capfd, monkey
 
     def said(level):
         monkeypatch.setattr(wp.config, "log_level", level)
-        for module in (kernel_modules()["warpshadow.stages.film"], somebody_elses.module):
+        for module in (kernel_modules()["warpshadow.stages.image.film"], somebody_elses.module):
             module.unload()
             module.load("cpu", 1)
         assert wp.config.log_level == level
         return capfd.readouterr().out
 
-    importlib.import_module("warpshadow.stages.film")
+    importlib.import_module("warpshadow.stages.image.film")
     assert "film" not in (lines := said(wp.LOG_INFO)) and "somebody_elses" in lines
     assert "film" in said(wp.LOG_DEBUG)
     assert "load" not in said(wp.LOG_WARNING)

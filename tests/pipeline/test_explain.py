@@ -20,11 +20,11 @@ from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.methods import directional as directional_method
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.pipeline.views.view import View
-from warpshadow.stages.light_samples import sample_map
-from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.poses import Poses
-from warpshadow.stages.ray_tracing import trace_shading
-from warpshadow.stages.traced_transfer import trace_transfer
+from warpshadow.stages.geometry.normals import vertex_normals
+from warpshadow.stages.geometry.poses import Poses
+from warpshadow.stages.light.light_samples import sample_map
+from warpshadow.stages.ray_traced.traced_transfer import trace_transfer
+from warpshadow.stages.rays.ray_tracing import trace_shading
 from warpshadow.stages.visibility import directional
 from warpshadow.torch import TorchRenderer
 

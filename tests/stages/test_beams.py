@@ -10,7 +10,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.stages.emitters.beams import beam_of, find_axis_weights, within_beam
 from warpshadow.stages.emitters.samples import EVERYWHERE, EmitterSpan, PlacedSamples
 from warpshadow.stages.emitters.shown_beams import show_beams
-from warpshadow.stages.rasterization import Fragments
+from warpshadow.stages.raster.rasterization import Fragments
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 

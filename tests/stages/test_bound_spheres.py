@@ -7,7 +7,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 import warpshadow as ws
-from warpshadow.stages.bound_spheres import SphereBinding
+from warpshadow.stages.geometry.bound_spheres import SphereBinding
 from warpshadow.torch import TorchRenderer
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")

@@ -6,7 +6,7 @@ import warp as wp
 
 from warpshadow.device.tape import recorded
 from warpshadow.maths.directions import CHUNK
-from warpshadow.stages.cached_cells import CachedRows, add_rows, cell_transfer, shade_cached_cells
+from warpshadow.stages.light.cached_cells import CachedRows, add_rows, cell_transfer, shade_cached_cells
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 

@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 from twins import central_differences
 
 from warpshadow.device.warp_internals import item_shape
-from warpshadow.stages.deform import DeformationGraph
-from warpshadow.stages.poses import Poses
-from warpshadow.stages.rotations import Vec6, rotation_matrices
+from warpshadow.stages.geometry.deform import DeformationGraph
+from warpshadow.stages.geometry.poses import Poses
+from warpshadow.stages.geometry.rotations import Vec6, rotation_matrices
 
 # Rounding of float32.
 FLOAT32 = 1e-5

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpshadow.stages.film import average, sample_radiance
-from warpshadow.stages.rasterization import Fragments
+from warpshadow.stages.image.film import average, sample_radiance
+from warpshadow.stages.raster.rasterization import Fragments
 
 # A handful of float32 products.
 FLOAT32 = 1e-6

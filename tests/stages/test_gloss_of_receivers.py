@@ -8,7 +8,7 @@ import warp as wp
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.gloss import lobes, prefilter, reflection, transmittance
 from warpshadow.stages.gloss.normal_spread import NormalSpread, find_normal_spread
-from warpshadow.stages.rasterization import Fragments
+from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.textures import numbers
 
 # Numbers near 1 after some tens of operations in float32.

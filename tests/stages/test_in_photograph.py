@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpshadow.stages.photograph import compose, find_ratio_image
+from warpshadow.stages.image.photograph import compose, find_ratio_image
 
 # A handful of float32 products.
 FLOAT32 = 3e-6

@@ -8,7 +8,7 @@ from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
 from warpshadow.device.tape import recorded
-from warpshadow.stages.nearest_rotation import nearest_rotations
+from warpshadow.stages.geometry.nearest_rotation import nearest_rotations
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 

@@ -8,9 +8,9 @@ import warpshadow as ws
 from tests.stages.test_self_light import of_square_above
 from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.primitives import icosphere, plane
-from warpshadow.stages import path_tracing
-from warpshadow.stages.light_samples import sample_map
-from warpshadow.stages.path_tracing import PathSurfaces, trace_bounces
+from warpshadow.stages.light.light_samples import sample_map
+from warpshadow.stages.ray_traced import path_tracing
+from warpshadow.stages.ray_traced.path_tracing import PathSurfaces, trace_bounces
 from warpshadow.stages.textures.pyramid import mip_pyramids
 
 SEED = 3

@@ -7,12 +7,12 @@ import pytest
 import warp as wp
 
 import warpshadow as ws
-from warpshadow.stages.interpolation import interpolate
-from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.project import to_clip
-from warpshadow.stages.quadtree import find_quadtree, probe_grid
-from warpshadow.stages.rasterization import rasterize
-from warpshadow.stages.receivers import find_receivers, number_receivers
+from warpshadow.stages.geometry.normals import vertex_normals
+from warpshadow.stages.raster.interpolation import interpolate
+from warpshadow.stages.raster.project import to_clip
+from warpshadow.stages.raster.rasterization import rasterize
+from warpshadow.stages.receivers.find import find_receivers, number_receivers
+from warpshadow.stages.receivers.quadtree import find_quadtree, probe_grid
 
 # Interpolated float32 positions of size 1.
 FLOAT32 = 2e-6

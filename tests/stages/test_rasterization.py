@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from twins import central_differences
 
 from warpshadow.assets.camera import Camera
-from warpshadow.stages.barycentrics import find_barycentrics
-from warpshadow.stages.interpolation import interpolate
-from warpshadow.stages.project import to_clip
-from warpshadow.stages.rasterization import Fragments, rasterize
+from warpshadow.stages.raster.barycentrics import find_barycentrics
+from warpshadow.stages.raster.interpolation import interpolate
+from warpshadow.stages.raster.project import to_clip
+from warpshadow.stages.raster.rasterization import Fragments, rasterize
 
 # Vertices snap to 1/4096 pixel, so coverage may differ from the twin's within this distance of an edge
 # [pixels].

@@ -7,8 +7,8 @@ import warp as wp
 import warpshadow as ws
 from warpshadow.device.lanes import lane_type, module_options, vectors_type
 from warpshadow.maths.directions import fibonacci
-from warpshadow.stages.ray_packets import PACKET, FaceTree, build_face_tree, make_find_open
-from warpshadow.stages.ray_tracing import trace_visibility
+from warpshadow.stages.rays.ray_packets import PACKET, FaceTree, build_face_tree, make_find_open
+from warpshadow.stages.rays.ray_tracing import trace_visibility
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 

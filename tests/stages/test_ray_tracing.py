@@ -11,10 +11,10 @@ from warpshadow.assets.primitives import icosphere, plane
 from warpshadow.maths import sh
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.pipeline.renderer import SceneRenderer
-from warpshadow.stages import ray_tracing
-from warpshadow.stages.light_samples import SET_COUNT, cell_samples, even_samples, sample_map
-from warpshadow.stages.ray_tracing import first_hit, trace_cells, trace_shading, trace_visibility
-from warpshadow.stages.traced_transfer import trace_transfer
+from warpshadow.stages.light.light_samples import SET_COUNT, cell_samples, even_samples, sample_map
+from warpshadow.stages.ray_traced.traced_transfer import trace_transfer
+from warpshadow.stages.rays import ray_tracing
+from warpshadow.stages.rays.ray_tracing import first_hit, trace_cells, trace_shading, trace_visibility
 
 SEED = 5
 

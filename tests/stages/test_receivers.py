@@ -9,11 +9,11 @@ import warp as wp
 
 import warpshadow as ws
 from warpshadow.assets.primitives import icosphere
-from warpshadow.stages.interpolation import interpolate
-from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.project import to_clip
-from warpshadow.stages.rasterization import Fragments, rasterize
-from warpshadow.stages.receivers import find_receivers, number_receivers, seen_vertices
+from warpshadow.stages.geometry.normals import vertex_normals
+from warpshadow.stages.raster.interpolation import interpolate
+from warpshadow.stages.raster.project import to_clip
+from warpshadow.stages.raster.rasterization import Fragments, rasterize
+from warpshadow.stages.receivers.find import find_receivers, number_receivers, seen_vertices
 from warpshadow.stages.silhouettes.find import Silhouettes, find_silhouettes
 
 # Interpolated float32 positions of size 1.

@@ -20,7 +20,7 @@ from warpshadow.stages.emitters.samples import (
 from warpshadow.stages.emitters.self_visibility import find_self_visibility, look_up_self_visibility
 from warpshadow.stages.planes.grid import find_grid
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneBody
-from warpshadow.stages.ray_tracing import trace_visibility
+from warpshadow.stages.rays.ray_tracing import trace_visibility
 from warpshadow.stages.sparse import SparseMatrix
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")

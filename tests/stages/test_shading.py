@@ -6,7 +6,7 @@ import twins
 import warp as wp
 
 from warpshadow.maths.directions import fibonacci
-from warpshadow.stages import shading
+from warpshadow.stages.light import shading
 
 # Sums of up to 10⁴ float32 products of size 1/100.
 FLOAT32 = 5e-6

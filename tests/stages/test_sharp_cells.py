@@ -8,7 +8,7 @@ from warpshadow import Body, Camera, EnvironmentMap, Mesh, Renderer, Scene, Sphe
 from warpshadow.assets.cells import gather_cells, without_spots
 from warpshadow.device.tape import recorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
-from warpshadow.stages.poses import Poses
+from warpshadow.stages.geometry.poses import Poses
 from warpshadow.stages.visibility.sharp_cells import MAX_RADIUS_PAST_PLANES, blend_sharp_cells, find_sharp_cells
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")

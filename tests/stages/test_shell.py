@@ -5,13 +5,13 @@ import pytest
 import warp as wp
 
 from warpshadow.maths.directions import cell_radius, fibonacci
-from warpshadow.stages.light_samples import cut_map, sample_map
-from warpshadow.stages.ray_packets import build_face_tree
-from warpshadow.stages.ray_tracing import trace_shading
-from warpshadow.stages.shared_rays import trace_shared
+from warpshadow.stages.light.light_samples import cut_map, sample_map
+from warpshadow.stages.ray_traced.shared_rays import trace_shared
+from warpshadow.stages.ray_traced.traced_transfer import trace_transfer
+from warpshadow.stages.rays.ray_packets import build_face_tree
+from warpshadow.stages.rays.ray_tracing import trace_shading
 from warpshadow.stages.shell.beams import check_within, exits_from_shell, exits_on_host
 from warpshadow.stages.shell.transfer import KERNEL_RADIUS, shell_transfer
-from warpshadow.stages.traced_transfer import trace_transfer
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 

@@ -15,10 +15,10 @@ from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.pipeline.views import receiver_finder
 from warpshadow.pipeline.views import view as view_module
-from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.project import to_clip
-from warpshadow.stages.rasterization import rasterize
-from warpshadow.stages.sides import find_sides
+from warpshadow.stages.geometry.normals import vertex_normals
+from warpshadow.stages.raster.project import to_clip
+from warpshadow.stages.raster.rasterization import rasterize
+from warpshadow.stages.raster.sides import find_sides
 from warpshadow.torch import TorchRenderer, rotation_matrices
 from warpshadow.tuning.point_sample import PointSample
 

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 import warpshadow as ws
 from warpshadow.maths.adjacency import edge_neighbors
-from warpshadow.stages.interpolation import interpolate
-from warpshadow.stages.project import to_clip
-from warpshadow.stages.rasterization import rasterize
+from warpshadow.stages.raster.interpolation import interpolate
+from warpshadow.stages.raster.project import to_clip
+from warpshadow.stages.raster.rasterization import rasterize
 from warpshadow.stages.silhouettes import find
 from warpshadow.stages.silhouettes.find import find_silhouettes
 from warpshadow.stages.silhouettes.smooth import smooth_silhouettes

@@ -7,12 +7,12 @@ from test_silhouettes import through_plane
 
 import warpshadow as ws
 from warpshadow.maths.adjacency import edge_neighbors
-from warpshadow.stages.film import sample_radiance
-from warpshadow.stages.project import to_clip
-from warpshadow.stages.rasterization import rasterize
+from warpshadow.stages.image.film import sample_radiance
+from warpshadow.stages.image.slopes import MIN_DISTANCE, moving_radiance
+from warpshadow.stages.raster.project import to_clip
+from warpshadow.stages.raster.rasterization import rasterize
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
 from warpshadow.stages.silhouettes.find import find_silhouettes
-from warpshadow.stages.slopes import MIN_DISTANCE, moving_radiance
 
 # float32 kernels against float64; measured 2e-6.
 FLOAT32 = 2e-5

@@ -7,10 +7,10 @@ import warp as wp
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.image import read_image, write_image
 from warpshadow.assets.primitives import plane
-from warpshadow.stages.barycentrics import find_barycentrics
-from warpshadow.stages.interpolation import interpolate
-from warpshadow.stages.project import to_clip
-from warpshadow.stages.rasterization import Fragments, rasterize
+from warpshadow.stages.raster.barycentrics import find_barycentrics
+from warpshadow.stages.raster.interpolation import interpolate
+from warpshadow.stages.raster.project import to_clip
+from warpshadow.stages.raster.rasterization import Fragments, rasterize
 from warpshadow.stages.textures.footprint import Footprints, find_footprints
 from warpshadow.stages.textures.pyramid import level_matrices, mip_pyramids
 from warpshadow.stages.textures.sample import sample_albedo, textured_radiance

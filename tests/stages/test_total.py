@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpshadow.stages.bounces.total import total_light
+from warpshadow.stages.light.total import total_light
 
 
 @pytest.mark.parametrize("count", [2, 3, 4])

@@ -6,9 +6,9 @@ import twins
 import warp as wp
 
 from warpshadow.maths import directions as cells
-from warpshadow.stages import transfer as transfer_module
-from warpshadow.stages.shading import shade
-from warpshadow.stages.transfer import directional_transfer, sh_transfer
+from warpshadow.stages.light import transfer as transfer_module
+from warpshadow.stages.light.shading import shade
+from warpshadow.stages.light.transfer import directional_transfer, sh_transfer
 from warpshadow.stages.visibility import directional, exponential, log_sh
 
 # Sums of up to 10⁴ float32 products of size 1/100.

@@ -10,10 +10,10 @@ import warpshadow as ws
 from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
 from warpshadow.scene.visibility import SHARED_DIRECTIONS
 from warpshadow.spheres import Spheres
-from warpshadow.stages.light_samples import cut_map
-from warpshadow.stages.ray_packets import build_face_tree
-from warpshadow.stages.ray_tracing import trace_visibility
-from warpshadow.stages.shared_rays import TOLERANCE, Corners, find_shares, trace_shared
+from warpshadow.stages.light.light_samples import cut_map
+from warpshadow.stages.ray_traced.shared_rays import TOLERANCE, Corners, find_shares, trace_shared
+from warpshadow.stages.rays.ray_packets import build_face_tree
+from warpshadow.stages.rays.ray_tracing import trace_visibility
 
 # Error of a still, 512 directions, against 4096 independent rays.
 STILL_ERROR = 0.03
@@ -97,7 +97,7 @@ def test_receivers_between_corners_get_the_light_that_they_get_alone(device):
 
 
 def test_a_still_is_that_of_all_rays_at_all_receivers(monkeypatch):
-    monkeypatch.setattr("warpshadow.stages.shared_rays.SQUARES", 32)  # of 2 × 2 pixels
+    monkeypatch.setattr("warpshadow.stages.ray_traced.shared_rays.SQUARES", 32)  # of 2 × 2 pixels
     image = ws.render(scene(64))
     monkeypatch.setattr("warpshadow.pipeline.methods.ray_traced.find_corners", lambda *_: None)
     assert 0 < error(image, ws.render(scene(64))) < 0.005

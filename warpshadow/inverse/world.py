@@ -18,7 +18,7 @@ from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.scene.scene import Scene
 from warpshadow.scene.visibility import SPHERE_METHODS, Visibility
 from warpshadow.spheres import Spheres
-from warpshadow.stages.deform import DeformationGraph
+from warpshadow.stages.geometry.deform import DeformationGraph
 from warpshadow.torch import TorchRenderer
 
 T = TypeVar("T")

@@ -51,7 +51,7 @@ class ImageInputs(Generic[Array, Placed]):
             [4], in place of the scene's or a map's own; all bodies are inside.
         geometry: Vertices and spheres in world space, from the renderer's ``placed``; by default the scene's, which
             stand still.
-        clip_matrices: Cameras, [4, 4], from :func:`warpshadow.stages.project.compose_clip_matrices`, or a
+        clip_matrices: Cameras, [4, 4], from :func:`warpshadow.stages.raster.project.compose_clip_matrices`, or a
             TorchRenderer's ``clip_matrices``; by default the renderer's own.
     """
 

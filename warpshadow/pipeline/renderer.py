@@ -186,7 +186,7 @@ class SceneRenderer:
         Args:
             geometry: Instances of vertices and spheres, by default the scene's own.
             clip_matrices: Cameras, mat44 of shape [batch], by default :attr:`clip_matrices`; see
-                :func:`warpshadow.stages.project.compose_clip_matrices`.
+                :func:`warpshadow.stages.raster.project.compose_clip_matrices`.
         Differentiable: geometry, clip_matrices.
         """
         view = self._views.view(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
@@ -264,7 +264,7 @@ class SceneRenderer:
         Raises:
             ValueError: where rays are asked for a gradient to geometry.
         Differentiable: light, view, but for the motion over the screen of receivers at samples beside outlines, which
-        images have by mean slopes of their colors (:mod:`warpshadow.stages.slopes`).
+        images have by mean slopes of their colors (:mod:`warpshadow.stages.image.slopes`).
         """
         view = self._checked(view)
         return self._transport.shading(view, light).value(self._views.call(view))
@@ -361,7 +361,7 @@ class SceneRenderer:
             Linear RGB, vec3 of shape [batch, height, width]; vec4 with coverage, without a photograph.
         Raises:
             ValueError: where no body of the scene is a catcher.
-        Differentiable: all, as :meth:`draw` is; see :mod:`warpshadow.stages.photograph`.
+        Differentiable: all, as :meth:`draw` is; see :mod:`warpshadow.stages.image.photograph`.
         """
         if not self.scene.catchers:
             raise ValueError(

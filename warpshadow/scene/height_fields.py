@@ -14,7 +14,7 @@ from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.topology import welded
 from warpshadow.maths.adjacency import edges_of
 from warpshadow.scene.body import Body, into_own_space
-from warpshadow.stages.ray_tracing import trace_visibility_on_host
+from warpshadow.stages.rays.ray_tracing import trace_visibility_on_host
 
 DEPTH = 1 / 16
 """How far the solid reaches beyond the mesh, over the longest side of its bounds: that land is 6.1% off with 1/4, of

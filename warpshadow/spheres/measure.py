@@ -13,7 +13,7 @@ from warpshadow.spheres.cover import ball_samples
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
 from warpshadow.spheres.occlusion import exact_occlusion
 from warpshadow.spheres.receivers import around
-from warpshadow.stages.ray_tracing import trace_visibility_on_host
+from warpshadow.stages.rays.ray_tracing import trace_visibility_on_host
 
 GROUND, SURFACE, NEARBY = 20, 400, 400  # receivers on a side of the ground's grid, on the surface and in the air
 DIRECTIONS = 512  # rays from each of them

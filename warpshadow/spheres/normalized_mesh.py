@@ -11,7 +11,7 @@ from warpshadow.assets.topology import CREASE, join_faces, part_at_creases, roun
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.directions import fibonacci
-from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.geometry.normals import vertex_normals
 
 ENCLOSED = 0.9
 """Of the points that an open mesh winds around, the share that sees next to nothing but the mesh if it is a solid with

@@ -1,30 +1,30 @@
 """The names that ``warpshadow.stages`` exports; stages import each other from their own modules."""
 
-from warpshadow.stages.barycentrics import find_barycentrics
-from warpshadow.stages.deform import DeformationGraph
-from warpshadow.stages.film import average, sample_radiance
-from warpshadow.stages.interpolation import interpolate
-from warpshadow.stages.light_samples import LightSamples, even_samples, sample_map
-from warpshadow.stages.nearest_rotation import nearest_rotations
-from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.poses import Poses
-from warpshadow.stages.project import compose_clip_matrices, to_clip
-from warpshadow.stages.rasterization import Fragments, rasterize
-from warpshadow.stages.ray_tracing import trace_shading, trace_visibility
-from warpshadow.stages.receivers import Numbering, Receivers, find_receivers, number_receivers, seen_vertices
-from warpshadow.stages.rotations import rotation_matrices
-from warpshadow.stages.shading import shade
-from warpshadow.stages.sides import find_sides
+from warpshadow.stages.geometry.deform import DeformationGraph
+from warpshadow.stages.geometry.nearest_rotation import nearest_rotations
+from warpshadow.stages.geometry.normals import vertex_normals
+from warpshadow.stages.geometry.poses import Poses
+from warpshadow.stages.geometry.rotations import rotation_matrices
+from warpshadow.stages.image.film import average, sample_radiance
+from warpshadow.stages.image.slopes import moving_radiance
+from warpshadow.stages.light.light_samples import LightSamples, even_samples, sample_map
+from warpshadow.stages.light.shading import shade
+from warpshadow.stages.light.transfer import directional_transfer, sh_transfer
+from warpshadow.stages.raster.barycentrics import find_barycentrics
+from warpshadow.stages.raster.interpolation import interpolate
+from warpshadow.stages.raster.project import compose_clip_matrices, to_clip
+from warpshadow.stages.raster.rasterization import Fragments, rasterize
+from warpshadow.stages.raster.sides import find_sides
+from warpshadow.stages.ray_traced.traced_transfer import trace_transfer
+from warpshadow.stages.rays.ray_tracing import trace_shading, trace_visibility
+from warpshadow.stages.receivers.find import Numbering, Receivers, find_receivers, number_receivers, seen_vertices
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
 from warpshadow.stages.silhouettes.find import Silhouettes, find_silhouettes
 from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
-from warpshadow.stages.slopes import moving_radiance
 from warpshadow.stages.textures.footprint import Footprints, find_footprints
 from warpshadow.stages.textures.pyramid import Textures, mip_pyramids
 from warpshadow.stages.textures.sample import sample_albedo, textured_radiance
 from warpshadow.stages.textures.seen import fill_unseen, seen_texels
-from warpshadow.stages.traced_transfer import trace_transfer
-from warpshadow.stages.transfer import directional_transfer, sh_transfer
 from warpshadow.stages.visibility.directional import transmittance
 from warpshadow.stages.visibility.exponential import exponentiate
 from warpshadow.stages.visibility.log_sh import accumulate

@@ -18,9 +18,9 @@ from warpshadow.pipeline.explain import Explanation
 from warpshadow.pipeline.image_inputs import ImageInputs, takes
 from warpshadow.scene.material import INPUTS_OF_BODIES
 from warpshadow.scene.scene import BodyLike, PerBody, Scene
-from warpshadow.stages.deform import DeformationGraph
-from warpshadow.stages.poses import Poses
-from warpshadow.stages.project import compose_clip_matrices
+from warpshadow.stages.geometry.deform import DeformationGraph
+from warpshadow.stages.geometry.poses import Poses
+from warpshadow.stages.raster.project import compose_clip_matrices
 from warpshadow.torch.arguments import Arguments, Slot
 from warpshadow.torch.autograd import uncompiled
 from warpshadow.torch.replay import Replays
@@ -225,7 +225,7 @@ class TorchRenderer(torch.nn.Module):
                 [height, width, 3] or [batch, height, width, 3].
             inputs: All that an image takes.
         Returns:
-            Linear RGB, [height, width, 3] or [batch, height, width, 3]; see :mod:`warpshadow.stages.photograph`.
+            Linear RGB, [height, width, 3] or [batch, height, width, 3]; see :mod:`warpshadow.stages.image.photograph`.
         Raises:
             ValueError: where no body of the scene is a catcher.
         Differentiable: all, as :meth:`forward` is; both the light with and that without the other bodies are.

@@ -5,8 +5,8 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.warp_internals import item_shape
-from warpshadow.stages.rotations import Vec6
-from warpshadow.stages.rotations import rotation_matrices as matrices_of_arrays
+from warpshadow.stages.geometry.rotations import Vec6
+from warpshadow.stages.geometry.rotations import rotation_matrices as matrices_of_arrays
 from warpshadow.torch.autograd import apply, check_float32, uncompiled
 
 _ROTATION_PARAMETERS = {3: wp.vec3, 4: wp.vec4, 6: Vec6, 9: wp.mat33}
@@ -16,7 +16,7 @@ _ROTATION_PARAMETERS = {3: wp.vec3, 4: wp.vec4, 6: Vec6, 9: wp.mat33}
 def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
     """Make rotation matrices of free parameters: of axis-angle vectors in radians (``torch.deg2rad``), quaternions, ….
 
-    It does so as :func:`warpshadow.stages.rotations.rotation_matrices`.
+    It does so as :func:`warpshadow.stages.geometry.rotations.rotation_matrices`.
 
     Args:
         parameters: Shape [..., n], where n decides their meaning: 4, quaternions (x, y, z, w) of any length but 0; 3,
@@ -26,7 +26,7 @@ def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
         Rotations, shape [..., 3, 3].
     Raises:
         ValueError: for another n, and for parameters without a rotation, as
-        :func:`warpshadow.stages.rotations.rotation_matrices` says.
+        :func:`warpshadow.stages.geometry.rotations.rotation_matrices` says.
     Warns:
         Of axis-angle vectors of more than two turns, which look like degrees; on a CPU.
     Differentiable: parameters.

@@ -34,7 +34,7 @@ def insert(
 
     Where the photograph shows a catcher, it is multiplied by the ratio of the light that the catcher receives with the
     other bodies to that without them; these are drawn over it, with soft edges. See
-    :mod:`warpshadow.stages.photograph`, and :meth:`warpshadow.torch.TorchRenderer.insert` for gradients.
+    :mod:`warpshadow.stages.image.photograph`, and :meth:`warpshadow.torch.TorchRenderer.insert` for gradients.
 
     Args:
         scene: The scene, with one or more bodies that are shadow catchers, and the camera of the photograph, whose size

@@ -13,7 +13,7 @@ from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.pipeline.views.view import View
 from warpshadow.scene.scene import Bounces, Scene, change_bodies
 from warpshadow.scene.visibility import AUTO, Visibility
-from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.geometry.normals import vertex_normals
 
 
 class PointReceivers(NamedTuple):

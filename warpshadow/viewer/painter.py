@@ -23,7 +23,7 @@ from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
 from warpshadow.pipeline.views.view import View
 from warpshadow.scene.scene import Scene
-from warpshadow.stages.poses import Poses
+from warpshadow.stages.geometry.poses import Poses
 from warpshadow.stages.shell.beams import exits_on_host
 from warpshadow.tuning.renderer import Renderer
 from warpshadow.viewer.page_camera import PageCamera, page_scale

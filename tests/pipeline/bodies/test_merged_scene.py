@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import warpshadow as ws
 from warpshadow.pipeline.bodies.free_shapes import FreeShapes
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
-from warpshadow.stages.poses import Poses
+from warpshadow.stages.geometry.poses import Poses
 
 # Rotated float32 positions of size 2.
 FLOAT32 = 2e-6

@@ -15,7 +15,7 @@ from warpshadow.pipeline.bodies import self_visibility
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.pipeline.views import receiver_finder
-from warpshadow.stages.poses import Poses
+from warpshadow.stages.geometry.poses import Poses
 from warpshadow.stages.self_visibility import trace
 from warpshadow.torch import TorchRenderer, rotation_matrices
 

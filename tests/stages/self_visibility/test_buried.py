@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import warpshadow as ws
-from warpshadow.stages.ray_packets import build_face_tree
+from warpshadow.stages.rays.ray_packets import build_face_tree
 from warpshadow.stages.self_visibility.buried import find_buried, find_dilation
 from warpshadow.stages.self_visibility.probes import find_probes
 from warpshadow.stages.self_visibility.trace import MIN_RAYS, trace_rows

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import warpshadow as ws
-from warpshadow.stages.rasterization import Fragments
+from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.self_visibility.probes import (
     _ENTRY_RATIO,
     ProbeTable,

@@ -10,8 +10,8 @@ import warpshadow as ws
 from warpshadow.assets.cells import draw_in_cells
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.maths.directions import fibonacci
-from warpshadow.stages.ray_packets import PACKET, build_face_tree
-from warpshadow.stages.ray_tracing import trace_visibility
+from warpshadow.stages.rays.ray_packets import PACKET, build_face_tree
+from warpshadow.stages.rays.ray_tracing import trace_visibility
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.self_visibility.sun_cells import RayProbes, find_sun_cells, trace_sun_cells
 

@@ -5,7 +5,7 @@ import pytest
 
 import warpshadow as ws
 from warpshadow.maths.directions import cell_radius, fibonacci
-from warpshadow.stages.ray_packets import build_face_tree
+from warpshadow.stages.rays.ray_packets import build_face_tree
 from warpshadow.stages.self_visibility import trace
 from warpshadow.stages.self_visibility.trace import MAX_MEMORY, MIN_RAYS, RAYS, RAYS_PER_CELL, ray_count, trace_rows
 

@@ -11,8 +11,8 @@ from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.scene.blockers import free_shape_remark
 from warpshadow.scene.scene import BodyLike
 from warpshadow.scene.visibility import SPHERE_METHODS
-from warpshadow.stages.bound_spheres import SphereBinding
-from warpshadow.stages.deform import DeformationGraph
+from warpshadow.stages.geometry.bound_spheres import SphereBinding
+from warpshadow.stages.geometry.deform import DeformationGraph
 
 
 class FreeShapes:
@@ -62,7 +62,7 @@ class FreeShapes:
             centers: Its spheres' centers, vec3 of shape [batch, sphere].
             radii: Its spheres' radii, float32 of shape [batch, sphere]. An item None stays as it is in ``rest``; but
                 its spheres follow its vertices, both centers and radii, unless ``centers`` are given
-                (:mod:`warpshadow.stages.bound_spheres`).
+                (:mod:`warpshadow.stages.geometry.bound_spheres`).
             rest: All bodies at rest, by default as their meshes are; batches of 1 serve every instance.
         Returns:
             All bodies at rest, for :meth:`.MergedScene.placed`, in arrays of their own.

@@ -20,7 +20,7 @@ from warpshadow.scene.blockers import scene_blockers
 from warpshadow.scene.scene import BodyLike, Scene
 from warpshadow.scene.visibility import AUTO, SPHERE_METHODS
 from warpshadow.spheres import MANY, Spheres
-from warpshadow.stages.poses import Poses
+from warpshadow.stages.geometry.poses import Poses
 
 if TYPE_CHECKING:  # it is imported where a body emits
     from warpshadow.stages.emitters.traced import EmittingFaces
@@ -106,7 +106,7 @@ class MergedScene:
     def creases(self) -> wp.array | None:
         """Creases of bodies that are shaded by pixel, int32 of shape [face]: ``Mesh.creases``; None where none has any.
 
-        On bodies that are shaded at vertices the mean slopes of :mod:`warpshadow.stages.slopes` go across creases.
+        On bodies that are shaded at vertices mean slopes (:mod:`warpshadow.stages.image.slopes`) go across creases.
         """
         is_by_pixel = [body.receivers == "pixel" for body in self.scene.bodies]
         result = np.zeros(self.first_face[-1], np.int32)

@@ -17,7 +17,7 @@ from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node, detached
 from warpshadow.scene.material import GLOSS_ARGUMENTS, GLOSS_DEFAULTS, INPUTS_OF_BODIES, MATERIAL_FIELDS
-from warpshadow.stages.interpolation import interpolate
+from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.textures.footprint import find_footprints
 from warpshadow.stages.textures.numbers import as_colors
 from warpshadow.stages.textures.pyramid import mip_pyramids

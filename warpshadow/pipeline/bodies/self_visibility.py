@@ -26,10 +26,10 @@ from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.scene.blockers import blocking_parts, solid_bodies
 from warpshadow.spheres.normalized_mesh import normalize
-from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.ray_packets import FaceTree, build_face_tree
-from warpshadow.stages.receivers import Receivers, Span
+from warpshadow.stages.geometry.normals import vertex_normals
+from warpshadow.stages.raster.rasterization import Fragments
+from warpshadow.stages.rays.ray_packets import FaceTree, build_face_tree
+from warpshadow.stages.receivers.find import Receivers, Span
 from warpshadow.stages.self_visibility.buried import find_buried, find_dilation
 from warpshadow.stages.self_visibility.gather import gather_self_transmittance
 from warpshadow.stages.self_visibility.lobes import (

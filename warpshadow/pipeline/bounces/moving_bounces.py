@@ -38,8 +38,8 @@ from warpshadow.pipeline.shading.transfers import joined
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.patch_weights import PatchWeights, find_mean_transmittance, find_patch_weights
 from warpshadow.stages.bounces.radiosity import patch_radiosity
-from warpshadow.stages.bounces.total import total_light
-from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.light.total import total_light
+from warpshadow.stages.receivers.find import Receivers
 
 
 class PortionVisibility(NamedTuple):

@@ -27,20 +27,20 @@ from warpshadow.pipeline.shading.shell import PATCHES, ShellPatches, project_on_
 from warpshadow.pipeline.shading.sphere_method import PortionedShading, ProjectedLight, SphereMethod
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, joined
 from warpshadow.scene.blockers import blocking_planes
-from warpshadow.stages.cached_cells import CachedRows, cell_transfer, shade_cached_cells
 from warpshadow.stages.gloss.reflection import blocked_radiance
 from warpshadow.stages.gloss.transmittance import transmittance_of_directions
 from warpshadow.stages.joint_coverage import transmittance_past
-from warpshadow.stages.light_samples import CellSamples, cell_samples, even_samples, sample_map
+from warpshadow.stages.light.cached_cells import CachedRows, cell_transfer, shade_cached_cells
+from warpshadow.stages.light.light_samples import CellSamples, cell_samples, even_samples, sample_map
+from warpshadow.stages.light.shading import shade, shade_cells
+from warpshadow.stages.light.transfer import directional_transfer
 from warpshadow.stages.planes.coverage import plane_coverage
 from warpshadow.stages.planes.partial_cells import coverage_of_light
-from warpshadow.stages.ray_tracing import trace_cells
-from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.raster.sides import split_sides
+from warpshadow.stages.rays.ray_tracing import trace_cells
+from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.self_visibility.gather import multiply_transmittances
 from warpshadow.stages.self_visibility.sun_cells import trace_sun_cells
-from warpshadow.stages.shading import shade, shade_cells
-from warpshadow.stages.sides import split_sides
-from warpshadow.stages.transfer import directional_transfer
 from warpshadow.stages.visibility import directional
 from warpshadow.stages.visibility.directional import SOFTNESS
 from warpshadow.stages.visibility.sharp_cells import (

@@ -19,8 +19,8 @@ from warpshadow.pipeline.receivers.lit_points import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.shading.shell import ShellPatches
 from warpshadow.pipeline.shading.sphere_method import SphereMethod
-from warpshadow.stages.cached_cells import add_rows
-from warpshadow.stages.transfer import sh_product, sh_transfer
+from warpshadow.stages.light.cached_cells import add_rows
+from warpshadow.stages.light.transfer import sh_product, sh_transfer
 from warpshadow.stages.visibility import exponential, log_sh
 
 

@@ -12,10 +12,10 @@ from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
-from warpshadow.stages.bounces.total import total_light
-from warpshadow.stages.light_samples import sample_map
-from warpshadow.stages.path_tracing import PathSurfaces, trace_bounces
-from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.light.light_samples import sample_map
+from warpshadow.stages.light.total import total_light
+from warpshadow.stages.ray_traced.path_tracing import PathSurfaces, trace_bounces
+from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.shell.beams import FAR
 from warpshadow.stages.textures.pyramid import Textures
 

@@ -16,13 +16,13 @@ from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.shading.method import LightInput, Method
 from warpshadow.stages.gloss.reflection import blocked_radiance
 from warpshadow.stages.gloss.traced import trace_lobes
-from warpshadow.stages.light_samples import cut_map, sample_map
-from warpshadow.stages.ray_packets import PACKET, FaceTree, build_face_tree
-from warpshadow.stages.ray_tracing import trace_shading
-from warpshadow.stages.receivers import Receivers
-from warpshadow.stages.shared_rays import find_corners, find_shares, trace_shared
+from warpshadow.stages.light.light_samples import cut_map, sample_map
+from warpshadow.stages.ray_traced.shared_rays import find_corners, find_shares, trace_shared
+from warpshadow.stages.ray_traced.traced_transfer import trace_transfer
+from warpshadow.stages.rays.ray_packets import PACKET, FaceTree, build_face_tree
+from warpshadow.stages.rays.ray_tracing import trace_shading
+from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.shell.beams import FAR, check_within
-from warpshadow.stages.traced_transfer import trace_transfer
 
 if TYPE_CHECKING:  # it is imported where bodies emit
     from warpshadow.stages.emitters.samples import PlacedSamples

@@ -1,7 +1,8 @@
 """Adaptive receivers: on flat bodies, close to each other where shadows have edges, far apart elsewhere.
 
 Edges of shadows are sharp where light comes from few cells: a sun's, or else the brightest. Only these cells are found
-at the probes of a quadtree (:mod:`warpshadow.stages.quadtree`), an eighth of all cells at a quarter of the pixels.
+at the probes of a quadtree (:mod:`warpshadow.stages.receivers.quadtree`), an eighth of all cells at a quarter of the
+pixels.
 """
 
 import functools
@@ -13,10 +14,10 @@ import warp as wp
 from warpshadow.device.launch import without_gradient
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.receivers.groups import Blockers, Group
-from warpshadow.stages.quadtree import Quadtree, find_quadtree, probe_grid
-from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.receivers import points_of_fragments
-from warpshadow.stages.sample_receivers import fragments_of_samples
+from warpshadow.stages.raster.rasterization import Fragments
+from warpshadow.stages.receivers.find import points_of_fragments
+from warpshadow.stages.receivers.quadtree import Quadtree, find_quadtree, probe_grid
+from warpshadow.stages.receivers.sample_receivers import fragments_of_samples
 
 
 def find_squares(

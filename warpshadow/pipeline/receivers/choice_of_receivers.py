@@ -30,8 +30,8 @@ from warpshadow.scene.body import Body
 from warpshadow.scene.scene import Scene, change_bodies
 from warpshadow.scene.visibility import AUTO, Visibility
 from warpshadow.spheres import Spheres
-from warpshadow.stages.project import to_clip
-from warpshadow.stages.rasterization import rasterize
+from warpshadow.stages.raster.project import to_clip
+from warpshadow.stages.raster.rasterization import rasterize
 from warpshadow.stages.visibility.sharp_cells import find_sharp_cells
 
 LARGE_FACE = 16.0

@@ -17,11 +17,11 @@ from warpshadow.pipeline.bodies.planes import GroupPlanes, ScenePlanes
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
-from warpshadow.stages.cached_cells import CachedRows
 from warpshadow.stages.convex.prepared import PlacedParts
+from warpshadow.stages.light.cached_cells import CachedRows
 from warpshadow.stages.planes.fronts import NearestBlockers, find_fronts, lifted_points
 from warpshadow.stages.planes.prepared import PlaneBlockers
-from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 

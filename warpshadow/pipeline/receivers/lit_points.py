@@ -12,8 +12,8 @@ import numpy as np
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Call, Input, Node
-from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.geometry.normals import vertex_normals
+from warpshadow.stages.receivers.find import Receivers
 
 if TYPE_CHECKING:
     from warpshadow.pipeline.receivers.static import StaticBodies

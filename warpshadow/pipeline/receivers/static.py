@@ -21,11 +21,11 @@ from warpshadow.maths.inset import inset_vertices
 from warpshadow.pipeline.bodies.geometry import Geometry, splice
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node
-from warpshadow.stages.cached_cells import CachedRows
-from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.project import to_clip
-from warpshadow.stages.receivers import Receivers
-from warpshadow.stages.sides import split_sides
+from warpshadow.stages.geometry.normals import vertex_normals
+from warpshadow.stages.light.cached_cells import CachedRows
+from warpshadow.stages.raster.project import to_clip
+from warpshadow.stages.raster.sides import split_sides
+from warpshadow.stages.receivers.find import Receivers
 
 
 class StaticBodies:

@@ -16,8 +16,8 @@ from warpshadow.assets.harmonic_light import KnownLight
 from warpshadow.maths.directions import fibonacci
 from warpshadow.maths.inset import inset_vertices
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
-from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.ray_tracing import trace_visibility_on_host
+from warpshadow.stages.geometry.normals import vertex_normals
+from warpshadow.stages.rays.ray_tracing import trace_visibility_on_host
 
 _CELLS = 128  # of directions; the default of "directional", which has them already
 _RAYS = 64  # from a point, to cells by their light

@@ -26,7 +26,6 @@ from warpshadow.pipeline.receivers.groups import Blockers, Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.shading.transfers import joined
 from warpshadow.stages.bounces.albedo import mean_over_texels
-from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.emitters.beams import find_axis_weights, within_beam
 from warpshadow.stages.emitters.convex import find_log_transmittance_of_parts
 from warpshadow.stages.emitters.light import directions_to_samples, sum_light
@@ -52,8 +51,9 @@ from warpshadow.stages.gloss.highlights import sum_highlights
 from warpshadow.stages.gloss.reflection import LobeLight
 from warpshadow.stages.gloss.transmittance import transmittance_of_directions
 from warpshadow.stages.joint_coverage import transmittance_past
-from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.light.total import total_light
+from warpshadow.stages.raster.rasterization import Fragments
+from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
 EMITTER_CELLS = fibonacci(512)

@@ -23,10 +23,10 @@ from warpshadow.stages.gloss.lobes import LobeSamples, sample_lobes
 from warpshadow.stages.gloss.normal_spread import NormalSpread, find_normal_spread
 from warpshadow.stages.gloss.prefilter import look_up_light, prefilter
 from warpshadow.stages.gloss.reflection import LobeLight, mix_reflection, number_runs, sum_lobes
-from warpshadow.stages.interpolation import interpolate
-from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.receivers import Receivers
-from warpshadow.stages.sample_receivers import Span
+from warpshadow.stages.raster.interpolation import interpolate
+from warpshadow.stages.raster.rasterization import Fragments
+from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.sample_receivers import Span
 from warpshadow.stages.shell.beams import exits_from_shell
 from warpshadow.stages.textures.footprint import Footprints
 from warpshadow.stages.textures.numbers import as_colors, as_scalars, means_of_receivers

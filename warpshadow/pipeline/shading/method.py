@@ -21,9 +21,9 @@ from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds,
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.transfers import Light, ShellLight, check_light, shade_free
 from warpshadow.stages.gloss.prefilter import prefilter
-from warpshadow.stages.quadtree import Quadtree
-from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.receivers import Numbering, number_receivers
+from warpshadow.stages.raster.rasterization import Fragments
+from warpshadow.stages.receivers.find import Numbering, number_receivers
+from warpshadow.stages.receivers.quadtree import Quadtree
 from warpshadow.stages.shell.beams import check_shell, shell_array
 
 if TYPE_CHECKING:  # it is imported where a body emits
@@ -323,6 +323,6 @@ class Method:
 
 def add_light(*summands: wp.array) -> wp.array:
     """Add light of several kinds. Differentiable: summands."""
-    from warpshadow.stages.bounces.total import total_light
+    from warpshadow.stages.light.total import total_light
 
     return total_light(summands)

@@ -21,10 +21,10 @@ from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.shading.method import LightInput, Method
 from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, joined
-from warpshadow.stages.quadtree import Quadtree
-from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.receivers import Receivers
-from warpshadow.stages.shading import shade
+from warpshadow.stages.light.shading import shade
+from warpshadow.stages.raster.rasterization import Fragments
+from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.quadtree import Quadtree
 
 Projected = TypeVar("Projected", bound="ProjectedLight")
 FoundVisibility = TypeVar("FoundVisibility", CellVisibility, HarmonicVisibility)

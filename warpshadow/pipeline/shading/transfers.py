@@ -11,7 +11,7 @@ from warpshadow import check
 from warpshadow.assets.light import LIGHT, EnvironmentMap, check_coefficients
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
-from warpshadow.stages.shading import shade
+from warpshadow.stages.light.shading import shade
 
 
 class ShellLight(NamedTuple):

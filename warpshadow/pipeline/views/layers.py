@@ -11,10 +11,10 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.views.view import View
-from warpshadow.stages.film import average
-from warpshadow.stages.interpolation import interpolate
-from warpshadow.stages.rasterization import rasterize
-from warpshadow.stages.sides import find_sides
+from warpshadow.stages.image.film import average
+from warpshadow.stages.raster.interpolation import interpolate
+from warpshadow.stages.raster.rasterization import rasterize
+from warpshadow.stages.raster.sides import find_sides
 from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
 
 

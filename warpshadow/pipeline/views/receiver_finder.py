@@ -7,10 +7,10 @@ from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.method import Method
-from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.receivers import Numbering, Receivers, find_receivers, number_receivers, seen_vertices
+from warpshadow.stages.image.slopes import find_mean_slopes
+from warpshadow.stages.raster.rasterization import Fragments
+from warpshadow.stages.receivers.find import Numbering, Receivers, find_receivers, number_receivers, seen_vertices
 from warpshadow.stages.silhouettes.find import Silhouettes
-from warpshadow.stages.slopes import find_mean_slopes
 
 MAX_SHARED = 2
 """Samples of a pixel across in stills up to which those on a smooth surface share a receiver: whoever asks for more

@@ -18,9 +18,9 @@ from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.view import View
-from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.project import check_clip_space
-from warpshadow.stages.receivers import Receivers, receivers_on_faces
+from warpshadow.stages.geometry.normals import vertex_normals
+from warpshadow.stages.raster.project import check_clip_space
+from warpshadow.stages.receivers.find import Receivers, receivers_on_faces
 
 
 class SceneViews:

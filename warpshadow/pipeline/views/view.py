@@ -14,23 +14,23 @@ from warpshadow.pipeline.shading.method import Method
 from warpshadow.pipeline.shading.transfers import Light
 from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.receiver_finder import ReceiverFinder
-from warpshadow.stages.film import average, sample_radiance, sum_radiance
-from warpshadow.stages.interpolation import interpolate
-from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.project import to_clip
-from warpshadow.stages.rasterization import Fragments, rasterize
-from warpshadow.stages.receivers import Receivers
-from warpshadow.stages.sides import find_sides
+from warpshadow.stages.geometry.normals import vertex_normals
+from warpshadow.stages.image.film import average, sample_radiance, sum_radiance
+from warpshadow.stages.image.slopes import moving_radiance
+from warpshadow.stages.raster.interpolation import interpolate
+from warpshadow.stages.raster.project import to_clip
+from warpshadow.stages.raster.rasterization import Fragments, rasterize
+from warpshadow.stages.raster.sides import find_sides
+from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.silhouettes.find import Silhouettes, find_silhouettes
 from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
-from warpshadow.stages.slopes import moving_radiance
 from warpshadow.stages.textures.footprint import Footprints
 from warpshadow.stages.textures.sample import sample_albedo, textured_radiance
 from warpshadow.stages.textures.seen import seen_texels
 
 if TYPE_CHECKING:
     from warpshadow.pipeline.receivers.static import StaticBodies
-    from warpshadow.stages.photograph import RatioImage
+    from warpshadow.stages.image.photograph import RatioImage
 
 
 class View(LitPoints):
@@ -260,10 +260,10 @@ class View(LitPoints):
             photograph: Linear RGB, vec3 of shape [batch, height, width]; None for nothing, where shadows are coverage,
                 vec4.
             unshadowed, catches: ``catcher_light`` and ``is_catcher`` of
-                :func:`warpshadow.stages.photograph.find_ratio_image`.
+                :func:`warpshadow.stages.image.photograph.find_ratio_image`.
             light, materials: As for :meth:`image`.
         """
-        from warpshadow.stages.photograph import compose, composite_alone, find_ratio_image
+        from warpshadow.stages.image.photograph import compose, composite_alone, find_ratio_image
 
         shading, reflectance = self.shading(light, materials), self.reflectance(materials)
 

@@ -6,7 +6,7 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.stages.interpolation import interpolate_at
+from warpshadow.stages.raster.interpolation import interpolate_at
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
 

@@ -26,7 +26,7 @@ from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.stages.cell_neighbors import KERNEL_RADIUS, cell_neighbors, texel_of
 from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, SurfacePoints
-from warpshadow.stages.nearest_rotation import nearest_rotations
+from warpshadow.stages.geometry.nearest_rotation import nearest_rotations
 
 CELLS = fibonacci(512)
 

@@ -10,9 +10,9 @@ from warpshadow.device.memory import empty, reshaped
 from warpshadow.device.parallel import find_run, run_dimensions, run_length
 from warpshadow.stages.emitters.beams import beam_share
 from warpshadow.stages.emitters.samples import PlacedSamples
-from warpshadow.stages.interpolation import interpolate_at
-from warpshadow.stages.project import eye_position
-from warpshadow.stages.rasterization import Fragments
+from warpshadow.stages.raster.interpolation import interpolate_at
+from warpshadow.stages.raster.project import eye_position
+from warpshadow.stages.raster.rasterization import Fragments
 
 _COST = 15.0  # nanoseconds that a sample takes
 

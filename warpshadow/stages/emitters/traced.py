@@ -18,8 +18,8 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.stages.emitters.beams import beam_share
 from warpshadow.stages.emitters.samples import SURFACE_POINTS, EmitterSamples, EmitterSpan, is_lit
-from warpshadow.stages.interpolation import interpolate_at
-from warpshadow.stages.ray_tracing import RAY_COST, mesh_id, progress_slices, sees_point
+from warpshadow.stages.raster.interpolation import interpolate_at
+from warpshadow.stages.rays.ray_tracing import RAY_COST, mesh_id, progress_slices, sees_point
 from warpshadow.stages.textures.pyramid import Textures
 from warpshadow.stages.textures.sample import interpolate_uv
 

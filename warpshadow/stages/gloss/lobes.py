@@ -38,7 +38,7 @@ from warpshadow.device.memory import empty, in_huge_pages, require_gradient
 from warpshadow.device.parallel import split_row
 from warpshadow.device.tape import record_adjoint
 from warpshadow.stages.gloss.normal_spread import NormalSpread
-from warpshadow.stages.project import eye_position
+from warpshadow.stages.raster.project import eye_position
 
 MIN_ROUGHNESS = 0.1  # roughness of the smoothest surface; maps of 128 rows have nothing sharper
 

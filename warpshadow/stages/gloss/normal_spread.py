@@ -17,8 +17,8 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import zeros
-from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.screen import volume_rates
+from warpshadow.stages.raster.rasterization import Fragments
+from warpshadow.stages.raster.screen import volume_rates
 
 _RANGE = 0.8
 """Change of a barycentric within a face: over a triangle one deviates by as much as numbers that are even over 0.8."""

@@ -6,7 +6,7 @@ import warp as wp
 
 from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, vectors_type
 from warpshadow.device.launch import launch
-from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open
+from warpshadow.stages.rays.ray_packets import PACKET, FaceTree, make_find_open
 
 _PACKET_COST = 2000.0  # nanoseconds that a packet takes
 

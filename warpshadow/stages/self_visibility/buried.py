@@ -10,7 +10,7 @@ import warp as wp
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.directions import fibonacci
-from warpshadow.stages.ray_tracing import first_hit
+from warpshadow.stages.rays.ray_tracing import first_hit
 from warpshadow.stages.self_visibility.probes import VisibilityProbes
 from warpshadow.stages.self_visibility.trace import VisibilityRows
 

@@ -16,8 +16,8 @@ import warp as wp
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.inset import inset_vertices
-from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.sides import split_side
+from warpshadow.stages.raster.rasterization import Fragments
+from warpshadow.stages.raster.sides import split_side
 
 _EVEN_FACES = 10_000
 """Faces of the even cut by which edges are judged, so that it resolves visibility between probes: 507 vertices alone

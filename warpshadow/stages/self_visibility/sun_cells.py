@@ -23,7 +23,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK, brightest_chunk
-from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open
+from warpshadow.stages.rays.ray_packets import PACKET, FaceTree, make_find_open
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 
 _PACKET_COST = 2000.0  # nanoseconds that a packet takes

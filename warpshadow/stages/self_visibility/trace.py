@@ -19,8 +19,8 @@ from warpshadow.device.lanes import lane_type, make_lane_functions, module_optio
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
 from warpshadow.maths.directions import cell_radius, fibonacci
-from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open, packets_of
-from warpshadow.stages.ray_tracing import progress_slices
+from warpshadow.stages.rays.ray_packets import PACKET, FaceTree, make_find_open, packets_of
+from warpshadow.stages.rays.ray_tracing import progress_slices
 
 RAYS = 4096  # rays of a probe, if memory allows
 MIN_RAYS = 256  # rays of a probe, for any amount of memory

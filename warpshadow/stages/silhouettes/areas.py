@@ -21,7 +21,7 @@ import warp as wp
 
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.stages.screen import (
+from warpshadow.stages.raster.screen import (
     direction_sign,
     face_plane,
     half_size,

@@ -5,7 +5,7 @@ import warp as wp
 from warpshadow.device.batch import instance_in, rows
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import reshaped, zeros
-from warpshadow.stages.screen import (
+from warpshadow.stages.raster.screen import (
     ends_before,
     half_size,
     has_neighbor,
@@ -15,7 +15,7 @@ from warpshadow.stages.screen import (
     relative_to_ray,
     sample_center,
 )
-from warpshadow.stages.sides import join_side, split_side
+from warpshadow.stages.raster.sides import join_side, split_side
 from warpshadow.stages.silhouettes.find import Silhouettes
 from warpshadow.stages.silhouettes.lines import NOTHING, FragmentArrays, image_index, line_between, make_fragment_arrays
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warpshadow.stages.screen import ends_before, neighbor, orientation, relative_to_ray, sample_center
+from warpshadow.stages.raster.screen import ends_before, neighbor, orientation, relative_to_ray, sample_center
 from warpshadow.stages.silhouettes.lines import FragmentArrays, image_index, line_between
 
 MAX_STEPS = 32

@@ -14,8 +14,8 @@ from warpshadow import check
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, filled
 from warpshadow.device.parallel import run_length, split_row, strip_count
-from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.screen import (
+from warpshadow.stages.raster.rasterization import Fragments
+from warpshadow.stages.raster.screen import (
     direction_sign,
     face_plane,
     half_size,

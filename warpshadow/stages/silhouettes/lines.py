@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.screen import face_plane, neighbor, relative_to_ray, sample_center
+from warpshadow.stages.raster.rasterization import Fragments
+from warpshadow.stages.raster.screen import face_plane, neighbor, relative_to_ray, sample_center
 
 NOTHING = -1
 INTERSECTION = -2  # in place of an edge's vertices, where there is no line, and where there is that of two faces

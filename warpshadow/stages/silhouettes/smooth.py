@@ -21,8 +21,8 @@ from warpshadow.device.batch import accumulate
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import copied, reshaped, zeros
 from warpshadow.device.warp_internals import scalar_type
-from warpshadow.stages.interpolation import inner_product
-from warpshadow.stages.screen import neighbor, opposite
+from warpshadow.stages.raster.interpolation import inner_product
+from warpshadow.stages.raster.screen import neighbor, opposite
 from warpshadow.stages.silhouettes.areas import measure_areas_adjoint
 from warpshadow.stages.silhouettes.find import Silhouettes
 from warpshadow.stages.silhouettes.lines import make_fragment_arrays

@@ -18,8 +18,8 @@ from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
-from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.screen import center, volume_rates
+from warpshadow.stages.raster.rasterization import Fragments
+from warpshadow.stages.raster.screen import center, volume_rates
 from warpshadow.stages.textures.pyramid import Textures
 
 PROBE_LINE_EXCESS = 0.25

@@ -15,8 +15,12 @@ from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import differentiable, launch, varies
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import run_length, split_row
-from warpshadow.stages.interpolation import interpolate_at, interpolate_values_adjoint, interpolate_weights_adjoint
-from warpshadow.stages.rasterization import Fragments
+from warpshadow.stages.raster.interpolation import (
+    interpolate_at,
+    interpolate_values_adjoint,
+    interpolate_weights_adjoint,
+)
+from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.textures.footprint import Footprints
 from warpshadow.stages.textures.pyramid import Textures
 
@@ -399,13 +403,13 @@ def textured_radiance(
 ) -> wp.array:
     """Radiance of samples whose reflectance is sampled here, where all else is cached.
 
-    It is :func:`sample_albedo` and :func:`warpshadow.stages.film.sample_radiance` in one: neither albedo nor its
+    It is :func:`sample_albedo` and :func:`warpshadow.stages.image.film.sample_radiance` in one: neither albedo nor its
     gradient is written.
 
     Args:
         fragments, faces, vertex_albedo, textures, footprints: As for :func:`sample_albedo`.
-        white: The samples if every surface were white, of :func:`warpshadow.stages.film.sample_radiance`, vec4 of shape
-            [batch, height, width]; a batch of 1 serves every instance.
+        white: The samples if every surface were white, of :func:`warpshadow.stages.image.film.sample_radiance`, vec4 of
+            shape [batch, height, width]; a batch of 1 serves every instance.
     Returns:
         Linear RGB and coverage, 1 or 0, vec4 of shape [batch, height, width].
     Differentiable: textures, vertex_albedo. Not: fragments, footprints, white.

@@ -27,11 +27,10 @@ from warpshadow.device.launch import launch, without_gradient
 from warpshadow.device.memory import empty, reshaped
 from warpshadow.device.parallel import run_length
 from warpshadow.device.tape import record_adjoint
-from warpshadow.stages.film import sample_radiance
-from warpshadow.stages.interpolation import interpolate, interpolate_values_adjoint, interpolate_weights_adjoint
-from warpshadow.stages.quadtree import Quadtree
-from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.screen import (
+from warpshadow.stages.image.film import sample_radiance
+from warpshadow.stages.raster.interpolation import interpolate, interpolate_values_adjoint, interpolate_weights_adjoint
+from warpshadow.stages.raster.rasterization import Fragments
+from warpshadow.stages.raster.screen import (
     direction_sign,
     ends_before,
     half_size,
@@ -42,6 +41,7 @@ from warpshadow.stages.screen import (
     relative_to_ray_adjoint,
     sample_center,
 )
+from warpshadow.stages.receivers.quadtree import Quadtree
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
 from warpshadow.stages.silhouettes.find import Silhouettes
 from warpshadow.stages.silhouettes.lines import (
@@ -259,7 +259,7 @@ def moving_radiance(
     receivers: wp.array,
     has_mean_slope: wp.array | None = None,
 ) -> tuple[wp.array, wp.array]:
-    """Radiance of samples of moving surfaces: :func:`warpshadow.stages.film.sample_radiance`, by mean slopes.
+    """Radiance of samples of moving surfaces: :func:`warpshadow.stages.image.film.sample_radiance`, by mean slopes.
 
     Args:
         fragments: The fragments, of faces of receivers.

@@ -15,7 +15,7 @@ from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK
-from warpshadow.stages.transfer import cell_inputs, spread, transfer_chunk
+from warpshadow.stages.light.transfer import cell_inputs, spread, transfer_chunk
 
 # receivers whose gradients to light a thread sums before it adds them to the others', on a CPU and on a GPU
 _SLICE, _GPU_SLICE = 256, 16
@@ -287,7 +287,7 @@ def shade_cells(
 ) -> wp.array:
     """Light receivers by known light in cells: Σ_q T_q max(n·ω_q, 0) (4/Q) L_q.
 
-    That is :func:`shade` of :func:`warpshadow.stages.transfer.directional_transfer`.
+    That is :func:`shade` of :func:`warpshadow.stages.light.transfer.directional_transfer`.
 
     Args:
         transmittance: T, float32 of shape [batch, receiver, direction].

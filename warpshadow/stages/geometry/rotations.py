@@ -8,7 +8,7 @@ from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.threads import one_at_a_time
-from warpshadow.stages.nearest_rotation import nearest_rotations
+from warpshadow.stages.geometry.nearest_rotation import nearest_rotations
 
 Vec6 = wp.types.vector(length=6, dtype=wp.float32)
 

@@ -17,7 +17,7 @@ import warp as wp
 
 from warpshadow.device.lanes import vectors_type
 from warpshadow.maths.directions import CHUNK
-from warpshadow.stages.ray_tracing import MIN_HIT_HEIGHT, ROUNDING, WALL_COSINE
+from warpshadow.stages.rays.ray_tracing import MIN_HIT_HEIGHT, ROUNDING, WALL_COSINE
 
 PACKET = CHUNK  # rays of a packet
 

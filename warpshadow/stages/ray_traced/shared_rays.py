@@ -23,12 +23,12 @@ from warpshadow.device.constants import constant
 from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, vectors_type
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
-from warpshadow.stages.beam_packets import make_beams
-from warpshadow.stages.light_samples import LightSamples
-from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open, packets_of
-from warpshadow.stages.ray_tracing import progress_slices
-from warpshadow.stages.receivers import Receivers
-from warpshadow.stages.sample_receivers import MAX_SHARED_SLOPE, MIN_SHARED_COSINE
+from warpshadow.stages.light.light_samples import LightSamples
+from warpshadow.stages.rays.beam_packets import make_beams
+from warpshadow.stages.rays.ray_packets import PACKET, FaceTree, make_find_open, packets_of
+from warpshadow.stages.rays.ray_tracing import progress_slices
+from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.sample_receivers import MAX_SHARED_SLOPE, MIN_SHARED_COSINE
 from warpshadow.stages.shell.beams import FAR
 
 _PACKET_COST = 2000.0  # nanoseconds that a packet takes
@@ -217,7 +217,7 @@ def trace_shared(
         points: Receiver positions [scene units], vec3 of shape [receiver].
         normals: Unit normals, vec3 of shape [receiver].
         samples: One set of directions, a multiple of 16, each run of 16 close to each other.
-        shell: As for :func:`warpshadow.stages.ray_tracing.trace_shading`.
+        shell: As for :func:`warpshadow.stages.rays.ray_tracing.trace_shading`.
         corners: Receivers around others, whose visibility they take over; None for none.
         progress: Show a progress bar where it takes longer than a second.
 

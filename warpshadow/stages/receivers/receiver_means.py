@@ -10,7 +10,7 @@ import warp as wp
 
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
-from warpshadow.stages.rasterization import Fragments
+from warpshadow.stages.raster.rasterization import Fragments
 
 
 class VisibleSurface(NamedTuple):

@@ -10,9 +10,9 @@ from warpshadow.device.lanes import lane_type, make_lane_functions, module_optio
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.directions import CHUNK, fibonacci
-from warpshadow.stages.beam_packets import make_beams
-from warpshadow.stages.ray_packets import PACKET, FaceTree, build_face_tree, make_find_open, packets_of
-from warpshadow.stages.ray_tracing import progress_slices
+from warpshadow.stages.rays.beam_packets import make_beams
+from warpshadow.stages.rays.ray_packets import PACKET, FaceTree, build_face_tree, make_find_open, packets_of
+from warpshadow.stages.rays.ray_tracing import progress_slices
 from warpshadow.stages.shell.beams import FAR
 
 _RAY_COST = 60.0  # nanoseconds that a ray takes
@@ -74,11 +74,11 @@ def trace_transfer(
     """Trace transfer vectors: light of a basis is then shadowed by the mesh itself, exactly but for sampling.
 
     Args:
-        mesh, points, normals: As for :func:`warpshadow.stages.ray_tracing.trace_shading`.
+        mesh, points, normals: As for :func:`warpshadow.stages.rays.ray_tracing.trace_shading`.
         functions: Evaluates the basis functions of the light at unit vectors [direction, 3]: shape [direction,
             coefficient].
         count: Number of directions, evenly over the sphere.
-        shell: As for :func:`warpshadow.stages.ray_tracing.trace_shading`.
+        shell: As for :func:`warpshadow.stages.rays.ray_tracing.trace_shading`.
     Returns:
         Transfer vectors, float32 of shape [receiver, coefficient].
     Differentiable: no.

@@ -18,9 +18,9 @@ from warpshadow.device.constants import cached_by_values, constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, filled, from_numpy, reshaped
 from warpshadow.device.parallel import run_length, split_row
-from warpshadow.stages.quadtree import Quadtree, sample_at
-from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.receiver_means import VisibleSurface, mean_fragments, sample_of_pixel
+from warpshadow.stages.raster.rasterization import Fragments
+from warpshadow.stages.receivers.quadtree import Quadtree, sample_at
+from warpshadow.stages.receivers.receiver_means import VisibleSurface, mean_fragments, sample_of_pixel
 
 TILE = 16  # pixels of a side of the tiles whose receivers follow each other
 

@@ -1,8 +1,8 @@
 """Receivers: the points at which light is evaluated, and how the samples of an image get theirs from them.
 
 Receivers are vertices of visible faces, or for some bodies points that samples see
-(:mod:`warpshadow.stages.sample_receivers`). The back of a face (:mod:`warpshadow.stages.sides`) has receivers of its
-own, at the same points, with opposite normals.
+(:mod:`warpshadow.stages.receivers.sample_receivers`). The back of a face (:mod:`warpshadow.stages.raster.sides`) has
+receivers of its own, at the same points, with opposite normals.
 """
 
 from typing import NamedTuple
@@ -15,12 +15,12 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, from_numpy, reshaped, zeros
 from warpshadow.device.parallel import run_length
-from warpshadow.stages.interpolation import interpolate_at
-from warpshadow.stages.quadtree import Quadtree
-from warpshadow.stages.rasterization import Fragments
-from warpshadow.stages.receiver_means import VisibleSurface
-from warpshadow.stages.sample_receivers import Span, find_sample_receivers, spans_of
-from warpshadow.stages.sides import split_side, split_sides
+from warpshadow.stages.raster.interpolation import interpolate_at
+from warpshadow.stages.raster.rasterization import Fragments
+from warpshadow.stages.raster.sides import split_side, split_sides
+from warpshadow.stages.receivers.quadtree import Quadtree
+from warpshadow.stages.receivers.receiver_means import VisibleSurface
+from warpshadow.stages.receivers.sample_receivers import Span, find_sample_receivers, spans_of
 from warpshadow.stages.silhouettes.find import Silhouettes
 
 _MARK_COST = 5.0  # nanoseconds that a sample takes, to mark the corners of its face

@@ -15,7 +15,7 @@ from warpshadow.device.batch import instance_in, rows
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import run_length
-from warpshadow.stages.rasterization import Fragments
+from warpshadow.stages.raster.rasterization import Fragments
 
 _FACE_RUN = 1024  # faces that a thread owns on a CPU, so that it finds the camera's eye once for all of them
 

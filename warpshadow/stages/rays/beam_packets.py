@@ -5,7 +5,7 @@ import functools
 import warp as wp
 
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
-from warpshadow.stages.ray_packets import PACKET
+from warpshadow.stages.rays.ray_packets import PACKET
 from warpshadow.stages.shell.beams import MIN_DISTANCE, center_of
 
 _MIN_DISTANCE2 = MIN_DISTANCE**2

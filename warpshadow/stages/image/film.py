@@ -7,8 +7,8 @@ from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, reshaped
 from warpshadow.device.parallel import find_run, run_dimensions, run_length
-from warpshadow.stages.interpolation import interpolate_at
-from warpshadow.stages.rasterization import Fragments
+from warpshadow.stages.raster.interpolation import interpolate_at
+from warpshadow.stages.raster.rasterization import Fragments
 
 _COST = 5.0  # nanoseconds that a sample takes
 
@@ -46,7 +46,7 @@ def _sample_radiance(
 def sample_radiance(fragments: Fragments, faces: wp.array, shading: wp.array, albedo: wp.array) -> wp.array:
     """Multiply the light at the samples, interpolated from the receivers, with their reflectance.
 
-    Where surfaces move, :func:`warpshadow.stages.slopes.moving_radiance` has the better gradient.
+    Where surfaces move, :func:`warpshadow.stages.image.slopes.moving_radiance` has the better gradient.
 
     Args:
         faces: Indices of receivers, vec3i of shape [face].

@@ -30,9 +30,9 @@ from warpshadow.stages.bounces.bright_patches import (
     point_of_bright_side,
 )
 from warpshadow.stages.emitters.traced import EmittingFaces, light_of_point
-from warpshadow.stages.interpolation import interpolate_at
-from warpshadow.stages.light_samples import LightSamples
-from warpshadow.stages.ray_tracing import RAY_COST, escapes, first_hit, mesh_id, progress_slices
+from warpshadow.stages.light.light_samples import LightSamples
+from warpshadow.stages.raster.interpolation import interpolate_at
+from warpshadow.stages.rays.ray_tracing import RAY_COST, escapes, first_hit, mesh_id, progress_slices
 from warpshadow.stages.shell.beams import FAR, beam_to_shell
 from warpshadow.stages.textures.pyramid import Textures
 from warpshadow.stages.textures.sample import interpolate_uv

@@ -10,7 +10,7 @@ from warpshadow.device.array_checks import finite_arrays, values_of
 from warpshadow.device.batch import common_batch, expand, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.stages.rotations import check_orthonormal
+from warpshadow.stages.geometry.rotations import check_orthonormal
 
 
 @wp.kernel

@@ -15,7 +15,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, reshaped
 from warpshadow.device.parallel import find_run, run_dimensions, run_length
 from warpshadow.device.warp_internals import scalar_type
-from warpshadow.stages.rasterization import Fragments
+from warpshadow.stages.raster.rasterization import Fragments
 
 _COST = 5.0  # nanoseconds that a sample takes
 

@@ -7,7 +7,7 @@ from warpshadow.device.batch import rows
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, reshaped
 from warpshadow.device.parallel import run_length, split_row
-from warpshadow.stages.screen import center, ray_volumes, relative_to_ray, relative_to_ray_adjoint
+from warpshadow.stages.raster.screen import center, ray_volumes, relative_to_ray, relative_to_ray_adjoint
 
 TINY_VOLUME = 1.0e-36  # below this the volumes of a face are subnormal numbers, which have no reciprocal in float32
 

@@ -1,6 +1,6 @@
 """Rasterize triangles: which face each sample of an image sees, and where on it.
 
-Samples and clip space follow :mod:`warpshadow.stages.screen`. Coverage is decided in integers, so it is exact:
+Samples and clip space follow :mod:`warpshadow.stages.raster.screen`. Coverage is decided in integers, so it is exact:
 vertices snap to 1/4096 sample, a sample sees the face that holds its center, and a center on an edge belongs to one of
 the two faces that share it (the top-left rule). Both sides of a face are drawn. Of the faces over a sample the nearest
 wins; of equally near ones, that of the lowest index.
@@ -20,7 +20,7 @@ from warpshadow.device.batch import rows
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, reshaped, zeros
 from warpshadow.device.parallel import run_length, split_row, strip_count, thread_count
-from warpshadow.stages.barycentrics import find_barycentrics
+from warpshadow.stages.raster.barycentrics import find_barycentrics
 
 MAX_SIZE = 1 << 15  # largest image width or height [samples]: beyond, fixed-point edge functions could overflow
 
@@ -55,7 +55,7 @@ class Fragments:
         face_ids: Index of the visible face, -1 where there is none, int32, shape [batch, height, width].
         barycentrics: Perspective-correct weights of the face's three vertices, non-negative with sum 1, zero
             where there is no face, vec3, shape [batch, height, width].
-        sides: Index of the visible side (`warpshadow.stages.sides`), -1 where there is no face, int32, shape
+        sides: Index of the visible side (`warpshadow.stages.raster.sides`), -1 where there is no face, int32, shape
             [batch, height, width]; None where no face is known to be seen from behind.
     """
 
@@ -388,7 +388,8 @@ def rasterize(clip_positions: wp.array, faces: wp.array, width: int, height: int
     plane and infinity); a face without area draws nothing.
 
     Args:
-        clip_positions: Vertices in clip space (`warpshadow.stages.project.to_clip`), vec4, shape [batch, vertex].
+        clip_positions: Vertices in clip space, of :func:`warpshadow.stages.raster.project.to_clip`, vec4, shape [batch,
+            vertex].
         faces: Vertex indices, vec3i, shape [face].
         width: Image width [samples], at most 32768.
         height: Image height [samples], at most 32768.

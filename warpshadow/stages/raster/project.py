@@ -65,7 +65,7 @@ def compose_clip_matrices(
     Args:
         intrinsics: K [pixels], last row (0, 0, 1), mat33 of shape [batch].
         rotations: R, world to camera, mat33 of shape [batch], from
-            :func:`warpshadow.stages.rotations.rotation_matrices`.
+            :func:`warpshadow.stages.geometry.rotations.rotation_matrices`.
         translations: t [scene units], world to camera, vec3 of shape [batch].
             Any batch may be 1 and then serves every instance.
         size: Width and height [pixels] of the image that K is for.

@@ -1,0 +1,1 @@
+"""Geometry: poses and deformation of vertices and spheres, and normals."""

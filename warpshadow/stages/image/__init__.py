@@ -1,0 +1,1 @@
+"""From samples to an image: pixels, their derivative as surfaces move, and photographs behind them."""

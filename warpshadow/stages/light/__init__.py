@@ -1,0 +1,1 @@
+"""Light on receivers: directions that sample it, visibility times cosine, and sums over the product."""

@@ -1,0 +1,1 @@
+"""Raster: projection, the face that each sample sees, and values of vertices there."""

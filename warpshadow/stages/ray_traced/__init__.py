@@ -1,0 +1,1 @@
+"""Ray-traced light: of stills, and of the path-traced reference."""

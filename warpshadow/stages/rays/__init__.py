@@ -1,0 +1,1 @@
+"""Rays against meshes: one at a time, and packets of sixteen."""

@@ -1,0 +1,1 @@
+"""Receivers: the points at which light is computed for an image."""
