@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -28,7 +27,7 @@ from warpshadow.pipeline.shading.transfers import joined
 from warpshadow.stages.bounces.albedo import mean_over_texels
 from warpshadow.stages.emitters.beams import find_axis_weights, within_beam
 from warpshadow.stages.emitters.convex import find_log_transmittance_of_parts
-from warpshadow.stages.emitters.light import directions_to_samples, sum_light
+from warpshadow.stages.emitters.light import directions_to_samples, sum_light, transmittance_to_samples
 from warpshadow.stages.emitters.planes import find_log_transmittance_of_planes
 from warpshadow.stages.emitters.samples import (
     EmitterBeams,
@@ -207,7 +206,7 @@ class SceneEmitters:
         ) -> wp.array:
             lit = receivers.points, receivers.normals, placed_samples, radiance
             pairs = self._within_beams(receivers, placed_samples, transmittance)
-            return total_light([sum_light(*lit, span, transmittance=item) for span, item in pairs])
+            return total_light([sum_light(*lit, *pair) for pair in pairs])
 
         return Node(name, light, receivers, placed, radiance, transmittance)
 
@@ -226,7 +225,7 @@ class SceneEmitters:
         ) -> LobeLight:
             seen = receivers.points, receivers.normals, roughness, clip_matrices, placed_samples, radiance
             pairs = self._within_beams(receivers, placed_samples, transmittance)
-            of_emitters = [sum_highlights(*seen, span, transmittance=item) for span, item in pairs]
+            of_emitters = [sum_highlights(*seen, *pair) for pair in pairs]
             return LobeLight(*(total_light(list(parts)) for parts in zip(*of_emitters, strict=True)))
 
         return Node("highlights", highlights, receivers, placed, radiance, transmittance, roughness, cameras)
@@ -261,9 +260,9 @@ def find_emitted_light(
 
     def light_of(portion: Group) -> wp.array:
         total = wp.zeros(portion.points.shape, dtype=wp.vec3, device=portion.points.device)
-        for span, transmittances in _find_transmittances(emitters, self_visibility, portion, blockers, placed_samples):
-            lit = portion.points, portion.normals, placed_samples, radiance, span
-            total = total_light([total, sum_light(*lit, **transmittances)])
+        lit = portion.points, portion.normals, placed_samples, radiance
+        for pair in _find_transmittances(emitters, self_visibility, portion, blockers, placed_samples):
+            total = total_light([total, sum_light(*lit, *pair)])
         return total
 
     return joined([light_of(portion) for group in groups for portion in group.portions()])
@@ -293,10 +292,8 @@ def find_highlights(
         seen = portion.points, portion.normals, cut(roughness, first, end), clip_matrices
         zeros = wp.zeros(portion.points.shape, dtype=wp.vec3, device=portion.points.device)
         of_emitters = [
-            sum_highlights(*seen, placed_samples, radiance, span, **transmittances)
-            for span, transmittances in _find_transmittances(
-                emitters, self_visibility, portion, blockers, placed_samples
-            )
+            sum_highlights(*seen, placed_samples, radiance, *pair)
+            for pair in _find_transmittances(emitters, self_visibility, portion, blockers, placed_samples)
         ]
         lobe_sums.append([total_light([zeros, *parts]) for parts in zip(*of_emitters, strict=True)] or [zeros, zeros])
         first = end
@@ -309,8 +306,8 @@ def _find_transmittances(
     group: Group,
     blockers: Blockers,
     placed_samples: PlacedSamples,
-) -> Iterator[tuple[EmitterSpan, dict[str, Any]]]:
-    """Samples of all emitters that light a portion of receivers, and transmittance to them: arguments of `sum_light`.
+) -> Iterator[tuple[EmitterSpan, wp.array | None]]:
+    """Samples of all emitters that light a portion of receivers, and the transmittance to them.
 
     The receivers' own body is among them if it is not convex.
     """
@@ -355,13 +352,13 @@ def _find_transmittances(
             transmittance_of_emitter = look_up_self_visibility(*lookup, is_own=is_own)
         yield (
             span,
-            {
-                "log_of_spheres": find_log_transmittance(points, normals, placed_samples, span, *spheres, skipped),
-                "log_of_planes": _log_of_planes(group, blockers, placed_samples, span, body),
-                "log_of_parts": _log_of_parts(group, blockers, placed_samples, span, body),
-                "transmittance": transmittance_self,
-                "transmittance_of_emitter": within_beam(points, placed_samples, span, transmittance_of_emitter),
-            },
+            transmittance_to_samples(
+                log_of_spheres=find_log_transmittance(points, normals, placed_samples, span, *spheres, skipped),
+                log_of_planes=_log_of_planes(group, blockers, placed_samples, span, body),
+                log_of_parts=_log_of_parts(group, blockers, placed_samples, span, body),
+                transmittance_self=transmittance_self,
+                transmittance_of_emitter=within_beam(points, placed_samples, span, transmittance_of_emitter),
+            ),
         )
 
 

@@ -17,7 +17,7 @@ from warpshadow.device.batch import common_batch, expand, expand_rows, instance_
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
-from warpshadow.stages.emitters.samples import EVERYWHERE, EmitterSpan, PlacedSamples
+from warpshadow.stages.emitters.samples import EVERYWHERE, EmitterSpan, PlacedSamples, sample_transmittance
 
 _COST = 4.0  # nanoseconds that a sample takes
 _MIN_FACING = 0.1  # of its area, that a surface faces a direction with on average
@@ -63,14 +63,6 @@ def beam_share(axis: wp.vec3, to_receiver: wp.vec3, beam: wp.vec2):
     return wp.smoothstep(beam[1], beam[0], 0.5 * wp.length_sq(wp.normalize(to_receiver) - axis))
 
 
-@wp.func
-def _transmittance_at(transmittance: wp.array3d(dtype=wp.float32), batch: int, receiver: int, i: int):
-    through = float(1.0)
-    if transmittance:
-        through = transmittance[batch, receiver, i]
-    return through
-
-
 @wp.kernel
 def _find_shares(
     first_row: int,
@@ -93,7 +85,7 @@ def _find_shares(
     axis = wp.normalize(axes[sample_batch, emitter])
     for i in range(shares.shape[2]):
         share = beam_share(axis, point - sample_points[sample_batch, first_sample + i], beam)
-        shares[batch, receiver, i] = share * _transmittance_at(transmittance, batch, receiver, i)
+        shares[batch, receiver, i] = share * sample_transmittance(transmittance, batch, receiver, i)
 
 
 def within_beam(

@@ -3,10 +3,10 @@
     E(x) = Σ_k L_k T_k max(n·ω_k, 0) max(−A_k·ω_k, 0) / √(π² d_k⁴ + |A_k|²)
 
 L_k is the radiance of sample k, A_k its area vector, d_k and ω_k the distance and the direction to its middle, T_k the
-transmittance on the way. E is over π, as all shading is. The root is π d² but for receivers closer to a sample than
-samples are to each other, where nothing becomes infinite. (The form factor of a disc on its axis has π d² + |A| in
-place of the root; samples are beside each other.) An open body sends light to both sides: |A_k·ω_k| is in place of the
-maximum.
+transmittance on the way past spheres, planes, convex parts, the receiver's own body and the emitter's. E is over π, as
+all shading is. The root is π d² but for receivers closer to a sample than samples are to each other, where nothing
+becomes infinite. (The form factor of a disc on its axis has π d² + |A| in place of the root; samples are beside each
+other.) An open body sends light to both sides: |A_k·ω_k| is in place of the maximum.
 
 A ball of radius r is 0.1 and 1% off from r and r/2 above it, by the form factor 4 and 12% too dark.
 """
@@ -17,7 +17,7 @@ from warpshadow.device.batch import common_batch, expand, expand_rows, instance_
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
-from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, is_lit
+from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, is_lit, sample_transmittance
 
 _COST = 6.0  # nanoseconds that a sample takes
 
@@ -50,31 +50,67 @@ def directions_to_samples(points: wp.array, samples: PlacedSamples, span: Emitte
     return directions
 
 
-@wp.func
-def transmittance_to_sample(
+@wp.kernel
+def _multiply_transmittances(
+    first_row: int,
+    worker: int,
+    # in
     log_of_spheres: wp.array3d(dtype=wp.float32),
     log_of_planes: wp.array3d(dtype=wp.float32),
     log_of_parts: wp.array3d(dtype=wp.float32),
-    transmittance: wp.array3d(dtype=wp.float32),
+    transmittance_self: wp.array3d(dtype=wp.float32),
     transmittance_of_emitter: wp.array3d(dtype=wp.float32),
-    batch: int,
-    receiver: int,
-    i: int,
+    # out
+    transmittance: wp.array3d(dtype=wp.float32),
 ):
-    """T of a sample, past all that blocks."""
-    exponent = float(0.0)
-    if log_of_spheres:
-        exponent += log_of_spheres[batch, receiver, i]
-    if log_of_planes:
-        exponent += log_of_planes[batch, receiver, i]
-    if log_of_parts:
-        exponent += log_of_parts[batch, receiver, i]
-    through = wp.exp(exponent)
-    if transmittance:
-        through = through * transmittance[batch, receiver, i]
-    if transmittance_of_emitter:
-        through = through * transmittance_of_emitter[batch, receiver, i]
-    return through
+    """A thread owns a receiver of an instance."""
+    batch, receiver = split_row(first_row + wp.tid(), transmittance.shape[1])
+    for i in range(transmittance.shape[2]):
+        exponent = float(0.0)
+        if log_of_spheres:
+            exponent += log_of_spheres[batch, receiver, i]
+        if log_of_planes:
+            exponent += log_of_planes[batch, receiver, i]
+        if log_of_parts:
+            exponent += log_of_parts[batch, receiver, i]
+        product = wp.exp(exponent) * sample_transmittance(transmittance_self, batch, receiver, i)
+        transmittance[batch, receiver, i] = product * sample_transmittance(transmittance_of_emitter, batch, receiver, i)
+
+
+def transmittance_to_samples(
+    *,
+    log_of_spheres: wp.array | None = None,
+    log_of_planes: wp.array | None = None,
+    log_of_parts: wp.array | None = None,
+    transmittance_self: wp.array | None = None,
+    transmittance_of_emitter: wp.array | None = None,
+) -> wp.array | None:
+    """Transmittance to the samples of an emitter past all that blocks; None where nothing does.
+
+    Args:
+        log_of_spheres, log_of_planes, log_of_parts: Logarithms of transmittance, float32 of shape [batch, receiver,
+            sample].
+        transmittance_self, transmittance_of_emitter: Transmittance past the receivers' own body and past the emitter's,
+            of the same shape. Any batch may be 1; None where nothing blocks.
+    Returns:
+        Of the same shape.
+    Differentiable: all.
+    """
+    factors = {"spheres": log_of_spheres, "planes": log_of_planes, "parts": log_of_parts}
+    factors |= {"others": transmittance_self, "emitter": transmittance_of_emitter}
+    first = next((item for item in factors.values() if item is not None), None)
+    if first is None:
+        return None
+    count = common_batch(factors)
+    transmittance = empty((count, *first.shape[1:]), dtype=wp.float32, device=first.device)
+    launch(
+        _multiply_transmittances,
+        count * first.shape[1],
+        inputs=[None if item is None else expand_rows(item, count) for item in factors.values()],
+        outputs=[transmittance],
+        cost=_COST * first.shape[2],
+    )
+    return transmittance
 
 
 @wp.kernel
@@ -90,11 +126,7 @@ def _sum_light(
     first_sample: int,
     sample_count: int,
     is_two_sided: int,
-    log_of_spheres: wp.array3d(dtype=wp.float32),
-    log_of_planes: wp.array3d(dtype=wp.float32),
-    log_of_parts: wp.array3d(dtype=wp.float32),
     transmittance: wp.array3d(dtype=wp.float32),
-    transmittance_of_emitter: wp.array3d(dtype=wp.float32),
     # out
     light: wp.array2d(dtype=wp.vec3),
 ):
@@ -110,17 +142,7 @@ def _sum_light(
         area = sample_areas[sample_batch, first_sample + i]
         if is_lit(beam, area, normal, is_two_sided):
             facing_area = wp.abs(wp.dot(beam, area))
-            through = transmittance_to_sample(
-                log_of_spheres,
-                log_of_planes,
-                log_of_parts,
-                transmittance,
-                transmittance_of_emitter,
-                batch,
-                receiver,
-                i,
-            )
-            factor = wp.dot(beam, normal) * facing_area * through
+            factor = wp.dot(beam, normal) * facing_area * sample_transmittance(transmittance, batch, receiver, i)
             distance2 = wp.length_sq(beam)
             factor = factor / (distance2 * wp.sqrt(wp.pi * wp.pi * distance2 * distance2 + wp.length_sq(area)))
             total += factor * radiance[radiance_batch, first_sample + i]
@@ -133,12 +155,7 @@ def sum_light(
     samples: PlacedSamples,
     radiance: wp.array,
     span: EmitterSpan,
-    *,
-    log_of_spheres: wp.array | None = None,
-    log_of_planes: wp.array | None = None,
-    log_of_parts: wp.array | None = None,
     transmittance: wp.array | None = None,
-    transmittance_of_emitter: wp.array | None = None,
 ) -> wp.array:
     """Light of an emitter on receivers.
 
@@ -148,20 +165,14 @@ def sum_light(
         samples: Of all emitters.
         radiance: Of the samples, linear RGB, vec3 of shape [batch, sample].
         span: Those of the emitter.
-        log_of_spheres, log_of_planes, log_of_parts: Logarithms of transmittance, float32 of shape [batch, receiver,
-            sample].
-        transmittance, transmittance_of_emitter: Factors beside them, of the receivers' own body and of the emitter's,
-            float32 of the same shape. Any batch may be 1; None where nothing blocks.
+        transmittance: To these, float32 of shape [batch, receiver, sample]; None for 1. Any batch may be 1.
     Returns:
         vec3 of shape [batch, receiver].
-    Differentiable: points, normals, samples, radiance and all transmittance.
+    Differentiable: points, normals, samples, radiance, transmittance.
     """
     arrays = {"points": points, "normals": normals, "emitters": samples.points, "emission": radiance}
-    rows = {"spheres": log_of_spheres, "planes": log_of_planes, "parts": log_of_parts}
-    rows |= {"others": transmittance, "emitter": transmittance_of_emitter}
-    count = common_batch(arrays | rows)
+    count = common_batch(arrays | {"transmittance": transmittance})
     points, normals = expand(points, count), expand(normals, count)
-    transmittances = [None if item is None else expand_rows(item, count) for item in rows.values()]
     light = empty((count, points.shape[1]), dtype=wp.vec3, device=points.device)
     launch(
         _sum_light,
@@ -169,10 +180,10 @@ def sum_light(
         inputs=[
             *(points, normals, samples.points, samples.areas, radiance, span.first, span.size),
             int(span.is_two_sided),
-            *transmittances,
+            None if transmittance is None else expand_rows(transmittance, count),
         ],
         outputs=[light],
         shared=[samples.points, samples.areas, radiance],
-        cost=_COST * (span.size),
+        cost=_COST * span.size,
     )
     return light

@@ -271,6 +271,15 @@ def is_lit(beam: wp.vec3, area: wp.vec3, normal: wp.vec3, is_two_sided: int):
     return wp.dot(beam, normal) > 0.0 and (facing < 0.0 or (facing > 0.0 and is_two_sided == 1))
 
 
+@wp.func
+def sample_transmittance(transmittance: wp.array3d(dtype=wp.float32), batch: int, receiver: int, i: int):
+    """Transmittance from a receiver to a sample, 1 where nothing blocks."""
+    through = float(1.0)
+    if transmittance:
+        through = transmittance[batch, receiver, i]
+    return through
+
+
 def place_samples(positions: wp.array, samples: EmitterSamples) -> PlacedSamples:
     """Place the samples of emitters by the vertices of all bodies.
 

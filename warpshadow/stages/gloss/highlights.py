@@ -17,8 +17,7 @@ from warpshadow.device.batch import common_batch, expand, expand_rows, instance_
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
-from warpshadow.stages.emitters.light import transmittance_to_sample
-from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, is_lit
+from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, is_lit, sample_transmittance
 from warpshadow.stages.gloss.lobes import MAX_COSINE, MIN_COSINE, MIN_ROUGHNESS
 from warpshadow.stages.gloss.reflection import LobeLight
 from warpshadow.stages.raster.project import eye_position
@@ -53,11 +52,7 @@ def _sum_highlights(
     first_sample: int,
     sample_count: int,
     is_two_sided: int,
-    log_of_spheres: wp.array3d(dtype=wp.float32),
-    log_of_planes: wp.array3d(dtype=wp.float32),
-    log_of_parts: wp.array3d(dtype=wp.float32),
     transmittance: wp.array3d(dtype=wp.float32),
-    transmittance_of_emitter: wp.array3d(dtype=wp.float32),
     # out
     straight: wp.array2d(dtype=wp.vec3),
     grazing_light: wp.array2d(dtype=wp.vec3),
@@ -78,16 +73,6 @@ def _sum_highlights(
         beam = sample_points[sample_batch, first_sample + i] - point
         area = sample_areas[sample_batch, first_sample + i]
         if is_lit(beam, area, normal, is_two_sided):
-            through = transmittance_to_sample(
-                log_of_spheres,
-                log_of_planes,
-                log_of_parts,
-                transmittance,
-                transmittance_of_emitter,
-                batch,
-                receiver,
-                i,
-            )
             distance2 = wp.length_sq(beam)
             distance = wp.sqrt(distance2)
             # pi d² facing / √(π² d⁴ + |A|²), as for diffuse light
@@ -96,7 +81,7 @@ def _sum_highlights(
             cosine = wp.dot(beam, normal) / distance
             mirror = wp.normalize(view + beam / distance)
             square = wp.min(rough * rough * rough * rough + solid_angle / (4.0 * wp.pi), 1.0)
-            weight = cosine * solid_angle * through
+            weight = cosine * solid_angle * sample_transmittance(transmittance, batch, receiver, i)
             weight = weight * _reflect(wp.dot(normal, mirror), cosine, view_cosine, square)
             base = wp.max(1.0 - wp.dot(view, mirror), 0.0)
             light = weight * radiance[radiance_batch, first_sample + i]
@@ -114,12 +99,7 @@ def sum_highlights(
     samples: PlacedSamples,
     radiance: wp.array,
     span: EmitterSpan,
-    *,
-    log_of_spheres: wp.array | None = None,
-    log_of_planes: wp.array | None = None,
-    log_of_parts: wp.array | None = None,
     transmittance: wp.array | None = None,
-    transmittance_of_emitter: wp.array | None = None,
 ) -> LobeLight:
     """Light of an emitter in the lobes of receivers.
 
@@ -128,17 +108,14 @@ def sum_highlights(
         normals: Their unit normals, vec3 of shape [batch, receiver].
         roughness: Float32 of shape [batch, receiver].
         clip_matrices: Cameras, mat44 of shape [batch].
-        samples, radiance, span: As for :func:`warpshadow.stages.emitters.light.sum_light`.
-        log_of_spheres, log_of_planes, log_of_parts, transmittance, transmittance_of_emitter: As for that. Any batch
-            may be 1.
+        samples, radiance, span, transmittance: As for :func:`warpshadow.stages.emitters.light.sum_light`. Any batch may
+            be 1.
     Differentiable: all but span.
     """
     check.shape("roughness", roughness.shape, ("batch", points.shape[1]))
     arrays = {"points": points, "normals": normals, "roughness": roughness, "clip_matrices": clip_matrices}
-    arrays |= {"emitters": samples.points, "emission": radiance}
-    rows = {"spheres": log_of_spheres, "planes": log_of_planes, "parts": log_of_parts}
-    rows |= {"others": transmittance, "emitter": transmittance_of_emitter}
-    count = common_batch(arrays | rows)
+    arrays |= {"emitters": samples.points, "emission": radiance, "transmittance": transmittance}
+    count = common_batch(arrays)
     points, normals, roughness = (expand(array, count) for array in (points, normals, roughness))
     lobe_sums = [empty((count, points.shape[1]), dtype=wp.vec3, device=points.device) for _ in range(2)]
     launch(
@@ -147,7 +124,7 @@ def sum_highlights(
         inputs=[
             *(points, normals, roughness, clip_matrices, samples.points, samples.areas, radiance),
             *(span.first, span.size, int(span.is_two_sided)),
-            *(None if item is None else expand_rows(item, count) for item in rows.values()),
+            None if transmittance is None else expand_rows(transmittance, count),
         ],
         outputs=lobe_sums,
         shared=[clip_matrices, samples.points, samples.areas, radiance],
