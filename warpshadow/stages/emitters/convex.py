@@ -49,21 +49,18 @@ class Beam:
 
 
 @wp.struct
-class BeamAdjoint:
-    """Gradients of a beam."""
-
-    point: wp.vec3
-    offset: wp.vec3
-    radius: float
-
-
-@wp.struct
-class NearestBorder:
+class Border:
     """The edge of a part's silhouette that is nearest to a beam, and the face seen that its end is nearest to."""
 
-    edge: int  # −1 for none
-    face: int
+    is_any: bool  # whether there is one
     side: float  # 1 where the receiver sees the face to the right of the edge, −1 where it sees the one to the left
+    ends: wp.vec4i  # of the edge, the first two
+    face: wp.vec3i
+    begin: wp.vec3  # positions of the ends
+    end: wp.vec3
+    a: wp.vec3  # positions of the face's corners
+    b: wp.vec3
+    c: wp.vec3
 
 
 @wp.func
@@ -85,8 +82,8 @@ def _nearest_border(parts: PlacedPartArrays, part: int, beam: Beam):
     """The nearest edge and face. Receivers that see both sides of a panel, or none, have none."""
     margin = _ON_FACE * parts.bounds[part][3]
     first_face = parts.arrays.first_face[part]
-    nearest = NearestBorder()
-    nearest.edge = -1
+    border = Border()
+    nearest_edge = int(-1)
     min_sine = float(wp.inf)
     for e in range(parts.arrays.first_edge[part], parts.arrays.first_edge[part + 1]):
         edge = parts.arrays.edges[e]
@@ -96,9 +93,9 @@ def _nearest_border(parts: PlacedPartArrays, part: int, beam: Beam):
             sine = side * wp.dot(wp.normalize(_edge_vector(parts, e, beam.point)), beam.offset)
             if sine < min_sine:
                 min_sine = sine
-                nearest.edge = e
-                nearest.side = side
-    nearest.face = -1
+                nearest_edge = e
+                border.side = side
+    nearest_face = int(-1)
     min_depth = float(wp.inf)
     for face in range(first_face, parts.arrays.first_face[part + 1]):
         if _sees(parts.planes, face, beam.point, margin):
@@ -106,48 +103,37 @@ def _nearest_border(parts: PlacedPartArrays, part: int, beam: Beam):
             depth = plane[3] - wp.dot(wp.vec3(plane[0], plane[1], plane[2]), beam.point + beam.offset)
             if depth < min_depth:
                 min_depth = depth
-                nearest.face = face
-    return nearest
+                nearest_face = face
+    if nearest_edge >= 0 and nearest_face >= 0:
+        border.is_any = True
+        border.ends = parts.arrays.edges[nearest_edge]
+        border.face = parts.arrays.faces[nearest_face]
+        border.begin = parts.corners[border.ends[0]]
+        border.end = parts.corners[border.ends[1]]
+        border.a = parts.corners[border.face[0]]
+        border.b = parts.corners[border.face[1]]
+        border.c = parts.corners[border.face[2]]
+    return border
 
 
 @wp.func
-def _face_vector(parts: PlacedPartArrays, face: wp.vec3i):
-    """Outward normal of a face, not of unit length."""
-    a = parts.corners[face[0]]
-    return wp.cross(parts.corners[face[1]] - a, parts.corners[face[2]] - a)
-
-
-@wp.func
-def _position_and_depth(parts: PlacedPartArrays, nearest: NearestBorder, beam: Beam):
-    """Find p and q; −1 where nothing is hidden."""
-    if nearest.edge < 0 or nearest.face < 0:
-        return wp.vec2(-1.0)
-    normal = nearest.side * wp.normalize(_edge_vector(parts, nearest.edge, beam.point))
-    face = parts.arrays.faces[nearest.face]
-    face_normal = wp.normalize(_face_vector(parts, face))
-    depth = wp.dot(face_normal, parts.corners[face[0]] - beam.point - beam.offset)
-    return wp.vec2(wp.dot(normal, beam.offset) / beam.radius, depth / beam.radius)
+def _share_within(border: Border, beam: Beam):
+    """The share a of a part whose nearest border is known."""
+    edge_normal = border.side * wp.normalize(wp.cross(border.begin - beam.point, border.end - beam.point))
+    face_normal = wp.normalize(wp.cross(border.b - border.a, border.c - border.a))
+    position = wp.dot(edge_normal, beam.offset) / beam.radius
+    depth = wp.dot(face_normal, border.a - beam.point - beam.offset) / beam.radius
+    return wp.smoothstep(-1.0, 1.0, position) * wp.smoothstep(-1.0, 1.0, depth)
 
 
 @wp.func
 def _hidden_share(parts: PlacedPartArrays, part: int, beam: Beam):
-    """The share a."""
-    values = _position_and_depth(parts, _nearest_border(parts, part, beam), beam)
-    return wp.smoothstep(-1.0, 1.0, values[0]) * wp.smoothstep(-1.0, 1.0, values[1])
-
-
-@wp.func
-def _smoothstep_slope(x: float):
-    """Slope of the smoothstep from −1 to 1."""
-    return 0.75 * wp.max(1.0 - x * x, 0.0)
-
-
-@wp.func
-def _unit_adjoint(vector: wp.vec3, adj_unit: wp.vec3):
-    """Gradient of a vector, given that of its direction."""
-    length = wp.length(vector)
-    unit = vector / wp.max(length, 1.0e-30)
-    return (adj_unit - wp.dot(unit, adj_unit) * unit) / wp.max(length, 1.0e-30)
+    """The share a of a part."""
+    border = _nearest_border(parts, part, beam)
+    share = float(0.0)
+    if border.is_any:
+        share = _share_within(border, beam)
+    return share
 
 
 @wp.func
@@ -155,39 +141,17 @@ def _hidden_share_adjoint(
     parts: PlacedPartArrays, part: int, beam: Beam, adj_share: float, batch: int, adj_corners: wp.array2d(dtype=wp.vec3)
 ):
     """Gradients of the beam, given that of the share; those of corners are added."""
-    adj = BeamAdjoint()
-    nearest = _nearest_border(parts, part, beam)
-    values = _position_and_depth(parts, nearest, beam)
-    adj_position = adj_share * _smoothstep_slope(values[0]) * wp.smoothstep(-1.0, 1.0, values[1]) / beam.radius
-    adj_depth = adj_share * wp.smoothstep(-1.0, 1.0, values[0]) * _smoothstep_slope(values[1]) / beam.radius
-    if adj_position != 0.0:
-        ends = parts.arrays.edges[nearest.edge]
-        edge_vector = _edge_vector(parts, nearest.edge, beam.point)
-        adj_vector = _unit_adjoint(edge_vector, nearest.side * adj_position * beam.offset)
-        adj_begin = wp.cross(parts.corners[ends[1]] - beam.point, adj_vector)
-        adj_end = wp.cross(adj_vector, parts.corners[ends[0]] - beam.point)
-        adj.point -= adj_begin + adj_end
-        adj.offset += nearest.side * adj_position * wp.normalize(edge_vector)
-        adj.radius -= adj_position * values[0]
+    adj_beam = Beam()
+    border = _nearest_border(parts, part, beam)
+    if border.is_any:
+        slopes, adj_beam = wp.grad(_share_within)(border, beam)
         if adj_corners:
-            wp.atomic_add(adj_corners, batch, ends[0], adj_begin)
-            wp.atomic_add(adj_corners, batch, ends[1], adj_end)
-    if adj_depth != 0.0:
-        face = parts.arrays.faces[nearest.face]
-        a = parts.corners[face[0]]
-        face_vector = _face_vector(parts, face)
-        adj_gap = adj_depth * wp.normalize(face_vector)
-        adj_vector = _unit_adjoint(face_vector, adj_depth * (a - beam.point - beam.offset))
-        adj_b = wp.cross(parts.corners[face[2]] - a, adj_vector)
-        adj_c = wp.cross(adj_vector, parts.corners[face[1]] - a)
-        adj.point -= adj_gap
-        adj.offset -= adj_gap
-        adj.radius -= adj_depth * values[1]
-        if adj_corners:
-            wp.atomic_add(adj_corners, batch, face[0], adj_gap - adj_b - adj_c)
-            wp.atomic_add(adj_corners, batch, face[1], adj_b)
-            wp.atomic_add(adj_corners, batch, face[2], adj_c)
-    return adj
+            wp.atomic_add(adj_corners, batch, border.ends[0], adj_share * slopes.begin)
+            wp.atomic_add(adj_corners, batch, border.ends[1], adj_share * slopes.end)
+            wp.atomic_add(adj_corners, batch, border.face[0], adj_share * slopes.a)
+            wp.atomic_add(adj_corners, batch, border.face[1], adj_share * slopes.b)
+            wp.atomic_add(adj_corners, batch, border.face[2], adj_share * slopes.c)
+    return Beam(adj_share * adj_beam.point, adj_share * adj_beam.offset, adj_share * adj_beam.radius)
 
 
 @wp.struct
