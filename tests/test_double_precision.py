@@ -77,9 +77,8 @@ def test_the_build_rasterizes_what_the_package_rasterizes(double, device, monkey
     clip_positions = random(0, 1, 60, 4).astype(np.float32) + np.float32([0, 0, 1, 2])
     faces = put(np.arange(60).reshape(20, 3), wp.vec3i, device)
     expected = rasterize(put(clip_positions, wp.vec4, device), faces, 40, 30).face_ids.numpy()
-    got = (
-        double("stages.rasterization").rasterize(put(clip_positions, wp.vec4d, device), faces, 40, 30).face_ids.numpy()
-    )
+    rasterize_doubled = double("stages.raster.rasterization").rasterize
+    got = rasterize_doubled(put(clip_positions, wp.vec4d, device), faces, 40, 30).face_ids.numpy()
     assert len(np.unique(expected)) > 10
     np.testing.assert_array_equal(got, expected)
 
@@ -89,7 +88,7 @@ def test_the_build_rasterizes_what_the_package_rasterizes(double, device, monkey
 
 def test_gradients_of_vertex_normals_are_exact(double, device, check):
     faces = put(FACES, wp.vec3i, device)
-    check(lambda p: double("stages.normals").vertex_normals(p, faces), (wp.vec3d, random(0, 2, 4, 3)))
+    check(lambda p: double("stages.geometry.normals").vertex_normals(p, faces), (wp.vec3d, random(0, 2, 4, 3)))
 
 
 @pytest.mark.parametrize("kind", ["quaternion", "axis-angle", "columns", "matrix"])
@@ -97,13 +96,13 @@ def test_gradients_of_rotation_matrices_are_exact(kind, double, device, check):
     dtype = {
         "quaternion": wp.vec4d,
         "axis-angle": wp.vec3d,
-        "columns": double("stages.rotations").Vec6,
+        "columns": double("stages.geometry.rotations").Vec6,
         "matrix": wp.mat33d,
     }[kind]
     parameters = random(0, 2, 3, *item_shape(dtype))
     if kind == "axis-angle":
         parameters[0] *= [[0], [1e-3], [0.3]]  # where the series is
-    check(double("stages.rotations").rotation_matrices, (dtype, parameters))
+    check(double("stages.geometry.rotations").rotation_matrices, (dtype, parameters))
 
 
 @pytest.fixture
@@ -115,7 +114,11 @@ def poses():
 
 def test_gradients_of_poses_of_points_are_exact(double, device, check, poses):
     bodies = put(np.int32([0, 2, 1, 2]), wp.int32, device)
-    check(lambda r, *p: double("stages.poses").Poses(*p).points(r, bodies), (wp.vec3d, random(3, 1, 4, 3)), *poses)
+    check(
+        lambda r, *p: double("stages.geometry.poses").Poses(*p).points(r, bodies),
+        (wp.vec3d, random(3, 1, 4, 3)),
+        *poses,
+    )
 
 
 def test_gradients_of_poses_of_radii_are_exact(double, device, check, poses):
@@ -124,14 +127,16 @@ def test_gradients_of_poses_of_radii_are_exact(double, device, check, poses):
 
     def radii(rest, scales):
         fixed = [put(values, dtype, device) for dtype, values in (rotations, translations)]
-        return double("stages.poses").Poses(*fixed, scales).radii(rest, bodies)
+        return double("stages.geometry.poses").Poses(*fixed, scales).radii(rest, bodies)
 
     check(radii, (wp.float64, random(3, 1, 4)), scales)
 
 
 @pytest.mark.parametrize("quantity", ["points", "centers", "rigidity", "shear"])
 def test_gradients_of_deformation_graphs_are_exact(quantity, double, device, check):
-    graph = double("stages.deform").DeformationGraph.bind(random(0, 5, 3), random(1, 4, 3), count=2, device=device)
+    graph = double("stages.geometry.deform").DeformationGraph.bind(
+        random(0, 5, 3), random(1, 4, 3), count=2, device=device
+    )
     matrices, translations = (wp.mat33d, random(2, 2, 4, 3, 3)), (wp.vec3d, random(3, 2, 4, 3))
     arguments = {"centers": [translations], "shear": [matrices]}.get(quantity, [matrices, translations])
     check(getattr(graph, quantity), *arguments)
@@ -140,7 +145,9 @@ def test_gradients_of_deformation_graphs_are_exact(quantity, double, device, che
 @pytest.mark.parametrize("quantity", [0, 1])
 def test_gradients_of_bound_spheres_are_exact(quantity, double, device, check):
     points, centers, radii = random(0, 30, 3), 0.2 * random(1, 4, 3), np.linspace(0.2, 0.5, 4)
-    binding = double("stages.bound_spheres").SphereBinding.bind(points, np.arange(30), centers, radii, device=device)
+    binding = double("stages.geometry.bound_spheres").SphereBinding.bind(
+        points, np.arange(30), centers, radii, device=device
+    )
     rest = (wp.vec3d, points[None]), (wp.vec3d, centers[None]), (wp.float64, radii[None])
     moved = wp.vec3d, points + 0.3 * random(2, 2, 30, 3)
     check(lambda *given: binding.moved(*given)[quantity], moved, *rest)
@@ -466,7 +473,7 @@ def test_gradients_of_the_exponential_where_squarings_are_held_are_exact(base, d
 @pytest.mark.parametrize("order", [3, 5])
 def test_gradients_of_harmonic_transfer_are_exact(order, double, device, check):
     visibility, normals = (wp.float64, random(0, 1, 3, order**2)), (wp.vec3d, unit(random(1, 1, 3, 3)))
-    sh_transfer = double("stages.transfer").sh_transfer
+    sh_transfer = double("stages.light.transfer").sh_transfer
     check(lambda v, n: sh_transfer(v, n, order=order), visibility, normals)
     check(lambda n: sh_transfer(None, n, order=order), normals)
 
@@ -475,7 +482,7 @@ def test_gradients_of_directional_transfer_are_exact(double, device, check):
     directions = double("maths.directions").fibonacci(16)
     transmittance, normals = random(0, 1, 3, 16) ** 2, unit(random(1, 1, 3, 3))
     check(
-        lambda t, n: double("stages.transfer").directional_transfer(t, n, directions),
+        lambda t, n: double("stages.light.transfer").directional_transfer(t, n, directions),
         (wp.float64, transmittance),
         (wp.vec3d, normals),
     )
@@ -483,11 +490,13 @@ def test_gradients_of_directional_transfer_are_exact(double, device, check):
 
 @pytest.mark.parametrize("count", [4, 36])
 def test_gradients_of_shading_are_exact(count, double, device, check):
-    check(double("stages.shading").shade, (wp.float64, random(0, 2, 3, count)), (wp.vec3d, random(1, 2, count, 3)))
+    check(
+        double("stages.light.shading").shade, (wp.float64, random(0, 2, 3, count)), (wp.vec3d, random(1, 2, count, 3))
+    )
 
 
 def test_gradients_of_shading_under_the_same_light_are_exact(double, device, check):
-    check(double("stages.shading").shade, (wp.float64, random(0, 2, 3, 4)), (wp.vec3d, random(1, 1, 4, 3)))
+    check(double("stages.light.shading").shade, (wp.float64, random(0, 2, 3, 4)), (wp.vec3d, random(1, 1, 4, 3)))
 
 
 # ---------------------------------------------------------------------------------------------- images
@@ -510,13 +519,13 @@ def clip(view):
 
 
 def test_gradients_of_projection_are_exact(double, check, view):
-    check(double("stages.project").to_clip, *view)
+    check(double("stages.raster.project").to_clip, *view)
 
 
 def test_gradients_of_cameras_are_exact(double, check):
     rotations = np.stack([twins.random_rotation(0), twins.random_rotation(1)])
     check(
-        lambda *camera: double("stages.project").compose_clip_matrices(*camera, size=SIZE),
+        lambda *camera: double("stages.raster.project").compose_clip_matrices(*camera, size=SIZE),
         (wp.mat33d, random(0, 1, 3, 3)),
         (wp.mat33d, rotations),
         (wp.vec3d, random(1, 2, 3)),
@@ -525,13 +534,13 @@ def test_gradients_of_cameras_are_exact(double, check):
 
 def test_gradients_of_interpolation_are_exact(double, device, check, clip):
     faces = put(FACES, wp.vec3i, device)
-    face_ids = double("stages.rasterization").rasterize(put(clip[1], wp.vec4d, device), faces, *SIZE).face_ids
+    face_ids = double("stages.raster.rasterization").rasterize(put(clip[1], wp.vec4d, device), faces, *SIZE).face_ids
     assert len(np.unique(face_ids.numpy())) == 3  # two sides and the background
 
     def draw(clip_positions, attributes):
-        weights = double("stages.barycentrics").find_barycentrics(face_ids, faces, clip_positions)
-        return double("stages.interpolation").interpolate(
-            double("stages.rasterization").Fragments(face_ids, weights), faces, attributes
+        weights = double("stages.raster.barycentrics").find_barycentrics(face_ids, faces, clip_positions)
+        return double("stages.raster.interpolation").interpolate(
+            double("stages.raster.rasterization").Fragments(face_ids, weights), faces, attributes
         )
 
     check(draw, clip, (wp.vec2d, random(0, 1, 4, 2)))
@@ -544,7 +553,7 @@ def test_gradients_of_textures_are_exact(double, device, check, clip):
     texture_of_face = put([0, -1, -1, 0], wp.int32, device)
 
     def reflect(clip_positions, uvs, vertex_albedo, image):
-        fragments = double("stages.rasterization").rasterize(clip_positions, faces, *SIZE)
+        fragments = double("stages.raster.rasterization").rasterize(clip_positions, faces, *SIZE)
         textures = double("stages.textures.pyramid").mip_pyramids([image])
         footprints = double("stages.textures.footprint").find_footprints(
             fragments, faces, clip_positions, uvs, faces, texture_of_face, textures
@@ -566,7 +575,7 @@ def test_gradients_of_upright_silhouettes_are_exact(double, device, check):
     neighbors = put(double("maths.adjacency").edge_neighbors(sides), wp.vec3i, device)
 
     def smooth(image, clip_positions):
-        fragments = double("stages.rasterization").rasterize(clip_positions, faces, *SIZE)
+        fragments = double("stages.raster.rasterization").rasterize(clip_positions, faces, *SIZE)
         silhouettes = double("stages.silhouettes.find").find_silhouettes(fragments, faces, neighbors, clip_positions)
         return double("stages.silhouettes.smooth").smooth_silhouettes(image, silhouettes, clip_positions)
 
@@ -575,13 +584,13 @@ def test_gradients_of_upright_silhouettes_are_exact(double, device, check):
 
 def test_gradients_of_exposure_are_exact(double, device, check, clip):
     faces = put(FACES, wp.vec3i, device)
-    face_ids = double("stages.rasterization").rasterize(put(clip[1], wp.vec4d, device), faces, *SIZE).face_ids
+    face_ids = double("stages.raster.rasterization").rasterize(put(clip[1], wp.vec4d, device), faces, *SIZE).face_ids
 
     def sample_radiance(clip_positions, shading, albedo):
-        weights = double("stages.barycentrics").find_barycentrics(face_ids, faces, clip_positions)
-        return double("stages.film").average(
-            double("stages.film").sample_radiance(
-                double("stages.rasterization").Fragments(face_ids, weights), faces, shading, albedo
+        weights = double("stages.raster.barycentrics").find_barycentrics(face_ids, faces, clip_positions)
+        return double("stages.image.film").average(
+            double("stages.image.film").sample_radiance(
+                double("stages.raster.rasterization").Fragments(face_ids, weights), faces, shading, albedo
             ),
             2,
         )
@@ -663,7 +672,7 @@ def test_gradients_of_a_ground_in_moving_shadows_are_exact(method, receivers, do
 
     Surfaces pull by the faces at the points of samples, of which images are made: mean slopes are no derivatives.
     """
-    sample_radiance = double("stages.film").sample_radiance
+    sample_radiance = double("stages.image.film").sample_radiance
     monkeypatch.setattr(
         double("pipeline.views.view"), "moving_radiance", lambda *inputs: (sample_radiance(*inputs[:4]), None)
     )
@@ -792,7 +801,7 @@ def test_gradients_of_beams_are_exact(double, check, device):
 def test_gradients_of_beams_that_cameras_see_are_exact(double, check, device):
     """To emission, to the point that a sample shows, to vertices and cameras."""
     emitters, _, samples = beam_of_emitter(double, device)
-    show, fragments = double("stages.emitters.shown_beams").show_beams, double("stages.rasterization").Fragments
+    show, fragments = double("stages.emitters.shown_beams").show_beams, double("stages.raster.rasterization").Fragments
     clip_matrix = np.array([[1.0, 0, 0, 0.5], [0, 1, 0, -0.4], [0, 0, 1, 0], [0, 0.3, 1, 4]])
     ids, corners = put(np.array([[[0, 1], [3, -1]]]), wp.int32, device), put(FACES, wp.vec3i, device)
     owners = put(np.int32([0, 0, 0, -1]), wp.int32, device)
