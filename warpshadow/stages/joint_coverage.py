@@ -35,127 +35,30 @@ _PASS_COST = 1.0  # time of a cell [ns]
 
 
 @wp.func
-def _moment_bound(share: float):
-    """ν(h), the moment of a half-plane that covers a share of a cell; within 3% from 0.02 to 0.98."""
-    u = share * (1.0 - share)
-    return u * (MOMENT_BOUND[0] + u * (MOMENT_BOUND[1] + u * MOMENT_BOUND[2]))
-
-
-@wp.func
-def _moment_bound_slope(share: float):
-    """Its derivative."""
-    u = share * (1.0 - share)
-    return (1.0 - 2.0 * share) * (MOMENT_BOUND[0] + u * (2.0 * MOMENT_BOUND[1] + u * (3.0 * MOMENT_BOUND[2])))
-
-
-@wp.struct
-class BlockerSums:
-    """Sums over the blockers of a cell; their gradients have the same fields."""
-
-    total: float  # Σ h
-    product: float  # Π (1 − h)
-    largest: float  # max h
-    moment: wp.vec3  # Σ μ
-    squares: float  # Σ |μ|²
-    bounds: float  # Σ ν
-    bound_squares: float  # Σ ν²
-
-
-@wp.func
-def no_blockers():
-    """Sums over nothing."""
-    sums = BlockerSums()
-    sums.product = 1.0
-    return sums
-
-
-@wp.func
-def _moment_of(coverage: wp.vec4):
-    return wp.vec3(coverage[1], coverage[2], coverage[3])
-
-
-@wp.func
-def with_blocker(sums: BlockerSums, coverage: wp.vec4):
-    """Sums over one blocker more, of a coverage (h, μ)."""
+def _open_share(coverage: wp.vec4, other: wp.vec4):
+    """T past two blockers of a cell; one function, since ``wp.grad`` leaves out the slopes of those that it calls."""
     share = wp.clamp(coverage[0], 0.0, 1.0)
-    moment = _moment_of(coverage)
-    bound = _moment_bound(share)
-    new_sums = sums
-    new_sums.total = sums.total + share
-    new_sums.product = sums.product * (1.0 - share)
-    new_sums.largest = wp.max(sums.largest, share)
-    new_sums.moment = sums.moment + moment
-    new_sums.squares = sums.squares + wp.dot(moment, moment)
-    new_sums.bounds = sums.bounds + bound
-    new_sums.bound_squares = sums.bound_squares + bound * bound
-    return new_sums
-
-
-@wp.func
-def _relation(sums: BlockerSums):
-    """k, before it is clamped."""
-    pairs = wp.dot(sums.moment, sums.moment) - sums.squares
-    return pairs / (sums.bounds * sums.bounds - sums.bound_squares + MIN_BOUNDS)
-
-
-@wp.func
-def _open_if_related(sums: BlockerSums, relation: float):
-    """The share that is open if blockers are beside each other, for k < 0, or behind each other."""
-    return wp.where(relation < 0.0, wp.max(0.0, 1.0 - sums.total), 1.0 - sums.largest)
-
-
-@wp.func
-def open_share(sums: BlockerSums):
-    """T, the share of a cell that blockers leave open."""
-    relation = wp.clamp(_relation(sums), -1.0, 1.0)
+    other_share = wp.clamp(other[0], 0.0, 1.0)
+    u = share * (1.0 - share)
+    v = other_share * (1.0 - other_share)
+    bound = u * (MOMENT_BOUND[0] + u * (MOMENT_BOUND[1] + u * MOMENT_BOUND[2]))
+    other_bound = v * (MOMENT_BOUND[0] + v * (MOMENT_BOUND[1] + v * MOMENT_BOUND[2]))
+    moment = wp.vec3(coverage[1], coverage[2], coverage[3])
+    other_moment = wp.vec3(other[1], other[2], other[3])
+    moment_sum = moment + other_moment
+    moment_pairs = wp.dot(moment_sum, moment_sum) - (wp.dot(moment, moment) + wp.dot(other_moment, other_moment))
+    bound_sum = bound + other_bound
+    bound_pairs = bound_sum * bound_sum - (bound * bound + other_bound * other_bound) + MIN_BOUNDS
+    relation = wp.clamp(moment_pairs / bound_pairs, -1.0, 1.0)
     weight = wp.abs(relation)
-    return (1.0 - weight) * sums.product + weight * _open_if_related(sums, relation)
+    related = wp.where(relation < 0.0, wp.max(0.0, 1.0 - (share + other_share)), 1.0 - wp.max(share, other_share))
+    return (1.0 - weight) * ((1.0 - share) * (1.0 - other_share)) + weight * related
 
 
 @wp.func
-def open_share_adjoint(sums: BlockerSums, adj_open: float):
-    """Gradients of the sums, given that of T."""
-    adj_sums = BlockerSums()
-    relation = _relation(sums)
-    weight = wp.min(wp.abs(relation), 1.0)
-    adj_sums.product = (1.0 - weight) * adj_open
-    if relation < 0.0:
-        adj_sums.total = wp.where(sums.total < 1.0, -weight * adj_open, 0.0)
-    else:
-        adj_sums.largest = -weight * adj_open
-    if weight < 1.0:
-        adj_relation = wp.sign(relation) * adj_open * (_open_if_related(sums, relation) - sums.product)
-        per_bounds = 1.0 / (sums.bounds * sums.bounds - sums.bound_squares + MIN_BOUNDS)
-        adj_pairs = adj_relation * per_bounds
-        adj_sums.moment = (2.0 * adj_pairs) * sums.moment
-        adj_sums.squares = -adj_pairs
-        adj_sums.bounds = -2.0 * adj_pairs * relation * sums.bounds
-        adj_sums.bound_squares = adj_pairs * relation
-    return adj_sums
-
-
-@wp.func
-def blocker_adjoint(sums: BlockerSums, adj_sums: BlockerSums, coverage: wp.vec4):
-    """Gradient of the coverage (h, μ) of one blocker, given those of the sums; 0 where that covers all or nothing."""
-    share = coverage[0]
-    if share <= 0.0 or share >= 1.0:
-        return wp.vec4()
-    adj_share = adj_sums.total - adj_sums.product * sums.product / (1.0 - share)
-    if share == sums.largest:
-        adj_share += adj_sums.largest
-    adj_share += (adj_sums.bounds + 2.0 * _moment_bound(share) * adj_sums.bound_squares) * _moment_bound_slope(share)
-    adj_moment = adj_sums.moment + (2.0 * adj_sums.squares) * _moment_of(coverage)
-    return wp.vec4(adj_share, adj_moment[0], adj_moment[1], adj_moment[2])
-
-
-@wp.func
-def _sums_of_both(
-    coverages: wp.array3d(dtype=wp.vec4), others: wp.array3d(dtype=wp.vec4), batch: int, receiver: int, q: int
-):
-    sums = with_blocker(no_blockers(), coverages[batch, receiver, q])
-    if others:
-        sums = with_blocker(sums, others[batch, receiver, q])
-    return sums
+def _is_partial(coverage: wp.vec4):
+    """Whether a blocker covers a cell in part; else it has no gradient."""
+    return coverage[0] > 0.0 and coverage[0] < 1.0
 
 
 @wp.kernel(enable_backward=False)
@@ -174,7 +77,7 @@ def _attenuate(
     for q in range(attenuated.shape[2]):
         share = wp.max(0.0, 1.0 - coverages[batch, receiver, q][0])
         if others and share > 0.0:
-            share = open_share(_sums_of_both(coverages, others, batch, receiver, q))
+            share = _open_share(coverages[batch, receiver, q], others[batch, receiver, q])
         if transmittance:
             share *= transmittance[batch, receiver, q]
         attenuated[batch, receiver, q] = share
@@ -198,24 +101,26 @@ def _attenuate_adjoint(
     batch, receiver = split_row(first_row + wp.tid(), adj_attenuated.shape[1])
     for q in range(adj_attenuated.shape[2]):
         adj_cell = adj_attenuated[batch, receiver, q]
-        if adj_cell != 0.0 and coverages[batch, receiver, q][0] < 1.0:
-            sums = _sums_of_both(coverages, others, batch, receiver, q)
-            share = open_share(sums)
+        coverage = coverages[batch, receiver, q]
+        if adj_cell != 0.0 and coverage[0] < 1.0:
+            other = wp.vec4()
+            if others:
+                other = others[batch, receiver, q]
+            share = _open_share(coverage, other)
+            adj_coverage = wp.vec4(wp.clamp(other[0], 0.0, 1.0) - 1.0, 0.0, 0.0, 0.0)
+            adj_other = wp.vec4(wp.clamp(coverage[0], 0.0, 1.0) - 1.0, 0.0, 0.0, 0.0)
+            if _is_partial(coverage) and _is_partial(other):
+                adj_coverage, adj_other = wp.grad(_open_share)(coverage, other)
             if share > 0.0:
-                factor = float(1.0)
+                factor = adj_cell
                 if transmittance:
-                    factor = transmittance[batch, receiver, q]
+                    factor = adj_cell * transmittance[batch, receiver, q]
                 if adj_transmittance:
                     adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + adj_cell * share
-                adj_sums = open_share_adjoint(sums, adj_cell * factor)
-                if adj_coverages:
-                    adj_coverages[batch, receiver, q] = adj_coverages[batch, receiver, q] + blocker_adjoint(
-                        sums, adj_sums, coverages[batch, receiver, q]
-                    )
-                if adj_others:
-                    adj_others[batch, receiver, q] = adj_others[batch, receiver, q] + blocker_adjoint(
-                        sums, adj_sums, others[batch, receiver, q]
-                    )
+                if adj_coverages and _is_partial(coverage):
+                    adj_coverages[batch, receiver, q] = adj_coverages[batch, receiver, q] + factor * adj_coverage
+                if adj_others and _is_partial(other):
+                    adj_others[batch, receiver, q] = adj_others[batch, receiver, q] + factor * adj_other
 
 
 def transmittance_past(transmittance: wp.array | None, coverages: wp.array, others: wp.array | None = None) -> wp.array:

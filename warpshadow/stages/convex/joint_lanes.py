@@ -24,18 +24,18 @@ def coverage_type(lanes: int) -> Any:
 
 @functools.cache
 def sums_type(lanes: int) -> Any:
-    """Struct of :class:`warpshadow.stages.joint_coverage.BlockerSums` for each receiver of a thread."""
+    """Struct of sums over the blockers of a cell for each receiver of a thread, or of their gradients."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
 
     @wp.struct
     class SumsOfBlockers:
-        total: Lane
-        product: Lane
-        largest: Lane
-        moment: Vectors
-        squares: Lane
-        bounds: Lane
-        bound_squares: Lane
+        total: Lane  # Σ h
+        product: Lane  # Π (1 − h)
+        largest: Lane  # max h
+        moment: Vectors  # Σ μ
+        squares: Lane  # Σ |μ|²
+        bounds: Lane  # Σ ν
+        bound_squares: Lane  # Σ ν²
 
     return SumsOfBlockers
 
