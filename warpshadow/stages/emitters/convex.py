@@ -141,17 +141,20 @@ def _hidden_share_adjoint(
     parts: PlacedPartArrays, part: int, beam: Beam, adj_share: float, batch: int, adj_corners: wp.array2d(dtype=wp.vec3)
 ):
     """Gradients of the beam, given that of the share; those of corners are added."""
-    adj_beam = Beam()
+    adj = Beam()
     border = _nearest_border(parts, part, beam)
     if border.is_any:
-        slopes, adj_beam = wp.grad(_share_within)(border, beam)
+        slopes, beam_slopes = wp.grad(_share_within)(border, beam)
+        adj.point = adj_share * beam_slopes.point
+        adj.offset = adj_share * beam_slopes.offset
+        adj.radius = adj_share * beam_slopes.radius
         if adj_corners:
             wp.atomic_add(adj_corners, batch, border.ends[0], adj_share * slopes.begin)
             wp.atomic_add(adj_corners, batch, border.ends[1], adj_share * slopes.end)
             wp.atomic_add(adj_corners, batch, border.face[0], adj_share * slopes.a)
             wp.atomic_add(adj_corners, batch, border.face[1], adj_share * slopes.b)
             wp.atomic_add(adj_corners, batch, border.face[2], adj_share * slopes.c)
-    return Beam(adj_share * adj_beam.point, adj_share * adj_beam.offset, adj_share * adj_beam.radius)
+    return adj
 
 
 @wp.struct
