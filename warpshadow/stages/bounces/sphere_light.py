@@ -36,6 +36,7 @@ from warpshadow.stages.visibility.culling import (
     make_cap_functions,
     make_cells,
     make_cull,
+    make_is_bundle_above,
 )
 from warpshadow.stages.visibility.directional import PAIR_COST, SOFTNESS
 from warpshadow.stages.visibility.falloff import make_cap_adjoint, make_falloff
@@ -68,9 +69,11 @@ def _task_type(lanes: int) -> Any:
         first_bundle: int
         ends: wp.array(dtype=wp.int32)  # [bundle] 0 where nothing is blocked, else the traversal's end
         reached_bundles: wp.array2d(dtype=wp.int32)  # bundles that a run, and then a cluster, may reach
-        blocked: wp.array(dtype=Lane)  # [direction] F − T; in the adjoint f of share_adjoint, once it is known
+        blocked: wp.array(dtype=Lane)  # [direction] F − T
+        transmittance_others: wp.array(dtype=Lane)  # [direction] F, until F − T is loaded
         sums: wp.array(dtype=Lane)  # [direction · sum] of R
-        adj_cells: wp.array(dtype=Lane)  # [direction] Ī·R; before that it holds F while F − T is loaded
+        factors: wp.array(dtype=Lane)  # [direction] f of share_adjoint, in the memory of F − T, which it needs no more
+        adj_cells: wp.array(dtype=Lane)  # [direction] Ī·R, in the memory of F
         adj_blocked: wp.array(dtype=Lane)  # [direction] the adjoint of F − T: added to that of F, subtracted from T's
         adj_light: Vectors
         proxy_radiance: wp.array2d(dtype=wp.vec4)  # [proxy, direction]
@@ -101,8 +104,8 @@ def _make_load_task(lanes: int) -> wp.Function:
     """Make the kernel function that loads the receivers and directions of a thread."""
     Lane, LightTask = lane_type(lanes), _task_type(lanes)
     fn = make_lane_functions(lanes)
-    is_any_above, dot_direction, load_columns = fn.is_any_above, fn.dot_direction, fn.load_columns
-    load_receivers = make_load_receivers(True, lanes)
+    is_any_above, load_columns = fn.is_any_above, fn.load_columns
+    load_receivers, is_bundle_above = make_load_receivers(True, lanes), make_is_bundle_above(True, lanes)
 
     @wp.func(inline=True)
     def load_blocked(batch: int, block: int, bundle: int, inputs: LightInputs, task: LightTask):
@@ -112,12 +115,12 @@ def _make_load_task(lanes: int) -> wp.Function:
         load_columns(inputs.transmittance[batch], first_direction, BUNDLE, block, 1.0, task.blocked, first_slot)
         if inputs.transmittance_others:
             others = inputs.transmittance_others[instance_in(batch, inputs.transmittance_others.shape[0])]
-            load_columns(others, first_direction, BUNDLE, block, 1.0, task.adj_cells, first_slot)
+            load_columns(others, first_direction, BUNDLE, block, 1.0, task.transmittance_others, first_slot)
         is_any_blocked = bool(False)
         for slot in range(first_slot, first_slot + BUNDLE):
             cell_transmittance_others = Lane(1.0)
             if inputs.transmittance_others:
-                cell_transmittance_others = task.adj_cells[slot]
+                cell_transmittance_others = task.transmittance_others[slot]
             blocked = cell_transmittance_others - task.blocked[slot]
             task.blocked[slot] = blocked
             is_any_blocked = is_any_blocked or is_any_above(wp.max(blocked, -blocked), 0.0)
@@ -143,6 +146,8 @@ def _make_load_task(lanes: int) -> wp.Function:
         task.reached_bundles = reached_bundles[slot]
         task.ends = reached_bundles[slot, 2]
         task.blocked = scratch[slot, 0]
+        task.factors = scratch[slot, 0]
+        task.transmittance_others = scratch[slot, 1]
         task.adj_cells = scratch[slot, 1]
         task.adj_blocked = scratch[slot, 2]
         task.sums = sums[wp.where(inputs.stores_sums, item, slot)]
@@ -156,11 +161,8 @@ def _make_load_task(lanes: int) -> wp.Function:
         task.weights.inverse_size = 1.0 / largest_radius
         for bundle in range(task.ends.shape[0]):
             task.ends[bundle] = 0
-            direction_bundle = task.first_bundle + bundle
-            if is_any_above(
-                dot_direction(task.cells.axes[direction_bundle], receivers.normals),
-                -task.cells.half_angles[direction_bundle][1],
-            ) and load_blocked(batch, block, bundle, inputs, task):
+            is_above = is_bundle_above(task.cells, task.first_bundle + bundle, receivers.normals)
+            if is_above and load_blocked(batch, block, bundle, inputs, task):
                 task.ends[bundle] = spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
         return batch, block, receivers, task
 
@@ -272,12 +274,12 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
     @wp.func(inline=True)
     def share_adjoint(sphere_view: SphereView, weight: Lane, share: Lane, slot: int, direction: int, task: LightTask):
         """With f = 4/Q max(n·ω, 0) (F − T) / Σ w a S:  ā = w f (Ī·L − S Ī·R),  L̄ = f w a Ī,  S̄ = −f w a Ī·R."""
-        weighted_blocked = wp.cw_mul(weight, task.blocked[slot])
+        weighted_factor = wp.cw_mul(weight, task.factors[slot])
         adj_cell = task.adj_cells[slot]
         radiance = task.proxy_radiance[sphere_view.node, direction]
         light = dot_direction(wp.vec3(radiance[0], radiance[1], radiance[2]), task.adj_light)
         if task.adj_radiance:
-            weighted_share = wp.cw_mul(weighted_blocked, share)
+            weighted_share = wp.cw_mul(weighted_factor, share)
             adj_radiance_of_proxy = wp.vec4(
                 total(wp.cw_mul(weighted_share, task.adj_light.x)),
                 total(wp.cw_mul(weighted_share, task.adj_light.y)),
@@ -286,13 +288,13 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
             )
             # summed over a warp first it took 1.4 times as long on an H200
             wp.atomic_add(task.adj_radiance, sphere_view.node, direction, adj_radiance_of_proxy)
-        return wp.cw_mul(weighted_blocked, light - radiance[3] * adj_cell)
+        return wp.cw_mul(weighted_factor, light - radiance[3] * adj_cell)
 
     cap_adjoint = make_cap_adjoint(True, find_weight, share_adjoint, True, LightTask, lanes)
 
     @wp.func(inline=True)
     def bundle_adjoint(receivers: ReceiverLanes, bundle: int, factor: float, task: LightTask):
-        """Store T̄ and the factors of R of a bundle's cells; returns their n̄."""
+        """Store Ī·R, F̄ = −T̄ and the factors f of a bundle's cells, in place of F and F − T; returns their n̄."""
         adj_normal = Vectors()
         for i in range(BUNDLE):
             slot = bundle * BUNDLE + i
@@ -308,7 +310,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
             adj_normal.z += omega[2] * adj_cosine
             factored_cosine = factor * wp.max(cosine, Lane(0.0))
             task.adj_blocked[slot] = wp.cw_mul(factored_cosine, adj_cell)
-            task.blocked[slot] = wp.cw_mul(wp.cw_mul(factored_cosine, task.blocked[slot]), inverse)
+            task.factors[slot] = wp.cw_mul(wp.cw_mul(factored_cosine, task.blocked[slot]), inverse)
             task.adj_cells[slot] = adj_cell
         return adj_normal
 

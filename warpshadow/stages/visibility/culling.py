@@ -110,6 +110,22 @@ def make_cap_functions(has_horizon: bool, lanes: int) -> CapFunctions:
 
 
 @functools.cache
+def make_is_bundle_above(has_horizon: bool, lanes: int) -> wp.Function:
+    """Make the kernel function that tells whether a bundle of directions rises above the horizon of any receiver."""
+    Vectors, fn = vectors_type(lanes), make_lane_functions(lanes)
+    is_any_above, dot_direction = fn.is_any_above, fn.dot_direction
+
+    @wp.func(inline=True)
+    def is_bundle_above(cells: DirectionCells, bundle: int, normals: Vectors):
+        is_above = bool(True)
+        if wp.static(has_horizon):
+            is_above = is_any_above(dot_direction(cells.axes[bundle], normals), -cells.half_angles[bundle][1])
+        return is_above
+
+    return is_bundle_above
+
+
+@functools.cache
 def make_cull(has_horizon: bool, Task: type, lanes: int) -> wp.Function:
     """Make the kernel function that lists the bundles of directions that spheres can reach, for the traversal.
 

@@ -21,7 +21,14 @@ from warpshadow.device.launch import launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_slot
 from warpshadow.maths.directions import BUNDLE, cell_radius
-from warpshadow.stages.visibility.culling import DirectionCells, cap_type, make_cap_functions, make_cells, make_cull
+from warpshadow.stages.visibility.culling import (
+    DirectionCells,
+    cap_type,
+    make_cap_functions,
+    make_cells,
+    make_cull,
+    make_is_bundle_above,
+)
 from warpshadow.stages.visibility.falloff import make_cap_adjoint, make_falloff
 from warpshadow.stages.visibility.merging import MERGING, NODES_PER_CLUSTER, Gradients
 from warpshadow.stages.visibility.traversal import (
@@ -110,8 +117,8 @@ def _make_attenuate(lanes: int) -> wp.Function:
 def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane, TransmittanceTask = lane_type(lanes), _task_type(lanes)
     ReceiverLanes, SphereView = receiver_lanes_type(lanes), sphere_view_type(lanes)
-    fn = make_lane_functions(lanes)
-    store_columns, sqrt, is_any_above, dot_direction = fn.store_columns, fn.sqrt, fn.is_any_above, fn.dot_direction
+    store_columns, sqrt = make_lane_functions(lanes).store_columns, make_lane_functions(lanes).sqrt
+    is_bundle_above = make_is_bundle_above(has_horizon, lanes)
     load_task, falloff, attenuate = _make_load_task(has_horizon, lanes), make_falloff(lanes), _make_attenuate(lanes)
     widen_cone, reaches_bundle, is_above_horizon, _soft_edge = make_cap_functions(has_horizon, lanes)
 
@@ -155,14 +162,9 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
         for bundle in range(task.ends.shape[0]):
             for cell in range(BUNDLE):
                 task.transmittances[bundle * BUNDLE + cell] = Lane(1.0)
-            task.ends[bundle] = inputs.spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
-            if wp.static(has_horizon):
-                direction_bundle = task.first_bundle + bundle
-                if not is_any_above(
-                    dot_direction(cells.axes[direction_bundle], receivers.normals),
-                    -cells.half_angles[direction_bundle][1],
-                ):
-                    task.ends[bundle] = 0  # wholly below the horizon: the cosine is zero there
+            task.ends[bundle] = 0  # wholly below the horizon: the cosine is zero there
+            if is_bundle_above(cells, task.first_bundle + bundle, receivers.normals):
+                task.ends[bundle] = inputs.spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
         traverse(receivers, batch, inputs.spheres, Gradients(), task)
         direction_count = task.ends.shape[0] * BUNDLE
         store_columns(task.transmittances, 0, transmittance[batch], task.first_bundle * BUNDLE, direction_count, block)
