@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 from warpshadow.device import array_checks
-from warpshadow.device.array_checks import finite_arrays, of_one_call, values_of
+from warpshadow.device.array_checks import finite_arrays, late_checks, values_of
 
 
 def vectors(device, **spoiled):
@@ -79,10 +79,10 @@ def reads(monkeypatch):
 def test_a_call_reads_once_what_a_gpu_found_in_all_arrays(device, reads):
     arrays = [vectors(device) for _ in range(20)]
     for _ in range(2):
-        with of_one_call():
+        with late_checks():
             for array in arrays:
                 finite_arrays({"points": array, "again": array})
-            with of_one_call():
+            with late_checks():
                 finite_arrays({"radii": arrays[0]}, maximum=7.0)
             assert not reads
         assert len(reads) == 1
@@ -95,7 +95,7 @@ def test_a_call_ends_with_the_first_fault_that_a_gpu_found(number, device, reads
     spoiled = dict.fromkeys([f"points {number}", "last"], vectors(device, _101=np.nan))
 
     def call():
-        with of_one_call():
+        with late_checks():
             for name, array in {**arrays, **spoiled}.items():
                 finite_arrays({name: array})
             values_of(arrays["points 0"], lambda values: pytest.fail("called after a fault"))
@@ -104,16 +104,16 @@ def test_a_call_ends_with_the_first_fault_that_a_gpu_found(number, device, reads
         with pytest.raises(ValueError, match=rf"^points {number}: got 1 NaN"):
             call()
     spoiled.clear()
-    with of_one_call():
+    with late_checks():
         finite_arrays(arrays)
 
 
 @pytest.mark.usefixtures("reads")
 def test_a_fault_is_raised_in_place_of_the_error_that_it_leads_to(device):
-    with pytest.raises(ValueError, match=r"^points: got 1 NaN"), of_one_call():
+    with pytest.raises(ValueError, match=r"^points: got 1 NaN"), late_checks():
         finite_arrays({"points": vectors(device, _000=np.nan)})
         raise RuntimeError("nothing fits")
-    with pytest.raises(RuntimeError, match="nothing fits"), of_one_call():
+    with pytest.raises(RuntimeError, match="nothing fits"), late_checks():
         finite_arrays({"points": vectors(device)})
         raise RuntimeError("nothing fits")
 
@@ -121,7 +121,7 @@ def test_a_fault_is_raised_in_place_of_the_error_that_it_leads_to(device):
 @pytest.mark.usefixtures("reads")
 def test_a_long_call_does_not_hold_all_its_arrays(device):
     held = []
-    with of_one_call():
+    with late_checks():
         for _ in range(500):
             array = vectors(device)
             held.append(weakref.ref(array))
@@ -133,6 +133,6 @@ def test_a_long_call_does_not_hold_all_its_arrays(device):
 def test_values_are_judged_once(device):
     judged = []
     values_of(vectors(device), lambda values: judged.append(values.shape))
-    with of_one_call():
+    with late_checks():
         values_of(vectors(device), lambda values: judged.append(values.shape))
     assert judged == [(2, 3, 3)] * 2

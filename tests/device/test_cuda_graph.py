@@ -342,11 +342,11 @@ def test_values_that_caches_may_let_go_are_noted_while_they_are_collected(scene,
     renderer.draw(view=view)
     static_bodies, receivers = view.static_bodies, view.receivers
     normals = static_bodies.normals.value(view.call)
-    points = static_bodies.receivers(receivers.on_static, normals)
+    points = static_bodies.receivers(receivers.static_vertices, normals)
     (rows,) = static_bodies._rows.values()
     with collected() as held:
         cached = rows.of_receivers(receivers, normals)
-        static_bodies.receivers(receivers.on_static, normals)
+        static_bodies.receivers(receivers.static_vertices, normals)
         levels = mip_pyramids([wp.zeros((1, 4, 4), dtype=wp.vec3, device=device)]).levels
         renderer.draw(view=renderer.view(renderer.placed(moving=[0])))
     for value in (*cached, *points, levels, static_bodies):

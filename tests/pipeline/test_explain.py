@@ -242,10 +242,11 @@ def mesh_of(body: ws.Body) -> wp.Mesh:
 def shading_and_truth(renderer: SceneRenderer, light, directions: int) -> list[np.ndarray]:
     """Of the receivers on still bodies, where the moving one is too far away to matter: as rendered, and by rays."""
     view = renderer.view(renderer.placed(poses_of(renderer, (0, 900, 0)), moving=[0]))
-    shading = renderer.shade(light, view).numpy()[0, : len(view.receivers.on_static)]
+    shading = renderer.shade(light, view).numpy()[0, : len(view.receivers.static_vertices)]
     vertices = renderer.geometry().positions.numpy()[0]
     normals = vertex_normals(renderer.geometry().positions, renderer.merged_scene.faces).numpy()[0]
-    points, normals = (wp.array(values[view.receivers.on_static], dtype=wp.vec3) for values in (vertices, normals))
+    seen = view.receivers.static_vertices
+    points, normals = (wp.array(values[seen], dtype=wp.vec3) for values in (vertices, normals))
     mesh = mesh_of(renderer.scene.bodies[1])
     if light is None:
         truth = trace_shading(mesh, points, normals, sample_map(renderer.scene.light.radiance, directions)).numpy()
@@ -266,8 +267,8 @@ def test_bodies_that_stand_still_shadow_one_another_as_rays_say(is_free):
     assert len(shading) > 200
     assert np.linalg.norm(shading - truth) < RAY_NOISE * np.linalg.norm(truth)
     view = renderer.view(renderer.placed(poses_of(renderer, (0, 900, 0))))  # any body may move
-    rows = view.receivers.of_vertices.numpy()[renderer.view(None).receivers.of_vertices.numpy() >= -1]
-    still = renderer.view(renderer.placed(poses_of(renderer, (0, 900, 0)), moving=[0])).receivers.on_static
+    rows = view.receivers.receiver_of_vertex.numpy()[renderer.view(None).receivers.receiver_of_vertex.numpy() >= -1]
+    still = renderer.view(renderer.placed(poses_of(renderer, (0, 900, 0)), moving=[0])).receivers.static_vertices
     by_spheres = renderer.shade(light, view).numpy()[0, rows[still]]
     assert np.linalg.norm(by_spheres - truth) > 3 * np.linalg.norm(shading - truth)
 
@@ -284,8 +285,8 @@ def test_a_shadow_on_bodies_that_stand_still_has_the_gradient_of_central_differe
         return renderer.view(renderer.placed(poses, moving=[0]))
 
     def weights_of(view: View) -> np.ndarray:
-        weights = np.zeros((1, (view.receivers.of_vertices.numpy() >= 0).sum(), 3), np.float32)
-        vertices = view.receivers.on_static
+        weights = np.zeros((1, (view.receivers.receiver_of_vertex.numpy() >= 0).sum(), 3), np.float32)
+        vertices = view.receivers.static_vertices
         weights[0, : len(vertices)] = weight_of_vertex[vertices] * np.isin(vertices, always_seen)[:, None]
         return weights
 
@@ -295,7 +296,7 @@ def test_a_shadow_on_bodies_that_stand_still_has_the_gradient_of_central_differe
 
     step = 4e-3  # at which float32 rounding and curvature are both below the tolerance
     shifts = step * np.concatenate([np.eye(3), -np.eye(3)])
-    seen = [view_of(poses_of(renderer, shift)).receivers.on_static for shift in shifts]
+    seen = [view_of(poses_of(renderer, shift)).receivers.static_vertices for shift in shifts]
     always_seen = functools.reduce(np.intersect1d, seen)
     differences = np.array([loss(shift) for shift in shifts])
     poses = poses_of(renderer, requires_grad=True)
@@ -457,11 +458,11 @@ SHADOWS = ("static shadows", VISIBILITY)
 def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
     """The stage that a kernel with some inputs belongs to; None for copies, poses and corners, which come before."""
     module, key = kernel.func.__module__.removeprefix("warpshadow."), kernel.key
-    if module in ("device.batch", "stages.poses", "stages.self_visibility.probes", "stages.sparse"):
+    if module in ("device.batch", "stages.geometry.poses", "stages.self_visibility.probes", "stages.sparse"):
         return None
     if module in ("stages.self_visibility.trace", "stages.self_visibility.lookup", "stages.self_visibility.lobes"):
         return "self-shadows"
-    of_visibility = "stages.visibility", "stages.self_visibility.gather", "stages.ray_tracing"
+    of_visibility = "stages.visibility", "stages.self_visibility.gather", "stages.rays.ray_tracing"
     if module.startswith(of_visibility) or key == "_add_cached_rows":
         return VISIBILITY
     if module.startswith("stages.silhouettes"):
@@ -475,18 +476,24 @@ def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
         if "_sample" in key:  # given the samples of white surfaces, it exposes them
             return "radiance" if any(getattr(each, "dtype", None) is wp.vec4 for each in inputs) else "reflectance"
         return "footprints" if "footprints" in key else "mip pyramids"
-    if module == "stages.interpolation":
+    if module == "stages.raster.interpolation":
         return "reflectance"
-    if module in ("stages.rasterization", "stages.barycentrics"):
+    if module in ("stages.raster.rasterization", "stages.raster.barycentrics"):
         return "rasterization"
-    if module in ("stages.transfer", "stages.cached_cells"):
+    if module in ("stages.light.transfer", "stages.light.cached_cells"):
         return "shading" if "_shade_cells" in key else "transfer"
-    if module == "stages.film":
+    if module == "stages.image.film":
         return "averaging" if "average" in key else "radiance"
-    if module in ("stages.sample_receivers", "stages.receiver_means", "stages.quadtree"):
+    if module in ("stages.receivers.sample_receivers", "stages.receivers.receiver_means", "stages.receivers.quadtree"):
         return "receivers"
-    same = {f"stages.{name}": name for name in ("receivers", "shading", "sides", "normals")}
-    return {"stages.project": "clip positions", "stages.slopes": "radiance", **same}[module]
+    return {
+        "stages.geometry.normals": "normals",
+        "stages.raster.project": "clip positions",
+        "stages.raster.sides": "sides",
+        "stages.receivers.find": "receivers",
+        "stages.light.shading": "shading",
+        "stages.image.slopes": "radiance",
+    }[module]
 
 
 class Launches:

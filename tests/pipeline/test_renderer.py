@@ -459,7 +459,7 @@ def test_no_light_is_lost_between_cells_of_different_size(device, count):
     assert np.abs(transfer.sum(axis=1) - own.sum(axis=1)).max() < FLOAT32
     upward = fibonacci(count)[:, 1] > 0.3
     body_of_vertex = np.repeat([0, 1], np.diff(renderer.merged_scene.first_vertex))
-    on_ground = renderer.view().receivers.of_vertices.numpy()[body_of_vertex == 1]
+    on_ground = renderer.view().receivers.receiver_of_vertex.numpy()[body_of_vertex == 1]
     on_ground = on_ground[on_ground >= 0]  # the ground sees every cell above it somewhere
     assert (transfer[on_ground].max(axis=0)[upward] > 0).all()
     if count == 128:

@@ -179,7 +179,7 @@ def test_views_of_one_geometry_share_the_vertices_that_any_of_them_sees(device):
     found = find_receivers(positions, normals, faces, fragments, numbering, np.zeros(2, bool))
     np.testing.assert_array_equal(found.points.numpy(), positions.numpy()[:, 3:])
     np.testing.assert_array_equal(found.normals.numpy(), normals.numpy()[:, 3:])
-    np.testing.assert_array_equal(found.of_vertices.numpy(), [-1, -1, -1, 0, 1, 2])
+    np.testing.assert_array_equal(found.receiver_of_vertex.numpy(), [-1, -1, -1, 0, 1, 2])
     np.testing.assert_array_equal(found.faces.numpy()[1], [0, 1, 2])
     assert found.fragments is fragments
 

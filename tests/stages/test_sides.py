@@ -201,7 +201,8 @@ def test_where_nothing_is_read_back_backs_are_lit_as_well(moving, monkeypatch):
     renderer = SceneRenderer(scene)
     view = renderer.view(renderer.placed(moving=moving))
     vertex_counts = [body.mesh.vertex_count for body in scene.bodies]
-    assert view.receivers.points.shape[1] + len(view.receivers.on_static) == 2 * vertex_counts[0] + vertex_counts[1]
+    receiver_count = view.receivers.points.shape[1] + len(view.receivers.static_vertices)
+    assert receiver_count == 2 * vertex_counts[0] + vertex_counts[1]
     assert_near(renderer.draw(view=view).numpy()[0], expected)
     front = SceneRenderer(replace(scene, bodies=(replace(scene.bodies[0], mesh=turned_over(bowl())),), camera=INSIDE))
     assert front.view().receivers.points.shape[1] == vertex_counts[0]
@@ -348,7 +349,7 @@ def test_closed_bodies_are_not_asked_which_side_is_seen(monkeypatch):
     monkeypatch.setattr(view_module, "find_sides", None)
     view = renderer.view()
     vertex_count = len(renderer.merged_scene.body_of_vertex)
-    assert view.receivers.of_vertices.shape == (vertex_count,) and view.fragments.sides is None
+    assert view.receivers.receiver_of_vertex.shape == (vertex_count,) and view.fragments.sides is None
     assert view.receivers.faces.shape == renderer.merged_scene.faces.shape
     assert view.receivers.fragments is view.fragments
     explained = SceneRenderer(renderer.scene).explain()

@@ -143,7 +143,7 @@ class _LateChecks(threading.local):
 _late_checks = _LateChecks()
 
 
-def of_one_call() -> contextlib.AbstractContextManager[None]:
+def late_checks() -> contextlib.AbstractContextManager[None]:
     """Check arrays on a GPU when the call ends, so that it waits for the device once.
 
     A call within a call ends with it. A fault is raised in place of the error that it led to.
@@ -165,7 +165,7 @@ def finite_arrays(
 ) -> None:
     """Raise ValueError when float32 arrays on a device, of any dtype, hold NaN, Inf or numbers out of range.
 
-    On a GPU that is found when the call ends (:func:`of_one_call`), at once where there is none. While a CUDA graph is
+    On a GPU that is found when the call ends (:func:`late_checks`), at once where there is none. While a CUDA graph is
     captured nothing can be read back, and nothing is checked.
 
     Args:
@@ -190,7 +190,7 @@ def finite_arrays(
     _late_checks.run_if_due()
 
 
-def values_of(array: wp.array, judge: Callable[[np.ndarray], None]) -> None:
+def look_at_values(array: wp.array, judge: Callable[[np.ndarray], None]) -> None:
     """Let a function look at an array's values and raise an error: on a GPU when the call ends, as finite_arrays does.
 
     While a CUDA graph is captured it does not.

@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable
 from typing import Concatenate, ParamSpec, Protocol, TypeVar
 
-from warpshadow.device.array_checks import of_one_call
+from warpshadow.device.array_checks import late_checks
 from warpshadow.device.progress import waiting
 
 P = ParamSpec("P")
@@ -29,7 +29,7 @@ def one_at_a_time(function: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(function)
     def alone(*args: P.args, **kwargs: P.kwargs) -> R:
-        with one_call, of_one_call():
+        with one_call, late_checks():
             return function(*args, **kwargs)
 
     return alone

@@ -101,7 +101,7 @@ def test_where_shadows_are_kept_at_vertices_they_stay_there():
         renderer = SceneRenderer(scene_of("adaptive", *others, segments=16, size=32))
         view = renderer.view(renderer.placed(renderer.scene_poses(), moving=[0]))
         first, end = renderer.merged_scene.first_vertex[1:3]
-        assert (view.receivers.of_vertices.numpy()[first:end] >= 0).any() == at_vertices
+        assert (view.receivers.receiver_of_vertex.numpy()[first:end] >= 0).any() == at_vertices
         assert np.isfinite(renderer.draw(view=view).numpy()).all()
 
 

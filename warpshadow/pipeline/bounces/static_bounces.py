@@ -319,9 +319,9 @@ class StaticBounces:
     def _ray_origins(self, receivers: Receivers, positions: wp.array) -> np.ndarray:
         """Points from which rays of receivers leave, [view, receiver, 3]: where walls meet, within that of a vertex."""
         points, vertices = receivers.points.numpy().copy(), positions.numpy()[0]
-        if receivers.of_vertices is None:  # of points that are given
+        if receivers.receiver_of_vertex is None:  # of points that are given
             return points
-        of_sides = receivers.of_vertices.numpy()
+        of_sides = receivers.receiver_of_vertex.numpy()
         sides = np.flatnonzero(of_sides >= 0)
         origins = inset_vertices(vertices, self._patches.merged_scene.faces.numpy())
         points[:, of_sides[sides]] = origins[sides % len(vertices)]

@@ -252,11 +252,11 @@ def find_groups(
         static_normals: Normals of all vertices of static bodies; None where any may move.
     """
     groups = list(_groups_that_move(receivers, blockers, self_lookups or {}, nearest_spheres))
-    if static_bodies is None or not len(receivers.on_static):
+    if static_bodies is None or not len(receivers.static_vertices):
         return groups
     assert static_normals is not None
     moving = static_bodies.moving
-    points_and_normals = static_bodies.receivers(receivers.on_static, static_normals)
+    points_and_normals = static_bodies.receivers(receivers.static_vertices, static_normals)
     planes, parts = blockers.planes_around(of_bodies=moving), blockers.convex_parts_around(of_bodies=moving)
     spheres = blockers.spheres_of(moving)
     group = Group(*points_and_normals, *spheres, cached_rows, planes=planes, convex_parts_around=parts)

@@ -132,7 +132,7 @@ class LitPoints:
     def counts(self) -> tuple[str, int, int]:
         """How many receivers may move and how many are static; "up to " where they are not found yet."""
         receivers = self.receivers
-        return "", receivers.points.size, len(receivers.on_static)
+        return "", receivers.points.size, len(receivers.static_vertices)
 
 
 def _cached(values: dict[str, tuple[Hashable, Any]], name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:

@@ -187,7 +187,7 @@ class VertexRows:
 
     def of_receivers(self, receivers: Receivers, normals: wp.array) -> CachedRows | None:
         """Rows of the static receivers, computed for vertices that come for the first time; None without any."""
-        vertices = receivers.on_static
+        vertices = receivers.static_vertices
         if not len(vertices):
             return None
         new = vertices[self._row_of_vertex[vertices] < 0]

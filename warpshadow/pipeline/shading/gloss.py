@@ -197,7 +197,7 @@ def _sample(
 
 def _means(receivers: Receivers, samples: wp.array) -> wp.array:
     """Means of the samples that share a receiver, float32 of shape [batch, receiver]. Differentiable: samples."""
-    count = len(receivers.on_static) + receivers.points.shape[1]
+    count = len(receivers.static_vertices) + receivers.points.shape[1]
     return means_of_receivers(samples, rows(receivers.fragments.face_ids), receivers.faces, count)
 
 
@@ -207,14 +207,14 @@ def _spans(is_glossy: np.ndarray, receivers: Receivers) -> list[Span]:
 
 def _numbers(is_glossy: np.ndarray, receivers: Receivers) -> wp.array:
     """Index of each receiver of a view among the glossy ones, −1 for diffuse ones, int32 of shape [receiver]."""
-    first = len(receivers.on_static)
+    first = len(receivers.static_vertices)
     runs = [(first + span.first, first + span.end) for span in _spans(is_glossy, receivers)]
     return number_runs(first + receivers.points.shape[1], runs, receivers.points.device)
 
 
 def _chosen(light: wp.array, receivers: Receivers, is_glossy: np.ndarray) -> wp.array:
     """Select light, or another value, of the glossy ones among a view's receivers. Differentiable: light."""
-    return _of_spans(light, _spans(is_glossy, receivers), -len(receivers.on_static))
+    return _of_spans(light, _spans(is_glossy, receivers), -len(receivers.static_vertices))
 
 
 def _of_spans(array: wp.array, spans: list[Span], first: int) -> wp.array:

@@ -321,7 +321,7 @@ class PortionedShading(Node):
         """Find it for one portion after another."""
         receivers, blockers, projected_light, *cached = self.values(call)
         groups = find_groups(*self._bodies_and_spheres, receivers, blockers, *cached)
-        total = len(receivers.on_static) + receivers.points.shape[1]
+        total = len(receivers.static_vertices) + receivers.points.shape[1]
         with progress_bar(total, "shading", "receiver", shows=self._progress) as bar:
             for group in groups:
                 for portion in group.portions():
@@ -412,7 +412,7 @@ def _static_shadows(method: SphereMethod, points: LitPoints, light: Input | None
 
     def missing() -> int:
         receivers = words.receivers_node.value_if_known(words.call)
-        return rows.missing(None if receivers is None else receivers.on_static)
+        return rows.missing(None if receivers is None else receivers.static_vertices)
 
     return Node(
         "static shadows",

@@ -370,8 +370,8 @@ def _moving_radiance(
     receivers: Receivers, shading: wp.array, reflectance: wp.array, silhouettes: Silhouettes, clip_positions: wp.array
 ) -> tuple[wp.array, wp.array]:
     """Samples, and the colors at edges."""
-    arguments = receivers.fragments, receivers.faces, shading, reflectance
-    return moving_radiance(*arguments, silhouettes, clip_positions, receivers.of_vertices, receivers.has_mean_slope)
+    arguments = receivers.fragments, receivers.faces, shading, reflectance, silhouettes, clip_positions
+    return moving_radiance(*arguments, receivers.receiver_of_vertex, receivers.has_mean_slope)
 
 
 def _sum_moving(first: tuple[wp.array, wp.array], second: tuple[wp.array, wp.array]) -> tuple[wp.array, wp.array]:
@@ -393,5 +393,5 @@ def _white_radiance(receivers: Receivers, shading: wp.array) -> wp.array:
 
 def _white_shading(receivers: Receivers) -> wp.array:
     """Light of 1 on all receivers, vec3 of shape [1, receiver]."""
-    count = len(receivers.on_static) + receivers.points.shape[1]
+    count = len(receivers.static_vertices) + receivers.points.shape[1]
     return wp.full((1, count), wp.vec3(1.0), dtype=wp.vec3, device=receivers.points.device)

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.array_checks import finite_arrays, values_of
+from warpshadow.device.array_checks import finite_arrays, look_at_values
 from warpshadow.device.batch import common_batch, expand, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
@@ -102,7 +102,7 @@ class Poses:
         """Validate."""
         check.shape("translations", self.translations.shape, self.rotations.shape)
         check.shape("scales", self.scales.shape, self.rotations.shape)
-        values_of(self.rotations, lambda values: check_orthonormal(values.astype(np.float64)))
+        look_at_values(self.rotations, lambda values: check_orthonormal(values.astype(np.float64)))
 
     def about(self, pivots: wp.array) -> "Poses":
         """The poses x → s R (x − pivot) + t, if these have t: it is where the pivot goes.

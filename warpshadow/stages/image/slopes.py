@@ -7,10 +7,11 @@ is far from the mean. So the mean over the sample is taken. To the right of the 
     ½ (c_right − c) over ½ sample    if the neighbor's center is on the surface,
     c_edge − c over t samples        if the surface has an edge before, of color c_edge at distance t,
 
-and likewise to the other sides. An edge at t > ½ lies within the neighbor, whose part before the edge has this sample's
-color. With that part, steps of color along a row add up to the change from edge to edge, which the derivative of the
-moving edges subtracts. Where another surface comes in front before the neighbor's center, or the image ends, the
-opposite half counts alone. Where all neighbors see the same face, the slope is the face's own.
+and likewise to the other sides. An edge at t > ½ lies in the neighbor, which shows this surface up to it. With the step
+c_edge − c over t, steps along a row add up to the color at the surface's right edge minus that at its left; the
+derivative of the moving edges has the same with the other sign, and both cancel. Where another surface comes in front
+before the neighbor's center, or the image ends, the opposite half counts alone. Where all neighbors see the same face,
+the slope is the face's own.
 
 A sample that is a receiver itself has the exact derivative at its point instead, except beside the outline of its
 surface. There the exact slope is often tiny and rarely huge, as it grows without bound towards a limb, and does not
@@ -148,7 +149,7 @@ def find_mean_slopes(silhouettes: Silhouettes, clip_positions: wp.array, quadtre
     sides = fragments.face_ids if fragments.sides is None else fragments.sides
     has_mean_slope = empty(rows(sides).shape, dtype=wp.bool, device=sides.device)
     arrays = make_fragment_arrays(fragments, silhouettes.faces, clip_positions)
-    keys = None if quadtree is None else quadtree.keys
+    keys = None if quadtree is None else quadtree.square_key_of_side
     inputs = [arrays, silhouettes.entries, silhouettes.edges, reshaped(sides, (-1,)), keys]
     launch(_find_mean_slopes, sides.size, inputs=inputs, outputs=[reshaped(has_mean_slope, (-1,))])
     return has_mean_slope

@@ -15,7 +15,7 @@ from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK
-from warpshadow.stages.light.transfer import cell_inputs, spread, transfer_chunk
+from warpshadow.stages.light.transfer import broadcast_normal, prepare_cells, transfer_chunk
 
 # receivers whose gradients to light a thread sums before it adds them to the others', on a CPU and on a GPU
 _SLICE, _GPU_SLICE = 256, 16
@@ -262,7 +262,7 @@ def _shade_cells(
     """A thread owns a receiver."""
     batch, receiver = split_row(first_row + wp.tid(), shading.shape[1])
     light_batch = instance_in(batch, light.shape[0])
-    nx, ny, nz = spread(normals[batch, receiver])
+    nx, ny, nz = broadcast_normal(normals[batch, receiver])
     red = Chunk(0.0)
     green = Chunk(0.0)
     blue = Chunk(0.0)
@@ -299,7 +299,7 @@ def shade_cells(
         Shading, vec3 of shape [batch, receiver].
     Differentiable: transmittance, normals. Not: light.
     """
-    cells, device = cell_inputs(transmittance, normals, directions), normals.device
+    cells, device = prepare_cells(transmittance, normals, directions), normals.device
     check.shape("light", light.shape, ("batch", len(directions)))
     finite_arrays({"light": light}, maximum=maximum)
     use_vector_registers(__name__, device)

@@ -280,7 +280,7 @@ def sh_product(visibility: wp.array, lobes: wp.array, *, order: int, bands: int 
 
 
 @wp.func(inline=True)
-def spread(normal: wp.vec3):
+def broadcast_normal(normal: wp.vec3):
     """A normal's coordinates, each for all cells of a chunk."""
     return Chunk(normal[0]), Chunk(normal[1]), Chunk(normal[2])
 
@@ -307,7 +307,7 @@ def transfer_chunk_adjoint(
     wp.adjoint[nz] += wp.cw_mul(adj_cosine, z)
 
 
-def cell_inputs(transmittance: wp.array, normals: wp.array, directions: np.ndarray) -> list[Any]:
+def prepare_cells(transmittance: wp.array, normals: wp.array, directions: np.ndarray) -> list[Any]:
     """Check transmittance towards cells; it in chunks, normals, directions and the cells' solid angle over π."""
     count, device = len(directions), normals.device
     check_count("directions", count)
@@ -332,7 +332,7 @@ def _transfer_directions(
 ):
     """A thread owns a receiver."""
     batch, vertex = split_row(first_row + wp.tid(), normals.shape[1])
-    nx, ny, nz = spread(normals[batch, vertex])
+    nx, ny, nz = broadcast_normal(normals[batch, vertex])
     for chunk in range(directions.shape[1]):
         x = directions[0, chunk]
         y = directions[1, chunk]
@@ -352,7 +352,7 @@ def directional_transfer(transmittance: wp.array, normals: wp.array, directions:
         Transfer vectors, float32 of shape [batch, vertex, direction].
     Differentiable: transmittance, normals.
     """
-    inputs, device = cell_inputs(transmittance, normals, directions), normals.device
+    inputs, device = prepare_cells(transmittance, normals, directions), normals.device
     use_vector_registers(__name__, device)
     transfer = empty(transmittance.shape, dtype=wp.float32, device=device)
     if transmittance.requires_grad or normals.requires_grad:

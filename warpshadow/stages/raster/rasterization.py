@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.array_checks import values_of
+from warpshadow.device.array_checks import look_at_values
 from warpshadow.device.batch import rows
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, reshaped, zeros
@@ -455,5 +455,5 @@ def _visible_faces(clip_positions: wp.array, faces: wp.array, width: int, height
                 f"faces: got {bad_face_count} with an index out of range, expected 0 to {vertex_count - 1}"
             )
 
-    values_of(fault_counts, judge)
+    look_at_values(fault_counts, judge)
     return face_ids

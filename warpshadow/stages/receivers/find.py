@@ -38,9 +38,9 @@ class Receivers(NamedTuple):
     points: wp.array  # [batch, receiver − on static] vec3
     normals: wp.array  # [batch, receiver − on static] vec3
     faces: wp.array  # [face or side + sample receiver + triangle] vec3i, indices of receivers
-    of_vertices: wp.array  # [vertex, then their backs if fragments have sides] int32, receiver or -1 for none
+    receiver_of_vertex: wp.array  # [vertex, then their backs if fragments have sides] int32, receiver or -1 for none
     fragments: Fragments  # of these faces
-    on_static: np.ndarray = np.empty(0, int)  # [on static], the vertices that the first receivers are
+    static_vertices: np.ndarray = np.empty(0, int)  # [static vertex], the vertices that the first receivers are
     spans: tuple[Span, ...] = ()  # of the others, where bodies are told apart; () for one group
     vertices: wp.array | None = None  # int32, the vertex or back of each vertex receiver, [vertex receiver]
     sample_fragments: Fragments | None = None  # side and barycentrics of each sample receiver, [batch, sample receiver]
@@ -125,7 +125,7 @@ def _gather_points(
 def _find_faces(
     # in
     faces: wp.array(dtype=wp.vec3i),
-    of_vertices: wp.array(dtype=wp.int32),
+    receiver_of_vertex: wp.array(dtype=wp.int32),
     vertex_count: int,
     side_count: int,
     receiver_count: int,
@@ -140,7 +140,7 @@ def _find_faces(
         side = face / faces.shape[0]
         corners = faces[face - side * faces.shape[0]]
         for k in range(3):
-            result[k] = of_vertices[side * vertex_count + corners[k]]
+            result[k] = receiver_of_vertex[side * vertex_count + corners[k]]
     receiver_faces[face] = result
 
 
@@ -149,19 +149,19 @@ class Numbering(NamedTuple):
 
     # [receiver − on static] int32, receivers not on static bodies; None for all vertices as they are
     vertices: wp.array | None
-    on_static: np.ndarray  # [on static], the receivers on static bodies, which come first
-    of_vertices: wp.array  # [vertex, and their backs] int32, -1 for none
+    static_vertices: np.ndarray  # [static vertex], the receivers on static bodies, which come first
+    receiver_of_vertex: wp.array  # [vertex, and their backs] int32, -1 for none
     spans: tuple[Span, ...] = ()  # of receivers not on static bodies, where bodies are told apart
 
     @property
     def moving_count(self) -> int:
         """Number of receivers at vertices that are not on static bodies."""
-        return self.of_vertices.size if self.vertices is None else self.vertices.size
+        return self.receiver_of_vertex.size if self.vertices is None else self.vertices.size
 
     @property
     def receiver_count(self) -> int:
         """Number of receivers at vertices."""
-        return len(self.on_static) + self.moving_count
+        return len(self.static_vertices) + self.moving_count
 
 
 def number_receivers(
@@ -185,8 +185,8 @@ def number_receivers(
     """
     side_count, vertex_count = keeps_vertex.shape
     if side_count == 1 and keeps_vertex.all() and is_static is None and sequence is None and bodies is None:
-        of_vertices = constant(np.arange(vertex_count), wp.int32, device)
-        return Numbering(None, np.empty(0, int), of_vertices)
+        receiver_of_vertex = constant(np.arange(vertex_count), wp.int32, device)
+        return Numbering(None, np.empty(0, int), receiver_of_vertex)
     is_static = np.zeros(vertex_count, bool) if is_static is None else is_static
     sequence = np.arange(vertex_count) if sequence is None else sequence
     side_offsets = vertex_count * np.arange(side_count)
@@ -195,13 +195,13 @@ def number_receivers(
         bodies = np.tile(bodies, side_count)
         sequence = sequence[np.argsort(bodies[sequence], kind="stable")]
     is_static_receiver, is_moving_receiver = (keeps_vertex & is_static).ravel(), (keeps_vertex & ~is_static).ravel()
-    on_static, vertices = sequence[is_static_receiver[sequence]], sequence[is_moving_receiver[sequence]]
-    of_vertices = np.full(keeps_vertex.size, -1, np.int32)
-    of_vertices[np.concatenate([on_static, vertices])] = np.arange(len(on_static) + len(vertices))
+    static_vertices, vertices = sequence[is_static_receiver[sequence]], sequence[is_moving_receiver[sequence]]
+    receiver_of_vertex = np.full(keeps_vertex.size, -1, np.int32)
+    receiver_of_vertex[np.concatenate([static_vertices, vertices])] = np.arange(len(static_vertices) + len(vertices))
     return Numbering(
         from_numpy(vertices, dtype=wp.int32, device=device),
-        on_static,
-        from_numpy(of_vertices, dtype=wp.int32, device=device),
+        static_vertices,
+        from_numpy(receiver_of_vertex, dtype=wp.int32, device=device),
         () if bodies is None else spans_of(bodies[vertices]),
     )
 
@@ -245,11 +245,11 @@ def find_receivers(
     Differentiable: positions, normals, barycentrics of the fragments.
     """
     device = positions.device
-    vertices, on_static, of_vertices, spans = numbering
+    vertices, static_vertices, receiver_of_vertex, spans = numbering
     sides = fragments.face_ids if fragments.sides is None else fragments.sides
     receiver_fragments = fragments if fragments.sides is None else Fragments(sides, fragments.barycentrics)
     batch_count, sample_fragments, triangles = len(positions), None, np.empty((0, 3), np.int32)
-    side_count, receiver_count = of_vertices.size // positions.shape[1] * len(faces), numbering.receiver_count
+    side_count, receiver_count = receiver_of_vertex.size // positions.shape[1] * len(faces), numbering.receiver_count
     count = side_count
     if wants_samples.any():
         batch_count = common_batch({"positions": positions, "fragments": sides})
@@ -268,16 +268,16 @@ def find_receivers(
         count += sample_fragments.face_ids.shape[1]
         triangles = sample_receivers.triangles
     elif vertices is None:
-        return Receivers(positions, normals, faces, of_vertices, receiver_fragments)
+        return Receivers(positions, normals, faces, receiver_of_vertex, receiver_fragments)
     receiver_faces = empty(count + len(triangles), dtype=wp.vec3i, device=device)
-    inputs = [faces, of_vertices, positions.shape[1], side_count, receiver_count]
+    inputs = [faces, receiver_of_vertex, positions.shape[1], side_count, receiver_count]
     launch(_find_faces, count, inputs=inputs, outputs=[receiver_faces])
     if len(triangles):
         wp.copy(receiver_faces[count:], from_numpy(receiver_count + triangles, dtype=wp.vec3i, device=device))
-    vertices = of_vertices if vertices is None else vertices
+    vertices = receiver_of_vertex if vertices is None else vertices
     points = _gather_receiver_points(batch_count, positions, normals, faces, vertices, sample_fragments, rises=rises)
     receivers = Receivers(
-        *points, receiver_faces, of_vertices, receiver_fragments, on_static, has_mean_slope=has_mean_slope
+        *points, receiver_faces, receiver_of_vertex, receiver_fragments, static_vertices, has_mean_slope=has_mean_slope
     )
     if bodies is None:
         return receivers

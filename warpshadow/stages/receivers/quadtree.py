@@ -39,7 +39,7 @@ class Quadtree(NamedTuple):
     numbers: wp.array  # [view, row, column] int32, number of the square, at its first pixel
     corners: np.ndarray  # [square, 4] a b c d of each: view · samples + sample
     is_corner: np.ndarray  # [view, sample] bool
-    keys: wp.array  # [side] int32, the same for sides that share squares; −1 for sides that are in none
+    square_key_of_side: wp.array  # [side] int32, the same for sides that share squares; −1 for sides that are in none
 
     @property
     def triangles(self) -> np.ndarray:

@@ -239,7 +239,7 @@ def find_sample_receivers(
     view_count, sample_count, width = shape[0], shape[1] * shape[2], shape[2]
     sizes = squares = is_corner = keys = None
     if quadtree is not None:
-        sizes, squares, keys = quadtree.sizes, quadtree.numbers, quadtree.keys
+        sizes, squares, keys = quadtree.sizes, quadtree.numbers, quadtree.square_key_of_side
         is_corner = from_numpy(quadtree.is_corner, dtype=wp.bool, device=device)
     owner_samples, receiver_sides = (empty(sides.shape, dtype=wp.int32, device=device) for _ in range(2))
     weights = empty(sides.shape, dtype=wp.vec3, device=device)

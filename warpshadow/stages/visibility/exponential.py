@@ -21,7 +21,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.array_checks import values_of
+from warpshadow.device.array_checks import look_at_values
 from warpshadow.device.lanes import block_count, lane_count, lane_type, make_lane_functions, module_options
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty, zeros
@@ -441,5 +441,5 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
                 "above 1, since many spheres overlap; fewer spheres, or directional transmittance, are accurate"
             )
 
-    values_of(faults, judge)
+    look_at_values(faults, judge)
     return visibility
