@@ -36,7 +36,7 @@ _PASS_COST = 1.0  # time of a cell [ns]
 
 @wp.func
 def _open_share(coverage: wp.vec4, other: wp.vec4):
-    """T past two blockers of a cell; one function, since ``wp.grad`` leaves out the slopes of those that it calls."""
+    """T past two blockers of a cell; it calls no function, whose slopes ``wp.grad`` may leave out."""
     share = wp.clamp(coverage[0], 0.0, 1.0)
     other_share = wp.clamp(other[0], 0.0, 1.0)
     u = share * (1.0 - share)

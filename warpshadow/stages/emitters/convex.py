@@ -71,13 +71,6 @@ def _sees(planes: wp.array(dtype=wp.vec4), face: int, point: wp.vec3, margin: fl
 
 
 @wp.func
-def _edge_vector(parts: PlacedPartArrays, edge: int, point: wp.vec3):
-    """Normal of the plane through a point and an edge, not of unit length."""
-    ends = parts.arrays.edges[edge]
-    return wp.cross(parts.corners[ends[0]] - point, parts.corners[ends[1]] - point)
-
-
-@wp.func
 def _nearest_border(parts: PlacedPartArrays, part: int, beam: Beam):
     """The nearest edge and face. Receivers that see both sides of a panel, or none, have none."""
     margin = _ON_FACE * parts.bounds[part][3]
@@ -90,7 +83,8 @@ def _nearest_border(parts: PlacedPartArrays, part: int, beam: Beam):
         sees_left = _sees(parts.planes, first_face + edge[2], beam.point, margin)
         if sees_left != _sees(parts.planes, first_face + edge[3], beam.point, margin):
             side = wp.where(sees_left, -1.0, 1.0)
-            sine = side * wp.dot(wp.normalize(_edge_vector(parts, e, beam.point)), beam.offset)
+            vector = wp.cross(parts.corners[edge[0]] - beam.point, parts.corners[edge[1]] - beam.point)
+            sine = side * wp.dot(wp.normalize(vector), beam.offset)
             if sine < min_sine:
                 min_sine = sine
                 nearest_edge = e

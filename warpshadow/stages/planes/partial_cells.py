@@ -56,15 +56,6 @@ def _partial_weight(coverage: float):
 
 
 @wp.func
-def _partial_weight_slope(coverage: float):
-    """Its derivative."""
-    slope = float(0.0)
-    if _PER_RAMP * wp.min(coverage, 1.0 - coverage) < 1.0:
-        slope = wp.where(coverage < 0.5, _PER_RAMP, -_PER_RAMP)
-    return slope
-
-
-@wp.func
 def _sample_weight(planes: PlaneArrays, normal: wp.vec3, direction: wp.vec3):
     """Weight of a direction in the mean: its cosine for receivers in a plane; for others 1 above their horizon."""
     cosine = wp.dot(normal, direction)
@@ -170,7 +161,7 @@ def _refine_coverage_adjoint(
         if adj_share != 0.0 and weight > 0.0:
             mean_coverage, weights = _find_mean_coverage(planes, samples[q], normal, receiver)
             if weights > 0.0:
-                slope = 1.0 - weight + _partial_weight_slope(coverage) * (mean_coverage - coverage)
+                slope = 1.0 - weight + wp.grad(_partial_weight)(coverage) * (mean_coverage - coverage)
             for s in range(samples.shape[1]):
                 direction = samples[q, s]
                 share = _sample_weight(planes, normal, direction)

@@ -38,6 +38,18 @@ from warpshadow.stages.silhouettes.lines import NOTHING, FragmentArrays, image_i
 wp.set_module_options({"max_unroll": 1})  # loops that are not unrolled compile faster, and run as fast
 
 
+@wp.func
+def _area_beyond(distance: float, slope: float):
+    """The area e, given t and m."""
+    area = float(0.0)
+    if distance <= 0.5 * (1.0 - slope):
+        area = 0.5 - distance
+    elif distance < 0.5 * (1.0 + slope):
+        overlap = 0.5 * (1.0 + slope) - distance
+        area = 0.5 * overlap * overlap / slope
+    return area
+
+
 @wp.kernel(enable_backward=False)
 def _measure_areas(
     # in
@@ -57,13 +69,7 @@ def _measure_areas(
         line = line_between(fragments, samples[entry], direction, edge)
         distance = wp.clamp(line_distance(line, direction, samples_per_unit), 0.0, 1.0)
         slope = line_slope(line, direction, samples_per_unit)
-        clamped_slope = wp.min(slope, 1.0)
-        area = float(0.0)
-        if distance <= 0.5 * (1.0 - clamped_slope):
-            area = 0.5 - distance
-        elif distance < 0.5 * (1.0 + clamped_slope):
-            overlap = 0.5 * (1.0 + clamped_slope) - distance
-            area = 0.5 * overlap * overlap / clamped_slope
+        area = _area_beyond(distance, wp.min(slope, 1.0))
         if wp.isfinite(line / line[direction / 2]):  # else vertices are so far away that products overflow
             neighbor_edge = edges[entries[neighbor(samples[entry], direction, fragments.width)], opposite(direction)]
             is_surface_end = edge[0] == neighbor_edge[0] and edge[1] == neighbor_edge[1]
@@ -95,14 +101,9 @@ def _measure_areas_adjoint(
         center = sample_center(sample, fragments.width, fragments.height)
         line = line_between(fragments, sample, direction, edge)
         distance = wp.clamp(line_distance(line, direction, samples_per_unit), 0.0, 1.0)
-        clamped_slope = wp.min(line_slope(line, direction, samples_per_unit), 1.0)
-        area_slope = float(0.0)  # of e with t
-        if distance <= 0.5 * (1.0 - clamped_slope):
-            area_slope = 1.0
-        elif distance < 0.5 * (1.0 + clamped_slope):
-            area_slope = (0.5 * (1.0 + clamped_slope) - distance) / clamped_slope
+        area_slope, _ = wp.grad(_area_beyond)(distance, wp.min(line_slope(line, direction, samples_per_unit), 1.0))
         # of the line's x in a row, or its y in a column
-        adj_position = -direction_sign(direction) * adj_area * area_slope * samples_per_unit[axis]
+        adj_position = direction_sign(direction) * adj_area * area_slope * samples_per_unit[axis]
         if edge[0] >= 0:
             offset_a = relative_to_ray(clip[edge[0]], center)[1 - axis]
             offset_b = relative_to_ray(clip[edge[1]], center)[1 - axis]
