@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from warpshadow.dataset.png import Channels, Coding, Even, Srgb
+from warpshadow.rendering.renderer import Renderer
 from warpshadow.scene.scene import Scene
-from warpshadow.tuning.renderer import Renderer
 
 
 class LazyLayers:

@@ -16,6 +16,7 @@ from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.bodies.geometry import GEOMETRY_DTYPES, Geometry
 from warpshadow.pipeline.explain import Explanation
 from warpshadow.pipeline.image_inputs import ImageInputs, takes
+from warpshadow.rendering.renderer import Renderer
 from warpshadow.scene.material import INPUTS_OF_BODIES
 from warpshadow.scene.scene import BodyLike, PerBody, Scene
 from warpshadow.stages.deform import DeformationGraph
@@ -24,7 +25,6 @@ from warpshadow.stages.project import compose_clip_matrices
 from warpshadow.torch.arguments import Arguments, Slot
 from warpshadow.torch.autograd import uncompiled
 from warpshadow.torch.replay import Replays
-from warpshadow.tuning.renderer import Renderer
 
 _ELSEWHERE = {
     **dict.fromkeys(

@@ -22,10 +22,10 @@ from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
 from warpshadow.pipeline.views.view import View
+from warpshadow.rendering.renderer import Renderer
 from warpshadow.scene.scene import Scene
 from warpshadow.stages.poses import Poses
 from warpshadow.stages.shell.beams import exits_on_host
-from warpshadow.tuning.renderer import Renderer
 from warpshadow.viewer.page_camera import PageCamera, page_scale
 from warpshadow.viewer.quality import Quality
 from warpshadow.viewer.state import ERROR, ViewerState
