@@ -170,6 +170,24 @@ class EnvironmentMap:
         """Center and radius of the shell [scene units], float32 of shape [4]; None for light infinitely far away."""
         return None if self.radius is None else np.array([*self.center, self.radius], np.float32)
 
+    @property
+    def as_argument(self) -> EnvironmentMap:
+        """The light as scenes and renderers take it: the map itself."""
+        return self
+
+    def coarsened(self, row_count: int) -> EnvironmentMap:
+        """Reduce the map to that many rows, each pixel the mean of those that it covers, by solid angle.
+
+        One of fewer rows, or not of a multiple of them, stays as it is.
+        """
+        step = len(self.radiance) // row_count
+        if step < 2 or len(self.radiance) % step:
+            return self
+        rows, columns, _ = self.radiance.shape
+        weights = self.solid_angles().reshape(-1, step, 1, 1, 1)
+        blocks = self.radiance.reshape(rows // step, step, columns // step, step, 3)
+        return self._with_radiance((weights * blocks).sum(axis=(1, 3)) / (step * weights.sum(axis=(1, 3))))
+
     def rotated(self, degrees: float) -> EnvironmentMap:
         """Turn the light about +y, around its center, counter-clockwise from above: +90 takes light from +z to +x.
 

@@ -20,7 +20,6 @@ import numpy as np
 
 from warpshadow import check
 from warpshadow.assets.image import exr_bytes, exr_channels
-from warpshadow.assets.light import EnvironmentMap
 from warpshadow.check import AnyPath
 from warpshadow.dataset.data_set import DataSet
 from warpshadow.dataset.layers import LAYERS, LazyLayers
@@ -118,8 +117,8 @@ def _about(data_set: DataSet, number: int, drawn_scene: DrawnScene) -> dict[str,
         light |= {"map": stock.maps[drawn_scene.light.number], **light_placement}
     if scene.shell is not None:
         light["radius"] = float(scene.shell[3])
-    if "light" in recipe.layers and isinstance(scene.light, EnvironmentMap):
-        light["sh"] = _numbers(scene.light.sh(LIGHT_ORDER))
+    if "light" in recipe.layers:
+        light["sh"] = _numbers(scene.known_light.sh(LIGHT_ORDER))
     return {
         "number": number,
         "split": split,

@@ -73,9 +73,10 @@ class Report:
         folder, result = Path(folder), self.result
         scene = result.scene
         written = write_scene(scene, folder, stems=file_stems(scene, _OTHER_FILES))
-        if not isinstance(scene.light, EnvironmentMap):
-            write_image(folder / "light.exr", scene.known_light.radiance.astype(np.float32))
-            written.append(folder / "light.exr")
+        light_map = folder / "light.exr"
+        if light_map not in written:
+            write_image(light_map, scene.known_light.radiance.astype(np.float32))
+            written.append(light_map)
         values: dict[str, Any] = {
             f"{name}.{key}": item.cpu().numpy() for name, parts in result.values.items() for key, item in parts.items()
         }

@@ -12,7 +12,7 @@ import numpy as np
 import viser
 from scipy.spatial.transform import Rotation
 
-from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.harmonic_light import as_light
 from warpshadow.assets.primitives import icosphere
 from warpshadow.scene.body import RECEIVERS
 from warpshadow.viewer import gizmo
@@ -61,7 +61,7 @@ class Panel:
         gui, viewer_state = self._server.gui, self._loop.viewer_state
         with gui.add_folder("Light"):
             self._map = None
-            if isinstance(self._scene.light, EnvironmentMap):
+            if self._painter.has_map:
                 self._map = gui.add_image(self._map_picture(viewer_state), label="middle: +z", format="jpeg")
             turn = gui.add_slider("Turn [°]", -180.0, 180.0, 1.0, viewer_state.turn)
             self._bind(turn, "turn")
@@ -191,10 +191,9 @@ class Panel:
 
     def _map_picture(self, viewer_state: ViewerState) -> np.ndarray:
         """The light as it is turned."""
-        light = viewer_state.light(self._painter.coarse_light)
-        assert isinstance(light, EnvironmentMap)
-        step = max(1, light.radiance.shape[1] // _MAP_COLUMNS)
-        thumbnail = light.radiance[::step, ::step]
+        radiance = as_light(viewer_state.light(self._painter.coarse_light)).radiance
+        step = max(1, radiance.shape[1] // _MAP_COLUMNS)
+        thumbnail = radiance[::step, ::step]
         alpha = np.ones((*thumbnail.shape[:2], 1), np.float32)
         stops = -float(np.log2(max(np.percentile(thumbnail.max(axis=-1), 95), 1e-12)))
         return picture(np.concatenate([thumbnail, alpha], axis=-1), stops, np.zeros(3))
