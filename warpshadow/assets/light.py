@@ -386,14 +386,14 @@ def _sanitized(radiance: np.ndarray, replacement: str) -> np.ndarray:
         raise ImageError("radiance: a channel has no good value, so sanitize='neighbors' has nothing to go by")
     is_good = (~bad_values).astype(np.float32)
     while (is_good == 0).any():
-        total, count = _around(values * is_good), _around(is_good)
+        total, count = _sums_around(values * is_good), _sums_around(is_good)
         fill = (is_good == 0) & (count > 0)
         values = np.where(fill, total / np.maximum(count, 1), values)
         is_good = np.maximum(is_good, fill)
     return values
 
 
-def _around(image: np.ndarray) -> np.ndarray:
+def _sums_around(image: np.ndarray) -> np.ndarray:
     """Sum over each pixel and the eight around it; columns wrap around, rows end at the poles."""
     row_sums = image + np.roll(image, 1, axis=1) + np.roll(image, -1, axis=1)
     padded_sums = np.pad(row_sums, ((1, 1), (0, 0), (0, 0)))

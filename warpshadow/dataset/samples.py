@@ -70,7 +70,7 @@ def render_sample(data_set: DataSet, number: int) -> dict[str, bytes]:
     recipe, drawn_scene = data_set.recipe, data_set.draw(number)
     lazy_layers = LazyLayers(drawn_scene.scene, data_set.device, recipe.ranges.count[1] + 1)
     result = {name: layer.find(lazy_layers) for name, layer in LAYERS.items() if name in recipe.layers}
-    about, files = _about(data_set, number, drawn_scene), {}
+    about, files = _scene_record(data_set, number, drawn_scene), {}
     if result and recipe.format == "exr":
         files["exr"] = exr_bytes({name: values for layer in result.values() for name, values in layer.items()})
     elif result:
@@ -106,7 +106,7 @@ def _spheres(scene: Scene) -> np.ndarray:
     return np.concatenate(rows).astype(np.float32)
 
 
-def _about(data_set: DataSet, number: int, drawn_scene: DrawnScene) -> dict[str, Plain]:
+def _scene_record(data_set: DataSet, number: int, drawn_scene: DrawnScene) -> dict[str, Plain]:
     """Random choices of a scene."""
     scene, recipe, split = drawn_scene.scene, data_set.recipe, data_set.split_of(number)
     stock = data_set.stocks[split]
@@ -123,12 +123,12 @@ def _about(data_set: DataSet, number: int, drawn_scene: DrawnScene) -> dict[str,
         "number": number,
         "split": split,
         "camera": camera_table(scene.camera),
-        "bodies": [_placed(body, mesh) for body, mesh in zip(scene.bodies, [*meshes, "ground"], strict=True)],
+        "bodies": [_body_record(body, mesh) for body, mesh in zip(scene.bodies, [*meshes, "ground"], strict=True)],
         "light": light,
     }
 
 
-def _placed(body: Body, mesh: str) -> dict[str, Plain]:
+def _body_record(body: Body, mesh: str) -> dict[str, Plain]:
     albedo = None if body.texture is not None or body.albedo.ndim > 1 else _numbers(body.albedo)
     pose_record = {
         "rotation": body.rotation.tolist(),

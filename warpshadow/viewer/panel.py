@@ -138,7 +138,7 @@ class Panel:
 
         @balls.on_update
         def _(event: viser.GuiEvent) -> None:  # in a thread of its own: spheres may have to be fitted
-            self._guarded(event, self._show_spheres)
+            self._obey(event, self._show_spheres)
 
         @back.on_click
         async def _(event: viser.GuiEvent) -> None:
@@ -160,9 +160,9 @@ class Panel:
         @handle.on_update
         async def _(event: viser.GuiEvent) -> None:
             if event.client is not None:  # not by ourselves
-                self._guarded(event, lambda: self._changed(**{field: read(handle.value)}))
+                self._obey(event, lambda: self._changed(**{field: read(handle.value)}))
 
-    def _guarded(self, event: viser.GuiEvent, act: Callable[[], None]) -> None:
+    def _obey(self, event: viser.GuiEvent, act: Callable[[], None]) -> None:
         """Obey a page's request; report why if it is refused."""
         try:
             act()
@@ -228,7 +228,7 @@ class Panel:
                 position=position,
             )
             self._handles.on_update(self._dragging)
-        self._loop.again(depth=self._needs_depth)
+        self._loop.repaint(depth=self._needs_depth)
 
     @property
     def _needs_depth(self) -> bool:
@@ -263,7 +263,7 @@ class Panel:
         with self._showing:
             self._replace_spheres(bool(self._balls.value))
         self._move_spheres(self._loop.viewer_state)
-        self._loop.again(depth=self._needs_depth)
+        self._loop.repaint(depth=self._needs_depth)
 
     def _replace_spheres(self, shows: bool) -> None:
         for handle in self._spheres.values():
