@@ -59,16 +59,10 @@ def trees() -> Iterator[tuple[str, ast.Module]]:
 
 
 def names(node: ast.AST) -> Iterator[tuple[str, int]]:
-    """Names of classes, functions, arguments and variables, but not of kernels' functions.
-
-    Methods and fields are read after a dot, with their object's name.
-    """
+    """Names of classes, arguments and variables; methods and fields are read after a dot, with their object's name."""
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.ClassDef):
             yield child.name, child.lineno
-        elif isinstance(child, ast.FunctionDef) and not isinstance(node, ast.ClassDef):
-            if not any(ast.unparse(decorator).startswith("wp.func") for decorator in child.decorator_list):
-                yield child.name.strip("_"), child.lineno
         elif isinstance(child, ast.arg):
             yield child.arg, child.lineno
         elif isinstance(child, ast.Name) and isinstance(child.ctx, ast.Store):

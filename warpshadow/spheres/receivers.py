@@ -75,7 +75,7 @@ class FitReceivers:
     def __init__(self, mesh: NormalizedMesh, count: int, rng: np.random.Generator, *, sharpness: float = SHARPNESS):
         ground, surface = int(self.GROUND * count), int(self.SURFACE * count)
         parts = [_on_surface(mesh, surface, rng), _on_grounds(mesh, ground, rng)]
-        parts.append(_around_body(mesh, count - ground - surface, rng))
+        parts.append(_around(mesh, count - ground - surface, rng))
         points, normals = (np.concatenate(item) for item in zip(*parts, strict=True))
         frames = _frames(normals, rng)
         self.frame_rows = np.column_stack([points, frames.reshape(-1, 9)]).T.astype(np.float32)
@@ -135,7 +135,7 @@ def draw_points_around(mesh: NormalizedMesh, count: int, rng: np.random.Generato
     return points, -slopes
 
 
-def _around_body(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _around(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     points, bias = draw_points_around(mesh, count, rng)
     bias = 0.5 * rng.normal(size=(count, 3)) + np.where(rng.uniform(size=(count, 1)) < 0.5, bias, 0.0)
     return points, bias / np.linalg.norm(bias, axis=1, keepdims=True)

@@ -177,7 +177,7 @@ def _find_height(blur: float, texels_per_radian: float):
 
 
 @functools.cache
-def _make_find_angles(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
+def _make_look_up(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
     """Make the kernel and its adjoint, which find the angles of as many samples at once as there are lanes."""
     Lane, Vectors, fn = lane_type(lanes), vectors_type(lanes), make_lane_functions(lanes)
     sqrt, is_positive = fn.sqrt, fn.is_positive
@@ -326,7 +326,7 @@ def look_up_light(texels: wp.array, directions: wp.array, filters: wp.array) -> 
     count, device = common_batch({"texels": texels, "directions": directions}), directions.device
     directions, filters = expand_rows(directions, count), expand_rows(filters, count)
     inputs = [texels, constant(_level_offsets(texels.shape[1]), wp.vec2i, device), directions, filters]
-    look_up, look_up_adjoint = _make_find_angles(lane_count(device))
+    look_up, look_up_adjoint = _make_look_up(lane_count(device))
     row_count, cost = count * directions.shape[1], _COST * directions.shape[2]
     return differentiable(
         lambda light: launch(look_up, row_count, inputs=inputs, outputs=[light], cost=cost),

@@ -112,7 +112,7 @@ class PlaneBlockers:
                     if patch_count:
                         first = body.first_patch + side * grid.covered.size
                         pyramids.append(
-                            _moved_into_columns(level_matrix.multiply(grid.covered.ravel()).tocsr(), first, patch_count)
+                            _shifted(level_matrix.multiply(grid.covered.ravel()).tocsr(), first, patch_count)
                         )
             grids.append(_kernel_grid(body, first_level, len(matrices), first_edge, edges[-1]))
             grids[-1].is_covered_by_texels = int(not is_exact)
@@ -180,7 +180,7 @@ def _means(fine: int, coarse: int) -> csr_matrix:
     return csr_matrix(np.maximum(overlap, 0) * coarse / fine)
 
 
-def _moved_into_columns(matrix: csr_matrix, first: int, count: int) -> csr_matrix:
+def _shifted(matrix: csr_matrix, first: int, count: int) -> csr_matrix:
     """The matrix as part of one with ``count`` columns, from the column ``first`` on."""
     from scipy.sparse import csr_matrix
 
