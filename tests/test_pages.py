@@ -131,6 +131,26 @@ def test_every_room_of_the_pipeline_stands_on_its_page_with_classes_that_it_has(
         assert not [name for name in re.findall(r"`([A-Z]\w+)`", f"`{classes}`") if f"class {name}" not in source], room
 
 
+def test_the_page_of_tests_has_the_folders_shared_files_fixtures_and_tolerances_that_there_are():
+    tests, text = ROOT / "tests", (ROOT / "tests" / "README.md").read_text("utf-8")
+    folders = [path for path in tests.rglob("*") if path.is_dir() and list(path.glob("test_*.py"))]
+    assert not [
+        path
+        for path in folders
+        if not list(ROOT.glob(f"{path.relative_to(tests)}/*.py"))
+        and not list((ROOT / "warpshadow").glob(f"{path.relative_to(tests)}/*.py"))
+    ]
+    assert not [path.name for path in tests.glob("*.py") if f"| `{path.name}`" not in text and path.stem[:5] != "test_"]
+    fixtures = re.findall(
+        r"^@pytest.fixture(?!.*autouse).*\ndef (\w+)", (tests / "conftest.py").read_text(), re.MULTILINE
+    )
+    assert len(fixtures) > 5 and not [name for name in fixtures if f"`{name}`" not in text]
+    tolerances = re.findall(r"^    ([A-Z0-9_]+ = .*)$", text, re.MULTILINE)
+    assert tolerances and not [
+        line for line in tolerances if not any(line in file.read_text("utf-8") for file in tests.rglob("test_*.py"))
+    ]
+
+
 CACHING = ("cached", "cached_of_bodies", "cached_for_light")  # methods that take the node's name first
 
 

@@ -39,8 +39,8 @@ from warpshadow.spheres import Spheres, fit_spheres
 
 if _TYPE_CHECKING:
     from warpshadow.pipeline.views.layers import Layers
-    from warpshadow.tuning.insert import insert
-    from warpshadow.tuning.renderer import Renderer, render
+    from warpshadow.rendering.insert import insert
+    from warpshadow.rendering.renderer import Renderer, render
     from warpshadow.tuning.tune import Tuning, tune
     from warpshadow.viewer import view
 
@@ -48,10 +48,10 @@ __version__ = "0.1.0"
 
 _MODULES = {
     "Layers": "pipeline.views.layers",
-    "Renderer": "tuning.renderer",
+    "Renderer": "rendering.renderer",
     "Tuning": "tuning.tune",
-    "insert": "tuning.insert",
-    "render": "tuning.renderer",
+    "insert": "rendering.insert",
+    "render": "rendering.renderer",
     "tune": "tuning.tune",
     "view": "viewer",
 }

@@ -513,3 +513,13 @@ def test_suns_that_no_map_holds_are_refused():
         EnvironmentMap.constant(1.0, radius=4.0).with_sun(Y, 1)
     with pytest.raises(TypeError, match="angular_radius, in degrees"):
         random_map(16).with_sun(Y, 1, radius=2)
+
+
+def test_coarse_light_has_the_same_integral():
+    light = EnvironmentMap(np.random.default_rng(0).uniform(0, 5, (256, 512, 3)).astype(np.float32))
+    small = light.coarsened(64)
+    assert small.radiance.shape == (64, 128, 3)
+    np.testing.assert_allclose(small.statistics()["integral"], light.statistics()["integral"], rtol=1e-3)
+    assert EnvironmentMap.constant(1.0).coarsened(64).radiance.shape == (16, 32, 3)
+    near = EnvironmentMap(light.radiance, radius=3.0, center=(0, 1, 0)).coarsened(64)
+    assert near.radius == 3 and near.center.tolist() == [0, 1, 0]

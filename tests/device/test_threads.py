@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from test_torch import small_scene
+from tensors import small_scene
 
 import warpshadow as ws
 from warpshadow.device import tape
@@ -252,7 +252,7 @@ def test_the_first_calls_of_a_process_may_come_from_several_threads():
 import sys, threading
 from concurrent.futures import ThreadPoolExecutor
 import torch
-from test_torch import small_scene
+from tensors import small_scene
 from warpshadow.torch import TorchRenderer
 torch.set_num_threads(1)
 sys.setswitchinterval(1e-5)

@@ -26,7 +26,7 @@ from warpshadow.inverse import (
     Target,
     Texture,
 )
-from warpshadow.inverse.target import stacked
+from warpshadow.inverse.target import stack_targets
 
 CPU = torch.device("cpu")
 
@@ -109,7 +109,7 @@ def test_what_is_masked_out_may_be_anything():
 def test_coarse_images_are_means_of_what_counts_and_coarse_weights_how_much_that_is():
     image, mask = noise(6, 8, 3), np.random.default_rng(1).uniform(0, 1, (6, 8)) ** 2
     mask[:4, :4] = 0  # a coarse pixel without any
-    images, weights, _ = stacked([Target(image, mask)], 0.5, CPU)
+    images, weights, _ = stack_targets([Target(image, mask)], 0.5, CPU)
     blocks = (image * mask[..., None]).reshape(3, 2, 4, 2, 3).sum(axis=(1, 3))
     sums = mask.reshape(3, 2, 4, 2).sum(axis=(1, 3))
     assert np.allclose(weights[0].numpy(), sums / 4, atol=1e-6)
@@ -121,7 +121,7 @@ def test_coarse_images_are_means_of_what_counts_and_coarse_weights_how_much_that
 @pytest.mark.parametrize("scale", [0.5, 0.3, 0.01])
 def test_coarse_pixels_count_what_they_overlap_by_its_area(scale):
     image = noise(7, 10, 3)
-    images, weights, _ = stacked([Target(image)], scale, CPU)
+    images, weights, _ = stack_targets([Target(image)], scale, CPU)
     height, width = max(1, round(7 * scale)), max(1, round(10 * scale))
     finer = np.repeat(np.repeat(image, height, axis=0), width, axis=1)  # of which coarse pixels are whole parts
     expected = finer.reshape(height, 7, width, 10, 3).mean(axis=(1, 3))
@@ -137,7 +137,7 @@ def test_masked_pixels_have_no_influence_whatever_is_in_them(scale):
     losses = []
     for pixels in (image, other):
         leaf = rendered.clone().requires_grad_()
-        loss = Loss("huber")(leaf, *stacked([Target(pixels, mask)], scale, CPU)[:2], 1.0)
+        loss = Loss("huber")(leaf, *stack_targets([Target(pixels, mask)], scale, CPU)[:2], 1.0)
         loss.backward()
         losses.append((loss.item(), leaf.grad))
     assert losses[0][0] == losses[1][0] and torch.equal(losses[0][1], losses[1][1])

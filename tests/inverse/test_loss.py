@@ -6,9 +6,9 @@ import torch
 
 import warpshadow as ws
 from warpshadow.inverse import Light, Loss, Problem, Target
-from warpshadow.inverse.loss import bounded
+from warpshadow.inverse.loss import clip_saturated
 from warpshadow.inverse.model import LightModel
-from warpshadow.inverse.target import stacked
+from warpshadow.inverse.target import stack_targets
 
 KINDS = [Loss(), Loss("l1"), Loss("huber"), Loss("geman-mcclure", 0.3)]
 KINDS += [Loss("barron", 0.3, alpha=alpha) for alpha in (2.0, 1.0, 0.0, -2.0, -7.5)]
@@ -67,12 +67,12 @@ def test_confidence_is_the_weight_relative_to_that_of_a_pixel_that_is_explained(
 def test_a_saturated_target_is_a_lower_bound():
     target = Target(np.array([[[1.0, 0.5, 0.2], [0.3, 0.3, 0.3]]]), saturation=1.0)
     assert target.saturated.tolist() == [[[True, False, False], [False] * 3]]
-    packed = stacked([target], 1.0, CPU)
+    packed = stack_targets([target], 1.0, CPU)
     brighter, darker = packed.images + 0.5, packed.images - 0.5
-    both = [(bounded(image, *packed[::2]) - packed.images)[0, 0] for image in (brighter, darker)]
+    both = [(clip_saturated(image, *packed[::2]) - packed.images)[0, 0] for image in (brighter, darker)]
     np.testing.assert_allclose(both[0], [[0, 0.5, 0.5], [0.5] * 3])
     np.testing.assert_allclose(both[1], np.full((2, 3), -0.5))
-    assert stacked([target], 0.5, CPU).saturated.tolist() == [[[[True, False, False]]]]
+    assert stack_targets([target], 0.5, CPU).saturated.tolist() == [[[[True, False, False]]]]
 
 
 def test_saturation_is_a_value_as_it_is_stored(tmp_path):

@@ -227,8 +227,8 @@ def test_values_that_are_clamped_end_at_the_least_within_their_bounds():
 
 def test_a_step_waits_for_the_device_three_times_however_long_its_memory_is(monkeypatch):
     """A wait is a read of numbers: of torch's own, as by float(), or several at once."""
-    read, waits = quasi_newton._read, []
-    monkeypatch.setattr(quasi_newton, "_read", lambda *values: waits.append("several") or read(*values))
+    read, waits = quasi_newton._read_numbers, []
+    monkeypatch.setattr(quasi_newton, "_read_numbers", lambda *values: waits.append("several") or read(*values))
 
     class Reads(TorchDispatchMode):
         def __torch_dispatch__(self, function, types, arguments=(), options=None):

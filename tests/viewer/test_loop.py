@@ -227,7 +227,7 @@ def test_depth_is_asked_for_once_something_needs_it(loop, painter):
     page.until(lambda: is_full(page))
     assert not any(asked[3] for asked in painter.asked)
     count = len(painter.asked)
-    loop.again(depth=True)
+    loop.repaint(depth=True)
     page.until(lambda: len(painter.asked) > count and is_full(page))
     assert all(asked[3] for asked in painter.asked[count:])
 

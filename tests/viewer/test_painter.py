@@ -11,7 +11,6 @@ from warpshadow.viewer.page_camera import PageCamera
 from warpshadow.viewer.painter import (
     Painter,
     bounds,
-    coarse,
     distances,
     error_picture,
     own_page,
@@ -154,14 +153,6 @@ def test_a_picture_is_the_librarys_but_for_a_code(stops):
     for behind in (np.array([0.05, 0.2, 1.0]), random.uniform(0, 2, (40, 50, 3))):
         expected = ws.Picture(image, exposure=stops, background=behind).pixels.astype(int)
         assert np.abs(picture(image, stops, behind.astype(np.float32)) - expected).max() <= 1
-
-
-def test_coarse_light_has_the_same_integral():
-    light = ws.EnvironmentMap(np.random.default_rng(0).uniform(0, 5, (256, 512, 3)).astype(np.float32))
-    small = coarse(light)
-    assert small.radiance.shape == (64, 128, 3)
-    np.testing.assert_allclose(small.statistics()["integral"], light.statistics()["integral"], rtol=1e-3)
-    assert coarse(ws.EnvironmentMap.constant(1.0)).radiance.shape == (16, 32, 3)
 
 
 def test_light_is_behind_the_bodies_as_the_scene_has_it(scene, painter):

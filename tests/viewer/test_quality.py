@@ -13,15 +13,15 @@ from warpshadow.viewer.quality import (
 def test_a_slow_motion_gets_fewer_pixels_down_to_a_least_and_a_quick_one_more_up_to_a_most():
     frame_rate = FrameRate()
     first = frame_rate.moving().pixels
-    frame_rate.took(MOVING_SECONDS)
+    frame_rate.learn_from(MOVING_SECONDS)
     assert frame_rate.moving().pixels == first
-    frame_rate.took(2 * MOVING_SECONDS)
+    frame_rate.learn_from(2 * MOVING_SECONDS)
     assert frame_rate.moving().pixels == first // 2
     for _ in range(20):
-        frame_rate.took(10.0)
+        frame_rate.learn_from(10.0)
     assert frame_rate.moving().pixels == MIN_MOVING_PIXELS
     for _ in range(20):
-        frame_rate.took(0.0)
+        frame_rate.learn_from(0.0)
     assert frame_rate.moving().pixels == MAX_MOVING_PIXELS
 
 
@@ -30,7 +30,7 @@ def chain(seconds_a_pixel, canvas):
     frame_rate = FrameRate()
     quality, seconds = frame_rate.moving(), 0.0
     pixels, times = [], []
-    while (quality := frame_rate.better(quality, seconds, canvas)) is not None:
+    while (quality := frame_rate.find_better(quality, seconds, canvas)) is not None:
         seconds = seconds_a_pixel * quality.pixels
         pixels.append(quality.pixels)
         times.append(seconds)

@@ -51,12 +51,12 @@ def from_opencv(
             f"K: got {intrinsics.tolist()}, as if widths and heights of images were 1, expected pixels: its first row "
             "times the width, its second times the height"
         )
-    rotation = _shaped("rvec", rvec, (3,), (3, 1), (1, 3), (3, 3))
+    rotation = _checked_numbers("rvec", rvec, (3,), (3, 1), (1, 3), (3, 3))
     if rotation.size == 3:
         from scipy.spatial.transform import Rotation
 
         rotation = Rotation.from_rotvec(rotation.ravel()).as_matrix()
-    translation = _shaped("tvec", tvec, (3,), (3, 1), (1, 3)).ravel()
+    translation = _checked_numbers("tvec", tvec, (3,), (3, 1), (1, 3)).ravel()
     return Pinhole(intrinsics + HALF_PIXEL, rotation, translation), check.image_size(size)
 
 
@@ -67,9 +67,9 @@ def _calibration(K: Any) -> tuple[np.ndarray, object, object]:
         return intrinsics, (K.width, K.height), getattr(K, "coeffs", None)
     names = next(((k, d) for k, d in (("k", "d"), ("K", "D")) if hasattr(K, k) and hasattr(K, d)), None)
     if names is None:
-        return _shaped("K", K, (3, 3), (9,)).reshape(3, 3), None, None
+        return _checked_numbers("K", K, (3, 3), (9,)).reshape(3, 3), None, None
     matrix, distortion = (getattr(K, name) for name in names)  # sensor_msgs/CameraInfo of ROS 2, or 1
-    intrinsics = _shaped("K", matrix, (9,), (3, 3)).reshape(3, 3)
+    intrinsics = _checked_numbers("K", matrix, (9,), (3, 3)).reshape(3, 3)
     return intrinsics, (K.width, K.height), distortion if len(distortion) else None
 
 
@@ -83,8 +83,8 @@ def from_pytorch3d(
     in_ndc: bool,
 ) -> Pinhole:
     """Camera of :meth:`warpshadow.Camera.from_pytorch3d`."""
-    rotation = _LEFT_UP @ _shaped("R", R, (3, 3), (1, 3, 3)).reshape(3, 3).T  # of row vectors: x R + T
-    translation = _LEFT_UP @ _shaped("T", T, (3,), (1, 3)).ravel()
+    rotation = _LEFT_UP @ _checked_numbers("R", R, (3, 3), (1, 3, 3)).reshape(3, 3).T  # of row vectors: x R + T
+    translation = _LEFT_UP @ _checked_numbers("T", T, (3,), (1, 3)).ravel()
     if (focal_length is None) == (fov is None):
         raise ValueError("focal_length, fov: expected exactly one of them")
     half = min(size) / 2  # NDC runs from -1 to 1 along the shorter side
@@ -93,11 +93,11 @@ def from_pytorch3d(
         if not (check.is_number(fov) and 0 < fov < 180):
             raise ValueError(f"fov: got {check.described(fov)}, expected degrees between 0 and 180")
         focal_length, in_ndc = 1 / np.tan(np.radians(fov / 2)), True
-    focal = np.broadcast_to(_shaped("focal_length", focal_length, (), (1,), (2,), (1, 2)).ravel(), 2)
+    focal = np.broadcast_to(_checked_numbers("focal_length", focal_length, (), (1,), (2,), (1, 2)).ravel(), 2)
     if principal_point is None:
         center = image_center
     else:
-        point = _shaped("principal_point", principal_point, (2,), (1, 2)).ravel()
+        point = _checked_numbers("principal_point", principal_point, (2,), (1, 2)).ravel()
         center = image_center - half * point if in_ndc else point
     focal = half * focal if in_ndc else focal
     return Pinhole(intrinsics_of(*focal, *center), rotation, translation)
@@ -136,7 +136,7 @@ def intrinsics_of(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def _shaped(name: str, given_numbers: object, *shapes: tuple[int, ...]) -> np.ndarray:
+def _checked_numbers(name: str, given_numbers: object, *shapes: tuple[int, ...]) -> np.ndarray:
     """Copy finite numbers of one of some shapes to float64."""
     expected = "an array of shape " + " or ".join(map(str, shapes))
     values = check.numbers(name, given_numbers, expected=expected, dtype=np.float64)

@@ -82,7 +82,7 @@ def emissive_entries(tree: dict) -> Mapping[tuple[Any, ...], EmissiveEntry]:
     """Entries of all materials, by their names and factors."""
     result = {}
     for material in tree.get("materials", []):
-        key = (material.get("name"), *_rounded(material.get("emissiveFactor", (0, 0, 0))))
+        key = (material.get("name"), *_float32_key(material.get("emissiveFactor", (0, 0, 0))))
         extension = material.get("extensions", {}).get("KHR_materials_emissive_strength", {})
         texture = material.get("emissiveTexture", {})
         transform = texture.get("extensions", {}).get("KHR_texture_transform", {})
@@ -91,7 +91,7 @@ def emissive_entries(tree: dict) -> Mapping[tuple[Any, ...], EmissiveEntry]:
     return result
 
 
-def _rounded(factor: Sequence[float]) -> tuple[float, ...]:
+def _float32_key(factor: Sequence[float]) -> tuple[float, ...]:
     return tuple(np.array(factor, np.float32).tolist())
 
 
@@ -100,7 +100,7 @@ def with_entry(part: MeshPart, entries: Mapping[tuple[Any, ...], EmissiveEntry])
     if part.emission is None:
         return part
     factor, image, material, _ = part.emission
-    entry = entries.get((material, *_rounded(factor)), EmissiveEntry(1.0, False))
+    entry = entries.get((material, *_float32_key(factor)), EmissiveEntry(1.0, False))
     red, green, blue = (entry.strength * color for color in factor)
     return part._replace(emission=EmissiveColor((red, green, blue), image, has_own_uvs=entry.has_own_uvs))
 

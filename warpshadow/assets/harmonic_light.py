@@ -46,6 +46,20 @@ class HarmonicLight:
         """The light as a map [height, 2·height, 3], negative where it rings."""
         return sh.reconstruct_map(self.coefficients, _ROWS)
 
+    @property
+    def shell(self) -> None:
+        """None: it comes from infinitely far away."""
+        return None
+
+    @property
+    def as_argument(self) -> np.ndarray:
+        """The light as scenes and renderers take it: its coefficients."""
+        return self.coefficients
+
+    def coarsened(self, row_count: int) -> HarmonicLight:
+        """The same: as a map of few rows it is as smooth."""
+        return self
+
     def towards(self, directions: np.ndarray) -> np.ndarray:
         """Radiance from directions [..., 3], 0 where it rings below that, float64 of shape [..., 3]."""
         harmonics = sh.evaluate(sh.order_of("light", self.coefficients), directions.reshape(-1, 3))
@@ -81,8 +95,8 @@ class HarmonicLight:
 
 
 KnownLight = EnvironmentMap | HarmonicLight
-"""Known light of any kind. It has ``radiance``, ``towards``, ``rotated``, ``scaled``, ``bands``, ``sh`` and ``cells``,
-and compares by value; methods of visibility ask for no more, but for the shell of a map."""
+"""Known light of any kind. It has ``radiance``, ``towards``, ``shell``, ``rotated``, ``scaled``, ``coarsened``,
+``bands``, ``sh``, ``cells`` and ``as_argument``, and compares by value; nothing asks for more, but for a map."""
 
 
 def as_light(light: EnvironmentMap | np.ndarray) -> KnownLight:

@@ -323,7 +323,7 @@ def _codes(path: Path, picture: Any) -> tuple[np.ndarray, bool]:
     """Codes of 8 or 16 bits, [height, width, channel], upright; and whether the last channel is alpha."""
     has_alpha = picture.has_transparency_data
     is_16_bit, low_tiles = is_wide(picture), _low_tiles(picture)  # which loading forgets
-    upper = _loaded(picture)
+    upper = _load_upright(picture)
     if upper.mode.startswith("I"):  # 16-bit gray
         return np.asarray(upper).astype(np.uint16)[..., None], False
     color = "L" if upper.mode in ("1", "L", "LA") else "RGB"
@@ -332,7 +332,7 @@ def _codes(path: Path, picture: Any) -> tuple[np.ndarray, bool]:
     if low_tiles is not None and has_alpha == (upper.mode == "RGBA"):
         with _open(path) as picture:
             picture.tile = low_tiles
-            codes = codes.astype(np.uint16) << 8 | np.asarray(_loaded(picture).convert(mode))
+            codes = codes.astype(np.uint16) << 8 | np.asarray(_load_upright(picture).convert(mode))
     elif is_16_bit:
         check.warn(f"{path}: 16-bit color is read at 8 bits")
     return codes.reshape(*codes.shape[:2], -1), has_alpha
@@ -361,7 +361,7 @@ def _low_tiles(picture: Any) -> list | None:
     return low_tiles
 
 
-def _loaded(picture: Any) -> Any:
+def _load_upright(picture: Any) -> Any:
     """A picture's pixels, upright."""
     from PIL import ImageOps
 

@@ -170,6 +170,24 @@ class EnvironmentMap:
         """Center and radius of the shell [scene units], float32 of shape [4]; None for light infinitely far away."""
         return None if self.radius is None else np.array([*self.center, self.radius], np.float32)
 
+    @property
+    def as_argument(self) -> EnvironmentMap:
+        """The light as scenes and renderers take it: the map itself."""
+        return self
+
+    def coarsened(self, row_count: int) -> EnvironmentMap:
+        """Reduce the map to that many rows, each pixel the mean of those that it covers, by solid angle.
+
+        One of fewer rows, or not of a multiple of them, stays as it is.
+        """
+        step = len(self.radiance) // row_count
+        if step < 2 or len(self.radiance) % step:
+            return self
+        rows, columns, _ = self.radiance.shape
+        weights = self.solid_angles().reshape(-1, step, 1, 1, 1)
+        blocks = self.radiance.reshape(rows // step, step, columns // step, step, 3)
+        return self._with_radiance((weights * blocks).sum(axis=(1, 3)) / (step * weights.sum(axis=(1, 3))))
+
     def rotated(self, degrees: float) -> EnvironmentMap:
         """Turn the light about +y, around its center, counter-clockwise from above: +90 takes light from +z to +x.
 
@@ -368,14 +386,14 @@ def _sanitized(radiance: np.ndarray, replacement: str) -> np.ndarray:
         raise ImageError("radiance: a channel has no good value, so sanitize='neighbors' has nothing to go by")
     is_good = (~bad_values).astype(np.float32)
     while (is_good == 0).any():
-        total, count = _around(values * is_good), _around(is_good)
+        total, count = _sums_around(values * is_good), _sums_around(is_good)
         fill = (is_good == 0) & (count > 0)
         values = np.where(fill, total / np.maximum(count, 1), values)
         is_good = np.maximum(is_good, fill)
     return values
 
 
-def _around(image: np.ndarray) -> np.ndarray:
+def _sums_around(image: np.ndarray) -> np.ndarray:
     """Sum over each pixel and the eight around it; columns wrap around, rows end at the poles."""
     row_sums = image + np.roll(image, 1, axis=1) + np.roll(image, -1, axis=1)
     padded_sums = np.pad(row_sums, ((1, 1), (0, 0), (0, 0)))

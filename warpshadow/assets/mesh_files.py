@@ -108,7 +108,7 @@ def load_mesh(path: MeshSource) -> Mesh:
     """
     result = _read(path)
     of_texture = ["its texture dropped, which Body(path) takes"] if result.picture is not None else []
-    _remark(path, [*result.remarks, *result.of_colors, *of_texture])
+    _warn_of(path, [*result.remarks, *result.of_colors, *of_texture])
     return result.mesh
 
 
@@ -130,12 +130,12 @@ def load_material(path: MeshSource) -> tuple[Mesh, Material]:
     texture = None
     if picture is not None:
         try:
-            texture = _texels(picture)
+            texture = _linear_pixels(picture)
             if mesh.colors is not None:
                 of_colors.append("colors of vertices do not count beside its texture")
         except (OSError, ValueError) as error:
             of_colors.append(f"its texture dropped ({error})")
-    _remark(path, remarks + of_colors + of_gloss)
+    _warn_of(path, remarks + of_colors + of_gloss)
     roughness, metallic = gloss or (None, None)
     return mesh, Material(texture, roughness, metallic, emission)
 
@@ -143,11 +143,11 @@ def load_material(path: MeshSource) -> tuple[Mesh, Material]:
 def load_shape(path: MeshSource) -> Mesh:
     """Read a mesh as :func:`load_mesh` does, without a word of the colors and textures that are not read."""
     result = _read(path)
-    _remark(path, result.remarks)
+    _warn_of(path, result.remarks)
     return result.mesh
 
 
-def _remark(path: MeshSource, remarks: list[str]) -> None:
+def _warn_of(path: MeshSource, remarks: list[str]) -> None:
     if remarks:
         check.warn(f"{path if check.is_path(path) else 'mesh'}: {', '.join(remarks)}")
 
@@ -169,7 +169,7 @@ def _read(source: MeshSource) -> JoinedMesh:
         raise MeshError(f"{path}: not a readable {path.suffix} file ({type(error).__name__}: {error})") from error
 
 
-def _texels(picture: BaseColor) -> np.ndarray:
+def _linear_pixels(picture: BaseColor) -> np.ndarray:
     """A picture as linear RGB, float32 of shape [height, width, 3]."""
     if isinstance(picture.image, Path):
         return read_rgb(picture.image)
@@ -211,7 +211,7 @@ def _read_trimesh(path: Path) -> list[MeshPart]:
     if path.suffix.lower() == ".stl":
         if not any(len(part.faces) for part in parts):
             raise MeshError(f"faces: got none, expected at least one triangle{_stl_fault(path.read_bytes())}")
-        return [_merged(part) for part in parts]
+        return [_weld_corners(part) for part in parts]
     if cuts_colors(tree):
         parts = [part._replace(colors=None, colorless="colors of 16 bits without a material dropped") for part in parts]
     return parts
@@ -231,7 +231,7 @@ def _stl_fault(content: bytes) -> str:
     )
 
 
-def _merged(part: MeshPart) -> MeshPart:
+def _weld_corners(part: MeshPart) -> MeshPart:
     """Weld vertices of the same place and color, where every face has three of its own.
 
     Sharp edges keep two where they are many, as of boxes. Where angles of all sizes occur, normals round them, as

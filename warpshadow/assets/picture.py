@@ -56,7 +56,7 @@ class Picture:
         tone: str = "clip",
         background: npt.ArrayLike | None = None,
     ):
-        linear = _checked("image", image)
+        linear = _checked_image("image", image)
         check.choice("tone", tone, TONES)
         if exposure is not None and not (check.is_number(exposure) and abs(exposure) <= MAX_STOPS):
             raise ValueError(
@@ -68,7 +68,7 @@ class Picture:
         if background is not None and not has_alpha:
             raise ValueError(f"background: got one behind an image of shape {linear.shape}, which covers all of it")
         color, alpha = (linear[..., :3], np.clip(linear[..., 3:], 0, 1)) if has_alpha else (linear, None)
-        background_pixels = None if background is None else _behind(background, color.shape)
+        background_pixels = None if background is None else _checked_background(background, color.shape)
         if alpha is not None and background_pixels is not None and background_pixels.ndim == 3:
             color, alpha = color + (1 - alpha) * background_pixels, None
         if alpha is not None:
@@ -109,7 +109,7 @@ class Picture:
         with files.atomic_write(path) as temporary_path:
             comment = f"warpshadow: exposure {self.exposure:+.6f} stops, tone {self.tone}"
             if path.suffix.lower() == ".png":
-                _pillow(self.pixels).save(temporary_path, pnginfo=_chunk(comment))
+                _pillow(self.pixels).save(temporary_path, pnginfo=_comment_chunk(comment))
             else:
                 opaque_pixels = self.opaque() if self.pixels.shape[2] == 4 else self.pixels
                 _pillow(opaque_pixels).save(temporary_path, quality=95, subsampling=0, comment=comment)
@@ -155,7 +155,7 @@ def development(path: AnyPath) -> Development | None:
     return None if match is None else Development(float(match[1]), match[2])
 
 
-def _checked(name: str, image: npt.ArrayLike) -> np.ndarray:
+def _checked_image(name: str, image: npt.ArrayLike) -> np.ndarray:
     """An image [height, width, channel], float64, without NaN and Inf."""
     expected = "linear values [height, width, channel]"
     pixels = check.pixels(name, image, expected=expected)
@@ -167,7 +167,7 @@ def _checked(name: str, image: npt.ArrayLike) -> np.ndarray:
     return np.clip(pixels.astype(np.float64), -check.LARGEST, check.LARGEST)
 
 
-def _behind(background: npt.ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
+def _checked_background(background: npt.ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
     """A color [3] or an image [height, width, 3], linear."""
     if isinstance(background, str):
         from PIL import ImageColor
@@ -195,7 +195,7 @@ def _pillow(pixels: np.ndarray) -> Any:
     return Image.fromarray(pixels[..., 0] if pixels.shape[2] == 1 else pixels)
 
 
-def _chunk(comment: str) -> Any:
+def _comment_chunk(comment: str) -> Any:
     """A PNG file's comment."""
     from PIL.PngImagePlugin import PngInfo
 

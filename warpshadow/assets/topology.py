@@ -83,7 +83,7 @@ def part_at_creases(
         shape [vertex]: the old ones are the first, in their order.
     """
     position_ids = number_positions(positions)[surface.faces]
-    face, edge, neighbor, cosines = _bends(surface, positions, each_once=False)
+    face, edge, neighbor, cosines = _find_bends(surface, positions, each_once=False)
     is_smooth = cosines >= np.cos(np.radians(angle))
     face, edge, neighbor = face[is_smooth], edge[is_smooth], neighbor[is_smooth]
     links = []
@@ -117,7 +117,7 @@ def rounds_edges(surface: MeshTopology, positions: np.ndarray) -> bool:
     vases, and at most 0.71 in 15 organic meshes.
     """
     corners = positions[surface.faces].astype(np.float64)
-    face, edge, neighbor, cosines = _bends(surface, positions)
+    face, edge, neighbor, cosines = _find_bends(surface, positions)
     bent_edges = np.flatnonzero(cosines < np.cos(np.radians(20)))
     bent_edges = bent_edges[~_is_parted(surface, face[bent_edges], edge[bent_edges], neighbor[bent_edges])]
     face, edge, cosines = face[bent_edges], edge[bent_edges], cosines[bent_edges]
@@ -175,7 +175,7 @@ def draws_lines(surface: MeshTopology, positions: np.ndarray) -> bool:
 
 def _parted_share(surface: MeshTopology, positions: np.ndarray, low: float, high: float) -> float:
     """Part of the edges that bend by some angles [degrees] whose faces have vertices of their own; 0 without any."""
-    face, edge, neighbor, cosines = _bends(surface, positions)
+    face, edge, neighbor, cosines = _find_bends(surface, positions)
     is_bent = (np.cos(np.radians(high)) <= cosines) & (cosines < np.cos(np.radians(low)))
     is_parted = _is_parted(surface, face[is_bent], edge[is_bent], neighbor[is_bent])
     return float(is_parted.mean()) if len(is_parted) else 0.0
@@ -202,12 +202,12 @@ def creases(surface: MeshTopology, positions: np.ndarray) -> np.ndarray:
 
 def smooth_pieces(surface: MeshTopology, positions: np.ndarray) -> np.ndarray:
     """Number the pieces of a mesh within which faces join across edges that are not sharp, shape [face]."""
-    face, _, neighbor, cosines = _bends(surface, positions)
+    face, _, neighbor, cosines = _find_bends(surface, positions)
     is_smooth = cosines >= np.cos(np.radians(CREASE))
     return connected_components(face[is_smooth], neighbor[is_smooth], len(surface.faces))
 
 
-def _bends(surface: MeshTopology, positions: np.ndarray, *, each_once: bool = True) -> tuple[np.ndarray, ...]:
+def _find_bends(surface: MeshTopology, positions: np.ndarray, *, each_once: bool = True) -> tuple[np.ndarray, ...]:
     """Edges of faces, opposite to corners, with the faces across and the cosines of the angles by which they bend."""
     normals = face_normals(positions[surface.faces])
     face, edge = np.nonzero(surface.neighbors > (np.arange(len(normals))[:, None] if each_once else -1))
@@ -258,7 +258,7 @@ def is_listed_first(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     Faces without area are not compared.
     """
     position_ids = number_positions(positions)
-    sums = _scrambled(position_ids)[faces].sum(axis=1)  # equal for the same corners, and hardly ever for others
+    sums = _scramble(position_ids)[faces].sum(axis=1)  # equal for the same corners, and hardly ever for others
     sorted_sums = np.sort(sums)
     repeated_sums = sorted_sums[1:][sorted_sums[1:] == sorted_sums[:-1]]
     is_first = np.ones(len(faces), bool)
@@ -274,7 +274,7 @@ def is_listed_first(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return is_first
 
 
-def _scrambled(numbers: np.ndarray) -> np.ndarray:
+def _scramble(numbers: np.ndarray) -> np.ndarray:
     """Scramble whole numbers to 64 bits, uint64 [Steele et al. 2014, SplitMix]."""
     words = (numbers.astype(np.uint64) + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
@@ -292,13 +292,11 @@ def join_faces(positions: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | 
     runs_back = (first[neighbor] == last[:, :, None]) & (last[neighbor] == first[:, :, None])
     winds_alike = runs_back.any(axis=2) | (neighbors < 0)
     if not winds_alike.all():
-        is_turned = _turned(neighbors, winds_alike)
+        is_turned = _find_faces_to_turn(neighbors, winds_alike)
         winds_alike ^= is_turned[:, None] ^ is_turned[neighbor]
         winds_alike |= neighbors < 0
-        faces, position_ids, neighbors = (
-            _with_turned(values, is_turned) for values in (faces, position_ids, neighbors)
-        )
-        uv_faces = None if uv_faces is None else _with_turned(uv_faces, is_turned)
+        faces, position_ids, neighbors = (_turn_faces(values, is_turned) for values in (faces, position_ids, neighbors))
+        uv_faces = None if uv_faces is None else _turn_faces(uv_faces, is_turned)
     is_closed = bool(winds_alike.all()) and _is_closed(positions, faces, position_ids, neighbors)
     return MeshTopology(faces, uv_faces, neighbors, is_closed)
 
@@ -329,7 +327,7 @@ def _is_closed(positions: np.ndarray, faces: np.ndarray, position_ids: np.ndarra
     return bool((volumes[np.unique(piece[is_proper])] > 0).all())
 
 
-def _turned(neighbors: np.ndarray, winds_alike: np.ndarray) -> np.ndarray:
+def _find_faces_to_turn(neighbors: np.ndarray, winds_alike: np.ndarray) -> np.ndarray:
     """Faces to turn over, as few as can be, so that neighbors wind alike, bool of shape [face].
 
     A graph has two nodes a face, "as it is" and "turned over". Nodes of neighbors that wind alike are joined, so each
@@ -347,7 +345,7 @@ def _turned(neighbors: np.ndarray, winds_alike: np.ndarray) -> np.ndarray:
     )
 
 
-def _with_turned(values: np.ndarray, is_turned: np.ndarray) -> np.ndarray:
+def _turn_faces(values: np.ndarray, is_turned: np.ndarray) -> np.ndarray:
     """Reverse the corner order [face, 3] of some faces."""
     flipped = np.where(is_turned[:, None], values[:, ::-1], values)
     flipped.setflags(write=False)

@@ -41,7 +41,7 @@ def write_video(path: AnyPath, frames: Iterable[Picture | np.ndarray], *, fps: f
     check.instance("frames", frames, Iterable, "pictures, one after another")
     if isinstance(frames, np.ndarray) and frames.ndim != 4:
         raise ValueError(f"frames: got an array of shape {frames.shape}, expected [frame, height, width, channel]")
-    shown_frames = _shown(frames)
+    shown_frames = _uint8_frames(frames)
     first = next(shown_frames, None)
     if first is None:
         raise ValueError("frames: got none, expected at least one picture")
@@ -71,7 +71,7 @@ def check_video(path: Path, fps: float) -> None:
             raise ImportError(f"{path}: {missing}; .gif and .webp need none") from error
 
 
-def _shown(frames: Iterable[Picture | np.ndarray]) -> Iterator[np.ndarray]:
+def _uint8_frames(frames: Iterable[Picture | np.ndarray]) -> Iterator[np.ndarray]:
     """Frames of uint8, [height, width, 3], all of one size."""
     exposure, shape = None, None
     for number, frame in enumerate(frames):

@@ -81,7 +81,7 @@ def main(
     warnings.showwarning = lambda message, *_: typer.secho(f"warning: {message}", fg="yellow", err=True)
 
 
-def interrupted(how: str = "") -> typer.Exit:
+def report_interrupt(how: str = "") -> typer.Exit:
     """Say in one line that the user interrupted the command, and how it goes on; returns the exit."""
     typer.secho(f"interrupted{how}", fg="yellow", err=True)
     return typer.Exit(INTERRUPTED)
@@ -94,7 +94,7 @@ def clear_errors() -> Iterator[None]:
         yield
     except KeyboardInterrupt as error:
         remark = f"; {error}" if error.args else ""
-        raise interrupted(remark) from error  # at once: threads and kernels take a second to end
+        raise report_interrupt(remark) from error  # at once: threads and kernels take a second to end
     except (ValueError, OSError, ImportError) as error:
         message = error if error.args else type(error).__name__
         typer.secho(f"error: {message}", fg="red", err=True)

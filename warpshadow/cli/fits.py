@@ -10,7 +10,7 @@ from typing import Annotated, Any, Optional
 
 import typer
 
-from warpshadow.cli.console import DIVERGED, Device, Quiet, app, clear_errors, device_of, interrupted, note
+from warpshadow.cli.console import DIVERGED, Device, Quiet, app, clear_errors, device_of, note, report_interrupt
 from warpshadow.viewer import PORT, FitViewer
 
 
@@ -132,7 +132,7 @@ def _fit_many(fit_path: Path | list[Path], output: Path, view: bool, is_quiet: b
         try:
             endings = fit_many(find_fits(fit_path), output, **options)
         except KeyboardInterrupt as error:
-            raise interrupted("; the same command goes on from the checkpoints") from error
+            raise report_interrupt("; the same command goes on from the checkpoints") from error
     for ending in endings:
         for warning in ending.warnings:
             typer.secho(f"warning: {ending.name}: {warning}", fg="yellow", err=True)
@@ -163,7 +163,7 @@ def _resumable(folder: Path) -> Iterator[None]:
             else " before a checkpoint; the same command starts over"
         )
         remark += f"; {error}" if error.args else ""
-        raise interrupted(remark) from error
+        raise report_interrupt(remark) from error
 
 
 @app.command()
@@ -191,7 +191,7 @@ def dataset(
         try:
             shards = write_shards(data_set, output, workers=workers)
         except KeyboardInterrupt as error:
-            raise interrupted(f"; the same command goes on in {output}") from error
+            raise report_interrupt(f"; the same command goes on in {output}") from error
         size = sum(shard.stat().st_size for shard in shards)
         seconds = time.perf_counter() - start
         made_text = (

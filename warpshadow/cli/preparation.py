@@ -52,7 +52,7 @@ def spheres(
         typer.echo(f"irradiance error in the air      {report.nearby_error:6.1%}")
         typer.echo(f"surface covered                  {report.coverage:6.1%}")
         typer.echo(f"volume outside the mesh          {report.outside_volume:6.1%}")
-        typer.echo(_judgement(report))
+        typer.echo(_describe_errors(report))
         if output is not None:
             fit.spheres.write(output)
         if picture is not None:
@@ -64,7 +64,7 @@ def spheres(
             )
 
 
-def _judgement(report: FitReport) -> str:
+def _describe_errors(report: FitReport) -> str:
     """The meaning of a fit's errors for images."""
     from warpshadow.spheres.enough import MAX_SPHERES, RAGGED_ERROR
 

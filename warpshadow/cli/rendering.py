@@ -212,7 +212,7 @@ def render(
             write_image(output, image, layers=renderer.layers().channels() if layers else None)
             note(f"{output}: {summary}", is_quiet)
         for file in (item for item in (output, png) if item is not None and item.suffix.lower() != ".exr"):
-            picture = Picture(image, exposure=exposure, tone=tone, background=_behind(loaded_scene, background))
+            picture = Picture(image, exposure=exposure, tone=tone, background=_background_of(loaded_scene, background))
             write_image(file, picture)
             note(f"{file}: {f'{summary}, ' * (file == output)}exposure {picture.exposure:+.2f} stops", is_quiet)
             if picture.pixels.shape[2] == 4 and picture.pixels[..., 3].min() < 255 and file.suffix.lower() != ".png":
@@ -220,7 +220,7 @@ def render(
                 note(f"{file}: {remark}; --background environment shows the light", is_quiet)
 
 
-def _behind(scene: Scene, background: str) -> str | np.ndarray | None:
+def _background_of(scene: Scene, background: str) -> str | np.ndarray | None:
     """The background of a picture, by its option."""
     if background == "environment":
         return scene.background()
@@ -238,7 +238,7 @@ def _frames(
 
     def picture(camera: Camera, exposure: float | None) -> Picture:
         image = renderer.with_cameras([camera]).render()[0]
-        background_image = _behind(replace(scene, camera=camera), background)
+        background_image = _background_of(replace(scene, camera=camera), background)
         return Picture(image, exposure=exposure, tone=tone, background=background_image)
 
     first = picture(cameras[0], exposure)  # its set-up, fits and tracing, has bars of its own

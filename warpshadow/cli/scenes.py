@@ -82,8 +82,8 @@ def insert(
     light bounces tint it.
     """
     from warpshadow.assets.image import write_image
+    from warpshadow.rendering.insert import insert as insert_bodies
     from warpshadow.scene.files import load_scene
-    from warpshadow.tuning.insert import insert as insert_bodies
 
     with clear_errors():
         check_output(output, ".exr", *SUFFIXES)

@@ -71,7 +71,7 @@ class DataSet:
         self.hashes: dict[str, dict[str, str]] = {}
         if recipe.meshes is None:
             self.hashes["meshes"] = {body.name: body.mesh.content_hash for body in primitives()}
-            self._primitives = [_fitted(body, self.device) if fits else body for body in primitives()]
+            self._primitives = [_with_fitted_spheres(body, self.device) if fits else body for body in primitives()]
         else:
             self.hashes["meshes"] = _hashes(
                 recipe.meshes, "meshes", MESH_SUFFIXES, lambda path: self._read_mesh(path).content_hash, progress
@@ -175,10 +175,10 @@ def _read_body(path: Path, blockers: int | str, creased: float | None, fits: boo
     if body.texture is not None or body.mesh.colors is not None:
         content_hash = hashlib.sha256(content_hash.encode() + colors.tobytes()).hexdigest()
     body = body if creased is None else body.creased(creased)
-    return _ReadMesh(_fitted(body, device) if fits else body, content_hash)
+    return _ReadMesh(_with_fitted_spheres(body, device) if fits else body, content_hash)
 
 
-def _fitted(body: Body, device: str) -> Body:
+def _with_fitted_spheres(body: Body, device: str) -> Body:
     """The body with its fitted spheres; a flat body has none and blocks as a plane."""
     if isinstance(body.blockers, Spheres) or body.mesh.is_flat:
         return body

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from warpshadow.dataset.png import Channels, Coding, Even, Srgb
+from warpshadow.rendering.renderer import Renderer
 from warpshadow.scene.scene import Scene
-from warpshadow.tuning.renderer import Renderer
 
 
 class LazyLayers:
@@ -31,11 +31,11 @@ class LazyLayers:
 
     def color(self) -> Channels:
         """Linear RGB, premultiplied, and coverage."""
-        return _named("RGBA", self.renderer.render())
+        return _as_channels("RGBA", self.renderer.render())
 
     def shadow(self) -> Channels:
         """Direct light on the bodies, divided by the same light without blockers."""
-        return _named([f"shadow.{color}" for color in "RGB"], self.renderer.shadow())
+        return _as_channels([f"shadow.{color}" for color in "RGB"], self.renderer.shadow())
 
     def some(self, *names: str) -> Channels:
         """Some of the channels of the renderer's layers."""
@@ -47,7 +47,7 @@ class LazyLayers:
         return {name: self._channels.get(name, np.zeros_like(self._channels["Z"])) for name in names}
 
 
-def _named(names: Sequence[str], values: np.ndarray) -> Channels:
+def _as_channels(names: Sequence[str], values: np.ndarray) -> Channels:
     return dict(zip(names, np.moveaxis(values, -1, 0), strict=True))
 
 

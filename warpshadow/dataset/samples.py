@@ -20,7 +20,6 @@ import numpy as np
 
 from warpshadow import check
 from warpshadow.assets.image import exr_bytes, exr_channels
-from warpshadow.assets.light import EnvironmentMap
 from warpshadow.check import AnyPath
 from warpshadow.dataset.data_set import DataSet
 from warpshadow.dataset.layers import LAYERS, LazyLayers
@@ -71,7 +70,7 @@ def render_sample(data_set: DataSet, number: int) -> dict[str, bytes]:
     recipe, drawn_scene = data_set.recipe, data_set.draw(number)
     lazy_layers = LazyLayers(drawn_scene.scene, data_set.device, recipe.ranges.count[1] + 1)
     result = {name: layer.find(lazy_layers) for name, layer in LAYERS.items() if name in recipe.layers}
-    about, files = _about(data_set, number, drawn_scene), {}
+    about, files = _scene_record(data_set, number, drawn_scene), {}
     if result and recipe.format == "exr":
         files["exr"] = exr_bytes({name: values for layer in result.values() for name, values in layer.items()})
     elif result:
@@ -107,7 +106,7 @@ def _spheres(scene: Scene) -> np.ndarray:
     return np.concatenate(rows).astype(np.float32)
 
 
-def _about(data_set: DataSet, number: int, drawn_scene: DrawnScene) -> dict[str, Plain]:
+def _scene_record(data_set: DataSet, number: int, drawn_scene: DrawnScene) -> dict[str, Plain]:
     """Random choices of a scene."""
     scene, recipe, split = drawn_scene.scene, data_set.recipe, data_set.split_of(number)
     stock = data_set.stocks[split]
@@ -118,18 +117,18 @@ def _about(data_set: DataSet, number: int, drawn_scene: DrawnScene) -> dict[str,
         light |= {"map": stock.maps[drawn_scene.light.number], **light_placement}
     if scene.shell is not None:
         light["radius"] = float(scene.shell[3])
-    if "light" in recipe.layers and isinstance(scene.light, EnvironmentMap):
-        light["sh"] = _numbers(scene.light.sh(LIGHT_ORDER))
+    if "light" in recipe.layers:
+        light["sh"] = _numbers(scene.known_light.sh(LIGHT_ORDER))
     return {
         "number": number,
         "split": split,
         "camera": camera_table(scene.camera),
-        "bodies": [_placed(body, mesh) for body, mesh in zip(scene.bodies, [*meshes, "ground"], strict=True)],
+        "bodies": [_body_record(body, mesh) for body, mesh in zip(scene.bodies, [*meshes, "ground"], strict=True)],
         "light": light,
     }
 
 
-def _placed(body: Body, mesh: str) -> dict[str, Plain]:
+def _body_record(body: Body, mesh: str) -> dict[str, Plain]:
     albedo = None if body.texture is not None or body.albedo.ndim > 1 else _numbers(body.albedo)
     pose_record = {
         "rotation": body.rotation.tolist(),

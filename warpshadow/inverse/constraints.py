@@ -71,7 +71,7 @@ class PoseConstraint:
         """The shift of coordinates among the possible ones. Differentiable: values."""
         return torch.as_tensor(self.shifts).to(values).T @ values
 
-    def touching(
+    def lower_onto_plane(
         self, pivot: torch.Tensor, rotation: torch.Tensor, scale: torch.Tensor, center: torch.Tensor
     ) -> torch.Tensor:
         """The body's middle in the world, moved until the lowest vertex touches the plane.
@@ -91,7 +91,7 @@ class PoseConstraint:
         return pivot + onto * (self.plane.offset - lowest_point - normal @ pivot)
 
 
-def remaining(removed: list[np.ndarray]) -> np.ndarray:
+def perpendicular_basis(removed: list[np.ndarray]) -> np.ndarray:
     """Orthonormal basis of the directions perpendicular to some, rows, shape [0 to 3, 3]."""
     if not removed:
         return np.eye(3)
@@ -191,7 +191,7 @@ def _returns_after_tilt(arms: np.ndarray, down: np.ndarray) -> bool:
         arms: Vertices of the hull, from the centroid, [vertex, 3].
         down: Normal of the support, outwards, shape [3].
     """
-    first, second = remaining([down])
+    first, second = perpendicular_basis([down])
     level = np.cos(_AZIMUTHS)[:, None] * first + np.sin(_AZIMUTHS)[:, None] * second
     cosine, sine = np.cos(_DISTURBANCE), np.sin(_DISTURBANCE)
     contacts = arms[np.argmax((cosine * down + sine * level) @ arms.T, axis=1)]

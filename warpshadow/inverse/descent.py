@@ -128,7 +128,7 @@ class _Descent:
     def _relocated(self, values: Mapping[str, Values], number: int) -> dict[str, Values]:
         """Values with free lamps elsewhere."""
         lamps = {lamp.name: lamp for lamp in self.problem.free_of(Lamp)}
-        copies = _copied(values)
+        copies = _copy_values(values)
         return copies | {name: lamp.relocated(copies[name], self.setting, number) for name, lamp in lamps.items()}
 
     def begin_stage(self) -> None:
@@ -141,7 +141,7 @@ class _Descent:
 
     def _begin_run(self, candidate: _Candidate) -> None:
         """Set up the optimizer for a candidate."""
-        self.values, self.best = _copied(candidate.values), _copied(candidate.values)
+        self.values, self.best = _copy_values(candidate.values), _copy_values(candidate.values)
         self.failure: str | None = None
         names = [free.name for free in self.problem.free if _descends(free, self.stages[self.stage])]
         self.tensors = {f"{name}.{key}": t for name in names for key, t in self.values[name].items()}
@@ -161,7 +161,7 @@ class _Descent:
             "candidates": [tuple(candidate) for candidate in self.candidates],
             "is_found": self.is_found,
             "ended": [tuple(run) for run in self.ended],
-            "values": _copied(self.values),
+            "values": _copy_values(self.values),
             "best": self.best,
             "failure": self.failure,
             "losses": self.losses,
@@ -188,13 +188,13 @@ class _Descent:
             )
         device = self.setting.device
         self.stage = state["stage"]
-        self.candidates = [_Candidate(_copied(values, device), *fields) for values, *fields in state["candidates"]]
+        self.candidates = [_Candidate(_copy_values(values, device), *fields) for values, *fields in state["candidates"]]
         self.is_found = state["is_found"]
         self.begin_stage()
-        self._begin_run(_Candidate(_copied(state["values"], device), None))
+        self._begin_run(_Candidate(_copy_values(state["values"], device), None))
         self.optimizer.load_state_dict(state["optimizer"])
-        self.ended = [_FinishedRun(loss, _copied(best, device), *fields) for loss, best, *fields in state["ended"]]
-        self.best, self.failure = _copied(state["best"], device), state["failure"]
+        self.ended = [_FinishedRun(loss, _copy_values(best, device), *fields) for loss, best, *fields in state["ended"]]
+        self.best, self.failure = _copy_values(state["best"], device), state["failure"]
         self.losses, self.descents, self.reason = state["losses"], state["descents"], state["reason"]
 
     # ---------------------------------------------------------------------------------------- steps
@@ -289,7 +289,7 @@ class _Descent:
                 last = float(self.model.loss(self.values)[0])
         except ValueError as error:  # a step too far to be drawn
             return best._replace(failure=str(error))
-        return best._replace(loss=last, best=_copied(self.values)) if last < best.loss else best
+        return best._replace(loss=last, best=_copy_values(self.values)) if last < best.loss else best
 
     def best_so_far(self) -> dict[str, Values]:
         """The best values found in the current stage."""
@@ -312,7 +312,7 @@ class _Descent:
                     raise  # values that were bad from the beginning
                 raise _Diverged(str(error)) from error
             if not evaluated_losses:  # with the light that was solved for there
-                evaluated_values.update(_copied(self.values))
+                evaluated_values.update(_copy_values(self.values))
             self.images = None if images is None else images.detach()
             _check_finite({"the images": images, "the loss": loss})
             loss.backward()
@@ -338,7 +338,7 @@ def _descends(free: Free, stage: Stage) -> bool:
     return not (stage.solves_light and free.is_light)
 
 
-def _copied(values: Mapping[str, Values], device: torch.device | None = None) -> dict[str, Values]:
+def _copy_values(values: Mapping[str, Values], device: torch.device | None = None) -> dict[str, Values]:
     """A copy, on another device if one is given."""
     return {
         name: {key: tensor.detach().to(device, copy=True) for key, tensor in tensors.items()}

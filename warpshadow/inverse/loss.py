@@ -69,7 +69,7 @@ class Loss:
             squares = x.square().sum(-1)
             if self.kind == "geman-mcclure":
                 return squares / (1 + squares / self.delta**2)
-            return self._general(squares / self.delta**2) * (2 * self.delta**2)
+            return self._robust_cost(squares / self.delta**2) * (2 * self.delta**2)
         if self.kind == "l2":
             return x.square().sum(-1)
         if self.kind == "l1":
@@ -77,7 +77,7 @@ class Loss:
         none = torch.zeros_like(x)
         return torch.nn.functional.huber_loss(x, none, reduction="none", delta=self.delta).sum(-1)
 
-    def _general(self, squares: torch.Tensor) -> torch.Tensor:
+    def _robust_cost(self, squares: torch.Tensor) -> torch.Tensor:
         """ρ(x, α, 1) of squares of x [Barron 2019, equation 8]."""
         if self.alpha == 2:
             return squares / 2
@@ -133,7 +133,7 @@ class Loss:
         return (self.pixel_weights(x) / self.pixel_weights(torch.zeros_like(x))).mean(dim=-1)
 
 
-def bounded(images: torch.Tensor, targets: torch.Tensor, saturated: torch.Tensor | None) -> torch.Tensor:
+def clip_saturated(images: torch.Tensor, targets: torch.Tensor, saturated: torch.Tensor | None) -> torch.Tensor:
     """Images to compare with targets: no brighter than these where they are saturated, and so lower bounds.
 
     Args:

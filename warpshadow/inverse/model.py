@@ -9,11 +9,11 @@ import torch
 
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.free.light import Light
-from warpshadow.inverse.loss import bounded
+from warpshadow.inverse.loss import clip_saturated
 from warpshadow.inverse.outlines import outlines_of
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
-from warpshadow.inverse.target import stacked
+from warpshadow.inverse.target import stack_targets
 from warpshadow.inverse.world import Setting, World
 from warpshadow.torch import TorchRenderer
 
@@ -34,7 +34,7 @@ class Model:
         self.problem, self.setting, self.regularization = problem, setting, stage.regularization
         self.cameras = tuple(camera.resized(stage.scale) for camera in setting.cameras)
         self.renderer = self._make_renderer(stage)
-        self.targets, self.weights, self.saturated = stacked(problem.targets, stage.scale, setting.device)
+        self.targets, self.weights, self.saturated = stack_targets(problem.targets, stage.scale, setting.device)
         self.outlines = outlines_of(problem.targets, setting.scene, stage.scale, setting.device)
         self.compares_images = stage.compares == "all"
 
@@ -68,7 +68,7 @@ class Model:
         """How much each pixel counts at images of the views: its mask times the loss's confidence, [view, height,
         width].
         """
-        differences = bounded(images, self.targets, self.saturated)[..., :3] - self.targets[..., :3]
+        differences = clip_saturated(images, self.targets, self.saturated)[..., :3] - self.targets[..., :3]
         return self.weights * self.problem.loss.confidence(differences / self.setting.unit)
 
     def loss(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor | None]:
@@ -85,7 +85,7 @@ class Model:
         total, images = torch.zeros((), device=self.setting.device), None
         if self.compares_images:
             images = world.images()
-            bounded_images = bounded(images, self.targets, self.saturated)
+            bounded_images = clip_saturated(images, self.targets, self.saturated)
             total = self.problem.loss(bounded_images, self.targets, self.weights, self.setting.unit)
         if self.outlines is not None:
             masks, weight = world.masks(), self.problem.loss.coverage

@@ -162,7 +162,7 @@ class Problem:
     def cameras(self) -> list[Camera]:
         """Camera of each target."""
         height, width, _ = self.targets[0].image.shape
-        return [target.camera or _fitted(self.scene.camera, width, height) for target in self.targets]
+        return [target.camera or _camera_of_size(self.scene.camera, width, height) for target in self.targets]
 
     def setting(self, device: torch.device, *, progress: bool = False) -> Setting:
         """Fit the spheres and find the units."""
@@ -207,7 +207,7 @@ class Problem:
         return {entry.name: _fingerprint(getattr(self, entry.name)) for entry in dataclasses.fields(self)}
 
 
-def _fitted(camera: Camera, width: int, height: int) -> Camera:
+def _camera_of_size(camera: Camera, width: int, height: int) -> Camera:
     """The camera with an image of another size."""
     if (camera.width, camera.height) == (width, height):
         return camera

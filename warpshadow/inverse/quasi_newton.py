@@ -81,14 +81,14 @@ class QuasiNewton(torch.optim.Optimizer):
         """Evaluate where the last step led, keep it or take it back, and take the next."""
         with torch.enable_grad():
             loss = float(closure())
-        memory, place, gradient = self._memory, self._flat(self._tensors), self._flat(self._gradients())
+        memory, place, gradient = self._memory, self._flatten(self._tensors), self._flatten(self._gradients())
         if "loss" not in memory:
             memory["bound"] = self._rate
             self._keep(loss, place, gradient, torch.zeros_like(place))
         else:
             self._accept_or_reject(loss, place, gradient)
         direction, bound = self._direction(), memory["bound"]
-        longest_step, slope = _read(direction.abs().max(), _dot(memory["gradient"], direction))
+        longest_step, slope = _read_numbers(direction.abs().max(), _dot(memory["gradient"], direction))
         if longest_step > bound or not self.curvature[0]:  # a gradient alone does not tell how far
             factor = bound / longest_step if longest_step > 0 else 0.0
             direction, slope = factor * direction, factor * slope
@@ -105,7 +105,7 @@ class QuasiNewton(torch.optim.Optimizer):
         return [torch.zeros_like(t) if t.grad is None else t.grad for t in self._tensors]
 
     @staticmethod
-    def _flat(tensors: Iterable[torch.Tensor]) -> torch.Tensor:
+    def _flatten(tensors: Iterable[torch.Tensor]) -> torch.Tensor:
         return torch.cat([tensor.reshape(-1) for tensor in tensors])
 
     def _move_to(self, place: torch.Tensor) -> None:
@@ -116,7 +116,7 @@ class QuasiNewton(torch.optim.Optimizer):
     def _keep(self, loss: float, place: torch.Tensor, gradient: torch.Tensor, sides: torch.Tensor) -> None:
         self._memory.update(loss=loss, place=place, gradient=gradient, sides=sides)
 
-    def _sides(self, place: torch.Tensor) -> torch.Tensor:
+    def _clamped_sides(self, place: torch.Tensor) -> torch.Tensor:
         """Side of the bound to which a value was clamped, ±1; 0 for other values."""
         memory = self._memory
         unchanged_sides = torch.where(place == memory["place"], memory["sides"], 0.0)
@@ -126,8 +126,12 @@ class QuasiNewton(torch.optim.Optimizer):
         """Keep the last step or take it back, and bound the next."""
         memory = self._memory
         step, change = place - memory["place"], gradient - memory["gradient"]  # maybe clamped
-        numbers = _dot(memory["gradient"], step), step.abs().max(), *(_dot(*pair) for pair in _products(step, change))
-        slope, length, *products = _read(*numbers)
+        numbers = (
+            _dot(memory["gradient"], step),
+            step.abs().max(),
+            *(_dot(*pair) for pair in _curvature_pairs(step, change)),
+        )
+        slope, length, *products = _read_numbers(*numbers)
         if _has_positive_curvature(*products):
             self._add_curvature_pair(step, change)
         loss_increase = loss - memory["loss"]
@@ -140,7 +144,7 @@ class QuasiNewton(torch.optim.Optimizer):
         if length > 0.8 * memory["bound"]:
             memory["bound"] = min(_BOUND_GROWTH * memory["bound"], _MAX_BOUND * self._rate)
         memory["gained"] = -loss_increase
-        self._keep(loss, place, gradient, self._sides(place))
+        self._keep(loss, place, gradient, self._clamped_sides(place))
 
     def _add_curvature_pair(self, step: torch.Tensor, change: torch.Tensor) -> None:
         """Add a step and how the gradient changed over it."""
@@ -163,10 +167,12 @@ class QuasiNewton(torch.optim.Optimizer):
         step_rows, change_rows = torch.stack(steps).double(), torch.stack([*changes, downhill]).double()
         scales = self._scales(step_rows, change_rows[:-1])
         vectors = torch.cat([step_rows / scales, change_rows * scales]) * is_movable
-        products = np.array(_read(*(vectors @ vectors.T)))
+        products = np.array(_read_numbers(*(vectors @ vectors.T)))
         count = len(steps)
         pairs = [(k, count + k) for k in range(count)]
-        pairs = [(k, j) for k, j in pairs if _has_positive_curvature(*(products[pair] for pair in _products(k, j)))]
+        pairs = [
+            (k, j) for k, j in pairs if _has_positive_curvature(*(products[pair] for pair in _curvature_pairs(k, j)))
+        ]
         factors, parts = np.zeros(2 * count + 1), []
         factors[-1] = 1.0
         for step, change in reversed(pairs):
@@ -199,13 +205,13 @@ class QuasiNewton(torch.optim.Optimizer):
         return torch.cat([scale.expand(size) for scale, size in zip(scales, sizes, strict=True)])
 
 
-def _products(step: T, change: T) -> tuple[tuple[T, T], ...]:
+def _curvature_pairs(step: T, change: T) -> tuple[tuple[T, T], ...]:
     """Dot products that decide whether the loss curves upwards over a step."""
     return (step, change), (step, step), (change, change)
 
 
 def _has_positive_curvature(mixed_product: float, step: float, change: float) -> bool:
-    """Whether the loss curves upwards over a step, by its :func:`_products` with how the gradient changed."""
+    """Whether the loss curves upwards over a step, by its :func:`_curvature_pairs` with how the gradient changed."""
     return mixed_product > _MIN_CURVATURE_COSINE * math.sqrt(step * change)
 
 
@@ -217,6 +223,6 @@ def _dot(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
     return first.double() @ second.double()
 
 
-def _read(*values: torch.Tensor) -> list[Any]:
+def _read_numbers(*values: torch.Tensor) -> list[Any]:
     """Numbers of a device, for which the host waits once."""
     return torch.stack([value.double() for value in values]).cpu().numpy().tolist()

@@ -52,8 +52,8 @@ class Report:
     def __init__(self, result: Result):
         self.result = result
         model = Model(result.problem, result.setting, Stage())
-        self.loss_before, self.before = _evaluated(model, result.problem.start(result.setting))
-        self.loss_after, self.after = _evaluated(model, result.values)
+        self.loss_before, self.before = _evaluate(model, result.problem.start(result.setting))
+        self.loss_after, self.after = _evaluate(model, result.values)
         images = torch.from_numpy(self.after).to(model.targets)
         self.pixel_weights = model.pixel_weights(images).cpu().numpy()
 
@@ -73,9 +73,10 @@ class Report:
         folder, result = Path(folder), self.result
         scene = result.scene
         written = write_scene(scene, folder, stems=file_stems(scene, _OTHER_FILES))
-        if not isinstance(scene.light, EnvironmentMap):
-            write_image(folder / "light.exr", scene.known_light.radiance.astype(np.float32))
-            written.append(folder / "light.exr")
+        light_map = folder / "light.exr"
+        if light_map not in written:
+            write_image(light_map, scene.known_light.radiance.astype(np.float32))
+            written.append(light_map)
         values: dict[str, Any] = {
             f"{name}.{key}": item.cpu().numpy() for name, parts in result.values.items() for key, item in parts.items()
         }
@@ -157,15 +158,15 @@ _OTHER_FILES = ("light", "target", "before", "after", "loss", "preview", "parame
 """Files of a fit whose suffixes bodies' files have, too."""
 
 
-def _rounded(values: ArrayLike) -> str:
+def _format_numbers(values: ArrayLike) -> str:
     return ", ".join(f"{value:.4g}" for value in np.ravel(values))
 
 
-def _shift(before: Body, after: Body) -> str:
+def _describe_shift(before: Body, after: Body) -> str:
     """How far the middle of a body moved: a translation is of the origin of its mesh, maybe far from it."""
     low, high = (corner.astype(np.float64) for corner in before.mesh.bounds)
     middle = (low + high) / 2
-    return f": its middle moved by ({_rounded(after.to_world(middle) - before.to_world(middle))})"
+    return f": its middle moved by ({_format_numbers(after.to_world(middle) - before.to_world(middle))})"
 
 
 def found_values(result: Result) -> list[str]:
@@ -179,22 +180,22 @@ def found_values(result: Result) -> list[str]:
                 and not np.array_equal(values, getattr(before, name))
                 and values.size <= 3
             ):
-                remark = {"rotation": "°", "translation": _shift(before, after)}.get(name, "")
-                lines.append(f"{after.name}: {name} ({_rounded(values)}){remark}")
+                remark = {"rotation": "°", "translation": _describe_shift(before, after)}.get(name, "")
+                lines.append(f"{after.name}: {name} ({_format_numbers(values)}){remark}")
     if scene.light is not start.light:
         radiance = scene.known_light.radiance
         x, y, z = EnvironmentMap(np.maximum(radiance, 0)).directions().reshape(-1, 3)[radiance.sum(axis=2).argmax()]
         lines.append(f"light: strongest from ({x:.3f}, {y:.3f}, {z:.3f})")
     for name, value in result.found.sun.items():
-        lines.append(f"sun: {name} ({_rounded(value)}){'°' if name == 'angular_radius' else ''}")
+        lines.append(f"sun: {name} ({_format_numbers(value)}){'°' if name == 'angular_radius' else ''}")
     if scene.shell is not None and start.shell is not None and scene.shell[3] != start.shell[3]:
         lines.append(f"light: radius {scene.shell[3]:.4g}")
     if any(factor != 1 for factor in result.found.exposures):
-        lines.append(f"exposure: {_rounded(result.found.exposures)}")
+        lines.append(f"exposure: {_format_numbers(result.found.exposures)}")
     return lines
 
 
-def _evaluated(model: Model, values: dict[str, Values]) -> tuple[float, np.ndarray]:
+def _evaluate(model: Model, values: dict[str, Values]) -> tuple[float, np.ndarray]:
     with torch.no_grad():
         loss, images = model.loss(values)
     assert images is not None  # only the model of light alone does without

@@ -137,8 +137,8 @@ def pose_stages(problem: Problem) -> tuple[Stage, ...]:
     of the loss of poses turned by 30°, wrong ones at a third and more. If the first does not stand out so, others start
     turned by 30° fourteen ways, until one does. Soft shadows have fewer wrong poses; under a sun firm ones lead nearer.
     """
-    small_scale, middle_scale, large_scale = (_scale(problem, size) for size in (32, 64, 512))
-    soft, firm = _soft(problem, 1.0), _soft(problem, 0.5)
+    small_scale, middle_scale, large_scale = (_scale_of_size(problem, size) for size in (32, 64, 512))
+    soft, firm = _softer_settings(problem, 1.0), _softer_settings(problem, 0.5)
     alone: dict[str, Any] = {"standout": 0.08, "tolerance": 0.01}
     return (
         Stage(30, 0.1, small_scale, candidates=15, **alone, **soft),
@@ -153,9 +153,9 @@ def deformation_stages(problem: Problem) -> tuple[Stage, ...]:
 
     The last stage goes on as long as the loss falls: 40 iterations end at a mean MDE of 2.4%, 150 at 2.2%.
     """
-    middle_scale, large_scale = (_scale(problem, size) for size in (64, 128))
+    middle_scale, large_scale = (_scale_of_size(problem, size) for size in (64, 128))
     return (
-        Stage(50, 0.06, middle_scale, supersampling=1, regularization=4.0, **_soft(problem, 0.7)),
+        Stage(50, 0.06, middle_scale, supersampling=1, regularization=4.0, **_softer_settings(problem, 0.7)),
         Stage(100, 0.04, middle_scale, supersampling=1, regularization=2.0),
         Stage(150, 0.02, large_scale),
     )
@@ -167,7 +167,7 @@ def photograph_stages(problem: Problem) -> tuple[Stage, ...]:
     A light that is fitted at a wrong pose confirms it. So the light is solved for at each pose, and of five poses along
     the flat direction that with the least loss goes on.
     """
-    side = {size: _scale(problem, size) for size in (32, 64, 160)}
+    side = {size: _scale_of_size(problem, size) for size in (32, 64, 160)}
     stages: list[Stage] = []
     has_outlines = all(target.outlines for target in problem.targets)
     if has_outlines:
@@ -198,12 +198,12 @@ READY_STAGES: dict[str, Callable[[Problem], tuple[Stage, ...]]] = {
 """Ready-made stages, by name."""
 
 
-def _soft(problem: Problem, softness: float) -> dict[str, Any]:
+def _softer_settings(problem: Problem, softness: float) -> dict[str, Any]:
     """Settings of a stage that sees softer shadows, of few directions, where the method has any."""
     return {"softness": softness, "directions": 64} if problem.visibility.method == "directional" else {}
 
 
-def _scale(problem: Problem, size: int) -> float:
+def _scale_of_size(problem: Problem, size: int) -> float:
     """The part 1 / n of the targets' size whose shorter side is about a number of pixels."""
     shorter = min(problem.targets[0].image.shape[:2])
     return 1 / max(1, round(shorter / size))

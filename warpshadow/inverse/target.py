@@ -205,7 +205,7 @@ class Stacked(NamedTuple):
     saturated: torch.Tensor | None
 
 
-def stacked(targets: Sequence[Target], scale: float, device: torch.device) -> Stacked:
+def stack_targets(targets: Sequence[Target], scale: float, device: torch.device) -> Stacked:
     """Targets at the size of a camera resized."""
     images = np.stack([target.image for target in targets])
     weights = np.stack([target.weights() for target in targets])[..., None]

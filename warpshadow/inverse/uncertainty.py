@@ -24,7 +24,7 @@ from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.free.plane import Plane
 from warpshadow.inverse.free.pose import Pose
 from warpshadow.inverse.free.views import OutlineOffset
-from warpshadow.inverse.loss import bounded
+from warpshadow.inverse.loss import clip_saturated
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.variable_projection import ProjectedModel
@@ -160,7 +160,7 @@ class NormalMatrix:
         """The free plane that a body stands on."""
         return next((plane for plane in self.problem.free_of(Plane) if free.number in plane.carries), None)
 
-    def posed(self, free: Pose) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def pose_of(self, free: Pose) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Rotation, middle in the world, and scale of a body, its plane moved."""
         rotation, center, scale = free.moved(self.values[free.name], self.setting)
         plane = self.plane(free)
@@ -177,7 +177,7 @@ class NormalMatrix:
             ends = []
             for step in (_STEP, -_STEP):
                 parts[key].view(-1)[number] += step
-                rotation, center, _ = self.posed(free)
+                rotation, center, _ = self.pose_of(free)
                 ends.append((rotation.double().numpy(force=True), center.double().numpy(force=True)))
                 parts[key].view(-1)[number] -= step
             turn = (ends[0][0] @ ends[1][0].T - ends[1][0] @ ends[0][0].T) / 2  # of small turns
@@ -191,7 +191,7 @@ class NormalMatrix:
         """
         model, loss = self.model, self.problem.loss
         world = model.world(self.values)
-        bounded_images = bounded(world.images(), model.targets, model.saturated)
+        bounded_images = clip_saturated(world.images(), model.targets, model.saturated)
         residuals = [(bounded_images[..., :3] - model.targets[..., :3]) / self.setting.unit]
         if model.targets.shape[-1] == 4:
             residuals.append(bounded_images[..., 3:] - model.targets[..., 3:])
@@ -308,7 +308,7 @@ def _pose_uncertainty(free: Pose, normal: NormalMatrix, covariance: np.ndarray) 
     plane = normal.plane(free)
     names = {free.name} if plane is None else {free.name, plane.name}
     rows = [index for index, (name, _, _) in enumerate(normal.parameter_entries) if name in names]
-    _, center, scale = normal.posed(free)
+    _, center, scale = normal.pose_of(free)
     half = setting.extent(free.number) * float(scale)
     slopes = normal.slopes(free, rows)
     cov = slopes @ covariance[np.ix_(rows, rows)] @ slopes.T

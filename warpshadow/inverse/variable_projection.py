@@ -59,13 +59,13 @@ class ProjectedModel(Model):
         lamp_numbers = {lamp.number for lamp in self.lamps}
         if not any(body.is_emitter and n not in lamp_numbers for n, body in enumerate(self.setting.scene.bodies)):
             return 0.0
-        return self._lit(self.world(values), self._darkness)[0]
+        return self._images_by_lights(self.world(values), self._darkness)[0]
 
     @property
     def _darkness(self) -> torch.Tensor:
         return torch.zeros(1, self.light.basis.size, 3, device=self.setting.device)
 
-    def _lit(self, world: World, lights: torch.Tensor, shining: Emission | None = None) -> torch.Tensor:
+    def _images_by_lights(self, world: World, lights: torch.Tensor, shining: Emission | None = None) -> torch.Tensor:
         """Images by lights [light, coefficient, 3] and one of the solved lamps: [light, view, height, width, 3]."""
         for lamp in self.lamps:
             radiance = torch.full((1, 3), float(lamp is shining), device=self.setting.device)
@@ -80,11 +80,11 @@ class ProjectedModel(Model):
         """Images by single atoms and single lamps, less those by other emitters: [atom, view, height, width, 3]."""
         world = self.world(values)
         coefficients = torch.eye(self.light.basis.size, device=self.setting.device)[..., None].expand(-1, -1, 3)
-        images = self._lit(world, coefficients.contiguous()) - emitted
+        images = self._images_by_lights(world, coefficients.contiguous()) - emitted
         images = torch.tensordot(torch.from_numpy(self.atoms).to(images), images, dims=1)
         if not self.lamps:
             return images
-        lamps = torch.cat([self._lit(world, self._darkness, lamp) for lamp in self.lamps]) - emitted
+        lamps = torch.cat([self._images_by_lights(world, self._darkness, lamp) for lamp in self.lamps]) - emitted
         units = images.flatten(1).norm(dim=1).mean() / lamps.flatten(1).norm(dim=1).clamp_min(1e-12)
         self.lamp_units = units.cpu().numpy()
         return torch.cat([images, lamps * units[:, None, None, None, None]])
@@ -104,13 +104,13 @@ class ProjectedModel(Model):
                 slope = (weighted_design @ target[color]).double().cpu().numpy()
                 radiance[color] = nonnegative_least_squares(form, slope)
             images = torch.einsum("cap,ca->cp", design, torch.from_numpy(radiance).to(design))
-            weights = share * self._reweighted(images, target)
+            weights = share * self._find_weights(images, target)
         self.solution = radiance.T
         self._store(self.solution[: len(self.atoms)], values[self.light.name])
         for lamp, unit, emission in zip(self.lamps, self.lamp_units, self.solution[len(self.atoms) :], strict=True):
             values[lamp.name]["radiance"].copy_(self.setting.tensor(unit * self.setting.unit * emission))
 
-    def _reweighted(self, images: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    def _find_weights(self, images: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """Weights of squares that stand for the loss at images, [color, pixel]; 0 where saturation allows them."""
         weights = self.problem.loss.pixel_weights((images - target).T).T
         if self.saturated is None:

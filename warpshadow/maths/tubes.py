@@ -64,9 +64,9 @@ def find_tube(points: np.ndarray, triangles: np.ndarray, maximum: int) -> Tube |
         return None
     quad_at = {edge: divmod(k, 4) for k, edge in enumerate(_sides(corners))}
     for direction in range(2):
-        steps, is_closed = _walk(corners, quad_at, 0, direction)
+        steps, is_closed = _traverse_quads(corners, quad_at, 0, direction)
         if not is_closed:
-            backward, _ = _walk(corners, quad_at, 0, direction + 2)
+            backward, _ = _traverse_quads(corners, quad_at, 0, direction + 2)
             steps = [(quad, (side + 2) % 4) for quad, side in backward[:0:-1]] + steps
         rings = [ring for ring in itertools.starmap(functools.partial(_ring, corners, quad_at), steps) if ring]
         if len(rings) == len(steps) and _covers(triangles, pairs, rings, is_closed):
@@ -167,7 +167,7 @@ def _sides(corners: np.ndarray) -> Iterator[tuple[int, int]]:
     return map(tuple, np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2).tolist())
 
 
-def _walk(
+def _traverse_quads(
     corners: np.ndarray, quad_at: dict[tuple[int, int], tuple[int, int]], quad: int, side: int
 ) -> tuple[list[tuple[int, int]], bool]:
     """Walk from a quad out of a side of it, straight on: quads and the sides by which each is left; whether it ends
@@ -188,7 +188,7 @@ def _walk(
 
 def _ring(corners: np.ndarray, quad_at: dict[tuple[int, int], tuple[int, int]], quad: int, side: int) -> _Ring | None:
     """The ring across a tube of a quad that is left by a side on the way along it; None if it does not close."""
-    steps, is_closed = _walk(corners, quad_at, quad, side + 1)
+    steps, is_closed = _traverse_quads(corners, quad_at, quad, side + 1)
     if not is_closed:
         return None
     quads, sides = np.array(steps).T

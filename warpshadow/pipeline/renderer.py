@@ -311,7 +311,6 @@ class SceneRenderer:
 
     # ------------------------------------------------------------------------------------------ image
 
-    @announced
     @takes(ViewArrays)
     def draw(self, inputs: ViewArrays) -> wp.array:
         """Draw images.
@@ -322,7 +321,11 @@ class SceneRenderer:
             Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]; the background is 0.
         Differentiable: all; not by "ray-traced": geometry, shell.
         """
-        view = inputs.view
+        return self.draw_inputs(inputs, inputs.view)
+
+    @announced
+    def draw_inputs(self, inputs: ImageArrays, view: View | None = None) -> wp.array:
+        """Draw images, as :meth:`draw` does, by a record of its arguments."""
         if view is None and not (inputs.geometry is None and inputs.clip_matrices is None):
             view = self.view(inputs.geometry, inputs.clip_matrices)
         view = self._checked(view)
@@ -347,7 +350,6 @@ class SceneRenderer:
             images = (self.insert(None, light) if self.scene.catchers else self.draw(light)).numpy().copy()
         return images if self.has_camera_batch else images[0]
 
-    @announced
     @takes(ImageArrays)
     def insert(self, photograph: wp.array | None, inputs: ImageArrays) -> wp.array:
         """Draw images of the bodies in a photograph whose surfaces the shadow catchers model.
@@ -363,6 +365,11 @@ class SceneRenderer:
             ValueError: where no body of the scene is a catcher.
         Differentiable: all, as :meth:`draw` is; see :mod:`warpshadow.stages.image.photograph`.
         """
+        return self.insert_inputs(photograph, inputs)
+
+    @announced
+    def insert_inputs(self, photograph: wp.array | None, inputs: ImageArrays) -> wp.array:
+        """Draw images in a photograph, as :meth:`insert` does, by a record of its arguments."""
         if not self.scene.catchers:
             raise ValueError(
                 "scene: got no body that is a shadow catcher, expected one or more: Body(…, shadow_catcher=True)"
@@ -447,7 +454,6 @@ class SceneRenderer:
 
     # ------------------------------------------------------------------------------------------ explanation
 
-    @one_at_a_time
     @takes(ViewArrays)
     def explain(self, inputs: ViewArrays) -> Explanation:
         """List the stages that the next call computes and skips, and why.
@@ -458,9 +464,14 @@ class SceneRenderer:
             The stages, which print as a table: whether each runs and on how many items, how long it took last, and why
             it does or does not run; then the same of the adjoints. Nothing is computed.
         """
+        return self.explain_inputs(inputs, inputs.view)
+
+    @one_at_a_time
+    def explain_inputs(self, inputs: ImageArrays, view: View | None = None) -> Explanation:
+        """List stages, as :meth:`explain` does, by a record of its arguments."""
         hidden: set[Node] = set()
-        if inputs.view is not None:
-            view = self._checked(inputs.view)
+        if view is not None:
+            view = self._checked(view)
             hidden = {*decide(view.receivers_node, view.call), view.silhouettes}
         else:
             geometry = None if inputs.geometry is None else as_geometry("geometry", inputs.geometry)

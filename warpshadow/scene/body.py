@@ -53,13 +53,9 @@ class Body:
             [height, width, 3], or a file that :func:`warpshadow.read_image` reads; needs uvs.
         blockers: Number of spheres to fit to the mesh, or "auto" for as many as it needs, 8 to 1024
             (:func:`warpshadow.fit_spheres`), or the spheres themselves, or an .npz file of them; 0 or none casts no
-            shadow, by rays neither. By method "directional" a flat body blocks light as the part of a plane that it is,
-            for any number, and with "auto" a body of closed convex pieces, such as boxes, of prisms that are at most 32
-            of these, such as walls with windows, or of at most 64 panels of cloth, the light of others as these; by
-            others a flat body with all else on one side is a ground, for which any number means one sphere touching it
-            from behind. Where light bounces, a body of 0 or none is lit and reflects all the same, and takes its light
-            from nobody. If it is not flat, other bodies get that light by rays only: a sphere sends light in place of
-            the light it blocks.
+            shadow, by rays neither. Flat bodies, and with "auto" convex pieces and cloth, may block by their own shape
+            instead: "Blockers" in scene/README.md says which. Where light bounces, a body of 0 or none is lit and
+            reflects all the same, and takes its light from nobody; "Bounces" in pipeline/README.md says onto which.
         rotation: Axis-angle vector [degrees], shape [3]: (0, 90, 0) is a quarter turn about +y, through the origin of
             the mesh's own space, wherever its vertices are; :meth:`on_ground` then stands the body where it is to
             stand, and :meth:`Renderer.placed` can turn it about its middle. A matrix, shape [3, 3], becomes such a
@@ -69,14 +65,8 @@ class Body:
         receivers: Where light is evaluated: at every "vertex", or at every "pixel" that shows the body, which a mesh
             of few faces needs to receive a shadow; or "adaptive": on a flat body at some pixels, close to each other
             where shadows have edges, between which it is interpolated (by pixel on other bodies, and on a GPU). "auto"
-            leaves it to each renderer: flat bodies of faces of more than 2 pixels are adaptive, with directional
-            visibility on a CPU. Else it is by pixel where its cameras see faces of more than 16 pixels on average, or
-            5% of the body's pixels show faces longer than 16 pixels (in images larger than 256 × 256, 1/4096 of the
-            pixels, at most 400, and four times the root of that), or where light that is interpolated between its
-            vertices is off by more than 6%. Pictures that are made once, as by :func:`warpshadow.render`, show flat
-            bodies by pixel, and under a sun all.
-        self_shadows: How it casts shadows on itself, "traced", by "rays" or by its "spheres", as for
-            :class:`Visibility`; None for the scene's setting.
+            leaves it to each renderer, which chooses by the table of pipeline/receivers/README.md.
+        self_shadows: How it casts shadows on itself, as for :class:`Visibility`; None for the scene's setting.
         name: Its name for lookups, by default that of its mesh, so of the mesh's file: ``scene.bodies["cow"]``.
         shadow_catcher: Whether it models a surface in the photograph: :func:`warpshadow.insert` does not draw it, and
             has it darken the photograph, or with bounces tint it, by the ratio of the light that it receives with the

@@ -151,7 +151,7 @@ class CameraPath:
         own_fov = float(2 * np.degrees(np.arctan(0.5 * like.height / like.intrinsics[1, 1])))
         rows = [[*key.eye, *key.target, *key.up, own_fov if key.fov_y is None else key.fov_y] for key in self.keyframes]
         start, cameras = self.keyframes[0].time, []
-        for number, values in enumerate(self._between(np.array(rows))):
+        for number, values in enumerate(self._interpolate(np.array(rows))):
             with check.located(f"the camera at {start + number / self.fps:g} s"):
                 eye, target, up = np.split(values[:9], 3)
                 seen = Camera.look_at(eye, target, up=up, fov_y=float(values[9]), size=(like.width, like.height))
@@ -160,7 +160,7 @@ class CameraPath:
             cameras.append(Camera(intrinsics, seen.rotation, seen.translation, like.width, like.height, like.near))
         return cameras
 
-    def _between(self, rows: np.ndarray) -> np.ndarray:
+    def _interpolate(self, rows: np.ndarray) -> np.ndarray:
         """Interpolate keyframe values at the times of the frames, shape [frame, value]."""
         from scipy.interpolate import PchipInterpolator
 

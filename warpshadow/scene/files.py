@@ -200,7 +200,7 @@ def turned_light(light: EnvironmentMap | np.ndarray, rotation: float, scale: flo
     changed = as_light(light)
     changed = changed.rotated(rotation) if rotation else changed
     changed = changed.scaled(scale) if scale != 1 else changed
-    return changed if isinstance(changed, EnvironmentMap) else changed.coefficients
+    return changed.as_argument
 
 
 def _body(table: Table, folder: Path) -> Body:
@@ -283,20 +283,23 @@ def write_scene(scene: Scene, folder: AnyPath, *, stems: Sequence[str] | None = 
             table["name"] = body.name
         bodies.append(table)
         written += files
-    if isinstance(scene.light, EnvironmentMap):
-        scene.light.write(folder / "light.exr")
-        written.append(folder / "light.exr")
-        light: Table = {"envmap": "light.exr"}
-        if scene.light.radius is not None:
-            light |= {"radius": scene.light.radius, "center": scene.light.center.tolist()}
-    else:
-        light = {"sh": [_numbers(row) for row in scene.light]}
+    light, files_of_light = _write_light(scene.light, folder)
+    written += files_of_light
     light["bounces"] = scene.bounces if scene.bounces == "all" else int(scene.bounces)
     visibility = {name: value for name, value in asdict(scene.visibility).items() if value is not None}
     camera = camera_table(scene.camera) | {"supersampling": scene.supersampling}
     tables = {"camera": camera, "light": light, "visibility": visibility, "body": bodies}
     toml_tables.write(path, tables, comment=_COMMENT)
     return [path, *written]
+
+
+def _write_light(light: EnvironmentMap | np.ndarray, folder: Path) -> tuple[Table, list[Path]]:
+    """Write the file that the table of a light names, if it names one, and make the table, which ``_light`` reads."""
+    if isinstance(light, np.ndarray):
+        return {"sh": [_numbers(row) for row in light]}, []
+    light.write(folder / "light.exr")
+    shell = {} if light.radius is None else {"radius": light.radius, "center": light.center.tolist()}
+    return {"envmap": "light.exr"} | shell, [folder / "light.exr"]
 
 
 def _written_stems(path: Path) -> set[str]:

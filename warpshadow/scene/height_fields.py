@@ -53,22 +53,22 @@ def solid_behind(body: Body, others: tuple[Body, ...]) -> Mesh | None:
 def _solid_behind(body: Body, others: tuple[Body, ...]) -> Mesh | None:
     """The solid behind an open, bent body, if it is land."""
     mesh, to_own = body.mesh, into_own_space(body)
-    axis = _axis(mesh, to_own["rotation"][:, 1])
-    if axis is None or _overlap(mesh, mesh, axis):
+    axis = _upward_axis(mesh, to_own["rotation"][:, 1])
+    if axis is None or _count_overlaps(mesh, mesh, axis):
         return None
     meshes = [other.world_mesh().transformed(**to_own) for other in others]
-    above, below = (np.array([_overlap(mesh, other, side) for other in meshes]) for side in (axis, -axis))
-    return _closed(mesh, axis) if above.any() and (above >= _STUCK * below).all() else None
+    above, below = (np.array([_count_overlaps(mesh, other, side) for other in meshes]) for side in (axis, -axis))
+    return _close_height_field(mesh, axis) if above.any() and (above >= _STUCK * below).all() else None
 
 
 def is_bowl(body: Body) -> bool:
     """Whether a body that is land is as deep as a bowl, whose panels are better blockers than the solid behind."""
-    axis = _axis(body.mesh, into_own_space(body)["rotation"][:, 1])
+    axis = _upward_axis(body.mesh, into_own_space(body)["rotation"][:, 1])
     depth = 0.0 if axis is None else np.ptp(body.mesh.positions @ axis)
     return bool(depth > _DEEP * np.ptp(body.mesh.positions, axis=0).max())
 
 
-def _axis(mesh: Mesh, up: np.ndarray) -> np.ndarray | None:
+def _upward_axis(mesh: Mesh, up: np.ndarray) -> np.ndarray | None:
     """Mean normal of a mesh, turned to look up; None if it hardly does, or if some face looks against it."""
     corners = mesh.positions[mesh.surface.faces].astype(np.float64)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -79,12 +79,12 @@ def _axis(mesh: Mesh, up: np.ndarray) -> np.ndarray | None:
     return np.sign(mean @ up) * mean / np.linalg.norm(mean)
 
 
-def _overlap(mesh: Mesh, other: Mesh, axis: np.ndarray) -> int:
+def _count_overlaps(mesh: Mesh, other: Mesh, axis: np.ndarray) -> int:
     """How many rays from points of a mesh along an axis meet another one, and from there against it."""
-    return _meet(mesh, other, axis) + _meet(other, mesh, -axis)
+    return _count_hits(mesh, other, axis) + _count_hits(other, mesh, -axis)
 
 
-def _meet(mesh: Mesh, other: Mesh, axis: np.ndarray) -> int:
+def _count_hits(mesh: Mesh, other: Mesh, axis: np.ndarray) -> int:
     """How many rays along an axis, from points of a mesh that are spread evenly, meet another one."""
     corners = mesh.positions[mesh.surface.faces]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).cumsum()
@@ -96,7 +96,7 @@ def _meet(mesh: Mesh, other: Mesh, axis: np.ndarray) -> int:
     return int((~visibility).sum())
 
 
-def _closed(mesh: Mesh, axis: np.ndarray) -> Mesh:
+def _close_height_field(mesh: Mesh, axis: np.ndarray) -> Mesh:
     """A height field that is seen from where an axis points, with walls and a bottom on the other side."""
     points, faces = welded(mesh.positions, mesh.surface.faces)
     normals = np.cross(points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]])

@@ -27,7 +27,7 @@ def point_light(
             a distance d gets intensity / d², and looks intensity / (π d²).
         radius: Of the ball [scene units]. It shows radiance, intensity / (π radius²).
     """
-    return _ball(position, intensity, radius, name, {})
+    return _lamp_ball(position, intensity, radius, name, {})
 
 
 @check.keywords(translation="position", emission="intensity", size="radius", cone="beam", direction="target")
@@ -51,7 +51,7 @@ def spot_light(
     axis = check.array("target", target, (3,), "a point (x, y, z)") - place
     if not axis.any():
         raise ValueError(f"target: got {place.tolist()}, the position, expected another point")
-    return _ball(place, intensity, radius, name, {"beam": beam, "rotation": _facing(axis)})
+    return _lamp_ball(place, intensity, radius, name, {"beam": beam, "rotation": _rotation_towards(axis)})
 
 
 def load_lights(
@@ -93,7 +93,7 @@ def load_lights(
     return lamps, result
 
 
-def _ball(position: npt.ArrayLike, intensity: npt.ArrayLike, radius: float, name: str, options: dict) -> Body:
+def _lamp_ball(position: npt.ArrayLike, intensity: npt.ArrayLike, radius: float, name: str, options: dict) -> Body:
     place = check.array("position", position, (3,), "a point (x, y, z)")
     colors = check.numbers("intensity", intensity, expected="one number of 0 or more, or RGB [3]", dtype=np.float64)
     if colors.shape not in ((), (3,)):
@@ -104,7 +104,7 @@ def _ball(position: npt.ArrayLike, intensity: npt.ArrayLike, radius: float, name
     return Body(mesh, (0.0, 0.0, 0.0), blockers=0, translation=place, emission=emission, name=name, **options)
 
 
-def _facing(axis: np.ndarray) -> np.ndarray:
+def _rotation_towards(axis: np.ndarray) -> np.ndarray:
     """A rotation that takes −z to an axis, shape [3, 3]."""
     back = -axis / np.linalg.norm(axis)
     side = np.cross(np.eye(3)[np.abs(back).argmin()], back)

@@ -58,16 +58,16 @@ def guess_up(mesh: Mesh, suffix: str = "") -> UpGuess:
     if suffix in _Y_UP_FORMATS:
         return UpGuess("y", f"as {suffix} files have it")
     rng = np.random.default_rng(0)
-    samples = _samples(mesh, rng), _samples(mesh, rng)
+    samples = _draw_surface_points(mesh, rng), _draw_surface_points(mesh, rng)
     usual = _mean_distance(*samples) or np.inf
     mirrored = {
-        axis: _mean_distance(_mirrored(samples[0], number), samples[1]) / usual for axis, number in _AXES.items()
+        axis: _mean_distance(_upside_down(samples[0], number), samples[1]) / usual for axis, number in _AXES.items()
     }
     for axis, other in (("y", "z"), ("z", "y")):
         if mirrored[other] < _SYMMETRIC and mirrored[axis] > _ASYMMETRIC:
             return UpGuess(axis, f"along {other} it is symmetric")
     points = mesh.world_points().astype(np.float64)
-    footing = {axis: _footing(points, samples[0].mean(axis=0), number) for axis, number in _AXES.items()}
+    footing = {axis: _standing_share(points, samples[0].mean(axis=0), number) for axis, number in _AXES.items()}
     axis, other = sorted(footing, key=lambda item: -footing[item])
     extents = np.ptp(points, axis=0)
     is_thin = extents[_AXES[axis]] < _PLATE_THINNESS * np.delete(extents, _AXES[axis]).min()
@@ -108,7 +108,7 @@ def default_scene(
     return Scene([body, ground], sky, camera, bounces=int(body.metallic is not None and body.metallic.any()))
 
 
-def _footing(points: np.ndarray, middle: np.ndarray, axis: int) -> float:
+def _standing_share(points: np.ndarray, middle: np.ndarray, axis: int) -> float:
     """Area on which points stand, as a part of that of their shadow from above; 0 where they would fall over."""
     level = np.delete(points, axis, axis=1)
     height = points[:, axis] - points[:, axis].min()
@@ -116,7 +116,7 @@ def _footing(points: np.ndarray, middle: np.ndarray, axis: int) -> float:
     if _area(base) <= 1e-9 * np.ptp(points, axis=0).max() ** 2:
         return 0.0
     ends = np.roll(base, -1, axis=0)
-    is_stable = (_cross(ends - base, np.delete(middle, axis) - base) > 0).all()
+    is_stable = (_cross_product(ends - base, np.delete(middle, axis) - base) > 0).all()
     return _area(base) / _area(shadow) if is_stable else 0.0
 
 
@@ -129,14 +129,14 @@ def _hull(points: np.ndarray) -> np.ndarray:
 
 def _area(corners: np.ndarray) -> float:
     """Area of a polygon."""
-    return float(_cross(corners, np.roll(corners, -1, axis=0)).sum() / 2)
+    return float(_cross_product(corners, np.roll(corners, -1, axis=0)).sum() / 2)
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _cross_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
-def _mirrored(points: np.ndarray, axis: int) -> np.ndarray:
+def _upside_down(points: np.ndarray, axis: int) -> np.ndarray:
     """Points upside down."""
     result = points.copy()
     result[:, axis] = points[:, axis].min() + points[:, axis].max() - points[:, axis]
@@ -153,7 +153,7 @@ def _mean_distance(points: np.ndarray, others: np.ndarray) -> float:
     return float(np.sqrt(np.maximum(np.concatenate(nearest) + (a**2).sum(axis=1), 0)).mean())
 
 
-def _samples(mesh: Mesh, rng: np.random.Generator) -> np.ndarray:
+def _draw_surface_points(mesh: Mesh, rng: np.random.Generator) -> np.ndarray:
     """Points of a mesh's surface, as many on equal areas, shape [sample, 3]."""
     corners = mesh.positions[mesh.faces].astype(np.float64)
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)

@@ -50,10 +50,13 @@ def primitives() -> tuple[Body, ...]:
         "cylinder": creation.cylinder(radius=0.35, height=1.0, sections=48),
         "cone": creation.cone(radius=0.45, height=1.0, sections=48),
     }
-    return (sphere, *(Body(_creased(name, shape), blockers=32, receivers="pixel") for name, shape in shapes.items()))
+    return (
+        sphere,
+        *(Body(_primitive_mesh(name, shape), blockers=32, receivers="pixel") for name, shape in shapes.items()),
+    )
 
 
-def _creased(name: str, shape) -> Mesh:
+def _primitive_mesh(name: str, shape) -> Mesh:
     """The mesh of a trimesh.Trimesh, z turned up, parted at its sharp edges, so that normals do not round them."""
     from trimesh import graph
 
@@ -218,7 +221,7 @@ class RandomScenes:
         rng = np.random.default_rng([self.seed, index % self.count])
         ranges = self.ranges
         bodies, prototypes = _random_bodies(rng, self.bodies, ranges)
-        gray = np.full(3, _drawn(rng, ranges.ground_albedo))
+        gray = np.full(3, _draw_between(rng, ranges.ground_albedo))
         ground_size = _ground_size(bodies)
         ground = Body(_ground_mesh(ground_size), albedo=gray, blockers=1, receivers="pixel")
         if self.maps is None:
@@ -226,7 +229,7 @@ class RandomScenes:
         else:
             light, drawn = _turned_map(rng, self.maps, ranges)
         if ranges.radius is not None:
-            light = replace(light, radius=_drawn(rng, ranges.radius) * ground_size / np.sqrt(2))
+            light = replace(light, radius=_draw_between(rng, ranges.radius) * ground_size / np.sqrt(2))
         camera = _random_camera(rng, bodies, self.size, ranges)
         scene = Scene((*bodies, ground), light, camera, self.visibility, self.supersampling, self.bounces)
         return DrawnScene(scene, prototypes, drawn)
@@ -244,7 +247,7 @@ def _ground_mesh(size: float) -> Mesh:
     return plane(size, 1)
 
 
-def _drawn(rng: np.random.Generator, between: Range) -> float:
+def _draw_between(rng: np.random.Generator, between: Range) -> float:
     low, high = between
     return low if low == high else float(rng.uniform(low, high))
 
@@ -260,7 +263,7 @@ def _random_bodies(
     count = int(rng.integers(minimum, maximum + 1))
     bodies, chosen = zip(*(_random_body(rng, prototypes, ranges) for _ in range(count)), strict=True)
     widest = max(_footprint(body) for body in bodies)
-    ring = 0.0 if count == 1 else _drawn(rng, ranges.gap) * widest / np.sin(np.pi / count)
+    ring = 0.0 if count == 1 else _draw_between(rng, ranges.gap) * widest / np.sin(np.pi / count)
     angles = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(count) / count
     places = ring * np.stack([np.cos(angles), np.zeros(count), np.sin(angles)], axis=1)
     placed = zip(bodies, places, strict=True)
@@ -279,11 +282,11 @@ def _random_body(rng: np.random.Generator, prototypes: Sequence[Body], ranges: R
         albedo=color if prototype.mesh.colors is None and prototype.albedo.ndim == 1 else prototype.albedo,
         rotation=rng.uniform(0, 360) * axis,
         translation=np.zeros(3),
-        scale=_drawn(rng, ranges.size) / (high - low).max(),
+        scale=_draw_between(rng, ranges.size) / (high - low).max(),
     )
     if ranges.glossy and not body.is_glossy and rng.random() < ranges.glossy:
         metallic = np.full(1, rng.random() < ranges.metal, np.float32)
-        body = replace(body, roughness=np.full(1, _drawn(rng, ranges.roughness)), metallic=metallic)
+        body = replace(body, roughness=np.full(1, _draw_between(rng, ranges.roughness)), metallic=metallic)
     low, high = body.world_mesh().bounds
     foot = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
     return replace(body, translation=-foot), chosen
@@ -312,14 +315,16 @@ def random_light(rng: np.random.Generator, scale: Range = Ranges.scale) -> Envir
 def _turned_map(
     rng: np.random.Generator, maps: Sequence[EnvironmentMap], ranges: Ranges
 ) -> tuple[EnvironmentMap, DrawnLight]:
-    drawn = DrawnLight(int(rng.integers(len(maps))), _drawn(rng, ranges.rotation), _random_scale(rng, ranges.scale))
+    drawn = DrawnLight(
+        int(rng.integers(len(maps))), _draw_between(rng, ranges.rotation), _random_scale(rng, ranges.scale)
+    )
     return maps[drawn.number].rotated(drawn.rotation).scaled(drawn.scale), drawn
 
 
 def _random_scale(rng: np.random.Generator, between: Range) -> float:
     """A factor, as often half as large as twice."""
     low, high = between
-    return float(2 ** _drawn(rng, (np.log2(low), np.log2(high))))
+    return float(2 ** _draw_between(rng, (np.log2(low), np.log2(high))))
 
 
 def _random_sky(rng: np.random.Generator) -> EnvironmentMap:
@@ -354,11 +359,11 @@ def _random_camera(rng: np.random.Generator, bodies: Sequence[Body], size: tuple
     """A camera above the ground that has all bodies in view, and some of their shadows."""
     low, high = np.transpose([body.world_mesh().bounds for body in bodies], (1, 0, 2))
     low, high = low.min(axis=0), high.max(axis=0)
-    azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(_drawn(rng, ranges.elevation))
+    azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(_draw_between(rng, ranges.elevation))
     away = np.array([np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)])
     reach = np.linalg.norm(high - low) / 2
-    fov_y = _drawn(rng, ranges.fov_y)
+    fov_y = _draw_between(rng, ranges.fov_y)
     narrowest = fov_y * min(1.0, size[0] / size[1])
-    distance = _drawn(rng, ranges.distance) * reach / np.sin(np.radians(narrowest / 2))
+    distance = _draw_between(rng, ranges.distance) * reach / np.sin(np.radians(narrowest / 2))
     middle = (low + high) / 2
     return Camera.look_at(middle + distance * away, middle, fov_y=fov_y, size=size)

@@ -271,7 +271,7 @@ class Scene:
     @property
     def shell(self) -> np.ndarray | None:
         """Center and radius of the sphere that sends the light, [4]; None for light from infinitely far away."""
-        return self.light.shell if isinstance(self.light, EnvironmentMap) else None
+        return self.known_light.shell
 
     @property
     def methods(self) -> tuple[str, ...]:

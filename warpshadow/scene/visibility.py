@@ -1,4 +1,8 @@
-"""How visibility is computed: methods, and their settings."""
+"""How visibility is computed: methods, and their settings.
+
+Stages are functions that users call on their own, too. So defaults and choices that a setting shares with a stage stand
+beside its kernel, whose error and time they decide, and are imported here.
+"""
 
 from __future__ import annotations
 
@@ -84,11 +88,9 @@ class Visibility:
         softness: κ of "directional": half-width of a shadow's soft edge in cell radii.
         merging: τ: half-angle under which four neighboring spheres of 512 or more are seen as one, in radii of a cell
             ("directional") or of a cell for each coefficient ("log-sh"); 0 for never.
-        self_shadows: How a body casts shadows on itself: from its mesh, "traced" once by rays wherever its shape is not
-            free, or from its "spheres". Under "directional" nothing is traced of a body of convex solids: they block
-            its own light as they do others'. "rays" are as "traced", but under "directional" pixels send rays to the
-            brightest cells in every image: a sun's edge has no teeth, and rotations and cameras have no gradient.
-            Stills of scenes that name the method have that under a sun. Bodies may say otherwise.
+        self_shadows: How bodies cast shadows on themselves: from their meshes, "traced" once by rays; by "rays", which
+            pixels send to a sun in every image, too; or from their "spheres". "Self-shadows" in scene/README.md
+            compares them. Bodies may say otherwise.
         order: Number of SH bands, 2 to 8: of "log-sh", of the light that "none" shades with, and of free light by
             "ray-traced".
         log: Logarithm of one cap of "log-sh": "eigen" or "cap".

@@ -12,7 +12,7 @@ from warpshadow.maths.directions import fibonacci
 from warpshadow.spheres.cover import ball_samples
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
 from warpshadow.spheres.occlusion import exact_occlusion
-from warpshadow.spheres.receivers import around
+from warpshadow.spheres.receivers import draw_points_around
 from warpshadow.stages.rays.ray_tracing import trace_visibility_on_host
 
 GROUND, SURFACE, NEARBY = 20, 400, 400  # receivers on a side of the ground's grid, on the surface and in the air
@@ -52,7 +52,7 @@ class FitReport:
         return max(self.ground_error, self.surface_error, self.nearby_error)
 
 
-def _sky(directions: np.ndarray, azimuth: float) -> np.ndarray:
+def _sky_radiance(directions: np.ndarray, azimuth: float) -> np.ndarray:
     """Radiance of a bright sky over a dim ground, with a sun lobe of 10° at a height of 52°."""
     sun = np.array([0.5, 0.7, 0.2]) / np.linalg.norm([0.5, 0.7, 0.2])
     c, s = np.cos(azimuth), np.sin(azimuth)
@@ -60,7 +60,9 @@ def _sky(directions: np.ndarray, azimuth: float) -> np.ndarray:
     return 0.3 + 0.7 * np.maximum(directions[:, 1], 0) + 6 * np.exp((directions @ sun - 1) / 0.03)
 
 
-def _errors(mesh: NormalizedMesh, spheres: np.ndarray, points: np.ndarray, normals: np.ndarray) -> tuple[float, float]:
+def _irradiance_errors(
+    mesh: NormalizedMesh, spheres: np.ndarray, points: np.ndarray, normals: np.ndarray
+) -> tuple[float, float]:
     """L2 error of irradiance at receivers, over four azimuths of the sun, relative to it and to its blocked part."""
     directions = fibonacci(DIRECTIONS)
     array = partial(wp.array, dtype=wp.vec3, device=mesh.device)
@@ -70,7 +72,7 @@ def _errors(mesh: NormalizedMesh, spheres: np.ndarray, points: np.ndarray, norma
     radii = wp.array(spheres[None, :, 3].astype(np.float32), dtype=wp.float32, device=mesh.device)
     transmittance = 1 - exact_occlusion(receivers, rays, centers, radii).numpy()[0]
     cosine = np.maximum(normals @ directions.T, 0)
-    light = np.stack([_sky(directions, azimuth) for azimuth in np.pi / 2 * np.arange(4)], axis=1)
+    light = np.stack([_sky_radiance(directions, azimuth) for azimuth in np.pi / 2 * np.arange(4)], axis=1)
     is_lit = 2 * visible.mean(axis=1) >= 0.05
     expected = (cosine * visible)[is_lit] @ light
     missing_shadow, wrong_shadow = 1.0 - visible, 1.0 * transmittance - visible
@@ -90,28 +92,28 @@ def measure(mesh: NormalizedMesh, spheres: np.ndarray, seconds: float) -> FitRep
     if (spheres[:, 3] > 0).any():
         samples = ball_samples(16 * max(1, 512 // len(spheres)), rng)
         points = spheres[:, None, :3] + spheres[:, None, 3:] * samples
-        shares = np.broadcast_to(spheres[:, 3:] ** 3, points.shape[:2]) / _containing(spheres, points)
+        shares = np.broadcast_to(spheres[:, 3:] ** 3, points.shape[:2]) / _count_containing(spheres, points)
         is_outside = mesh.signed_distances(points.reshape(-1, 3))[0].reshape(shares.shape) > 0
         outside_volume = float(shares[is_outside].sum() / shares.sum())
     surface, _ = mesh.sample(4000, rng)
     grown = spheres + [0, 0, 0, 0.01]
-    air, _ = around(mesh, NEARBY, rng)
+    air, _ = draw_points_around(mesh, NEARBY, rng)
     random_directions = rng.normal(size=air.shape)
     nearby = air, random_directions / np.linalg.norm(random_directions, axis=1, keepdims=True)
-    ground_error, shadow_error = _errors(mesh, spheres, ground, up_normals)
+    ground_error, shadow_error = _irradiance_errors(mesh, spheres, ground, up_normals)
     return FitReport(
         sphere_count=len(spheres),
-        coverage=float((_containing(grown, surface) > 0).mean()),
+        coverage=float((_count_containing(grown, surface) > 0).mean()),
         outside_volume=outside_volume,
         ground_error=ground_error,
-        surface_error=_errors(mesh, spheres, *mesh.sample_vertices(SURFACE, rng))[0],
-        nearby_error=_errors(mesh, spheres, *nearby)[0],
+        surface_error=_irradiance_errors(mesh, spheres, *mesh.sample_vertices(SURFACE, rng))[0],
+        nearby_error=_irradiance_errors(mesh, spheres, *nearby)[0],
         shadow_error=shadow_error,
         seconds=seconds,
     )
 
 
-def _containing(spheres: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _count_containing(spheres: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Number of spheres [sphere, 4] that contain each of the points [..., 3]."""
     count = np.zeros(points.shape[:-1])
     for sphere in spheres:

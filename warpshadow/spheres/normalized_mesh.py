@@ -149,7 +149,7 @@ class NormalizedMesh:
         launch(_count_escaping, len(inner_points), inputs=inputs, outputs=[counts])
         return bool((counts.numpy() <= 1).mean() < ENCLOSED)
 
-    def _on_sides(self, normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def _turn_to_sides(self, normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Normals, turned to either side at random if the mesh has two."""
         return normals * rng.choice([-1.0, 1.0], size=(len(normals), 1)) if self.has_two_sides else normals
 
@@ -164,12 +164,12 @@ class NormalizedMesh:
         normals = (weights * self.normals[corners]).sum(axis=1)
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
         normals = np.where(lengths > 1e-3, normals / np.maximum(lengths, 1e-3), self.face_normals[face_indices])
-        return (weights * self.positions[corners]).sum(axis=1), self._on_sides(normals, rng)
+        return (weights * self.positions[corners]).sum(axis=1), self._turn_to_sides(normals, rng)
 
     def sample_vertices(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Draw vertices in proportion to the area around them: positions and normals, both [count, 3]."""
         face_indices = rng.choice(len(self.positions), count, p=self.vertex_shares)
-        return self.positions[face_indices].astype(np.float64), self._on_sides(self.normals[face_indices], rng)
+        return self.positions[face_indices].astype(np.float64), self._turn_to_sides(self.normals[face_indices], rng)
 
     def nearest(self, points: np.ndarray) -> np.ndarray:
         """Points of the surface nearest to others [point, 3]."""

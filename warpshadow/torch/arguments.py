@@ -1,5 +1,6 @@
 """Arguments: check tensors, and pass them as Warp arrays."""
 
+import dataclasses
 import functools
 from collections.abc import Callable, Collection, Hashable, Sequence
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.batch import common_batch
 from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.bodies.geometry import GEOMETRY_DTYPES, PLACED, Geometry, as_geometry
+from warpshadow.pipeline.image_inputs import ImageInputs
 from warpshadow.torch.autograd import apply, as_array, check_float32, is_capturing
 from warpshadow.torch.replay import Replays
 
@@ -21,16 +23,16 @@ _REUSED = ("geometry.", "clip_matrices")  # tensors about which a renderer cache
 
 
 class Slot(NamedTuple):
-    """Place of a tensor among the inputs of a function, which its array takes."""
+    """Place of a tensor in an input of a function, which its array takes."""
 
     number: int
 
 
 class Arguments:
-    """Tensors that become arrays among the inputs of a function, checked and with a leading batch dimension.
+    """Tensors that become arrays in the inputs of a function, checked and with a leading batch dimension.
 
-    Inputs are dictionaries, lists and geometries, with the slot of each tensor that was added, and anything else as it
-    is.
+    An input is the slot of a tensor that was added; or :class:`.ImageInputs`, a :class:`.Geometry` or a list that have
+    such slots; or any other value, which stays as it is.
     """
 
     def __init__(self, device: torch.device, *, cameras: Sequence[Camera] | None = None):
@@ -82,33 +84,32 @@ class Arguments:
             rotations = self.add(f"{name}.rotations", geometry.rotations, wp.mat33, like.rotations.shape[1:])
         return Geometry(**slots, rotations=rotations, moving=geometry.moving, deformed=geometry.deformed)
 
-    def filled(self, inputs: dict[str, Any]) -> dict[str, Any]:
-        """Inputs with arrays in the slots, which require a gradient as the tensors do."""
+    def filled(self, value: Any) -> Any:
+        """An input with arrays in the slots, which require a gradient as the tensors do."""
         arrays = []
         for tensor, dtype in zip(self.tensors, self.dtypes, strict=True):
             arrays.append(as_array(tensor, dtype))
             arrays[-1].requires_grad = tensor.requires_grad and torch.is_grad_enabled()
-        return _filled(inputs, arrays)
+        return _filled(value, arrays)
 
     def apply(
         self,
-        function: Callable[[dict[str, Any]], Any],
-        inputs: dict[str, Any],
-        *,
+        function: Callable[..., Any],
+        *inputs: Any,
         affine: Collection[str] = (),
         replays: Replays | None = None,
     ) -> Any:
         """Apply a function of inputs, as :func:`~warpshadow.torch.apply` does, or replay it if there are replays.
 
-        Results lose a batch dimension that no tensor had.
+        It gets the inputs with arrays in the slots. Results lose a batch dimension that no tensor had.
         """
         self._common_batch()
         find_capture = None
         if replays is not None:
             reused = [number for number, name in enumerate(self.names) if name.startswith(_REUSED)]
-            find_capture = functools.partial(replays.find, _key(inputs), reused)
+            find_capture = functools.partial(replays.find, tuple(map(_key, inputs)), reused)
         results = apply(
-            lambda *arrays: function(_filled(inputs, arrays)),
+            lambda *arrays: function(*(_filled(value, arrays) for value in inputs)),
             *self.tensors,
             dtypes=self.dtypes,
             device=self.device,
@@ -120,18 +121,16 @@ class Arguments:
             return results
         return tuple(result[0] for result in results) if isinstance(results, tuple) else results[0]
 
-    def apply_geometry(
-        self, function: Callable[[dict[str, Any]], Geometry[wp.array]], inputs: dict[str, Any]
-    ) -> Geometry[torch.Tensor]:
+    def apply_geometry(self, function: Callable[..., Geometry[wp.array]], *inputs: Any) -> Geometry[torch.Tensor]:
         """Apply a function that makes a geometry."""
         geometries: list[Geometry[wp.array]] = []
 
-        def make(inputs: dict[str, Any]) -> tuple[wp.array, ...]:
-            geometries.append(function(inputs))
+        def make(*inputs: Any) -> tuple[wp.array, ...]:
+            geometries.append(function(*inputs))
             rotations = geometries[0].rotations
             return (*geometries[0].arrays().values(), *([] if rotations is None else [rotations]))
 
-        positions, centers, radii, *rotations = self.apply(make, inputs)
+        positions, centers, radii, *rotations = self.apply(make, *inputs)
         return Geometry(
             positions,
             centers,
@@ -158,27 +157,26 @@ class _Same:
         return id(self._value)
 
 
-def _key(inputs: Any) -> Hashable:
-    """Key of inputs, which equals the key of others that differ in their tensors alone."""
-    if isinstance(inputs, Slot):
-        return inputs
-    if isinstance(inputs, Geometry):
-        return *inputs.arrays().values(), inputs.rotations, inputs.moving, inputs.deformed
-    if isinstance(inputs, dict):
-        return tuple((name, _key(item)) for name, item in inputs.items())
-    return tuple(map(_key, inputs)) if isinstance(inputs, list) else _Same(inputs)
+def _key(value: Any) -> Hashable:
+    """Key of an input, which equals the key of others that differ in their tensors alone."""
+    if isinstance(value, Slot):
+        return value
+    if isinstance(value, Geometry):
+        return *value.arrays().values(), value.rotations, value.moving, value.deformed
+    if isinstance(value, ImageInputs):
+        return tuple(map(_key, vars(value).values()))
+    return tuple(map(_key, value)) if isinstance(value, list) else _Same(value)
 
 
-def _filled(inputs: Any, arrays: Sequence[wp.array]) -> Any:
-    if isinstance(inputs, Slot):
-        return arrays[inputs.number]
-    if isinstance(inputs, dict):
-        return {name: _filled(item, arrays) for name, item in inputs.items()}
-    if isinstance(inputs, list):
-        return [_filled(item, arrays) for item in inputs]
-    if isinstance(inputs, Geometry):
-        return inputs.map(lambda slot: arrays[slot.number])
-    return inputs
+def _filled(value: Any, arrays: Sequence[wp.array]) -> Any:
+    """An input with arrays in its slots."""
+    if isinstance(value, Slot):
+        return arrays[value.number]
+    if isinstance(value, Geometry):
+        return value.map(lambda slot: arrays[slot.number])
+    if isinstance(value, ImageInputs):
+        return dataclasses.replace(value, **{name: _filled(item, arrays) for name, item in vars(value).items()})
+    return [_filled(item, arrays) for item in value] if isinstance(value, list) else value
 
 
 def _check_tensor(

@@ -190,7 +190,9 @@ class _Call:
     affine: frozenset[str]
     find_capture: FindCapture | None
 
-    def moved(self, tensors: Sequence[torch.Tensor], directions: Sequence[torch.Tensor | None]) -> list[torch.Tensor]:
+    def change_along(
+        self, tensors: Sequence[torch.Tensor], directions: Sequence[torch.Tensor | None]
+    ) -> list[torch.Tensor]:
         """Change of the results as tensors move in directions: Σ f(…, direction, …) − f(…, 0, …), exact if affine.
 
         Differentiable: tensors, directions.
@@ -206,12 +208,14 @@ class _Call:
                     "expected one of first order"
                     f"{f'; of second order there are those of {affine_names}' if affine_names else ''}"
                 )
-            ends = (self._at(tensors, number, end) for end in (direction, torch.zeros_like(direction)))
+            ends = (self._results_at(tensors, number, end) for end in (direction, torch.zeros_like(direction)))
             change = [one - other for one, other in zip(*ends, strict=True)]
             total = [one + other for one, other in zip(total, change, strict=True)] if total else change
         return total
 
-    def _at(self, tensors: Sequence[torch.Tensor], number: int, value: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def _results_at(
+        self, tensors: Sequence[torch.Tensor], number: int, value: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
         """The results where one tensor has another value."""
         arguments = [*tensors[:number], value, *tensors[number + 1 :]]
         requires_grad = tuple(tensor.requires_grad and torch.is_grad_enabled() for tensor in arguments)
@@ -299,7 +303,7 @@ class _WarpAdjoint(torch.autograd.Function):
         with torch.enable_grad():
             # views, so that gradients end here where one argument was computed from another
             arguments = [tensor.view_as(tensor) for tensor in ctx.saved_tensors]
-            changes = ctx.call.moved(arguments[: ctx.count], directions)
+            changes = ctx.call.change_along(arguments[: ctx.count], directions)
             pairs = zip(arguments[ctx.count :], changes, strict=True)
             total = torch.stack([(adjoint * change).sum() for adjoint, change in pairs]).sum()
             variables = [tensor for tensor in arguments if tensor.requires_grad] if total.requires_grad else []

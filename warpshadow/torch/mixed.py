@@ -160,7 +160,10 @@ class MixedRenderer(torch.nn.Module):
             geometries.which = batch.numbers
         for scene in batch.rows:
             renderer, counts = self._renderer(scene), self._vertex_counts[scene]
-            R, t, s = (_cut(of(scene), n, len(renderer.scene.bodies)) for of, n in zip(poses, (3, 2, 1), strict=True))
+            R, t, s = (
+                _without_padding(of(scene), n, len(renderer.scene.bodies))
+                for of, n in zip(poses, (3, 2, 1), strict=True)
+            )
             moved = None if bodies is None else [body for body in bodies if body in counts]
             geometries[scene] = renderer.placed(R, t, s, moving=moved, pivot=pivot)
         return geometries
@@ -254,7 +257,7 @@ class MixedRenderer(torch.nn.Module):
                 check.shape(name, tuple(tensor.shape), shape, meaning)
             ndim = 2
         of_scene = batch.split(name, tensor, ndim)
-        return lambda scene: _cut(of_scene(scene), ndim, self._vertex_counts[scene][body])
+        return lambda scene: _without_padding(of_scene(scene), ndim, self._vertex_counts[scene][body])
 
     def _checked_poses(self, name: str, poses: torch.Tensor | None, item: tuple[int, ...]) -> torch.Tensor | None:
         """Poses of as many bodies as the scene with the most has."""
@@ -341,7 +344,7 @@ def _instances(geometry: Geometry[torch.Tensor]) -> int:
     return len(geometry.positions) if geometry.positions.ndim > 2 else 1
 
 
-def _cut(tensor: Any, ndim: int, count: int) -> Any:
+def _without_padding(tensor: Any, ndim: int, count: int) -> Any:
     """Without padding: the first items of the dimension that begins the last ``ndim``, unless one item serves all."""
     if tensor is None or tensor.ndim < ndim or tensor.shape[-ndim] == 1:
         return tensor

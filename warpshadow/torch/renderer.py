@@ -1,5 +1,6 @@
 """A renderer of one scene, whose arguments are tensors."""
 
+import functools
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -13,9 +14,10 @@ from warpshadow.assets.basis import Basis, describe_coefficients
 from warpshadow.assets.camera import Camera
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.device.warp_internals import item_shape
-from warpshadow.pipeline.bodies.geometry import GEOMETRY_DTYPES, Geometry
+from warpshadow.pipeline.bodies.geometry import GEOMETRY_DTYPES, Geometry, Pivot
 from warpshadow.pipeline.explain import Explanation
-from warpshadow.pipeline.image_inputs import ImageInputs, takes
+from warpshadow.pipeline.image_inputs import ImageArrays, ImageInputs, takes
+from warpshadow.rendering.renderer import Renderer
 from warpshadow.scene.material import INPUTS_OF_BODIES
 from warpshadow.scene.scene import BodyLike, PerBody, Scene
 from warpshadow.stages.geometry.deform import DeformationGraph
@@ -24,7 +26,6 @@ from warpshadow.stages.raster.project import compose_clip_matrices
 from warpshadow.torch.arguments import Arguments, Slot
 from warpshadow.torch.autograd import uncompiled
 from warpshadow.torch.replay import Replays
-from warpshadow.tuning.renderer import Renderer
 
 _ELSEWHERE = {
     **dict.fromkeys(
@@ -42,6 +43,7 @@ _ELSEWHERE = {
 
 
 ImageTensors = ImageInputs[torch.Tensor, Geometry[torch.Tensor]]
+ImageSlots = ImageInputs[Slot, Geometry[Slot]]
 
 
 class LayerTensors(NamedTuple):
@@ -175,11 +177,10 @@ class TorchRenderer(torch.nn.Module):
             and where no light bounces to albedo and textures, may be differentiated again, in all tensors;
             others raise NotImplementedError then.
         """
-        arguments, arrays = self._arrays_of(inputs)
+        arguments, slots = self._slots_of(inputs)
 
-        def draw(inputs: dict[str, Any]) -> wp.array:
-            geometry_and_cameras = inputs.pop("geometry"), inputs.pop("clip_matrices")
-            return self.warp.draw(**inputs, view=self.warp.view(*geometry_and_cameras))
+        def draw(inputs: ImageArrays) -> wp.array:
+            return self.warp.draw_inputs(inputs, self.warp.view(inputs.geometry, inputs.clip_matrices))
 
         is_affine = {
             "light": True,
@@ -188,7 +189,7 @@ class TorchRenderer(torch.nn.Module):
             "textures": not self.scene.bounces,
         }
         affine = [name for name in arguments.names if is_affine.get(name.partition("[")[0])]
-        return arguments.apply(draw, arrays, affine=affine, replays=self.replays)
+        return arguments.apply(draw, slots, affine=affine, replays=self.replays)
 
     @uncompiled
     @one_at_a_time
@@ -203,14 +204,13 @@ class TorchRenderer(torch.nn.Module):
             have no gradient for another that comes in front of it; masks and coverage have that of silhouettes, as
             images have.
         """
-        arguments, arrays = self._arrays_of(ImageInputs(geometry=geometry, clip_matrices=clip_matrices))
+        arguments, slots = self._slots_of(ImageInputs(geometry=geometry, clip_matrices=clip_matrices))
 
-        def find(inputs: dict[str, Any]) -> tuple[wp.array, ...]:
-            view = self.warp.view(inputs["geometry"], inputs["clip_matrices"])
-            result = self.warp.layer_arrays(view)
+        def find(inputs: ImageArrays) -> tuple[wp.array, ...]:
+            result = self.warp.layer_arrays(self.warp.view(inputs.geometry, inputs.clip_matrices))
             return (*result[:3], *result.masks)
 
-        depth, normals, bodies, *quartets = arguments.apply(find, arrays)
+        depth, normals, bodies, *quartets = arguments.apply(find, slots)
         masks = torch.cat(quartets, dim=-1)[..., : len(self.scene.bodies)]
         return LayerTensors(depth, normals, bodies, masks.movedim(-1, -3))
 
@@ -230,11 +230,10 @@ class TorchRenderer(torch.nn.Module):
             ValueError: where no body of the scene is a catcher.
         Differentiable: all, as :meth:`forward` is; both the light with and that without the other bodies are.
         """
-        arguments, arrays = self._arrays_of(inputs)
-        camera = self.cameras[0]
-        size = camera.height, camera.width
-        arrays["photograph"] = arguments.add("photograph", photograph, wp.vec3, size, "linear RGB")
-        return arguments.apply(lambda inputs: self.warp.insert(inputs.pop("photograph"), **inputs), arrays)
+        arguments, slots = self._slots_of(inputs)
+        size = self.cameras[0].height, self.cameras[0].width
+        photograph_slot = arguments.add("photograph", photograph, wp.vec3, size, "linear RGB")
+        return arguments.apply(self.warp.insert_inputs, photograph_slot, slots)
 
     @uncompiled
     @takes(ImageTensors, **_ELSEWHERE)
@@ -245,15 +244,15 @@ class TorchRenderer(torch.nn.Module):
         Args:
             inputs: All that an image takes.
         """
-        arguments, arrays = self._arrays_of(inputs)
-        return self.warp.explain(**arguments.filled(arrays))
+        arguments, slots = self._slots_of(inputs)
+        return self.warp.explain_inputs(arguments.filled(slots))
 
-    def _arrays_of(self, inputs: ImageTensors) -> tuple[Arguments, dict[str, Any]]:
-        """The tensors among the inputs of an image, checked, and the arguments of the renderer of arrays."""
+    def _slots_of(self, inputs: ImageTensors) -> tuple[Arguments, ImageSlots]:
+        """The tensors of an image, checked, and its inputs with slots in their place."""
         light, geometry, clip_matrices = inputs.light, inputs.geometry, inputs.clip_matrices
         has_cameras = self.warp.has_camera_batch and clip_matrices is None
         arguments = Arguments(self.device, cameras=self.cameras if has_cameras else None)
-        arrays: dict[str, Any] = {"light": light, "geometry": None, "clip_matrices": None}
+        slots: dict[str, Any] = {"light": light}
         if isinstance(light, torch.Tensor):
             description = describe_coefficients(self.basis, light.shape[-2] if light.ndim > 1 else 0)
             if light.ndim == 3 and light.shape[1] == 2 * light.shape[0]:
@@ -261,24 +260,24 @@ class TorchRenderer(torch.nn.Module):
                     "; of a map [height, width, 3] that is known, light=EnvironmentMap(map.numpy()); its coefficients "
                     "are torch.as_tensor(renderer.basis.coefficients(EnvironmentMap(map.numpy())), dtype=torch.float32)"
                 )
-            arrays["light"] = arguments.add("light", light, wp.vec3, (self.basis.size,), description)
+            slots["light"] = arguments.add("light", light, wp.vec3, (self.basis.size,), description)
         elif isinstance(light, np.ndarray):  # which a renderer takes for known light
             raise ValueError("light: got ndarray, expected a tensor of torch.float32: torch.as_tensor makes one")
         if geometry is not None:
-            arrays["geometry"] = arguments.add_geometry("geometry", geometry, self.warp.rest())
+            slots["geometry"] = arguments.add_geometry("geometry", geometry, self.warp.rest())
         if clip_matrices is not None:
-            arrays["clip_matrices"] = arguments.add("clip_matrices", clip_matrices, wp.mat44, ())
+            slots["clip_matrices"] = arguments.add("clip_matrices", clip_matrices, wp.mat44, ())
         if inputs.shell is not None:
-            arrays["shell"] = arguments.add("shell", inputs.shell, wp.vec4, (), "its center and radius")
+            slots["shell"] = arguments.add("shell", inputs.shell, wp.vec4, (), "its center and radius")
         for name, values in inputs.of_bodies.items():
-            slots: list[Slot | None] = [None] * len(self.scene.bodies)
+            of_bodies: list[Slot | None] = [None] * len(self.scene.bodies)
             for number, tensor in enumerate(self.scene.per_body(values, name)):
                 if tensor is not None:
                     message_name = self._item_name(name, values, number)
                     body_rows = self._body_rows(name, number, tensor)
-                    slots[number] = arguments.add(f"{name}[{number}]", *body_rows, message_name=message_name)
-            arrays[name] = slots
-        return arguments, arrays
+                    of_bodies[number] = arguments.add(f"{name}[{number}]", *body_rows, message_name=message_name)
+            slots[name] = of_bodies
+        return arguments, ImageInputs(**slots)
 
     def _body_rows(
         self, name: str, number: int, tensor: torch.Tensor
@@ -341,23 +340,21 @@ class TorchRenderer(torch.nn.Module):
         arguments = Arguments(self.device)
         all_bodies = f"of all {count} bodies, as scene_poses() has them"
         remedy = f"matrices {all_bodies}; rotation_matrices(…) makes them of axis-angle vectors and quaternions"
-        inputs: dict[str, Any] = {
-            "poses": [
-                arguments.add("rotations", rotations, wp.mat33, (count,), remedy),
-                arguments.add("translations", translations, wp.vec3, (count,), all_bodies),
-                arguments.add("scales", scales, wp.float32, (count,), all_bodies),
-            ],
-            "pivot": pivot,
-        }
+        pose_slots = [
+            arguments.add("rotations", rotations, wp.mat33, (count,), remedy),
+            arguments.add("translations", translations, wp.vec3, (count,), all_bodies),
+            arguments.add("scales", scales, wp.float32, (count,), all_bodies),
+        ]
+        pivot_slot: Any = pivot
         if isinstance(pivot, torch.Tensor):
-            inputs["pivot"] = arguments.add("pivot", pivot, wp.vec3, (count,), "a point of each body's own space")
+            pivot_slot = arguments.add("pivot", pivot, wp.vec3, (count,), "a point of each body's own space")
         arguments.expand()
-        inputs["rest"] = None if rest is None else arguments.add_geometry("rest", rest, self.warp.rest())
+        rest_slots = None if rest is None else arguments.add_geometry("rest", rest, self.warp.rest())
 
-        def place(inputs: dict[str, Any]) -> Geometry[wp.array]:
-            return self.warp.placed(Poses(*inputs["poses"]), inputs["rest"], moving=moving, pivot=inputs["pivot"])
+        def place(poses: list[wp.array], rest: Geometry[wp.array] | None, pivot: Pivot) -> Geometry[wp.array]:
+            return self.warp.placed(Poses(*poses), rest, moving=moving, pivot=pivot)
 
-        return arguments.apply_geometry(place, inputs)
+        return arguments.apply_geometry(place, pose_slots, rest_slots, pivot_slot)
 
     @uncompiled
     def scene_poses(
@@ -414,12 +411,14 @@ class TorchRenderer(torch.nn.Module):
         """
         parts = {"positions": positions, "centers": centers, "radii": radii}
         arguments = Arguments(self.device)
-        inputs: dict[str, Any] = {
-            name: None if tensor is None else arguments.add(name, tensor, GEOMETRY_DTYPES[name], ("item",))
+        slots = [
+            None if tensor is None else arguments.add(name, tensor, GEOMETRY_DTYPES[name], ("item",))
             for name, tensor in parts.items()
-        }
-        inputs["rest"] = None if rest is None else arguments.add_geometry("rest", rest, self.warp.rest())
-        return arguments.apply_geometry(lambda inputs: self.warp.deformed(body, **inputs), inputs)
+        ]
+        rest_slots = None if rest is None else arguments.add_geometry("rest", rest, self.warp.rest())
+        return arguments.apply_geometry(
+            lambda rest, *arrays: self.warp.deformed(body, *arrays, rest=rest), rest_slots, *slots
+        )
 
     @uncompiled
     def deformation_graph(self, body: BodyLike, *, count: int = 4) -> DeformationGraph:
@@ -445,10 +444,10 @@ class TorchRenderer(torch.nn.Module):
         """
         camera = self.cameras[0]
         arguments = Arguments(self.device)
-        inputs = {
-            "intrinsics": arguments.add("intrinsics", intrinsics, wp.mat33, ()),
-            "rotations": arguments.add("rotations", rotations, wp.mat33, ()),
-            "translations": arguments.add("translations", translations, wp.vec3, ()),
-        }
-        options: dict[str, Any] = {"size": (camera.width, camera.height), "near": camera.near}
-        return arguments.apply(lambda inputs: compose_clip_matrices(**inputs, **options), inputs)
+        slots = (
+            arguments.add("intrinsics", intrinsics, wp.mat33, ()),
+            arguments.add("rotations", rotations, wp.mat33, ()),
+            arguments.add("translations", translations, wp.vec3, ()),
+        )
+        compose = functools.partial(compose_clip_matrices, size=(camera.width, camera.height), near=camera.near)
+        return arguments.apply(compose, *slots)

@@ -64,7 +64,7 @@ class PointSample:
         stage = SceneRenderer(bare, device=device)
         self._view = stage.view()
         face_ids = self._view.fragments.face_ids.numpy()[0]
-        chosen_samples = _spread(face_ids >= 0, count, seed)
+        chosen_samples = _draw_spread_pixels(face_ids >= 0, count, seed)
         if not len(chosen_samples):
             raise ValueError("scene: the camera sees no body, expected one in the image")
         positions = stage.geometry().positions.numpy()[0]
@@ -94,7 +94,7 @@ class PointSample:
         scene = change_bodies(self._scene, "receivers", changes)
         return self.shading(replace(scene, visibility=visibility, supersampling=1, bounces=self._bounces))
 
-    def decided(self, scene: Scene) -> Scene:
+    def with_chosen_receivers(self, scene: Scene) -> Scene:
         """A variant of the scene with the receivers that a renderer of the whole image chooses for "auto"."""
         is_open = [body.receivers == AUTO for body in scene.bodies]
         return change_bodies(scene, "receivers", {k: self._chosen[k] for k in np.flatnonzero(is_open).tolist()})
@@ -105,7 +105,7 @@ class PointSample:
         Returns:
             Linear RGB, float32 of shape [point, 3].
         """
-        scene = self.decided(scene)
+        scene = self.with_chosen_receivers(scene)
         # it draws no image, so a renderer may prepare as little as possible
         glimpse = replace(scene.camera, width=1, height=1)
         renderer = SceneRenderer(scene, cameras=[glimpse], device=self.device, progress=self._progress)
@@ -184,7 +184,7 @@ def places_of_receivers(
     return points, weights, receivers
 
 
-def _spread(mask: np.ndarray, count: int, seed: int) -> np.ndarray:
+def _draw_spread_pixels(mask: np.ndarray, count: int, seed: int) -> np.ndarray:
     """Draw pixels of a mask [height, width], one from each of as many patches along a Z-order curve: flat indices."""
     rows, columns = np.nonzero(mask)
     curve_order = z_order_of_cells(np.stack([columns, rows], axis=-1))

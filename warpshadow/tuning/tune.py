@@ -146,7 +146,7 @@ _HEAD = f"{'method':18}{'bounces':>8}{'spheres':>12}  {'receivers':16}"
 def _columns(scene: Scene, fitted: Iterable[int]) -> str:
     """The settings of a scene, below the head of a table."""
     columns = f"{_method(scene.visibility):18}{scene.bounces:>8}{_spheres(scene, fitted):>12}"
-    return f"{columns}  {_listed(_receivers(scene)):16}"
+    return f"{columns}  {_join_words(_receivers(scene)):16}"
 
 
 def _error_table(settings: Sequence[Scene], errors: Sequence[float], fitted: Iterable[int]) -> str:
@@ -159,7 +159,7 @@ def _error_table(settings: Sequence[Scene], errors: Sequence[float], fitted: Ite
 def describe(scene: Scene) -> str:
     """Name the settings of a scene in a few words."""
     spheres = f", {_spheres(scene, fitted_counts(scene))} spheres" if scene.visibility.method in SPHERE_METHODS else ""
-    return f"{_method(scene.visibility)}{_bounces(scene)}{spheres}, receivers {_listed(_receivers(scene))}"
+    return f"{_method(scene.visibility)}{_bounces(scene)}{spheres}, receivers {_join_words(_receivers(scene))}"
 
 
 def _method(visibility: Visibility) -> str:
@@ -180,14 +180,14 @@ def _spheres(scene: Scene, fitted: Iterable[int]) -> str:
         return "–"
     counts = [scene.bodies[number].blockers for number in fitted]
     counts += [len(body.blockers) for body in scene.bodies if isinstance(body.blockers, Spheres)]
-    return _listed([str(count) for count in counts or [0]])
+    return _join_words([str(count) for count in counts or [0]])
 
 
 def _receivers(scene: Scene) -> tuple[str, ...]:
     return tuple(body.receivers for body in scene.bodies)
 
 
-def _listed(words: Sequence[str]) -> str:
+def _join_words(words: Sequence[str]) -> str:
     """Words, once where all are the same."""
     return words[0] if len(set(words)) == 1 else ", ".join(words)
 
@@ -243,7 +243,10 @@ def tune(
     sample = PointSample(scene, bounces=bounces, device=device, progress=progress)
     is_coarse = sample.interpolation_errors() > COARSE_FACES_ERROR
     pairs = zip(
-        scene.bodies, sample.decided(scene).bodies, np.where(is_coarse, "pixel", "vertex").tolist(), strict=True
+        scene.bodies,
+        sample.with_chosen_receivers(scene).bodies,
+        np.where(is_coarse, "pixel", "vertex").tolist(),
+        strict=True,
     )
     fine = [
         body.receivers if receivers == decided.receivers or body.is_glossy else receivers
@@ -253,7 +256,7 @@ def tune(
     if bounces is not None:
         counts = (*BOUNCE_COUNTS, "all") if bounces == "all" else [count for count in BOUNCE_COUNTS if count <= bounces]
     scenes_with_bounces = [replace(scene, bounces=count) for count in counts]
-    settings = [setting for item in scenes_with_bounces for setting in _settings(item, fine, fits, device)]
+    settings = [setting for item in scenes_with_bounces for setting in _trial_scenes(item, fine, fits, device)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a setting's warnings show in its error
         errors = []
@@ -370,7 +373,7 @@ def _resolve(scene: Scene, device: wp.DeviceLike, progress: bool) -> Scene:
     accepted_error = scene.visibility.error
     sample = PointSample(scene, device=device, progress=progress)
     tried_scenes: list[tuple[float, Scene]] = []
-    for setting in _by_work(scene, sample):
+    for setting in _settings_by_work(scene, sample):
         tried_scenes.append((sample.error(sample.shading(setting)), setting))
         if tried_scenes[-1][0] <= accepted_error:
             return setting
@@ -387,11 +390,11 @@ def _resolve(scene: Scene, device: wp.DeviceLike, progress: bool) -> Scene:
 
 def _interpolation_error(scene: Scene, sample: PointSample) -> float:
     """Error that is left however visibility is computed: of the bodies whose vertices are receivers."""
-    is_interpolated = [body.receivers == "vertex" for body in sample.decided(scene).bodies]
+    is_interpolated = [body.receivers == "vertex" for body in sample.with_chosen_receivers(scene).bodies]
     return float(np.linalg.norm(sample.interpolation_errors()[is_interpolated]))
 
 
-def _by_work(scene: Scene, sample: PointSample) -> Iterator[Scene]:
+def _settings_by_work(scene: Scene, sample: PointSample) -> Iterator[Scene]:
     """Settings that "auto" chooses from, the least work first."""
     if not scene.bounces:  # bounced light needs visibility
         yield replace(scene, visibility=scene.visibility.by("none"))
@@ -416,7 +419,7 @@ def _all_directions(scene: Scene) -> Iterator[Scene]:
 # ---------------------------------------------------------------------------------------------- settings
 
 
-def _settings(scene: Scene, fine: Sequence[str], fits: bool, device: wp.DeviceLike) -> Iterator[Scene]:
+def _trial_scenes(scene: Scene, fine: Sequence[str], fits: bool, device: wp.DeviceLike) -> Iterator[Scene]:
     """Trials, a variant of the scene each: with its own receivers, and with fine ones."""
     for receivers in dict.fromkeys((_receivers(scene), tuple(fine))):
         scene_with_receivers = change_bodies(scene, "receivers", dict(enumerate(receivers)))

@@ -36,7 +36,7 @@ class FitPage:
         self._wishes = threading.Condition()  # guards the attributes below
         self._pauses = self._stops = False
         gui = self._server.gui
-        self._note = gui.add_html(_padded("preparing"))
+        self._note = gui.add_html(_note_html("preparing"))
         self._failure = gui.add_html("")
         self._pause = gui.add_button("Pause", hint="The fit waits until it is to go on")
         self._stop = gui.add_button("Stop", color="gray", hint="A checkpoint is left from which the same fit goes on")
@@ -89,8 +89,8 @@ class FitPage:
             stage: The present one.
             candidates: How many descents it has.
         """
-        self._note.content = _padded(html.escape(note))
-        self._plot.content = _padded(loss_plot(losses))
+        self._note.content = _note_html(html.escape(note))
+        self._plot.content = _note_html(loss_plot(losses))
         color = COLORS[stage % len(COLORS)]
         least_losses = [min(run, default=np.inf) for run in losses[stage]]
         rows = []
@@ -103,7 +103,7 @@ class FitPage:
                 f'<tr style="{style}"><td>{"▸" if is_present else ""}</td><td>{number + 1}</td><td>{loss_text}</td>'
             )
         head = "<tr><td></td><td>candidate</td><td>least loss</td></tr>"
-        self._candidates.content = _padded(f"<table>{head}{''.join(rows)}</table>") if rows else ""
+        self._candidates.content = _note_html(f"<table>{head}{''.join(rows)}</table>") if rows else ""
 
     def show_pictures(self, pictures: np.ndarray) -> None:
         """Show target, image and difference: uint8 of shape [height, width, 3]."""
@@ -118,13 +118,13 @@ class FitPage:
 
     def fail(self, message: str | None) -> None:
         """Show an error in the view; None clears it."""
-        content = _padded(f'<b style="color:#f66">{html.escape(message)}</b>') if message else ""
+        content = _note_html(f'<b style="color:#f66">{html.escape(message)}</b>') if message else ""
         if content != self._failure.content:
             self._failure.content = content
 
     def end(self, note: str) -> None:
         """Show how the fit ended, to be seen as long as browsers stay open."""
-        self._note.content = _padded(html.escape(note))
+        self._note.content = _note_html(html.escape(note))
         self._pause.disabled = self._stop.disabled = True
         self._server.flush()
 
@@ -133,5 +133,5 @@ class FitPage:
         self._server.close()
 
 
-def _padded(content: str) -> str:
+def _note_html(content: str) -> str:
     return f'<div style="padding:0.4em 1em;font-size:0.8em;line-height:1.4">{content}</div>'

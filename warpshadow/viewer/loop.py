@@ -109,7 +109,7 @@ class Loop:
                 self._ask(*self._clients.values())
             return self.viewer_state
 
-    def again(self, *, depth: bool | None = None) -> None:
+    def repaint(self, *, depth: bool | None = None) -> None:
         """Paint again for all pages, with or without depth."""
         with self._changed:
             self.depth = self.depth if depth is None else depth
@@ -151,7 +151,7 @@ class Loop:
                 continue
             seconds = time.monotonic() - start
             if quality.is_moving:
-                frame_rate.took(seconds)
+                frame_rate.learn_from(seconds)
             client.page.fail(None)
             client.page.wait()
             if client.is_open:
@@ -170,7 +170,7 @@ class Loop:
                 better_image = None
                 if last is not None:
                     camera, quality, seconds = last
-                    better_image = frame_rate.better(quality, seconds, camera.width * camera.height)
+                    better_image = frame_rate.find_better(quality, seconds, camera.width * camera.height)
                 client.is_content = better_image is None
                 if better_image is None:
                     self._changed.wait()

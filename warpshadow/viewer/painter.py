@@ -16,16 +16,17 @@ from scipy.spatial.transform import Rotation
 from warpshadow import check
 from warpshadow.assets.camera import Camera, framed_points
 from warpshadow.assets.color import auto_exposure, linear_to_srgb
+from warpshadow.assets.harmonic_light import as_light
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
 from warpshadow.pipeline.views.view import View
+from warpshadow.rendering.renderer import Renderer
 from warpshadow.scene.scene import Scene
 from warpshadow.stages.geometry.poses import Poses
 from warpshadow.stages.shell.beams import exits_on_host
-from warpshadow.tuning.renderer import Renderer
 from warpshadow.viewer.page_camera import PageCamera, page_scale
 from warpshadow.viewer.quality import Quality
 from warpshadow.viewer.state import ERROR, ViewerState
@@ -72,10 +73,12 @@ class Painter:
     Attributes:
         page_scale: Units of a page in a unit of the scene.
         coarse_light: The scene's light, as it is used while something moves.
+        has_map: Whether the light is a map, which is drawn behind the bodies and beside the controls.
     """
 
     def __init__(self, scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False):
         self.scene = scene = scene.with_method()
+        self.has_map = isinstance(scene.light, EnvironmentMap)
         self._device, self._progress = device, progress
         low, high = bounds(scene)
         self.page_scale = page_scale(low, high)
@@ -84,7 +87,7 @@ class Painter:
         self._lights: RecentCache[EnvironmentMap | np.ndarray] = RecentCache(4)
         self._geometries: RecentCache[Geometry] = RecentCache(_RENDERERS)
         self._numbers: RecentCache[wp.array] = RecentCache(_NUMBERS)
-        self.coarse_light = coarse(scene.light)
+        self.coarse_light = scene.known_light.coarsened(_COARSE_MAP).as_argument
 
     def paint(self, viewer_state: ViewerState, page: PageCamera, quality: Quality, *, depth: bool = False) -> Frame:
         """Paint the image of a page.
@@ -208,10 +211,9 @@ class Painter:
 
     def _behind(self, viewer_state: ViewerState, camera: Camera, quality: Quality) -> np.ndarray:
         """Background behind the bodies: a gray, or the light itself."""
-        if not (viewer_state.shows_light and isinstance(self.scene.light, EnvironmentMap)):
+        if not (viewer_state.shows_light and self.has_map):
             return np.full(3, _BACKGROUND, np.float32)
-        light = self._light_of(viewer_state, quality)
-        assert isinstance(light, EnvironmentMap)
+        light = as_light(self._light_of(viewer_state, quality))
         directions = camera.rays()[1]
         if light.shell is not None:
             directions = exits_on_host(camera.eye, directions, light.shell)
@@ -245,20 +247,6 @@ def bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     maximum = _HORIZON * np.ptp(framed_points(scene), axis=0).max()
     points = np.concatenate([part for part in parts if np.ptp(part, axis=0).max() <= maximum])
     return points.min(axis=0), points.max(axis=0)
-
-
-def coarse(light: EnvironmentMap | np.ndarray) -> EnvironmentMap | np.ndarray:
-    """Light of at most 64 rows, each pixel the mean of the pixels that it covers, weighted by solid angle."""
-    if not isinstance(light, EnvironmentMap):
-        return light
-    step = len(light.radiance) // _COARSE_MAP
-    if step < 2 or len(light.radiance) % step:
-        return light
-    rows, columns, _ = light.radiance.shape
-    weights = light.solid_angles().reshape(-1, step, 1, 1, 1)
-    blocks = light.radiance.reshape(rows // step, step, columns // step, step, 3)
-    means = (weights * blocks).sum(axis=(1, 3)) / (step * weights.sum(axis=(1, 3)))
-    return EnvironmentMap(means, radius=light.radius, center=light.center)
 
 
 def picture(image: np.ndarray, stops: float, background: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 import viser
 from scipy.spatial.transform import Rotation
 
-from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.harmonic_light import as_light
 from warpshadow.assets.primitives import icosphere
 from warpshadow.scene.body import RECEIVERS
 from warpshadow.viewer import gizmo
@@ -61,7 +61,7 @@ class Panel:
         gui, viewer_state = self._server.gui, self._loop.viewer_state
         with gui.add_folder("Light"):
             self._map = None
-            if isinstance(self._scene.light, EnvironmentMap):
+            if self._painter.has_map:
                 self._map = gui.add_image(self._map_picture(viewer_state), label="middle: +z", format="jpeg")
             turn = gui.add_slider("Turn [°]", -180.0, 180.0, 1.0, viewer_state.turn)
             self._bind(turn, "turn")
@@ -138,7 +138,7 @@ class Panel:
 
         @balls.on_update
         def _(event: viser.GuiEvent) -> None:  # in a thread of its own: spheres may have to be fitted
-            self._guarded(event, self._show_spheres)
+            self._obey(event, self._show_spheres)
 
         @back.on_click
         async def _(event: viser.GuiEvent) -> None:
@@ -160,9 +160,9 @@ class Panel:
         @handle.on_update
         async def _(event: viser.GuiEvent) -> None:
             if event.client is not None:  # not by ourselves
-                self._guarded(event, lambda: self._changed(**{field: read(handle.value)}))
+                self._obey(event, lambda: self._changed(**{field: read(handle.value)}))
 
-    def _guarded(self, event: viser.GuiEvent, act: Callable[[], None]) -> None:
+    def _obey(self, event: viser.GuiEvent, act: Callable[[], None]) -> None:
         """Obey a page's request; report why if it is refused."""
         try:
             act()
@@ -191,10 +191,9 @@ class Panel:
 
     def _map_picture(self, viewer_state: ViewerState) -> np.ndarray:
         """The light as it is turned."""
-        light = viewer_state.light(self._painter.coarse_light)
-        assert isinstance(light, EnvironmentMap)
-        step = max(1, light.radiance.shape[1] // _MAP_COLUMNS)
-        thumbnail = light.radiance[::step, ::step]
+        radiance = as_light(viewer_state.light(self._painter.coarse_light)).radiance
+        step = max(1, radiance.shape[1] // _MAP_COLUMNS)
+        thumbnail = radiance[::step, ::step]
         alpha = np.ones((*thumbnail.shape[:2], 1), np.float32)
         stops = -float(np.log2(max(np.percentile(thumbnail.max(axis=-1), 95), 1e-12)))
         return picture(np.concatenate([thumbnail, alpha], axis=-1), stops, np.zeros(3))
@@ -229,7 +228,7 @@ class Panel:
                 position=position,
             )
             self._handles.on_update(self._dragging)
-        self._loop.again(depth=self._needs_depth)
+        self._loop.repaint(depth=self._needs_depth)
 
     @property
     def _needs_depth(self) -> bool:
@@ -264,7 +263,7 @@ class Panel:
         with self._showing:
             self._replace_spheres(bool(self._balls.value))
         self._move_spheres(self._loop.viewer_state)
-        self._loop.again(depth=self._needs_depth)
+        self._loop.repaint(depth=self._needs_depth)
 
     def _replace_spheres(self, shows: bool) -> None:
         for handle in self._spheres.values():

@@ -41,14 +41,14 @@ class FrameRate:
         """While something moves."""
         return Quality(self.pixels, cells=64, rays=16, supersampling=1, is_moving=True)
 
-    def took(self, seconds: float) -> None:
+    def learn_from(self, seconds: float) -> None:
         """Learn from the time of an image in a motion; only a time far from the budget changes anything."""
         if seconds > 1.6 * MOVING_SECONDS:
             self.pixels = max(MIN_MOVING_PIXELS, self.pixels // 2)
         elif seconds < 0.3 * MOVING_SECONDS:
             self.pixels = min(MAX_MOVING_PIXELS, self.pixels * 2)
 
-    def better(self, last: Quality, seconds: float, canvas: int) -> Quality | None:
+    def find_better(self, last: Quality, seconds: float, canvas: int) -> Quality | None:
         """The next quality while all rests.
 
         Args:

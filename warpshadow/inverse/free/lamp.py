@@ -76,7 +76,7 @@ class Lamp(FreeOfBody):
         middle, towards, distance = self._start(setting)
         body = setting.scene.bodies[self.number]
         factor = (_REACH * values["log_distance"]).exp()
-        tangents = setting.tensor(constraints.remaining([towards]))
+        tangents = setting.tensor(constraints.perpendicular_basis([towards]))
         turn = _REACH * values["turn"]
         angle = (turn.square().sum() + 1e-12).sqrt()
         direction = angle.cos() * setting.tensor(towards) + angle.sin() / angle * (turn @ tangents)
@@ -95,7 +95,7 @@ class Lamp(FreeOfBody):
         _, towards, _ = self._start(setting)
         above = fibonacci(2 * STARTS)[:, [0, 2, 1]]
         direction = above[above[:, 1] > 0][number % STARTS]
-        sideways = constraints.remaining([towards]) @ direction
+        sideways = constraints.perpendicular_basis([towards]) @ direction
         angle = np.arctan2(np.linalg.norm(sideways), direction @ towards)
         turn = angle / max(float(np.linalg.norm(sideways)), 1e-12) * sideways / _REACH
         return {"turn": setting.tensor(turn), "log_distance": values["log_distance"].detach().clone()}

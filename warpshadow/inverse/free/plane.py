@@ -105,7 +105,7 @@ class Plane(FreeOfBody):
             nearest = np.linalg.svd(points - middle)[2][-1]
             nearest = nearest * np.sign(nearest @ normal)
             turn = Rotation.from_matrix(constraints.turn_onto(normal, nearest)).as_rotvec()
-            tilt = constraints.remaining([normal]) @ turn
+            tilt = constraints.perpendicular_basis([normal]) @ turn
             height = (nearest @ (middle - foot)) / (nearest @ normal) / unit
         return {"tilt": setting.tensor(tilt), "height": setting.tensor(height)}
 
@@ -114,7 +114,7 @@ class Plane(FreeOfBody):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Move a rotation and a point along with the plane. Differentiable: all but setting."""
         normal, foot, unit = self._start(setting)
-        about = setting.tensor(constraints.remaining([normal]))
+        about = setting.tensor(constraints.perpendicular_basis([normal]))
         turn = rotation_matrices(about.T @ values["tilt"])
         pivot = setting.tensor(foot)
         return turn @ rotation, turn @ (point - pivot) + pivot + unit * values["height"] * setting.tensor(normal)

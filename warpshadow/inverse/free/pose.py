@@ -144,16 +144,16 @@ class Pose(FreeOfBody):
         turns = np.eye(3) if axis is None else np.array([axis])
         fixed_axes = [np.eye(3)[constraints.AXES[coordinate]] for coordinate in self.fixed]
         if self.stands_on is None:
-            return PoseConstraint(turns, constraints.remaining(fixed_axes), rotation)
+            return PoseConstraint(turns, constraints.perpendicular_basis(fixed_axes), rotation)
         ground = setting.scene.bodies[setting.scene.body_number(self.stands_on, "stands_on")]
         plane = constraints.plane_below(ground, self._start_middle(setting))
         if self.resting != "free":
             turns = plane.normal[None]
         if self.tilt is not None:
-            turns = np.concatenate([turns, constraints.remaining([plane.normal])])
+            turns = np.concatenate([turns, constraints.perpendicular_basis([plane.normal])])
         if self.resting == "stable":
             rotation = _stable_rotation(body, plane, is_scan=self.tilt is not None)
-        shifts = constraints.remaining([plane.normal, *fixed_axes])
+        shifts = constraints.perpendicular_basis([plane.normal, *fixed_axes])
         onto = constraints.onto_plane(plane.normal, self.fixed)
         return PoseConstraint(turns, shifts, rotation, plane, onto, constraints.hull_points(body.mesh))
 
@@ -197,7 +197,11 @@ class Pose(FreeOfBody):
         scale = setting.tensor(body.scale) * (values["log_scale"].exp() if self.scale else 1)
         shift = body.scale * setting.extent(self.number) * possible.shift(values["shift"])
         center = setting.tensor(self._start_middle(setting)) + shift
-        return rotation, possible.touching(center, rotation, scale, setting.tensor(setting.middle(self.number))), scale
+        return (
+            rotation,
+            possible.lower_onto_plane(center, rotation, scale, setting.tensor(setting.middle(self.number))),
+            scale,
+        )
 
     def _start_middle(self, setting: Setting) -> np.ndarray:
         """Initial position of the body's middle in the world."""

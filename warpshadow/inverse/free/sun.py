@@ -119,7 +119,7 @@ class Sun(Free):
         towards = np.array(self.direction) / np.linalg.norm(self.direction)
         turn = _REACH * values["turn"].double()
         angle = (turn.square().sum() + 1e-12).sqrt()
-        tangents = torch.tensor(constraints.remaining([towards])).to(turn)
+        tangents = torch.tensor(constraints.perpendicular_basis([towards])).to(turn)
         direction = angle.cos() * torch.tensor(towards).to(turn) + angle.sin() / angle * (turn @ tangents)
         strength = torch.tensor(self.irradiance).to(turn) * (_REACH * values["log_irradiance"].double()).exp()
         radius = np.radians(self._first_radius) * values["log_radius"].double().exp()

@@ -1,11 +1,8 @@
-"""The choice of receivers: bodies whose faces are large or long in the image are shaded by pixel, others at vertices.
+"""The choice of receivers, by the table of README.md beside this file.
 
-So are bodies on whose faces the light varies, from creases to the open or across shadows' edges (:data:`UNEVEN`).
-
-Flat bodies whose faces have more than 2 pixels, or between whose vertices light varies, are adaptive
-(:mod:`.receivers.adaptive`) where shadows may have edges, with directional visibility, where the light is known, and
-where arrays are readable, on a CPU: the ground has about the error that it has by pixel, in less time. Where a renderer
-has a basis, light is free, and nobody knows where edges will be.
+Flat bodies are adaptive (:mod:`.receivers.adaptive`) where shadows may have edges, and where arrays are readable, on a
+CPU: a ground has about the error that it has by pixel, in less time. Where a renderer has a basis, light is free, and
+nobody knows where edges will be.
 
 Between vertices light is interpolated, which shows where a face is large, or small and long, as spokes and rails are;
 so faces count by their pixels and by their longest edges. A picture that is made once can afford per-pixel receivers on

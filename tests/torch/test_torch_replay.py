@@ -133,7 +133,7 @@ def test_geometry_without_a_gradient_that_stays_is_not_computed_again(make_rende
 
 def test_calls_that_cannot_be_captured_stay_plain_and_say_why(make_renderer, monkeypatch):
     renderer, plain = make_renderer(), make_renderer(graphs=False)
-    draw, tries = renderer.warp.draw, []
+    draw, tries = renderer.warp.draw_inputs, []
 
     def reading(*arguments, **options):
         tries.append(renderer.warp.device.is_capturing)
@@ -141,7 +141,7 @@ def test_calls_that_cannot_be_captured_stay_plain_and_say_why(make_renderer, mon
             raise RuntimeError("nothing is read while a graph is captured")
         return draw(*arguments, **options)
 
-    monkeypatch.setattr(renderer.warp, "draw", reading)
+    monkeypatch.setattr(renderer.warp, "draw_inputs", reading)
     for shift in (0.1, 0.2, 0.3, 0.1, 0.2, 0.3, 0.1, 0.2):
         found, expected = image_and_gradients(renderer, shift), image_and_gradients(plain, shift)
         torch.testing.assert_close(found, expected, **SAME)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from tensors import random, small_scene
 
 import warpshadow as ws
 from warpshadow.device import memory
@@ -28,31 +29,6 @@ DIFFERENCE = 1e-4
 WHITE = (1.0, 1.0, 1.0)
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-def small_scene(method: str = "directional", *, size: int = 12, supersampling: int = 2, **options) -> ws.Scene:
-    ball = ws.Body(
-        ws.icosphere(1.0, 2),
-        albedo=(0.7, 0.5, 0.3),
-        blockers=ws.Spheres([[0, 0, 0]], [1.0]),
-        translation=(0, 1, 0),
-        scale=0.8,
-    )
-    texture = np.random.default_rng(0).uniform(0.1, 0.9, (8, 8, 3))
-    ground = ws.Body(ws.plane(3.0, 12), texture=texture, blockers=0)
-    camera = ws.Camera.look_at((0, 2.5, 5), (0, 0.6, 0), size=(size, size))
-    visibility = ws.Visibility.of({"method": method, "samples": 64, "directions": 32, "order": 4} | options)
-    sky = ws.synthetic_sky(height=16, sun_radius=12)
-    return ws.Scene((ball, ground), sky, camera, visibility, supersampling)
-
-
-def random(*shape: int, device: str = "cpu", seed: int = 0, low: float = 0.1) -> torch.Tensor:
-    values = torch.rand(*shape, generator=torch.Generator().manual_seed(seed)) + low
-    return values.to(device).requires_grad_()
-
-
-def torch_device(device: str) -> str:
-    return "cpu" if device == "cpu" else device
 
 
 @pytest.fixture(scope="module")
@@ -85,9 +61,9 @@ def image_of(renderer: TorchRenderer, name: str, values: dict[str, torch.Tensor]
 @pytest.mark.parametrize("method", METHODS)
 def test_the_image_is_the_renderers(device, method, supersampling):
     scene = small_scene(method, supersampling=supersampling)
-    image = TorchRenderer(scene, device=torch_device(device))()
+    image = TorchRenderer(scene, device=device)()
     expected = ws.Renderer(scene, device=device).render()
-    assert image.dtype == torch.float32 and image.device == torch.device(torch_device(device))
+    assert image.dtype == torch.float32 and image.device == torch.device(device)
     assert np.abs(image.cpu().numpy() - expected).max() < FLOAT32 * expected.max()
 
 
@@ -203,8 +179,8 @@ def test_gradients_are_central_differences(method, name):
 @pytest.mark.parametrize("name", ["light", "color", "vertices", "texture"])
 def test_forward_and_backward_are_adjoint(device, name):
     """⟨J v, w⟩ = ⟨v, Jᵀ w⟩ for random v and w, J the linear map from one input to the image."""
-    renderer = TorchRenderer(small_scene(), device=torch_device(device))
-    values = {key: value.detach().to(torch_device(device)) for key, value in inputs_of(renderer).items()}
+    renderer = TorchRenderer(small_scene(), device=device)
+    values = {key: value.detach().to(device) for key, value in inputs_of(renderer).items()}
     values[name].requires_grad_()
     image = image_of(renderer, name, values)[..., :3]
     weights = torch.rand(image.shape, generator=torch.Generator().manual_seed(7)).to(image.device)

@@ -7,7 +7,7 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from test_torch import random, small_scene, torch_device
+from tensors import random, small_scene
 from torch.nn.utils.rnn import pad_sequence
 
 import warpshadow as ws
@@ -42,9 +42,9 @@ def assert_images(images: torch.Tensor, expected: list[torch.Tensor]) -> None:
 
 
 def test_each_image_is_that_of_its_scenes_renderer(device):
-    own = [TorchRenderer(scene, device=torch_device(device)) for scene in scenes()]
+    own = [TorchRenderer(scene, device=device) for scene in scenes()]
     mixed = MixedRenderer(own)
-    lights = random(5, 32, 3, device=torch_device(device))
+    lights = random(5, 32, 3, device=device)
     for which in (WHICH, torch.tensor(WHICH), torch.tensor(WHICH, dtype=torch.int32)):
         images = mixed(which, lights)
         assert images.device == mixed.device and images.shape == (5, SIZE, SIZE, 4)

@@ -13,8 +13,8 @@ from warpshadow.assets.image import ImageError, read_rgb
 from warpshadow.check import AnyPath
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
+from warpshadow.rendering.renderer import Renderer
 from warpshadow.scene.scene import Scene, check_scene
-from warpshadow.tuning.renderer import Renderer
 
 _COVERED_SHARE = 0.5  # part of a pixel that bodies cover, above which it is theirs
 
@@ -50,9 +50,9 @@ def insert(
         ValueError: for a photograph of other proportions than the camera's, and a scene without a catcher.
     """
     check_scene(scene)
-    pixels = linear_photograph(photograph)
+    pixels = _linear_photograph(photograph)
     height, width, _ = pixels.shape
-    camera, gain = fitting_camera(scene.camera, width, height), 2.0 ** check.number("exposure", exposure)
+    camera, gain = _fitting_camera(scene.camera, width, height), 2.0 ** check.number("exposure", exposure)
     renderer = Renderer(for_picture(replace(scene, camera=camera)), device=device, progress=progress)
     photo = wp.array(pixels[None] / gain, dtype=wp.vec3, device=renderer.device)
     with unrecorded():
@@ -85,7 +85,7 @@ def _overexposure(image: np.ndarray, photograph: np.ndarray, coverage: np.ndarra
     )
 
 
-def linear_photograph(photograph: npt.ArrayLike | AnyPath) -> np.ndarray:
+def _linear_photograph(photograph: npt.ArrayLike | AnyPath) -> np.ndarray:
     """Linear RGB of a photograph or of its file, float32 of shape [height, width, 3]."""
     if check.is_path(photograph):
         path = check.file("photograph", photograph)
@@ -97,7 +97,7 @@ def linear_photograph(photograph: npt.ArrayLike | AnyPath) -> np.ndarray:
     return pixels
 
 
-def fitting_camera(camera: Camera, width: int, height: int) -> Camera:
+def _fitting_camera(camera: Camera, width: int, height: int) -> Camera:
     """The camera for a photograph of another size; ValueError unless its proportions are the same up to a pixel."""
     if abs(width * camera.height - height * camera.width) > max(camera.width, camera.height, width, height):
         raise ValueError(

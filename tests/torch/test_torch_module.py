@@ -4,7 +4,7 @@ import json
 
 import pytest
 import torch
-from test_torch import small_scene, torch_device
+from tensors import small_scene
 
 import warpshadow as ws
 from warpshadow.torch import TorchRenderer
@@ -27,7 +27,7 @@ def test_it_has_what_its_scene_is_made_of_and_no_parameters(renderer):
 
 
 def test_moved_to_a_device_it_draws_there(device):
-    moved = network(TorchRenderer(small_scene(size=8))).to(torch_device(device))[1]
+    moved = network(TorchRenderer(small_scene(size=8))).to(device)[1]
     light = torch.ones(32, 3, device=moved.device)
     assert moved.device == light.device == moved(light).device
     assert torch.equal(moved(light), TorchRenderer(small_scene(size=8), device=moved.device)(light))
