@@ -387,7 +387,7 @@ def test_gradients_of_transmittance_past_parts_to_samples_are_exact(double, chec
     span = emitters.EmitterSpan(0, 0, 16, True)
 
     def transmittance(points, middles, areas, positions):
-        samples = emitters.PlacedSamples(middles, areas, bundles, balls)
+        samples = emitters.PlacedSamples(middles, areas, None, None, bundles, balls)
         around = blockers.placed(positions), blockers, (-1, -1)
         return past.find_log_transmittance_of_parts(points, normals, samples, span, *around)
 
@@ -766,6 +766,39 @@ def test_gradients_of_where_rays_leave_a_shell_are_exact(double, check):
     check(leave, *given, (wp.vec4d, np.array([[0.1, -0.2, 0.1, 2.2]])))
 
 
+@pytest.mark.parametrize("is_two_sided", [False, True])
+def test_gradients_of_light_of_emitters_are_exact(double, check, device, is_two_sided):
+    """Far from samples, beside their pieces, with pieces cut by the horizon, and at the rim of bent samples."""
+    emitters, light = double("stages.emitters.samples"), double("stages.emitters.light")
+    sparse = double("stages.sparse").SparseMatrix
+    corners = np.zeros((12, 3, 4))
+    for piece, face in enumerate(FACES[[0, 1, 2, 3] * 3]):
+        corners[piece, [0, 1, 2], face] = 1  # a sample of each face, and three more of others
+    areas = np.zeros((8, 4))
+    areas[np.arange(8), [0, 1, 2, 3, 0, 1, 2, 3]] = 0.7
+    middles = (areas / 0.7) @ np.stack([corners[face].mean(axis=0) for face in range(4)])
+    vertices, faces, of_corners = (
+        sparse.from_matrix(row, device=device) for row in (middles, areas, corners.reshape(36, 4))
+    )
+    constants = np.arange(0, 13)[[0, 1, 2, 3, 4, 5, 6, 7, 12]], np.full(8, 0.9), np.tile([0.0, 0.25], 4)
+    pieces = emitters.SamplePieces(
+        of_corners,
+        *(put(item, kind, device) for item, kind in zip(constants, (wp.int32, *[wp.float64] * 2), strict=True)),
+    )
+    face_corners = put(FACES, wp.vec3i, device)
+    first = np.array([0, 8])
+    samples = emitters.EmitterSamples(vertices, faces, pieces, None, face_corners, (0,), (is_two_sided,), first)
+    (span,) = samples.spans()
+    points = unit(random(3, 1, 16, 3)) * np.linspace(1.1, 7, 16)[:, None]
+    normals = unit(-points + 1.2 * random(4, 1, 16, 3))
+
+    def light_of(points, normals, positions, radiance):
+        return light.sum_light(points, normals, emitters.place_samples(positions, samples), radiance, span)
+
+    given = (wp.vec3d, points), (wp.vec3d, normals), (wp.vec3d, VERTICES[None]), (wp.vec3d, random(5, 1, 8, 3) ** 2)
+    check(light_of, *given)
+
+
 def beam_of_emitter(double, device):
     """Samples of a tetrahedron that emits within a cone, by its vertices."""
     emitters, beams = double("stages.emitters.samples"), double("stages.emitters.beams")
@@ -778,7 +811,8 @@ def beam_of_emitter(double, device):
     cone = np.array([beams.beam_of((20, 75))])
     made = emitters.EmitterBeams(cone, of_vertices, of_faces)
     corners = put(FACES, wp.vec3i, device)
-    samples = emitters.EmitterSamples(vertices, faces, None, corners, (0,), (False,), np.array([0, 8]), made)
+    pieces = emitters.SamplePieces(vertices, None, None, None)
+    samples = emitters.EmitterSamples(vertices, faces, pieces, None, corners, (0,), (False,), np.array([0, 8]), made)
     return emitters, beams, samples
 
 

@@ -379,5 +379,5 @@ def test_a_fit_finds_emission(free):
     parameters += {"emission and light": [inverse.Light(2)], "emission and pose": [inverse.Pose("ball")]}.get(free, [])
     still = None if free == "emission and pose" else ws.Visibility("directional")
     problem = inverse.Problem(start, inverse.Target(target), parameters, still=still)
-    result = inverse.fit(problem, [inverse.Stage(40)], progress=False)
+    result = inverse.fit(problem, [inverse.Stage(80)], progress=False)
     np.testing.assert_allclose(result.scene.bodies[0].emission, (6, 5, 4), rtol=0.05)

@@ -594,14 +594,24 @@ def transmittance_near(transmittance, normals, directions, cells, reach):
 # ---------------------------------------------------------------------------------------------------- emitters
 
 
-def light_of_samples(points, normals, samples, areas, radiance, transmittance, is_two_sided=False):
-    """Σ L T cos max(−A·ω, 0) / √(π² d⁴ + |A|²), [receiver, 3]."""
+def may_light(beam, area, normal, is_two_sided=False):
+    """Whether a part of a sample may light a receiver, given the way to it."""
+    facing = -beam @ area / np.linalg.norm(area) / np.linalg.norm(beam)
+    return beam @ normal > 0 and (facing > -0.3 or is_two_sided)
+
+
+def light_of_samples(points, normals, samples, areas, softness, radiance, transmittance, is_two_sided=False):
+    """Σ L T cos f(−A·ω) / √(π² d⁴ + |A|²), [receiver, 3], far from all samples."""
     beams = samples - points[:, None]
     distances = np.linalg.norm(beams, axis=-1)
     cosines = np.maximum(np.einsum("rsx,rx->rs", beams, normals) / distances, 0)
+    sizes = np.linalg.norm(areas, axis=-1)
     facing = -np.einsum("rsx,sx->rs", beams, areas) / distances
-    facing = np.abs(facing) if is_two_sided else np.maximum(facing, 0)
-    factors = cosines * facing / np.hypot(np.pi * distances**2, np.linalg.norm(areas, axis=-1))
+    facing = sum(
+        np.where(np.abs(side) < softness * sizes, (side + softness * sizes) ** 2 / (4 * softness * sizes), side.clip(0))
+        for side in ([facing, -facing] if is_two_sided else [facing])
+    )
+    factors = cosines * facing / np.hypot(np.pi * distances**2, sizes)
     return (factors * transmittance) @ radiance
 
 

@@ -3,9 +3,10 @@
     python demos/benchmarks/emitters.py [--by mitsuba|rays] [--size 96] [--bounces 0 all] [--scenes lamp table …]
         [--samples 4096] [--picture emitters.png]
 
-Errors are of all pixels but those that show a lamp, relative L2, noise of the reference taken off; "edges" are errors
-without the pixels where the reference jumps, beside shadows' edges and outlines; "far" is a renderer's error if the map
-is taken to be infinitely far away. CPU time is of a renderer's image of moved bodies, and of that with its gradient.
+Errors are of all pixels but those that show a lamp and those beside them, relative L2, noise of the reference taken
+off; "edges" are errors without the pixels where the reference jumps, beside shadows' edges and outlines; "far" is a
+renderer's error if the map is taken to be infinitely far away. CPU time is of a renderer's image of moved bodies, and
+of that with its gradient.
 Mitsuba knows no map on a sphere: scenes with one are compared by rays alone.
 """
 
@@ -141,9 +142,14 @@ SCENES = {
 
 
 def counted(reference: Reference, scene: ws.Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels that show no lamp, and those among them that are away from jumps, bool of shape [height, width]."""
+    """Pixels that show no lamp nor are beside one, and those among them away from jumps, bool [height, width]."""
     is_lamp = np.array([item.is_emitter for item in scene.bodies])
-    chosen = reference.covered & ~is_lamp[reference.body] & reference.is_whole
+    lamps = np.pad(is_lamp[reference.body] & (reference.body >= 0), 1)
+    height, width = reference.body.shape
+    beside = np.any(
+        [lamps[row : row + height, column : column + width] for row in range(3) for column in range(3)], axis=0
+    )
+    chosen = reference.covered & ~beside & reference.is_whole
     gray = reference.mean[..., :3].mean(axis=-1)
     jump = np.zeros(gray.shape, bool)
     for axis in (0, 1):

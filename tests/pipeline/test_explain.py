@@ -484,17 +484,13 @@ def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
         return "shading" if "_shade_cells" in key else "transfer"
     if module == "stages.image.film":
         return "averaging" if "average" in key else "radiance"
-    if module in (
-        "stages.receivers.find.sample_receivers",
-        "stages.receivers.find.receiver_means",
-        "stages.receivers.find.quadtree",
-    ):
+    if module in ("stages.receivers.sample_receivers", "stages.receivers.receiver_means", "stages.receivers.quadtree"):
         return "receivers"
     return {
         "stages.geometry.normals": "normals",
         "stages.raster.project": "clip positions",
         "stages.raster.sides": "sides",
-        "stages.receivers.find.find": "receivers",
+        "stages.receivers.find": "receivers",
         "stages.light.shading": "shading",
         "stages.image.slopes": "radiance",
     }[module]

@@ -78,7 +78,7 @@ def test_receivers_get_the_share_of_the_twin(angles, passes, device):
     arrays = [wp.array(item, dtype=wp.vec3, device=device) for item in (points, samples, 3 * axes)]
     through = None if transmittance is None else wp.array(transmittance, dtype=wp.float32, device=device)
     span = EmitterSpan(1, 8, 16, False, beam_of(angles))
-    got = within_beam(arrays[0], PlacedSamples(arrays[1], *arrays[:1] * 3, arrays[2]), span, through).numpy()
+    got = within_beam(arrays[0], PlacedSamples(arrays[1], *arrays[:1] * 5, arrays[2]), span, through).numpy()
     expected = np.array(
         [
             [[share(axes[batch, 1], point - sample, angles) for sample in samples[batch, 8:]] for point in points[0]]
@@ -93,7 +93,7 @@ def test_receivers_get_the_share_of_the_twin(angles, passes, device):
 def test_an_emitter_without_a_beam_launches_nothing(device):
     points = wp.zeros((1, 3), dtype=wp.vec3, device=device)
     through = wp.zeros((1, 3, 8), dtype=wp.float32, device=device)
-    placed = PlacedSamples(*[points] * 5)
+    placed = PlacedSamples(*[points] * 7)
     for transmittance in (through, None):
         assert within_beam(points, placed, EmitterSpan(0, 0, 8, False), transmittance) is transmittance
 
@@ -112,7 +112,7 @@ def test_cameras_see_the_share_of_the_twin(device):
     shown, (faces_array, positions_array, cameras, axes_array, owners) = arrays[0], arrays[1:]
     angles = [(10.0, 120.0), None, WIDE]
     beams = np.array([beam_of(item) for item in angles])
-    placed = PlacedSamples(*[positions_array] * 4, axes_array)
+    placed = PlacedSamples(*[positions_array] * 6, axes_array)
     arguments = Fragments(ids_array, weights_array), faces_array, positions_array, cameras, placed, owners, beams
     got = show_beams(shown, *arguments).numpy()
     expected = np.repeat(emission, 2, axis=0)

@@ -6,7 +6,7 @@ import twins
 import warp as wp
 
 import warpshadow as ws
-from warpshadow.stages.emitters.samples import EmitterSamples, find_sample_weights, place_samples
+from warpshadow.stages.emitters.samples import EmitterSamples, SamplePieces, find_sample_weights, place_samples
 from warpshadow.stages.gloss.highlights import sum_highlights
 from warpshadow.stages.sparse import SparseMatrix
 
@@ -24,7 +24,8 @@ def highlights(device, center, points, roughness, requires_grad=False):
     matrices = (SparseMatrix.from_matrix(weight, device=device) for weight in weights[:2])
     faces = wp.array(mesh.surface.faces, dtype=wp.vec3i, device=device)
     first = np.array([0, weights.vertices.shape[0]])
-    samples = EmitterSamples(*matrices, weights.surface_points, faces, (0,), (False,), first)
+    pieces = SamplePieces.of_emitters([weights], weights.corners, device)
+    samples = EmitterSamples(*matrices, pieces, weights.surface_points, faces, (0,), (False,), first)
     (span,) = samples.spans()
     placed = place_samples(wp.array((mesh.positions + center)[None], dtype=wp.vec3, device=device), samples)
     radiance = wp.full((1, span.size), wp.vec3(1.0), dtype=wp.vec3, device=device)

@@ -31,6 +31,7 @@ from warpshadow.pipeline.methods.by_name import make_method
 from warpshadow.pipeline.node import Clock, Input, Node
 from warpshadow.pipeline.receivers.choice_of_receivers import choose_receivers, receiver_notes, with_receivers
 from warpshadow.pipeline.receivers.lit_points import LitPoints
+from warpshadow.pipeline.receivers.unevenness import NearLight
 from warpshadow.pipeline.shading.transfers import Light, ShellLight, one_transfer
 from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.catchers import CatchersAlone
@@ -105,7 +106,12 @@ class SceneRenderer:
         with waiting("preparing", shows=progress):
             merged_scene = MergedScene(scene, device=self.device, progress=progress)
             with unrecorded():
-                self._choices = choose_receivers(merged_scene, self.cameras, is_light_free=basis is not None)
+                self._choices = choose_receivers(
+                    merged_scene,
+                    self.cameras,
+                    is_light_free=basis is not None,
+                    near_light=_find_near_light(merged_scene),
+                )
         self._given_scene, self.scene = scene, with_receivers(scene, self._choices)
         self.merged_scene = merged_scene.with_settings(self.scene)
         self._free_shapes = FreeShapes(self.merged_scene)
@@ -491,3 +497,12 @@ class SceneRenderer:
 def _light_of(inputs: ImageArrays) -> Light | None:
     """The light of an image, with its own shell where one is given."""
     return inputs.light if inputs.shell is None else ShellLight(inputs.light, inputs.shell)
+
+
+def _find_near_light(merged_scene: MergedScene) -> NearLight | None:
+    """Light of emitters for the choice of receivers; None without any."""
+    if not merged_scene.is_emitter.any():
+        return None
+    from warpshadow.pipeline.shading.emitters import SceneEmitters
+
+    return SceneEmitters(merged_scene).unshadowed_luminance

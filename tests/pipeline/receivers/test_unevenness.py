@@ -119,3 +119,28 @@ def test_sheets_are_lit_on_the_side_that_is_seen():
 
 def test_no_light_is_even():
     assert chosen(waves(light=ws.EnvironmentMap.constant(0.0)))[0].unevenness == 0
+
+
+def lit_by(lamp, *, mesh=None, receivers="auto"):
+    """A wall of short faces, with a thin panel in front of it, whose sides are strips of 4 cm."""
+    wall = ws.Body(mesh or ws.plane(4.0, 40), rotation=(90, 0, 0), name="wall", receivers=receivers)
+    box = trimesh.creation.box((1, 1, 0.04))
+    panel = ws.Body(ws.Mesh(box.vertices, box.faces), (0, 0, 0), emission=(8, 8, 8), translation=lamp).creased()
+    camera = ws.Camera.look_at((0, 0, 7.0), (0, 0, 0), fov_y=30, size=(48, 48))
+    return ws.Scene([wall, panel], ws.EnvironmentMap.constant(0.0), camera)
+
+
+def test_the_light_of_emitters_counts():
+    kept = [ws.Renderer(lit_by((0, 0, distance))).scene.bodies[0].receivers for distance in (0.03, 2.0)]
+    assert kept == ["pixel", "vertex"]
+
+
+def test_a_wall_that_a_lamp_nearly_touches_has_its_light():
+    """1 cm behind the lamp; the truth has receivers at vertices 1 cm apart."""
+    near = (0, 0, 0.03)
+    renderer = ws.Renderer(lit_by(near))
+    shows = renderer.layers().bodies == 0
+    truth = ws.Renderer(lit_by(near, mesh=ws.plane(4.0, 400), receivers="vertex")).render()[shows]
+    images = renderer.render(), ws.render(lit_by(near)), ws.Renderer(lit_by(near, receivers="vertex")).render()
+    kept, still, coarse = (np.linalg.norm(image[shows] - truth) / np.linalg.norm(truth) for image in images)
+    assert kept < 0.01 and still < 0.02 and coarse > 0.05

@@ -22,7 +22,7 @@ from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
-from warpshadow.pipeline.receivers.unevenness import light_unevenness
+from warpshadow.pipeline.receivers.unevenness import NearLight, light_unevenness
 from warpshadow.scene.body import Body
 from warpshadow.scene.scene import Scene, change_bodies
 from warpshadow.scene.visibility import AUTO, Visibility
@@ -95,7 +95,11 @@ class ReceiverChoice(NamedTuple):
 
 
 def choose_receivers(
-    merged_scene: MergedScene, cameras: Sequence[Camera], *, is_light_free: bool = False
+    merged_scene: MergedScene,
+    cameras: Sequence[Camera],
+    *,
+    is_light_free: bool = False,
+    near_light: NearLight | None = None,
 ) -> list[ReceiverChoice]:
     """Choose the receivers of the bodies that leave it open, as cameras see the scene.
 
@@ -106,6 +110,7 @@ def choose_receivers(
         merged_scene: The bodies.
         cameras: The cameras that see them.
         is_light_free: Whether light is given as coefficients, so that nobody knows where shadows will have edges.
+        near_light: Of emitters; None without any.
     """
     if merged_scene.scene.visibility.method == "ray-traced":  # every sample is a receiver, overriding the bodies
         return [ReceiverChoice(body.receivers, None) for body in merged_scene.scene.bodies]
@@ -134,7 +139,7 @@ def choose_receivers(
         seen = [(camera, *counted) for camera, counted in zip(cameras, faces, strict=True)]
         light = EnvironmentMap.constant() if is_light_free else merged_scene.scene.known_light
         bodies = np.flatnonzero(is_open).tolist()
-        unevenness[is_open] = light_unevenness(merged_scene, positions, seen, bodies, light)
+        unevenness[is_open] = light_unevenness(merged_scene, positions, seen, bodies, light, near_light)
     chosen = np.where(unevenness > UNEVEN, np.where(merged_scene.is_flat, where_edges_are, "pixel"), chosen)
     return [
         ReceiverChoice(choice if receivers == AUTO else receivers, size, float(error))

@@ -5,7 +5,8 @@ edge crosses is gray, however short it is in the image. Where much of a body's l
 vertices does not tell the light on it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import numpy as np
 import warp as wp
@@ -24,12 +25,17 @@ _RAYS = 64  # from a point, to cells by their light
 _FACES = 256  # of a body that are looked at, at most
 
 
+NearLight: TypeAlias = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Gives the luminance of light of emitters past no blockers, at points with unit normals, [point, 3]."""
+
+
 def light_unevenness(
     merged_scene: MergedScene,
     positions: np.ndarray,
     images: Sequence[tuple[Camera, np.ndarray, np.ndarray]],
     bodies: Sequence[int],
     light: KnownLight,
+    near_light: NearLight | None = None,
 ) -> np.ndarray:
     """Error of direct light on bodies that is interpolated between their vertices, over their pixels, relative L2.
 
@@ -39,7 +45,8 @@ def light_unevenness(
         images: Of each its camera, the faces that it shows, and their pixels, [face]; some are looked at, the same
             each time.
         bodies: Bodies to look at.
-        light: Their light.
+        light: Their light from afar.
+        near_light: That of emitters; None without any.
     Returns:
         Of each of these bodies, shape [body]; 0 where no image shows it.
     """
@@ -49,7 +56,7 @@ def light_unevenness(
     of_body = [np.flatnonzero(merged_scene.body_of_face[seen] == body) for body in bodies]
     chosen = [rows[:: -(-len(rows) // _FACES)] if len(rows) else rows for rows in of_body]
     rows = np.concatenate(chosen)
-    if not merged_scene.casting or not len(rows):
+    if not len(rows) or not (merged_scene.casting or near_light):
         return result
     vertices = wp.array(positions, dtype=wp.vec3, device=device)
     mesh = merged_scene.casting_mesh(vertices)
@@ -62,6 +69,8 @@ def light_unevenness(
     lengths = np.linalg.norm(point_normals, axis=2, keepdims=True)
     point_normals *= np.where(is_behind, -1, 1)[:, None, None] / lengths.clip(1e-30)
     received = _irradiance(mesh, points, point_normals, light, device)
+    if near_light is not None:
+        received += near_light(points.reshape(-1, 3), point_normals.reshape(-1, 3)).reshape(received.shape)
     at_middles, errors = received[:, 3], received[:, :3].mean(axis=1) - received[:, 3]
     first = 0
     for number, part in enumerate(chosen):

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 import warp as wp
 
+from warpshadow.assets.color import LUMINANCE
 from warpshadow.device.batch import common_batch, cut, rows
 from warpshadow.device.constants import constant
 from warpshadow.device.cuda_graph import is_readable
@@ -20,7 +21,7 @@ from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
-from warpshadow.pipeline.node import Input, Node
+from warpshadow.pipeline.node import Call, Clock, Input, Node
 from warpshadow.pipeline.receivers.groups import Blockers, Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.shading.transfers import joined
@@ -34,6 +35,7 @@ from warpshadow.stages.emitters.samples import (
     EmitterSamples,
     EmitterSpan,
     PlacedSamples,
+    SamplePieces,
     SampleWeights,
     SurfacePoints,
     find_sample_weights,
@@ -90,6 +92,7 @@ class SceneEmitters:
         return EmitterSamples(
             SparseMatrix.from_matrix(of_vertices, device=merged_scene.device),
             SparseMatrix.from_matrix(block_diag([item.faces for item in weights]), device=merged_scene.device),
+            self._find_pieces(vertices),
             SurfacePoints(np.concatenate(surface_faces), surface_weights),
             wp.array(merged_scene.faces.numpy()[is_emitting], dtype=wp.vec3i, device=merged_scene.device),
             tuple(bodies),
@@ -97,6 +100,16 @@ class SceneEmitters:
             np.cumsum([0, *(item.vertices.shape[0] for item in weights)]),
             self._find_beams(vertices),
         )
+
+    def _find_pieces(self, vertices: np.ndarray) -> SamplePieces:
+        """Pieces of the samples of all emitters, whose vertices are some of all."""
+        from scipy.sparse import block_diag, csr_matrix
+
+        weights, device = self._sample_weights, self._merged_scene.device
+        of_emitters = block_diag([item.corners for item in weights], format="csr")
+        shape = of_emitters.shape[0], int(self._merged_scene.first_vertex[-1])
+        corners = csr_matrix((of_emitters.data, vertices[of_emitters.indices], of_emitters.indptr), shape)
+        return SamplePieces.of_emitters(weights, corners, device)
 
     def _find_beams(self, vertices: np.ndarray) -> EmitterBeams | None:
         """Beams of the emitters, whose vertices are some of all; None where none has one."""
@@ -161,6 +174,22 @@ class SceneEmitters:
         surface, device = (mesh.positions, mesh.surface.faces), merged_scene.device
         with unrecorded():
             return find_self_visibility(*surface, *samples, is_two_sided=is_open, device=device)
+
+    def unshadowed_luminance(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Luminance of their light past no blockers, at points with unit normals, [point, 3]."""
+        scene, samples = self._merged_scene, self.samples
+        positions = np.concatenate([body.world_mesh().positions for body in scene.scene.bodies])
+        vertices, at_points, along_normals = (
+            wp.array(item[None], dtype=wp.vec3, device=scene.device) for item in (positions, points, normals)
+        )
+        placed_samples = place_samples(vertices, samples)
+        radiance = self.radiance(Materials.of_scene(scene)).value(Call(Clock()))
+        total = np.zeros(len(points))
+        for span in samples.spans():
+            inside = within_beam(at_points, placed_samples, span, None)
+            light = sum_light(at_points, along_normals, placed_samples, radiance, span, inside)
+            total += light.numpy()[0] @ LUMINANCE
+        return total
 
     def placed(self, points: LitPoints) -> Node:
         """Node of the samples among the bodies around points."""

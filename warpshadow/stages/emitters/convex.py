@@ -20,7 +20,7 @@ from warpshadow.device.launch import launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, scratch_slot, split_row
 from warpshadow.stages.convex.prepared import ConvexArrays, ConvexBlockers, PlacedParts
-from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, is_lit, sample_radius
+from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, may_light, sample_radius
 from warpshadow.stages.emitters.spheres import MIN_TRANSMITTANCE, log_transmittance, reaches_ball
 
 _COST = 40.0  # nanoseconds that a part takes
@@ -213,7 +213,9 @@ def _find_beam(receiver: LitReceiver, i: int):
     beam = Beam()
     beam.point = receiver.point
     beam.offset = receiver.sample_points[receiver.first_sample + i] - receiver.point
-    beam.radius = wp.where(is_lit(beam.offset, area, receiver.normal, receiver.is_two_sided), sample_radius(area), 0.0)
+    beam.radius = wp.where(
+        may_light(beam.offset, area, receiver.normal, receiver.is_two_sided), sample_radius(area), 0.0
+    )
     return beam
 
 

@@ -15,7 +15,7 @@ from warpshadow.device.batch import common_batch, expand, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import zeros
 from warpshadow.device.parallel import split_row
-from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, is_lit, sample_radius
+from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, may_light, sample_radius
 from warpshadow.stages.emitters.spheres import log_transmittance
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 
@@ -127,7 +127,7 @@ def _block_by_planes(
             for i in range(log_transmittances.shape[2]):
                 area = sample_areas[sample_batch, first_sample + i]
                 beam = sample_points[sample_batch, first_sample + i] - point
-                if is_lit(beam, area, normal, is_two_sided):
+                if may_light(beam, area, normal, is_two_sided):
                     share = _covered_share(grid, edges, origin, axis_u, axis_v, point, beam, sample_radius(area))
                     if share > 0.0:
                         wp.atomic_add(log_transmittances, batch, receiver, i, log_transmittance(share))

@@ -5,14 +5,21 @@ move with the body: of pieces p of faces f, with middles z_p,
 
     y_k = Σ_p |A_p| z_p / Σ_p |A_p|,   A_k = s_k Σ_p A_p,   A_p = share_p (b_f − a_f) × (c_f − a_f) / 2
 
-s_k, which is 1 for flat patches, gives bent ones their whole area at rest: the mean of max(A_k·ω, 0) over all
-directions ω is then that of the surface.
+A receiver in the direction ω has f = A_k·ω of it, if the patch is flat. Of one that is bent, such as a cap of a ball, a
+part looks beyond its horizon, so around 0 f is soft:
+
+    f → (f + w_k |A_k|)² / (4 w_k |A_k|) for |f| < w_k |A_k|,   1 + w_k² / 3 = S_k / |A_k|,   w_k ≤ 0.3
+
+S_k is the area of the patch at rest: the mean of f over all directions is then that of the surface. s_k, which is 1
+elsewhere, gives patches that are bent more their area.
+
+Receivers close by see the pieces themselves (:mod:`.light`).
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -35,7 +42,12 @@ SAMPLES = 64  # samples of an emitter
 
 SURFACE_POINTS = 32  # points of each sample to which rays go
 
-_MAX_STRETCH = 4.0  # greatest s
+_MAX_STRETCH = 4.0  # greatest S_k / |A_k|
+
+_MAX_SOFTNESS = wp.constant(0.3)  # greatest w
+
+_TRIANGLE_POINTS = np.full((3, 3), 1 / 6) + np.eye(3) / 2
+"""Barycentric coordinates of three points that have the second moments of a triangle."""
 
 
 class SurfacePoints(NamedTuple):
@@ -50,6 +62,10 @@ class SampleWeights(NamedTuple):
 
     vertices: csr_matrix  # of its vertices in the samples' middles, [sample, vertex]
     faces: csr_matrix  # of its faces' area vectors in those of samples, [sample, face]
+    corners: csr_matrix  # of its vertices in those of the samples' pieces, [3 · piece, vertex]
+    first_pieces: np.ndarray  # where the pieces of each begin, and the end of the last, [sample + 1]
+    elongations: np.ndarray  # square of half the diagonal over the area, float32 of shape [sample]
+    softness: np.ndarray  # w, float32 of shape [sample]
     surface_points: SurfacePoints
     patches: Patches
     patch_of_samples: np.ndarray  # the patch that each stands for, [sample]
@@ -83,19 +99,55 @@ def find_sample_weights(
     of_vertices = csr_matrix(
         (middles.ravel(), (np.repeat(labels, 3), faces[owners].ravel())), shape=(patch_count, len(positions))
     )
-    of_faces = diags(stretch) @ csr_matrix((shares, (labels, owners)), shape=(patch_count, len(faces)))
+    softness = np.minimum(np.sqrt(3 * (stretch - 1)), _MAX_SOFTNESS)
+    of_faces = diags(stretch / (1 + softness**2 / 3)) @ csr_matrix(
+        (shares, (labels, owners)), shape=(patch_count, len(faces))
+    )
     permutation = compact_order(of_vertices @ positions.astype(np.float64), runs=(SAMPLE_BUNDLE,))
     padding = np.full(-patch_count % SAMPLE_BUNDLE, permutation[-1] if patch_count else 0)
     is_real = np.repeat([1.0, 0.0], [patch_count, len(padding)])
     chosen = np.concatenate([permutation, padding]).astype(int)
+    permutation_of_pieces, first_pieces = _pieces_of_samples(labels, chosen)
+    owners_of_corners = faces[owners[permutation_of_pieces]]
+    of_corners = csr_matrix(
+        (
+            pieces.corners[is_used][permutation_of_pieces].ravel(),
+            np.repeat(owners_of_corners[:, None], 3, axis=1).ravel(),
+            np.arange(0, 9 * len(permutation_of_pieces) + 1, 3),
+        ),
+        shape=(3 * len(permutation_of_pieces), len(positions)),
+    )
     surface_points = _find_surface_points(owners, pieces.corners[is_used], corners[is_used], labels, areas)
     return SampleWeights(
         of_vertices[chosen].tocsr(),
         (diags(is_real) @ of_faces[chosen]).tocsr(),
+        of_corners,
+        first_pieces,
+        _find_elongations(corners[is_used], labels, areas)[chosen].astype(np.float32),
+        softness[chosen].astype(np.float32),
         SurfacePoints(*(item[chosen] for item in surface_points)),
         patches,
         chosen,
     )
+
+
+def _pieces_of_samples(labels: np.ndarray, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pieces sorted by sample, and where those of each begin, given the patch of each piece and of each sample."""
+    permutation = np.argsort(labels, kind="stable")
+    starts = np.searchsorted(labels[permutation], np.arange(int(labels.max(initial=-1)) + 2))
+    spans = [permutation[starts[patch] : starts[patch + 1]] for patch in chosen]
+    return np.concatenate([*spans, np.zeros(0, int)]), np.cumsum([0, *(len(span) for span in spans)])
+
+
+def _find_elongations(corners: np.ndarray, labels: np.ndarray, areas: np.ndarray) -> np.ndarray:
+    """Squares of half the diagonal of samples over their areas, given the corners, samples and areas of pieces."""
+    points, weights = _TRIANGLE_POINTS @ corners, areas[:, None, None] / 3
+    totals = np.bincount(labels, areas)
+    means, squares = (
+        np.stack([np.bincount(labels, (weights * powers).sum(axis=1)[:, k]) for k in range(3)]) / totals
+        for powers in (points, points**2)
+    )
+    return 3 * (squares - means**2).sum(axis=0) / totals  # a rectangle a × b has the moments a²/12 and b²/12
 
 
 def _find_surface_points(
@@ -152,12 +204,42 @@ class EmitterSpan(NamedTuple):
         return self.end - self.first
 
 
+class SamplePieces(NamedTuple):
+    """Triangles that samples are made of.
+
+    Args:
+        corners: Weights of all vertices in their corners, [3 · piece, vertex].
+        first: Where those of each sample begin, and the end of the last, int32 of shape [sample + 1].
+        elongations: Square of half a sample's diagonal over its area, float32 of shape [sample].
+        softness: w of each, float32 of shape [sample].
+    """
+
+    corners: SparseMatrix
+    first: wp.array
+    elongations: wp.array
+    softness: wp.array
+
+    @classmethod
+    def of_emitters(cls, weights: Sequence[SampleWeights], corners: csr_matrix, device: wp.DeviceLike) -> SamplePieces:
+        """Of the samples of some emitters, given the weights of all vertices in the corners of their pieces."""
+        first = np.cumsum([0, *itertools.chain.from_iterable(np.diff(item.first_pieces) for item in weights)])
+        matrix, starts = (
+            SparseMatrix.from_matrix(corners, device=device),
+            wp.array(first, dtype=wp.int32, device=device),
+        )
+        constants = zip(*((item.elongations, item.softness) for item in weights), strict=True)
+        return cls(
+            matrix, starts, *(wp.array(np.concatenate(item), dtype=wp.float32, device=device) for item in constants)
+        )
+
+
 class EmitterSamples(NamedTuple):
     """Samples of all emitters of a scene.
 
     Args:
         vertices: Weights of all vertices in the samples' middles, [sample, vertex].
         face_shares: Weights of the emitting faces in the samples' area vectors, [sample, face].
+        pieces: Pieces of each sample.
         surface_points: Points of the samples, on ``faces``.
         faces: Emitting faces, vec3i of shape [face].
         bodies: The emitters, by number.
@@ -168,6 +250,7 @@ class EmitterSamples(NamedTuple):
 
     vertices: SparseMatrix
     face_shares: SparseMatrix
+    pieces: SamplePieces
     surface_points: SurfacePoints
     faces: wp.array
     bodies: tuple[int, ...]
@@ -188,6 +271,8 @@ class PlacedSamples(NamedTuple):
     Args:
         points: Middles y [scene units], vec3 of shape [batch, sample].
         areas: Area vectors A [square of scene units], vec3 of shape [batch, sample].
+        corners: Of their pieces [scene units], vec3 of shape [batch, 3 · piece].
+        pieces: Which pieces belong to which sample.
         bundles: Middle and radius of a sphere around each bundle, vec4 of shape [batch, bundle], without a gradient.
         balls: The same of each emitter, vec4 of shape [batch, emitter].
         axes: Of the emitters' beams, of any length, vec3 of shape [batch, emitter]; None where none has one.
@@ -195,6 +280,8 @@ class PlacedSamples(NamedTuple):
 
     points: wp.array
     areas: wp.array
+    corners: wp.array
+    pieces: SamplePieces
     bundles: wp.array
     balls: wp.array
     axes: wp.array | None = None
@@ -265,10 +352,31 @@ def sample_radius(area: wp.vec3):
 
 
 @wp.func
-def is_lit(beam: wp.vec3, area: wp.vec3, normal: wp.vec3, is_two_sided: int):
-    """Whether a receiver and a sample face each other, given the way from the receiver to the sample."""
+def facing_area(beam: wp.vec3, area: wp.vec3, softness: float, is_two_sided: int):
+    """Area of a sample that a receiver sees, times the length of the way to it: that of its front, or of both sides."""
+    facing = -wp.dot(beam, area)
+    width = softness * wp.length(area) * wp.length(beam)
+    seen = _soft_positive(facing, width)
+    if is_two_sided == 1:
+        seen = seen + _soft_positive(-facing, width)
+    return seen
+
+
+@wp.func
+def _soft_positive(value: float, width: float):
+    """The maximum of a value and 0, soft where it is closer to 0 than a width."""
+    if wp.abs(value) < width:
+        share = (value / width + 1.0) / 2.0
+        return width * share * share
+    return wp.max(value, 0.0)
+
+
+@wp.func
+def may_light(beam: wp.vec3, area: wp.vec3, normal: wp.vec3, is_two_sided: int):
+    """Whether a part of a sample may light a receiver; a bent one does by its rim where its middle just faces away."""
     facing = wp.dot(beam, area)
-    return wp.dot(beam, normal) > 0.0 and (facing < 0.0 or (facing > 0.0 and is_two_sided == 1))
+    rim = _MAX_SOFTNESS * wp.length(beam) * wp.length(area)
+    return wp.dot(beam, normal) > 0.0 and (facing < rim or is_two_sided == 1)
 
 
 @wp.func
@@ -299,4 +407,5 @@ def place_samples(positions: wp.array, samples: EmitterSamples) -> PlacedSamples
     if samples.beams is not None:
         of_vertices = multiply(samples.beams.vertices, positions)
         axes = multiply(samples.beams.faces, vectors, addend=of_vertices)
-    return PlacedSamples(points, areas, bundles, balls, axes)
+    corners = multiply(samples.pieces.corners, positions)
+    return PlacedSamples(points, areas, corners, samples.pieces, bundles, balls, axes)

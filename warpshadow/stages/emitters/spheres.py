@@ -18,7 +18,7 @@ from warpshadow.device.batch import common_batch, expand, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import zeros
 from warpshadow.device.parallel import split_row
-from warpshadow.stages.emitters.samples import SAMPLE_BUNDLE, EmitterSpan, PlacedSamples, is_lit, sample_radius
+from warpshadow.stages.emitters.samples import SAMPLE_BUNDLE, EmitterSpan, PlacedSamples, may_light, sample_radius
 
 _SOFTNESS = 0.05  # κ: least half-width of the edge of a sphere's shadow, in its radii
 MIN_TRANSMITTANCE = 1.0e-4  # of a sphere
@@ -116,7 +116,7 @@ def _block_by_spheres(
                         area = sample_areas[sample_batch, first + i]
                         beam = sample_points[sample_batch, first + i] - point
                         share = float(0.0)
-                        if is_lit(beam, area, normal, is_two_sided):
+                        if may_light(beam, area, normal, is_two_sided):
                             share = _blocked_share(offset, beam, sample_radius(area), radius)
                         if share > 0.0:
                             index = bundle * SAMPLE_BUNDLE + i

@@ -17,7 +17,7 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.stages.emitters.beams import beam_share
-from warpshadow.stages.emitters.samples import SURFACE_POINTS, EmitterSamples, EmitterSpan, is_lit
+from warpshadow.stages.emitters.samples import SURFACE_POINTS, EmitterSamples, EmitterSpan, may_light
 from warpshadow.stages.raster.interpolation import interpolate_at
 from warpshadow.stages.rays.ray_tracing import RAY_COST, mesh_id, progress_slices, sees_point
 from warpshadow.stages.textures.pyramid import Textures
@@ -227,7 +227,7 @@ def _trace_transmittance(
     normal = normals[receiver]
     for i in range(transmittance.shape[1]):
         sample = first_sample + i
-        is_sending = is_lit(sample_points[sample] - point, sample_areas[sample], normal, is_two_sided)
+        is_sending = may_light(sample_points[sample] - point, sample_areas[sample], normal, is_two_sided)
         open_weight = float(0.0)
         total_weight = float(0.0)
         point_count = surface.point_faces.shape[1]

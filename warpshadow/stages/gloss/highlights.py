@@ -17,7 +17,7 @@ from warpshadow.device.batch import common_batch, expand, expand_rows, instance_
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
-from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, is_lit, sample_transmittance
+from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, facing_area, may_light, sample_transmittance
 from warpshadow.stages.gloss.lobes import MAX_COSINE, MIN_COSINE, MIN_ROUGHNESS
 from warpshadow.stages.gloss.reflection import LobeLight
 from warpshadow.stages.raster.project import eye_position
@@ -48,6 +48,7 @@ def _sum_highlights(
     clip_matrices: wp.array(dtype=wp.mat44),
     sample_points: wp.array2d(dtype=wp.vec3),
     sample_areas: wp.array2d(dtype=wp.vec3),
+    softness: wp.array(dtype=wp.float32),
     radiance: wp.array2d(dtype=wp.vec3),
     first_sample: int,
     sample_count: int,
@@ -72,11 +73,11 @@ def _sum_highlights(
     for i in range(sample_count):
         beam = sample_points[sample_batch, first_sample + i] - point
         area = sample_areas[sample_batch, first_sample + i]
-        if is_lit(beam, area, normal, is_two_sided):
+        if may_light(beam, area, normal, is_two_sided):
             distance2 = wp.length_sq(beam)
             distance = wp.sqrt(distance2)
             # pi d² facing / √(π² d⁴ + |A|²), as for diffuse light
-            solid_angle = wp.pi * wp.abs(wp.dot(beam, area)) / distance
+            solid_angle = wp.pi * facing_area(beam, area, softness[first_sample + i], is_two_sided) / distance
             solid_angle = solid_angle / wp.sqrt(wp.pi * wp.pi * distance2 * distance2 + wp.length_sq(area))
             cosine = wp.dot(beam, normal) / distance
             mirror = wp.normalize(view + beam / distance)
@@ -122,7 +123,16 @@ def sum_highlights(
         _sum_highlights,
         count * points.shape[1],
         inputs=[
-            *(points, normals, roughness, clip_matrices, samples.points, samples.areas, radiance),
+            *(
+                points,
+                normals,
+                roughness,
+                clip_matrices,
+                samples.points,
+                samples.areas,
+                samples.pieces.softness,
+                radiance,
+            ),
             *(span.first, span.size, int(span.is_two_sided)),
             None if transmittance is None else expand_rows(transmittance, count),
         ],
