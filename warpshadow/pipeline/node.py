@@ -57,11 +57,6 @@ class Input:
         use(self._value)
         return self._value
 
-    @property
-    def is_free(self) -> bool:
-        """Whether the value of an input of light is free light, an array, and not known light."""
-        return isinstance(self.value(), wp.array)
-
     @classmethod
     def renewed(cls, name: str, value: Any, last: "Input | None") -> "Input":
         """Make an input with a copy of the value, or return the last input if the value is the same.

@@ -84,8 +84,6 @@ class LitPoints:
         self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
         self.call, self.static_bodies = call, static_bodies
         self.normals = Node("", vertex_normals, vertices, merged_scene.faces) if normals is None else normals
-        self.last_light: Any = None  # that was known, but for the scene's: a ``LightInput``
-        self.last_shell: Input | None = None  # of light, but for the scene's
         self._cached: dict[str, tuple[Hashable, Any]] = {}
         self._cached_of_bodies: dict[str, tuple[Hashable, Any]] = {}
         if neighbors is not None:
@@ -95,6 +93,10 @@ class LitPoints:
         """A value for the points, such as a node, cached under a name while its inputs stay the same."""
         return _cached(self._cached, name, key, make)
 
+    def last_cached(self, name: str) -> Any:
+        """The value cached under a name, whatever it was made from; None without one."""
+        return self._cached.get(name, (None, None))[1]
+
     def cached_of_bodies(self, name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:
         """The same of a value that is equal for all points among the same bodies."""
         return _cached(self._cached_of_bodies, name, key, make)
@@ -103,7 +105,7 @@ class LitPoints:
         """Other receivers, of which nothing is cached, among the same blockers, any of which may move."""
         points = copy.copy(self)
         points.receivers_node, points.static_bodies, points.is_scene_view = receivers, None, False
-        points._cached, points.last_light, points.last_shell = {}, None, None
+        points._cached = {}
         return points
 
     def preview(self: Points) -> Points:

@@ -44,6 +44,11 @@ class LightInput(Input):
         self.shell = shell
 
     @property
+    def is_free(self) -> bool:
+        """Whether it is free light, an array, and not known light."""
+        return isinstance(self.value(), wp.array)
+
+    @property
     def visibility_key(self) -> Input | None:
         """The input of visibility beside points and blockers.
 
@@ -197,11 +202,9 @@ class Method:
         shell = self._shell_input(points, light, own_shell)
         if isinstance(light, wp.array):
             return LightInput(light, shell, news="light is given")
-        known, last = self.light.value() if light is None else as_light(light), points.last_light
-        if last is not None and last.shell is shell and last.value() == known:
-            return last
-        points.last_light = LightInput(known, shell, news="light changed since the last call" if last else "")
-        return points.last_light
+        known = self.light.value() if light is None else as_light(light)
+        news = "" if points.last_cached("light") is None else "light changed since the last call"
+        return points.cached("light", (known, shell), lambda: LightInput(known, shell, news=news))
 
     def _shell_input(self, points: LitPoints, light: Light | None, shell: wp.array | None) -> Input | None:
         """The shell of light that is not the scene's, the same while its values are; None for the scene's."""
@@ -215,8 +218,8 @@ class Method:
                 "scene's light has to have one: EnvironmentMap(…, radius=…)"
             )
         check_shell(shell)
-        points.last_shell = Input.renewed("shell", shell, points.last_shell)
-        return points.last_shell
+        renewed = Input.renewed("shell", shell, points.last_cached("shell"))
+        return points.cached("shell", renewed, lambda: renewed)
 
     def shell_of(self, light: LightInput) -> Input | wp.array | None:
         """Center and radius of the sphere that sends light, vec4 of shape [batch]; None for light infinitely far."""
