@@ -27,8 +27,9 @@ from typing import TYPE_CHECKING
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints
-from warpshadow.pipeline.shading.method import LightInput, Method, add_light
+from warpshadow.pipeline.shading.method import LightInput, Method
 from warpshadow.pipeline.shading.transfers import Light
+from warpshadow.stages.sums import add_light
 
 if TYPE_CHECKING:  # they are imported where light bounces
     from warpshadow.pipeline.bounces.moving_bounces import MovingBounces

@@ -38,8 +38,8 @@ from warpshadow.pipeline.shading.transfers import joined
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.patch_weights import PatchWeights, find_mean_transmittance, find_patch_weights
 from warpshadow.stages.bounces.radiosity import patch_radiosity
-from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.sums import add_light
 
 
 class PortionVisibility(NamedTuple):
@@ -129,7 +129,7 @@ def _add_emitted(lit: list[PortionDirectLight], emitted: wp.array) -> list[Porti
     result, first = [], 0
     for portion in lit:
         end = first + portion.direct.shape[1]
-        result.append(portion._replace(direct=total_light([portion.direct, cut(emitted, first, end)])))
+        result.append(portion._replace(direct=add_light(portion.direct, cut(emitted, first, end))))
         first = end
     return result
 
@@ -209,7 +209,7 @@ class Radiosity(Node):
     def _light(self, call: Call, portion: PortionDirectLight, outgoing: OutgoingRadiance) -> wp.array:
         """Light of a portion of the patch samples past its own body, from the sky and from others."""
         bounced = self._gathering.lights(self, call, portion.group, portion.cells, outgoing)
-        return total_light([portion.direct, *bounced])
+        return add_light(portion.direct, *bounced)
 
 
 class BouncedShading(PortionedDirectLight):
@@ -244,7 +244,7 @@ class BouncedShading(PortionedDirectLight):
 
     def _bounced(self, call: Call, portion: PortionDirectLight, outgoing: OutgoingRadiance) -> wp.array:
         bounced = self._gathering.lights(self, call, portion.group, portion.cells, outgoing)
-        return total_light([portion.direct, *bounced])
+        return add_light(portion.direct, *bounced)
 
 
 class MovingBounces:

@@ -12,11 +12,11 @@ from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
-from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.light_samples import sample_map
 from warpshadow.stages.path_tracing import PathSurfaces, trace_bounces
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.shell.beams import FAR
+from warpshadow.stages.sums import add_light
 from warpshadow.stages.textures.pyramid import Textures
 
 if TYPE_CHECKING:  # it is imported where bodies emit
@@ -116,7 +116,7 @@ def path_traced(
             options = {"bounces": bounces, "paths": paths, "shell": of_instance(shells), "progress": progress}
             light = trace_bounces(surfaces, *places, drawn, **options)
             wp.copy(bounced[instance], light)
-        return total_light([shading, bounced])
+        return add_light(shading, bounced)
 
     words = points.in_words
     return Node(

@@ -26,7 +26,6 @@ from warpshadow.pipeline.receivers.groups import Blockers, Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.shading.transfers import joined
 from warpshadow.stages.bounces.albedo import mean_over_texels
-from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.emitters.beams import find_axis_weights, within_beam
 from warpshadow.stages.emitters.convex import find_log_transmittance_of_parts
 from warpshadow.stages.emitters.light import directions_to_samples, sum_light
@@ -55,6 +54,7 @@ from warpshadow.stages.joint_coverage import transmittance_past
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
+from warpshadow.stages.sums import add_light
 
 EMITTER_CELLS = fibonacci(512)
 """Cells in which receivers look up the self-visibility of their body. With 128 in place of 512, a bear and a bunny at
@@ -207,7 +207,7 @@ class SceneEmitters:
         ) -> wp.array:
             lit = receivers.points, receivers.normals, placed_samples, radiance
             pairs = self._within_beams(receivers, placed_samples, transmittance)
-            return total_light([sum_light(*lit, span, transmittance=item) for span, item in pairs])
+            return add_light(*(sum_light(*lit, span, transmittance=item) for span, item in pairs))
 
         return Node(name, light, receivers, placed, radiance, transmittance)
 
@@ -227,7 +227,7 @@ class SceneEmitters:
             seen = receivers.points, receivers.normals, roughness, clip_matrices, placed_samples, radiance
             pairs = self._within_beams(receivers, placed_samples, transmittance)
             of_emitters = [sum_highlights(*seen, span, transmittance=item) for span, item in pairs]
-            return LobeLight(*(total_light(list(parts)) for parts in zip(*of_emitters, strict=True)))
+            return LobeLight(*(add_light(*parts) for parts in zip(*of_emitters, strict=True)))
 
         return Node("highlights", highlights, receivers, placed, radiance, transmittance, roughness, cameras)
 
@@ -263,7 +263,7 @@ def find_emitted_light(
         total = wp.zeros(portion.points.shape, dtype=wp.vec3, device=portion.points.device)
         for span, transmittances in _find_transmittances(emitters, self_visibility, portion, blockers, placed_samples):
             lit = portion.points, portion.normals, placed_samples, radiance, span
-            total = total_light([total, sum_light(*lit, **transmittances)])
+            total = add_light(total, sum_light(*lit, **transmittances))
         return total
 
     return joined([light_of(portion) for group in groups for portion in group.portions()])
@@ -298,7 +298,7 @@ def find_highlights(
                 emitters, self_visibility, portion, blockers, placed_samples
             )
         ]
-        lobe_sums.append([total_light([zeros, *parts]) for parts in zip(*of_emitters, strict=True)] or [zeros, zeros])
+        lobe_sums.append([add_light(zeros, *parts) for parts in zip(*of_emitters, strict=True)] or [zeros, zeros])
         first = end
     return LobeLight(*(joined(list(portions)) for portions in zip(*lobe_sums, strict=True)))
 

@@ -16,7 +16,7 @@ from warpshadow.device.constants import constant
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node, detached, field_of
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
-from warpshadow.pipeline.shading.method import LightInput, Method, add_light
+from warpshadow.pipeline.shading.method import LightInput, Method
 from warpshadow.pipeline.shading.transfers import Light, change_basis
 from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.stages.gloss.lobes import LobeSamples, sample_lobes
@@ -28,6 +28,7 @@ from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sample_receivers import Span
 from warpshadow.stages.shell.beams import exits_from_shell
+from warpshadow.stages.sums import add_light
 from warpshadow.stages.textures.footprint import Footprints
 from warpshadow.stages.textures.numbers import as_colors, as_scalars, means_of_receivers
 from warpshadow.stages.textures.pyramid import Textures

@@ -322,10 +322,3 @@ class Method:
     def openness(self, points: LitPoints) -> Node | None:
         """Light that points reflect as white surfaces under an even sky of 1; None where rays find it on average."""
         return None
-
-
-def add_light(*summands: wp.array) -> wp.array:
-    """Add light of several kinds. Differentiable: summands."""
-    from warpshadow.stages.bounces.total import total_light
-
-    return total_light(summands)
