@@ -211,7 +211,7 @@ class SceneRenderer:
     def _scene_view(self) -> View:
         """Build the view of the cameras on the scene; a warning tells of coarse faces."""
         view = self.view()
-        if not self._method.lights_samples:
+        if not self._method.every_sample_receives:
             warn_of_vertex_receivers(view, self._given_scene.bodies, self.cameras[0])
         return view
 
@@ -469,7 +469,7 @@ class SceneRenderer:
         light, materials = _light_of(inputs), self.materials(inputs.of_bodies)
         image = preview.image(light, materials)
         is_host = self.device.is_cpu or self.clock.waits
-        of_receivers = receiver_notes(self._given_scene, self._choices, view.blocker_kinds.bulging)
+        of_receivers = receiver_notes(self._given_scene, self._choices, view.blocker_kinds.bulging_bodies)
         of_bounces = self._transport.notes(preview, light, materials)
         notes = [*of_receivers, *of_bounces, *shell_notes(self.scene.shell)]
         return Explanation(

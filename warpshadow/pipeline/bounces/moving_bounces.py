@@ -273,13 +273,16 @@ class MovingBounces:
             materials: Reflectance of the bodies.
         """
         method, senders = self._method, self._patches.senders(materials)
-        projected_light, projection = method.projected(points, light), method.projection(points, light)
+        projected_light, visibility_light = (
+            method.projected_light(points, light),
+            method.light_of_visibility(points, light),
+        )
         if not senders.bodies:
             idle = NodeStage("bounces", idle="every body is black")
             return PortionedShading(method, points, projected_light, light, joined, stages=(idle,))
         proxies = self._proxies.setdefault(senders, Proxies(senders, method.visibility.merging))
         make_visibility = functools.partial(
-            PortionedVisibility, method, projected_light=projection, light=light, finish=list, is_shaded=False
+            PortionedVisibility, method, projected_light=visibility_light, light=light, finish=list, is_shaded=False
         )
         key, is_cached = light.visibility_key, light.is_free or materials is not points.materials
         visibility = points.cached("visibility", (key, is_cached), lambda: make_visibility(points, caches=is_cached))
@@ -287,7 +290,7 @@ class MovingBounces:
             "of patch samples", (key, senders), lambda: self._patch_samples(make_visibility, proxies, points)
         )
         radiosity = self._radiosity(of_patch_samples, projected_light, proxies, materials)
-        item_text = functools.partial(receiver_text, points.in_words)
+        item_text = functools.partial(receiver_text, points.weak)
         at_points = self._gathering(senders, item_text)
         return BouncedShading(visibility, projected_light, item_text, radiosity, at_points)
 

@@ -70,7 +70,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         is_near = merged_scene.scene.shell is not None
         native_basis = PATCHES if is_near else CellBasis(self._directions)
         super().__init__(merged_scene, native_basis, basis, progress=progress)
-        self.free_projection = ProjectedCells(
+        self.free_basis = ProjectedCells(
             self._directions, patches=None if self.shell is None else ShellPatches(self.shell)
         )
 
@@ -81,7 +81,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         """
         if shell is not None:
             patches, radiance = project_on_shell(light, shell)
-            return self.free_projection._replace(patches=patches, coefficients=radiance)
+            return self.free_basis._replace(patches=patches, coefficients=radiance)
         blockers = self.scene_blockers
         return project_on_cells(
             light,
@@ -95,9 +95,9 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     def _on_device(self, coefficients: np.ndarray) -> wp.array:
         return constant(coefficients[None], wp.vec3, self.merged_scene.device)
 
-    def project_free_light(self, shell: wp.array) -> ProjectedCells:
+    def free_basis_of_shell(self, shell: wp.array) -> ProjectedCells:
         """The basis of free light of another shell than the scene's. Differentiable: shell."""
-        return self.free_projection._replace(patches=ShellPatches(shell))
+        return self.free_basis._replace(patches=ShellPatches(shell))
 
     def coefficient_count(self, light: Input | None) -> int:
         """Number of coefficients that take part: all."""
@@ -127,7 +127,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
             cover = functools.partial(group.convex_parts_around.coverage, points, horizon_normals)
             parts = self._coverages(cover, projected_light)
         # planes multiply their share in later; only bounces need the product without them, too
-        if group.is_before_planes and not self.merged_scene.scene.bounces:
+        if group.is_blocked_by_planes and not self.merged_scene.scene.bounces:
             return CellVisibility(
                 directions, None, transmittance_self, transmittance_self_and_spheres=past_spheres, part_coverages=parts
             )
@@ -190,7 +190,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         return {"softness": scale * self.visibility.softness, "merging": scale * self.visibility.merging}
 
     @functools.cached_property
-    def emitter_projection(self) -> ProjectedCells:
+    def emitter_cells(self) -> ProjectedCells:
         """Even light in cells that are finer than those of the map: emitters are small."""
         from warpshadow.pipeline.shading.emitters import EMITTER_CELLS
 
@@ -210,7 +210,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     ) -> CellVisibility:
         """Transmittance past the flat bodies around a group, too."""
         planes = group.planes
-        if planes is None or not group.is_before_planes:
+        if planes is None or not group.is_blocked_by_planes:
             return visibility
         horizon_normals = group.normals if group.cached_rows is None else None
         points, fronts = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
@@ -295,7 +295,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         light = light[:, None] * [CHUNK / len(power), 0, 0]
         return SharpestCells(directions, self._on_device(light), scale, radius, power)
 
-    def sharp_share(self, group: Group) -> np.ndarray | None:
+    def share_of_sharpest_light(self, group: Group) -> np.ndarray | None:
         """Share of a group's unblocked light that still comes from the sharpest cells; None where nothing blocks."""
         directions, light, scale, radius, power = self._sharpest_cells
         points, normals, centers, radii = group[:4]
@@ -311,7 +311,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         if group.convex_parts_around is not None:
             coverages.append(group.convex_parts_around.coverage(points, normals, directions, radius))
         planes = group.planes
-        if planes is not None and group.is_before_planes:
+        if planes is not None and group.is_blocked_by_planes:
             lifted, fronts = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
             options: dict[str, Any] = {"radius": radius, "horizon_normals": normals, "fronts": fronts}
             coverages.append(
@@ -320,7 +320,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         if coverages:
             transmittance = transmittance_past(transmittance, *coverages)
         lit = shade_cells(transmittance, normals, directions, light, maximum=LARGEST_COEFFICIENT).numpy()[..., 0]
-        receiver_normals, towards = normals.numpy(), self.free_projection.directions
+        receiver_normals, towards = normals.numpy(), self.free_basis.directions
         plane_normals = receiver_normals[:, :1]  # points of a plane have this normal or its opposite
         facing = plane_normals @ towards.T  # [batch, 1, cell]
         whole = [4 / len(power) * np.maximum(cosines, 0) @ power for cosines in (facing, -facing)]
@@ -331,7 +331,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     def lobe_transmittance(self, points: LitPoints, directions: Node, light: LightInput, view: LitPoints) -> Node:
         """Transmittance towards the samples of lobes, between cells; of known light, to where it comes from in them."""
         cells, projected_light = self._lobe_cells(points, light, view)
-        item_text = functools.partial(receiver_text, points.in_words)
+        item_text = functools.partial(receiver_text, points.weak)
         arguments = cells, points.receivers_node, directions, projected_light
         return Node("transmittance of lobes", _towards, *arguments, items=item_text)
 
@@ -383,7 +383,9 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
 
     def _shading_with_cells(self, view: LitPoints, light: LightInput) -> Node:
         """Node of the shading of a view in known light, and of the transmittance of its glossy receivers' cells."""
-        make = functools.partial(ShadingWithCells, self, view, self.projected(view, light), light, _joined_with_cells)
+        make = functools.partial(
+            ShadingWithCells, self, view, self.projected_light(view, light), light, _joined_with_cells
+        )
         return self.cached_for_light("direct with cells", view, light, make)
 
     def _lobe_cells(self, points: LitPoints, light: LightInput, view: LitPoints) -> tuple[Node, Node | ProjectedCells]:
@@ -391,14 +393,16 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
 
         In known light that does not bounce the shading of the view has found it.
         """
-        projection = self.projection(points, light)
+        visibility_light = self.light_of_visibility(points, light)
         if not light.is_free and self._shades_with_cells(view):
-            return field_of(self._shading_with_cells(view, light), "cells"), projection
+            return field_of(self._shading_with_cells(view, light), "cells"), visibility_light
 
         def in_cells() -> Node:
-            return PortionedCellTransmittance(self, points, projection, None, list, suffix=" of gloss", is_shaded=False)
+            return PortionedCellTransmittance(
+                self, points, visibility_light, None, list, suffix=" of gloss", is_shaded=False
+            )
 
-        return points.cached("cells", light.visibility_key, in_cells), projection
+        return points.cached("cells", light.visibility_key, in_cells), visibility_light
 
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """Rows of the light of each cell that static bodies let through.

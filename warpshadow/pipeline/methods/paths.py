@@ -118,7 +118,7 @@ def path_traced(
             wp.copy(bounced[instance], light)
         return add_light(shading, bounced)
 
-    words = points.in_words
+    weak_points = points.weak
     return Node(
         "bounces",
         trace,
@@ -134,7 +134,7 @@ def path_traced(
         materials.of_vertices("emission") if materials.emission else None,
         emission_images.pyramids if emission_images and emission_images.images else None,
         emitters,
-        items=lambda: f"{receiver_text(words)} × {paths:,} paths of {maximum} bounces",
+        items=lambda: f"{receiver_text(weak_points)} × {paths:,} paths of {maximum} bounces",
         has_adjoint=False,
     )
 

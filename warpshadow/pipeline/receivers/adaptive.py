@@ -21,7 +21,7 @@ from warpshadow.stages.sample_receivers import fragments_of_samples
 
 def find_squares(
     place_blockers: Callable[[wp.array, tuple[wp.array, wp.array]], Blockers],
-    sharp_share: Callable[[Group], np.ndarray | None],
+    share_of_sharpest_light: Callable[[Group], np.ndarray | None],
     positions: wp.array,
     normals: wp.array,
     fragments: Fragments,
@@ -33,8 +33,8 @@ def find_squares(
 
     Args:
         place_blockers: Places blockers, given the vertices, and the spheres.
-        sharp_share: Finds the share of the unblocked light of a group that comes from the cells with the sharpest
-            shadows, shape [batch, receiver]; None where no shadow is sharp.
+        share_of_sharpest_light: Finds the share of the unblocked light of a group that comes from the cells with the
+            sharpest shadows, shape [batch, receiver]; None where no shadow is sharp.
         positions, normals: Of the vertices, vec3 of shape [batch, vertex]; no gradient passes.
         spheres: Centers and radii of all spheres.
         is_adaptive: The bodies, which are flat, bool of shape [body].
@@ -58,7 +58,7 @@ def find_squares(
             seen = fragments_of_samples(fragments, probes[columns])
             points_and_normals = points_of_fragments(positions, normals, merged_scene.faces, seen)
             group = blockers.around_plane(*points_and_normals, body)
-            portions = [sharp_share(portion) for portion in group.portions()]
+            portions = [share_of_sharpest_light(portion) for portion in group.portions()]
             known = [portion for portion in portions if portion is not None]
             if known:
                 shares[np.arange(len(sides))[:, None], numbers[columns]] = np.concatenate(known, axis=1)

@@ -59,7 +59,7 @@ class Group(NamedTuple):
     clusters: ClusterTree | None = None  # of the spheres, where they are found already
 
     @property
-    def is_before_planes(self) -> bool:
+    def is_blocked_by_planes(self) -> bool:
         """Whether planes block light of its receivers."""
         return self.planes is not None and bool(self.points.size and self.planes.blocking)
 

@@ -31,7 +31,7 @@ class BlockerKinds(NamedTuple):
     planes: tuple[int, ...] = ()  # bodies that block all light as the planes in which they lie
     convex: tuple[int, ...] = ()  # bodies that block the light of others by the convex parts that they consist of
     solids: tuple[int, ...] = ()  # convex bodies whose parts block their own light, too; of others rays are traced
-    bulging: tuple[int, ...] = ()  # bodies out of which their spheres bulge: receivers are vertices, whatever is chosen
+    bulging_bodies: tuple[int, ...] = ()  # out of which their spheres bulge: receivers are vertices, whatever is chosen
 
     @property
     def separate(self) -> set[int]:
@@ -119,8 +119,8 @@ class LitPoints:
         return points
 
     @property
-    def in_words(self: Points) -> Points:
-        """The points for functions that put a node of theirs into words.
+    def weak(self: Points) -> Points:
+        """A weak reference to the points, for functions that put a node of theirs into words.
 
         These must not hold the points, which hold the node: arrays would stay until Python collects garbage.
         """

@@ -429,7 +429,7 @@ def _log_of_planes(
 ) -> wp.array | None:
     """Logarithm of the transmittance of planes between a group and an emitter; None without any."""
     planes, numbers = group.planes, blockers.blocker_kinds.planes
-    if planes is None or not group.is_before_planes:
+    if planes is None or not group.is_blocked_by_planes:
         return None
     points, _ = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
     skipped = -1 if planes.skip is None else planes.skip, numbers.index(body) if body in numbers else -1

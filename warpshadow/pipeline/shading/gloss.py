@@ -81,7 +81,7 @@ class GlossyPoints(LitPoints):
             bounced: Node of the view's shading without direct light of emitters.
             openness: Of the view, as of :meth:`.LightTransport.openness`.
         """
-        item_text = functools.partial(receiver_text, self.in_words)
+        item_text = functools.partial(receiver_text, self.weak)
         numbers = {name: self._values(materials, name) for name in GLOSS_ARGUMENTS}
         roughness = numbers["roughness"]
         key = materials.roughness

@@ -66,9 +66,9 @@ class Method:
         basis: Basis of free light; None for the method's own.
     """
 
-    lights_samples = False  # whether every sample is a receiver, overriding the bodies
+    every_sample_receives = False  # whether every sample is a receiver, overriding the bodies
 
-    has_proxies = False  # whether spheres stand in for bodies, by which light bounces where these move
+    spheres_stand_in = False  # whether spheres stand in for bodies, by which light bounces where these move
 
     shares_directions = False
     """Whether all receivers look for light in the same directions, so that one is enough for a surface in a pixel."""
@@ -99,8 +99,8 @@ class Method:
     def samples_receive(self, blocker_kinds: BlockerKinds = ONLY_SPHERES) -> np.ndarray:
         """Bodies on which samples are receivers while bodies block in some ways, bool of shape [body]."""
         bodies = enumerate(self.merged_scene.scene.bodies)
-        by_vertex = [body.receivers == "vertex" or number in blocker_kinds.bulging for number, body in bodies]
-        return ~np.array(by_vertex) | self.lights_samples
+        by_vertex = [body.receivers == "vertex" or number in blocker_kinds.bulging_bodies for number, body in bodies]
+        return ~np.array(by_vertex) | self.every_sample_receives
 
     @functools.cached_property
     def is_adaptive(self) -> np.ndarray:
@@ -109,7 +109,7 @@ class Method:
         No body where one emits or light is near: where shadows have edges, nobody knows.
         """
         adaptive = np.array([body.receivers == "adaptive" for body in self.merged_scene.scene.bodies])
-        is_known = not (self.lights_samples or self.has_emitters or self.shell is not None)
+        is_known = not (self.every_sample_receives or self.has_emitters or self.shell is not None)
         return adaptive & self.merged_scene.is_flat & is_known
 
     def find_squares(
@@ -127,7 +127,7 @@ class Method:
 
     def can_receive(self, blocker_kinds: BlockerKinds) -> np.ndarray:
         """Vertices that may be receivers, and vertices whose backs may be, bool of shape [2, vertex]."""
-        key = blocker_kinds.bulging
+        key = blocker_kinds.bulging_bodies
         if key not in self._can_receive:
             body_of_vertex, receives = self.merged_scene.body_of_vertex, ~self.samples_receive(blocker_kinds)
             backs = (receives & self.merged_scene.is_two_sided)[body_of_vertex]
@@ -151,7 +151,7 @@ class Method:
         that rows cached for one serve the other.
         """
         moving = None if static_bodies is None else static_bodies.moving
-        key = frozenset(blocker_kinds.separate), blocker_kinds.bulging, moving
+        key = frozenset(blocker_kinds.separate), blocker_kinds.bulging_bodies, moving
         if key not in self._numberings:
             device = self.merged_scene.device
             can_receive, separate_bodies = self.can_receive(blocker_kinds), self.separate_bodies(blocker_kinds)
@@ -255,7 +255,7 @@ class Method:
         """Direct free light on points, which is converted where the transfer vectors are not."""
         transfers = self.cached_transfers(points, light.shell)
         matrix = self.native_from_basis if transfers.requires_grad else None
-        items = functools.partial(receiver_text, points.in_words)
+        items = functools.partial(receiver_text, points.weak)
         name, shade = f"shading{points.suffix}", functools.partial(shade_free, matrix=matrix)
         return Node(name, shade, transfers, light, items=items)
 

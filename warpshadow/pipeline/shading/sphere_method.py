@@ -50,21 +50,21 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     Its two types say in which basis it has light, and visibility.
 
     Attributes:
-        free_projection: The basis in which the method projects any free light, of the scene's shell if it has one.
+        free_basis: The basis in which the method projects any free light, of the scene's shell if it has one.
         why_no_shadows: Why the method has no shadows, in words; empty if it has.
-        joins_cached: Whether visibility combines cached rows with moving blockers.
+        adds_cached_rows: Whether visibility combines cached rows with moving blockers.
         shades_transmittance: Whether known light is summed from transmittance at once (:meth:`shade_transmittance`);
             transfer vectors are then made only with cached rows, and for light from a shell.
     """
 
-    free_projection: Projected
+    free_basis: Projected
     why_no_shadows = ""
-    joins_cached = False
+    adds_cached_rows = False
     shades_transmittance = False
-    has_proxies = True
+    spheres_stand_in = True
 
     @property
-    def emitter_projection(self) -> Projected | None:
+    def emitter_cells(self) -> Projected | None:
         """Even light in the cells in which self-visibility towards emitters is looked up; None where nothing is."""
         return None
 
@@ -93,37 +93,37 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         """
         raise NotImplementedError
 
-    def project_free_light(self, shell: wp.array) -> Projected:
+    def free_basis_of_shell(self, shell: wp.array) -> Projected:
         """The basis in which the method projects free light of another shell than the scene's."""
         raise NotImplementedError
 
     @functools.cached_property
-    def _projected_from_scene(self) -> Node:
+    def _projected_scene_light(self) -> Node:
         return Node("", self.project_light, self.light, self.shell)
 
-    def projected(self, points: LitPoints, light: LightInput) -> Node:
+    def projected_light(self, points: LitPoints, light: LightInput) -> Node:
         """Node of light on points, projected for the method; the same for the same known light."""
         if light.is_free:
-            return Node("", self._projected_if_given, light, self.projection(points, light))
+            return Node("", self._with_free_light, light, self.light_of_visibility(points, light))
         if light is self.light:
-            return self._projected_from_scene
+            return self._projected_scene_light
         make = functools.partial(Node, "", self.project_light, light, self.shell_of(light))
         return points.cached_of_bodies("projected", light, make)
 
-    def projection(self, points: LitPoints, light: LightInput) -> Node | Projected:
+    def light_of_visibility(self, points: LitPoints, light: LightInput) -> Node | Projected:
         """The light by which visibility is found, projected: known light, or any free light of the same shell."""
-        return self.free_projection_of(points, light.shell) if light.is_free else self.projected(points, light)
+        return self.free_basis_of(points, light.shell) if light.is_free else self.projected_light(points, light)
 
-    def free_projection_of(self, points: LitPoints, shell: Input | None) -> Node | Projected:
+    def free_basis_of(self, points: LitPoints, shell: Input | None) -> Node | Projected:
         """The basis in which the method projects free light, or a node of it, the same for the same shell."""
         if shell is None:
-            return self.free_projection
-        make = functools.partial(Node, "", self.project_free_light, shell)
-        return points.cached_of_bodies("free projection", shell, make)
+            return self.free_basis
+        make = functools.partial(Node, "", self.free_basis_of_shell, shell)
+        return points.cached_of_bodies("free basis", shell, make)
 
-    def _projected_if_given(self, light: wp.array, free_projection: Projected) -> Projected:
+    def _with_free_light(self, light: wp.array, free_basis: Projected) -> Projected:
         """Project given free light for the method. Differentiable: light."""
-        return free_projection.with_coefficients(change_basis(light, self.native_from_basis))
+        return free_basis.with_coefficients(change_basis(light, self.native_from_basis))
 
     def coefficient_count(self, light: Input | None) -> int:
         """Number of light coefficients that shading uses; all of them where the light is None, not known yet."""
@@ -164,9 +164,9 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
 
         place = functools.partial(self.scene_blockers.placed, blocker_kinds)
         seen = positions, normals, fragments, spheres
-        return find_squares(place, self.sharp_share, *seen, is_adaptive, supersampling)
+        return find_squares(place, self.share_of_sharpest_light, *seen, is_adaptive, supersampling)
 
-    def sharp_share(self, group: Group) -> np.ndarray | None:
+    def share_of_sharpest_light(self, group: Group) -> np.ndarray | None:
         """Share of a group's unblocked light that comes from the cells with the sharpest shadows.
 
         Returns:
@@ -193,7 +193,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     def _sum_over_emitters(
         self, name: str, find: Callable[..., Any], points: LitPoints, materials: Materials, *others: Node | Input
     ) -> Node:
-        emitters, words = (self.emitters.samples, self.emitters.self_visibility), points.in_words
+        emitters, weak_points = (self.emitters.samples, self.emitters.self_visibility), points.weak
         bodies_and_spheres = points.static_bodies, points.nearest_spheres
 
         def find_in_groups(
@@ -203,9 +203,9 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
             return find(*emitters, groups, blockers, *arrays)
 
         def lookups() -> Node:
-            if self.emitter_projection is None:
+            if self.emitter_cells is None:
                 return Node("", None)
-            return _self_visibility(self, points.blocker_kinds, self.emitter_projection)
+            return _self_visibility(self, points.blocker_kinds, self.emitter_cells)
 
         return Node(
             name,
@@ -216,12 +216,12 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
             self.emitters.placed(points),
             self.emitters.radiance(materials),
             *others,
-            items=lambda: f"{receiver_text(words)} × {emitters[0].first[-1]} samples",
+            items=lambda: f"{receiver_text(weak_points)} × {emitters[0].first[-1]} samples",
         )
 
     def known_shading(self, points: LitPoints, light: LightInput) -> Node:
         """Direct known light on points."""
-        return PortionedShading(self, points, self.projected(points, light), light, joined)
+        return PortionedShading(self, points, self.projected_light(points, light), light, joined)
 
     def openness(self, points: LitPoints) -> Node:
         """Light that points reflect as white surfaces under an even sky of 1, vec3 of shape [batch, receiver]."""
@@ -230,8 +230,8 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
 
     def transfers(self, points: LitPoints, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`; where they vary, to the method's native basis."""
-        matrix, projection = self.native_from_basis, self.free_projection_of(points, shell)
-        transfers = PortionedShading(self, points, projection, None, list, caches=matrix is None)
+        matrix, visibility_light = self.native_from_basis, self.free_basis_of(points, shell)
+        transfers = PortionedShading(self, points, visibility_light, None, list, caches=matrix is None)
         if matrix is None or transfers.requires_grad:
             return transfers
 
@@ -273,9 +273,9 @@ class PortionedShading(Node):
     ):
         self.method, self._bodies_and_spheres = method, (points.static_bodies, points.nearest_spheres)
         self._finish, self._progress = finish, method.progress and light is not None
-        receivers, words = points.receivers_node, points.in_words
+        receivers, weak_points = points.receivers_node, points.weak
         suffix = points.suffix if suffix is None else suffix
-        item_text = functools.partial(receiver_text, words)
+        item_text = functools.partial(receiver_text, weak_points)
         self_visibility = self_visibility_node(method, points, projected_light)
         shadows = _static_shadows(method, points, light)
         planes = points.blocker_kinds.planes
@@ -284,8 +284,8 @@ class PortionedShading(Node):
         self._is_transferred = not (self._is_shaded and method.shades_transmittance)
         self._visibility = NodeStage(
             f"visibility{suffix}",
-            lambda: method.scene_blockers.pairs_with(words),
-            lambda: _why_unblocked(method, words),
+            lambda: method.scene_blockers.pairs_with(weak_points),
+            lambda: _why_unblocked(method, weak_points),
         )
         self._planes = NodeStage(
             f"planes{suffix}",
@@ -370,7 +370,8 @@ def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
     if not blockers.has_any(kinds):
         return f"no body {'but flat ones ' if kinds.planes else ''}has blockers"
     _, moving, static = points.counts()
-    if moving or (static_bodies and static and (method.joins_cached or blockers.has_any(kinds, static_bodies.moving))):
+    blocks_static = static_bodies and (method.adds_cached_rows or blockers.has_any(kinds, static_bodies.moving))
+    if moving or (static and blocks_static):
         return ""
     return "no moving body has blockers" if static else "nothing is seen"
 
@@ -403,7 +404,7 @@ def _self_visibility(method: SphereMethod, blocker_kinds: BlockerKinds, projecte
 
 def _static_shadows(method: SphereMethod, points: LitPoints, light: Input | None) -> Node:
     """Node of cached transmittance past static bodies; its value is None if there are none."""
-    static_bodies, words = points.static_bodies, points.in_words
+    static_bodies, weak_points = points.static_bodies, points.weak
     if static_bodies is None or not static_bodies.spheres[1].shape[1]:
         bouncing = bool(method.merged_scene.scene.bounces)
         why = "light bounces: nothing of static bodies is cached" if bouncing else "no static body has blockers"
@@ -411,7 +412,7 @@ def _static_shadows(method: SphereMethod, points: LitPoints, light: Input | None
     rows = method.cached_rows(static_bodies, light, points.blocker_kinds)
 
     def missing() -> int:
-        receivers = words.receivers_node.value_if_known(words.call)
+        receivers = weak_points.receivers_node.value_if_known(weak_points.call)
         return rows.missing(None if receivers is None else receivers.on_static)
 
     return Node(

@@ -82,7 +82,7 @@ class ReceiverFinder:
             bodies=None if self._separate_bodies is None else self._separate_bodies[merged_scene.body_of_face],
             supersampling=1 if method.shares_directions and not self._shares_surfaces else self._supersampling,
             quadtree=quadtree,
-            rises=method.lights_samples,
+            rises=method.every_sample_receives,
             smooth_pieces=merged_scene.smooth_pieces if self._shares_surfaces else None,
             has_mean_slope=has_mean_slope,
         )

@@ -102,7 +102,7 @@ class View(LitPoints):
     ) -> tuple[Node, Node]:
         """From the vertices to their normals and to the receivers."""
         merged_scene, samples = method.merged_scene, self._samples
-        corners = functools.partial(View._vertices, self.in_words)
+        corners = functools.partial(View._vertices, self.weak)
         faces, two_sided = merged_scene.faces, merged_scene.two_sided_faces
         if static_bodies is None or cameras.requires_grad:
             clip = Node("clip positions", to_clip, vertices, cameras, items=corners)
@@ -127,7 +127,7 @@ class View(LitPoints):
             normals = Node("normals", static_bodies.with_moving_normals, vertices, static_bodies.normals, items=corners)
         # receivers at vertices move with these alone; receivers at samples move with the samples' fragments, too
         seen = sides if self._samples_receive.any() else detached(sides)
-        item_text = functools.partial(receiver_text, self.in_words)
+        item_text = functools.partial(receiver_text, self.weak)
         arguments = [vertices, normals, seen, detached(silhouettes), detached(clip)]
         if method.is_adaptive.any():
             arguments.append(detached(spheres))
