@@ -13,7 +13,7 @@ from pages import PATIENCE, WirePage
 
 from warpshadow.viewer.app import ViewerApp
 from warpshadow.viewer.painter import Painter
-from warpshadow.viewer.preparing import Preparation, is_prepared
+from warpshadow.viewer.preparing import Preparation, is_cached_on_disk
 
 pytestmark = [
     pytest.mark.slow,
@@ -43,10 +43,10 @@ def eventually(condition):
 
 def test_another_process_fills_the_caches_and_says_how_far_it_is():
     notes = []
-    assert not is_prepared(Painter(scene()))
+    assert not is_cached_on_disk(Painter(scene()))
     Preparation(scene(), notes.append)
     eventually(lambda: "" in notes)
-    assert is_prepared(Painter(scene())) and len(cached_files("spheres")) == 1
+    assert is_cached_on_disk(Painter(scene())) and len(cached_files("spheres")) == 1
     assert len(cached_files("own_shadows")) == 2  # as it moves, and at rest
     assert all(note.startswith("rendering: ") for note in notes[:-1]) and notes[-1] == ""  # a fast one says nothing
 
@@ -79,7 +79,7 @@ def test_pages_see_rays_until_spheres_are_there():
 
 def test_spheres_and_tables_that_are_cached_are_used_at_once_and_both_are_needed():
     ws.spheres.fit_spheres(scene().bodies[0].mesh, 2, progress=False)
-    assert not is_prepared(Painter(scene()))  # its shadow on itself is not traced yet
+    assert not is_cached_on_disk(Painter(scene()))  # its shadow on itself is not traced yet
     for receivers in ("vertex", "pixel"):  # as bodies that move have it, and those at rest
         ball = dataclasses.replace(scene().bodies[0], receivers=receivers)
         ws.Renderer(dataclasses.replace(scene(), bodies=(ball,)), progress=False).render()

@@ -95,7 +95,7 @@ def blocking_parts(scene: Scene) -> dict[int, list[ConvexPart]]:
     return {number: parts for number, parts in result.items() if parts}
 
 
-def solid_bodies(scene: Scene, parts: Mapping[int, Sequence[ConvexPart]]) -> frozenset[int]:
+def find_solids(scene: Scene, parts: Mapping[int, Sequence[ConvexPart]]) -> frozenset[int]:
     """Find the bodies whose convex parts block their own light, too: those that consist of solids alone.
 
     Panels are chords of bent sheets, in which receivers do not lie; and rays to a sun may be asked for.

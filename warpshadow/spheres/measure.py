@@ -12,7 +12,7 @@ from warpshadow.maths.directions import fibonacci
 from warpshadow.spheres.cover import ball_samples
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
 from warpshadow.spheres.occlusion import exact_occlusion
-from warpshadow.spheres.receivers import around
+from warpshadow.spheres.receivers import draw_points_around
 from warpshadow.stages.ray_tracing import trace_visibility_on_host
 
 GROUND, SURFACE, NEARBY = 20, 400, 400  # receivers on a side of the ground's grid, on the surface and in the air
@@ -95,7 +95,7 @@ def measure(mesh: NormalizedMesh, spheres: np.ndarray, seconds: float) -> FitRep
         outside_volume = float(shares[is_outside].sum() / shares.sum())
     surface, _ = mesh.sample(4000, rng)
     grown = spheres + [0, 0, 0, 0.01]
-    air, _ = around(mesh, NEARBY, rng)
+    air, _ = draw_points_around(mesh, NEARBY, rng)
     random_directions = rng.normal(size=air.shape)
     nearby = air, random_directions / np.linalg.norm(random_directions, axis=1, keepdims=True)
     ground_error, shadow_error = _errors(mesh, spheres, ground, up_normals)

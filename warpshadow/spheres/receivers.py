@@ -122,7 +122,7 @@ def _on_grounds(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> t
     return points, np.tile([0.0, 1.0, 0.0], (count, 1))
 
 
-def around(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def draw_points_around(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Draw points outside a body, most near it, a third anywhere within its bounds: positions, directions toward it."""
     shell_count = count - count // 3
     away = rng.normal(size=(shell_count, 3))
@@ -136,7 +136,7 @@ def around(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[
 
 
 def _around(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    points, bias = around(mesh, count, rng)
+    points, bias = draw_points_around(mesh, count, rng)
     bias = 0.5 * rng.normal(size=(count, 3)) + np.where(rng.uniform(size=(count, 1)) < 0.5, bias, 0.0)
     return points, bias / np.linalg.norm(bias, axis=1, keepdims=True)
 

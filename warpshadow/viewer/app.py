@@ -20,7 +20,7 @@ from warpshadow.viewer.loop import Loop
 from warpshadow.viewer.page_camera import PageCamera, rotation, upward
 from warpshadow.viewer.painter import Frame, Painter, bounds, own_page
 from warpshadow.viewer.panel import Panel
-from warpshadow.viewer.preparing import Preparation, is_prepared
+from warpshadow.viewer.preparing import Preparation, is_cached_on_disk
 from warpshadow.viewer.quality import Quality
 from warpshadow.viewer.server import Server, check_address
 from warpshadow.viewer.state import ViewerState
@@ -60,7 +60,7 @@ class ViewerApp:
         check_address(host, port)
         scene = resolved(scene, device=device, progress=progress)
         self.painter = Painter(scene, device=device, progress=progress)
-        self._is_prepared = is_prepared(self.painter, device=device)
+        self._is_prepared = is_cached_on_disk(self.painter, device=device)
         self._preparation: Preparation | None = None
         self._pages: dict[int, _ViserPage] = {}
         stops = self.painter.natural_stops(self._look_for_now(ViewerState.of(scene)))

@@ -43,7 +43,7 @@ _QUALITIES = (
 )
 
 
-def is_prepared(painter: Painter, *, device: wp.DeviceLike = "cpu") -> bool:
+def is_cached_on_disk(painter: Painter, *, device: wp.DeviceLike = "cpu") -> bool:
     """Whether the disk has all spheres and tables that the pages of a scene need."""
     scene = painter.scene
     if scene.visibility.method not in SPHERE_METHODS:

@@ -15,7 +15,7 @@ import warp as wp
 
 from warpshadow.maths.convex import ConvexPart
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
-from warpshadow.scene.blockers import blocking_parts, solid_bodies
+from warpshadow.scene.blockers import blocking_parts, find_solids
 from warpshadow.stages.convex.coverage import part_coverage
 from warpshadow.stages.convex.prepared import ConvexBlockers, ConvexBody, PlacedParts
 
@@ -65,7 +65,7 @@ class SceneConvexParts:
     @functools.cached_property
     def solids(self) -> frozenset[int]:
         """Bodies whose parts block their own light, too."""
-        return solid_bodies(self._merged_scene.scene, self.parts)
+        return find_solids(self._merged_scene.scene, self.parts)
 
     def blockers(self, bodies: tuple[int, ...], blocking_bodies: tuple[int, ...]) -> ConvexBlockers:
         """Convex blockers of some of these bodies; ``blocking_bodies`` cast shadows."""

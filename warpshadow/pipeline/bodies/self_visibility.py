@@ -24,7 +24,7 @@ from warpshadow.device.progress import announce
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
-from warpshadow.scene.blockers import blocking_parts, solid_bodies
+from warpshadow.scene.blockers import blocking_parts, find_solids
 from warpshadow.spheres.normalized_mesh import normalize
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.rasterization import Fragments
@@ -276,7 +276,7 @@ class SelfVisibility:
     def is_cached(self) -> bool:
         """Whether the disk has the rows of all bodies that cast shadows on themselves, where the scene has them."""
         scene = self._merged_scene.scene
-        solids = solid_bodies(scene, blocking_parts(scene))
+        solids = find_solids(scene, blocking_parts(scene))
         traced = (body for body, is_flat in enumerate(self._merged_scene.is_flat) if not (is_flat or body in solids))
         return all(self._rows_path(body).exists() for body in traced if not self.why_spheres(body, None))
 
