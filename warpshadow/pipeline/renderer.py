@@ -25,13 +25,13 @@ from warpshadow.pipeline.bodies.geometry import Geometry, as_geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.delegation import delegated
-from warpshadow.pipeline.explain import Explanation, decide, shell_notes
+from warpshadow.pipeline.explain import Explanation, decide_which_nodes_run, shell_notes
 from warpshadow.pipeline.image_inputs import ImageArrays, takes
 from warpshadow.pipeline.methods.by_name import make_method
 from warpshadow.pipeline.node import Clock, Input, Node
 from warpshadow.pipeline.receivers.choice_of_receivers import choose_receivers, receiver_notes, with_receivers
 from warpshadow.pipeline.receivers.lit_points import LitPoints
-from warpshadow.pipeline.shading.transfers import Light, ShellLight, one_transfer
+from warpshadow.pipeline.shading.transfers import Light, ShellLight, join_transfers
 from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.catchers import CatchersAlone
 from warpshadow.pipeline.views.layers import LayerArrays, Layers, find_layer_arrays, find_layers
@@ -194,11 +194,11 @@ class SceneRenderer:
             return view
         for node in (view.receivers_node, view.silhouettes):
             node.value(view.call)
-        self._warn_of_nothing(view)
+        self._warn_once(view)
         self._views.keep(view)
         return view
 
-    def _warn_of_nothing(self, view: View) -> None:
+    def _warn_once(self, view: View) -> None:
         """Say once why an image shows nothing, and the likely mistakes in the scene itself."""
         is_of_scene, device = self._views.is_of_scene(view), self.device
         if not self._has_warned and (is_readable(device) or (is_of_scene and not device.is_capturing)):
@@ -247,7 +247,7 @@ class SceneRenderer:
                 "shade and draw take free light that bounces, with any method"
             )
         view = self._scene_view
-        return one_transfer(view.transfers.value(self._views.call(view)))
+        return join_transfers(view.transfers.value(self._views.call(view)))
 
     @announced
     def shade(self, light: Light | None = None, view: LitPoints | None = None) -> wp.array:
@@ -461,7 +461,7 @@ class SceneRenderer:
         hidden: set[Node] = set()
         if inputs.view is not None:
             view = self._checked(inputs.view)
-            hidden = {*decide(view.receivers_node, view.call), view.silhouettes}
+            hidden = {*decide_which_nodes_run(view.receivers_node, view.call), view.silhouettes}
         else:
             geometry = None if inputs.geometry is None else as_geometry("geometry", inputs.geometry)
             view = self._views.view(geometry, inputs.clip_matrices)

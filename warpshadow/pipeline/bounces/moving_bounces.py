@@ -34,7 +34,7 @@ from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.shading.method import LightInput
 from warpshadow.pipeline.shading.sphere_method import PortionedShading, ProjectedLight, SphereMethod
-from warpshadow.pipeline.shading.transfers import joined
+from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.patch_weights import PatchWeights, find_mean_transmittance, find_patch_weights
 from warpshadow.stages.bounces.radiosity import patch_radiosity
@@ -121,7 +121,7 @@ def _patch_weights(senders: Senders, visibility: list[PortionVisibility]) -> Pat
         )
         for portion in visibility
     ]
-    return find_patch_weights(joined(portions), senders.mean, senders.patch_of_sample)
+    return find_patch_weights(join_portions(portions), senders.mean, senders.patch_of_sample)
 
 
 def _add_emitted(lit: list[PortionDirectLight], emitted: wp.array) -> list[PortionDirectLight]:
@@ -193,7 +193,7 @@ class Radiosity(Node):
                 outgoing = sent(radiosity)
                 portions = [self._light(call, portion, outgoing) for portion in lit]
             with self.timed(call, self._reflection):
-                return patch_radiosity(albedo, joined(portions), senders.mean, weights.shares)
+                return patch_radiosity(albedo, join_portions(portions), senders.mean, weights.shares)
 
         def add_radiosity_by_self(by_others: wp.array, radiosity: wp.array | None) -> wp.array:
             if between is None or radiosity is None:
@@ -238,7 +238,7 @@ class BouncedShading(PortionedDirectLight):
         """Light all portions, directly and by the patches' radiosity."""
         projected_light, outgoing = self.values(call)
         portions = self._visibility.value(call) if self._visibility.caches else self._visibility.portions(call)
-        return joined(
+        return join_portions(
             [self._bounced(call, self._light(call, portion, projected_light), outgoing) for portion in portions]
         )
 
@@ -279,7 +279,7 @@ class MovingBounces:
         )
         if not senders.bodies:
             idle = NodeStage("bounces", idle="every body is black")
-            return PortionedShading(method, points, projected_light, light, joined, stages=(idle,))
+            return PortionedShading(method, points, projected_light, light, join_portions, stages=(idle,))
         proxies = self._proxies.setdefault(senders, Proxies(senders, method.visibility.merging))
         make_visibility = functools.partial(
             PortionedVisibility, method, projected_light=visibility_light, light=light, finish=list, is_shaded=False
@@ -306,7 +306,7 @@ class MovingBounces:
         arguments = senders, points, proxies.nearest_spheres
         lit_samples = points.cached("patch samples beside proxies", proxies, lambda: lit_patch_samples(*arguments))
         visibility = make_visibility(lit_samples)
-        frames = Node("", planes.all.frames if planes else lambda _: None, points.vertices)
+        frames = Node("", planes.blockers.frames if planes else lambda _: None, points.vertices)
         projected_patches = Node("", project, lit_samples.receivers_node, visibility, spheres, frames)
         weights = Node("", functools.partial(_patch_weights, senders), visibility)
         return PatchSampleNodes(lit_samples, visibility, frames, projected_patches, weights)

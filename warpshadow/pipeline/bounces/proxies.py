@@ -16,7 +16,7 @@ from warpshadow.device.constants import constant
 from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance
 from warpshadow.pipeline.bounces.overlays import find_overlays
 from warpshadow.pipeline.bounces.patches import Senders
-from warpshadow.pipeline.shading.transfers import joined
+from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.stages.bounces.projected_areas import find_projected_areas, tilt_normals_off_planes
 from warpshadow.stages.bounces.proxies import find_depths, place_proxies
 from warpshadow.stages.bounces.proxy_radiance import patches_of_clusters
@@ -29,10 +29,10 @@ from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 
 
 class SenderPlanes(NamedTuple):
-    """Flat bodies."""
+    """The flat bodies among senders."""
 
-    all: PlaneBlockers
-    number: dict[int | None, int]  # of each among them, by the number of the body
+    blockers: PlaneBlockers
+    index_of_body: dict[int | None, int]  # of each among them, by the number of the body
 
 
 class ProjectedPatches(NamedTuple):
@@ -176,17 +176,17 @@ class Proxies:
         if planes is not None:
             numbers, points, device = self.nearest_spheres, patch_samples.points, normals.device
             of_patch_samples = NearestBlockers(centers, radii, constant(numbers, wp.int32, device))
-            fronts = find_fronts(points, normals, None, of_patch_samples, frames, planes.all)
+            fronts = find_fronts(points, normals, None, of_patch_samples, frames, planes.blockers)
             if self.overlays is not None:
                 numbers = np.where(self.overlays[1][senders.patch_of_sample] > 0, np.int32(-1), numbers)
-            normals = tilt_normals_off_planes(points, normals, radii, numbers, fronts, frames, planes.all)
+            normals = tilt_normals_off_planes(points, normals, radii, numbers, fronts, frames, planes.blockers)
         rows = [
             wp.full_like(portion.transmittance_nonplanar, 1.0, requires_grad=False)
             if portion.transmittance_self is None
             else portion.transmittance_self
             for portion in cells
         ]
-        transmittance = joined([row.reshape((len(row), -1)) for row in rows])
+        transmittance = join_portions([row.reshape((len(row), -1)) for row in rows])
         directions = cells[0].directions
         transmittance = transmittance.reshape((len(transmittance), len(senders.sides), len(directions)))
         mean_points = multiply(senders.mean, patch_samples.points)

@@ -104,7 +104,9 @@ class Rays(Method):
             for span in samples.spans()
         ]
 
-    def lobe_transmittance(self, points: LitPoints, directions: Node, light: LightInput, view: LitPoints) -> Node:
+    def lobe_transmittance(
+        self, points: LitPoints, directions: Node, light: LightInput, shaded_points: LitPoints
+    ) -> Node:
         """Transmittance towards the samples of lobes: rays, each of its own."""
         item_text = functools.partial(receiver_text, points.weak)
         return Node(
@@ -121,12 +123,12 @@ class Rays(Method):
         points: LitPoints,
         diffuse: Node,
         light: LightInput,
-        view: LitPoints,
+        shaded_points: LitPoints,
         choose: Callable[[Node], Node],
         openness: Node | None,
     ) -> Node:
         """Mean radiance of the blockers of points, by their light with bounces and without."""
-        direct, trees = self.direct_shading(view, light), self._trees_around(points)
+        direct, trees = self.direct_shading(shaded_points, light), self._trees_around(points)
         if openness is None:
             openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
         return Node("light of blockers", blocked_radiance, diffuse, choose(direct), openness)

@@ -45,14 +45,14 @@ def find_squares(
         blockers = place_blockers(positions, (centers, radii))
     merged_scene = blockers.merged_scene
     sides = fragments.face_ids if fragments.sides is None else fragments.sides
-    keys, bodies = _keys(is_adaptive.tobytes(), merged_scene.first_face.tobytes())
+    keys, bodies = _find_keys_of_sides(is_adaptive.tobytes(), merged_scene.first_face.tobytes())
     row, column = probe_grid(sides.shape[1:], supersampling)
-    numbers, probes = _by_tiles(sides.shape[1:], supersampling)
+    numbers, probes = _order_by_tiles(sides.shape[1:], supersampling)
     body_of_probe = bodies[sides.numpy().reshape(len(sides), -1)[:, probes[:-1]]]
     shares = np.zeros((len(sides), len(probes)), np.float32)  # the last is of no probe
     with unrecorded():
         for body in np.flatnonzero(is_adaptive).tolist():
-            columns = _ragged(body_of_probe == body)
+            columns = _list_chosen(body_of_probe == body)
             if not columns.shape[1]:
                 continue
             seen = fragments_of_samples(fragments, probes[columns])
@@ -67,10 +67,10 @@ def find_squares(
 
 
 @functools.lru_cache(maxsize=16)
-def _keys(is_adaptive: bytes, first_face: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """A number of each face side by body, fronts first and then backs, and its body; −1 where that is not adaptive.
+def _find_keys_of_sides(is_adaptive: bytes, first_face: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """Find a key for each face side, of its body and side, and its body; both −1 where that is not adaptive.
 
-    The last body, −1, is that of side −1.
+    Fronts come first, then backs. The last body, −1, is that of side −1.
     """
     adaptive, starts = np.frombuffer(is_adaptive, bool), np.frombuffer(first_face, int)
     bodies = np.repeat(np.where(adaptive, np.arange(len(adaptive), dtype=np.int32), -1), np.diff(starts))
@@ -79,7 +79,7 @@ def _keys(is_adaptive: bytes, first_face: bytes) -> tuple[np.ndarray, np.ndarray
 
 
 @functools.lru_cache(maxsize=16)
-def _by_tiles(size: tuple[int, int], supersampling: int) -> tuple[np.ndarray, np.ndarray]:
+def _order_by_tiles(size: tuple[int, int], supersampling: int) -> tuple[np.ndarray, np.ndarray]:
     """Order the probes of a grid by 4 × 4 tiles, so that neighbors are shaded one after another.
 
     Returns:
@@ -92,7 +92,7 @@ def _by_tiles(size: tuple[int, int], supersampling: int) -> tuple[np.ndarray, np
     return np.append(permutation, len(permutation)), np.append(samples, -1)
 
 
-def _ragged(chosen: np.ndarray) -> np.ndarray:
+def _list_chosen(chosen: np.ndarray) -> np.ndarray:
     """List the chosen columns of each row, padded with −1, shape [row, longest row]."""
     if len(chosen) == 1:
         return np.flatnonzero(chosen)[None]

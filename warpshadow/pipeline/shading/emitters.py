@@ -24,7 +24,7 @@ from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.receivers.groups import Blockers, Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints
-from warpshadow.pipeline.shading.transfers import joined
+from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.stages.bounces.albedo import mean_over_texels
 from warpshadow.stages.emitters.beams import find_axis_weights, within_beam
 from warpshadow.stages.emitters.convex import find_log_transmittance_of_parts
@@ -266,7 +266,7 @@ def find_emitted_light(
             total = add_light(total, sum_light(*lit, **transmittances))
         return total
 
-    return joined([light_of(portion) for group in groups for portion in group.portions()])
+    return join_portions([light_of(portion) for group in groups for portion in group.portions()])
 
 
 def find_highlights(
@@ -300,7 +300,7 @@ def find_highlights(
         ]
         lobe_sums.append([add_light(zeros, *parts) for parts in zip(*of_emitters, strict=True)] or [zeros, zeros])
         first = end
-    return LobeLight(*(joined(list(portions)) for portions in zip(*lobe_sums, strict=True)))
+    return LobeLight(*(join_portions(list(portions)) for portions in zip(*lobe_sums, strict=True)))
 
 
 def _find_transmittances(

@@ -36,11 +36,11 @@ class LightInput(Input):
     Args:
         value: The light.
         shell: Of the light, vec4 of shape [batch], where it is not the scene's; None where it is, or is infinitely far.
-        news: As for :class:`Input`.
+        why_new: As for :class:`Input`.
     """
 
-    def __init__(self, value: KnownLight | wp.array, shell: Input | None = None, *, news: str = ""):
-        super().__init__("light", value, news=news)
+    def __init__(self, value: KnownLight | wp.array, shell: Input | None = None, *, why_new: str = ""):
+        super().__init__("light", value, why_new=why_new)
         self.shell = shell
 
     @property
@@ -201,10 +201,10 @@ class Method:
             return self.light
         shell = self._shell_input(points, light, own_shell)
         if isinstance(light, wp.array):
-            return LightInput(light, shell, news="light is given")
+            return LightInput(light, shell, why_new="light is given")
         known = self.light.value() if light is None else as_light(light)
-        news = "" if points.last_cached("light") is None else "light changed since the last call"
-        return points.cached("light", (known, shell), lambda: LightInput(known, shell, news=news))
+        why_new = "" if points.last_cached("light") is None else "light changed since the last call"
+        return points.cached("light", (known, shell), lambda: LightInput(known, shell, why_new=why_new))
 
     def _shell_input(self, points: LitPoints, light: Light | None, shell: wp.array | None) -> Input | None:
         """The shell of light that is not the scene's, the same while its values are; None for the scene's."""
@@ -282,14 +282,16 @@ class Method:
     def _prefilter(self, light: KnownLight) -> wp.array:
         return constant(prefilter(light.radiance)[None], wp.vec3, self.merged_scene.device)
 
-    def lobe_transmittance(self, points: LitPoints, directions: Node, light: LightInput, view: LitPoints) -> Node:
+    def lobe_transmittance(
+        self, points: LitPoints, directions: Node, light: LightInput, shaded_points: LitPoints
+    ) -> Node:
         """Transmittance towards the samples of lobes of points, float32 of shape [batch, receiver, sample].
 
         Args:
             points: Receivers on bodies that shine.
             directions: Node of the samples' directions, vec3 of shape [batch, receiver, sample].
             light: Known or free light, which says where shadows have to be sharp.
-            view: The receivers among which they are, which are shaded.
+            shaded_points: The receivers of the image, among which they are.
 
         Without shadows it is 1.
         """
@@ -300,7 +302,7 @@ class Method:
         points: LitPoints,
         diffuse: Node,
         light: LightInput,
-        view: LitPoints,
+        shaded_points: LitPoints,
         choose: Callable[[Node], Node],
         openness: Node | None,
     ) -> Node:
@@ -309,8 +311,8 @@ class Method:
         Args:
             points, light: As for :meth:`lobe_transmittance`.
             diffuse: Node of their shading.
-            view: As for :meth:`lobe_transmittance`.
-            choose: Makes a node of light on the view's receivers one of light on these.
+            shaded_points: As for :meth:`lobe_transmittance`.
+            choose: Makes a node of light on all these one of light on the points.
             openness: Of the points, as of :meth:`.LightTransport.openness`.
         """
         raise NotImplementedError

@@ -20,7 +20,7 @@ from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, re
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.shading.method import LightInput, Method
 from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
-from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, joined
+from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, join_portions
 from warpshadow.stages.quadtree import Quadtree
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import Receivers
@@ -221,12 +221,14 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
 
     def known_shading(self, points: LitPoints, light: LightInput) -> Node:
         """Direct known light on points."""
-        return PortionedShading(self, points, self.projected_light(points, light), light, joined)
+        return PortionedShading(self, points, self.projected_light(points, light), light, join_portions)
 
     def openness(self, points: LitPoints) -> Node:
         """Light that points reflect as white surfaces under an even sky of 1, vec3 of shape [batch, receiver]."""
         sky = LightInput(EnvironmentMap.constant(1.0))
-        return PortionedShading(self, points, Node("", self.project_light, sky), sky, joined, suffix=" in an even sky")
+        return PortionedShading(
+            self, points, Node("", self.project_light, sky), sky, join_portions, suffix=" in an even sky"
+        )
 
     def transfers(self, points: LitPoints, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`; where they vary, to the method's native basis."""

@@ -61,4 +61,4 @@ class CatchersAlone:
         alone = renderer.view(inputs.geometry, inputs.clip_matrices)
         if renderer._method.every_sample_receives:  # rays are drawn by a receiver's number: the same for both views
             alone = alone.at_receivers_of(view)
-        return alone.white(light, materials).value(renderer._views.call(alone))
+        return alone.white_samples(light, materials).value(renderer._views.call(alone))
