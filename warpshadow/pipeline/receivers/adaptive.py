@@ -13,8 +13,8 @@ import warp as wp
 from warpshadow.device.launch import without_gradient
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.receivers.groups import Blockers, Group
+from warpshadow.pipeline.receivers.lit_points import VisibleSurfaces
 from warpshadow.stages.quadtree import Quadtree, find_quadtree, probe_grid
-from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import points_of_fragments
 from warpshadow.stages.sample_receivers import fragments_of_samples
 
@@ -22,12 +22,7 @@ from warpshadow.stages.sample_receivers import fragments_of_samples
 def find_squares(
     place_blockers: Callable[[wp.array, tuple[wp.array, wp.array]], Blockers],
     share_of_sharpest_light: Callable[[Group], np.ndarray | None],
-    positions: wp.array,
-    normals: wp.array,
-    fragments: Fragments,
-    spheres: tuple[wp.array, wp.array],
-    is_adaptive: np.ndarray,
-    supersampling: int,
+    surfaces: VisibleSurfaces,
 ) -> Quadtree:
     """Find the squares of images in which the samples of some bodies interpolate.
 
@@ -35,11 +30,9 @@ def find_squares(
         place_blockers: Places blockers, given the vertices, and the spheres.
         share_of_sharpest_light: Finds the share of the unblocked light of a group that comes from the cells with the
             sharpest shadows, shape [batch, receiver]; None where no shadow is sharp.
-        positions, normals: Of the vertices, vec3 of shape [batch, vertex]; no gradient passes.
-        spheres: Centers and radii of all spheres.
-        is_adaptive: The bodies, which are flat, bool of shape [body].
-        supersampling: Samples of a pixel across and down.
+        surfaces: The samples, and the bodies; no gradient passes to them.
     """
+    positions, normals, fragments, spheres, is_adaptive, supersampling = surfaces
     positions, normals, centers, radii = map(without_gradient, (positions, normals, *spheres))
     with unrecorded():
         blockers = place_blockers(positions, (centers, radii))

@@ -8,11 +8,13 @@ from collections.abc import Callable, Hashable
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
+import warp as wp
 
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import Receivers
 
 if TYPE_CHECKING:
@@ -37,6 +39,17 @@ class BlockerKinds(NamedTuple):
     def separate(self) -> set[int]:
         """Bodies whose receivers form a group each."""
         return {*self.self_traced, *self.solids, *self.planes}
+
+
+class VisibleSurfaces(NamedTuple):
+    """Surfaces that the samples of an image see, some of them by adaptive receivers."""
+
+    positions: wp.array  # of all vertices, vec3 of shape [batch, vertex]
+    normals: wp.array  # likewise
+    fragments: Fragments
+    spheres: tuple[wp.array, wp.array]  # centers and radii of all spheres
+    is_adaptive: np.ndarray  # bodies whose samples interpolate, which are flat, bool of shape [body]
+    supersampling: int  # samples of a pixel across and down
 
 
 ONLY_SPHERES = BlockerKinds()  # all bodies block by their spheres

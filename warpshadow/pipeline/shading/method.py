@@ -17,12 +17,17 @@ from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node
-from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds, LitPoints, receiver_text
+from warpshadow.pipeline.receivers.lit_points import (
+    ONLY_SPHERES,
+    BlockerKinds,
+    LitPoints,
+    VisibleSurfaces,
+    receiver_text,
+)
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.transfers import Light, ShellLight, check_light, shade_free
 from warpshadow.stages.gloss.prefilter import prefilter
 from warpshadow.stages.quadtree import Quadtree
-from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import Numbering, number_receivers
 from warpshadow.stages.shell.beams import check_shell, shell_array
 
@@ -112,16 +117,7 @@ class Method:
         is_known = not (self.every_sample_receives or self.has_emitters or self.shell is not None)
         return adaptive & self.merged_scene.is_flat & is_known
 
-    def find_squares(
-        self,
-        blocker_kinds: BlockerKinds,
-        positions: wp.array,
-        normals: wp.array,
-        fragments: Fragments,
-        spheres: tuple[wp.array, wp.array],
-        is_adaptive: np.ndarray,
-        supersampling: int,
-    ) -> Quadtree | None:
+    def find_squares(self, blocker_kinds: BlockerKinds, surfaces: VisibleSurfaces) -> Quadtree | None:
         """Find the squares in which samples of adaptive bodies interpolate (:func:`.adaptive.find_squares`)."""
         return None
 

@@ -16,13 +16,12 @@ from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached
 from warpshadow.pipeline.receivers.groups import Blockers, CellVisibility, Group, HarmonicVisibility, find_groups
-from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
+from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, VisibleSurfaces, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.shading.method import LightInput, Method
 from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, join_portions
 from warpshadow.stages.quadtree import Quadtree
-from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.shading import shade
 
@@ -149,22 +148,12 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         """Shading of a group in known light."""
         raise NotImplementedError
 
-    def find_squares(
-        self,
-        blocker_kinds: BlockerKinds,
-        positions: wp.array,
-        normals: wp.array,
-        fragments: Fragments,
-        spheres: tuple[wp.array, wp.array],
-        is_adaptive: np.ndarray,
-        supersampling: int,
-    ) -> Quadtree:
+    def find_squares(self, blocker_kinds: BlockerKinds, surfaces: VisibleSurfaces) -> Quadtree:
         """Find the squares in which samples of adaptive bodies interpolate."""
         from warpshadow.pipeline.receivers.adaptive import find_squares
 
         place = functools.partial(self.scene_blockers.placed, blocker_kinds)
-        seen = positions, normals, fragments, spheres
-        return find_squares(place, self.share_of_sharpest_light, *seen, is_adaptive, supersampling)
+        return find_squares(place, self.share_of_sharpest_light, surfaces)
 
     def share_of_sharpest_light(self, group: Group) -> np.ndarray | None:
         """Share of a group's unblocked light that comes from the cells with the sharpest shadows.
