@@ -33,7 +33,7 @@ from warpshadow.pipeline.node import Call, Node, NodeStage
 from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.shading.method import LightInput
-from warpshadow.pipeline.shading.sphere_method import PortionedShading, ProjectedLight, SphereMethod
+from warpshadow.pipeline.shading.sphere_method import LitPortion, PortionedShading, ProjectedLight, SphereMethod
 from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.patch_weights import PatchWeights, find_mean_transmittance, find_patch_weights
@@ -58,19 +58,10 @@ class PortionDirectLight(NamedTuple):
     cells: CellTransmittance
 
 
-class PortionedVisibility(PortionedShading):
-    """Visibility of receivers for direct and bounced light, in portions."""
-
-    def find(
-        self, call: Call, portion: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
-    ) -> PortionVisibility:
-        """Find the visibility of a portion."""
-        visibility = self.find_visibility(call, portion, projected_light)
-        return PortionVisibility(
-            self.light(call, portion, visibility, projected_light),
-            portion,
-            find_cell_transmittance(self.method, portion, visibility, spheres),
-        )
+def _visibility_of(method: SphereMethod, portion: LitPortion) -> PortionVisibility:
+    """Visibility of a portion for direct and bounced light, given its transfer vectors."""
+    cells = find_cell_transmittance(method, portion.group, portion.visibility, portion.spheres)
+    return PortionVisibility(portion.light, portion.group, cells)
 
 
 class PortionedDirectLight(Node):
@@ -87,7 +78,7 @@ class PortionedDirectLight(Node):
 
     def __init__(
         self,
-        visibility: PortionedVisibility,
+        visibility: PortionedShading,
         projected_light: Node,
         item_text: str | Callable[[], str],
         where: str = "",
@@ -138,7 +129,7 @@ class PatchSampleNodes(NamedTuple):
     """Nodes of the points at which patches are lit."""
 
     points: LitPoints
-    visibility: PortionedVisibility  # of the patch samples, for any light
+    visibility: PortionedShading  # of the patch samples, for any light
     frames: Node  # of flat bodies
     projected_patches: Node  # patches as receivers see them
     weights: Node  # of patch samples and patches, by how open they are
@@ -225,7 +216,7 @@ class BouncedShading(PortionedDirectLight):
 
     def __init__(
         self,
-        visibility: PortionedVisibility,
+        visibility: PortionedShading,
         projected_light: Node,
         item_text: Callable[[], str],
         radiosity: Radiosity,
@@ -282,7 +273,13 @@ class MovingBounces:
             return PortionedShading(method, points, projected_light, light, join_portions, stages=(idle,))
         proxies = self._proxies.setdefault(senders, Proxies(senders, method.visibility.merging))
         make_visibility = functools.partial(
-            PortionedVisibility, method, projected_light=visibility_light, light=light, finish=list, is_shaded=False
+            PortionedShading,
+            method,
+            projected_light=visibility_light,
+            light=light,
+            finish=list,
+            end="transfer",
+            result_of=functools.partial(_visibility_of, method),
         )
         key, is_cached = light.visibility_key, light.is_free or materials is not points.materials
         visibility = points.cached("visibility", (key, is_cached), lambda: make_visibility(points, caches=is_cached))
@@ -295,7 +292,7 @@ class MovingBounces:
         return BouncedShading(visibility, projected_light, item_text, radiosity, at_points)
 
     def _patch_samples(
-        self, make_visibility: Callable[..., PortionedVisibility], proxies: Proxies, points: LitPoints
+        self, make_visibility: Callable[..., PortionedShading], proxies: Proxies, points: LitPoints
     ) -> PatchSampleNodes:
         """Nodes of the patch samples of the bodies around points."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres

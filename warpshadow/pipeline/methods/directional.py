@@ -16,7 +16,7 @@ from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibilityLookup
-from warpshadow.pipeline.node import Call, Input, Node, field_of
+from warpshadow.pipeline.node import Input, Node, field_of
 from warpshadow.pipeline.receivers.groups import CellCoverages, CellVisibility, Group
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
@@ -24,7 +24,7 @@ from warpshadow.pipeline.shading.method import LightInput
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells, project_on_cells
 from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
 from warpshadow.pipeline.shading.shell import PATCHES, ShellPatches, project_on_shell
-from warpshadow.pipeline.shading.sphere_method import PortionedShading, ProjectedLight, SphereMethod
+from warpshadow.pipeline.shading.sphere_method import LitPortion, PortionedShading, SphereMethod
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, join_portions
 from warpshadow.scene.blockers import blocking_planes
 from warpshadow.stages.cached_cells import CachedRows, cell_transfer, shade_cached_cells
@@ -395,10 +395,15 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
 
     def _shading_with_cells(self, points: LitPoints, light: LightInput) -> Node:
         """Node of the shading of points in known light, and of the transmittance of the glossy ones' cells."""
-        make = functools.partial(
-            ShadingWithCells, self, points, self.projected_light(points, light), light, _join_with_cells
-        )
+        arguments = self, points, self.projected_light(points, light), light, _join_with_cells
+        make = functools.partial(PortionedShading, *arguments, result_of=self._shading_and_cells_of)
         return self.cached_for_light("direct with cells", points, light, make)
+
+    def _shading_and_cells_of(self, portion: LitPortion) -> tuple[wp.array | None, wp.array | None]:
+        """Shading of a portion, and the transmittance of its cells if its body shines."""
+        body = portion.group.body
+        is_glossy = body is not None and self.merged_scene.is_glossy[body]
+        return portion.light, _transmittance_of(portion) if is_glossy else None
 
     def _cell_transmittance(
         self, points: LitPoints, light: LightInput, shaded_points: LitPoints
@@ -412,8 +417,11 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
             return field_of(self._shading_with_cells(shaded_points, light), "cells"), visibility_light
 
         def in_cells() -> Node:
-            return PortionedCellTransmittance(
-                self, points, visibility_light, None, list, suffix=" of gloss", is_shaded=False
+            return PortionedShading(
+                *(self, points, visibility_light, None, list),
+                result_of=_transmittance_of,
+                end="visibility",
+                suffix=" of gloss",
             )
 
         return points.cached("cells", light.visibility_key, in_cells), visibility_light
@@ -449,34 +457,17 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         return cell_samples(samples, self._directions, device=self.merged_scene.device)
 
 
-class PortionedCellTransmittance(PortionedShading):
-    """Transmittance of receivers past all bodies, in portions, float32 of shape [batch, receiver, direction]."""
-
-    def find(
-        self, call: Call, portion: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
-    ) -> wp.array:
-        """Find the transmittance of a portion."""
-        return self.find_visibility(call, portion, projected_light).transmittance_total
-
-
-class ShadingWithCells(PortionedShading):
-    """Shading of receivers, in portions, and their transmittance towards cells if their body shines."""
-
-    def find(
-        self, call: Call, portion: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
-    ) -> tuple[wp.array, wp.array | None]:
-        """Shade a portion."""
-        visibility = self.find_visibility(call, portion, projected_light)
-        is_glossy = portion.body is not None and self.method.merged_scene.is_glossy[portion.body]
-        shading = self.light(call, portion, visibility, projected_light)
-        return shading, visibility.transmittance_total if is_glossy else None
-
-
 class _LightAndCells(NamedTuple):
     """Light on receivers, and their transmittance towards cells."""
 
     shading: wp.array  # vec3 of shape [batch, receiver]
     cells: list[wp.array]  # of portions of bodies that shine, float32 of shape [batch, receiver, direction]
+
+
+def _transmittance_of(portion: LitPortion) -> wp.array | None:
+    """Transmittance of a portion past all bodies, float32 of shape [batch, receiver, direction]."""
+    assert isinstance(portion.visibility, CellVisibility)
+    return portion.visibility.transmittance_total
 
 
 def _join_with_cells(portions: list[tuple[wp.array, wp.array | None]]) -> _LightAndCells:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import functools
+import operator
 from collections.abc import Callable, Iterator
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import warp as wp
@@ -232,20 +233,31 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         return Node("", to_basis, transfers)
 
 
+class LitPortion(NamedTuple):
+    """A portion of receivers, and the results of its steps."""
+
+    group: Group
+    visibility: CellVisibility | HarmonicVisibility
+    light: wp.array | None  # shading, or transfer vectors where these are the end; None where visibility is
+    spheres: tuple[wp.array, wp.array]  # centers and radii of all spheres
+
+
 class PortionedShading(Node):
     """Shading or transfer vectors of receivers, found group by group and portion by portion.
 
-    Without a gradient, transfer vectors of all receivers are in memory at once only where they are the result: for free
-    light, and in the visibility that bounces cache while colors vary. Receivers with cached rows are one portion.
+    Its program is :meth:`_light`; each step is a function of the method. Without a gradient, transfer vectors of all
+    receivers are in memory at once only where they are the result: for free light, and in the visibility that bounces
+    cache while colors vary. Receivers with cached rows are one portion.
 
     Args:
         points: The receivers.
         projected_light: The light projected for the method.
         light: Known or free light; None where it is not given yet: portions end with transfer vectors.
         finish: Combines the list of results of all portions.
+        result_of: The result of a portion; by default its light.
+        end: The last step.
         caches: As for :class:`Node`.
         suffix: Ends the names of its stages, such as " of patch samples"; by default the suffix of the points.
-        is_shaded: Whether portions are shaded in known light; else they end with transfer vectors, too.
         stages: Further ones, as for :class:`Node`.
     """
 
@@ -255,24 +267,22 @@ class PortionedShading(Node):
         points: LitPoints,
         projected_light: Node | ProjectedLight,
         light: Input | None,
-        finish: Callable[[list[wp.array]], Any],
+        finish: Callable[[list[Any]], Any],
         *,
+        result_of: Callable[[LitPortion], Any] = operator.attrgetter("light"),
+        end: Literal["visibility", "transfer", "shading"] = "shading",
         caches: bool = True,
         suffix: str | None = None,
-        is_shaded: bool = True,
         stages: tuple[NodeStage, ...] = (),
     ):
         self.method, self._bodies_and_spheres = method, (points.static_bodies, points.nearest_spheres)
-        self._finish, self._progress = finish, method.progress and light is not None
+        self._finish, self._result_of, self._progress = finish, result_of, method.progress and light is not None
+        self._end = "transfer" if light is None and end == "shading" else end
+        self._needs_transfer = self._end == "transfer" or (self._end == "shading" and not method.shades_transmittance)
         receivers, weak_points = points.receivers_node, points.weak
         suffix = points.suffix if suffix is None else suffix
         item_text = functools.partial(receiver_text, weak_points)
-        self_visibility = self_visibility_node(method, points, projected_light)
-        shadows = _static_shadows(method, points, light)
         planes = points.blocker_kinds.planes
-        blockers = placed_blockers(method, points)
-        self._is_shaded = light is not None and is_shaded
-        self._is_transferred = not (self._is_shaded and method.shades_transmittance)
         self._visibility = NodeStage(
             f"visibility{suffix}",
             lambda: method.scene_blockers.pairs_with(weak_points),
@@ -286,21 +296,20 @@ class PortionedShading(Node):
         self._transfer = NodeStage(
             f"transfer{suffix}",
             lambda: f"{item_text()} × {method.coefficient_count(light)} coefficients",
-            "" if self._is_transferred else "shading takes transmittance at once",
+            "" if self._needs_transfer else "shading takes transmittance at once",
         )
         self._shading = NodeStage(f"shading{suffix}", item_text)
-        own_stages = self._visibility, self._planes, self._transfer, self._shading
-        static_normals = None if points.static_bodies is None else points.static_bodies.normals
+        steps = self._visibility, self._planes, self._transfer, self._shading
         super().__init__(
             "",
             None,
             receivers,
-            blockers,
+            placed_blockers(method, points),
             projected_light,
-            self_visibility,
-            shadows,
-            static_normals,
-            stages=(*(own_stages if self._is_shaded else own_stages[:3]), *stages),
+            self_visibility_node(method, points, projected_light),
+            _static_shadows(method, points, light),
+            None if points.static_bodies is None else points.static_bodies.normals,
+            stages=(*steps[: {"visibility": 2, "transfer": 3, "shading": 4}[self._end]], *stages),
             caches=caches,
         )
 
@@ -314,43 +323,31 @@ class PortionedShading(Node):
         groups = find_groups(*self._bodies_and_spheres, receivers, blockers, *cached)
         total = len(receivers.on_static) + receivers.points.shape[1]
         with progress_bar(total, "shading", "receiver", shows=self._progress) as bar:
-            for group in groups:
-                for portion in group.portions():
-                    yield self.find(call, portion, projected_light, blockers.spheres)
-                    bar.update(portion.points.shape[1])
+            for portion in (portion for group in groups for portion in group.portions()):
+                yield self._result_of(self._light(call, portion, projected_light, blockers.spheres))
+                bar.update(portion.points.shape[1])
 
-    def find(
-        self, call: Call, portion: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
-    ) -> Any:
-        """Compute a portion's visibility, given the projected light and all spheres."""
-        return self.light(call, portion, self.find_visibility(call, portion, projected_light), projected_light)
-
-    def find_visibility(self, call: Call, portion: Group, projected_light: ProjectedLight) -> Any:
-        """Find the visibility of a portion, of the method's type."""
-        with self.timed(call, self._visibility):
-            visibility = self.method.find_visibility(portion, projected_light)
-        if portion.planes is None:
-            return visibility
-        with self.timed(call, self._planes):
-            return self.method.find_visibility_past_planes(portion, visibility, projected_light)
-
-    def light(
-        self,
-        call: Call,
-        portion: Group,
-        visibility: CellVisibility | HarmonicVisibility,
-        projected_light: ProjectedLight,
-    ) -> wp.array:
-        """Transfer vectors of a portion, or its shading."""
-        if not self._is_transferred:
-            with self.timed(call, self._shading):
-                return self.method.shade_transmittance(visibility, portion, projected_light)
-        with self.timed(call, self._transfer):
-            transfer = self.method.transfer(visibility, portion, projected_light)
-        if not self._is_shaded:
-            return transfer
-        with self.timed(call, self._shading):
-            return self.method.shade_transfer(transfer, portion, projected_light)
+    def _light(
+        self, call: Call, group: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
+    ) -> LitPortion:
+        """From the blockers of a portion to its light, step by step."""
+        method, timed, light = self.method, functools.partial(self.timed, call), None
+        with timed(self._visibility):
+            visibility = method.find_visibility(group, projected_light)
+        if group.planes is not None:
+            with timed(self._planes):
+                visibility = method.find_visibility_past_planes(group, visibility, projected_light)
+        if self._needs_transfer:
+            with timed(self._transfer):
+                light = method.transfer(visibility, group, projected_light)
+        if self._end == "shading":
+            with timed(self._shading):
+                light = (
+                    method.shade_transmittance(visibility, group, projected_light)
+                    if light is None
+                    else method.shade_transfer(light, group, projected_light)
+                )
+        return LitPortion(group, visibility, light, spheres)
 
 
 def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
