@@ -45,6 +45,13 @@ BANNED = {
     *("turn_from_planes", "unblocked_batch", "with_rows", "with_tail", "without_owners"),
     *("find_openness", "HIT_ROWS", "load_hit", "node_centers", "open_shares", "open_weights", "Openness", "SIDE_ROWS"),
 }
+BANNED_EVERYWHERE = {
+    *("bulging", "decide", "emitter_projection", "free_projection", "free_projection_of", "has_proxies", "in_words"),
+    *("is_before_planes", "joins_cached", "last_light", "last_shell", "lights_samples", "news", "one_transfer"),
+    *("project_free_light", "sharp_share", "solid_bodies", "total_light", "_blocked", "_blurred", "_exits"),
+    *("_lobe_cells", "_projected_from_scene", "_projected_if_given", "_shining", "_towards", "_warn_of_nothing"),
+}
+"""Replaced names of methods and fields, too, which were not to be understood even with their object's name."""
 BANNED_PARTS = {"asked", "kept", "meant", "most", "pull", "pulled", "said", "taken", "told", "wanted"}
 """Words that no name has among its parts. A preposition may be one, as in ``planes_around``, where an object follows it
 or it follows one."""
@@ -59,9 +66,10 @@ def trees() -> Iterator[tuple[str, ast.Module]]:
 
 
 def names(node: ast.AST) -> Iterator[tuple[str, int]]:
-    """Names of classes, arguments and variables; methods and fields are read after a dot, with their object's name."""
+    """Names of classes, functions, arguments and variables; a method or field is read with its object's name."""
     for child in ast.iter_child_nodes(node):
-        if isinstance(child, ast.ClassDef):
+        is_function = isinstance(child, ast.FunctionDef) and not isinstance(node, ast.ClassDef)
+        if is_function or isinstance(child, ast.ClassDef):
             yield child.name, child.lineno
         elif isinstance(child, ast.arg):
             yield child.arg, child.lineno
@@ -72,14 +80,12 @@ def names(node: ast.AST) -> Iterator[tuple[str, int]]:
             yield from names(child)
 
 
-def parts(tree: ast.Module) -> Iterator[tuple[str, str]]:
-    """Each part of each name, fields, attributes, functions and methods included; and the name, with its line."""
+def all_names(tree: ast.Module) -> Iterator[tuple[str, int]]:
+    """Each name, fields, attributes, functions and methods included."""
     for node in ast.walk(tree):
         stored = isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store)
         if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.arg) or stored:
-            name = next(getattr(node, key) for key in ("name", "arg", "id", "attr") if hasattr(node, key))
-            for part in name.lower().split("_"):
-                yield part, f"{name} (line {node.lineno})"
+            yield next(getattr(node, key) for key in ("name", "arg", "id", "attr") if hasattr(node, key)), node.lineno
 
 
 def docstrings(tree: ast.Module) -> Iterator[tuple[str, int]]:
@@ -129,7 +135,16 @@ def test_no_two_classes_have_one_name():
 def test_a_module_uses_no_banned_name(path):
     tree = ast.parse(path.read_text("utf-8"))
     banned = {f"{name} (line {line})" for name, line in names(tree) if name in BANNED}
-    assert not banned | {name for part, name in parts(tree) if part in BANNED_PARTS}
+    for name, line in all_names(tree):
+        if name in BANNED_EVERYWHERE or BANNED_PARTS.intersection(name.lower().split("_")):
+            banned.add(f"{name} (line {line})")
+    assert not banned
+
+
+def test_names_of_functions_and_of_members_are_read():
+    tree = ast.parse("class A:\n    x: int = 0\n    def f(self): self.y = 1\ndef g(a): b = 2")
+    assert {name for name, _ in names(tree)} == {"A", "self", "g", "a", "b"}
+    assert {name for name, _ in all_names(tree)} == {"A", "x", "f", "self", "y", "g", "a", "b"}
 
 
 def test_indices_into_batches_are_called_so():

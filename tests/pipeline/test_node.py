@@ -9,7 +9,7 @@ import warp as wp
 from warpshadow.assets.harmonic_light import HarmonicLight
 from warpshadow.device.constants import collected
 from warpshadow.device.tape import recorded
-from warpshadow.pipeline.explain import Explanation, decide
+from warpshadow.pipeline.explain import Explanation, decide_which_nodes_run
 from warpshadow.pipeline.node import Call, Clock, Input, Node, NodeStage, detached
 
 
@@ -94,7 +94,7 @@ def test_the_same_values_are_the_same_source():
     first = Input.renewed("vertices", array(), None)
     assert Input.renewed("vertices", array(), first) is first
     other = Input.renewed("vertices", array((1.0, 3.0)), first)
-    assert other is not first and other.news == "vertices changed since the last call" and not first.news
+    assert other is not first and other.why_new == "vertices changed since the last call" and not first.why_new
 
 
 def test_a_source_has_the_values_that_it_was_given():
@@ -174,7 +174,7 @@ def test_coefficients_are_compared_and_other_things_are_what_they_are():
 def wired(vertices=2, cameras=3, **options):
     """Silhouettes of what cameras see, which no gradient passes, and an image."""
     vertices = Input("vertices", vertices)
-    cameras = Input("cameras", cameras, news="cameras changed since the last call")
+    cameras = Input("cameras", cameras, why_new="cameras changed since the last call")
     clip = Node("clip positions", lambda a, b: 1, vertices, cameras, items="4 vertices")
     silhouettes = Node("silhouettes", lambda clip: clip, clip, has_adjoint=False)
     normals = Node("normals", lambda a: 1, vertices)
@@ -197,7 +197,7 @@ def test_each_node_says_why_it_runs_or_does_not(clock):
     }
     assert list(explanation.stages)[0] == "clip positions" and explanation["clip positions"].items == "4 vertices"
     image.value(call)
-    decisions = decide(image, Call(clock))
+    decisions = decide_which_nodes_run(image, Call(clock))
     assert decisions[nodes["normals"]].why == "cached: vertices are the same"
     assert decisions[nodes["clip positions"]].why == "cached: vertices and cameras are the same"
     assert decisions[image].runs
@@ -207,7 +207,7 @@ def test_what_is_not_asked_for_is_left_out_for_the_reason_of_who_would_ask(clock
     transfer = Node("transfer", lambda a: a, Input("vertices", 1), caches=False)
     shading = Node("shading", lambda a, b: a + b, transfer, Input("light", 2))
     shading.value(Call(clock))
-    decisions = decide(shading, Call(clock))
+    decisions = decide_which_nodes_run(shading, Call(clock))
     assert not decisions[transfer] and decisions[transfer].why == "cached: vertices and light are the same"
 
 

@@ -64,7 +64,7 @@ class Explanation:
         hidden: Collection[Node] = (),
         notes: Iterable[str] = (),
     ):
-        decisions = decide(image, call)
+        decisions = decide_which_nodes_run(image, call)
         self.stages: dict[str, StageReport] = {}
         for node in decisions:
             if node not in hidden:
@@ -109,7 +109,7 @@ def shell_notes(shell: np.ndarray | None) -> list[str]:
     return [f"Light comes from {radius:g} around ({x:g}, {y:g}, {z:g})."]
 
 
-def decide(image: Node, call: Call) -> dict[Node, Decision]:
+def decide_which_nodes_run(image: Node, call: Call) -> dict[Node, Decision]:
     """Decide which nodes run when a call asks for an image, in the order in which they do; nothing is computed."""
     decisions: dict[Node, Decision] = {}
     requested: set[Node] = set()
@@ -147,8 +147,8 @@ def _reason_to_run(inputs: Iterable[AnyInput], reason: Decision, otherwise: str 
     root_inputs = dict.fromkeys(root for item in inputs for root in item.root_inputs)
     if varying := [root for root in root_inputs if root.requires_grad]:
         return Decision(True, f"a gradient to {_names(varying)} is asked for")
-    if news := [root.news for root in root_inputs if root.news]:
-        return Decision(True, _listed(dict.fromkeys(news)))
+    if reasons := [root.why_new for root in root_inputs if root.why_new]:
+        return Decision(True, _listed(dict.fromkeys(reasons)))
     return Decision(True, otherwise) if otherwise else reason
 
 

@@ -91,14 +91,14 @@ class _Taking(Protocol[P, Inputs_co]):
     def __call__(self, method: Callable[[Owner, First, Inputs_co], R]) -> Callable[Concatenate[Owner, First, P], R]: ...
 
 
-def takes(record: Callable[P, Inputs_co], **instead: str) -> _Taking[P, Inputs_co]:
+def takes(record: Callable[P, Inputs_co], **remedies: str) -> _Taking[P, Inputs_co]:
     """Let users give the fields of a record as arguments to a method whose last argument is the record, ``inputs``.
 
     The method's signature, types and documentation then say them one by one.
 
     Args:
         record: A dataclass such as :class:`ImageInputs`, of some type of arrays.
-        instead: Remedies for other keywords, as of :func:`.check.keywords`.
+        remedies: Remedies for other keywords, as of :func:`.check.keywords`.
     """
     kind: Any = typing.get_origin(record) or record
     types = _field_types(record)
@@ -121,7 +121,7 @@ def takes(record: Callable[P, Inputs_co], **instead: str) -> _Taking[P, Inputs_c
         hints = {name: hint for name, hint in method.__annotations__.items() if name != "inputs"}
         taking.__annotations__ = hints | types
         taking.__doc__ = re.sub(r"^ +inputs: .*$", lambda _: entries, method.__doc__ or "", flags=re.MULTILINE)
-        return check.keywords(**instead)(taking)
+        return check.keywords(**remedies)(taking)
 
     return decorate  # type: ignore[return-value]
 

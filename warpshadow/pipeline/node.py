@@ -29,13 +29,13 @@ class Input:
     Args:
         name: Name of the stage.
         value: The value; or a function that makes it when it is first asked for.
-        news: Why it takes the place of another, in words, such as "light is given".
+        why_new: Why it takes the place of another, in words, such as "light is given".
     Attributes:
         requires_grad: Whether a gradient to it is asked for.
     """
 
-    def __init__(self, name: str, value: Any, *, news: str = ""):
-        self.name, self.news, self.original, self._value = name, news, value, value
+    def __init__(self, name: str, value: Any, *, why_new: str = ""):
+        self.name, self.why_new, self.original, self._value = name, why_new, value, value
         self.requires_grad = False
         for item in value if isinstance(value, (tuple, list)) else [value]:
             self.requires_grad |= getattr(item, "requires_grad", False)
@@ -57,11 +57,6 @@ class Input:
         use(self._value)
         return self._value
 
-    @property
-    def is_free(self) -> bool:
-        """Whether the value of an input of light is free light, an array, and not known light."""
-        return isinstance(self.value(), wp.array)
-
     @classmethod
     def renewed(cls, name: str, value: Any, last: "Input | None") -> "Input":
         """Make an input with a copy of the value, or return the last input if the value is the same.
@@ -76,7 +71,7 @@ class Input:
         if last is not None and not last.requires_grad:
             if _is_same(value, last):
                 return last
-            result.news = f"{name} changed since the last call"
+            result.why_new = f"{name} changed since the last call"
         result._value = _copied(value)
         return result
 

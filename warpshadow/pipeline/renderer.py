@@ -25,14 +25,14 @@ from warpshadow.pipeline.bodies.geometry import Geometry, as_geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.delegation import delegated
-from warpshadow.pipeline.explain import Explanation, decide, shell_notes
+from warpshadow.pipeline.explain import Explanation, decide_which_nodes_run, shell_notes
 from warpshadow.pipeline.image_inputs import ImageArrays, takes
 from warpshadow.pipeline.methods.by_name import make_method
 from warpshadow.pipeline.node import Clock, Input, Node
 from warpshadow.pipeline.receivers.choice_of_receivers import choose_receivers, receiver_notes, with_receivers
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.receivers.unevenness import NearLight
-from warpshadow.pipeline.shading.transfers import Light, ShellLight, one_transfer
+from warpshadow.pipeline.shading.transfers import Light, ShellLight, join_transfers
 from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.catchers import CatchersAlone
 from warpshadow.pipeline.views.layers import LayerArrays, Layers, find_layer_arrays, find_layers
@@ -200,11 +200,11 @@ class SceneRenderer:
             return view
         for node in (view.receivers_node, view.silhouettes):
             node.value(view.call)
-        self._warn_of_nothing(view)
+        self._warn_once(view)
         self._views.keep(view)
         return view
 
-    def _warn_of_nothing(self, view: View) -> None:
+    def _warn_once(self, view: View) -> None:
         """Say once why an image shows nothing, and the likely mistakes in the scene itself."""
         is_of_scene, device = self._views.is_of_scene(view), self.device
         if not self._has_warned and (is_readable(device) or (is_of_scene and not device.is_capturing)):
@@ -217,7 +217,7 @@ class SceneRenderer:
     def _scene_view(self) -> View:
         """Build the view of the cameras on the scene; a warning tells of coarse faces."""
         view = self.view()
-        if not self._method.lights_samples:
+        if not self._method.every_sample_receives:
             warn_of_vertex_receivers(view, self._given_scene.bodies, self.cameras[0])
         return view
 
@@ -253,7 +253,7 @@ class SceneRenderer:
                 "shade and draw take free light that bounces, with any method"
             )
         view = self._scene_view
-        return one_transfer(view.transfers.value(self._views.call(view)))
+        return join_transfers(view.transfers.value(self._views.call(view)))
 
     @announced
     def shade(self, light: Light | None = None, view: LitPoints | None = None) -> wp.array:
@@ -478,7 +478,7 @@ class SceneRenderer:
         hidden: set[Node] = set()
         if view is not None:
             view = self._checked(view)
-            hidden = {*decide(view.receivers_node, view.call), view.silhouettes}
+            hidden = {*decide_which_nodes_run(view.receivers_node, view.call), view.silhouettes}
         else:
             geometry = None if inputs.geometry is None else as_geometry("geometry", inputs.geometry)
             view = self._views.view(geometry, inputs.clip_matrices)
@@ -486,7 +486,7 @@ class SceneRenderer:
         light, materials = _light_of(inputs), self.materials(inputs.of_bodies)
         image = preview.image(light, materials)
         is_host = self.device.is_cpu or self.clock.waits
-        of_receivers = receiver_notes(self._given_scene, self._choices, view.blocker_kinds.bulging)
+        of_receivers = receiver_notes(self._given_scene, self._choices, view.blocker_kinds.bulging_bodies)
         of_bounces = self._transport.notes(preview, light, materials)
         notes = [*of_receivers, *of_bounces, *shell_notes(self.scene.shell)]
         return Explanation(

@@ -27,8 +27,9 @@ from typing import TYPE_CHECKING
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints
-from warpshadow.pipeline.shading.method import LightInput, Method, add_light
+from warpshadow.pipeline.shading.method import LightInput, Method
 from warpshadow.pipeline.shading.transfers import Light
+from warpshadow.stages.light.sums import add_light
 
 if TYPE_CHECKING:  # they are imported where light bounces
     from warpshadow.pipeline.bounces.moving_bounces import MovingBounces
@@ -45,7 +46,7 @@ class Bouncing(enum.Enum):
 
 
 def choose_bouncing(
-    *, is_free: bool, is_given: bool, is_of_scene: bool, has_proxies: bool, shares_directions: bool
+    *, is_free: bool, is_given: bool, is_of_scene: bool, spheres_stand_in: bool, shares_directions: bool
 ) -> Bouncing:
     """Choose how light bounces: the lower rows of the table above.
 
@@ -53,9 +54,9 @@ def choose_bouncing(
         is_free: Whether the light is free.
         is_given: Whether some reflectance is given in place of the scene's.
         is_of_scene: Whether bodies and cameras are where the scene has them, for good, and no shell moves.
-        has_proxies, shares_directions: Of the method.
+        spheres_stand_in, shares_directions: Of the method.
     """
-    if has_proxies:
+    if spheres_stand_in:
         return Bouncing.STATIC if is_of_scene and (is_free or is_given) else Bouncing.MOVING
     return Bouncing.STATIC if is_free or is_given or shares_directions else Bouncing.PATHS
 
@@ -103,7 +104,7 @@ class LightTransport:
             is_free=light.is_free,
             is_given=materials is not points.materials,
             is_of_scene=points.is_scene_view and not shell_moves,
-            has_proxies=self.method.has_proxies,
+            spheres_stand_in=self.method.spheres_stand_in,
             shares_directions=self.method.shares_directions,
         )
 

@@ -136,6 +136,11 @@ class MergedScene:
         return np.array([body.mesh.is_flat for body in self.scene.bodies])
 
     @functools.cached_property
+    def nonplanar_bodies(self) -> list[int]:
+        """Bodies that are not flat, which spheres represent in bounced light."""
+        return np.flatnonzero(~self.is_flat).tolist()
+
+    @functools.cached_property
     def is_glossy(self) -> np.ndarray:
         """Bodies that shine, bool of shape [body]."""
         return np.array([body.is_glossy for body in self.scene.bodies])

@@ -165,7 +165,7 @@ class Materials:
             if name == "albedo":
                 values["textures"][number] = None
         changed = {
-            name: Input(name, arrays, news=f"{name} {'are' if name == 'textures' else 'is'} given")
+            name: Input(name, arrays, why_new=f"{name} {'are' if name == 'textures' else 'is'} given")
             for name, arrays in values.items()
             if not all(map(operator.is_, arrays, self._inputs[name].value()))
         }

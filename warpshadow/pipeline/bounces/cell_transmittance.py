@@ -12,7 +12,7 @@ import warp as wp
 
 from warpshadow.device.batch import common_batch, expand
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.receivers.groups import CellVisibility, Group, HarmonicVisibility, nonplanar_bodies
+from warpshadow.pipeline.receivers.groups import CellVisibility, Group, HarmonicVisibility
 from warpshadow.pipeline.shading.sphere_method import SphereMethod
 from warpshadow.stages.visibility.directional import transmittance
 
@@ -54,7 +54,7 @@ def find_cell_transmittance(
         )
     else:
         directions, transmittance_self = HARMONIC_GATHER_CELLS, None
-        transmittance_nonplanar = _transmittance(method, group, nonplanar_bodies(merged_scene), spheres, directions)
+        transmittance_nonplanar = _transmittance(method, group, merged_scene.nonplanar_bodies, spheres, directions)
     own = group.own
     if transmittance_self is None and own is not None and not (own.is_solid or merged_scene.is_flat[own.number]):
         transmittance_self = _transmittance(method, group, [own.number], spheres, directions)

@@ -75,7 +75,7 @@ class OutgoingRadiance:
     def texels(self) -> wp.array:
         """Radiosity of the flat bodies, vec3 of shape [batch, texel]."""
         assert self.proxies.planes is not None
-        return find_texels(self.radiosity, self.patch_weights, self.proxies.planes.all)
+        return find_texels(self.radiosity, self.patch_weights, self.proxies.planes.blockers)
 
 
 class Gathering:
@@ -142,12 +142,19 @@ class Gathering:
     def _from_planes(self, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array:
         planes = outgoing.proxies.planes
         assert planes is not None
-        skip = planes.number.get(group.body)
-        points, fronts = group.lifted_points_and_fronts(outgoing.frames, planes.all, skip)
+        skip = planes.index_of_body.get(group.body)
+        points, fronts = group.lifted_points_and_fronts(outgoing.frames, planes.blockers, skip)
         # Cells look to where the light of the sky is, above horizons; light of planes is found around their middles. A
         # ball on a ground lost 4% of the ground's light by the former.
         middles = fibonacci(len(cells.directions))
-        arguments = points, group.normals, cells.transmittance_nonplanar, outgoing.frames, outgoing.texels, planes.all
+        arguments = (
+            points,
+            group.normals,
+            cells.transmittance_nonplanar,
+            outgoing.frames,
+            outgoing.texels,
+            planes.blockers,
+        )
         return plane_light(*arguments, middles, coverages=cells.part_coverages, fronts=fronts, skip=skip)
 
     def _from_spheres(self, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:

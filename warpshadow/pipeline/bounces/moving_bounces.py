@@ -33,12 +33,12 @@ from warpshadow.pipeline.node import Call, Node, NodeStage
 from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.shading.method import LightInput
-from warpshadow.pipeline.shading.sphere_method import PortionedShading, ProjectedLight, SphereMethod
-from warpshadow.pipeline.shading.transfers import joined
+from warpshadow.pipeline.shading.sphere_method import LitPortion, PortionedShading, ProjectedLight, SphereMethod
+from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.patch_weights import PatchWeights, find_mean_transmittance, find_patch_weights
 from warpshadow.stages.bounces.radiosity import patch_radiosity
-from warpshadow.stages.light.total import total_light
+from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.receivers.find import Receivers
 
 
@@ -58,19 +58,10 @@ class PortionDirectLight(NamedTuple):
     cells: CellTransmittance
 
 
-class PortionedVisibility(PortionedShading):
-    """Visibility of receivers for direct and bounced light, in portions."""
-
-    def find(
-        self, call: Call, portion: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
-    ) -> PortionVisibility:
-        """Find the visibility of a portion."""
-        visibility = self.find_visibility(call, portion, projected_light)
-        return PortionVisibility(
-            self.light(call, portion, visibility, projected_light),
-            portion,
-            find_cell_transmittance(self.method, portion, visibility, spheres),
-        )
+def _visibility_of(method: SphereMethod, portion: LitPortion) -> PortionVisibility:
+    """Visibility of a portion for direct and bounced light, given its transfer vectors."""
+    cells = find_cell_transmittance(method, portion.group, portion.visibility, portion.spheres)
+    return PortionVisibility(portion.light, portion.group, cells)
 
 
 class PortionedDirectLight(Node):
@@ -87,7 +78,7 @@ class PortionedDirectLight(Node):
 
     def __init__(
         self,
-        visibility: PortionedVisibility,
+        visibility: PortionedShading,
         projected_light: Node,
         item_text: str | Callable[[], str],
         where: str = "",
@@ -121,7 +112,7 @@ def _patch_weights(senders: Senders, visibility: list[PortionVisibility]) -> Pat
         )
         for portion in visibility
     ]
-    return find_patch_weights(joined(portions), senders.mean, senders.patch_of_sample)
+    return find_patch_weights(join_portions(portions), senders.mean, senders.patch_of_sample)
 
 
 def _add_emitted(lit: list[PortionDirectLight], emitted: wp.array) -> list[PortionDirectLight]:
@@ -129,7 +120,7 @@ def _add_emitted(lit: list[PortionDirectLight], emitted: wp.array) -> list[Porti
     result, first = [], 0
     for portion in lit:
         end = first + portion.direct.shape[1]
-        result.append(portion._replace(direct=total_light([portion.direct, cut(emitted, first, end)])))
+        result.append(portion._replace(direct=add_light(portion.direct, cut(emitted, first, end))))
         first = end
     return result
 
@@ -138,7 +129,7 @@ class PatchSampleNodes(NamedTuple):
     """Nodes of the points at which patches are lit."""
 
     points: LitPoints
-    visibility: PortionedVisibility  # of the patch samples, for any light
+    visibility: PortionedShading  # of the patch samples, for any light
     frames: Node  # of flat bodies
     projected_patches: Node  # patches as receivers see them
     weights: Node  # of patch samples and patches, by how open they are
@@ -193,7 +184,7 @@ class Radiosity(Node):
                 outgoing = sent(radiosity)
                 portions = [self._light(call, portion, outgoing) for portion in lit]
             with self.timed(call, self._reflection):
-                return patch_radiosity(albedo, joined(portions), senders.mean, weights.shares)
+                return patch_radiosity(albedo, join_portions(portions), senders.mean, weights.shares)
 
         def add_radiosity_by_self(by_others: wp.array, radiosity: wp.array | None) -> wp.array:
             if between is None or radiosity is None:
@@ -209,7 +200,7 @@ class Radiosity(Node):
     def _light(self, call: Call, portion: PortionDirectLight, outgoing: OutgoingRadiance) -> wp.array:
         """Light of a portion of the patch samples past its own body, from the sky and from others."""
         bounced = self._gathering.lights(self, call, portion.group, portion.cells, outgoing)
-        return total_light([portion.direct, *bounced])
+        return add_light(portion.direct, *bounced)
 
 
 class BouncedShading(PortionedDirectLight):
@@ -225,7 +216,7 @@ class BouncedShading(PortionedDirectLight):
 
     def __init__(
         self,
-        visibility: PortionedVisibility,
+        visibility: PortionedShading,
         projected_light: Node,
         item_text: Callable[[], str],
         radiosity: Radiosity,
@@ -238,13 +229,13 @@ class BouncedShading(PortionedDirectLight):
         """Light all portions, directly and by the patches' radiosity."""
         projected_light, outgoing = self.values(call)
         portions = self._visibility.value(call) if self._visibility.caches else self._visibility.portions(call)
-        return joined(
+        return join_portions(
             [self._bounced(call, self._light(call, portion, projected_light), outgoing) for portion in portions]
         )
 
     def _bounced(self, call: Call, portion: PortionDirectLight, outgoing: OutgoingRadiance) -> wp.array:
         bounced = self._gathering.lights(self, call, portion.group, portion.cells, outgoing)
-        return total_light([portion.direct, *bounced])
+        return add_light(portion.direct, *bounced)
 
 
 class MovingBounces:
@@ -273,13 +264,22 @@ class MovingBounces:
             materials: Reflectance of the bodies.
         """
         method, senders = self._method, self._patches.senders(materials)
-        projected_light, projection = method.projected(points, light), method.projection(points, light)
+        projected_light, visibility_light = (
+            method.projected_light(points, light),
+            method.light_of_visibility(points, light),
+        )
         if not senders.bodies:
             idle = NodeStage("bounces", idle="every body is black")
-            return PortionedShading(method, points, projected_light, light, joined, stages=(idle,))
+            return PortionedShading(method, points, projected_light, light, join_portions, stages=(idle,))
         proxies = self._proxies.setdefault(senders, Proxies(senders, method.visibility.merging))
         make_visibility = functools.partial(
-            PortionedVisibility, method, projected_light=projection, light=light, finish=list, is_shaded=False
+            PortionedShading,
+            method,
+            projected_light=visibility_light,
+            light=light,
+            finish=list,
+            end="transfer",
+            result_of=functools.partial(_visibility_of, method),
         )
         key, is_cached = light.visibility_key, light.is_free or materials is not points.materials
         visibility = points.cached("visibility", (key, is_cached), lambda: make_visibility(points, caches=is_cached))
@@ -287,12 +287,12 @@ class MovingBounces:
             "of patch samples", (key, senders), lambda: self._patch_samples(make_visibility, proxies, points)
         )
         radiosity = self._radiosity(of_patch_samples, projected_light, proxies, materials)
-        item_text = functools.partial(receiver_text, points.in_words)
+        item_text = functools.partial(receiver_text, points.weak)
         at_points = self._gathering(senders, item_text)
         return BouncedShading(visibility, projected_light, item_text, radiosity, at_points)
 
     def _patch_samples(
-        self, make_visibility: Callable[..., PortionedVisibility], proxies: Proxies, points: LitPoints
+        self, make_visibility: Callable[..., PortionedShading], proxies: Proxies, points: LitPoints
     ) -> PatchSampleNodes:
         """Nodes of the patch samples of the bodies around points."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
@@ -303,7 +303,7 @@ class MovingBounces:
         arguments = senders, points, proxies.nearest_spheres
         lit_samples = points.cached("patch samples beside proxies", proxies, lambda: lit_patch_samples(*arguments))
         visibility = make_visibility(lit_samples)
-        frames = Node("", planes.all.frames if planes else lambda _: None, points.vertices)
+        frames = Node("", planes.blockers.frames if planes else lambda _: None, points.vertices)
         projected_patches = Node("", project, lit_samples.receivers_node, visibility, spheres, frames)
         weights = Node("", functools.partial(_patch_weights, senders), visibility)
         return PatchSampleNodes(lit_samples, visibility, frames, projected_patches, weights)

@@ -16,8 +16,7 @@ from warpshadow.device.constants import constant
 from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance
 from warpshadow.pipeline.bounces.overlays import find_overlays
 from warpshadow.pipeline.bounces.patches import Senders
-from warpshadow.pipeline.receivers.groups import nonplanar_bodies
-from warpshadow.pipeline.shading.transfers import joined
+from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.stages.bounces.projected_areas import find_projected_areas, tilt_normals_off_planes
 from warpshadow.stages.bounces.proxies import find_depths, place_proxies
 from warpshadow.stages.bounces.proxy_radiance import patches_of_clusters
@@ -30,10 +29,10 @@ from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 
 
 class SenderPlanes(NamedTuple):
-    """Flat bodies."""
+    """The flat bodies among senders."""
 
-    all: PlaneBlockers
-    number: dict[int | None, int]  # of each among them, by the number of the body
+    blockers: PlaneBlockers
+    index_of_body: dict[int | None, int]  # of each among them, by the number of the body
 
 
 class ProjectedPatches(NamedTuple):
@@ -76,14 +75,9 @@ class Proxies:
         return SenderPlanes(planes, {number: k for k, number in enumerate(numbers)})
 
     @functools.cached_property
-    def nonplanar_bodies(self) -> list[int]:
-        """The bodies whose proxies are spheres."""
-        return nonplanar_bodies(self.merged_scene)
-
-    @functools.cached_property
     def black_bodies(self) -> list[int]:
         """Nonplanar bodies that send no light: their blocker spheres are their proxies."""
-        return [body for body in self.nonplanar_bodies if body not in self.senders.bodies]
+        return [body for body in self.merged_scene.nonplanar_bodies if body not in self.senders.bodies]
 
     @functools.cached_property
     def overlays(self) -> tuple[SparseMatrix, np.ndarray] | None:
@@ -135,7 +129,7 @@ class Proxies:
         centers, radii = rest.centers.numpy()[0], rest.radii.numpy()[0]
         numbers, ratios = np.full(len(senders.areas), -1, np.int32), np.zeros(len(senders.areas), np.float32)
         start = 0
-        for body in self.nonplanar_bodies:
+        for body in self.merged_scene.nonplanar_bodies:
             of_body = slice(*first_sphere[body : body + 2])
             if len(radii[of_body]) and body in senders.bodies:
                 sender_index = senders.bodies.index(body)
@@ -178,21 +172,21 @@ class Proxies:
             frames: Where flat bodies are.
         """
         normals, planes, senders = patch_samples.normals, self.planes, self.senders
-        centers, radii = self.merged_scene.spheres_of(self.nonplanar_bodies, spheres)
+        centers, radii = self.merged_scene.spheres_of(self.merged_scene.nonplanar_bodies, spheres)
         if planes is not None:
             numbers, points, device = self.nearest_spheres, patch_samples.points, normals.device
             of_patch_samples = NearestBlockers(centers, radii, constant(numbers, wp.int32, device))
-            fronts = find_fronts(points, normals, None, of_patch_samples, frames, planes.all)
+            fronts = find_fronts(points, normals, None, of_patch_samples, frames, planes.blockers)
             if self.overlays is not None:
                 numbers = np.where(self.overlays[1][senders.patch_of_sample] > 0, np.int32(-1), numbers)
-            normals = tilt_normals_off_planes(points, normals, radii, numbers, fronts, frames, planes.all)
+            normals = tilt_normals_off_planes(points, normals, radii, numbers, fronts, frames, planes.blockers)
         rows = [
             wp.full_like(portion.transmittance_nonplanar, 1.0, requires_grad=False)
             if portion.transmittance_self is None
             else portion.transmittance_self
             for portion in cells
         ]
-        transmittance = joined([row.reshape((len(row), -1)) for row in rows])
+        transmittance = join_portions([row.reshape((len(row), -1)) for row in rows])
         directions = cells[0].directions
         transmittance = transmittance.reshape((len(transmittance), len(senders.sides), len(directions)))
         mean_points = multiply(senders.mean, patch_samples.points)

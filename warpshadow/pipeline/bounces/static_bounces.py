@@ -214,8 +214,8 @@ class StaticBounces:
         return field_of(self._factors(points, materials, senders, at_patch_samples), "openness")
 
     def _item_text(self, points: LitPoints, senders: Senders) -> Callable[[], str]:
-        words = points.in_words
-        return lambda: f"{receiver_text(words)}, {len(senders.areas):,} patches, {self._bounces} bounces"
+        weak_points = points.weak
+        return lambda: f"{receiver_text(weak_points)}, {len(senders.areas):,} patches, {self._bounces} bounces"
 
     def _factors(
         self, points: LitPoints, materials: Materials, senders: Senders, at_patch_samples: Node | None = None

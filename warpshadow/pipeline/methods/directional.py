@@ -16,7 +16,7 @@ from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibilityLookup
-from warpshadow.pipeline.node import Call, Input, Node, field_of
+from warpshadow.pipeline.node import Input, Node, field_of
 from warpshadow.pipeline.receivers.groups import CellCoverages, CellVisibility, Group
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
@@ -24,8 +24,8 @@ from warpshadow.pipeline.shading.method import LightInput
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells, project_on_cells
 from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
 from warpshadow.pipeline.shading.shell import PATCHES, ShellPatches, project_on_shell
-from warpshadow.pipeline.shading.sphere_method import PortionedShading, ProjectedLight, SphereMethod
-from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, joined
+from warpshadow.pipeline.shading.sphere_method import LitPortion, PortionedShading, SphereMethod
+from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, join_portions
 from warpshadow.scene.blockers import blocking_planes
 from warpshadow.stages.gloss.reflection import blocked_radiance
 from warpshadow.stages.gloss.transmittance import transmittance_of_directions
@@ -55,8 +55,8 @@ class SharpestCells(NamedTuple):
 
     directions: np.ndarray  # [16, 3]
     light: wp.array  # luminance in channel 0, for cells of 4π/16, vec3 of shape [1, 16]
-    scale: float  # their radius, over that of cells of 4π/16
-    edge_radius: float  # how soft the edges of planes and convex parts are in them [rad]
+    relative_radius: float  # of their cells, over that of cells of 4π/16
+    edge_radius: float  # of the disc by which planes and convex parts cover them [rad]
     power: np.ndarray  # luminance of all cells [direction]
 
 
@@ -70,7 +70,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         is_near = merged_scene.scene.shell is not None
         native_basis = PATCHES if is_near else CellBasis(self._directions)
         super().__init__(merged_scene, native_basis, basis, progress=progress)
-        self.free_projection = ProjectedCells(
+        self.free_basis = ProjectedCells(
             self._directions, patches=None if self.shell is None else ShellPatches(self.shell)
         )
 
@@ -81,7 +81,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         """
         if shell is not None:
             patches, radiance = project_on_shell(light, shell)
-            return self.free_projection._replace(patches=patches, coefficients=radiance)
+            return self.free_basis._replace(patches=patches, coefficients=radiance)
         blockers = self.scene_blockers
         return project_on_cells(
             light,
@@ -95,9 +95,9 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     def _on_device(self, coefficients: np.ndarray) -> wp.array:
         return constant(coefficients[None], wp.vec3, self.merged_scene.device)
 
-    def project_free_light(self, shell: wp.array) -> ProjectedCells:
+    def free_basis_of_shell(self, shell: wp.array) -> ProjectedCells:
         """The basis of free light of another shell than the scene's. Differentiable: shell."""
-        return self.free_projection._replace(patches=ShellPatches(shell))
+        return self.free_basis._replace(patches=ShellPatches(shell))
 
     def coefficient_count(self, light: Input | None) -> int:
         """Number of coefficients that take part: all."""
@@ -107,7 +107,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         self, bodies: tuple[int, ...], rotations: wp.array, projected_light: ProjectedCells
     ) -> dict[int, SelfVisibilityLookup]:
         """Lookups of the receivers of some bodies. Differentiable: rotations."""
-        towards = projected_light.directions if projected_light.spots is None else projected_light.spots
+        towards = projected_light.blocking_directions if projected_light.spots is None else projected_light.spots
         has_sun = projected_light.sun is not None
         lookups = self.scene_blockers.self_visibility.lookups
         return lookups(bodies, rotations, towards, projected_light.half_angles, has_sun=has_sun)
@@ -115,7 +115,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     def find_visibility(self, group: Group, projected_light: ProjectedCells) -> CellVisibility:
         """Transmittance of a group past its own body, spheres and convex parts."""
         points, normals, radii, cached_rows = group.points, group.normals, group.radii, group.cached_rows
-        directions = projected_light.directions
+        directions = projected_light.blocking_directions
         transmittance_self = self._transmittance_self(group, projected_light)
         # cached cells have light although their middles are below the horizon
         horizon_normals = normals if cached_rows is None else None
@@ -127,7 +127,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
             cover = functools.partial(group.convex_parts_around.coverage, points, horizon_normals)
             parts = self._coverages(cover, projected_light)
         # planes multiply their share in later; only bounces need the product without them, too
-        if group.is_before_planes and not self.merged_scene.scene.bounces:
+        if group.is_blocked_by_planes and not self.merged_scene.scene.bounces:
             return CellVisibility(
                 directions, None, transmittance_self, transmittance_self_and_spheres=past_spheres, part_coverages=parts
             )
@@ -141,7 +141,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
 
     def _coverages(self, cover: Callable[..., wp.array], projected_light: ProjectedCells) -> CellCoverages:
         """Coverage of all cells and of sharp ones."""
-        coverage = cover(projected_light.directions)
+        coverage = cover(projected_light.blocking_directions)
         sharp_cells = projected_light.sharp_cells_past_planes
         if sharp_cells is None:
             return CellCoverages(coverage)
@@ -178,7 +178,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         """Transmittance past spheres."""
         arguments, scales = (group.points, horizon_normals, group.centers, group.radii), self._scales
         block = functools.partial(directional.transmittance, *arguments, skip=group.skip, clusters=group.clusters)
-        transmittance = block(projected_light.directions, **scales(1.0))
+        transmittance = block(projected_light.blocking_directions, **scales(1.0))
         if projected_light.sharp_cells is None:
             return transmittance
         directions, slots, scale = projected_light.sharp_cells
@@ -190,7 +190,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         return {"softness": scale * self.visibility.softness, "merging": scale * self.visibility.merging}
 
     @functools.cached_property
-    def emitter_projection(self) -> ProjectedCells:
+    def emitter_cells(self) -> ProjectedCells:
         """Even light in cells that are finer than those of the map: emitters are small."""
         from warpshadow.pipeline.shading.emitters import EMITTER_CELLS
 
@@ -210,7 +210,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     ) -> CellVisibility:
         """Transmittance past the flat bodies around a group, too."""
         planes = group.planes
-        if planes is None or not group.is_before_planes:
+        if planes is None or not group.is_blocked_by_planes:
             return visibility
         horizon_normals = group.normals if group.cached_rows is None else None
         points, fronts = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
@@ -219,7 +219,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
             functools.partial(plane_coverage, points, planes.frames, planes.planes, **options), projected_light
         )
         if projected_light.samples is not None and planes.planes.has_holes:
-            cells = projected_light.directions, projected_light.samples
+            cells = projected_light.blocking_directions, projected_light.samples
             covered = covered._replace(
                 cells=coverage_of_light(points, covered.cells, planes.frames, planes.planes, *cells, **options)
             )
@@ -251,10 +251,12 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         """Transfer vectors; the transmittance as it is where cached cells hold known light."""
         assert visibility.transmittance_total is not None
         if projected_light.patches is not None:
-            arguments = group.points, group.normals, visibility.transmittance_total, projected_light.directions
+            arguments = group.points, group.normals, visibility.transmittance_total, projected_light.blocking_directions
             return projected_light.patches.transfer(*arguments)
         if group.cached_rows is None:
-            return directional_transfer(visibility.transmittance_total, group.normals, projected_light.facing)
+            return directional_transfer(
+                visibility.transmittance_total, group.normals, projected_light.cosine_directions
+            )
         if _has_light(group.cached_rows):
             return visibility.transmittance_total
         return cell_transfer(visibility.transmittance_total, group.cached_rows)
@@ -272,7 +274,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         if group.cached_rows is not None or projected_light.patches is not None:
             return self.shade_transfer(self.transfer(visibility, group, projected_light), group, projected_light)
         assert visibility.transmittance_total is not None and projected_light.coefficients is not None
-        cells = projected_light.facing, projected_light.coefficients
+        cells = projected_light.cosine_directions, projected_light.coefficients
         return shade_cells(visibility.transmittance_total, group.normals, *cells, maximum=LARGEST_COEFFICIENT)
 
     @functools.cached_property
@@ -285,42 +287,42 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         directions, light = np.empty((CHUNK, 3)), np.zeros(CHUNK)
         if projected_light.sharp_cells_past_planes is None:
             chosen = np.sort(np.argsort(-power, kind="stable")[:CHUNK])
-            directions, light = projected_light.directions[chosen], power[chosen]
-            scale = cell_radius(len(power)) / cell_radius(CHUNK)
-            radius = cell_radius(len(power))
+            directions, light = projected_light.blocking_directions[chosen], power[chosen]
+            relative_radius = cell_radius(len(power)) / cell_radius(CHUNK)
+            edge_radius = cell_radius(len(power))
         else:
-            directions, slots, scale = projected_light.sharp_cells_past_planes
+            directions, slots, relative_radius = projected_light.sharp_cells_past_planes
             light[slots[slots >= 0]] = power[slots >= 0]
-            radius = self._edge_radius(projected_light.sharp_cells_past_planes)
+            edge_radius = self._edge_radius(projected_light.sharp_cells_past_planes)
         light = light[:, None] * [CHUNK / len(power), 0, 0]
-        return SharpestCells(directions, self._on_device(light), scale, radius, power)
+        return SharpestCells(directions, self._on_device(light), relative_radius, edge_radius, power)
 
-    def sharp_share(self, group: Group) -> np.ndarray | None:
+    def share_of_sharpest_light(self, group: Group) -> np.ndarray | None:
         """Share of a group's unblocked light that still comes from the sharpest cells; None where nothing blocks."""
-        directions, light, scale, radius, power = self._sharpest_cells
+        directions, light, relative_radius, edge_radius, power = self._sharpest_cells
         points, normals, centers, radii = group[:4]
         if not radii.shape[1] and group.planes is None and group.convex_parts_around is None:
             return None
         if radii.shape[1]:
             transmittance = directional.transmittance(
-                points, normals, centers, radii, directions, **self._scales(scale)
+                points, normals, centers, radii, directions, **self._scales(relative_radius)
             )
         else:
             transmittance = wp.full((*points.shape, CHUNK), 1.0, dtype=wp.float32, device=points.device)
         coverages = []
         if group.convex_parts_around is not None:
-            coverages.append(group.convex_parts_around.coverage(points, normals, directions, radius))
+            coverages.append(group.convex_parts_around.coverage(points, normals, directions, edge_radius))
         planes = group.planes
-        if planes is not None and group.is_before_planes:
+        if planes is not None and group.is_blocked_by_planes:
             lifted, fronts = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
-            options: dict[str, Any] = {"radius": radius, "horizon_normals": normals, "fronts": fronts}
+            options: dict[str, Any] = {"radius": edge_radius, "horizon_normals": normals, "fronts": fronts}
             coverages.append(
                 plane_coverage(lifted, planes.frames, planes.planes, directions, skip=planes.skip, **options)
             )
         if coverages:
             transmittance = transmittance_past(transmittance, *coverages)
         lit = shade_cells(transmittance, normals, directions, light, maximum=LARGEST_COEFFICIENT).numpy()[..., 0]
-        receiver_normals, towards = normals.numpy(), self.free_projection.directions
+        receiver_normals, towards = normals.numpy(), self.free_basis.blocking_directions
         plane_normals = receiver_normals[:, :1]  # points of a plane have this normal or its opposite
         facing = plane_normals @ towards.T  # [batch, 1, cell]
         whole = [4 / len(power) * np.maximum(cosines, 0) @ power for cosines in (facing, -facing)]
@@ -328,28 +330,38 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         unblocked = np.where(is_front, *whole)
         return np.divide(lit, unblocked, out=np.zeros_like(lit), where=unblocked > 0)
 
-    def lobe_transmittance(self, points: LitPoints, directions: Node, light: LightInput, view: LitPoints) -> Node:
+    def lobe_transmittance(
+        self, points: LitPoints, directions: Node, light: LightInput, shaded_points: LitPoints
+    ) -> Node:
         """Transmittance towards the samples of lobes, between cells; of known light, to where it comes from in them."""
-        cells, projected_light = self._lobe_cells(points, light, view)
-        item_text = functools.partial(receiver_text, points.in_words)
+        cells, projected_light = self._cell_transmittance(points, light, shaded_points)
+        item_text = functools.partial(receiver_text, points.weak)
         arguments = cells, points.receivers_node, directions, projected_light
-        return Node("transmittance of lobes", _towards, *arguments, items=item_text)
+        return Node("transmittance of lobes", _lobe_transmittance, *arguments, items=item_text)
 
     def blocked_radiance(
         self,
         points: LitPoints,
         diffuse: Node,
         light: LightInput,
-        view: LitPoints,
+        shaded_points: LitPoints,
         choose: Callable[[Node], Node],
         openness: Node | None,
     ) -> Node:
         """Mean radiance of the blockers of points, by their light with bounces and without."""
-        cells, projected_light = self._lobe_cells(points, light, view)
+        cells, projected_light = self._cell_transmittance(points, light, shaded_points)
         free = light if light.is_free else None
-        return Node("light of blockers", self._blocked, cells, points.receivers_node, projected_light, diffuse, free)
+        return Node(
+            "light of blockers",
+            self._mean_radiance_of_blockers,
+            cells,
+            points.receivers_node,
+            projected_light,
+            diffuse,
+            free,
+        )
 
-    def _blocked(
+    def _mean_radiance_of_blockers(
         self,
         cells: list[wp.array],
         receivers: Receivers,
@@ -359,11 +371,11 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     ) -> wp.array:
         if not diffuse.size:
             return diffuse
-        count = len(projected_light.directions)
-        transmittance = _joined_cells(cells, count)
-        of_cells = transfer = directional_transfer(transmittance, receivers.normals, projected_light.facing)
+        count = len(projected_light.blocking_directions)
+        transmittance = _join_cells(cells, count)
+        of_cells = transfer = directional_transfer(transmittance, receivers.normals, projected_light.cosine_directions)
         if projected_light.patches is not None:
-            arguments = receivers.points, receivers.normals, transmittance, projected_light.directions
+            arguments = receivers.points, receivers.normals, transmittance, projected_light.blocking_directions
             transfer = projected_light.patches.transfer(*arguments)
         light = projected_light.coefficients if free is None else change_basis(free, self.native_from_basis)
         assert light is not None
@@ -381,24 +393,38 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         """Whether the transmittance of cells at bodies that shine comes with the shading of a view."""
         return not self.merged_scene.scene.bounces and points.materials.roughness is not None
 
-    def _shading_with_cells(self, view: LitPoints, light: LightInput) -> Node:
-        """Node of the shading of a view in known light, and of the transmittance of its glossy receivers' cells."""
-        make = functools.partial(ShadingWithCells, self, view, self.projected(view, light), light, _joined_with_cells)
-        return self.cached_for_light("direct with cells", view, light, make)
+    def _shading_with_cells(self, points: LitPoints, light: LightInput) -> Node:
+        """Node of the shading of points in known light, and of the transmittance of the glossy ones' cells."""
+        arguments = self, points, self.projected_light(points, light), light, _join_with_cells
+        make = functools.partial(PortionedShading, *arguments, result_of=self._shading_and_cells_of)
+        return self.cached_for_light("direct with cells", points, light, make)
 
-    def _lobe_cells(self, points: LitPoints, light: LightInput, view: LitPoints) -> tuple[Node, Node | ProjectedCells]:
+    def _shading_and_cells_of(self, portion: LitPortion) -> tuple[wp.array | None, wp.array | None]:
+        """Shading of a portion, and the transmittance of its cells if its body shines."""
+        body = portion.group.body
+        is_glossy = body is not None and self.merged_scene.is_glossy[body]
+        return portion.light, _transmittance_of(portion) if is_glossy else None
+
+    def _cell_transmittance(
+        self, points: LitPoints, light: LightInput, shaded_points: LitPoints
+    ) -> tuple[Node, Node | ProjectedCells]:
         """Node of the transmittance of cells, in portions, and the projected light that says which.
 
         In known light that does not bounce the shading of the view has found it.
         """
-        projection = self.projection(points, light)
-        if not light.is_free and self._shades_with_cells(view):
-            return field_of(self._shading_with_cells(view, light), "cells"), projection
+        visibility_light = self.light_of_visibility(points, light)
+        if not light.is_free and self._shades_with_cells(shaded_points):
+            return field_of(self._shading_with_cells(shaded_points, light), "cells"), visibility_light
 
         def in_cells() -> Node:
-            return PortionedCellTransmittance(self, points, projection, None, list, suffix=" of gloss", is_shaded=False)
+            return PortionedShading(
+                *(self, points, visibility_light, None, list),
+                result_of=_transmittance_of,
+                end="visibility",
+                suffix=" of gloss",
+            )
 
-        return points.cached("cells", light.visibility_key, in_cells), projection
+        return points.cached("cells", light.visibility_key, in_cells), visibility_light
 
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """Rows of the light of each cell that static bodies let through.
@@ -431,29 +457,6 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         return cell_samples(samples, self._directions, device=self.merged_scene.device)
 
 
-class PortionedCellTransmittance(PortionedShading):
-    """Transmittance of receivers past all bodies, in portions, float32 of shape [batch, receiver, direction]."""
-
-    def find(
-        self, call: Call, portion: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
-    ) -> wp.array:
-        """Find the transmittance of a portion."""
-        return self.find_visibility(call, portion, projected_light).transmittance_total
-
-
-class ShadingWithCells(PortionedShading):
-    """Shading of receivers, in portions, and their transmittance towards cells if their body shines."""
-
-    def find(
-        self, call: Call, portion: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
-    ) -> tuple[wp.array, wp.array | None]:
-        """Shade a portion."""
-        visibility = self.find_visibility(call, portion, projected_light)
-        is_glossy = portion.body is not None and self.method.merged_scene.is_glossy[portion.body]
-        shading = self.light(call, portion, visibility, projected_light)
-        return shading, visibility.transmittance_total if is_glossy else None
-
-
 class _LightAndCells(NamedTuple):
     """Light on receivers, and their transmittance towards cells."""
 
@@ -461,24 +464,30 @@ class _LightAndCells(NamedTuple):
     cells: list[wp.array]  # of portions of bodies that shine, float32 of shape [batch, receiver, direction]
 
 
-def _joined_with_cells(portions: list[tuple[wp.array, wp.array | None]]) -> _LightAndCells:
+def _transmittance_of(portion: LitPortion) -> wp.array | None:
+    """Transmittance of a portion past all bodies, float32 of shape [batch, receiver, direction]."""
+    assert isinstance(portion.visibility, CellVisibility)
+    return portion.visibility.transmittance_total
+
+
+def _join_with_cells(portions: list[tuple[wp.array, wp.array | None]]) -> _LightAndCells:
     cells_of_glossy = [cells for _, cells in portions if cells is not None]
-    return _LightAndCells(joined([shading for shading, _ in portions]), cells_of_glossy)
+    return _LightAndCells(join_portions([shading for shading, _ in portions]), cells_of_glossy)
 
 
-def _towards(
+def _lobe_transmittance(
     cells: list[wp.array], receivers: Receivers, directions: wp.array, projected_light: ProjectedCells
 ) -> wp.array:
-    count = len(projected_light.directions)
+    count = len(projected_light.blocking_directions)
     if not directions.size:
         return wp.empty(directions.shape, dtype=wp.float32, device=directions.device)
-    transmittance = _joined_cells(cells, count)
-    return transmittance_of_directions(transmittance, receivers.normals, directions, projected_light.facing)
+    transmittance = _join_cells(cells, count)
+    return transmittance_of_directions(transmittance, receivers.normals, directions, projected_light.cosine_directions)
 
 
-def _joined_cells(cells: list[wp.array], count: int) -> wp.array:
+def _join_cells(cells: list[wp.array], count: int) -> wp.array:
     """Transmittance of all portions, [batch, receiver, direction]. Differentiable."""
-    rows = joined([portion.reshape((len(portion), -1)) for portion in cells])
+    rows = join_portions([portion.reshape((len(portion), -1)) for portion in cells])
     return rows.reshape((len(rows), -1, count))
 
 

@@ -39,12 +39,12 @@ class ProjectedBands(NamedTuple):
 class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
     """Visibility of low frequencies. Where no body has spheres there are no shadows."""
 
-    joins_cached = True
+    adds_cached_rows = True
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
         self._order = order = merged_scene.scene.visibility.order
         super().__init__(merged_scene, HarmonicBasis(order), basis, progress=progress)
-        self.free_projection = ProjectedBands(
+        self.free_basis = ProjectedBands(
             min(order, self.basis.order) if isinstance(self.basis, HarmonicBasis) else order
         )
 
@@ -58,7 +58,7 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
         """Number of coefficients that take part."""
         known = None if light is None else light.value()
         if known is None or isinstance(known, wp.array):
-            return self.free_projection.bands**2
+            return self.free_basis.bands**2
         return known.bands(self._order) ** 2
 
     def self_lookups(

@@ -26,7 +26,7 @@ class NoShadows(LogSH):
         super().__init__(merged_scene, basis, progress=progress)
         if self.shell is not None:
             self.native_basis, self.basis = PATCHES, PATCHES if basis is None else basis
-            self.free_projection = self.project_free_light(self.shell)
+            self.free_basis = self.free_basis_of_shell(self.shell)
 
     @functools.cached_property
     def scene_blockers(self) -> SceneBlockers:
@@ -40,7 +40,7 @@ class NoShadows(LogSH):
         patches, radiance = project_on_shell(light, shell)
         return ProjectedBands(0, radiance, patches)
 
-    def project_free_light(self, shell: wp.array) -> ProjectedBands:
+    def free_basis_of_shell(self, shell: wp.array) -> ProjectedBands:
         """The basis of free light of a shell. Differentiable: shell."""
         return ProjectedBands(0, patches=ShellPatches(shell))
 

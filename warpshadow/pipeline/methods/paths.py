@@ -13,7 +13,7 @@ from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.stages.light.light_samples import sample_map
-from warpshadow.stages.light.total import total_light
+from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.ray_traced.path_tracing import PathSurfaces, trace_bounces
 from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.shell.beams import FAR
@@ -116,9 +116,9 @@ def path_traced(
             options = {"bounces": bounces, "paths": paths, "shell": of_instance(shells), "progress": progress}
             light = trace_bounces(surfaces, *places, drawn, **options)
             wp.copy(bounced[instance], light)
-        return total_light([shading, bounced])
+        return add_light(shading, bounced)
 
-    words = points.in_words
+    weak_points = points.weak
     return Node(
         "bounces",
         trace,
@@ -134,7 +134,7 @@ def path_traced(
         materials.of_vertices("emission") if materials.emission else None,
         emission_images.pyramids if emission_images and emission_images.images else None,
         emitters,
-        items=lambda: f"{receiver_text(words)} × {paths:,} paths of {maximum} bounces",
+        items=lambda: f"{receiver_text(weak_points)} × {paths:,} paths of {maximum} bounces",
         has_adjoint=False,
     )
 

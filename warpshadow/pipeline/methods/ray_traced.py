@@ -37,7 +37,7 @@ _EVEN_RAYS = 128  # directions in which receivers that shine look for how much o
 class Rays(Method):
     """Visibility of the meshes."""
 
-    lights_samples = True
+    every_sample_receives = True
     lobe_samples = 64  # each is blocked or not: with 32, reflected edges show as many edges
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
@@ -53,7 +53,7 @@ class Rays(Method):
             points.receivers_node,
             light,
             self.shell_of(light),
-            items=functools.partial(receiver_text, points.in_words),
+            items=functools.partial(receiver_text, points.weak),
             stages=(NodeStage("transfer", idle="rays shade known light at once"),),
         )
 
@@ -80,7 +80,7 @@ class Rays(Method):
         receivers, placed = points.receivers_node, self.emitters.placed(points)
 
         def traced() -> Node:
-            name, items = f"rays to emitters{points.suffix}", functools.partial(receiver_text, points.in_words)
+            name, items = f"rays to emitters{points.suffix}", functools.partial(receiver_text, points.weak)
             arguments = points.vertices, receivers, placed
             return Node(name, self._trace_emitters, *arguments, items=items, has_adjoint=False)
 
@@ -104,9 +104,11 @@ class Rays(Method):
             for span in samples.spans()
         ]
 
-    def lobe_transmittance(self, points: LitPoints, directions: Node, light: LightInput, view: LitPoints) -> Node:
+    def lobe_transmittance(
+        self, points: LitPoints, directions: Node, light: LightInput, shaded_points: LitPoints
+    ) -> Node:
         """Transmittance towards the samples of lobes: rays, each of its own."""
-        item_text = functools.partial(receiver_text, points.in_words)
+        item_text = functools.partial(receiver_text, points.weak)
         return Node(
             "transmittance of lobes",
             _trace_lobes,
@@ -121,26 +123,26 @@ class Rays(Method):
         points: LitPoints,
         diffuse: Node,
         light: LightInput,
-        view: LitPoints,
+        shaded_points: LitPoints,
         choose: Callable[[Node], Node],
         openness: Node | None,
     ) -> Node:
         """Mean radiance of the blockers of points, by their light with bounces and without."""
-        direct, trees = self.direct_shading(view, light), self._trees_around(points)
+        direct, trees = self.direct_shading(shaded_points, light), self._trees_around(points)
         if openness is None:
             openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
         return Node("light of blockers", blocked_radiance, diffuse, choose(direct), openness)
 
     def transfers(self, points: LitPoints, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""
-        words = points.in_words
+        weak_points = points.weak
         node = Node(
             f"transfer{points.suffix}",
             self._transfer,
             self._meshes(points),
             points.receivers_node,
             self.shell if shell is None else shell,
-            items=lambda: f"{receiver_text(words)} × {self.basis.size} coefficients",
+            items=lambda: f"{receiver_text(weak_points)} × {self.basis.size} coefficients",
         )
         if node.requires_grad:
             node.function = _refuse
@@ -162,13 +164,13 @@ class Rays(Method):
         """Node of the meshes that rays from points meet."""
 
         def meshes() -> Node:
-            words = points.in_words
+            weak_points = points.weak
             return Node(
                 f"visibility{points.suffix}",
                 self._casting_meshes,
                 points.vertices,
                 detached(points.receivers_node),
-                items=lambda: f"{receiver_text(words)} by rays",
+                items=lambda: f"{receiver_text(weak_points)} by rays",
                 idle="" if self.merged_scene.casting else "no body has blockers",
                 caches=False,
                 stages=(NodeStage("static shadows", idle="rays treat all receivers alike"),),

@@ -14,7 +14,7 @@ import warp as wp
 from warpshadow.device.launch import without_gradient
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.receivers.groups import Blockers, Group
-from warpshadow.stages.raster.rasterization import Fragments
+from warpshadow.pipeline.receivers.lit_points import VisibleSurfaces
 from warpshadow.stages.receivers.find import points_of_fragments
 from warpshadow.stages.receivers.quadtree import Quadtree, find_quadtree, probe_grid
 from warpshadow.stages.receivers.sample_receivers import fragments_of_samples
@@ -22,44 +22,37 @@ from warpshadow.stages.receivers.sample_receivers import fragments_of_samples
 
 def find_squares(
     place_blockers: Callable[[wp.array, tuple[wp.array, wp.array]], Blockers],
-    sharp_share: Callable[[Group], np.ndarray | None],
-    positions: wp.array,
-    normals: wp.array,
-    fragments: Fragments,
-    spheres: tuple[wp.array, wp.array],
-    is_adaptive: np.ndarray,
-    supersampling: int,
+    share_of_sharpest_light: Callable[[Group], np.ndarray | None],
+    surfaces: VisibleSurfaces,
 ) -> Quadtree:
     """Find the squares of images in which the samples of some bodies interpolate.
 
     Args:
         place_blockers: Places blockers, given the vertices, and the spheres.
-        sharp_share: Finds the share of the unblocked light of a group that comes from the cells with the sharpest
-            shadows, shape [batch, receiver]; None where no shadow is sharp.
-        positions, normals: Of the vertices, vec3 of shape [batch, vertex]; no gradient passes.
-        spheres: Centers and radii of all spheres.
-        is_adaptive: The bodies, which are flat, bool of shape [body].
-        supersampling: Samples of a pixel across and down.
+        share_of_sharpest_light: Finds the share of the unblocked light of a group that comes from the cells with the
+            sharpest shadows, shape [batch, receiver]; None where no shadow is sharp.
+        surfaces: The samples, and the bodies; no gradient passes to them.
     """
+    positions, normals, fragments, spheres, is_adaptive, supersampling = surfaces
     positions, normals, centers, radii = map(without_gradient, (positions, normals, *spheres))
     with unrecorded():
         blockers = place_blockers(positions, (centers, radii))
     merged_scene = blockers.merged_scene
     sides = fragments.face_ids if fragments.sides is None else fragments.sides
-    keys, bodies = _keys(is_adaptive.tobytes(), merged_scene.first_face.tobytes())
+    keys, bodies = _find_keys_of_sides(is_adaptive.tobytes(), merged_scene.first_face.tobytes())
     row, column = probe_grid(sides.shape[1:], supersampling)
-    numbers, probes = _by_tiles(sides.shape[1:], supersampling)
+    numbers, probes = _order_by_tiles(sides.shape[1:], supersampling)
     body_of_probe = bodies[sides.numpy().reshape(len(sides), -1)[:, probes[:-1]]]
     shares = np.zeros((len(sides), len(probes)), np.float32)  # the last is of no probe
     with unrecorded():
         for body in np.flatnonzero(is_adaptive).tolist():
-            columns = _ragged(body_of_probe == body)
+            columns = _list_chosen(body_of_probe == body)
             if not columns.shape[1]:
                 continue
             seen = fragments_of_samples(fragments, probes[columns])
             points_and_normals = points_of_fragments(positions, normals, merged_scene.faces, seen)
             group = blockers.around_plane(*points_and_normals, body)
-            portions = [sharp_share(portion) for portion in group.portions()]
+            portions = [share_of_sharpest_light(portion) for portion in group.portions()]
             known = [portion for portion in portions if portion is not None]
             if known:
                 shares[np.arange(len(sides))[:, None], numbers[columns]] = np.concatenate(known, axis=1)
@@ -68,10 +61,10 @@ def find_squares(
 
 
 @functools.lru_cache(maxsize=16)
-def _keys(is_adaptive: bytes, first_face: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """A number of each face side by body, fronts first and then backs, and its body; −1 where that is not adaptive.
+def _find_keys_of_sides(is_adaptive: bytes, first_face: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """Find a key for each face side, of its body and side, and its body; both −1 where that is not adaptive.
 
-    The last body, −1, is that of side −1.
+    Fronts come first, then backs. The last body, −1, is that of side −1.
     """
     adaptive, starts = np.frombuffer(is_adaptive, bool), np.frombuffer(first_face, int)
     bodies = np.repeat(np.where(adaptive, np.arange(len(adaptive), dtype=np.int32), -1), np.diff(starts))
@@ -80,7 +73,7 @@ def _keys(is_adaptive: bytes, first_face: bytes) -> tuple[np.ndarray, np.ndarray
 
 
 @functools.lru_cache(maxsize=16)
-def _by_tiles(size: tuple[int, int], supersampling: int) -> tuple[np.ndarray, np.ndarray]:
+def _order_by_tiles(size: tuple[int, int], supersampling: int) -> tuple[np.ndarray, np.ndarray]:
     """Order the probes of a grid by 4 × 4 tiles, so that neighbors are shaded one after another.
 
     Returns:
@@ -93,7 +86,7 @@ def _by_tiles(size: tuple[int, int], supersampling: int) -> tuple[np.ndarray, np
     return np.append(permutation, len(permutation)), np.append(samples, -1)
 
 
-def _ragged(chosen: np.ndarray) -> np.ndarray:
+def _list_chosen(chosen: np.ndarray) -> np.ndarray:
     """List the chosen columns of each row, padded with −1, shape [row, longest row]."""
     if len(chosen) == 1:
         return np.flatnonzero(chosen)[None]

@@ -196,19 +196,19 @@ def _has_sun(scene: Scene) -> bool:
     return find_sharp_cells(cells.radiance @ LUMINANCE, cells.spots, cells.half_angles) is not None
 
 
-def receiver_notes(scene: Scene, choices: Sequence[ReceiverChoice], bulging: Collection[int] = ()) -> list[str]:
+def receiver_notes(scene: Scene, choices: Sequence[ReceiverChoice], bulging_bodies: Collection[int] = ()) -> list[str]:
     """Describe the choice for each body that leaves it open, a line each.
 
     Args:
         scene: The scene as it was given.
         choices: The choices for its bodies.
-        bulging: Bodies out of which their spheres bulge: :class:`.BlockerKinds`.
+        bulging_bodies: Bodies out of which their spheres bulge: :class:`.BlockerKinds`.
     """
     notes = []
     for number, (body, choice) in enumerate(zip(scene.bodies, choices, strict=True)):
         if body.receivers == AUTO and choice.size is not None:
             where, why = _WHERE[choice.receivers], _reason(choice)
-            if number in bulging:
+            if number in bulging_bodies:
                 where, why = _WHERE["vertex"], "spheres block its light, and bulge out of it between vertices"
             notes.append(f"Body {number} ({body.name!r}) has receivers at {where}: {why}.")
     return notes

@@ -28,11 +28,6 @@ from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 RECEIVERS_AT_ONCE = 1 << 13  # receivers of each instance that are lit at once where no gradient is asked for
 
 
-def nonplanar_bodies(merged_scene: MergedScene) -> list[int]:
-    """Bodies that spheres represent in bounced light: all that are not flat."""
-    return [body for body in range(len(merged_scene.scene.bodies)) if not merged_scene.is_flat[body]]
-
-
 class OwnBody(NamedTuple):
     """The body on which the receivers of a group lie, which may block their light."""
 
@@ -64,7 +59,7 @@ class Group(NamedTuple):
     clusters: ClusterTree | None = None  # of the spheres, where they are found already
 
     @property
-    def is_before_planes(self) -> bool:
+    def is_blocked_by_planes(self) -> bool:
         """Whether planes block light of its receivers."""
         return self.planes is not None and bool(self.points.size and self.planes.blocking)
 
@@ -311,5 +306,5 @@ def _nearest_blockers(nearest_spheres: np.ndarray | None, blockers: Blockers) ->
     if nearest_spheres is None:
         return None
     merged_scene = blockers.merged_scene
-    sphere_arrays = merged_scene.spheres_of(nonplanar_bodies(merged_scene), blockers.spheres)
+    sphere_arrays = merged_scene.spheres_of(merged_scene.nonplanar_bodies, blockers.spheres)
     return NearestBlockers(*sphere_arrays, constant(nearest_spheres, wp.int32, merged_scene.device))

@@ -8,11 +8,13 @@ from collections.abc import Callable, Hashable
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
+import warp as wp
 
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.stages.geometry.normals import vertex_normals
+from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.receivers.find import Receivers
 
 if TYPE_CHECKING:
@@ -31,12 +33,23 @@ class BlockerKinds(NamedTuple):
     planes: tuple[int, ...] = ()  # bodies that block all light as the planes in which they lie
     convex: tuple[int, ...] = ()  # bodies that block the light of others by the convex parts that they consist of
     solids: tuple[int, ...] = ()  # convex bodies whose parts block their own light, too; of others rays are traced
-    bulging: tuple[int, ...] = ()  # bodies out of which their spheres bulge: receivers are vertices, whatever is chosen
+    bulging_bodies: tuple[int, ...] = ()  # out of which their spheres bulge: receivers are vertices, whatever is chosen
 
     @property
     def separate(self) -> set[int]:
         """Bodies whose receivers form a group each."""
         return {*self.self_traced, *self.solids, *self.planes}
+
+
+class VisibleSurfaces(NamedTuple):
+    """Surfaces that the samples of an image see, some of them by adaptive receivers."""
+
+    positions: wp.array  # of all vertices, vec3 of shape [batch, vertex]
+    normals: wp.array  # likewise
+    fragments: Fragments
+    spheres: tuple[wp.array, wp.array]  # centers and radii of all spheres
+    is_adaptive: np.ndarray  # bodies whose samples interpolate, which are flat, bool of shape [body]
+    supersampling: int  # samples of a pixel across and down
 
 
 ONLY_SPHERES = BlockerKinds()  # all bodies block by their spheres
@@ -84,8 +97,6 @@ class LitPoints:
         self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
         self.call, self.static_bodies = call, static_bodies
         self.normals = Node("", vertex_normals, vertices, merged_scene.faces) if normals is None else normals
-        self.last_light: Any = None  # that was known, but for the scene's: a ``LightInput``
-        self.last_shell: Input | None = None  # of light, but for the scene's
         self._cached: dict[str, tuple[Hashable, Any]] = {}
         self._cached_of_bodies: dict[str, tuple[Hashable, Any]] = {}
         if neighbors is not None:
@@ -95,6 +106,10 @@ class LitPoints:
         """A value for the points, such as a node, cached under a name while its inputs stay the same."""
         return _cached(self._cached, name, key, make)
 
+    def last_cached(self, name: str) -> Any:
+        """The value cached under a name, whatever it was made from; None without one."""
+        return self._cached.get(name, (None, None))[1]
+
     def cached_of_bodies(self, name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:
         """The same of a value that is equal for all points among the same bodies."""
         return _cached(self._cached_of_bodies, name, key, make)
@@ -103,7 +118,7 @@ class LitPoints:
         """Other receivers, of which nothing is cached, among the same blockers, any of which may move."""
         points = copy.copy(self)
         points.receivers_node, points.static_bodies, points.is_scene_view = receivers, None, False
-        points._cached, points.last_light, points.last_shell = {}, None, None
+        points._cached = {}
         return points
 
     def preview(self: Points) -> Points:
@@ -117,8 +132,8 @@ class LitPoints:
         return points
 
     @property
-    def in_words(self: Points) -> Points:
-        """The points for functions that put a node of theirs into words.
+    def weak(self: Points) -> Points:
+        """A weak reference to the points, for functions that put a node of theirs into words.
 
         These must not hold the points, which hold the node: arrays would stay until Python collects garbage.
         """

@@ -24,7 +24,7 @@ from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Call, Clock, Input, Node
 from warpshadow.pipeline.receivers.groups import Blockers, Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints
-from warpshadow.pipeline.shading.transfers import joined
+from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.stages.bounces.albedo import mean_over_texels
 from warpshadow.stages.emitters.beams import find_axis_weights, within_beam
 from warpshadow.stages.emitters.convex import find_log_transmittance_of_parts
@@ -52,7 +52,7 @@ from warpshadow.stages.gloss.highlights import sum_highlights
 from warpshadow.stages.gloss.reflection import LobeLight
 from warpshadow.stages.gloss.transmittance import transmittance_of_directions
 from warpshadow.stages.joint_coverage import transmittance_past
-from warpshadow.stages.light.total import total_light
+from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
@@ -235,7 +235,7 @@ class SceneEmitters:
         ) -> wp.array:
             lit = receivers.points, receivers.normals, placed_samples, radiance
             pairs = self._within_beams(receivers, placed_samples, transmittance)
-            return total_light([sum_light(*lit, *pair) for pair in pairs])
+            return add_light(*(sum_light(*lit, *pair) for pair in pairs))
 
         return Node(name, light, receivers, placed, radiance, transmittance)
 
@@ -255,7 +255,7 @@ class SceneEmitters:
             seen = receivers.points, receivers.normals, roughness, clip_matrices, placed_samples, radiance
             pairs = self._within_beams(receivers, placed_samples, transmittance)
             of_emitters = [sum_highlights(*seen, *pair) for pair in pairs]
-            return LobeLight(*(total_light(list(parts)) for parts in zip(*of_emitters, strict=True)))
+            return LobeLight(*(add_light(*parts) for parts in zip(*of_emitters, strict=True)))
 
         return Node("highlights", highlights, receivers, placed, radiance, transmittance, roughness, cameras)
 
@@ -291,10 +291,10 @@ def find_emitted_light(
         total = wp.zeros(portion.points.shape, dtype=wp.vec3, device=portion.points.device)
         lit = portion.points, portion.normals, placed_samples, radiance
         for pair in _find_transmittances(emitters, self_visibility, portion, blockers, placed_samples):
-            total = total_light([total, sum_light(*lit, *pair)])
+            total = add_light(total, sum_light(*lit, *pair))
         return total
 
-    return joined([light_of(portion) for group in groups for portion in group.portions()])
+    return join_portions([light_of(portion) for group in groups for portion in group.portions()])
 
 
 def find_highlights(
@@ -324,9 +324,9 @@ def find_highlights(
             sum_highlights(*seen, placed_samples, radiance, *pair)
             for pair in _find_transmittances(emitters, self_visibility, portion, blockers, placed_samples)
         ]
-        lobe_sums.append([total_light([zeros, *parts]) for parts in zip(*of_emitters, strict=True)] or [zeros, zeros])
+        lobe_sums.append([add_light(zeros, *parts) for parts in zip(*of_emitters, strict=True)] or [zeros, zeros])
         first = end
-    return LobeLight(*(joined(list(portions)) for portions in zip(*lobe_sums, strict=True)))
+    return LobeLight(*(join_portions(list(portions)) for portions in zip(*lobe_sums, strict=True)))
 
 
 def _find_transmittances(
@@ -455,7 +455,7 @@ def _log_of_planes(
 ) -> wp.array | None:
     """Logarithm of the transmittance of planes between a group and an emitter; None without any."""
     planes, numbers = group.planes, blockers.blocker_kinds.planes
-    if planes is None or not group.is_before_planes:
+    if planes is None or not group.is_blocked_by_planes:
         return None
     points, _ = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
     skipped = -1 if planes.skip is None else planes.skip, numbers.index(body) if body in numbers else -1

@@ -16,13 +16,14 @@ from warpshadow.device.constants import constant
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node, detached, field_of
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
-from warpshadow.pipeline.shading.method import LightInput, Method, add_light
+from warpshadow.pipeline.shading.method import LightInput, Method
 from warpshadow.pipeline.shading.transfers import Light, change_basis
 from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.stages.gloss.lobes import LobeSamples, sample_lobes
 from warpshadow.stages.gloss.normal_spread import NormalSpread, find_normal_spread
 from warpshadow.stages.gloss.prefilter import look_up_light, prefilter
 from warpshadow.stages.gloss.reflection import LobeLight, mix_reflection, number_runs, sum_lobes
+from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.receivers.find import Receivers
@@ -47,7 +48,7 @@ class GlossyPoints(LitPoints):
 
     def __init__(self, method: Method, view: LitPoints, cameras: Input, fragments: Node, clip_positions: Node):
         glossy = view.merged_scene.is_glossy
-        receivers = Node("", functools.partial(_glossy_receivers, glossy), view.receivers_node)
+        receivers = Node("", functools.partial(_select_glossy_receivers, glossy), view.receivers_node)
         self._all_receivers, self._cameras = view.receivers_node, cameras
         self._fragments, self._clip_positions = fragments, clip_positions
         self.method = method
@@ -59,9 +60,9 @@ class GlossyPoints(LitPoints):
             is_scene_view=view.is_scene_view,
             neighbors=view,
         )
-        self._numbers = Node("", functools.partial(_numbers, glossy), detached(view.receivers_node))
+        self._numbers = Node("", functools.partial(_number_glossy, glossy), detached(view.receivers_node))
 
-    def mixed(
+    def mix(
         self,
         view: LitPoints,
         diffuse: Node,
@@ -70,7 +71,10 @@ class GlossyPoints(LitPoints):
         bounced: Node,
         openness: Node | None,
     ) -> tuple[Node, Node]:
-        """Light that colored and that white surfaces reflect, of all receivers of the view: vec3 [batch, receiver].
+        """Mix mirrored light with diffuse light, of all receivers of the view.
+
+        Returns:
+            Nodes of the light that colored and that white surfaces reflect, vec3 of shape [batch, receiver].
 
         Args:
             view: The view, or its preview.
@@ -80,32 +84,34 @@ class GlossyPoints(LitPoints):
             bounced: Node of the view's shading without direct light of emitters.
             openness: Of the view, as of :meth:`.LightTransport.openness`.
         """
-        item_text = functools.partial(receiver_text, self.in_words)
-        numbers = {name: self._values(materials, name) for name in GLOSS_ARGUMENTS}
+        item_text = functools.partial(receiver_text, self.weak)
+        numbers = {name: self._find_numbers(materials, name) for name in GLOSS_ARGUMENTS}
         roughness = numbers["roughness"]
         key = materials.roughness
 
         def lobes() -> Node:
-            spread = Node("", self._spread, self.receivers_node, self.normals, self._clip_positions, self._fragments)
+            spread = Node(
+                "", self._find_normal_spread, self.receivers_node, self.normals, self._clip_positions, self._fragments
+            )
             inputs = self.receivers_node, roughness, self._cameras, self.method.lobe_samples, spread
-            return Node("lobes", _sample, *inputs, items=item_text)
+            return Node("lobes", _sample_lobes, *inputs, items=item_text)
 
         sampled = self.cached("lobes", key, lobes)
         directions, filters = field_of(sampled, "directions"), field_of(sampled, "filters")
         source = self.method.light_input(self, light)
-        texels = self.cached("prefiltered", source, lambda: self._prefiltered(source))
+        texels = self.cached("prefiltered", source, lambda: self._prefilter(source))
         shell, towards = self.method.shell_of(source), directions
         if shell is not None:
-            towards = Node("", _exits, self.receivers_node, directions, shell)
+            towards = Node("", _find_exits, self.receivers_node, directions, shell)
         radiance = Node("prefiltered light", look_up_light, texels, towards, filters, items=item_text)
         through = self.method.lobe_transmittance(self, directions, source, view)
         blocked = None
         if self.merged_scene.scene.bounces:
-            opennesses = None if openness is None else self.chosen(openness)
-            blocked = self.method.blocked_radiance(self, self.chosen(bounced), source, view, self.chosen, opennesses)
+            opennesses = None if openness is None else self.select(openness)
+            blocked = self.method.blocked_radiance(self, self.select(bounced), source, view, self.select, opennesses)
         sums = Node("gloss", sum_lobes, filters, radiance, through, blocked, items=item_text)
         if materials.emission:
-            sums = Node("", _add, sums, self.method.highlights(self, materials, roughness, self._cameras))
+            sums = Node("", _add_highlights, sums, self.method.highlights(self, materials, roughness, self._cameras))
         lobe_light = field_of(sums, "straight"), field_of(sums, "grazing")
         arguments = (
             self._numbers,
@@ -118,23 +124,23 @@ class GlossyPoints(LitPoints):
         mix = Node("reflection", mix_reflection, *arguments, items=item_text)
         return field_of(mix, "colored"), field_of(mix, "white")
 
-    def chosen(self, light: Node) -> Node:
-        """Node of light on these receivers, given that of all receivers of the view."""
-        return Node("", _chosen, light, detached(self._all_receivers), self.merged_scene.is_glossy)
+    def select(self, light: Node) -> Node:
+        """Select the light on these receivers from that on all receivers of the view; a node."""
+        return Node("", _select_glossy, light, detached(self._all_receivers), self.merged_scene.is_glossy)
 
-    def _values(self, materials: Materials, name: str) -> Node:
-        """Roughness or the like at the receivers, float32 of shape [batch, receiver]."""
+    def _find_numbers(self, materials: Materials, name: str) -> Node:
+        """Node of roughness or the like at the receivers, float32 of shape [batch, receiver]."""
         of_vertices, textures = materials.of_vertices(name), materials.textures_of[name]
         if not textures.images:
             return Node("", self._interpolate, self.receivers_node, of_vertices)
         arguments = self._fragments, self._clip_positions, textures.pyramids, ""
         cached_name = f"footprints in textures of {textures.sizes}"
         footprints = self.cached(cached_name, None, functools.partial(textures.footprints, *arguments))
-        samples = Node("", self._sample, self._fragments, of_vertices, textures.pyramids, footprints)
-        return self.chosen(Node("", _means, self._all_receivers, samples))
+        samples = Node("", self._sample_textures, self._fragments, of_vertices, textures.pyramids, footprints)
+        return self.select(Node("", _average_samples, self._all_receivers, samples))
 
     def _interpolate(self, receivers: Receivers, values: wp.array) -> wp.array:
-        """Numbers of the receivers, from those of all vertices."""
+        """Interpolate numbers at the receivers between those of vertices."""
         samples = receivers.sample_fragments
         assert samples is not None
         if not samples.face_ids.size:
@@ -144,34 +150,38 @@ class GlossyPoints(LitPoints):
         )
         return rows(interpolate(fragments, self.merged_scene.side_faces, values))
 
-    def _spread(
+    def _find_normal_spread(
         self, receivers: Receivers, normals: wp.array, clip_positions: wp.array, seen: Fragments
     ) -> NormalSpread:
-        """How normals vary over the receivers. Differentiable: all but seen."""
+        """Find how normals vary over the receivers. Differentiable: all but seen."""
         supersampling = self.merged_scene.scene.supersampling
         _, height, width = seen.face_ids.shape
         fragments, size = receivers.sample_fragments, (width // supersampling, height // supersampling)
         assert fragments is not None
         return find_normal_spread(fragments, self.merged_scene.side_faces, normals, clip_positions, size, supersampling)
 
-    def _sample(self, fragments: Fragments, values: wp.array, textures: Textures, footprints: Footprints) -> wp.array:
-        """Numbers of the view's samples: of textures and, on bodies without one, of vertices."""
+    def _sample_textures(
+        self, fragments: Fragments, values: wp.array, textures: Textures, footprints: Footprints
+    ) -> wp.array:
+        """Find numbers of the view's samples: of textures and, on bodies without one, of vertices."""
         return as_scalars(sample_albedo(fragments, self.merged_scene.faces, as_colors(values), textures, footprints))
 
-    def _prefiltered(self, light: LightInput) -> Node:
-        """Node of the texels of light, vec3 of shape [batch, texel]."""
+    def _prefilter(self, light: LightInput) -> Node:
+        """Node of prefiltered light, vec3 of shape [batch, texel]."""
         if light.is_free:
-            return Node("prefiltering", self._blurred, light, items=lambda: f"{self.method.basis.size} coefficients")
+            return Node(
+                "prefiltering", self._prefilter_free, light, items=lambda: f"{self.method.basis.size} coefficients"
+            )
         return self.method.prefiltered(light)
 
-    def _blurred(self, light: wp.array) -> wp.array:
-        """Prefiltered texels of free light. Differentiable: light."""
-        return change_basis(light, _blurred_basis(self.method.basis))
+    def _prefilter_free(self, light: wp.array) -> wp.array:
+        """Prefilter free light. Differentiable: light."""
+        return change_basis(light, _prefilter_basis(self.method.basis))
 
 
 @functools.lru_cache(maxsize=4)
-def _blurred_basis(basis: object) -> np.ndarray:
-    """The matrix from coefficients of a basis to texels, float32 of shape [texel, coefficient]."""
+def _prefilter_basis(basis: object) -> np.ndarray:
+    """Prefilter the functions of a basis: a matrix from coefficients to texels, float32 [texel, coefficient]."""
     from warpshadow.maths import sh
 
     directions = sh.equirectangular_directions(_CELL_ROWS)
@@ -179,45 +189,45 @@ def _blurred_basis(basis: object) -> np.ndarray:
     return prefilter(functions.reshape(_CELL_ROWS, 2 * _CELL_ROWS, -1))
 
 
-def _exits(receivers: Receivers, directions: wp.array, shell: wp.array) -> wp.array:
-    """Directions from the center of a shell to where samples of lobes meet it. Differentiable: all."""
+def _find_exits(receivers: Receivers, directions: wp.array, shell: wp.array) -> wp.array:
+    """Find directions from the center of a shell to where samples of lobes meet it. Differentiable: all."""
     return exits_from_shell(receivers.points, directions, shell)
 
 
-def _add(lobe_light: LobeLight, highlights: LobeLight) -> LobeLight:
-    """Light in lobes, of emitters, too. Differentiable: all."""
+def _add_highlights(lobe_light: LobeLight, highlights: LobeLight) -> LobeLight:
+    """Add the highlights of emitters to other light in lobes. Differentiable: all."""
     return LobeLight(*(add_light(*pair) for pair in zip(lobe_light, highlights, strict=True)))
 
 
-def _sample(
+def _sample_lobes(
     receivers: Receivers, roughness: wp.array, cameras: wp.array, sample_count: int, spread: NormalSpread
 ) -> LobeSamples:
     return sample_lobes(receivers.points, receivers.normals, roughness, cameras, sample_count, spread)
 
 
-def _means(receivers: Receivers, samples: wp.array) -> wp.array:
-    """Means of the samples that share a receiver, float32 of shape [batch, receiver]. Differentiable: samples."""
+def _average_samples(receivers: Receivers, samples: wp.array) -> wp.array:
+    """Average the samples that share a receiver, float32 of shape [batch, receiver]. Differentiable: samples."""
     count = len(receivers.static_vertices) + receivers.points.shape[1]
     return means_of_receivers(samples, rows(receivers.fragments.face_ids), receivers.faces, count)
 
 
-def _spans(is_glossy: np.ndarray, receivers: Receivers) -> list[Span]:
+def _find_glossy_spans(is_glossy: np.ndarray, receivers: Receivers) -> list[Span]:
     return [span for span in receivers.spans if span.body >= 0 and is_glossy[span.body]]
 
 
-def _numbers(is_glossy: np.ndarray, receivers: Receivers) -> wp.array:
-    """Index of each receiver of a view among the glossy ones, −1 for diffuse ones, int32 of shape [receiver]."""
+def _number_glossy(is_glossy: np.ndarray, receivers: Receivers) -> wp.array:
+    """Number the glossy ones among the receivers of a view, −1 for diffuse ones, int32 of shape [receiver]."""
     first = len(receivers.static_vertices)
-    runs = [(first + span.first, first + span.end) for span in _spans(is_glossy, receivers)]
+    runs = [(first + span.first, first + span.end) for span in _find_glossy_spans(is_glossy, receivers)]
     return number_runs(first + receivers.points.shape[1], runs, receivers.points.device)
 
 
-def _chosen(light: wp.array, receivers: Receivers, is_glossy: np.ndarray) -> wp.array:
+def _select_glossy(light: wp.array, receivers: Receivers, is_glossy: np.ndarray) -> wp.array:
     """Select light, or another value, of the glossy ones among a view's receivers. Differentiable: light."""
-    return _of_spans(light, _spans(is_glossy, receivers), -len(receivers.static_vertices))
+    return _cut_spans(light, _find_glossy_spans(is_glossy, receivers), -len(receivers.static_vertices))
 
 
-def _of_spans(array: wp.array, spans: list[Span], first: int) -> wp.array:
+def _cut_spans(array: wp.array, spans: list[Span], first: int) -> wp.array:
     """Cut spans of items out of an array, counting from an item."""
     parts = [cut(array, span.first - first, span.end - first) for span in spans]
     if not parts:
@@ -225,9 +235,9 @@ def _of_spans(array: wp.array, spans: list[Span], first: int) -> wp.array:
     return parts[0] if len(parts) == 1 else concatenate(parts, [part.shape[1] for part in parts])
 
 
-def _glossy_receivers(is_glossy: np.ndarray, receivers: Receivers) -> Receivers:
-    """The glossy ones among the receivers of a view, all of which pixels see. Differentiable: points, normals."""
-    spans, count = _spans(is_glossy, receivers), 0
+def _select_glossy_receivers(is_glossy: np.ndarray, receivers: Receivers) -> Receivers:
+    """Select the glossy receivers of a view, all of which pixels see. Differentiable: points, normals."""
+    spans, count = _find_glossy_spans(is_glossy, receivers), 0
     assert receivers.vertices is not None
     at_vertices, samples = receivers.vertices.size, receivers.sample_fragments
     renumbered = []
@@ -238,8 +248,10 @@ def _glossy_receivers(is_glossy: np.ndarray, receivers: Receivers) -> Receivers:
     if samples is None:
         device = receivers.points.device
         samples = Fragments(*(wp.empty((1, 0), dtype=dtype, device=device) for dtype in (wp.int32, wp.vec3)))
-    fragments = Fragments(*(_of_spans(array, spans, at_vertices) for array in (samples.face_ids, samples.barycentrics)))
+    fragments = Fragments(
+        *(_cut_spans(array, spans, at_vertices) for array in (samples.face_ids, samples.barycentrics))
+    )
     none = constant(np.empty(0, int), wp.int32, receivers.points.device)
-    points, normals = (_of_spans(array, spans, 0) for array in (receivers.points, receivers.normals))
+    points, normals = (_cut_spans(array, spans, 0) for array in (receivers.points, receivers.normals))
     arguments = points, normals, receivers.faces, none, fragments
     return Receivers(*arguments, spans=tuple(renumbered), vertices=none, sample_fragments=fragments)

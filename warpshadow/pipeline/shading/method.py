@@ -17,11 +17,16 @@ from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node
-from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds, LitPoints, receiver_text
+from warpshadow.pipeline.receivers.lit_points import (
+    ONLY_SPHERES,
+    BlockerKinds,
+    LitPoints,
+    VisibleSurfaces,
+    receiver_text,
+)
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.transfers import Light, ShellLight, check_light, shade_free
 from warpshadow.stages.gloss.prefilter import prefilter
-from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.receivers.find import Numbering, number_receivers
 from warpshadow.stages.receivers.quadtree import Quadtree
 from warpshadow.stages.shell.beams import check_shell, shell_array
@@ -36,12 +41,17 @@ class LightInput(Input):
     Args:
         value: The light.
         shell: Of the light, vec4 of shape [batch], where it is not the scene's; None where it is, or is infinitely far.
-        news: As for :class:`Input`.
+        why_new: As for :class:`Input`.
     """
 
-    def __init__(self, value: KnownLight | wp.array, shell: Input | None = None, *, news: str = ""):
-        super().__init__("light", value, news=news)
+    def __init__(self, value: KnownLight | wp.array, shell: Input | None = None, *, why_new: str = ""):
+        super().__init__("light", value, why_new=why_new)
         self.shell = shell
+
+    @property
+    def is_free(self) -> bool:
+        """Whether it is free light, an array, and not known light."""
+        return isinstance(self.value(), wp.array)
 
     @property
     def visibility_key(self) -> Input | None:
@@ -61,9 +71,9 @@ class Method:
         basis: Basis of free light; None for the method's own.
     """
 
-    lights_samples = False  # whether every sample is a receiver, overriding the bodies
+    every_sample_receives = False  # whether every sample is a receiver, overriding the bodies
 
-    has_proxies = False  # whether spheres stand in for bodies, by which light bounces where these move
+    spheres_stand_in = False  # whether spheres stand in for bodies, by which light bounces where these move
 
     shares_directions = False
     """Whether all receivers look for light in the same directions, so that one is enough for a surface in a pixel."""
@@ -94,8 +104,8 @@ class Method:
     def samples_receive(self, blocker_kinds: BlockerKinds = ONLY_SPHERES) -> np.ndarray:
         """Bodies on which samples are receivers while bodies block in some ways, bool of shape [body]."""
         bodies = enumerate(self.merged_scene.scene.bodies)
-        by_vertex = [body.receivers == "vertex" or number in blocker_kinds.bulging for number, body in bodies]
-        return ~np.array(by_vertex) | self.lights_samples
+        by_vertex = [body.receivers == "vertex" or number in blocker_kinds.bulging_bodies for number, body in bodies]
+        return ~np.array(by_vertex) | self.every_sample_receives
 
     @functools.cached_property
     def is_adaptive(self) -> np.ndarray:
@@ -104,25 +114,16 @@ class Method:
         No body where one emits or light is near: where shadows have edges, nobody knows.
         """
         adaptive = np.array([body.receivers == "adaptive" for body in self.merged_scene.scene.bodies])
-        is_known = not (self.lights_samples or self.has_emitters or self.shell is not None)
+        is_known = not (self.every_sample_receives or self.has_emitters or self.shell is not None)
         return adaptive & self.merged_scene.is_flat & is_known
 
-    def find_squares(
-        self,
-        blocker_kinds: BlockerKinds,
-        positions: wp.array,
-        normals: wp.array,
-        fragments: Fragments,
-        spheres: tuple[wp.array, wp.array],
-        is_adaptive: np.ndarray,
-        supersampling: int,
-    ) -> Quadtree | None:
+    def find_squares(self, blocker_kinds: BlockerKinds, surfaces: VisibleSurfaces) -> Quadtree | None:
         """Find the squares in which samples of adaptive bodies interpolate (:func:`.adaptive.find_squares`)."""
         return None
 
     def can_receive(self, blocker_kinds: BlockerKinds) -> np.ndarray:
         """Vertices that may be receivers, and vertices whose backs may be, bool of shape [2, vertex]."""
-        key = blocker_kinds.bulging
+        key = blocker_kinds.bulging_bodies
         if key not in self._can_receive:
             body_of_vertex, receives = self.merged_scene.body_of_vertex, ~self.samples_receive(blocker_kinds)
             backs = (receives & self.merged_scene.is_two_sided)[body_of_vertex]
@@ -146,7 +147,7 @@ class Method:
         that rows cached for one serve the other.
         """
         moving = None if static_bodies is None else static_bodies.moving
-        key = frozenset(blocker_kinds.separate), blocker_kinds.bulging, moving
+        key = frozenset(blocker_kinds.separate), blocker_kinds.bulging_bodies, moving
         if key not in self._numberings:
             device = self.merged_scene.device
             can_receive, separate_bodies = self.can_receive(blocker_kinds), self.separate_bodies(blocker_kinds)
@@ -196,12 +197,10 @@ class Method:
             return self.light
         shell = self._shell_input(points, light, own_shell)
         if isinstance(light, wp.array):
-            return LightInput(light, shell, news="light is given")
-        known, last = self.light.value() if light is None else as_light(light), points.last_light
-        if last is not None and last.shell is shell and last.value() == known:
-            return last
-        points.last_light = LightInput(known, shell, news="light changed since the last call" if last else "")
-        return points.last_light
+            return LightInput(light, shell, why_new="light is given")
+        known = self.light.value() if light is None else as_light(light)
+        why_new = "" if points.last_cached("light") is None else "light changed since the last call"
+        return points.cached("light", (known, shell), lambda: LightInput(known, shell, why_new=why_new))
 
     def _shell_input(self, points: LitPoints, light: Light | None, shell: wp.array | None) -> Input | None:
         """The shell of light that is not the scene's, the same while its values are; None for the scene's."""
@@ -215,8 +214,8 @@ class Method:
                 "scene's light has to have one: EnvironmentMap(…, radius=…)"
             )
         check_shell(shell)
-        points.last_shell = Input.renewed("shell", shell, points.last_shell)
-        return points.last_shell
+        renewed = Input.renewed("shell", shell, points.last_cached("shell"))
+        return points.cached("shell", renewed, lambda: renewed)
 
     def shell_of(self, light: LightInput) -> Input | wp.array | None:
         """Center and radius of the sphere that sends light, vec4 of shape [batch]; None for light infinitely far."""
@@ -252,7 +251,7 @@ class Method:
         """Direct free light on points, which is converted where the transfer vectors are not."""
         transfers = self.cached_transfers(points, light.shell)
         matrix = self.native_from_basis if transfers.requires_grad else None
-        items = functools.partial(receiver_text, points.in_words)
+        items = functools.partial(receiver_text, points.weak)
         name, shade = f"shading{points.suffix}", functools.partial(shade_free, matrix=matrix)
         return Node(name, shade, transfers, light, items=items)
 
@@ -279,14 +278,16 @@ class Method:
     def _prefilter(self, light: KnownLight) -> wp.array:
         return constant(prefilter(light.radiance)[None], wp.vec3, self.merged_scene.device)
 
-    def lobe_transmittance(self, points: LitPoints, directions: Node, light: LightInput, view: LitPoints) -> Node:
+    def lobe_transmittance(
+        self, points: LitPoints, directions: Node, light: LightInput, shaded_points: LitPoints
+    ) -> Node:
         """Transmittance towards the samples of lobes of points, float32 of shape [batch, receiver, sample].
 
         Args:
             points: Receivers on bodies that shine.
             directions: Node of the samples' directions, vec3 of shape [batch, receiver, sample].
             light: Known or free light, which says where shadows have to be sharp.
-            view: The receivers among which they are, which are shaded.
+            shaded_points: The receivers of the image, among which they are.
 
         Without shadows it is 1.
         """
@@ -297,7 +298,7 @@ class Method:
         points: LitPoints,
         diffuse: Node,
         light: LightInput,
-        view: LitPoints,
+        shaded_points: LitPoints,
         choose: Callable[[Node], Node],
         openness: Node | None,
     ) -> Node:
@@ -306,8 +307,8 @@ class Method:
         Args:
             points, light: As for :meth:`lobe_transmittance`.
             diffuse: Node of their shading.
-            view: As for :meth:`lobe_transmittance`.
-            choose: Makes a node of light on the view's receivers one of light on these.
+            shaded_points: As for :meth:`lobe_transmittance`.
+            choose: Makes a node of light on all these one of light on the points.
             openness: Of the points, as of :meth:`.LightTransport.openness`.
         """
         raise NotImplementedError
@@ -319,10 +320,3 @@ class Method:
     def openness(self, points: LitPoints) -> Node | None:
         """Light that points reflect as white surfaces under an even sky of 1; None where rays find it on average."""
         return None
-
-
-def add_light(*summands: wp.array) -> wp.array:
-    """Add light of several kinds. Differentiable: summands."""
-    from warpshadow.stages.light.total import total_light
-
-    return total_light(summands)

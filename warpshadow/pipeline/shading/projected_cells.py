@@ -23,26 +23,34 @@ _NEAR_SPOT = 2.0  # half-angles of a spot within which light is its own: of the 
 class ProjectedCells(NamedTuple):
     """Light in cells, and the directions that stand for a cell.
 
-    ``directions`` are those that blockers are tested in, ``mean_directions`` those of the cosine, ``spots`` the
-    brightest part of a cell, whose shadow has an edge of its own, and ``samples`` all of its light.
+    | field | towards | read where |
+    | --- | --- | --- |
+    | ``blocking_directions`` | light of the cell, but for the spot of a sharp one | blockers are seen |
+    | ``cosine_directions`` | all light of the cell | the cosine is taken |
+    | ``spots`` | the brightest part of the cell | self-visibility is looked up |
+    | ``sharp_cells`` | spots of sharp cells, whose shadow has an edge of its own | spheres are seen, once more |
+    | ``sharp_cells_past_planes`` | likewise | planes and convex parts are seen, once more |
+    | ``samples`` | light of the cell, but for such spots: eight directions drawn | planes with holes are seen |
+
+    Of free light all but the first two are None, and both are the middles of the cells.
     """
 
-    directions: np.ndarray  # [direction, 3]: to light of the cells, past the spots of sharp ones
+    blocking_directions: np.ndarray  # [direction, 3]
     coefficients: wp.array | None = None  # of known light, vec3 of shape [1, direction]
-    mean_directions: np.ndarray | None = None  # to all known light of the cells, for the cosine [direction, 3]
-    spots: np.ndarray | None = None  # where the brightest part of known light is in its cells [direction, 3]
+    mean_directions: np.ndarray | None = None  # ``cosine_directions``, where others [direction, 3]
+    spots: np.ndarray | None = None  # [direction, 3]
     half_angles: np.ndarray | None = None  # half-angles of those spots [direction]
     sharp_cells: SharpCells | None = None  # cells that a sun is in, where spheres block it
     sharp_cells_past_planes: SharpCells | None = None  # and where planes do
     spot_shares: np.ndarray | None = None  # share of the light of sharp cells that their spot has [direction]
-    samples: np.ndarray | None = None  # directions drawn from known light in its cells, and even ones [direction, 8, 3]
+    samples: np.ndarray | None = None  # even ones in cells without light [direction, 8, 3]
     sun: SunCells | None = None  # the brightest cells, where bodies want rays to them
     patches: ShellPatches | None = None  # that send the light, whose coefficients are theirs; None where it is far
 
     @property
-    def facing(self) -> np.ndarray:
+    def cosine_directions(self) -> np.ndarray:
         """Directions for the cosine, [direction, 3]."""
-        return self.directions if self.mean_directions is None else self.mean_directions
+        return self.blocking_directions if self.mean_directions is None else self.mean_directions
 
     def with_coefficients(self, coefficients: wp.array) -> ProjectedCells:
         """Light of the same basis."""

@@ -67,8 +67,8 @@ class SceneBlockers:
         convex = tuple(body for body in rigid if body in self.parts.parts) if self._has_convex_parts else ()
         solids = tuple(body for body in convex if body in self.parts.solids)
         traced = tuple(body for body in rigid if body not in solids)
-        bulging = tuple(body for body, reason in enumerate(why) if reason and self._can_bulge[body])
-        return BlockerKinds(traced, rotations, why, planes, convex, solids, bulging)
+        bulging_bodies = tuple(body for body, reason in enumerate(why) if reason and self._can_bulge[body])
+        return BlockerKinds(traced, rotations, why, planes, convex, solids, bulging_bodies)
 
     @functools.cached_property
     def _can_bulge(self) -> list[bool]:

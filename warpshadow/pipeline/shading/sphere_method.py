@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import functools
+import operator
 from collections.abc import Callable, Iterator
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import warp as wp
@@ -16,13 +17,12 @@ from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached
 from warpshadow.pipeline.receivers.groups import Blockers, CellVisibility, Group, HarmonicVisibility, find_groups
-from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
+from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, VisibleSurfaces, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.shading.method import LightInput, Method
 from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
-from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, joined
+from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, join_portions
 from warpshadow.stages.light.shading import shade
-from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.receivers.quadtree import Quadtree
 
@@ -50,21 +50,21 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     Its two types say in which basis it has light, and visibility.
 
     Attributes:
-        free_projection: The basis in which the method projects any free light, of the scene's shell if it has one.
+        free_basis: The basis in which the method projects any free light, of the scene's shell if it has one.
         why_no_shadows: Why the method has no shadows, in words; empty if it has.
-        joins_cached: Whether visibility combines cached rows with moving blockers.
+        adds_cached_rows: Whether visibility combines cached rows with moving blockers.
         shades_transmittance: Whether known light is summed from transmittance at once (:meth:`shade_transmittance`);
             transfer vectors are then made only with cached rows, and for light from a shell.
     """
 
-    free_projection: Projected
+    free_basis: Projected
     why_no_shadows = ""
-    joins_cached = False
+    adds_cached_rows = False
     shades_transmittance = False
-    has_proxies = True
+    spheres_stand_in = True
 
     @property
-    def emitter_projection(self) -> Projected | None:
+    def emitter_cells(self) -> Projected | None:
         """Even light in the cells in which self-visibility towards emitters is looked up; None where nothing is."""
         return None
 
@@ -93,37 +93,37 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         """
         raise NotImplementedError
 
-    def project_free_light(self, shell: wp.array) -> Projected:
+    def free_basis_of_shell(self, shell: wp.array) -> Projected:
         """The basis in which the method projects free light of another shell than the scene's."""
         raise NotImplementedError
 
     @functools.cached_property
-    def _projected_from_scene(self) -> Node:
+    def _projected_scene_light(self) -> Node:
         return Node("", self.project_light, self.light, self.shell)
 
-    def projected(self, points: LitPoints, light: LightInput) -> Node:
+    def projected_light(self, points: LitPoints, light: LightInput) -> Node:
         """Node of light on points, projected for the method; the same for the same known light."""
         if light.is_free:
-            return Node("", self._projected_if_given, light, self.projection(points, light))
+            return Node("", self._with_free_light, light, self.light_of_visibility(points, light))
         if light is self.light:
-            return self._projected_from_scene
+            return self._projected_scene_light
         make = functools.partial(Node, "", self.project_light, light, self.shell_of(light))
         return points.cached_of_bodies("projected", light, make)
 
-    def projection(self, points: LitPoints, light: LightInput) -> Node | Projected:
+    def light_of_visibility(self, points: LitPoints, light: LightInput) -> Node | Projected:
         """The light by which visibility is found, projected: known light, or any free light of the same shell."""
-        return self.free_projection_of(points, light.shell) if light.is_free else self.projected(points, light)
+        return self.free_basis_of(points, light.shell) if light.is_free else self.projected_light(points, light)
 
-    def free_projection_of(self, points: LitPoints, shell: Input | None) -> Node | Projected:
+    def free_basis_of(self, points: LitPoints, shell: Input | None) -> Node | Projected:
         """The basis in which the method projects free light, or a node of it, the same for the same shell."""
         if shell is None:
-            return self.free_projection
-        make = functools.partial(Node, "", self.project_free_light, shell)
-        return points.cached_of_bodies("free projection", shell, make)
+            return self.free_basis
+        make = functools.partial(Node, "", self.free_basis_of_shell, shell)
+        return points.cached_of_bodies("free basis", shell, make)
 
-    def _projected_if_given(self, light: wp.array, free_projection: Projected) -> Projected:
+    def _with_free_light(self, light: wp.array, free_basis: Projected) -> Projected:
         """Project given free light for the method. Differentiable: light."""
-        return free_projection.with_coefficients(change_basis(light, self.native_from_basis))
+        return free_basis.with_coefficients(change_basis(light, self.native_from_basis))
 
     def coefficient_count(self, light: Input | None) -> int:
         """Number of light coefficients that shading uses; all of them where the light is None, not known yet."""
@@ -149,24 +149,14 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         """Shading of a group in known light."""
         raise NotImplementedError
 
-    def find_squares(
-        self,
-        blocker_kinds: BlockerKinds,
-        positions: wp.array,
-        normals: wp.array,
-        fragments: Fragments,
-        spheres: tuple[wp.array, wp.array],
-        is_adaptive: np.ndarray,
-        supersampling: int,
-    ) -> Quadtree:
+    def find_squares(self, blocker_kinds: BlockerKinds, surfaces: VisibleSurfaces) -> Quadtree:
         """Find the squares in which samples of adaptive bodies interpolate."""
         from warpshadow.pipeline.receivers.adaptive import find_squares
 
         place = functools.partial(self.scene_blockers.placed, blocker_kinds)
-        seen = positions, normals, fragments, spheres
-        return find_squares(place, self.sharp_share, *seen, is_adaptive, supersampling)
+        return find_squares(place, self.share_of_sharpest_light, surfaces)
 
-    def sharp_share(self, group: Group) -> np.ndarray | None:
+    def share_of_sharpest_light(self, group: Group) -> np.ndarray | None:
         """Share of a group's unblocked light that comes from the cells with the sharpest shadows.
 
         Returns:
@@ -193,7 +183,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     def _sum_over_emitters(
         self, name: str, find: Callable[..., Any], points: LitPoints, materials: Materials, *others: Node | Input
     ) -> Node:
-        emitters, words = (self.emitters.samples, self.emitters.self_visibility), points.in_words
+        emitters, weak_points = (self.emitters.samples, self.emitters.self_visibility), points.weak
         bodies_and_spheres = points.static_bodies, points.nearest_spheres
 
         def find_in_groups(
@@ -203,9 +193,9 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
             return find(*emitters, groups, blockers, *arrays)
 
         def lookups() -> Node:
-            if self.emitter_projection is None:
+            if self.emitter_cells is None:
                 return Node("", None)
-            return _self_visibility(self, points.blocker_kinds, self.emitter_projection)
+            return _self_visibility(self, points.blocker_kinds, self.emitter_cells)
 
         return Node(
             name,
@@ -216,22 +206,24 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
             self.emitters.placed(points),
             self.emitters.radiance(materials),
             *others,
-            items=lambda: f"{receiver_text(words)} × {emitters[0].first[-1]} samples",
+            items=lambda: f"{receiver_text(weak_points)} × {emitters[0].first[-1]} samples",
         )
 
     def known_shading(self, points: LitPoints, light: LightInput) -> Node:
         """Direct known light on points."""
-        return PortionedShading(self, points, self.projected(points, light), light, joined)
+        return PortionedShading(self, points, self.projected_light(points, light), light, join_portions)
 
     def openness(self, points: LitPoints) -> Node:
         """Light that points reflect as white surfaces under an even sky of 1, vec3 of shape [batch, receiver]."""
         sky = LightInput(EnvironmentMap.constant(1.0))
-        return PortionedShading(self, points, Node("", self.project_light, sky), sky, joined, suffix=" in an even sky")
+        return PortionedShading(
+            self, points, Node("", self.project_light, sky), sky, join_portions, suffix=" in an even sky"
+        )
 
     def transfers(self, points: LitPoints, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`; where they vary, to the method's native basis."""
-        matrix, projection = self.native_from_basis, self.free_projection_of(points, shell)
-        transfers = PortionedShading(self, points, projection, None, list, caches=matrix is None)
+        matrix, visibility_light = self.native_from_basis, self.free_basis_of(points, shell)
+        transfers = PortionedShading(self, points, visibility_light, None, list, caches=matrix is None)
         if matrix is None or transfers.requires_grad:
             return transfers
 
@@ -241,20 +233,31 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         return Node("", to_basis, transfers)
 
 
+class LitPortion(NamedTuple):
+    """A portion of receivers, and the results of its steps."""
+
+    group: Group
+    visibility: CellVisibility | HarmonicVisibility
+    light: wp.array | None  # shading, or transfer vectors where these are the end; None where visibility is
+    spheres: tuple[wp.array, wp.array]  # centers and radii of all spheres
+
+
 class PortionedShading(Node):
     """Shading or transfer vectors of receivers, found group by group and portion by portion.
 
-    Without a gradient, transfer vectors of all receivers are in memory at once only where they are the result: for free
-    light, and in the visibility that bounces cache while colors vary. Receivers with cached rows are one portion.
+    Its program is :meth:`_light`; each step is a function of the method. Without a gradient, transfer vectors of all
+    receivers are in memory at once only where they are the result: for free light, and in the visibility that bounces
+    cache while colors vary. Receivers with cached rows are one portion.
 
     Args:
         points: The receivers.
         projected_light: The light projected for the method.
         light: Known or free light; None where it is not given yet: portions end with transfer vectors.
         finish: Combines the list of results of all portions.
+        result_of: The result of a portion; by default its light.
+        end: The last step.
         caches: As for :class:`Node`.
         suffix: Ends the names of its stages, such as " of patch samples"; by default the suffix of the points.
-        is_shaded: Whether portions are shaded in known light; else they end with transfer vectors, too.
         stages: Further ones, as for :class:`Node`.
     """
 
@@ -264,28 +267,26 @@ class PortionedShading(Node):
         points: LitPoints,
         projected_light: Node | ProjectedLight,
         light: Input | None,
-        finish: Callable[[list[wp.array]], Any],
+        finish: Callable[[list[Any]], Any],
         *,
+        result_of: Callable[[LitPortion], Any] = operator.attrgetter("light"),
+        end: Literal["visibility", "transfer", "shading"] = "shading",
         caches: bool = True,
         suffix: str | None = None,
-        is_shaded: bool = True,
         stages: tuple[NodeStage, ...] = (),
     ):
         self.method, self._bodies_and_spheres = method, (points.static_bodies, points.nearest_spheres)
-        self._finish, self._progress = finish, method.progress and light is not None
-        receivers, words = points.receivers_node, points.in_words
+        self._finish, self._result_of, self._progress = finish, result_of, method.progress and light is not None
+        self._end = "transfer" if light is None and end == "shading" else end
+        self._needs_transfer = self._end == "transfer" or (self._end == "shading" and not method.shades_transmittance)
+        receivers, weak_points = points.receivers_node, points.weak
         suffix = points.suffix if suffix is None else suffix
-        item_text = functools.partial(receiver_text, words)
-        self_visibility = self_visibility_node(method, points, projected_light)
-        shadows = _static_shadows(method, points, light)
+        item_text = functools.partial(receiver_text, weak_points)
         planes = points.blocker_kinds.planes
-        blockers = placed_blockers(method, points)
-        self._is_shaded = light is not None and is_shaded
-        self._is_transferred = not (self._is_shaded and method.shades_transmittance)
         self._visibility = NodeStage(
             f"visibility{suffix}",
-            lambda: method.scene_blockers.pairs_with(words),
-            lambda: _why_unblocked(method, words),
+            lambda: method.scene_blockers.pairs_with(weak_points),
+            lambda: _why_unblocked(method, weak_points),
         )
         self._planes = NodeStage(
             f"planes{suffix}",
@@ -295,21 +296,20 @@ class PortionedShading(Node):
         self._transfer = NodeStage(
             f"transfer{suffix}",
             lambda: f"{item_text()} × {method.coefficient_count(light)} coefficients",
-            "" if self._is_transferred else "shading takes transmittance at once",
+            "" if self._needs_transfer else "shading takes transmittance at once",
         )
         self._shading = NodeStage(f"shading{suffix}", item_text)
-        own_stages = self._visibility, self._planes, self._transfer, self._shading
-        static_normals = None if points.static_bodies is None else points.static_bodies.normals
+        steps = self._visibility, self._planes, self._transfer, self._shading
         super().__init__(
             "",
             None,
             receivers,
-            blockers,
+            placed_blockers(method, points),
             projected_light,
-            self_visibility,
-            shadows,
-            static_normals,
-            stages=(*(own_stages if self._is_shaded else own_stages[:3]), *stages),
+            self_visibility_node(method, points, projected_light),
+            _static_shadows(method, points, light),
+            None if points.static_bodies is None else points.static_bodies.normals,
+            stages=(*steps[: {"visibility": 2, "transfer": 3, "shading": 4}[self._end]], *stages),
             caches=caches,
         )
 
@@ -323,43 +323,31 @@ class PortionedShading(Node):
         groups = find_groups(*self._bodies_and_spheres, receivers, blockers, *cached)
         total = len(receivers.static_vertices) + receivers.points.shape[1]
         with progress_bar(total, "shading", "receiver", shows=self._progress) as bar:
-            for group in groups:
-                for portion in group.portions():
-                    yield self.find(call, portion, projected_light, blockers.spheres)
-                    bar.update(portion.points.shape[1])
+            for portion in (portion for group in groups for portion in group.portions()):
+                yield self._result_of(self._light(call, portion, projected_light, blockers.spheres))
+                bar.update(portion.points.shape[1])
 
-    def find(
-        self, call: Call, portion: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
-    ) -> Any:
-        """Compute a portion's visibility, given the projected light and all spheres."""
-        return self.light(call, portion, self.find_visibility(call, portion, projected_light), projected_light)
-
-    def find_visibility(self, call: Call, portion: Group, projected_light: ProjectedLight) -> Any:
-        """Find the visibility of a portion, of the method's type."""
-        with self.timed(call, self._visibility):
-            visibility = self.method.find_visibility(portion, projected_light)
-        if portion.planes is None:
-            return visibility
-        with self.timed(call, self._planes):
-            return self.method.find_visibility_past_planes(portion, visibility, projected_light)
-
-    def light(
-        self,
-        call: Call,
-        portion: Group,
-        visibility: CellVisibility | HarmonicVisibility,
-        projected_light: ProjectedLight,
-    ) -> wp.array:
-        """Transfer vectors of a portion, or its shading."""
-        if not self._is_transferred:
-            with self.timed(call, self._shading):
-                return self.method.shade_transmittance(visibility, portion, projected_light)
-        with self.timed(call, self._transfer):
-            transfer = self.method.transfer(visibility, portion, projected_light)
-        if not self._is_shaded:
-            return transfer
-        with self.timed(call, self._shading):
-            return self.method.shade_transfer(transfer, portion, projected_light)
+    def _light(
+        self, call: Call, group: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
+    ) -> LitPortion:
+        """From the blockers of a portion to its light, step by step."""
+        method, timed, light = self.method, functools.partial(self.timed, call), None
+        with timed(self._visibility):
+            visibility = method.find_visibility(group, projected_light)
+        if group.planes is not None:
+            with timed(self._planes):
+                visibility = method.find_visibility_past_planes(group, visibility, projected_light)
+        if self._needs_transfer:
+            with timed(self._transfer):
+                light = method.transfer(visibility, group, projected_light)
+        if self._end == "shading":
+            with timed(self._shading):
+                light = (
+                    method.shade_transmittance(visibility, group, projected_light)
+                    if light is None
+                    else method.shade_transfer(light, group, projected_light)
+                )
+        return LitPortion(group, visibility, light, spheres)
 
 
 def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
@@ -370,7 +358,8 @@ def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
     if not blockers.has_any(kinds):
         return f"no body {'but flat ones ' if kinds.planes else ''}has blockers"
     _, moving, static = points.counts()
-    if moving or (static_bodies and static and (method.joins_cached or blockers.has_any(kinds, static_bodies.moving))):
+    blocks_static = static_bodies and (method.adds_cached_rows or blockers.has_any(kinds, static_bodies.moving))
+    if moving or (static and blocks_static):
         return ""
     return "no moving body has blockers" if static else "nothing is seen"
 
@@ -403,7 +392,7 @@ def _self_visibility(method: SphereMethod, blocker_kinds: BlockerKinds, projecte
 
 def _static_shadows(method: SphereMethod, points: LitPoints, light: Input | None) -> Node:
     """Node of cached transmittance past static bodies; its value is None if there are none."""
-    static_bodies, words = points.static_bodies, points.in_words
+    static_bodies, weak_points = points.static_bodies, points.weak
     if static_bodies is None or not static_bodies.spheres[1].shape[1]:
         bouncing = bool(method.merged_scene.scene.bounces)
         why = "light bounces: nothing of static bodies is cached" if bouncing else "no static body has blockers"
@@ -411,7 +400,7 @@ def _static_shadows(method: SphereMethod, points: LitPoints, light: Input | None
     rows = method.cached_rows(static_bodies, light, points.blocker_kinds)
 
     def missing() -> int:
-        receivers = words.receivers_node.value_if_known(words.call)
+        receivers = weak_points.receivers_node.value_if_known(weak_points.call)
         return rows.missing(None if receivers is None else receivers.static_vertices)
 
     return Node(

@@ -49,7 +49,7 @@ def shade_free(transfers: list[wp.array], light: wp.array, *, matrix: np.ndarray
     maximum = check.LARGEST
     if matrix is not None:
         light, maximum = change_basis(light, matrix), LARGEST_COEFFICIENT
-    return joined([shade(transfer, light, maximum=maximum) for transfer in transfers])
+    return join_portions([shade(transfer, light, maximum=maximum) for transfer in transfers])
 
 
 def change_basis(light: wp.array, matrix: np.ndarray | None) -> wp.array:
@@ -57,14 +57,14 @@ def change_basis(light: wp.array, matrix: np.ndarray | None) -> wp.array:
     return light if matrix is None else shade(constant(matrix[None], wp.float32, light.device), light)
 
 
-def joined(portions: list[wp.array]) -> wp.array:
-    """Receivers of portions one after another, of shape [batch, receiver]. Differentiable: portions."""
+def join_portions(portions: list[wp.array]) -> wp.array:
+    """Join the receivers of portions, [batch, receiver]. Differentiable: portions."""
     return portions[0] if len(portions) == 1 else concatenate(portions, [portion.shape[1] for portion in portions])
 
 
-def one_transfer(portions: list[wp.array]) -> wp.array:
-    """Transfer vectors of all groups one after another, float32 of shape [batch, receiver, coefficient]."""
+def join_transfers(portions: list[wp.array]) -> wp.array:
+    """Join the transfer vectors of all portions, float32 of shape [batch, receiver, coefficient]."""
     if len(portions) == 1:
         return portions[0]
-    rows = joined([portion.reshape((portion.shape[0], -1)) for portion in portions])
+    rows = join_portions([portion.reshape((portion.shape[0], -1)) for portion in portions])
     return rows.reshape((rows.shape[0], -1, portions[0].shape[2]))

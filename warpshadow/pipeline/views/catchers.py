@@ -59,6 +59,6 @@ class CatchersAlone:
         of_scene = {name: scene.per_body(inputs.of_bodies[name], name) for name in ("albedo", "textures")}
         materials = renderer.materials({name: [items[n] for n in self._numbers] for name, items in of_scene.items()})
         alone = renderer.view(inputs.geometry, inputs.clip_matrices)
-        if renderer._method.lights_samples:  # rays are drawn by the number of a receiver, and so are the same for both
+        if renderer._method.every_sample_receives:  # rays are drawn by a receiver's number: the same for both views
             alone = alone.at_receivers_of(view)
-        return alone.white(light, materials).value(renderer._views.call(alone))
+        return alone.white_samples(light, materials).value(renderer._views.call(alone))

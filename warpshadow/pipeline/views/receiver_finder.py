@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.pipeline.receivers.lit_points import BlockerKinds
+from warpshadow.pipeline.receivers.lit_points import BlockerKinds, VisibleSurfaces
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.image.slopes import find_mean_slopes
@@ -68,8 +68,8 @@ class ReceiverFinder:
             at_samples = at_samples & ~has_cached_rows
             numbering = self._number_seen(seen_vertices(fragments, silhouettes, positions.shape[1]), has_cached_rows)
             if spheres is not None and (is_adaptive := method.is_adaptive & at_samples).any():
-                seen = positions, normals, fragments, spheres
-                quadtree = method.find_squares(self._blocker_kinds, *seen, is_adaptive, self._supersampling)
+                surfaces = VisibleSurfaces(positions, normals, fragments, spheres, is_adaptive, self._supersampling)
+                quadtree = method.find_squares(self._blocker_kinds, surfaces)
         if at_samples.any() and fragments.barycentrics.requires_grad:
             has_mean_slope = find_mean_slopes(silhouettes, clip_positions, quadtree)
         return find_receivers(
@@ -82,7 +82,7 @@ class ReceiverFinder:
             bodies=None if self._separate_bodies is None else self._separate_bodies[merged_scene.body_of_face],
             supersampling=1 if method.shares_directions and not self._shares_surfaces else self._supersampling,
             quadtree=quadtree,
-            rises=method.lights_samples,
+            rises=method.every_sample_receives,
             smooth_pieces=merged_scene.smooth_pieces if self._shares_surfaces else None,
             has_mean_slope=has_mean_slope,
         )

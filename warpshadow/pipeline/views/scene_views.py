@@ -95,7 +95,7 @@ class SceneViews:
         # rows of static bodies are valid only where nothing of moving bodies reaches them, neither rays nor bounced
         # light nor light of lamps; and rows are of light from infinitely far away, not from a shell
         sends_light = self._merged_scene.scene.bounces or self._method.has_emitters
-        caches_rows = not (self._method.lights_samples or sends_light or self._method.shell is not None)
+        caches_rows = not (self._method.every_sample_receives or sends_light or self._method.shell is not None)
         if geometry is not None and geometry.moving is not None and caches_rows:
             static_bodies = self._static.get(geometry.moving)
             if static_bodies is None or not static_bodies.matches(geometry):

@@ -102,7 +102,7 @@ class View(LitPoints):
     ) -> tuple[Node, Node]:
         """From the vertices to their normals and to the receivers."""
         merged_scene, samples = method.merged_scene, self._samples
-        corners = functools.partial(View._vertices, self.in_words)
+        corners = functools.partial(View._vertices, self.weak)
         faces, two_sided = merged_scene.faces, merged_scene.two_sided_faces
         if static_bodies is None or cameras.requires_grad:
             clip = Node("clip positions", to_clip, vertices, cameras, items=corners)
@@ -127,7 +127,7 @@ class View(LitPoints):
             normals = Node("normals", static_bodies.with_moving_normals, vertices, static_bodies.normals, items=corners)
         # receivers at vertices move with these alone; receivers at samples move with the samples' fragments, too
         seen = sides if self._samples_receive.any() else detached(sides)
-        item_text = functools.partial(receiver_text, self.in_words)
+        item_text = functools.partial(receiver_text, self.weak)
         arguments = [vertices, normals, seen, detached(silhouettes), detached(clip)]
         if method.is_adaptive.any():
             arguments.append(detached(spheres))
@@ -158,7 +158,7 @@ class View(LitPoints):
                 "radiance", textured_radiance, *arguments, items=item_text, caches=False, stages=replaced_stages
             )
         else:
-            samples = self._shining(shading, light, materials, reflectance.samples)
+            samples = self._reflected_and_emitted(shading, light, materials, reflectance.samples)
         return self._averaged(samples, is_moving=self._is_moving)
 
     def reflectance(self, materials: Materials) -> SampleReflectance:
@@ -194,7 +194,9 @@ class View(LitPoints):
         textures, footprints = (node.value(self.call) for node in (reflectance.pyramids, reflectance.footprints))
         return seen_texels(textures, footprints)[sum(has_texture[:number])].sum(axis=0)
 
-    def _shining(self, shading: Node, light: Light | None, materials: Materials, reflectance: Node) -> Node:
+    def _reflected_and_emitted(
+        self, shading: Node, light: Light | None, materials: Materials, reflectance: Node
+    ) -> Node:
         """Node of the samples, of bodies that may shine and emit."""
         if materials.roughness:
             reflected = self._glossy(shading, light, materials, reflectance)
@@ -238,7 +240,7 @@ class View(LitPoints):
         if materials.emission:
             blockers_light = self.transport.shading_without_emitters(self, light, materials)
         openness = self.transport.openness(self, light, materials)
-        colored, white = points.mixed(self, shading, light, materials, blockers_light, openness)
+        colored, white = points.mix(self, shading, light, materials, blockers_light, openness)
         return self._sum_of(self._radiance(colored, reflectance), self._radiance(white, self._white_reflectance))
 
     @property
@@ -275,14 +277,17 @@ class View(LitPoints):
         body_light, inverse_light, base_factor = (
             field_of(ratio, name, caches=False) for name in ("body_light", "inverse_light", "base_factor")
         )
-        surfaces = self._shining(shading, light, materials, body_light), self._radiance(shading, inverse_light)
+        surfaces = (
+            self._reflected_and_emitted(shading, light, materials, body_light),
+            self._radiance(shading, inverse_light),
+        )
         films = [self._averaged(samples, is_moving=self._is_moving) for samples in surfaces]
         films.append(self._averaged(base_factor))
         if photograph is None:
             return Node("photograph", composite_alone, *films, caches=False)
         return Node("photograph", compose, photograph, *films, caches=False)
 
-    def white(self, light: Light | None, materials: Materials) -> Node:
+    def white_samples(self, light: Light | None, materials: Materials) -> Node:
         """Light received by the samples, and coverage, vec4 of shape [batch, sample row, sample column].
 
         Materials matter where light bounces.
@@ -316,7 +321,7 @@ class View(LitPoints):
 
     def _white_radiance_of(self, shading: Node) -> Node:
         """Node of the samples if every surface were white; cached with the last shading."""
-        return self.cached("white", shading, lambda: Node("", _white_radiance, self.receivers_node, shading))
+        return self.cached("white samples", shading, lambda: Node("", _white_radiance, self.receivers_node, shading))
 
     # ------------------------------------------------------------------------------------------ in words
 

@@ -227,7 +227,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         return result
 
     @wp.func(inline=True)
-    def reaches(bound: PartBound, axis: wp.vec3, half_angle: wp.vec2):
+    def reaches_bundle(bound: PartBound, axis: wp.vec3, half_angle: wp.vec2):
         """Whether the cone around a part reaches that of a bundle."""
         # as far as π together, else all does
         cosine = half_angle[0] * bound.cosine - half_angle[1] * bound.sine
@@ -253,7 +253,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
             if is_any_above(bound.rise, 0.0):
                 is_found = bool(False)
                 for bundle in range(cells.axes.shape[0]):
-                    if reaches(bound, cells.axes[bundle], cells.half_angles[bundle]):
+                    if reaches_bundle(bound, cells.axes[bundle], cells.half_angles[bundle]):
                         for q in range(bundle * BUNDLE, (bundle + 1) * BUNDLE):
                             direction = cells.directions[q]
                             before = task.coverage[q].share

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpshadow.stages.light.total import total_light
+from warpshadow.stages.light.sums import add_light
 
 
 @pytest.mark.parametrize("count", [2, 3, 4])
@@ -14,7 +14,7 @@ def test_light_adds_up_and_its_gradient_goes_to_every_part(count, device):
     values = [random.normal(size=shape).astype(np.float32) for shape in shapes]
     parts = [wp.array(each, dtype=wp.vec3, device=device, requires_grad=True) for each in values]
     with wp.Tape() as tape:
-        total = total_light(parts)
+        total = add_light(*parts)
     np.testing.assert_allclose(total.numpy(), sum(values), rtol=1e-6)
     seed = random.normal(size=total.numpy().shape).astype(np.float32)
     total.grad.assign(seed)
@@ -26,4 +26,4 @@ def test_light_adds_up_and_its_gradient_goes_to_every_part(count, device):
 
 def test_one_part_is_the_total(device):
     part = wp.ones((1, 3), dtype=wp.vec3, device=device)
-    assert total_light([part]) is part
+    assert add_light(part) is part

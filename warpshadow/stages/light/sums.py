@@ -1,7 +1,5 @@
 """Sums of light that comes to receivers on several ways."""
 
-from collections.abc import Sequence
-
 import warp as wp
 
 from warpshadow.device.batch import common_batch, instance_in
@@ -29,15 +27,15 @@ def _add_light(
     total[batch, receiver] = light
 
 
-def total_light(summands: Sequence[wp.array]) -> wp.array:
-    """Add summands of light, vec3 of shape [batch, receiver], four in a launch; a batch of 1 serves every instance.
+def add_light(*summands: wp.array) -> wp.array:
+    """Add light of several kinds, vec3 of shape [batch, receiver]; a batch of 1 serves every instance.
 
     Differentiable: summands.
     """
     if len(summands) == 1:
         return summands[0]
     if len(summands) > 4:
-        return total_light([total_light(summands[:4]), *summands[4:]])
+        return add_light(add_light(*summands[:4]), *summands[4:])
     count = common_batch({f"summand {number}": summand for number, summand in enumerate(summands)})
     total = empty((count, summands[0].shape[1]), dtype=wp.vec3, device=summands[0].device)
     launch(_add_light, total.shape, inputs=[*summands, *[None] * (4 - len(summands))], outputs=[total])
