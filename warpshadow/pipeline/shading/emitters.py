@@ -186,8 +186,8 @@ class SceneEmitters:
         radiance = self.radiance(Materials.of_scene(scene)).value(Call(Clock()))
         total = np.zeros(len(points))
         for span in samples.spans():
-            inside = within_beam(at_points, placed_samples, span, None)
-            light = sum_light(at_points, along_normals, placed_samples, radiance, span, inside)
+            transmittance = within_beam(at_points, placed_samples, span, None)
+            light = sum_light(at_points, along_normals, placed_samples, radiance, span, transmittance)
             total += light.numpy()[0] @ LUMINANCE
         return total
 

@@ -331,17 +331,17 @@ class PortionedShading(Node):
         self, call: Call, group: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
     ) -> LitPortion:
         """From the blockers of a portion to its light, step by step."""
-        method, timed, light = self.method, functools.partial(self.timed, call), None
-        with timed(self._visibility):
+        method, note_time, light = self.method, functools.partial(self.note_time, call), None
+        with note_time(self._visibility):
             visibility = method.find_visibility(group, projected_light)
         if group.planes is not None:
-            with timed(self._planes):
+            with note_time(self._planes):
                 visibility = method.find_visibility_past_planes(group, visibility, projected_light)
         if self._needs_transfer:
-            with timed(self._transfer):
+            with note_time(self._transfer):
                 light = method.transfer(visibility, group, projected_light)
         if self._end == "shading":
-            with timed(self._shading):
+            with note_time(self._shading):
                 light = (
                     method.shade_transmittance(visibility, group, projected_light)
                     if light is None

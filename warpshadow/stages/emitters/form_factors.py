@@ -1,4 +1,4 @@
-"""Form factors of triangles, exactly: what share of its cosine-weighted hemisphere a receiver sees filled.
+"""Form factors of triangles, exactly: the share of the cosine-weighted hemisphere of a receiver that they fill.
 
 The receiver is the origin. With the directions a_j of the corners of the part above its horizon, and the angles γ_j
 between a_j and a_{j+1}, it is [Lambert 1760; Baum, Rushmeier and Winget 1989]

@@ -99,7 +99,7 @@ def find_sample_weights(
     of_vertices = csr_matrix(
         (middles.ravel(), (np.repeat(labels, 3), faces[owners].ravel())), shape=(patch_count, len(positions))
     )
-    softness = np.minimum(np.sqrt(3 * (stretch - 1)), _MAX_SOFTNESS)
+    softness = np.minimum(np.sqrt(3 * np.maximum(stretch - 1, 0)), _MAX_SOFTNESS)
     of_faces = diags(stretch / (1 + softness**2 / 3)) @ csr_matrix(
         (shares, (labels, owners)), shape=(patch_count, len(faces))
     )
