@@ -721,7 +721,7 @@ def test_gradients_of_transmittance_of_lobes_are_exact(double, device, check, gl
     module, cells = double("stages.gloss.transmittance"), double("maths.directions").fibonacci(16)
     towards = unit(glossy[1][1][:, :, None] + 0.3 * random(4, 1, 2, 2, 3))
     arguments = (wp.float64, random(3, 1, 2, 16)), glossy[1], (wp.vec3d, towards)
-    check(lambda *arguments: module.transmittance_of_directions(*arguments, cells), *arguments)
+    check(lambda *arguments: module.interpolate_transmittance(*arguments, cells), *arguments)
 
 
 @pytest.mark.parametrize("quantity", [0, 1])
@@ -733,7 +733,7 @@ def test_gradients_of_sums_of_lobes_are_exact(quantity, double, device, check):
 
 
 def test_gradients_of_radiance_of_blockers_are_exact(double, device, check):
-    blocked = double("stages.gloss.reflection").blocked_radiance
+    blocked = double("stages.gloss.reflection").find_blocked_radiance
     direct, openness = random(0, 1, 3, 3), np.repeat(np.linspace(0, 0.9, 3)[None, :, None], 3, axis=2)
     check(blocked, (wp.vec3d, direct + 0.5 + random(1, 1, 3, 3) ** 2), (wp.vec3d, direct), (wp.vec3d, openness))
 
@@ -824,7 +824,7 @@ def test_gradients_of_beams_are_exact(double, check, device):
     through = np.random.default_rng(7).uniform(0.2, 1, size=(1, 12, 8))
 
     def shares(points, positions, through):
-        return beams.within_beam(points, emitters.place_samples(positions, samples), span, through)
+        return beams.weigh_by_beam(points, emitters.place_samples(positions, samples), span, through)
 
     given = (wp.vec3d, aside), (wp.vec3d, VERTICES[None]), (wp.float64, through)
     found = shares(*(put(values, dtype, device) for dtype, values in given)).numpy() / through

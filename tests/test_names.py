@@ -44,6 +44,7 @@ BANNED = {
     *("ReceiverInPlane", "scaled_to_sky", "see_samples", "SeenSurface", "trace_factors", "transmittance_towards"),
     *("turn_from_planes", "unblocked_batch", "with_rows", "with_tail", "without_owners"),
     *("find_openness", "HIT_ROWS", "load_hit", "node_centers", "open_shares", "open_weights", "Openness", "SIDE_ROWS"),
+    *("BeamAdjoint", "NearestBorder", "on_static"),
 }
 BANNED_EVERYWHERE = {
     *("bulging", "decide", "emitter_projection", "free_projection", "free_projection_of", "has_proxies", "in_words"),

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 from warpshadow.device import array_checks
-from warpshadow.device.array_checks import finite_arrays, late_checks, values_of
+from warpshadow.device.array_checks import finite_arrays, late_checks, look_at_values
 
 
 def vectors(device, **spoiled):
@@ -98,7 +98,7 @@ def test_a_call_ends_with_the_first_fault_that_a_gpu_found(number, device, reads
         with late_checks():
             for name, array in {**arrays, **spoiled}.items():
                 finite_arrays({name: array})
-            values_of(arrays["points 0"], lambda values: pytest.fail("called after a fault"))
+            look_at_values(arrays["points 0"], lambda values: pytest.fail("called after a fault"))
 
     for _ in range(2):
         with pytest.raises(ValueError, match=rf"^points {number}: got 1 NaN"):
@@ -132,7 +132,7 @@ def test_a_long_call_does_not_hold_all_its_arrays(device):
 @pytest.mark.usefixtures("found")
 def test_values_are_judged_once(device):
     judged = []
-    values_of(vectors(device), lambda values: judged.append(values.shape))
+    look_at_values(vectors(device), lambda values: judged.append(values.shape))
     with late_checks():
-        values_of(vectors(device), lambda values: judged.append(values.shape))
+        look_at_values(vectors(device), lambda values: judged.append(values.shape))
     assert judged == [(2, 3, 3)] * 2

@@ -7,7 +7,7 @@ import warp as wp
 
 import warpshadow as ws
 from warpshadow.assets.camera import Camera
-from warpshadow.stages.emitters.beams import beam_of, find_axis_weights, within_beam
+from warpshadow.stages.emitters.beams import beam_of, find_axis_weights, weigh_by_beam
 from warpshadow.stages.emitters.samples import EVERYWHERE, EmitterSpan, PlacedSamples
 from warpshadow.stages.emitters.shown_beams import show_beams
 from warpshadow.stages.raster.rasterization import Fragments
@@ -78,7 +78,7 @@ def test_receivers_get_the_share_of_the_twin(angles, passes, device):
     arrays = [wp.array(item, dtype=wp.vec3, device=device) for item in (points, samples, 3 * axes)]
     through = None if transmittance is None else wp.array(transmittance, dtype=wp.float32, device=device)
     span = EmitterSpan(1, 8, 16, False, beam_of(angles))
-    got = within_beam(arrays[0], PlacedSamples(arrays[1], *arrays[:1] * 5, arrays[2]), span, through).numpy()
+    got = weigh_by_beam(arrays[0], PlacedSamples(arrays[1], *arrays[:1] * 5, arrays[2]), span, through).numpy()
     expected = np.array(
         [
             [[share(axes[batch, 1], point - sample, angles) for sample in samples[batch, 8:]] for point in points[0]]
@@ -95,7 +95,7 @@ def test_an_emitter_without_a_beam_launches_nothing(device):
     through = wp.zeros((1, 3, 8), dtype=wp.float32, device=device)
     placed = PlacedSamples(*[points] * 7)
     for transmittance in (through, None):
-        assert within_beam(points, placed, EmitterSpan(0, 0, 8, False), transmittance) is transmittance
+        assert weigh_by_beam(points, placed, EmitterSpan(0, 0, 8, False), transmittance) is transmittance
 
 
 def test_cameras_see_the_share_of_the_twin(device):

@@ -182,7 +182,7 @@ def test_transmittance_of_samples_is_the_mean_of_the_cells_around(device):
         wp.array(through, dtype=wp.float32, device=device),
         *(wp.array(value, dtype=wp.vec3, device=device) for value in (normals, directions)),
     ]
-    got = transmittance.transmittance_of_directions(*inputs, cells).numpy()
+    got = transmittance.interpolate_transmittance(*inputs, cells).numpy()
     expected = twins.transmittance_near(through, normals, directions, cells, transmittance.KERNEL_RADIUS)
     assert np.abs(got - expected).max() < 20 * FLOAT32
 
@@ -192,7 +192,7 @@ def test_blockers_send_what_is_blocked(device):
     even = wp.full((1, 2), wp.vec3(0.7), dtype=wp.vec3, device=device)
     direct = wp.array([[[0.35] * 3, [0.7] * 3]], dtype=wp.vec3, device=device)
     openness = wp.array([[[0.5] * 3, [1.0] * 3]], dtype=wp.vec3, device=device)
-    blocked = reflection.blocked_radiance(even, direct, openness)
+    blocked = reflection.find_blocked_radiance(even, direct, openness)
     np.testing.assert_allclose(blocked.numpy()[0], [[0.7] * 3, [0.0] * 3], rtol=1e-6)
     filters = wp.full((1, 2, 4), wp.vec3(0.25), dtype=wp.vec3, device=device)
     light = wp.full((1, 2, 4), wp.vec3(0.7), dtype=wp.vec3, device=device)
@@ -232,7 +232,7 @@ def test_samples_that_share_a_receiver_give_it_the_mean_of_their_numbers(device)
     values = rng.uniform(size=(3, 6)).astype(np.float32)
     samples = wp.array(values, dtype=wp.float32, device=device, requires_grad=True)
     with wp.Tape() as tape:
-        means = numbers.means_of_receivers(samples, face_ids, faces, 4)
+        means = numbers.average_over_receivers(samples, face_ids, faces, 4)
     expected = np.stack([0 * values[:, 0], 0 * values[:, 0], values[:, [0, 2, 5]].mean(axis=1), values[:, 1]], axis=1)
     np.testing.assert_allclose(means.numpy(), expected, atol=FLOAT32)
     adj_means = rng.normal(size=(3, 4)).astype(np.float32)

@@ -162,7 +162,7 @@ def test_light_is_that_of_the_twin(is_two_sided, device):
     on_device = [wp.array(item, dtype=wp.float32, device=device) for item in (*logs, factor)]
     radiance_array = wp.array(radiance[None], dtype=wp.vec3, device=device)
     options = dict(zip(("log_of_spheres", "log_of_planes", "transmittance_self"), on_device, strict=True))
-    transmittance = light.transmittance_to_samples(**options)
+    transmittance = light.find_transmittance_to_samples(**options)
     got = numbers(light.sum_light(*arrays, own, radiance_array, next(samples.spans()), transmittance))
     through = np.exp(logs[0] + logs[1])[0] * factor[0]
     softness = own.pieces.softness.numpy().astype(float)
@@ -400,7 +400,7 @@ def test_gradients_of_light_agree_with_differences(between, device):
             parts = box_blockers.placed(arrays[4])
             found = convex.find_log_transmittance_of_parts(*seen, parts, box_blockers, (-1, -1))
             logs = {"log_of_parts": found}
-        return light.sum_light(*arrays[:2], own, arrays[3], span, light.transmittance_to_samples(**logs))
+        return light.sum_light(*arrays[:2], own, arrays[3], span, light.find_transmittance_to_samples(**logs))
 
     arrays = [wp.array(item, dtype=wp.vec3, device=device, requires_grad=True) for item in inputs]
     with recorded() as tape:

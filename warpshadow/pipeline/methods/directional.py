@@ -27,8 +27,8 @@ from warpshadow.pipeline.shading.shell import PATCHES, ShellPatches, project_on_
 from warpshadow.pipeline.shading.sphere_method import LitPortion, PortionedShading, SphereMethod
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, join_portions
 from warpshadow.scene.blockers import blocking_planes
-from warpshadow.stages.gloss.reflection import blocked_radiance
-from warpshadow.stages.gloss.transmittance import transmittance_of_directions
+from warpshadow.stages.gloss.reflection import find_blocked_radiance
+from warpshadow.stages.gloss.transmittance import interpolate_transmittance
 from warpshadow.stages.joint_coverage import transmittance_past
 from warpshadow.stages.light.cached_cells import CachedRows, cell_transfer, shade_cached_cells
 from warpshadow.stages.light.light_samples import CellSamples, cell_samples, even_samples, sample_map
@@ -381,7 +381,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         assert light is not None
         even = wp.full((1, count), wp.vec3(1.0), dtype=wp.vec3, device=diffuse.device)
         direct, openness = shade(transfer, light, maximum=LARGEST_COEFFICIENT), shade(of_cells, even)
-        return blocked_radiance(diffuse, direct, openness)
+        return find_blocked_radiance(diffuse, direct, openness)
 
     def known_shading(self, points: LitPoints, light: LightInput) -> Node:
         """Direct known light on points."""
@@ -482,7 +482,7 @@ def _lobe_transmittance(
     if not directions.size:
         return wp.empty(directions.shape, dtype=wp.float32, device=directions.device)
     transmittance = _join_cells(cells, count)
-    return transmittance_of_directions(transmittance, receivers.normals, directions, projected_light.cosine_directions)
+    return interpolate_transmittance(transmittance, receivers.normals, directions, projected_light.cosine_directions)
 
 
 def _join_cells(cells: list[wp.array], count: int) -> wp.array:

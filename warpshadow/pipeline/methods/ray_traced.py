@@ -14,7 +14,7 @@ from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node, NodeStage, detached
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.shading.method import LightInput, Method
-from warpshadow.stages.gloss.reflection import blocked_radiance
+from warpshadow.stages.gloss.reflection import find_blocked_radiance
 from warpshadow.stages.gloss.traced import trace_lobes
 from warpshadow.stages.light.light_samples import cut_map, sample_map
 from warpshadow.stages.ray_traced.shared_rays import find_corners, find_shares, trace_shared
@@ -131,7 +131,7 @@ class Rays(Method):
         direct, trees = self.direct_shading(shaded_points, light), self._trees_around(points)
         if openness is None:
             openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
-        return Node("light of blockers", blocked_radiance, diffuse, choose(direct), openness)
+        return Node("light of blockers", find_blocked_radiance, diffuse, choose(direct), openness)
 
     def transfers(self, points: LitPoints, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""

@@ -26,9 +26,9 @@ from warpshadow.pipeline.receivers.groups import Blockers, Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.stages.bounces.albedo import mean_over_texels
-from warpshadow.stages.emitters.beams import find_axis_weights, within_beam
+from warpshadow.stages.emitters.beams import find_axis_weights, weigh_by_beam
 from warpshadow.stages.emitters.convex import find_log_transmittance_of_parts
-from warpshadow.stages.emitters.light import directions_to_samples, sum_light, transmittance_to_samples
+from warpshadow.stages.emitters.light import find_directions_to_samples, find_transmittance_to_samples, sum_light
 from warpshadow.stages.emitters.planes import find_log_transmittance_of_planes
 from warpshadow.stages.emitters.samples import (
     EmitterBeams,
@@ -50,7 +50,7 @@ from warpshadow.stages.emitters.shown_beams import show_beams
 from warpshadow.stages.emitters.spheres import find_log_transmittance
 from warpshadow.stages.gloss.highlights import sum_highlights
 from warpshadow.stages.gloss.reflection import LobeLight
-from warpshadow.stages.gloss.transmittance import transmittance_of_directions
+from warpshadow.stages.gloss.transmittance import interpolate_transmittance
 from warpshadow.stages.joint_coverage import transmittance_past
 from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.raster.rasterization import Fragments
@@ -186,7 +186,7 @@ class SceneEmitters:
         radiance = self.radiance(Materials.of_scene(scene)).value(Call(Clock()))
         total = np.zeros(len(points))
         for span in samples.spans():
-            transmittance = within_beam(at_points, placed_samples, span, None)
+            transmittance = weigh_by_beam(at_points, placed_samples, span, None)
             light = sum_light(at_points, along_normals, placed_samples, radiance, span, transmittance)
             total += light.numpy()[0] @ LUMINANCE
         return total
@@ -264,7 +264,7 @@ class SceneEmitters:
     ) -> Iterator[tuple[EmitterSpan, wp.array | None]]:
         """Samples of each emitter, and the part of their light that receivers get, given the transmittance."""
         for span, item in zip(self.samples.spans(), transmittance, strict=True):
-            yield span, within_beam(receivers.points, placed_samples, span, item)
+            yield span, weigh_by_beam(receivers.points, placed_samples, span, item)
 
 
 def find_emitted_light(
@@ -373,20 +373,20 @@ def _find_transmittances(
                     arguments = own_meshes(), points, normals, emitters, blockers.positions, placed_samples, span
                     transmittance_self = trace_transmittances(*arguments, rays=1)
             else:
-                towards = directions_to_samples(points, placed_samples, span)
-                transmittance_self = transmittance_of_directions(cells, normals, towards, EMITTER_CELLS)
+                towards = find_directions_to_samples(points, placed_samples, span)
+                transmittance_self = interpolate_transmittance(cells, normals, towards, EMITTER_CELLS)
         transmittance_of_emitter = None
         if hidden_by_itself is not None:
             lookup = points, placed_samples, span, hidden_by_itself
             transmittance_of_emitter = look_up_self_visibility(*lookup, is_own=is_own)
         yield (
             span,
-            transmittance_to_samples(
+            find_transmittance_to_samples(
                 log_of_spheres=find_log_transmittance(points, normals, placed_samples, span, *spheres, skipped),
                 log_of_planes=_log_of_planes(group, blockers, placed_samples, span, body),
                 log_of_parts=_log_of_parts(group, blockers, placed_samples, span, body),
                 transmittance_self=transmittance_self,
-                transmittance_of_emitter=within_beam(points, placed_samples, span, transmittance_of_emitter),
+                transmittance_of_emitter=weigh_by_beam(points, placed_samples, span, transmittance_of_emitter),
             ),
         )
 

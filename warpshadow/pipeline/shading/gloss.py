@@ -30,7 +30,7 @@ from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.receivers.sample_receivers import Span
 from warpshadow.stages.shell.beams import exits_from_shell
 from warpshadow.stages.textures.footprint import Footprints
-from warpshadow.stages.textures.numbers import as_colors, as_scalars, means_of_receivers
+from warpshadow.stages.textures.numbers import as_colors, as_scalars, average_over_receivers
 from warpshadow.stages.textures.pyramid import Textures
 from warpshadow.stages.textures.sample import sample_albedo
 
@@ -208,7 +208,7 @@ def _sample_lobes(
 def _average_samples(receivers: Receivers, samples: wp.array) -> wp.array:
     """Average the samples that share a receiver, float32 of shape [batch, receiver]. Differentiable: samples."""
     count = len(receivers.static_vertices) + receivers.points.shape[1]
-    return means_of_receivers(samples, rows(receivers.fragments.face_ids), receivers.faces, count)
+    return average_over_receivers(samples, rows(receivers.fragments.face_ids), receivers.faces, count)
 
 
 def _find_glossy_spans(is_glossy: np.ndarray, receivers: Receivers) -> list[Span]:

@@ -331,7 +331,7 @@ class PortionedShading(Node):
         self, call: Call, group: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
     ) -> LitPortion:
         """From the blockers of a portion to its light, step by step."""
-        method, note_time, light = self.method, functools.partial(self.note_time, call), None
+        method, note_time, light = self.method, functools.partial(self.timed, call), None
         with note_time(self._visibility):
             visibility = method.find_visibility(group, projected_light)
         if group.planes is not None:

@@ -88,7 +88,7 @@ def _find_shares(
         shares[batch, receiver, i] = share * sample_transmittance(transmittance, batch, receiver, i)
 
 
-def within_beam(
+def weigh_by_beam(
     points: wp.array, samples: PlacedSamples, span: EmitterSpan, transmittance: wp.array | None
 ) -> wp.array | None:
     """Multiply the transmittance to the samples of an emitter with the part of their emission that receivers get.

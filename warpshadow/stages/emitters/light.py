@@ -41,7 +41,7 @@ def _find_directions(
     directions[batch, receiver, i] = wp.normalize(sample_point - points[instance_in(batch, points.shape[0]), receiver])
 
 
-def directions_to_samples(points: wp.array, samples: PlacedSamples, span: EmitterSpan) -> wp.array:
+def find_directions_to_samples(points: wp.array, samples: PlacedSamples, span: EmitterSpan) -> wp.array:
     """Unit vectors from receivers to the samples of an emitter, vec3 of shape [batch, receiver, sample].
 
     Differentiable: points, samples.
@@ -79,7 +79,7 @@ def _multiply_transmittances(
         transmittance[batch, receiver, i] = product * sample_transmittance(transmittance_of_emitter, batch, receiver, i)
 
 
-def transmittance_to_samples(
+def find_transmittance_to_samples(
     *,
     log_of_spheres: wp.array | None = None,
     log_of_planes: wp.array | None = None,

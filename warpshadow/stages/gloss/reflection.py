@@ -84,7 +84,7 @@ def sum_lobes(
         filters: Of :func:`.lobes.sample_lobes`, vec3 of shape [batch, receiver, sample].
         light: Radiance from the samples, vec3 of shape [batch, receiver, sample].
         transmittance: Float32 of shape [batch, receiver, sample].
-        blocked_light: R, of :func:`blocked_radiance`, vec3 of shape [batch, receiver]; None where light does not
+        blocked_light: R, of :func:`find_blocked_radiance`, vec3 of shape [batch, receiver]; None where light does not
             bounce.
 
     Differentiable: all.
@@ -125,7 +125,7 @@ def _find_blocked_radiance(
     blocked_light[batch, receiver] = wp.max(indirect_light, wp.vec3()) / wp.max(share, MIN_BLOCKED_SHARE)
 
 
-def blocked_radiance(bounced_light: wp.array, direct: wp.array, openness: wp.array) -> wp.array:
+def find_blocked_radiance(bounced_light: wp.array, direct: wp.array, openness: wp.array) -> wp.array:
     """Mean radiance of all that blocks a receiver's light, (E − S) / (1 − O).
 
     Args:

@@ -174,7 +174,7 @@ def _interpolate_cells_adjoint(
         adj_normals[batch, receiver] = adj_normals[batch, receiver] + adj_normal
 
 
-def transmittance_of_directions(
+def interpolate_transmittance(
     transmittance: wp.array, normals: wp.array, directions: wp.array, cells: np.ndarray
 ) -> wp.array:
     """Interpolate transmittance towards the samples of lobes.

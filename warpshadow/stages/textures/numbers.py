@@ -84,7 +84,7 @@ def _divide_sums(
     means[batch, receiver] = sums[batch, receiver][0] / wp.max(sums[batch, receiver][1], 1.0)
 
 
-def means_of_receivers(scalars: wp.array, face_ids: wp.array, faces: wp.array, receiver_count: int) -> wp.array:
+def average_over_receivers(scalars: wp.array, face_ids: wp.array, faces: wp.array, receiver_count: int) -> wp.array:
     """Means of the scalars of samples that share a receiver; samples of different faces are in different texels.
 
     Args:
