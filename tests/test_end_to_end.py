@@ -136,6 +136,13 @@ def relative_error(got: np.ndarray, expected: np.ndarray) -> float:
     return float(np.linalg.norm(got - expected) / np.linalg.norm(expected))
 
 
+def error_along_nodes(renderer: TorchRenderer) -> float:
+    """Of the gradient of the image's color along six random directions of the blob's nodes."""
+    image_of = Deformations(renderer)
+    directions = np.random.default_rng(4).normal(size=(6, len(image_of.start)))
+    return relative_error(*gradient_and_differences(image_of, directions, 2e-3, slice(3)))
+
+
 # ---------------------------------------------------------------------------------------------- smooth paths
 
 
@@ -151,11 +158,7 @@ def test_a_shadow_alone_moves_the_body_that_casts_it(method):
 
 @pytest.mark.parametrize("method", ["directional", "log-sh"])
 def test_a_shadow_alone_moves_the_nodes_of_a_deforming_body(method):
-    renderer = TorchRenderer(scene_of(method, ON_GROUND))
-    image_of = Deformations(renderer)
-    directions = np.random.default_rng(4).normal(size=(6, len(image_of.start)))
-    got, expected = gradient_and_differences(image_of, directions, 2e-3, slice(3))
-    assert relative_error(got, expected) < SMOOTH
+    assert error_along_nodes(TorchRenderer(scene_of(method, ON_GROUND))) < SMOOTH
 
 
 # ---------------------------------------------------------------------------------------------- with silhouettes

@@ -142,8 +142,8 @@ def frozen(**instead: str) -> Callable[[type[T]], type[T]]:
                 remedy = f"that of a {label} does not change; dataclasses.replace({variable}, {name}=…) makes another"
             raise dataclasses.FrozenInstanceError(f"{name}: {remedy}")
 
-        made = vars(kind)["__init__"]
-        checked = made if hasattr(made, "__wrapped__") else keywords(**instead)(made)
+        initialize = vars(kind)["__init__"]
+        checked = initialize if hasattr(initialize, "__wrapped__") else keywords(**instead)(initialize)
         checked.__doc__ = f"Make one: help({label}) describes the arguments."
         for name, function in (("__init__", checked), ("__setattr__", refuse)):
             setattr(kind, name, function)
@@ -319,8 +319,8 @@ def nonnegative(name: str, value: object) -> float:
 def integer(name: str, value: object, *, minimum: int = 1, unit: str = "") -> int:
     """Return a whole number, maybe of something, as an int, or raise ValueError."""
     if not is_integer(value) or value < minimum:
-        of = f"{unit}, " if unit else ""
-        raise ValueError(f"{name}: got {described(value)}, expected a whole number of {of}at least {minimum}")
+        of_unit = f"{unit}, " if unit else ""
+        raise ValueError(f"{name}: got {described(value)}, expected a whole number of {of_unit}at least {minimum}")
     return int(value)
 
 

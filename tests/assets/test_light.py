@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from warpshadow.assets.color import LUMINANCE
+from warpshadow.assets.harmonic_light import as_light
 from warpshadow.assets.image import ImageError, exr_bytes, write_image
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.sky import synthetic_sky
@@ -523,3 +524,12 @@ def test_coarse_light_has_the_same_integral():
     assert EnvironmentMap.constant(1.0).coarsened(64).radiance.shape == (16, 32, 3)
     near = EnvironmentMap(light.radiance, radius=3.0, center=(0, 1, 0)).coarsened(64)
     assert near.radius == 3 and near.center.tolist() == [0, 1, 0]
+
+
+def test_light_in_harmonics_answers_as_a_map_does_and_goes_on_as_it_came():
+    coefficients = np.random.default_rng(0).normal(size=(9, 3)).astype(np.float32)
+    light, light_map = as_light(coefficients), EnvironmentMap.constant(1.0)
+    assert as_light(light_map) is light_map and light_map.as_argument is light_map
+    np.testing.assert_array_equal(light.as_argument, coefficients)
+    assert light.coarsened(4) == light and light.shell is None and light_map.shell is None
+    assert not {name for name in dir(light) if name[0] != "_"} - {"coefficients"} - set(dir(light_map))

@@ -26,14 +26,7 @@ from warpshadow.tuning import tune
 
 TESTS = Path(__file__).parents[1]
 
-
-@pytest.fixture(autouse=True)
-def one_torch_thread():
-    """Tensors this small gain nothing from threads, which wait for each other where cores are shared."""
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(count)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture

@@ -72,7 +72,7 @@ def fit(
             raise ValueError(
                 f"--workers, --ray: got the fit file {fit_path}, expected a pattern, a folder or a .txt file"
             )
-        on = device_of(device)
+        warp_device = device_of(device)
         check_folder(output)
         loaded_fit = load_fit(fit_path)
         output.mkdir(exist_ok=True)
@@ -88,7 +88,7 @@ def fit(
             typer.echo(viewer.url)
             viewer.open(browser)
         result = loaded_fit.run(
-            device=str(on),
+            device=str(warp_device),
             checkpoint=output / CHECKPOINT,
             checkpoint_seconds=checkpoint_seconds,
             preview=output / PREVIEW if preview else None,
@@ -101,9 +101,9 @@ def fit(
         ending = "diverged" if has_diverged else result.reason
         ending += f" after {sum(map(len, result.losses))} iterations"
         if was_over and (output / SUMMARY).exists():
-            last = datetime.fromtimestamp((output / CHECKPOINT).stat().st_mtime)
+            end_time = datetime.fromtimestamp((output / CHECKPOINT).stat().st_mtime)
             remedy = f"remove {output} or choose another folder by -o to start anew"
-            note(f"already {ending} (on {last:%Y-%m-%d at %H:%M}); {remedy}", is_quiet)
+            note(f"already {ending} (on {end_time:%Y-%m-%d at %H:%M}); {remedy}", is_quiet)
         else:
             report = Report(result)
             frame_rate = f", {1e3 * result.seconds:.3g} ms each" if math.isfinite(result.seconds) else ""

@@ -156,13 +156,7 @@ def render(
         video = "--turntable" if turntable is not None else "--camera-path" if camera_path is not None else None
         path = None if camera_path is None else CameraPath.read(camera_path)
         if video is None:
-            if stills:
-                raise ValueError("--stills: got it for an image, expected --turntable FRAMES or --camera-path FILE")
-            is_video = output.suffix.lower() in VIDEO_SUFFIXES
-            remedy = "; videos take --turntable FRAMES or --camera-path FILE" if is_video else ""
-            check_output(output, ".exr", *SUFFIXES, instead=remedy)
-            if layers and output.suffix.lower() in SUFFIXES:
-                raise ValueError(f"--layers: got it with {output}, expected an .exr file, which has channels for them")
+            _check_image_options(output, stills, layers)
         else:
             check_output(output, *VIDEO_SUFFIXES)
             for option, value in (("--png", png), ("--layers", layers or None), ("--camera-path", camera_path)):
@@ -218,6 +212,17 @@ def render(
             if picture.pixels.shape[2] == 4 and picture.pixels[..., 3].min() < 255 and file.suffix.lower() != ".png":
                 remark = f"white behind the bodies, as {file.suffix} has no transparency"
                 note(f"{file}: {remark}; --background environment shows the light", is_quiet)
+
+
+def _check_image_options(output: Path, stills: bool, layers: bool) -> None:
+    """Raise an error for options that an image does not have, or a file that is none."""
+    if stills:
+        raise ValueError("--stills: got it for an image, expected --turntable FRAMES or --camera-path FILE")
+    is_video = output.suffix.lower() in VIDEO_SUFFIXES
+    remedy = "; videos take --turntable FRAMES or --camera-path FILE" if is_video else ""
+    check_output(output, ".exr", *SUFFIXES, instead=remedy)
+    if layers and output.suffix.lower() in SUFFIXES:
+        raise ValueError(f"--layers: got it with {output}, expected an .exr file, which has channels for them")
 
 
 def _background_of(scene: Scene, background: str) -> str | np.ndarray | None:

@@ -69,29 +69,29 @@ class Srgb:
         max_radiance = float(color.max())
         exposure = -float(np.log2(max_radiance)) if max_radiance > 0 else 0.0
         encoded_color = linear_to_srgb((color.astype(np.float64) * 2**exposure).clip(0, 1))
-        about = {"exposure": exposure, "below_zero": float((color < 0).any(axis=-1).mean())}
-        return np.concatenate([np.rint(encoded_color * 255), alpha], axis=-1).astype(np.uint8), about
+        coding_record = {"exposure": exposure, "below_zero": float((color < 0).any(axis=-1).mean())}
+        return np.concatenate([np.rint(encoded_color * 255), alpha], axis=-1).astype(np.uint8), coding_record
 
 
 def as_png(channels: Channels, coding: Coding) -> tuple[bytes, dict[str, Any]]:
     """Encode 1, 3 or 4 channels as a PNG file; return it and the range of its codes."""
-    codes, about = coding.codes(np.stack([*channels.values()], axis=-1))
-    return png_bytes(codes), {"channels": list(channels), **about}
+    codes, coding_record = coding.codes(np.stack([*channels.values()], axis=-1))
+    return png_bytes(codes), {"channels": list(channels), **coding_record}
 
 
-def from_png(content: bytes, about: Mapping[str, Any]) -> Channels:
+def from_png(content: bytes, coding_record: Mapping[str, Any]) -> Channels:
     """Decode the channels of a PNG file, given the range of its codes.
 
     Raises:
         ImageError: for a file that is no PNG, or is truncated.
     """
     codes = png_codes(content)
-    check.shape("a PNG file of a sample", codes.shape, ("height", "width", len(about["channels"])))
+    check.shape("a PNG file of a sample", codes.shape, ("height", "width", len(coding_record["channels"])))
     maximum, codes = np.iinfo(codes.dtype).max, codes.astype(np.float64)
-    if "range" in about:
-        low, high = about["range"]
+    if "range" in coding_record:
+        low, high = coding_record["range"]
         values = (low * (maximum - codes) + high * codes) / maximum
     else:
         color, alpha = codes[..., :3] / maximum, codes[..., 3:] / maximum
-        values = np.concatenate([alpha * srgb_to_linear(color) / 2 ** about["exposure"], alpha], axis=-1)
-    return {name: values[..., k].astype(np.float32) for k, name in enumerate(about["channels"])}
+        values = np.concatenate([alpha * srgb_to_linear(color) / 2 ** coding_record["exposure"], alpha], axis=-1)
+    return {name: values[..., k].astype(np.float32) for k, name in enumerate(coding_record["channels"])}

@@ -70,27 +70,27 @@ def render_sample(data_set: DataSet, number: int) -> dict[str, bytes]:
     recipe, drawn_scene = data_set.recipe, data_set.draw(number)
     lazy_layers = LazyLayers(drawn_scene.scene, data_set.device, recipe.ranges.count[1] + 1)
     result = {name: layer.find(lazy_layers) for name, layer in LAYERS.items() if name in recipe.layers}
-    about, files = _scene_record(data_set, number, drawn_scene), {}
+    record, files = _scene_record(data_set, number, drawn_scene), {}
     if result and recipe.format == "exr":
         files["exr"] = exr_bytes({name: values for layer in result.values() for name, values in layer.items()})
     elif result:
-        files, about["png"] = _pictures(result)
+        files, record["png"] = _pictures(result)
     if "spheres" in recipe.layers:
         stream = io.BytesIO()
         np.save(stream, _spheres(drawn_scene.scene))
         files["spheres.npy"] = stream.getvalue()
-    files["json"] = json.dumps(about, ensure_ascii=False).encode()
+    files["json"] = json.dumps(record, ensure_ascii=False).encode()
     return files
 
 
 def _pictures(result: dict[str, Channels]) -> tuple[dict[str, bytes], dict[str, Plain]]:
     """PNG files of layers, by suffix; and the range of the codes of each."""
     files: dict[str, bytes] = {}
-    about: dict[str, Plain] = {}
+    codings: dict[str, Plain] = {}
     for name, channels in result.items():
         for ending, png_channels in LAYERS[name].pictures(name, channels).items():
-            files[ending], about[ending] = as_png(png_channels, LAYERS[name].coding)
-    return files, about
+            files[ending], codings[ending] = as_png(png_channels, LAYERS[name].coding)
+    return files, codings
 
 
 def _spheres(scene: Scene) -> np.ndarray:
@@ -174,9 +174,9 @@ def _sample(key: str, files: dict[str, bytes]) -> Sample:
         raise ValueError(f"{key}: got {', '.join(files)}, expected a .json file")
     scene = json.loads(files["json"])
     channels = exr_channels(files["exr"]) if "exr" in files else {}
-    for ending, about in scene.get("png", {}).items():
+    for ending, coding in scene.get("png", {}).items():
         if ending not in files:
             raise ValueError(f"{key}: got {', '.join(files)}, expected a .{ending} file, too")
-        channels |= from_png(files[ending], about)
+        channels |= from_png(files[ending], coding)
     spheres = np.load(io.BytesIO(files["spheres.npy"])) if "spheres.npy" in files else None
     return Sample(key, channels, spheres, scene)

@@ -264,8 +264,8 @@ class _Descent:
         if losses and isinstance(self.optimizer, QuasiNewton):
             return self.optimizer.has_converged(tolerance)
         # means, as the least loss may be the luck of a passing iterate
-        last, earlier = losses[-CONVERGENCE_WINDOW:], losses[-2 * CONVERGENCE_WINDOW : -CONVERGENCE_WINDOW]
-        return len(earlier) == CONVERGENCE_WINDOW and sum(last) >= (1 - tolerance) * sum(earlier)
+        recent, earlier = losses[-CONVERGENCE_WINDOW:], losses[-2 * CONVERGENCE_WINDOW : -CONVERGENCE_WINDOW]
+        return len(earlier) == CONVERGENCE_WINDOW and sum(recent) >= (1 - tolerance) * sum(earlier)
 
     def _is_clearly_best(self, run: _FinishedRun) -> bool:
         """Whether a run's loss is far below the losses at perturbed values around its result."""
@@ -286,10 +286,10 @@ class _Descent:
             return best
         try:
             with torch.no_grad():
-                last = float(self.model.loss(self.values)[0])
+                final_loss = float(self.model.loss(self.values)[0])
         except ValueError as error:  # a step too far to be drawn
             return best._replace(failure=str(error))
-        return best._replace(loss=last, best=_copy_values(self.values)) if last < best.loss else best
+        return best._replace(loss=final_loss, best=_copy_values(self.values)) if final_loss < best.loss else best
 
     def best_so_far(self) -> dict[str, Values]:
         """The best values found in the current stage."""

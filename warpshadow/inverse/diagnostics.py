@@ -65,8 +65,8 @@ def gain_of_last(losses: Sequence[float]) -> float:
     half = _WINDOW // 2
     if len(losses) < 2 * half:
         return 0.0
-    last, earlier_sum = sum(losses[-half:]), sum(losses[-2 * half : -half])
-    return 1 - last / earlier_sum if earlier_sum > 0 else 0.0
+    recent_sum, earlier_sum = sum(losses[-half:]), sum(losses[-2 * half : -half])
+    return 1 - recent_sum / earlier_sum if earlier_sum > 0 else 0.0
 
 
 def warn_of(

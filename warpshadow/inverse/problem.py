@@ -83,20 +83,7 @@ class Problem:
         for number, item in enumerate(self.free):
             check.instance(f"free[{number}]", item, Free, "a free parameter, such as Pose(0) or Light()")
         object.__setattr__(self, "free", with_planes_last(tuple(self._numbered())))
-        shapes = {target.image.shape for target in self.targets}
-        if len(shapes) > 1:
-            raise ValueError(f"targets: got images of shapes {sorted(shapes)}, expected one shape")
-        names = [free.name for free in self.free]
-        twice = [name for name in names if names.count(name) > 1]
-        if twice:
-            raise ValueError(f"free: got {twice[0]} twice, expected it once")
-        if {Light.key, Sun.key} <= set(names):
-            raise ValueError("free: got Light and Sun, expected one of them: free light has any sun in it")
-        for body in range(len(self.scene.bodies)):
-            if {Albedo(body).name, Texture(body).name} <= set(names):
-                raise ValueError(f"free: got Albedo({body}) and Texture({body}), expected one of them for a body")
-            if {Lamp(body).name, Pose(body).name} <= set(names):
-                raise ValueError(f"free: got Lamp({body}) and Pose({body}), expected one of them for a body")
+        self._check_combinations()
         if self.still is not None:
             object.__setattr__(self, "still", self.still.with_method())
             check.choice("still.method", self.still.method, METHODS)
@@ -118,6 +105,23 @@ class Problem:
         free = ", ".join(free.name for free in self.free)
         height, width, _ = self.targets[0].image.shape
         return f"Problem({self.scene!r}, {len(self.targets)} targets of {width} × {height}, free: {free})"
+
+    def _check_combinations(self) -> None:
+        """Raise ValueError for targets of several shapes, and parameters that exclude each other."""
+        shapes = {target.image.shape for target in self.targets}
+        if len(shapes) > 1:
+            raise ValueError(f"targets: got images of shapes {sorted(shapes)}, expected one shape")
+        names = [free.name for free in self.free]
+        twice = [name for name in names if names.count(name) > 1]
+        if twice:
+            raise ValueError(f"free: got {twice[0]} twice, expected it once")
+        if {Light.key, Sun.key} <= set(names):
+            raise ValueError("free: got Light and Sun, expected one of them: free light has any sun in it")
+        for body in range(len(self.scene.bodies)):
+            if {Albedo(body).name, Texture(body).name} <= set(names):
+                raise ValueError(f"free: got Albedo({body}) and Texture({body}), expected one of them for a body")
+            if {Lamp(body).name, Pose(body).name} <= set(names):
+                raise ValueError(f"free: got Lamp({body}) and Pose({body}), expected one of them for a body")
 
     def _of_images(self) -> Iterator[Target]:
         for number, item in enumerate(self.targets):

@@ -15,7 +15,6 @@ from warpshadow import check
 from warpshadow.assets import files
 from warpshadow.assets.color import auto_exposure, srgb_to_linear
 from warpshadow.assets.image import write_image
-from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.picture import Picture
 from warpshadow.check import AnyPath
 from warpshadow.inverse.diagnostics import DiagnosticWarning
@@ -26,6 +25,7 @@ from warpshadow.inverse.one_thread import torch_on_one_thread
 from warpshadow.inverse.result import Result
 from warpshadow.inverse.schedule import Stage
 from warpshadow.inverse.uncertainty import MAX_POSE_UNCERTAINTY
+from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
 from warpshadow.scene.body import Body
 from warpshadow.scene.files import camera_table, file_stems, write_scene
@@ -184,7 +184,8 @@ def found_values(result: Result) -> list[str]:
                 lines.append(f"{after.name}: {name} ({_format_numbers(values)}){remark}")
     if scene.light is not start.light:
         radiance = scene.known_light.radiance
-        x, y, z = EnvironmentMap(np.maximum(radiance, 0)).directions().reshape(-1, 3)[radiance.sum(axis=2).argmax()]
+        directions = sh.equirectangular_directions(len(radiance)).astype(np.float32)
+        x, y, z = directions.reshape(-1, 3)[radiance.sum(axis=2).argmax()]
         lines.append(f"light: strongest from ({x:.3f}, {y:.3f}, {z:.3f})")
     for name, value in result.found.sun.items():
         lines.append(f"sun: {name} ({_format_numbers(value)}){'°' if name == 'angular_radius' else ''}")

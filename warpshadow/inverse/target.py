@@ -97,19 +97,7 @@ class Target:
                 f"image: got shape {image.shape}, expected [height, width, 3 or 4]{remedy and f': {remedy}'}"
             )
         if self.mask is not None:
-            is_bool = np.asarray(self.mask).dtype == bool
-            given_mask = np.asarray(self.mask, np.float32) if is_bool else self.mask
-            mask = check.numbers(
-                "mask", given_mask, expected="weights of pixels [height, width], or the path of a picture"
-            )
-            check.shape("mask", mask.shape, image.shape[:2])
-            check.finite("mask", mask)
-            if mask.min() < 0 or mask.max() > 1 or not mask.any():
-                raise ValueError(
-                    f"mask: got values from {mask.min():g} to {mask.max():g}, expected 0 to 1, and not 0 alone; of "
-                    "8 bits: mask / 255"
-                )
-            object.__setattr__(self, "mask", mask)
+            object.__setattr__(self, "mask", _checked_mask(self.mask, image.shape[:2]))
         object.__setattr__(self, "outlines", _outlines(outlines or {}, image.shape[:2]))
         check.flag("moves_outlines", moves_outlines)
         if moves_outlines:
@@ -157,6 +145,21 @@ class Target:
     def weights(self) -> np.ndarray:
         """Weights of the pixels, float32 of shape [height, width]."""
         return np.ones(self.image.shape[:2], np.float32) if self.mask is None else self.mask
+
+
+def _checked_mask(mask: npt.ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
+    """Weights of the pixels of an image of a shape [height, width], float32."""
+    is_bool = np.asarray(mask).dtype == bool
+    given_mask = np.asarray(mask, np.float32) if is_bool else mask
+    weights = check.numbers("mask", given_mask, expected="weights of pixels [height, width], or the path of a picture")
+    check.shape("mask", weights.shape, shape)
+    check.finite("mask", weights)
+    if weights.min() < 0 or weights.max() > 1 or not weights.any():
+        raise ValueError(
+            f"mask: got values from {weights.min():g} to {weights.max():g}, expected 0 to 1, and not 0 alone; of "
+            "8 bits: mask / 255"
+        )
+    return weights
 
 
 def _outlines(

@@ -348,10 +348,8 @@ def _write_body(body: Body, stem: Path) -> tuple[Table, list[Path]]:
     elif np.ndim(body.albedo) == 1:
         table["albedo"] = _numbers(body.albedo)
     else:
-        with files.atomic_write(colors) as unfinished:
-            np.save(unfinished, body.albedo)
+        written.append(_write_array(colors, body.albedo))
         table["albedo"] = colors.name
-        written.append(colors)
     if not isinstance(body.blockers, Spheres):
         table["blockers"] = body.blockers
     elif not len(body.blockers):
@@ -368,19 +366,13 @@ def _write_body(body: Body, stem: Path) -> tuple[Table, list[Path]]:
         if values.shape == (1,):
             place[name] = _numbers(values)[0]
         else:
-            path = stem.with_name(f"{stem.name}_{name}{VALUES_SUFFIX}")
-            with files.atomic_write(path) as unfinished:
-                np.save(unfinished, values)
-            place[name] = path.name
-            written.append(path)
+            written.append(_write_array(stem.with_name(f"{stem.name}_{name}{VALUES_SUFFIX}"), values))
+            place[name] = written[-1].name
     if body.emission is not None and body.emission.ndim == 1:
         place["emission"] = _numbers(body.emission)
     elif body.emission is not None:
-        path = stem.with_name(f"{stem.name}_emission{COLORS_SUFFIX}")
-        with files.atomic_write(path) as unfinished:
-            np.save(unfinished, body.emission)
-        place["emission"] = path.name
-        written.append(path)
+        written.append(_write_array(stem.with_name(f"{stem.name}_emission{COLORS_SUFFIX}"), body.emission))
+        place["emission"] = written[-1].name
     if body.beam is not None:
         place["beam"] = list(body.beam)
     if body.self_shadows is not None:
@@ -388,6 +380,13 @@ def _write_body(body: Body, stem: Path) -> tuple[Table, list[Path]]:
     if body.shadow_catcher:
         place["shadow_catcher"] = True
     return table | place | {"receivers": body.receivers}, written
+
+
+def _write_array(path: Path, values: np.ndarray) -> Path:
+    """Write an .npy file and return its path."""
+    with files.atomic_write(path) as unfinished:
+        np.save(unfinished, values)
+    return path
 
 
 def _write_material(mesh: Path, texture: np.ndarray) -> list[Path]:

@@ -75,12 +75,12 @@ def misplacements(scene: Scene) -> list[str]:
         others = [other for k, other in enumerate(boxes) if k != number and box.is_over(other)]
         gap = min((box.low[1] - other.high[1] for other in others if other.low[1] <= box.low[1]), default=-np.inf)
         depth = boxes[ground].low[1] - box.low[1]
-        where = f"body {number} ({body.name!r}), which is {size:.3g} large,"
-        which = f"body {ground} ({scene.bodies[ground].name!r}); on_ground() stands it there"
+        body_words = f"body {number} ({body.name!r}), which is {size:.3g} large,"
+        ground_words = f"body {ground} ({scene.bodies[ground].name!r}); on_ground() stands it there"
         if below and gap > size and not any(map(box.meets, lamps)):
-            remarks.append(f"{where} floats {gap:.3g} above {which}")
+            remarks.append(f"{body_words} floats {gap:.3g} above {ground_words}")
         elif depth > size:
-            remarks.append(f"{where} lies {depth:.3g} below {which}")
+            remarks.append(f"{body_words} lies {depth:.3g} below {ground_words}")
     return remarks
 
 

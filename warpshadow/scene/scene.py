@@ -224,6 +224,10 @@ class Scene:
             object.__setattr__(self, "light", light)
         check_supersampling(self.supersampling)
         check_bounces(self.bounces)
+        self._check_method()
+
+    def _check_method(self) -> None:
+        """Raise ValueError for bodies, light and bounces that the named method does not show."""
         glossy = next((body for body in self.bodies if body.is_glossy), None)
         if glossy is not None and self.visibility.method not in (*GLOSS_METHODS, None):
             raise ValueError(

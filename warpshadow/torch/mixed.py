@@ -161,8 +161,8 @@ class MixedRenderer(torch.nn.Module):
         for scene in batch.rows:
             renderer, counts = self._renderer(scene), self._vertex_counts[scene]
             R, t, s = (
-                _without_padding(of(scene), n, len(renderer.scene.bodies))
-                for of, n in zip(poses, (3, 2, 1), strict=True)
+                _without_padding(of_scene(scene), ndim, len(renderer.scene.bodies))
+                for of_scene, ndim in zip(poses, (3, 2, 1), strict=True)
             )
             moved = None if bodies is None else [body for body in bodies if body in counts]
             geometries[scene] = renderer.placed(R, t, s, moving=moved, pivot=pivot)

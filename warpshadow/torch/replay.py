@@ -134,13 +134,16 @@ class Capture:
         self._arguments = [as_array(*pair) for pair in zip(self._inputs, dtypes, strict=True)]
         self._state = 0  # counts replays; gradients are of the last
         self._backward: wp.Graph | None = None
-        where = wp.device_from_torch(device)
-        if where.is_cuda and not wp.is_mempool_enabled(where):
-            raise RuntimeError(f"{where} has no memory pool (wp.set_mempool_enabled)")
+        warp_device = wp.device_from_torch(device)
+        if warp_device.is_cuda and not wp.is_mempool_enabled(warp_device):
+            raise RuntimeError(f"{warp_device} has no memory pool (wp.set_mempool_enabled)")
         with current_stream(device), unrecorded():
             self.plain_seconds = self._seconds_of(lambda: function(*self._arguments))
         with collected() as self._cached_values:
-            with wp.ScopedCapture(device=where) as capture, recorded() if any(requires_grad) else unrecorded() as tape:
+            with (
+                wp.ScopedCapture(device=warp_device) as capture,
+                recorded() if any(requires_grad) else unrecorded() as tape,
+            ):
                 for argument, needs_gradient in zip(self._arguments, requires_grad, strict=True):
                     if needs_gradient:
                         require_gradient(argument)  # by the graph, which zeroes it
@@ -155,7 +158,7 @@ class Capture:
                     array_of(adjoint, result.dtype)
                     for adjoint, result in zip(self._adjoints, self._results, strict=True)
                 ]
-                with wp.ScopedCapture(device=where) as capture, unrecorded():
+                with wp.ScopedCapture(device=warp_device) as capture, unrecorded():
                     for result, source in zip(self._results, sources, strict=True):
                         if result.requires_grad:
                             wp.copy(result.grad, source)

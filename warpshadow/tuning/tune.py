@@ -241,17 +241,7 @@ def tune(
     _warn_if_busy()
     scene = scene.with_method()
     sample = PointSample(scene, bounces=bounces, device=device, progress=progress)
-    is_coarse = sample.interpolation_errors() > COARSE_FACES_ERROR
-    pairs = zip(
-        scene.bodies,
-        sample.with_chosen_receivers(scene).bodies,
-        np.where(is_coarse, "pixel", "vertex").tolist(),
-        strict=True,
-    )
-    fine = [
-        body.receivers if receivers == decided.receivers or body.is_glossy else receivers
-        for body, decided, receivers in pairs
-    ]
+    fine = _fine_receivers(scene, sample)
     counts: Sequence[Bounces] = (scene.bounces,)
     if bounces is not None:
         counts = (*BOUNCE_COUNTS, "all") if bounces == "all" else [count for count in BOUNCE_COUNTS if count <= bounces]
@@ -279,12 +269,26 @@ def tune(
     ]
     trials.sort(key=lambda trial: (trial.milliseconds, trial.error))
     if milliseconds is None:
-        accurate_trials = [trial for trial in trials if trial.error <= requested]
-        chosen = _cheapest(accurate_trials) if accurate_trials else _nearest(trials)
+        good_trials = [trial for trial in trials if trial.error <= requested]
+        chosen = _cheapest(good_trials) if good_trials else _nearest(trials)
     else:
-        accurate_trials = [trial for trial in trials if trial.milliseconds <= requested]
-        chosen = min(accurate_trials, key=lambda trial: trial.error) if accurate_trials else _cheapest(trials)
-    return Tuning(scene, chosen, bool(accurate_trials), tuple(trials))
+        good_trials = [trial for trial in trials if trial.milliseconds <= requested]
+        chosen = min(good_trials, key=lambda trial: trial.error) if good_trials else _cheapest(trials)
+    return Tuning(scene, chosen, bool(good_trials), tuple(trials))
+
+
+def _fine_receivers(scene: Scene, sample: PointSample) -> list[str]:
+    """The finer of the receivers that are tried of each body; its own where renderers choose these, or where it shines.
+
+    They are pixels where interpolation between the vertices misses shadows.
+    """
+    is_coarse = sample.interpolation_errors() > COARSE_FACES_ERROR
+    fine = np.where(is_coarse, "pixel", "vertex").tolist()
+    chosen = [body.receivers for body in sample.with_chosen_receivers(scene).bodies]
+    return [
+        body.receivers if receivers == receivers_chosen or body.is_glossy else receivers
+        for body, receivers_chosen, receivers in zip(scene.bodies, chosen, fine, strict=True)
+    ]
 
 
 def _time_front(

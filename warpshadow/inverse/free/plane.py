@@ -114,8 +114,8 @@ class Plane(FreeOfBody):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Move a rotation and a point along with the plane. Differentiable: all but setting."""
         normal, foot, unit = self._start(setting)
-        about = setting.tensor(constraints.perpendicular_basis([normal]))
-        turn = rotation_matrices(about.T @ values["tilt"])
+        tangents = setting.tensor(constraints.perpendicular_basis([normal]))
+        turn = rotation_matrices(tangents.T @ values["tilt"])
         pivot = setting.tensor(foot)
         return turn @ rotation, turn @ (point - pivot) + pivot + unit * values["height"] * setting.tensor(normal)
 
