@@ -12,7 +12,7 @@ import numpy as np
 from warpshadow.maths.adjacency import edges_of
 from warpshadow.maths.components import connected_components
 from warpshadow.maths.outline import cut_outline, find_outline
-from warpshadow.maths.panels import MAX_PANELS, TOLERANCES, find_panels
+from warpshadow.maths.panels import FLAT, TOLERANCES, find_panels
 from warpshadow.maths.tubes import MAX_SEGMENTS, find_tube
 
 MAX_FACES = 64
@@ -56,21 +56,20 @@ def is_panel(part: ConvexPart) -> bool:
 
 
 def find_convex_parts(
-    positions: np.ndarray, faces: np.ndarray, tolerances: Sequence[float] = TOLERANCES
+    positions: np.ndarray, faces: np.ndarray, *, flat_panels: bool = False
 ) -> list[ConvexPart] | None:
     """Find the convex parts of which a mesh consists.
 
     Args:
         positions: Vertices, shape [vertex, 3]; vertices at one place count as one.
         faces: Triangles that wind alike, shape [face, 3].
-        tolerances: Thickness and mean gap of a panel at most, over the size of the mesh: the first with which there are
-            few enough.
+        flat_panels: Whether panels are flat: no bent sheet has any.
 
     Returns:
         The parts, which may touch and overlap: for each closed piece of the mesh a solid, or the prisms into which it
         is cut if it is one, with holes or without, or the segments of a bent tube; panels for each open one. They come
         by pieces, and in each the seams come last. None where a closed piece is hollow or curved otherwise, where a
-        part has more than 64 faces, or where there are more than 32 prisms of a piece, 128 segments or 64 panels.
+        part has more than 64 faces, or where there are more than 32 prisms of a piece, 128 segments or 144 panels.
     """
     _, first, vertex = np.unique(positions, axis=0, return_index=True, return_inverse=True)
     triangles = vertex.reshape(-1)[faces]
@@ -92,7 +91,7 @@ def find_convex_parts(
                 return None
             segment_count += len(parts_of_piece) - sum(part.is_seam for part in parts_of_piece)
         pieces.append(parts_of_piece)
-    panels = _find_panels(points, sheets, tolerances)
+    panels = _find_panels(points, sheets, flat_panels)
     if panels is None:
         return None
     if panels:
@@ -104,13 +103,13 @@ def find_convex_parts(
     ]
 
 
-def _find_panels(points: np.ndarray, sheets: list[np.ndarray], tolerances: Sequence[float]) -> list[np.ndarray] | None:
+def _find_panels(points: np.ndarray, sheets: list[np.ndarray], flat: bool) -> list[np.ndarray] | None:
     """Cut sheets into panels, as flat ones as there may be."""
     size = np.ptp(points, axis=0).max()
-    for tolerance in tolerances:
+    for tolerance, maximum in (FLAT if flat else TOLERANCES).items():
         panels: list[np.ndarray] = []
         for sheet in sheets:
-            new_panels = find_panels(points, sheet, tolerance * size, MAX_PANELS - len(panels))
+            new_panels = find_panels(points, sheet, tolerance * size, maximum - len(panels), decimates=not flat)
             if new_panels is None:
                 break
             panels += new_panels
