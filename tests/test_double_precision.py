@@ -755,3 +755,57 @@ def test_gradients_of_where_rays_leave_a_shell_are_exact(double, check):
     leave = double("stages.shell.beams").exits_from_shell
     given = (wp.vec3d, 0.3 * random(7, 1, 3, 3)), (wp.vec3d, unit(random(8, 1, 3, 2, 3)))
     check(leave, *given, (wp.vec4d, np.array([[0.1, -0.2, 0.1, 2.2]])))
+
+
+def beam_of_emitter(double, device):
+    """Samples of a tetrahedron that emits within a cone, by its vertices."""
+    emitters, beams = double("stages.emitters.samples"), double("stages.emitters.beams")
+    sparse = double("stages.sparse").SparseMatrix
+    middles = np.random.default_rng(5).dirichlet((1, 1, 1, 1), size=8)
+    axis, normals = beams.find_axis_weights(VERTICES, FACES)
+    assert axis.any() and not normals.any()
+    rows = middles, np.ones((8, 4)) / 8, axis[None], np.array([[0.3, 0, 0.1, 0]])  # and of faces, for their adjoint
+    vertices, faces, of_vertices, of_faces = (sparse.from_matrix(row, device=device) for row in rows)
+    cone = np.array([beams.beam_of((20, 75))])
+    made = emitters.EmitterBeams(cone, of_vertices, of_faces)
+    corners = put(FACES, wp.vec3i, device)
+    samples = emitters.EmitterSamples(vertices, faces, None, corners, (0,), (False,), np.array([0, 8]), made)
+    return emitters, beams, samples
+
+
+def test_gradients_of_beams_are_exact(double, check, device):
+    """To receivers, transmittance and the vertices of the emitter, which turn its axis."""
+    emitters, beams, samples = beam_of_emitter(double, device)
+    (span,) = samples.spans()
+    aside = 2 * random(6, 1, 12, 3) + [0, 0, -4]
+    through = np.random.default_rng(7).uniform(0.2, 1, size=(1, 12, 8))
+
+    def shares(points, positions, through):
+        return beams.within_beam(points, emitters.place_samples(positions, samples), span, through)
+
+    given = (wp.vec3d, aside), (wp.vec3d, VERTICES[None]), (wp.float64, through)
+    found = shares(*(put(values, dtype, device) for dtype, values in given)).numpy() / through
+    assert ((found > 0.05) & (found < 0.95)).mean() > 0.2
+    check(shares, *given)
+
+
+def test_gradients_of_beams_that_cameras_see_are_exact(double, check, device):
+    """To emission, to the point that a sample shows, to vertices and cameras."""
+    emitters, _, samples = beam_of_emitter(double, device)
+    show, fragments = double("stages.emitters.shown_beams").show_beams, double("stages.rasterization").Fragments
+    clip_matrix = np.array([[1.0, 0, 0, 0.5], [0, 1, 0, -0.4], [0, 0, 1, 0], [0, 0.3, 1, 4]])
+    ids, corners = put(np.array([[[0, 1], [3, -1]]]), wp.int32, device), put(FACES, wp.vec3i, device)
+    owners = put(np.int32([0, 0, 0, -1]), wp.int32, device)
+
+    def shown(emission, weights, positions, cameras):
+        placed = emitters.place_samples(positions, samples)
+        seen = fragments(ids, weights), corners, positions, cameras
+        return show(emission, *seen, placed, owners, samples.beams.beams)
+
+    weights = np.random.default_rng(8).dirichlet((1, 1, 1), size=(1, 2, 2))
+    given = (wp.vec3d, random(9, 1, 2, 2, 3) ** 2), (wp.vec3d, weights), (wp.vec3d, VERTICES[None])
+    given = *given, (wp.mat44d, clip_matrix[None])
+    emission, *others = (put(values, dtype, device) for dtype, values in given)
+    share = shown(emission, *others).numpy()[0, 0] / emission.numpy()[0, 0]
+    assert ((share > 0.02) & (share < 0.98)).all()
+    check(shown, *given)

@@ -456,7 +456,7 @@ def test_every_method_refuses_what_is_beyond_the_bound_by_the_name_of_the_argume
     renderer = ws.Renderer(small_scene(method))
     free = np.full((renderer.basis.size, 3), beyond)
     calls = [
-        ("radiance", lambda: small_scene(method, light=beyond)),
+        ("rgb", lambda: small_scene(method, light=beyond)),
         ("light", lambda: small_scene(method, light=np.full((16, 3), beyond))),
         ("light", lambda: renderer.render(free[:16])),
         ("light", lambda: renderer.draw(put(free, wp.vec3))),

@@ -30,6 +30,7 @@ from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.scene.body import Body
 from warpshadow.scene.camera_path import CameraPath, Keyframe
 from warpshadow.scene.files import SceneError, load_scene, write_scene
+from warpshadow.scene.lamps import load_lights, point_light, spot_light
 from warpshadow.scene.mesh_scene import default_scene
 from warpshadow.scene.scene import Scene
 from warpshadow.scene.visibility import Visibility
@@ -87,13 +88,16 @@ __all__ = [
     "insert",
     "linear_to_srgb",
     "load_cameras",
+    "load_lights",
     "load_mesh",
     "load_scene",
     "plane",
+    "point_light",
     "quiet",
     "read_image",
     "render",
     "set_thread_count",
+    "spot_light",
     "srgb_to_linear",
     "synthetic_sky",
     "thread_count",

@@ -228,7 +228,7 @@ def test_factors_that_no_light_has_are_refused_by_their_names(value):
         ("rgb", EnvironmentMap.constant),
         ("irradiance", functools.partial(random_map().with_sun, (0, 1, 0), angular_radius=30)),
     ):
-        with pytest.raises(ImageError, match=f"^{name}: got .*, expected finite numbers of 0 or more"):
+        with pytest.raises(ImageError, match=rf"^{name}: got .*, expected numbers from 0 to 1e\+18"):
             call(value)
 
 
@@ -272,7 +272,7 @@ def test_scaling_is_linear_and_never_negative():
     environment = random_map()
     np.testing.assert_allclose(environment.scaled(3).radiance, 3 * environment.radiance)
     np.testing.assert_allclose(environment.scaled([1, 0, 2]).radiance, environment.radiance * np.float32([1, 0, 2]))
-    with pytest.raises(ImageError, match="expected finite numbers of 0 or more"):
+    with pytest.raises(ImageError, match=r"expected numbers from 0 to 1e\+18"):
         environment.scaled(-1)
 
 

@@ -63,7 +63,7 @@ def numbers(array):
 @pytest.mark.parametrize("mesh", [BALL, SQUARE], ids=["ball", "square"])
 def test_samples_have_the_whole_area_in_bundles_close_to_each_other(mesh, device):
     samples = samples_of(mesh, device)
-    points, areas, bundles, balls = (numbers(item) for item in placed(samples, mesh.positions, device))
+    points, areas, bundles, balls = (numbers(item) for item in placed(samples, mesh.positions, device)[:4])
     assert len(points) % SAMPLE_BUNDLE == 0 and len(points) >= 64
     a, b, c = np.moveaxis(mesh.positions[mesh.surface.faces].astype(float), 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
@@ -289,6 +289,25 @@ def test_rays_meet_what_is_between_and_not_what_is_behind(device):
         np.testing.assert_array_equal(got[0, faces_it], share)
         far = trace_visibility(wall, *(a.reshape((1, 1)) for a in arrays), wp.array([(0, 1.0, 0)], dtype=wp.vec3))
         assert far.numpy()[0, 0, 0] == (height < -2)
+
+
+def test_rays_to_a_lamp_are_spread_over_each_sample_and_over_samples(device):
+    """Half of a panel is hidden: its visible share varies less than by rays to points drawn one by one."""
+    panel, wall = ws.plane(1.0, 4), ws.plane(2.0, 2)
+    samples = samples_of(panel, device)
+    own, span = placed(samples, panel.positions, device), next(samples.spans())
+    points, normals = (wp.array(np.tile([[0, y, 0]], (500, 1)), dtype=wp.vec3, device=device) for y in (2.0, -1.0))
+    vertices = wp.array(wall.positions + np.float32([1.03, 1.0, 0]), dtype=wp.vec3, device=device)
+    hides = wp.Mesh(vertices, wp.array(wall.surface.faces.ravel(), dtype=wp.int32, device=device))
+    lamp = samples, wp.array(panel.positions, dtype=wp.vec3, device=device), own.points[0], own.areas[0], span
+    share = traced.trace_transmittance(hides, points, normals, *lamp, rays=4).numpy()
+    exact = traced.trace_transmittance(hides, points, normals, *lamp, rays=32).numpy()
+    np.testing.assert_allclose(exact, np.broadcast_to(exact[0], exact.shape), atol=FLOAT32)
+    p = exact[0]
+    drawn = np.sqrt((p * (1 - p)).sum() / 4) / len(p)
+    error = share.mean(axis=1) - p.mean()
+    assert abs(error.mean()) < 0.2 * drawn
+    assert error.std() < 0.7 * drawn  # 0.59
 
 
 @pytest.mark.parametrize("between", ["nothing", "spheres", "planes", "parts", "panels"])

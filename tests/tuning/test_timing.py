@@ -8,7 +8,7 @@ import pytest
 from test_point_sample import make_scene
 
 import warpshadow as ws
-from warpshadow.pipeline.receivers import groups
+from warpshadow.pipeline.bodies import self_visibility
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.tuning import timing
 from warpshadow.tuning.timing import image_times, median_times, whole_image
@@ -84,10 +84,8 @@ def test_what_shadows_add_on_a_sample_is_extrapolated_to_all_receivers(monkeypat
 
 
 def test_bodies_shadows_on_themselves_are_timed(monkeypatch):
-    gather_self_transmittance, bodies = groups.gather_self_transmittance, []
-    monkeypatch.setattr(
-        groups, "gather_self_transmittance", lambda *given: bodies.append(1) or gather_self_transmittance(*given)
-    )
+    gather, bodies = self_visibility.gather_self_transmittance, []
+    monkeypatch.setattr(self_visibility, "gather_self_transmittance", lambda *given: bodies.append(1) or gather(*given))
     monkeypatch.setattr(
         timing, "median_times", lambda functions, runs, **_: [function() and 1.0 for function in functions]
     )

@@ -1,14 +1,15 @@
-"""Materials of glTF, as trimesh reads them and as it does not."""
+"""Materials and lights of glTF, as trimesh reads them and as it does not."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from warpshadow import check
 from warpshadow.assets.color import srgb_to_linear
 from warpshadow.assets.mesh import EmissiveColor, Gloss, MeshPart
 
@@ -126,3 +127,61 @@ def gloss_texels(gloss: Gloss) -> tuple[np.ndarray, np.ndarray]:
     textures = codes[..., 1] / 255 * gloss.roughness, codes[..., 2] / 255 * gloss.metallic
     roughness, metallic = ((texels if np.ptp(texels) else texels[0, :1]).astype(np.float32) for texels in textures)
     return roughness, metallic
+
+
+class PunctualLight(NamedTuple):
+    """A light of KHR_lights_punctual."""
+
+    kind: str  # "point", "spot" or "directional"
+    name: str
+    position: np.ndarray
+    direction: np.ndarray  # in which it shines, of length 1
+    intensity: np.ndarray  # color times candela or lux, shape [3]
+    beam: tuple[float, float] | None  # inner and outer angle of a spot's cone [degrees]
+
+
+def punctual_lights(tree: dict) -> list[PunctualLight]:
+    """The lights of the scene in a glTF file."""
+    lights = tree.get("extensions", {}).get("KHR_lights_punctual", {}).get("lights", [])
+    result = []
+    for node, to_world in _nodes(tree):
+        number = node.get("extensions", {}).get("KHR_lights_punctual", {}).get("light")
+        if number is None:
+            continue
+        light, backward = lights[number], to_world[:3, 2]
+        check.choice("type", light["type"], ("point", "spot", "directional"))
+        beam = None
+        if light["type"] == "spot":
+            cone = light.get("spot", {})
+            angles = cone.get("innerConeAngle", 0.0), cone.get("outerConeAngle", np.pi / 4)
+            beam = tuple(np.degrees(angles).tolist())
+        intensity = light.get("intensity", 1.0) * np.array(light.get("color", (1.0, 1.0, 1.0)), np.float64)
+        name = node.get("name") or light.get("name") or f"{light['type']} light"
+        direction = -backward / np.linalg.norm(backward)
+        result.append(PunctualLight(light["type"], name, to_world[:3, 3], direction, intensity, beam))
+    return result
+
+
+def _nodes(tree: dict) -> Iterator[tuple[dict, np.ndarray]]:
+    """The nodes of a file's scene, each with the matrix from its own space to the world."""
+    nodes, scenes = tree.get("nodes", []), tree.get("scenes", [])
+    roots = scenes[tree.get("scene", 0)].get("nodes", []) if scenes else []
+    waiting = [(number, np.eye(4)) for number in roots]
+    while waiting:
+        number, parent = waiting.pop()
+        to_world = parent @ _local_matrix(nodes[number])
+        yield nodes[number], to_world
+        waiting += [(child, to_world) for child in nodes[number].get("children", [])]
+
+
+def _local_matrix(node: dict) -> np.ndarray:
+    """The matrix of a node, in its parent's space."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    from scipy.spatial.transform import Rotation
+
+    rotation = Rotation.from_quat(node.get("rotation", (0.0, 0.0, 0.0, 1.0))).as_matrix()
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation * node.get("scale", (1.0, 1.0, 1.0))
+    matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
+    return matrix

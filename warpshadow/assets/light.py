@@ -350,7 +350,7 @@ def _color(name: str, values: npt.ArrayLike) -> np.ndarray:
     if color.shape not in ((), (3,)):
         raise ImageError(f"{name}: got shape {color.shape}, expected {expected}")
     if not ((color >= 0) & (color <= check.LARGEST)).all():
-        raise ImageError(f"{name}: got {check.described(values)}, expected finite numbers of 0 or more")
+        raise ImageError(f"{name}: got {check.described(values)}, expected numbers from 0 to {check.LARGEST:g}")
     return color
 
 

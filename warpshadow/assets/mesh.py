@@ -180,6 +180,12 @@ class Mesh:
         return find_convex_parts(self.positions, self.surface.faces) or []
 
     @functools.cached_property
+    def area(self) -> float:
+        """Area of its surface [square of its units]."""
+        a, b, c = np.moveaxis(self.positions.astype(np.float64)[self.surface.faces], 1, 0)
+        return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+    @functools.cached_property
     def flat_parts(self) -> list[ConvexPart]:
         """The convex solids and flat panels of which it consists; empty where it has anything else."""
         return find_convex_parts(self.positions, self.surface.faces, flat_panels=True) or []

@@ -112,7 +112,9 @@ def _is_same_array(array: wp.array, before: wp.array, copy: wp.array) -> bool:
 
 
 class NodeStage(NamedTuple):
-    """A stage as it is timed and explained. A node with a name has one, and others that its function runs or replaces.
+    """A stage as it is timed and explained: a row of ``explain``.
+
+    A node with a name is one. Further ones are steps that its function times itself, or makes needless.
 
     Args:
         name: Its name.

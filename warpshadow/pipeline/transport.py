@@ -124,16 +124,34 @@ class LightTransport:
         direct = self.method.direct_shading(points, light)
         if bouncing is Bouncing.PATHS:
             return self.method.along_paths(direct, points, light, materials)
-        static, samples = self._static_bounces, self._static_bounces.patch_samples(points, materials)
+        static = self._static_bounces
         if not light.is_free:
-            lit = self._with_emitters(self.method.direct_shading(samples, light), samples, materials)
-            return static.add_bounces(direct, lit, points, materials)
+            return static.add_bounces(direct, self._lit_patch_samples(points, light, materials), points, materials)
+        samples = static.patch_samples(points, materials)
         if materials.emission:
             emitted = self.method.light_of_emitters(samples, materials)
             direct = static.add_bounces(direct, emitted, points, materials)
         return static.add_free_bounces(
             direct, self.method.cached_transfers(samples, light.shell), light, points, materials
         )
+
+    def _lit_patch_samples(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
+        """Direct shading of the samples of static patches in known light, vec3 of shape [batch, patch sample]."""
+        samples = self._static_bounces.patch_samples(points, materials)
+        return self._with_emitters(self.method.direct_shading(samples, light), samples, materials)
+
+    def openness(self, points: LitPoints, light: Light | None, materials: Materials) -> Node | None:
+        """Part of the hemispheres of points that no blocker takes, vec3 of shape [view, receiver].
+
+        It is found by the rays along which light bounces between static patches; None where light bounces in another
+        way, or not at all.
+        """
+        light_input = self.method.light_input(points, light)
+        has_bounces = bool(self.method.merged_scene.scene.bounces)
+        if not has_bounces or self.bouncing(points, light_input, materials) is not Bouncing.STATIC:
+            return None
+        lit = None if light_input.is_free else self._lit_patch_samples(points, light_input, materials)
+        return self._static_bounces.openness(points, materials, lit)
 
     def _with_emitters(self, light: Node, points: LitPoints, materials: Materials) -> Node:
         """Add direct light of emitters to other light on points; nothing where no body emits."""

@@ -95,6 +95,11 @@ class Body:
             the other bodies past all that is between, from where it is, and itself if it is not convex. None, the
             default, is no emission, or that of the mesh's file, if that is glTF and neither ``albedo`` nor ``texture``
             is given. Open bodies emit to both sides. All methods but "log-sh" have it.
+        beam: Of a body that emits, a cone in which alone it does, as a spot light: an inner and an outer angle from its
+            axis [degrees], 0 ≤ inner ≤ outer ≤ 180, between which radiance falls smoothly to 0; equal ones have a sharp
+            edge, without a gradient. The axis is the mean of its normals, such as that of a disc; or, of a body that
+            faces all ways, such as a ball, −z in its own space, as in glTF. It turns with the body. None, the default,
+            is all directions.
     """
 
     mesh: Mesh
@@ -112,6 +117,7 @@ class Body:
     metallic: np.ndarray | None
     specular: np.ndarray | None
     emission: np.ndarray | None
+    beam: tuple[float, float] | None
 
     @check.keywords(**LIKELY_MISTAKES, spheres="blockers", path="mesh", size="Body(…).on_ground(size=…)")
     def __init__(
@@ -131,11 +137,13 @@ class Body:
         metallic: npt.ArrayLike | AnyPath | None = None,
         specular: npt.ArrayLike | AnyPath | None = None,
         emission: npt.ArrayLike | AnyPath | None = None,
+        beam: npt.ArrayLike | None = None,
     ):
         vars(self).update(mesh=mesh, albedo=albedo, texture=texture, blockers=blockers)
         vars(self).update(rotation=rotation, translation=translation, scale=scale, receivers=receivers, name=name)
         vars(self).update(self_shadows=self_shadows, shadow_catcher=check.flag("shadow_catcher", shadow_catcher))
         vars(self).update(roughness=roughness, metallic=metallic, specular=specular, emission=emission)
+        vars(self).update(beam=beam)
         self._read_mesh()
         self._read_files()
         expected = "a Mesh or the path of a file, or a mesh of trimesh; Mesh(positions, faces) makes one of arrays"
@@ -161,6 +169,8 @@ class Body:
         self._check_gloss()
         if self.emission is not None:
             object.__setattr__(self, "emission", self._checked_emission(self.emission))
+        if self.beam is not None:
+            object.__setattr__(self, "beam", self._checked_beam(self.beam))
         if self.self_shadows is not None:
             check.choice("self_shadows", self.self_shadows, SELF_SHADOWS)
         if self.name is not None and not (isinstance(self.name, str) and self.name):
@@ -273,6 +283,15 @@ class Body:
             raise ValueError("emission: got some for a shadow catcher, expected None: it is not drawn")
         emission.setflags(write=False)
         return emission
+
+    def _checked_beam(self, angles: npt.ArrayLike) -> tuple[float, float]:
+        expected = "inner and outer angles [degrees] from the axis, 0 <= inner <= outer <= 180, such as (20, 30)"
+        inner, outer = check.array("beam", angles, (2,), expected).tolist()
+        if not 0 <= inner <= outer <= 180 or outer == 0:
+            raise ValueError(f"beam: got {(inner, outer)}, expected {expected}")
+        if self.emission is None:
+            raise ValueError("beam: got one without emission, expected emission, too")
+        return inner, outer
 
     def _checked_texture(self, image: np.ndarray) -> np.ndarray:
         if self.mesh.uvs is None:

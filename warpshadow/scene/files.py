@@ -378,6 +378,8 @@ def _write_body(body: Body, stem: Path) -> tuple[Table, list[Path]]:
             np.save(unfinished, body.emission)
         place["emission"] = path.name
         written.append(path)
+    if body.beam is not None:
+        place["beam"] = list(body.beam)
     if body.self_shadows is not None:
         place["self_shadows"] = body.self_shadows
     if body.shadow_catcher:

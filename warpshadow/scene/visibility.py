@@ -88,7 +88,7 @@ class Visibility:
             free, or from its "spheres". Under "directional" nothing is traced of a body of convex solids: they block
             its own light as they do others'. "rays" are as "traced", but under "directional" pixels send rays to the
             brightest cells in every image: a sun's edge has no teeth, and rotations and cameras have no gradient.
-            Pictures that are made once have that under a sun. Bodies may say otherwise.
+            Stills of scenes that name the method have that under a sun. Bodies may say otherwise.
         order: Number of SH bands, 2 to 8: of "log-sh", of the light that "none" shades with, and of free light by
             "ray-traced".
         log: Logarithm of one cap of "log-sh": "eigen" or "cap".

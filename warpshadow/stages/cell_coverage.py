@@ -116,7 +116,8 @@ def _coverage_within_edges(
             chord = _find_chord(edges, edge, cosine, direction, radius)
             if chord.end > chord.begin:
                 length = chord.end - chord.begin
-                d = wp.where(cosine > 0.0, chord.distance, wp.min(chord.distance, -MIN_DISTANCE))  # of 0, turns by +π
+                # a line through ω counts as just behind it: the angle of its factor is +π then, never −π
+                d = wp.where(cosine > 0.0, chord.distance, wp.min(chord.distance, -MIN_DISTANCE))
                 area += 0.5 * d * length
                 normal_part = (radius * radius - d * d) * _line_normal(edges[edge], cosine, direction, chord)
                 moment += length * (normal_part + (0.5 * d * (chord.begin + chord.end)) * chord.tangent)

@@ -13,6 +13,23 @@ from warpshadow.device.memory import empty
 from warpshadow.device.threads import one_at_a_time
 
 
+@wp.func
+def eye_position(clip_matrix: wp.mat44):
+    """The point that a camera sees the world from, where x, y and w of clip space are all 0."""
+    rows = wp.mat33(
+        clip_matrix[0, 0],
+        clip_matrix[0, 1],
+        clip_matrix[0, 2],
+        clip_matrix[1, 0],
+        clip_matrix[1, 1],
+        clip_matrix[1, 2],
+        clip_matrix[3, 0],
+        clip_matrix[3, 1],
+        clip_matrix[3, 2],
+    )
+    return -(wp.inverse(rows) * wp.vec3(clip_matrix[0, 3], clip_matrix[1, 3], clip_matrix[3, 3]))
+
+
 @wp.kernel
 def _compose_clip_matrices(
     # in

@@ -145,8 +145,30 @@ class MergedScene:
         """Bodies that emit light, bool of shape [body]."""
         return np.array([body.is_emitter for body in self.scene.bodies])
 
+    @property
+    def has_beams(self) -> bool:
+        """Whether a body emits within a cone alone."""
+        return any(body.beam is not None for body in self.scene.bodies)
+
+    @functools.cached_property
+    def emitter_of_face(self) -> np.ndarray:
+        """Number of the emitter that each face is of, −1 for none, shape [face]."""
+        return np.where(self.is_emitter, np.cumsum(self.is_emitter) - 1, -1)[self.body_of_face]
+
+    @functools.cached_property
+    def emitter_beams(self) -> np.ndarray:
+        """Beams of the emitters (:mod:`warpshadow.stages.emitters.beams`), shape [emitter, 2]."""
+        from warpshadow.stages.emitters.beams import beam_of
+
+        return np.array([beam_of(body.beam) for body in self.scene.bodies if body.is_emitter])
+
     def emitting_faces(
-        self, positions: wp.array, emission: wp.array, textures: "Textures | None", texture_of_face: wp.array
+        self,
+        positions: wp.array,
+        emission: wp.array,
+        textures: "Textures | None",
+        texture_of_face: wp.array,
+        axes: wp.array | None,
     ) -> "EmittingFaces":
         """Prepare the faces of emitters for rays.
 
@@ -154,8 +176,9 @@ class MergedScene:
             positions, emission: Of all vertices, the radiance 0 where textures have it, vec3 of shape [vertex].
             textures: Of radiance, of one instance; None for none.
             texture_of_face: The texture of each face, −1 for none, int32 of shape [face].
+            axes: Of the emitters' beams, of one instance, vec3 of shape [emitter]; None where none has one.
         """
-        from warpshadow.stages.emitters.traced import EmissionTextures, emitting_faces
+        from warpshadow.stages.emitters.traced import EmissionTextures, FaceBeams, emitting_faces
 
         is_emitting = self.is_emitter[self.body_of_face]
         faces, uv_faces = (self._array(item.numpy()[is_emitting], wp.vec3i) for item in (self.faces, self.uv_faces))
@@ -164,7 +187,11 @@ class MergedScene:
             texture_ids = self._array(texture_of_face.numpy()[is_emitting], wp.int32)
             of_textures = EmissionTextures(textures, texture_ids, self.uvs[0], uv_faces)
         is_two_sided = self.is_two_sided[self.body_of_face[is_emitting]]
-        return emitting_faces(positions, emission, faces, is_two_sided, of_textures)
+        face_beams = None
+        if axes is not None:
+            emitter_ids = self.emitter_of_face[is_emitting]
+            face_beams = FaceBeams(axes.numpy()[emitter_ids], self.emitter_beams[emitter_ids])
+        return emitting_faces(positions, emission, faces, is_two_sided, of_textures, face_beams)
 
     @functools.cached_property
     def two_sided_faces(self) -> wp.array:

@@ -38,12 +38,6 @@ _MIN_BODY_PATCHES = 32  # patches of each of many bodies, at least: a side of a 
 _SCENE_PATCH_SAMPLES = 4096  # patch samples of the patches of a scene, but at least one of each
 
 
-def _area(mesh: Mesh) -> float:
-    """Area of a mesh [square of its units]."""
-    a, b, c = np.moveaxis(mesh.positions.astype(np.float64)[mesh.surface.faces], 1, 0)
-    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
-
-
 def _patch_count(mesh: Mesh) -> int:
     """Number of patches that a mesh wants, by its faces and its smooth sides."""
     side_count = len(np.unique(mesh.smooth_pieces))
@@ -99,7 +93,7 @@ class ScenePatches:
         So bodies of one shape that differ little in size have the same.
         """
         bodies = self.merged_scene.scene.bodies
-        areas = {n: body.scale**2 * _area(body.mesh) for n, body in enumerate(bodies) if n not in self.planes}
+        areas = {n: body.scale**2 * body.mesh.area for n, body in enumerate(bodies) if n not in self.planes}
         total, counts = sum(areas.values()), {}
         for number, area in areas.items():
             share = _SCENE_PATCHES * area / total if total > 0 else _MIN_BODY_PATCHES

@@ -8,8 +8,8 @@ With direct shading S and albedo a an iteration finds the radiosity of patches a
 and receivers gather F B. Light that a body sends to itself may go on for longer than that. Receivers of an image are
 many: F is found at some of them, and interpolated.
 
-Direct light and form factors must agree on how much of a hemisphere is open: where spheres block a part 1 − s of an
-even sky, and rays hit bodies in a part f, F is scaled by (1 − s) / f. Otherwise light is gained and lost: eighteen
+Direct light, past spheres, leaves the share s of an even sky open; rays hit bodies in the share f of the hemisphere. So
+that sky and bodies fill it once, F of a point is scaled by (1 − s) / f. Otherwise light is gained and lost: eighteen
 white balls in a white furnace were 0.91 to 1.06 bright.
 
 Points inside another body see its inside; they count neither in means over patch samples nor as cache points. Where all
@@ -33,7 +33,7 @@ from warpshadow.maths.inset import inset_vertices
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.bounces.patches import ScenePatches, Senders, lit_patch_samples
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
-from warpshadow.pipeline.node import Input, Node
+from warpshadow.pipeline.node import Input, Node, field_of
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.bounces.bright_patches import BrightPatches, find_bright_patches
@@ -76,6 +76,7 @@ class _GeometryFactors(NamedTuple):
     between_bodies: SparseMatrix  # [patch, patch] of different ones, likewise
     to_cache_points: SparseMatrix  # [cache point, patch], those of each view after one another
     receiver_weights: SparseMatrix  # [receiver, cache point]
+    openness: wp.array  # part of receivers' hemispheres that no blocker takes, by the same rays, vec3 [view, receiver]
     shape: tuple[int, int]  # views, receivers of each
 
     def to_receivers(self, direct: wp.array, bounced: wp.array) -> wp.array:
@@ -122,8 +123,7 @@ class StaticBounces:
         senders = self._patches.senders(materials)
         if not senders.bodies:
             return direct
-        follows_light = self._is_still and materials is points.materials  # which a fit's form factors must not
-        factors = self._factors(points, materials, senders, at_patch_samples if follows_light else None)
+        factors = self._factors(points, materials, senders, at_patch_samples)
         make = functools.partial(Node, "", _light_on_patches, at_patch_samples, factors)
         light = points.cached("light of patches", at_patch_samples, make)
         return self._shading(direct, light, factors, points, materials)
@@ -196,6 +196,23 @@ class StaticBounces:
         arguments = self._bounces, light_of_others, reflect_all, senders.areas
         return multiply(factors.to_cache_points, after_bounces(*arguments, self_bounces=SELF_BOUNCES))
 
+    def openness(self, points: LitPoints, materials: Materials, at_patch_samples: Node | None) -> Node | None:
+        """Part of the hemispheres of points that no blocker takes, by the rays that find the light of blockers.
+
+        Both so vary alike, and blockers' mean radiance does not.
+
+        Args:
+            points, materials: As above.
+            at_patch_samples: Node of direct shading as above; None in free light.
+
+        Returns:
+            Node of vec3 of shape [view, receiver]; None where no body sends light.
+        """
+        senders = self._patches.senders(materials)
+        if not senders.bodies:
+            return None
+        return field_of(self._factors(points, materials, senders, at_patch_samples), "openness")
+
     def _item_text(self, points: LitPoints, senders: Senders) -> Callable[[], str]:
         words = points.in_words
         return lambda: f"{receiver_text(words)}, {len(senders.areas):,} patches, {self._bounces} bounces"
@@ -204,6 +221,8 @@ class StaticBounces:
         self, points: LitPoints, materials: Materials, senders: Senders, at_patch_samples: Node | None = None
     ) -> Node:
         """Node of the form factors, which are those of any light: that of patch samples tells where rays are sent."""
+        if not self._is_still or materials is not points.materials:  # form factors of a fit must not follow its light
+            at_patch_samples = None
 
         def find(
             positions: wp.array,
@@ -237,8 +256,8 @@ class StaticBounces:
 
             def find_cache_points(
                 points: np.ndarray, normals: np.ndarray, sky: np.ndarray | None
-            ) -> tuple[csr_matrix, csr_matrix]:
-                """Weights of cache points at receivers of a view, [receiver, cache point], and their form factors."""
+            ) -> tuple[csr_matrix, csr_matrix, np.ndarray]:
+                """Weights of cache points at receivers of a view, their form factors, and openness of receivers."""
                 cache_points = choose_cache_points(points)
                 form_factors = trace(
                     points[cache_points], normals[cache_points], None if sky is None else sky[cache_points]
@@ -248,7 +267,8 @@ class StaticBounces:
                 means = interpolation_matrix(points, normals, cache_points)
                 if sky is not None:
                     means = scale_rows(means, scaling_factors(1 - sky, means @ (1 - sky[cache_points])))
-                return means, form_factors.factors[is_cache_point]
+                openness = 1 - means @ form_factors.blocked[is_cache_point]
+                return means, form_factors.factors[is_cache_point], openness
 
             receiver_points, receiver_normals = self._ray_origins(receivers, positions), receivers.normals.numpy()
             shape, device = receiver_points.shape[:2], positions.device
@@ -259,7 +279,7 @@ class StaticBounces:
                 patch_samples.points.numpy()[0], patch_samples.normals.numpy()[0], sky_of_samples
             )
             factors = map(find_cache_points, receiver_points, receiver_normals, at_receivers)
-            receiver_weights, to_cache_points = zip(*factors, strict=True)
+            receiver_weights, to_cache_points, openness = zip(*factors, strict=True)
             means, is_buried = senders.mean.to_scipy(), seen_by_patch_samples.is_buried
             mean = mean_outside(means, is_buried)[senders.nearest_open_patches(means @ ~is_buried > 0)]
             between = (mean @ seen_by_patch_samples.factors).tocoo()
@@ -274,6 +294,7 @@ class StaticBounces:
                 SparseMatrix.from_matrix(between_bodies, device=device),
                 SparseMatrix.from_matrix(vstack(to_cache_points), device=device),
                 SparseMatrix.from_matrix(block_diag(receiver_weights), device=device),
+                wp.array(np.repeat(np.stack(openness)[..., None], 3, axis=-1), dtype=wp.vec3, device=device),
                 shape,
             )
 

@@ -126,7 +126,8 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         if points.size and group.convex_parts_around is not None:
             cover = functools.partial(group.convex_parts_around.coverage, points, horizon_normals)
             parts = self._coverages(cover, projected_light)
-        if group.is_before_planes and not self.merged_scene.scene.bounces:  # which need transmittance past all else
+        # planes multiply their share in later; only bounces need the product without them, too
+        if group.is_before_planes and not self.merged_scene.scene.bounces:
             return CellVisibility(
                 directions, None, transmittance_self, transmittance_self_and_spheres=past_spheres, part_coverages=parts
             )
@@ -335,7 +336,13 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         return Node("transmittance of lobes", _towards, *arguments, items=item_text)
 
     def blocked_radiance(
-        self, points: LitPoints, diffuse: Node, light: LightInput, view: LitPoints, choose: Callable[[Node], Node]
+        self,
+        points: LitPoints,
+        diffuse: Node,
+        light: LightInput,
+        view: LitPoints,
+        choose: Callable[[Node], Node],
+        openness: Node | None,
     ) -> Node:
         """Mean radiance of the blockers of points, by their light with bounces and without."""
         cells, projected_light = self._lobe_cells(points, light, view)

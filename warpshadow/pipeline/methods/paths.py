@@ -1,6 +1,7 @@
 """Paths: light that bounces between the meshes, for the ray-traced method."""
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import warp as wp
 
@@ -18,6 +19,9 @@ from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.shell.beams import FAR
 from warpshadow.stages.textures.pyramid import Textures
 
+if TYPE_CHECKING:  # it is imported where bodies emit
+    from warpshadow.stages.emitters.samples import PlacedSamples
+
 _LIGHT_SAMPLES = 1024  # directions of each set from which hits draw light
 # most bounces of a path where it may have any number: in a closed room of albedo 0.9 one in 800 ends there
 _MAX_PATH_BOUNCES = 64
@@ -33,6 +37,7 @@ def path_traced(
     light: Input,
     shell: Input | wp.array | None,
     materials: Materials,
+    emitters: Node | None,
     *,
     samples: int,
     progress: bool,
@@ -46,6 +51,7 @@ def path_traced(
         light: Known light.
         shell: Center and radius of the sphere that sends it, vec4 of shape [batch]; None for light infinitely far away.
         materials: Reflectance of the bodies.
+        emitters: Node of the samples of emitters, where one emits within a cone alone; else None.
         samples: Rays of direct light for each receiver.
     """
     merged_scene = points.merged_scene
@@ -65,9 +71,11 @@ def path_traced(
         textures: Textures | None,
         emission: wp.array | None,
         emission_textures: Textures | None,
+        placed_samples: "PlacedSamples | None",
     ) -> wp.array:
         if not receivers.points.size:
             return shading
+        axes = None if placed_samples is None else placed_samples.axes
         texels, emitted = (None if item is None else item.texels for item in (textures, emission_textures))
         shells = FAR[None] if shell is None else shell.numpy()
         count = common_batch(
@@ -101,6 +109,7 @@ def path_traced(
                     of_instance(emission),
                     textures_of_instance(emission_textures),
                     emission_images.texture_of_face,
+                    None if axes is None else of_instance(axes),
                 ),
             )
             places = of_instance(receivers.points), of_instance(receivers.normals)
@@ -124,6 +133,7 @@ def path_traced(
         colors.pyramids if colors.images else None,
         materials.of_vertices("emission") if materials.emission else None,
         emission_images.pyramids if emission_images and emission_images.images else None,
+        emitters,
         items=lambda: f"{receiver_text(words)} × {paths:,} paths of {maximum} bounces",
         has_adjoint=False,
     )

@@ -61,7 +61,8 @@ class Rays(Method):
         """Shading of points in known light that bounces along paths, which have no gradient."""
         from warpshadow.pipeline.methods.paths import path_traced
 
-        arguments = direct, self._meshes(points), points, light, self.shell_of(light), materials
+        emitters = self.emitters.placed(points) if self.merged_scene.has_beams else None
+        arguments = direct, self._meshes(points), points, light, self.shell_of(light), materials, emitters
         return path_traced(*arguments, samples=self._sample_count, progress=self.progress)
 
     def emitted_light(self, points: LitPoints, materials: Materials) -> Node:
@@ -116,11 +117,18 @@ class Rays(Method):
         )
 
     def blocked_radiance(
-        self, points: LitPoints, diffuse: Node, light: LightInput, view: LitPoints, choose: Callable[[Node], Node]
+        self,
+        points: LitPoints,
+        diffuse: Node,
+        light: LightInput,
+        view: LitPoints,
+        choose: Callable[[Node], Node],
+        openness: Node | None,
     ) -> Node:
         """Mean radiance of the blockers of points, by their light with bounces and without."""
         direct, trees = self.direct_shading(view, light), self._trees_around(points)
-        openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
+        if openness is None:
+            openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
         return Node("light of blockers", blocked_radiance, diffuse, choose(direct), openness)
 
     def transfers(self, points: LitPoints, shell: Input | None) -> Node:

@@ -40,7 +40,7 @@ class OwnBody(NamedTuple):
     probe_weights: ProbeWeights  # where on it they lie
     lookup: Any  # traced self-visibility, of the method's kind; None where there is none, or its spheres block
     is_solid: bool  # whether it blocks its own light as its convex parts do
-    parts: GroupConvexParts | None  # these; None where it has one, which blocks none
+    parts: GroupConvexParts | None  # these, two or more: one alone never shades itself; else None
     corners: wp.array | None = None  # vertices farthest out, vec3 of shape [batch, corner]; None without planes
 
     def cut(self, receivers: slice) -> OwnBody:
@@ -158,7 +158,7 @@ class CellVisibility(NamedTuple):
     """Visibility of a group in cells of directions: transmittances, float32 of shape [batch, receiver, cell]."""
 
     directions: np.ndarray  # of the cells, [cell, 3]
-    transmittance_total: wp.array | None  # past all bodies; None before those of planes, where light does not bounce
+    transmittance_total: wp.array | None  # past all bodies; until planes are: past all others, or None
     transmittance_self: wp.array | None = None  # a factor of it: transmittance past its own body; None where that is 1
     transmittance_nonplanar: wp.array | None = None  # past all but planes; None where no planes block, or nobody asks
     # transmittance past its own body and spheres, without convex parts and planes; None where that is 1

@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import common_batch, cut, rows
+from warpshadow.device.constants import constant
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import fibonacci
@@ -26,10 +27,12 @@ from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.shading.transfers import joined
 from warpshadow.stages.bounces.albedo import mean_over_texels
 from warpshadow.stages.bounces.total import total_light
+from warpshadow.stages.emitters.beams import find_axis_weights, within_beam
 from warpshadow.stages.emitters.convex import find_log_transmittance_of_parts
 from warpshadow.stages.emitters.light import directions_to_samples, sum_light
 from warpshadow.stages.emitters.planes import find_log_transmittance_of_planes
 from warpshadow.stages.emitters.samples import (
+    EmitterBeams,
     EmitterSamples,
     EmitterSpan,
     PlacedSamples,
@@ -43,11 +46,13 @@ from warpshadow.stages.emitters.self_visibility import (
     find_self_visibility,
     look_up_self_visibility,
 )
+from warpshadow.stages.emitters.shown_beams import show_beams
 from warpshadow.stages.emitters.spheres import find_log_transmittance
 from warpshadow.stages.gloss.highlights import sum_highlights
 from warpshadow.stages.gloss.reflection import LobeLight
 from warpshadow.stages.gloss.transmittance import transmittance_of_directions
 from warpshadow.stages.joint_coverage import transmittance_past
+from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
@@ -91,7 +96,46 @@ class SceneEmitters:
             tuple(bodies),
             tuple(merged_scene.is_two_sided[bodies].tolist()),
             np.cumsum([0, *(item.vertices.shape[0] for item in weights)]),
+            self._find_beams(vertices),
         )
+
+    def _find_beams(self, vertices: np.ndarray) -> EmitterBeams | None:
+        """Beams of the emitters, whose vertices are some of all; None where none has one."""
+        from scipy.sparse import block_diag, csr_matrix
+
+        scene = self._merged_scene
+        if not scene.has_beams:
+            return None
+        bodies = [body for body in scene.scene.bodies if body.is_emitter]
+        weights = [find_axis_weights(body.mesh.positions, body.mesh.surface.faces) for body in bodies]
+        of_vertices, of_faces = (
+            block_diag([row[None] for row in rows], format="csr") for rows in zip(*weights, strict=True)
+        )
+        shape = len(bodies), int(scene.first_vertex[-1])
+        of_vertices = csr_matrix((of_vertices.data, vertices[of_vertices.indices], of_vertices.indptr), shape)
+        return EmitterBeams(
+            scene.emitter_beams,
+            SparseMatrix.from_matrix(of_vertices, device=scene.device),
+            SparseMatrix.from_matrix(of_faces, device=scene.device),
+        )
+
+    def shown(self, emission: Node, fragments: Node, vertices: Input, cameras: Input, placed: Node) -> Node:
+        """Node of the emission that samples of an image show, given all of it, vec3 of shape [batch, height, width]."""
+        merged_scene, beams = self._merged_scene, self.samples.beams
+        assert beams is not None
+
+        def show(
+            emission: wp.array,
+            fragments: Fragments,
+            vertices: wp.array,
+            cameras: wp.array,
+            placed_samples: PlacedSamples,
+        ) -> wp.array:
+            emitter_of_face = constant(merged_scene.emitter_of_face, wp.int32, merged_scene.device)
+            seen = fragments, merged_scene.faces, vertices, cameras
+            return show_beams(emission, *seen, placed_samples, emitter_of_face, beams.beams)
+
+        return Node("beams", show, emission, fragments, vertices, cameras, placed)
 
     @functools.cached_property
     def _sample_weights(self) -> list[SampleWeights]:
@@ -162,7 +206,7 @@ class SceneEmitters:
             receivers: Receivers, placed_samples: PlacedSamples, radiance: wp.array, transmittance: list[wp.array]
         ) -> wp.array:
             lit = receivers.points, receivers.normals, placed_samples, radiance
-            pairs = zip(self.samples.spans(), transmittance, strict=True)
+            pairs = self._within_beams(receivers, placed_samples, transmittance)
             return total_light([sum_light(*lit, span, transmittance=item) for span, item in pairs])
 
         return Node(name, light, receivers, placed, radiance, transmittance)
@@ -181,11 +225,18 @@ class SceneEmitters:
             clip_matrices: wp.array,
         ) -> LobeLight:
             seen = receivers.points, receivers.normals, roughness, clip_matrices, placed_samples, radiance
-            pairs = zip(self.samples.spans(), transmittance, strict=True)
+            pairs = self._within_beams(receivers, placed_samples, transmittance)
             of_emitters = [sum_highlights(*seen, span, transmittance=item) for span, item in pairs]
             return LobeLight(*(total_light(list(parts)) for parts in zip(*of_emitters, strict=True)))
 
         return Node("highlights", highlights, receivers, placed, radiance, transmittance, roughness, cameras)
+
+    def _within_beams(
+        self, receivers: Receivers, placed_samples: PlacedSamples, transmittance: list[wp.array]
+    ) -> Iterator[tuple[EmitterSpan, wp.array | None]]:
+        """Samples of each emitter, and the part of their light that receivers get, given the transmittance."""
+        for span, item in zip(self.samples.spans(), transmittance, strict=True):
+            yield span, within_beam(receivers.points, placed_samples, span, item)
 
 
 def find_emitted_light(
@@ -298,6 +349,10 @@ def _find_transmittances(
             else:
                 towards = directions_to_samples(points, placed_samples, span)
                 transmittance_self = transmittance_of_directions(cells, normals, towards, EMITTER_CELLS)
+        transmittance_of_emitter = None
+        if hidden_by_itself is not None:
+            lookup = points, placed_samples, span, hidden_by_itself
+            transmittance_of_emitter = look_up_self_visibility(*lookup, is_own=is_own)
         yield (
             span,
             {
@@ -305,9 +360,7 @@ def _find_transmittances(
                 "log_of_planes": _log_of_planes(group, blockers, placed_samples, span, body),
                 "log_of_parts": _log_of_parts(group, blockers, placed_samples, span, body),
                 "transmittance": transmittance_self,
-                "transmittance_of_emitter": None
-                if hidden_by_itself is None
-                else look_up_self_visibility(points, placed_samples, span, hidden_by_itself, is_own=is_own),
+                "transmittance_of_emitter": within_beam(points, placed_samples, span, transmittance_of_emitter),
             },
         )
 

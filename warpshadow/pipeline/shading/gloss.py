@@ -62,7 +62,13 @@ class GlossyPoints(LitPoints):
         self._numbers = Node("", functools.partial(_numbers, glossy), detached(view.receivers_node))
 
     def mixed(
-        self, view: LitPoints, diffuse: Node, light: Light | None, materials: Materials, bounced: Node
+        self,
+        view: LitPoints,
+        diffuse: Node,
+        light: Light | None,
+        materials: Materials,
+        bounced: Node,
+        openness: Node | None,
     ) -> tuple[Node, Node]:
         """Light that colored and that white surfaces reflect, of all receivers of the view: vec3 [batch, receiver].
 
@@ -72,6 +78,7 @@ class GlossyPoints(LitPoints):
             light: As for :meth:`.LightTransport.shading`.
             materials: Of the bodies.
             bounced: Node of the view's shading without direct light of emitters.
+            openness: Of the view, as of :meth:`.LightTransport.openness`.
         """
         item_text = functools.partial(receiver_text, self.in_words)
         numbers = {name: self._values(materials, name) for name in GLOSS_ARGUMENTS}
@@ -94,7 +101,8 @@ class GlossyPoints(LitPoints):
         through = self.method.lobe_transmittance(self, directions, source, view)
         blocked = None
         if self.merged_scene.scene.bounces:
-            blocked = self.method.blocked_radiance(self, self.chosen(bounced), source, view, self.chosen)
+            opennesses = None if openness is None else self.chosen(openness)
+            blocked = self.method.blocked_radiance(self, self.chosen(bounced), source, view, self.chosen, opennesses)
         sums = Node("gloss", sum_lobes, filters, radiance, through, blocked, items=item_text)
         if materials.emission:
             sums = Node("", _add, sums, self.method.highlights(self, materials, roughness, self._cameras))

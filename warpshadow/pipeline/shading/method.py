@@ -45,9 +45,9 @@ class LightInput(Input):
 
     @property
     def visibility_key(self) -> Input | None:
-        """The input of visibility beside points and blockers: known light itself, of free light its shell alone.
+        """The input of visibility beside points and blockers.
 
-        Known light says where in cells it comes from.
+        Known light, since cells look to where it comes from; of free light, whose cells are even, its shell alone.
         """
         return self.shell if self.is_free else self
 
@@ -140,9 +140,10 @@ class Method:
     def numbering(
         self, blocker_kinds: BlockerKinds, has_backs: bool, static_bodies: StaticBodies | None = None
     ) -> Numbering:
-        """Number all vertices, or all with their backs; the first call makes both, so that a capture finds them.
+        """Number all vertices, or all with their backs.
 
-        Those on static bodies are the same in both, as results about them are cached.
+        Both numberings are made at once, since a capture cannot make constants. Backs of static bodies are in both, so
+        that rows cached for one serve the other.
         """
         moving = None if static_bodies is None else static_bodies.moving
         key = frozenset(blocker_kinds.separate), blocker_kinds.bulging, moving
@@ -292,7 +293,13 @@ class Method:
         return Node("", lambda towards: wp.full(towards.shape, 1.0, wp.float32, device=towards.device), directions)
 
     def blocked_radiance(
-        self, points: LitPoints, diffuse: Node, light: LightInput, view: LitPoints, choose: Callable[[Node], Node]
+        self,
+        points: LitPoints,
+        diffuse: Node,
+        light: LightInput,
+        view: LitPoints,
+        choose: Callable[[Node], Node],
+        openness: Node | None,
     ) -> Node:
         """Mean radiance of the blockers of points, where light bounces, vec3 of shape [batch, receiver].
 
@@ -301,6 +308,7 @@ class Method:
             diffuse: Node of their shading.
             view: As for :meth:`lobe_transmittance`.
             choose: Makes a node of light on the view's receivers one of light on these.
+            openness: Of the points, as of :meth:`.LightTransport.openness`.
         """
         raise NotImplementedError
 

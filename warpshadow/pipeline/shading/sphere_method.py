@@ -53,8 +53,8 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         free_projection: The basis in which the method projects any free light, of the scene's shell if it has one.
         why_no_shadows: Why the method has no shadows, in words; empty if it has.
         joins_cached: Whether visibility combines cached rows with moving blockers.
-        shades_transmittance: Whether transmittance is shaded in known light at once, by :meth:`shade_transmittance`,
-            which finds transfer vectors itself where it takes them: of cached rows, and for light from a shell.
+        shades_transmittance: Whether known light is summed from transmittance at once (:meth:`shade_transmittance`);
+            transfer vectors are then made only with cached rows, and for light from a shell.
     """
 
     free_projection: Projected

@@ -135,8 +135,8 @@ class SceneViews:
     def at_points(self, points: wp.array, normals: wp.array, geometry: Geometry | None = None) -> LitPoints:
         """Points to be lit by :meth:`shade` that are given, not found in an image.
 
-        Nobody knows which body a point is on: all spheres block its light, and where light bounces, none comes from its
-        own body as such. For points of bodies take :meth:`on_faces`.
+        Nobody knows which body a point is on: all spheres and planes block its light, and where light bounces, none
+        comes from its own body as such. For points of bodies take :meth:`on_faces`.
 
         Args:
             points: Positions [scene units], vec3 of shape [batch, receiver].

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 class View(LitPoints):
-    """A geometry seen by cameras: all inputs of an image except light and reflectance.
+    """A geometry seen by cameras: all inputs of an image except light and given reflectance.
 
     Args:
         transport: Light on receivers, by a method of visibility.
@@ -210,11 +210,18 @@ class View(LitPoints):
         textures = materials.textures_of["emission"]
         seen = self.fragments_node, self.merged_scene.faces, materials.of_vertices("emission")
         if not textures.images:
-            return Node("emission", interpolate, *seen)
+            return self._within_beams(Node("emission", interpolate, *seen))
         arguments = self.fragments_node, self.clip_positions, textures.pyramids, ""
         wire = functools.partial(textures.footprints, *arguments)
         footprints = self.cached("footprints in emission", textures.sizes, wire)
-        return Node("emission", sample_albedo, *seen, textures.pyramids, footprints)
+        return self._within_beams(Node("emission", sample_albedo, *seen, textures.pyramids, footprints))
+
+    def _within_beams(self, emission: Node) -> Node:
+        """Node of the part of emission that goes towards the cameras; itself where no emitter has a beam."""
+        if not self.merged_scene.has_beams:
+            return emission
+        emitters = self.method.emitters
+        return emitters.shown(emission, self.fragments_node, self.vertices, self.cameras, emitters.placed(self))
 
     def _sum_of(self, first: Node, second: Node) -> Node:
         """Node of the samples, of light of two kinds."""
@@ -230,7 +237,8 @@ class View(LitPoints):
         blockers_light = shading
         if materials.emission:
             blockers_light = self.transport.shading_without_emitters(self, light, materials)
-        colored, white = points.mixed(self, shading, light, materials, blockers_light)
+        openness = self.transport.openness(self, light, materials)
+        colored, white = points.mixed(self, shading, light, materials, blockers_light, openness)
         return self._sum_of(self._radiance(colored, reflectance), self._radiance(white, self._white_reflectance))
 
     @property

@@ -162,6 +162,7 @@ class PatchFormFactors(NamedTuple):
     """Form factors of points to patches."""
 
     factors: csr_matrix  # [point, patch]
+    blocked: np.ndarray  # part of the hemisphere that blockers take, those that send nothing, too, shape [point]
     is_buried: np.ndarray  # whether they lie inside another body, bool of shape [point]
 
 
@@ -176,13 +177,12 @@ def scale_to_sky(factors: csr_matrix, is_blocker: np.ndarray, sky: np.ndarray | 
     from scipy.sparse import diags
 
     is_buried = factors[:, [-1]].toarray().ravel() > _BURIED_SHARE
+    blocker_factors = factors @ diags(is_blocker.astype(np.float32))
+    blocked = np.asarray(blocker_factors.sum(axis=1)).ravel()
     if sky is not None:
-        blocker_factors = factors @ diags(is_blocker.astype(np.float32))
-        factors = (
-            factors
-            + scale_rows(blocker_factors, scaling_factors(1 - sky, np.asarray(blocker_factors.sum(axis=1)).ravel()) - 1)
-        ).tocsr()
-    return PatchFormFactors(factors[:, : -len(BLACK_ENTRIES)], is_buried)
+        scaling = scaling_factors(1 - sky, blocked)
+        factors, blocked = (factors + scale_rows(blocker_factors, scaling - 1)).tocsr(), scaling * blocked
+    return PatchFormFactors(factors[:, : -len(BLACK_ENTRIES)], blocked, is_buried)
 
 
 def scaling_factors(target: np.ndarray, current_values: np.ndarray) -> np.ndarray:

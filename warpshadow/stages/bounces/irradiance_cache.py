@@ -17,6 +17,11 @@ _NEIGHBORS = 3
 
 _NORMAL_DISTANCE = 0.1  # distance that a difference of normals by 1 counts as, in parts of the receivers' extent
 
+_MAX_EXTENT = 16.0
+"""Most of that extent, in median distances of receivers from their middle: on a ground without end it is a thousand,
+and then places on a body would not count beside its normals. Grounds of a few bodies have 7 to 8. A vase on a ground
+without end is 3.9% off in place of 1.1%, and one that shines 5.1 in place of 1.1%, without it."""
+
 
 def choose_cache_points(points: np.ndarray, count: int = CACHE_POINT_COUNT) -> np.ndarray:
     """Choose receivers that are as dense as all are, numbers of shape [cache point].
@@ -51,6 +56,9 @@ def interpolation_matrix(points: np.ndarray, normals: np.ndarray, cache_points: 
     if not len(points):
         return csr_matrix((0, len(cache_points)), dtype=np.float32)
     extent = float(np.ptp(points, axis=0).max()) or 1.0
+    distance_to_middle = float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
+    if distance_to_middle > 0:
+        extent = min(extent, _MAX_EXTENT * distance_to_middle)
     features = np.concatenate([points / extent, _NORMAL_DISTANCE * normals], axis=1).astype(np.float64)
     neighbor_count = min(_NEIGHBORS + 1, len(cache_points))
     distances, neighbors = cKDTree(features[cache_points]).query(features, k=neighbor_count)

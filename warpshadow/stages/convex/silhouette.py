@@ -17,8 +17,9 @@ from warpshadow.stages.convex.joint_lanes import coverage_type
 from warpshadow.stages.convex.prepared import ConvexArrays
 
 EDGE_LANES = 5
-"""Lanes of an edge: its normal m towards the part, its sign, 1 where a receiver sees the face to its right, −1 where it
-sees the one to its left, 0 where it sees both or none; and 0, or there 2: a cosine beyond all radii."""
+"""Lanes of an edge: its normal m towards the part, three; its sign, 1 where a receiver sees the face to its right
+alone, −1 where it sees the one to its left alone, else 0; and a number added to m·ω: 2 where the sign is 0, so that no
+cell meets the edge, else 0."""
 
 ADJOINT_LANES = 6
 """Lanes of an edge's gradients: of its normal; or of its two ends."""

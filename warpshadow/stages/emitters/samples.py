@@ -21,7 +21,7 @@ import warp as wp
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.maths.spatial_sort import compact_order
+from warpshadow.maths.spatial_sort import compact_order, z_order
 from warpshadow.stages.bounces.patches import Patches, find_patches
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
@@ -39,7 +39,7 @@ _MAX_STRETCH = 4.0  # greatest s
 
 
 class SurfacePoints(NamedTuple):
-    """Points on the surface of an emitter, spread evenly over each sample."""
+    """Points on the surface of an emitter, spread evenly over each sample, on a curve: so is every nth of them."""
 
     faces: np.ndarray  # face of the emitter that each lies on, int32 of shape [sample, point]
     weights: np.ndarray  # barycentric coordinates in it, float32 of shape [sample, point, 3]
@@ -88,7 +88,7 @@ def find_sample_weights(
     padding = np.full(-patch_count % SAMPLE_BUNDLE, permutation[-1] if patch_count else 0)
     is_real = np.repeat([1.0, 0.0], [patch_count, len(padding)])
     chosen = np.concatenate([permutation, padding]).astype(int)
-    surface_points = _find_surface_points(owners, pieces.corners[is_used], labels, areas)
+    surface_points = _find_surface_points(owners, pieces.corners[is_used], corners[is_used], labels, areas)
     return SampleWeights(
         of_vertices[chosen].tocsr(),
         (diags(is_real) @ of_faces[chosen]).tocsr(),
@@ -99,9 +99,9 @@ def find_sample_weights(
 
 
 def _find_surface_points(
-    faces: np.ndarray, corners: np.ndarray, labels: np.ndarray, areas: np.ndarray
+    faces: np.ndarray, corners: np.ndarray, positions: np.ndarray, labels: np.ndarray, areas: np.ndarray
 ) -> SurfacePoints:
-    """Spread points over samples, given the pieces: their faces, corners, samples and areas."""
+    """Spread points over samples, given the pieces: their faces, corners in these and in space, samples and areas."""
     permutation = np.argsort(labels, kind="stable")
     sums = np.cumsum(areas[permutation])
     ends = sums[np.searchsorted(labels[permutation], np.arange(labels.max(initial=-1) + 1), side="right") - 1]
@@ -112,8 +112,29 @@ def _find_surface_points(
     ]
     u, v = np.random.default_rng(0).uniform(size=(2, *pieces.shape, 1))
     in_pieces = np.concatenate([1 - np.sqrt(u), np.sqrt(u) * (1 - v), np.sqrt(u) * v], axis=-1)
-    weights = np.einsum("spk,spkc->spc", in_pieces, corners[pieces])
+    points = np.einsum("spk,spkx->spx", in_pieces, positions[pieces].astype(np.float64))
+    orders = np.array([z_order(of_sample) for of_sample in points], dtype=int).reshape(pieces.shape)
+    pieces = np.take_along_axis(pieces, orders, axis=1)
+    weights = np.einsum("spk,spkc->spc", np.take_along_axis(in_pieces, orders[..., None], axis=1), corners[pieces])
     return SurfacePoints(faces[pieces].astype(np.int32), weights.astype(np.float32))
+
+
+EVERYWHERE = (3.0, 4.0)
+"""The beam (:mod:`.beams`) of an emitter that has none."""
+
+
+class EmitterBeams(NamedTuple):
+    """Beams of emitters (:mod:`.beams`), some of which may have none.
+
+    Args:
+        beams: Of the emitters, EVERYWHERE for none, shape [emitter, 2].
+        vertices: Weights of all vertices in the emitters' axes, [emitter, vertex].
+        faces: Weights of the emitting faces' area vectors in them, [emitter, face].
+    """
+
+    beams: np.ndarray
+    vertices: SparseMatrix
+    faces: SparseMatrix
 
 
 class EmitterSpan(NamedTuple):
@@ -123,6 +144,7 @@ class EmitterSpan(NamedTuple):
     first: int  # of the samples
     end: int
     is_two_sided: bool  # whether it is open
+    beam: tuple[float, float] | None = None
 
     @property
     def size(self) -> int:
@@ -141,6 +163,7 @@ class EmitterSamples(NamedTuple):
         bodies: The emitters, by number.
         is_two_sided: Whether each is open.
         first: Where the samples of each begin, and the end of the last, shape [emitter + 1].
+        beams: Of the emitters; None where none has one.
     """
 
     vertices: SparseMatrix
@@ -150,11 +173,13 @@ class EmitterSamples(NamedTuple):
     bodies: tuple[int, ...]
     is_two_sided: tuple[bool, ...]
     first: np.ndarray
+    beams: EmitterBeams | None = None
 
     def spans(self) -> Iterator[EmitterSpan]:
         """The samples of each emitter."""
         for number, span in enumerate(itertools.pairwise(self.first.tolist())):
-            yield EmitterSpan(number, *span, self.is_two_sided[number])
+            beam = EVERYWHERE if self.beams is None else tuple(self.beams.beams[number].tolist())
+            yield EmitterSpan(number, *span, self.is_two_sided[number], None if beam == EVERYWHERE else beam)
 
 
 class PlacedSamples(NamedTuple):
@@ -165,12 +190,14 @@ class PlacedSamples(NamedTuple):
         areas: Area vectors A [square of scene units], vec3 of shape [batch, sample].
         bundles: Middle and radius of a sphere around each bundle, vec4 of shape [batch, bundle], without a gradient.
         balls: The same of each emitter, vec4 of shape [batch, emitter].
+        axes: Of the emitters' beams, of any length, vec3 of shape [batch, emitter]; None where none has one.
     """
 
     points: wp.array
     areas: wp.array
     bundles: wp.array
     balls: wp.array
+    axes: wp.array | None = None
 
 
 @wp.kernel
@@ -259,4 +286,8 @@ def place_samples(positions: wp.array, samples: EmitterSamples) -> PlacedSamples
     launch(_find_bundles, bundles.shape, inputs=[points, areas], outputs=[bundles])
     balls = empty((count, len(samples.bodies)), dtype=wp.vec4, device=device)
     launch(_find_balls, balls.shape, inputs=[bundles, constant(samples.first, wp.int32, device)], outputs=[balls])
-    return PlacedSamples(points, areas, bundles, balls)
+    axes = None
+    if samples.beams is not None:
+        of_vertices = multiply(samples.beams.vertices, positions)
+        axes = multiply(samples.beams.faces, vectors, addend=of_vertices)
+    return PlacedSamples(points, areas, bundles, balls, axes)

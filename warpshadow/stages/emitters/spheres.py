@@ -157,7 +157,8 @@ def find_log_transmittance(
         _block_by_spheres,
         count * points.shape[1],
         inputs=[
-            *(points, normals, *samples, span.emitter, span.first, int(span.is_two_sided)),
+            *(points, normals, samples.points, samples.areas, samples.bundles, samples.balls),
+            *(span.emitter, span.first, int(span.is_two_sided)),
             *(centers, radii, skip_values),
         ],
         outputs=[result],

@@ -16,13 +16,18 @@ import warp as wp
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.stages.emitters.samples import EmitterSamples, EmitterSpan, is_lit
+from warpshadow.stages.emitters.beams import beam_share
+from warpshadow.stages.emitters.samples import SURFACE_POINTS, EmitterSamples, EmitterSpan, is_lit
 from warpshadow.stages.interpolation import interpolate_at
 from warpshadow.stages.ray_tracing import RAY_COST, mesh_id, progress_slices, sees_point
 from warpshadow.stages.textures.pyramid import Textures
 from warpshadow.stages.textures.sample import interpolate_uv
 
 _SEED = 43
+
+_GOLDEN_SHARE = (5**0.5 - 1) / 2
+"""Part of a sample's points by which the first ray to the next sample goes further, so that those to near samples
+differ."""
 
 _POWER_POINTS = 64  # of a face, at which its texture tells how often it is drawn
 _LEAST_POWER = 0.1  # of its texture's mean radiance, that a face counts beside: those points may miss its bright ones
@@ -42,6 +47,8 @@ class EmittingFaces:
     texture_of_face: wp.array(dtype=wp.int32)  # [emitting face], -1 for none
     uvs: wp.array(dtype=wp.vec2)
     uv_faces: wp.array(dtype=wp.vec3i)  # [emitting face]
+    axes: wp.array(dtype=wp.vec3)  # of their beams, [emitting face], or none
+    beams: wp.array(dtype=wp.vec2)
 
 
 class EmissionTextures(NamedTuple):
@@ -53,12 +60,20 @@ class EmissionTextures(NamedTuple):
     uv_faces: wp.array  # vec3i of shape [emitting face]
 
 
+class FaceBeams(NamedTuple):
+    """Beams of emitting faces, of one instance."""
+
+    axes: np.ndarray  # [emitting face, 3]
+    beams: np.ndarray  # [emitting face, 2]
+
+
 def emitting_faces(
     positions: wp.array,
     emission: wp.array,
     faces: wp.array,
     is_two_sided: np.ndarray,
     textures: EmissionTextures | None = None,
+    beams: FaceBeams | None = None,
 ) -> EmittingFaces:
     """Prepare the faces of emitters.
 
@@ -68,6 +83,7 @@ def emitting_faces(
         faces: That emit, vec3i of shape [face].
         is_two_sided: Whether their bodies are open, bool of shape [face].
         textures: Of radiance, in place of that of vertices; None for none.
+        beams: Of the faces; None where none has one.
     """
     result = EmittingFaces()
     result.positions, result.emission, result.faces = positions, emission, faces
@@ -80,6 +96,9 @@ def emitting_faces(
         result.texels, result.levels = textures.textures.texels[0], textures.textures.levels
         result.texture_of_face, result.uvs, result.uv_faces = textures[1:]
         radiance = radiance + _mean_radiance(textures)
+    if beams is not None:
+        result.axes = wp.array(beams.axes, dtype=wp.vec3, device=device)
+        result.beams = wp.array(beams.beams, dtype=wp.vec2, device=device)
     power = areas * radiance
     sums = np.cumsum(power)
     has_power = bool(len(sums) and sums[-1] > 0)
@@ -142,6 +161,9 @@ def light_of_point(
             uv = interpolate_at(emitters.uvs, emitters.uv_faces[index], weights)
             radiance = interpolate_uv(emitters.texels, emitters.levels[texture, 0], uv)
         light = cosine * (facing_area / (distance * distance)) / (wp.pi * probability) * radiance
+        if emitters.axes.shape[0] > 0:
+            axis = wp.normalize(emitters.axes[index])
+            light = beam_share(axis, -ray_direction, emitters.beams[index]) * light
     return light
 
 
@@ -200,7 +222,7 @@ def _trace_transmittance(
 ):
     """A thread owns a receiver."""
     receiver = first_row + wp.tid()
-    state = wp.rand_init(_SEED, first_receiver + receiver)
+    turn = wp.randf(wp.rand_init(_SEED, first_receiver + receiver))
     point = points[receiver]
     normal = normals[receiver]
     for i in range(transmittance.shape[1]):
@@ -208,8 +230,10 @@ def _trace_transmittance(
         is_sending = is_lit(sample_points[sample] - point, sample_areas[sample], normal, is_two_sided)
         open_weight = float(0.0)
         total_weight = float(0.0)
-        for _ray in range(wp.where(is_sending, ray_count, 0)):
-            start = wp.randi(state, 0, surface.point_faces.shape[1])
+        point_count = surface.point_faces.shape[1]
+        first_point = int(float(point_count) * wp.frac(turn + _GOLDEN_SHARE * float(i)))
+        for ray in range(wp.where(is_sending, ray_count, 0)):
+            start = (first_point + ray * point_count // ray_count) % point_count
             beam, facing = _beam_to_facing_point(surface, sample, start, point, is_two_sided)
             if facing > 0.0:
                 total_weight += facing
@@ -244,12 +268,12 @@ def trace_transmittance(
         positions: All vertices [scene units], of one instance, vec3 of shape [vertex].
         sample_points, sample_areas: Of :class:`.samples.PlacedSamples`, of one instance.
         span: Samples of the emitter.
-        rays: To each sample.
+        rays: To each sample, spread over its points; no more than these.
     Returns:
         Float32 of shape [receiver, sample]; 0 where a sample sends nothing.
     Differentiable: no.
     """
-    device = points.device
+    device, rays = points.device, min(rays, SURFACE_POINTS)
     transmittance = empty((len(points), span.size), dtype=wp.float32, device=device)
     surface = EmitterSurface()
     surface.positions, surface.faces = positions, samples.faces

@@ -19,8 +19,9 @@ from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 from warpshadow.stages.emitters.light import transmittance_to_sample
 from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, is_lit
-from warpshadow.stages.gloss.lobes import MAX_COSINE, MIN_COSINE, MIN_ROUGHNESS, eye_position
+from warpshadow.stages.gloss.lobes import MAX_COSINE, MIN_COSINE, MIN_ROUGHNESS
 from warpshadow.stages.gloss.reflection import LobeLight
+from warpshadow.stages.project import eye_position
 
 _COST = 20.0  # nanoseconds that a sample takes
 

@@ -38,6 +38,7 @@ from warpshadow.device.memory import empty, in_huge_pages, require_gradient
 from warpshadow.device.parallel import split_row
 from warpshadow.device.tape import record_adjoint
 from warpshadow.stages.gloss.normal_spread import NormalSpread
+from warpshadow.stages.project import eye_position
 
 MIN_ROUGHNESS = 0.1  # roughness of the smoothest surface; maps of 128 rows have nothing sharper
 
@@ -57,23 +58,6 @@ def hemisphere_points(count: int, sample_count: int) -> np.ndarray:
     i = np.minimum(np.arange(count), sample_count - 1)
     azimuth = np.pi * (1 + np.sqrt(5)) * i
     return np.stack([(i + 0.5) / sample_count, np.cos(azimuth), np.sin(azimuth)], axis=1)
-
-
-@wp.func
-def eye_position(clip_matrix: wp.mat44):
-    """The point that a camera sees the world from, where x, y and w of clip space are all 0."""
-    rows = wp.mat33(
-        clip_matrix[0, 0],
-        clip_matrix[0, 1],
-        clip_matrix[0, 2],
-        clip_matrix[1, 0],
-        clip_matrix[1, 1],
-        clip_matrix[1, 2],
-        clip_matrix[3, 0],
-        clip_matrix[3, 1],
-        clip_matrix[3, 2],
-    )
-    return -(wp.inverse(rows) * wp.vec3(clip_matrix[0, 3], clip_matrix[1, 3], clip_matrix[3, 3]))
 
 
 @wp.func

@@ -7,7 +7,8 @@ a A + C:
     A = (1 − m) (E − s (F₀ E + (1 − F₀) E')) + m (G − G'),
     C = (1 − m) s (F₀ G + (1 − F₀) G') + m G'.
 
-R is the same in all directions that are blocked: their mean by the cosine, which bounced light tells.
+R is the same in all directions that are blocked: their mean by the cosine, which bounced light tells. In stills it is a
+ratio of two sums over the same rays, of which most noise cancels.
 E' is diffuse light times (1 − v·h)⁵: of even light it is E e(μ), which is taken for all light.
 """
 
@@ -131,7 +132,7 @@ def blocked_radiance(bounced_light: wp.array, direct: wp.array, openness: wp.arr
         bounced_light: E, light that receivers would reflect as white diffuse surfaces, with bounces; vec3 [batch,
             receiver].
         direct: S, the same without bounces.
-        openness: O, the same under an even sky of 1 without bounces.
+        openness: O, the same under an even sky of 1 without bounces; best found by the rays that found E − S.
 
     Returns:
         Vec3 of shape [batch, receiver].

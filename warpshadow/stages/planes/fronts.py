@@ -10,8 +10,8 @@ front of the plane (b = 1) or behind it (b = −1) has all its receivers there; 
 their heights are; and in the same plane (b = 0, h = 0) normals decide. The height term has no gradient: over so short a
 way as the margin it would be hundreds of times that of receivers beside it.
 
-Receivers within 2 k of planes, k = 5 m, are lit where they are lifted to, off all of them: on a seam of planes half of
-each would cover nothing.
+Receivers nearer than 2 k to a plane, k = 5 m, are moved off it, by k at most, before they are lit. A receiver on the
+line where two planes meet would lie in both, and each, seen edge-on, would cover none of the half that it hides.
 
     x + Σ_f (2 front_f − 1) k (1 − (h_f / 2 k)²)² N_f
 

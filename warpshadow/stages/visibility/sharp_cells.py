@@ -107,7 +107,7 @@ def _blend_sharp_cells_adjoint(
     adj_blended: wp.array3d(dtype=wp.float32),
     adj_sharp: wp.array3d(dtype=wp.float32),
 ):
-    """A thread owns a receiver: a cell's previous value counts for the rest."""
+    """A thread owns a receiver: the adjoint of T ← s T′ + (1 − s) T, in place."""
     batch, receiver = split_row(first_row + wp.tid(), adj_blended.shape[1])
     for i in range(pairs.shape[0]):
         cell = pairs[i][0]
