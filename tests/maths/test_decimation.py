@@ -61,6 +61,17 @@ def test_folds_stay_where_they_are():
     assert distances(points, decimated).max() < 1e-6
 
 
+@pytest.mark.parametrize("tolerance", [0.1, 1.0, 100.0])
+def test_each_sheet_keeps_a_triangle(tolerance):
+    """Leaves of two triangles, however coarse it gets."""
+    leaf = np.array([(-0.7, 0, 0), (0, 0, 0.5), (0.9, 0, 0), (0, 0, -0.5)])
+    points = np.concatenate([leaf, leaf + (3, 0, 0), dome(1)[0]])
+    triangles = np.concatenate([[(0, 1, 2), (0, 2, 3), (4, 5, 6), (4, 6, 7)], dome(1)[1] + 8])
+    np.testing.assert_array_equal(
+        np.unique(np.searchsorted([4, 8], decimate(points, triangles, tolerance), "right")), [0, 1, 2]
+    )
+
+
 def test_large_meshes_are_sampled_first():
     points, triangles = dome(6)
     decimated = decimate(points, triangles, 0.02)

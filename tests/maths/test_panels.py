@@ -6,7 +6,7 @@ import trimesh
 
 import warpshadow as ws
 from warpshadow.maths.convex import find_convex_parts
-from warpshadow.maths.panels import TOLERANCES, find_panels
+from warpshadow.maths.panels import MAX_LEAVES, TOLERANCES, find_panels
 
 TOLERANCE = 0.02
 
@@ -143,6 +143,51 @@ def test_rims_with_teeth_are_cut_between_tips_and_roots():
     points, faces = shell("sphere of 16", 0.5, axis=2)
     panels = [part.corners for part in find_convex_parts(points.astype(np.float32), faces)]
     assert areas(points, panels).sum() / area(points, faces) > 0.93
+
+
+def leaves(count):
+    """Leaves of two triangles, about as large as a tenth of the mesh."""
+    rng = np.random.default_rng(0)
+    axes = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    leaf = np.array([(-0.07, 0, 0), (0, 0, 0.05), (0.09, 0, 0), (0, 0, -0.05)])
+    points = (leaf @ axes + rng.uniform(-1, 1, (count, 1, 3))).reshape(-1, 3)
+    return points, (np.array([(0, 1, 2), (0, 2, 3)]) + 4 * np.arange(count)[:, None, None]).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("count", [40, 100, MAX_LEAVES])
+def test_all_leaves_of_a_tree_are_panels_each_a_piece_of_its_own(count):
+    points, faces = leaves(count)
+    parts = find_convex_parts(points.astype(np.float32), faces)
+    assert [part.piece for part in parts] == list(range(count))
+    np.testing.assert_allclose(areas(points, [part.corners for part in parts]), 0.16 * 0.05, rtol=1e-4)
+
+
+def test_more_leaves_than_that_have_spheres():
+    points, faces = leaves(MAX_LEAVES + 1)
+    assert find_convex_parts(points.astype(np.float32), faces) is None
+
+
+@pytest.mark.parametrize("size", [0.4, 0.15, 0.03])
+def test_small_bowls_beside_large_ones_are_bowls(size):
+    """With the tolerance of the large one, the smaller ones had 17, 9 and 1 panels."""
+    points, faces = shell("icosphere 3", 0.5)
+    both = np.concatenate([points, size * points + (1.5, 0, 0)]).astype(np.float32)
+    parts = find_convex_parts(both, np.concatenate([faces, faces + len(points)]))
+    assert [part.piece for part in parts] == sorted(part.piece for part in parts)
+    large, small = ([part.corners for part in parts if part.piece == piece] for piece in (0, 1))
+    assert 20 <= len(small) < len(large)
+    share = areas(both, small).sum() / (area(points, faces) * size**2)
+    assert 0.85 < share < 1.02
+
+
+def test_sheets_that_share_an_edge_are_one_piece():
+    """Walls that meet in a T; a leaf that touches one of them in a corner is a piece of its own."""
+    points = [(x, y, z) for x, z in ((0, 0), (1, 0), (-1, 0), (0, 1)) for y in (0, 1)]
+    points += [(1, 2, 0), (2, 1, 0)]
+    walls = [triangle for a, b in ((0, 2), (4, 0), (0, 6)) for triangle in ((a, b, b + 1), (a, b + 1, a + 1))]
+    parts = find_convex_parts(np.array(points, np.float32), np.array([*walls, (3, 8, 9)]))
+    assert np.bincount([part.piece for part in parts]).tolist() == [3, 1]
+    assert len(parts[-1].corners) == 3
 
 
 @pytest.mark.parametrize("sections", [24, 48, 200])

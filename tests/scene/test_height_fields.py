@@ -140,6 +140,22 @@ def test_a_ball_in_a_bowl_of_one_layer_is_as_dark_as_by_rays(level):
     assert light == pytest.approx(expected, rel=0.03)  # by spheres of the land below 18% brighter
 
 
+@pytest.mark.slow
+def test_a_ball_in_a_small_bowl_beside_a_large_one_is_as_dark_as_by_rays():
+    """With panels as coarse as those of the large bowl 5% too dark."""
+    large, small = bowl(3), bowl(3)
+    positions = np.concatenate([large.positions, 0.15 * small.positions + np.float32([1.3, 0, 0])])
+    bowls = ws.Mesh(positions, np.concatenate([large.faces, small.faces + len(large.positions)]), name="bowls")
+    in_small = ws.Body(ws.icosphere(0.045, 3), translation=(1.31, -0.1, 0))
+    camera = ws.Camera.look_at((1.3, 0.4, 0.33), (1.3, -0.06, 0), size=(48, 48))
+    scene = ws.Scene([ws.Body(bowls), in_small], ws.EnvironmentMap.constant(), camera)
+    renderer = ws.Renderer(scene)
+    traced = ws.Renderer(dataclasses.replace(scene, visibility=ws.Visibility("ray-traced", samples=256)))
+    shows_ball = renderer.layers().bodies == 1
+    light, expected = (each.render()[shows_ball][:, :3].mean() for each in (renderer, traced))
+    assert light == pytest.approx(expected, rel=0.03)
+
+
 def test_water_and_rocks_stick_in_land():
     water = ws.Body(ws.plane(4.0), translation=(0, -0.1, 0))
     rock = ball((0.5, height(0.5, 0.5), 0.5))

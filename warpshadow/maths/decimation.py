@@ -167,8 +167,12 @@ def _collapses(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Vertices, and the neighbors to which they may go, such that the mesh stays a surface with the same border."""
     from scipy.sparse import csr_matrix
 
-    codes, counts = np.unique(np.sort(edges_of(faces), axis=1) @ [count, 1], return_counts=True)
-    ends = np.stack([codes // count, codes % count])
+    codes, edge, counts = np.unique(
+        np.sort(edges_of(faces), axis=1) @ [count, 1], return_inverse=True, return_counts=True
+    )
+    ends, edge = np.stack([codes // count, codes % count]), edge.reshape(3, -1)
+    is_lone = np.zeros(len(codes), bool)
+    is_lone[edge[:, (counts[edge] == 1).all(axis=0)]] = True  # of triangles without neighbors, which would be gone
     borders_at = np.bincount(ends[:, counts == 1].ravel(), minlength=count)
     is_fixed = borders_at > 2  # where borders touch
     is_fixed[ends[:, counts > 2]] = True
@@ -176,7 +180,13 @@ def _collapses(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     adjacency = csr_matrix((np.ones(len(begin), np.int32), (begin, end)), (count, count))
     common_neighbors = np.asarray((adjacency @ adjacency)[begin, end]).ravel()
     counts = np.tile(counts, 2)
-    stays = is_fixed[begin] | is_fixed[end] | (common_neighbors != counts) | ((borders_at[begin] > 0) & (counts != 1))
+    stays = (
+        np.tile(is_lone, 2)
+        | is_fixed[begin]
+        | is_fixed[end]
+        | (common_neighbors != counts)
+        | ((borders_at[begin] > 0) & (counts != 1))
+    )
     return begin[~stays], end[~stays]
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from warpshadow.maths.adjacency import edge_neighbors
@@ -11,12 +13,21 @@ from warpshadow.maths.outline import cut_outline, find_outline
 from warpshadow.maths.plane import is_flat, principal_axes
 from warpshadow.maths.polygons import join_triangles
 
-TOLERANCES = {0.02: 64, 0.03: 96, 0.04: 144}
-"""Thickness and mean gap of a panel at most, over the size of the mesh, and panels of a mesh at most: the first with
-which there are no more. An icosphere without a fifth has 90 to 120; a bunny would have 200, and has spheres."""
+TOLERANCES = {0.007: 40, 0.02: 64, 0.03: 96, 0.04: 144}
+"""Thickness and mean gap of a panel at most, over the scale of its sheet, and panels of a mesh at most: the first with
+which there are no more. An icosphere without a fifth has 90 to 120; a bunny would have 190, and has spheres."""
 
 FLAT = {1e-3: 64}
 """The same for flat panels, which shade nothing that lies on the mesh."""
+
+MAX_LEAVES = 256
+"""Panels at most of a mesh of which no sheet is decimated, such as leaves. 243 of a tree take 1.4 times as long as 1024
+spheres, and the image is 3.2% off, not 4.4%."""
+
+_MAX_SCALE = 2.0
+"""Scale of a sheet over its extent at most. The scale is the geometric mean of the extents of the sheet and the mesh:
+small sheets have fewer panels. Half a shell beside one of 7 times its size has 29, and a ball in it is 0.2% too dark;
+with 3 it has 24, and the ball is 4.7% too dark; by spheres it is 16% too bright."""
 
 _DECIMATION = 0.6  # tolerance of decimation over that of panels, which are joined from its triangles
 _MAX_TRIANGLES = 3  # of a panel that are joined, in the mean, at most
@@ -62,6 +73,39 @@ def find_panels(
     joined = [join_triangles(points, mesh, tolerance) for mesh in meshes if len(mesh) <= _MAX_TRIANGLES * maximum]
     panels = min(joined, key=len, default=None)
     return exact + panels if panels is not None and len(panels) <= maximum else None
+
+
+def find_panels_of_sheets(
+    points: np.ndarray, sheets: Sequence[np.ndarray], *, flat: bool = False
+) -> list[list[np.ndarray]] | None:
+    """Cut sheets of a mesh into panels, as flat as there may be.
+
+    Args:
+        points: Vertices, float64 of shape [vertex, 3].
+        sheets: Triangles of each, [sheet][triangle, 3].
+        flat: Whether panels are flat: no bent sheet has any.
+
+    Returns:
+        Corners of the panels of each sheet, as of :func:`find_panels`; None where there are more than 144, or 256 where
+        no sheet is decimated.
+    """
+    size = np.ptp(points, axis=0).max()
+    extents = np.array([np.ptp(points[sheet.ravel()], axis=0).max() for sheet in sheets])
+    scales = np.minimum(np.sqrt(extents * size), _MAX_SCALE * extents).tolist()
+    trials = [(*item, not flat) for item in (FLAT if flat else TOLERANCES).items()]
+    if not flat:
+        trials.append((max(TOLERANCES), MAX_LEAVES, False))
+    for tolerance, maximum, decimates in trials:
+        panels: list[list[np.ndarray]] = []
+        for sheet, scale in zip(sheets, scales, strict=True):
+            left = maximum - sum(map(len, panels))
+            new_panels = find_panels(points, sheet, tolerance * scale, left, decimates=decimates)
+            if new_panels is None:
+                break
+            panels.append(new_panels)
+        else:
+            return panels
+    return None
 
 
 def _smooth_regions(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
