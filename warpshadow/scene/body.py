@@ -55,11 +55,11 @@ class Body:
             (:func:`warpshadow.fit_spheres`), or the spheres themselves, or an .npz file of them; 0 or none casts no
             shadow, by rays neither. By method "directional" a flat body blocks light as the part of a plane that it is,
             for any number, and with "auto" a body of closed convex pieces, such as boxes, of prisms that are at most 32
-            of these, such as walls with windows, or of at most 144 panels of cloth or 256 leaves, the light of others as
-            these; by others a flat body with all else on one side is a ground, for which any number means one sphere touching it
-            from behind. Where light bounces, a body of 0 or none is lit and reflects all the same, and takes its light
-            from nobody. If it is not flat, other bodies get that light by rays only: a sphere sends light in place of
-            the light it blocks.
+            of these, such as walls with windows, or of at most 144 panels of cloth or 256 leaves, the light of others
+            as these; by others a flat body with all else on one side is a ground, for which any number means one sphere
+            touching it from behind. Where light bounces, a body of 0 or none is lit and reflects all the same, and
+            takes its light from nobody. If it is not flat, other bodies get that light by rays only: a sphere sends
+            light in place of the light it blocks.
         rotation: Axis-angle vector [degrees], shape [3]: (0, 90, 0) is a quarter turn about +y, through the origin of
             the mesh's own space, wherever its vertices are; :meth:`on_ground` then stands the body where it is to
             stand, and :meth:`Renderer.placed` can turn it about its middle. A matrix, shape [3, 3], becomes such a
