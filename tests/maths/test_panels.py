@@ -6,7 +6,7 @@ import trimesh
 
 import warpshadow as ws
 from warpshadow.maths.convex import find_convex_parts
-from warpshadow.maths.panels import MAX_PANELS, TOLERANCES, find_panels
+from warpshadow.maths.panels import MAX_LEAVES, TOLERANCES, find_panels
 
 TOLERANCE = 0.02
 
@@ -63,7 +63,7 @@ def test_panels_are_convex_and_as_thin_as_asked():
             assert np.ptp((corners - middle) @ normal) <= tolerance
             sides, following = np.roll(corners, -1, axis=0) - corners, np.roll(corners, -2, axis=0)
             turns = np.cross(sides, following - corners) @ normal
-            assert (turns > 0).all() or (turns < 0).all()
+            assert (turns >= -1e-6).all() or (turns <= 1e-6).all()  # neighbors may have corners on its sides
 
 
 def test_a_flat_sheet_whose_outline_is_not_convex_is_cut():
@@ -88,12 +88,119 @@ def test_domes_have_panels_and_deep_ones_coarser_ones(height):
     ball = trimesh.creation.icosphere(4)
     faces = np.asarray(ball.faces)[ball.triangles_center[:, 1] > 1 - height]
     parts = find_convex_parts(np.asarray(ball.vertices, np.float32), faces)
-    assert 16 <= len(parts) <= MAX_PANELS
+    assert 16 <= len(parts) <= max(TOLERANCES.values())
     polygons = [part.corners for part in parts]
     share = areas(ball.vertices, polygons).sum() / area(ball.vertices, faces)
-    assert 0.95 < share < 1.25  # they overlap
+    assert 0.9 < share < 1  # chords are shorter
     middles = np.array([ball.vertices[polygon].mean(axis=0) for polygon in polygons])
-    assert 1 - np.linalg.norm(middles, axis=1).min() < TOLERANCES[-1] * 2
+    assert 1 - np.linalg.norm(middles, axis=1).min() < max(TOLERANCES) * 2
+
+
+SHELLS = {
+    "icosphere 2": trimesh.creation.icosphere(2),
+    "icosphere 3": trimesh.creation.icosphere(3),
+    "icosphere 4": trimesh.creation.icosphere(4),
+    "sphere of 16": trimesh.creation.uv_sphere(1.0, (16, 16)),
+    "sphere of 32": trimesh.creation.uv_sphere(1.0, (32, 32)),
+    "sphere of 64": trimesh.creation.uv_sphere(1.0, (64, 64)),
+}
+
+
+def shell(name, height, noise=0.0, axis=1):
+    """A sphere without what is above a part of its height, and with noise in its vertices."""
+    ball = SHELLS[name]
+    faces = np.asarray(ball.faces)[ball.triangles_center[:, axis] < 2 * height - 1]
+    return ball.vertices + noise * np.random.default_rng(0).normal(size=ball.vertices.shape), faces
+
+
+@pytest.mark.parametrize("height", [0.2, 0.3, 0.5, 0.6, 0.8])
+@pytest.mark.parametrize("name", SHELLS)
+def test_shells_have_panels_however_they_are_tessellated(name, height):
+    points, faces = shell(name, height, axis=2 if "of" in name else 1)
+    parts = find_convex_parts(points.astype(np.float32), faces)
+    share = areas(points, [part.corners for part in parts]).sum() / area(points, faces)
+    assert 0.85 < share < 1.02
+
+
+@pytest.mark.parametrize("noise", [0.002, 0.006])
+def test_shells_of_a_scan_have_panels(noise):
+    points, faces = shell("icosphere 4", 0.5, noise)
+    assert find_convex_parts(points.astype(np.float32), faces)
+
+
+def test_there_are_no_gaps_between_panels_of_a_shell():
+    """Where two meet, they share a side, or corners on it: all that is not is the rim."""
+    points, faces = shell("icosphere 3", 0.5)
+    panels = [part.corners for part in find_convex_parts(points.astype(np.float32), faces)]
+    sides = {(a, b) for panel in panels for a, b in zip(panel, np.roll(panel, -1), strict=True)}
+    rim = np.array([side for side in sides if side[::-1] not in sides])
+    assert points[rim][..., 1].min() > -0.2
+    assert len(rim) < 0.2 * len(sides)
+
+
+def test_rims_with_teeth_are_cut_between_tips_and_roots():
+    """So that as much light comes in: teeth that are cut away alone would leave 0.86 of the area, not 0.97."""
+    points, faces = shell("sphere of 16", 0.5, axis=2)
+    panels = [part.corners for part in find_convex_parts(points.astype(np.float32), faces)]
+    assert areas(points, panels).sum() / area(points, faces) > 0.93
+
+
+def leaves(count):
+    """Leaves of two triangles, about as large as a tenth of the mesh."""
+    rng = np.random.default_rng(0)
+    axes = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    leaf = np.array([(-0.07, 0, 0), (0, 0, 0.05), (0.09, 0, 0), (0, 0, -0.05)])
+    points = (leaf @ axes + rng.uniform(-1, 1, (count, 1, 3))).reshape(-1, 3)
+    return points, (np.array([(0, 1, 2), (0, 2, 3)]) + 4 * np.arange(count)[:, None, None]).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("count", [40, 100, MAX_LEAVES])
+def test_all_leaves_of_a_tree_are_panels_each_a_piece_of_its_own(count):
+    points, faces = leaves(count)
+    parts = find_convex_parts(points.astype(np.float32), faces)
+    assert [part.piece for part in parts] == list(range(count))
+    np.testing.assert_allclose(areas(points, [part.corners for part in parts]), 0.16 * 0.05, rtol=1e-4)
+
+
+def test_more_leaves_than_that_have_spheres():
+    points, faces = leaves(MAX_LEAVES + 1)
+    assert find_convex_parts(points.astype(np.float32), faces) is None
+
+
+@pytest.mark.parametrize("size", [0.4, 0.15, 0.03])
+def test_small_bowls_beside_large_ones_are_bowls(size):
+    """With the tolerance of the large one, the smaller ones had 17, 9 and 1 panels."""
+    points, faces = shell("icosphere 3", 0.5)
+    both = np.concatenate([points, size * points + (1.5, 0, 0)]).astype(np.float32)
+    parts = find_convex_parts(both, np.concatenate([faces, faces + len(points)]))
+    assert [part.piece for part in parts] == sorted(part.piece for part in parts)
+    large, small = ([part.corners for part in parts if part.piece == piece] for piece in (0, 1))
+    assert 20 <= len(small) < len(large)
+    share = areas(both, small).sum() / (area(points, faces) * size**2)
+    assert 0.85 < share < 1.02
+
+
+def test_sheets_that_share_an_edge_are_one_piece():
+    """Walls that meet in a T; a leaf that touches one of them in a corner is a piece of its own."""
+    points = [(x, y, z) for x, z in ((0, 0), (1, 0), (-1, 0), (0, 1)) for y in (0, 1)]
+    points += [(1, 2, 0), (2, 1, 0)]
+    walls = [triangle for a, b in ((0, 2), (4, 0), (0, 6)) for triangle in ((a, b, b + 1), (a, b + 1, a + 1))]
+    parts = find_convex_parts(np.array(points, np.float32), np.array([*walls, (3, 8, 9)]))
+    assert np.bincount([part.piece for part in parts]).tolist() == [3, 1]
+    assert len(parts[-1].corners) == 3
+
+
+@pytest.mark.parametrize("sections", [24, 48, 200])
+def test_lamp_shades_have_no_more_panels_than_sides(sections):
+    angles = 2 * np.pi * np.arange(sections) / sections
+    ring = np.stack([np.cos(angles), 0 * angles, np.sin(angles)], axis=1)
+    begin, end = np.arange(sections), np.roll(np.arange(sections), -1)
+    faces = [
+        np.stack([begin, begin + sections, end], axis=1),
+        np.stack([end, begin + sections, end + sections], axis=1),
+    ]
+    panels = find_panels(np.concatenate([ring, 0.7 * ring + [0, 1, 0]]), np.concatenate(faces), 0.04, 144)
+    assert len(panels) <= min(sections, 40)
 
 
 def test_triangles_without_area_do_not_count():

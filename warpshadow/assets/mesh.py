@@ -32,7 +32,6 @@ from warpshadow.assets.topology import (
 )
 from warpshadow.check import AnyPath
 from warpshadow.maths.convex import ConvexPart, find_convex_parts
-from warpshadow.maths.panels import FLAT
 from warpshadow.maths.plane import plane_normal
 
 
@@ -189,7 +188,7 @@ class Mesh:
     @functools.cached_property
     def flat_parts(self) -> list[ConvexPart]:
         """The convex solids and flat panels of which it consists; empty where it has anything else."""
-        return find_convex_parts(self.positions, self.surface.faces, tolerances=(FLAT,)) or []
+        return find_convex_parts(self.positions, self.surface.faces, flat_panels=True) or []
 
     def transformed(
         self,

@@ -12,7 +12,7 @@ import numpy as np
 from warpshadow.maths.adjacency import edges_of
 from warpshadow.maths.components import connected_components
 from warpshadow.maths.outline import cut_outline, find_outline
-from warpshadow.maths.panels import MAX_PANELS, TOLERANCES, find_panels
+from warpshadow.maths.panels import find_panels_of_sheets
 from warpshadow.maths.tubes import MAX_SEGMENTS, find_tube
 
 MAX_FACES = 64
@@ -45,7 +45,7 @@ class ConvexPart(NamedTuple):
     is_seam: bool = False
     """Whether it is the face that two prisms share: seen at a slant both cover it, so it is to be taken off."""
     piece: int = 0
-    """Number of the piece of the mesh, from 0. Parts of one piece are beside each other. All panels are of one."""
+    """Number of the piece of the mesh, from 0. Parts of one piece are beside each other."""
     gap: float = 0.0
     """Distance of the mesh from a part that stands in for a bent piece of it, at most, over the radius of the part."""
 
@@ -56,21 +56,21 @@ def is_panel(part: ConvexPart) -> bool:
 
 
 def find_convex_parts(
-    positions: np.ndarray, faces: np.ndarray, tolerances: Sequence[float] = TOLERANCES
+    positions: np.ndarray, faces: np.ndarray, *, flat_panels: bool = False
 ) -> list[ConvexPart] | None:
     """Find the convex parts of which a mesh consists.
 
     Args:
         positions: Vertices, shape [vertex, 3]; vertices at one place count as one.
         faces: Triangles that wind alike, shape [face, 3].
-        tolerances: Thickness and mean gap of a panel at most, over the size of the mesh: the first with which there are
-            few enough.
+        flat_panels: Whether panels are flat: no bent sheet has any.
 
     Returns:
         The parts, which may touch and overlap: for each closed piece of the mesh a solid, or the prisms into which it
         is cut if it is one, with holes or without, or the segments of a bent tube; panels for each open one. They come
-        by pieces, and in each the seams come last. None where a closed piece is hollow or curved otherwise, where a
-        part has more than 64 faces, or where there are more than 32 prisms of a piece, 128 segments or 64 panels.
+        by pieces, and in each the seams come last. Panels of sheets that share edges are of one piece. None where a
+        closed piece is hollow or curved otherwise, where a part has more than 64 faces, or where there are more than 32
+        prisms of a piece, 128 segments or 144 panels, 256 of leaves.
     """
     _, first, vertex = np.unique(positions, axis=0, return_index=True, return_inverse=True)
     triangles = vertex.reshape(-1)[faces]
@@ -92,31 +92,18 @@ def find_convex_parts(
                 return None
             segment_count += len(parts_of_piece) - sum(part.is_seam for part in parts_of_piece)
         pieces.append(parts_of_piece)
-    panels = _find_panels(points, sheets, tolerances)
+    panels = find_panels_of_sheets(points, sheets, flat=flat_panels)
     if panels is None:
         return None
-    if panels:
-        pieces.append([_panel(panel) for panel in panels])
+    panels_of_group: dict[int, list[ConvexPart]] = {}
+    for number, panels_of_sheet in zip(_groups(sheets).tolist(), panels, strict=True):
+        panels_of_group.setdefault(number, []).extend(map(_panel, panels_of_sheet))
+    pieces += filter(None, panels_of_group.values())
     return [
         part._replace(corners=first[part.corners], piece=number)
         for number, parts in enumerate(pieces)
         for part in parts
     ]
-
-
-def _find_panels(points: np.ndarray, sheets: list[np.ndarray], tolerances: Sequence[float]) -> list[np.ndarray] | None:
-    """Cut sheets into panels, as flat ones as there may be."""
-    size = np.ptp(points, axis=0).max()
-    for tolerance in tolerances:
-        panels: list[np.ndarray] = []
-        for sheet in sheets:
-            new_panels = find_panels(points, sheet, tolerance * size, MAX_PANELS - len(panels))
-            if new_panels is None:
-                break
-            panels += new_panels
-        else:
-            return panels
-    return None
 
 
 def _pieces(triangles: np.ndarray) -> np.ndarray:
@@ -126,6 +113,16 @@ def _pieces(triangles: np.ndarray) -> np.ndarray:
     permutation = np.lexsort((np.arange(len(edges)) % count, edge.reshape(-1)))
     pairs = permutation[np.repeat(counts % 2 == 0, counts)].reshape(-1, 2) % count
     return connected_components(pairs[:, 0], pairs[:, 1], count)
+
+
+def _groups(sheets: list[np.ndarray]) -> np.ndarray:
+    """Number of the group of each sheet, of those that share edges, such as walls that meet in a T."""
+    edges, none = [np.unique(np.sort(edges_of(sheet), axis=1), axis=0) for sheet in sheets], np.zeros((0, 2), int)
+    sheet = np.repeat(np.arange(len(sheets)), list(map(len, edges)))
+    _, edge = np.unique(np.concatenate([none, *edges]), axis=0, return_inverse=True)
+    permutation = np.argsort(edge.reshape(-1), kind="stable")
+    is_shared = np.diff(edge.reshape(-1)[permutation]) == 0
+    return connected_components(sheet[permutation[:-1][is_shared]], sheet[permutation[1:][is_shared]], len(sheets))
 
 
 def _is_open(triangles: np.ndarray) -> bool:
