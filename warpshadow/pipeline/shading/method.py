@@ -56,9 +56,10 @@ class LightInput(Input):
 
     @property
     def visibility_key(self) -> Input | None:
-        """The input of visibility beside points and blockers.
+        """The input on which visibility depends besides points and blockers.
 
-        Known light, since cells look to where it comes from; of free light, whose cells are even, its shell alone.
+        It depends on known light, since cells look to where that comes from. Of free light, whose cells are even, it
+        depends on the shell alone.
         """
         return self.shell if self.is_free else self
 
