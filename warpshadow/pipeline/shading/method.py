@@ -67,8 +67,8 @@ class LightInput(Input):
 class Method(abc.ABC):
     """How light is blocked: a method of visibility.
 
-    A method gives these members. A method by spheres derives from :class:`.SphereMethod`, which gives the first four,
-    and has a table of its own:
+    A method gives these members. A method by spheres derives from :class:`.SphereMethod`, which gives all but
+    :meth:`lobe_transmittance`, :meth:`blocked_radiance` and :meth:`along_paths`, and has a table of its own:
 
     | member | needed for | default |
     | --- | --- | --- |
