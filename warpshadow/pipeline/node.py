@@ -107,9 +107,10 @@ def _is_same_array(array: wp.array, before: wp.array, copy: wp.array) -> bool:
 
 
 class NodeStage(NamedTuple):
-    """A stage as it is timed and explained: a row of ``explain``.
+    """A row of ``explain``: a stage as it is timed and explained.
 
-    A node with a name is one. Further ones are steps that its function times itself, or makes needless.
+    A named node is one row. Further rows are steps that its function times itself, and steps that it makes needless,
+    which are idle.
 
     Args:
         name: Its name.
@@ -138,7 +139,7 @@ class Node:
         items, idle, has_adjoint: As for :class:`NodeStage`; a function of an idle node passes something on.
         caches: Whether the value may outlive a call.
         extra_inputs: Other nodes that run for this one.
-        stages: Further stages, explained before its own: such as its function times, and such as it makes needless.
+        stages: Further rows, before its own.
 
     Attributes:
         stage: Its own stage; None without a name.

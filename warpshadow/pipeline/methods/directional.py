@@ -272,7 +272,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     ) -> wp.array:
         """Shading of a group in known light."""
         if group.cached_rows is not None or projected_light.patches is not None:
-            return self.shade_transfer(self.transfer(visibility, group, projected_light), group, projected_light)
+            return super().shade_transmittance(visibility, group, projected_light)
         assert visibility.transmittance_total is not None and projected_light.coefficients is not None
         cells = projected_light.cosine_directions, projected_light.coefficients
         return shade_cells(visibility.transmittance_total, group.normals, *cells, maximum=LARGEST_COEFFICIENT)

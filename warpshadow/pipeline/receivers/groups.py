@@ -153,7 +153,8 @@ class CellVisibility(NamedTuple):
     """Visibility of a group in cells of directions: transmittances, float32 of shape [batch, receiver, cell]."""
 
     directions: np.ndarray  # of the cells, [cell, 3]
-    transmittance_total: wp.array | None  # past all bodies; until planes are: past all others, or None
+    # after find_visibility past all but planes, None if planes follow and light does not bounce; then past all bodies
+    transmittance_total: wp.array | None
     transmittance_self: wp.array | None = None  # a factor of it: transmittance past its own body; None where that is 1
     transmittance_nonplanar: wp.array | None = None  # past all but planes; None where no planes block, or nobody asks
     # transmittance past its own body and spheres, without convex parts and planes; None where that is 1

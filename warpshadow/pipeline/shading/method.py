@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import functools
 from collections.abc import Callable, Hashable
 from typing import TYPE_CHECKING
@@ -55,15 +56,36 @@ class LightInput(Input):
 
     @property
     def visibility_key(self) -> Input | None:
-        """The input of visibility beside points and blockers.
+        """The input on which visibility depends besides points and blockers.
 
-        Known light, since cells look to where it comes from; of free light, whose cells are even, its shell alone.
+        It depends on known light, since cells look to where that comes from. Of free light, whose cells are even, it
+        depends on the shell alone.
         """
         return self.shell if self.is_free else self
 
 
-class Method:
+class Method(abc.ABC):
     """How light is blocked: a method of visibility.
+
+    A method gives these members. A method by spheres derives from :class:`.SphereMethod`, which gives all but
+    :meth:`lobe_transmittance`, :meth:`blocked_radiance` and :meth:`along_paths`, and has a table of its own:
+
+    | member | needed for | default |
+    | --- | --- | --- |
+    | :meth:`known_shading` | known light | – |
+    | :meth:`transfers` | free light | – |
+    | :meth:`emitted_light` | lamps | – |
+    | :meth:`highlights` | lamps, on bodies that shine | – |
+    | :meth:`lobe_transmittance` | bodies that shine | 1: no shadows |
+    | :meth:`blocked_radiance` | bodies that shine, where light bounces | refused |
+    | :meth:`openness` | light that bounces between static patches | None: rays find it, as they find form factors |
+    | :meth:`along_paths` | light that bounces along paths (:func:`.choose_bouncing`) | refused |
+    | :meth:`blocker_kinds` | planes, convex parts, traced self-visibility | spheres alone |
+    | :meth:`find_squares` | adaptive receivers | None, where every sample receives light |
+    | the four fields below | as they say | False; 32 |
+
+    A scene is refused whose bodies shine, or whose light bounces, where the method's row of ``METHOD_TRAITS``
+    (:mod:`warpshadow.scene.visibility`) says no: the method then needs no member for that.
 
     Args:
         merged_scene: The bodies.
@@ -171,10 +193,11 @@ class Method:
         """Direct light of emitters on points, vec3 of shape [batch, receiver], cached for the last emission."""
         return points.cached("emitted", materials.emission, lambda: self.emitted_light(points, materials))
 
+    @abc.abstractmethod
     def emitted_light(self, points: LitPoints, materials: Materials) -> Node:
         """Direct light of emitters on points, past the blockers between, vec3 of shape [batch, receiver]."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def highlights(self, points: LitPoints, materials: Materials, roughness: Node, cameras: Input) -> Node:
         """Direct light of emitters in the lobes of points, past the blockers between: G and G', vec3 [batch, receiver].
 
@@ -184,7 +207,6 @@ class Method:
             roughness: Of the points, float32 of shape [batch, receiver].
             cameras: Clip matrices.
         """
-        raise NotImplementedError
 
     def light_input(self, points: LitPoints, light: Light | None) -> LightInput:
         """The light of points as an input; the same for the same known light of the same shell."""
@@ -243,9 +265,9 @@ class Method:
             return self._free_shading(points, light)
         return self.cached_for_light("direct", points, light, lambda: self.known_shading(points, light))
 
+    @abc.abstractmethod
     def known_shading(self, points: LitPoints, light: LightInput) -> Node:
         """Direct known light on points."""
-        raise NotImplementedError
 
     def _free_shading(self, points: LitPoints, light: LightInput) -> Node:
         """Direct free light on points, which is converted where the transfer vectors are not."""
@@ -263,9 +285,9 @@ class Method:
             return None
         return conversion(basis, native)
 
+    @abc.abstractmethod
     def transfers(self, points: LitPoints, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`, an array for each group, for light from a shell."""
-        raise NotImplementedError
 
     @functools.cached_property
     def _prefiltered_from_scene(self) -> Node:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import functools
 import operator
 from collections.abc import Callable, Iterator
@@ -47,14 +48,34 @@ class ProjectedLight(Protocol):
 class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     """A method in which spheres stand in for the bodies: visibility, transfer vectors, and shading.
 
-    Its two types say in which basis it has light, and visibility.
+    Its two types say in which basis it has light, and visibility. A method gives these members, besides those of
+    :class:`.Method` for bodies that shine:
+
+    | member | needed for | default |
+    | --- | --- | --- |
+    | :attr:`free_basis` | free light | – |
+    | :meth:`project_light` | known light | – |
+    | :meth:`find_visibility`, :meth:`transfer` | any light | – |
+    | :meth:`coefficient_count` | ``explain`` | – |
+    | :meth:`self_lookups` | self-visibility by rays | – |
+    | :meth:`cached_rows` | static bodies among moving ones | – |
+    | :meth:`shade_transfer` | known light | a sum over the coefficients |
+    | :meth:`shade_transmittance` | known light, where it is faster than transfer vectors | transfer vectors |
+    | :meth:`find_visibility_past_planes` | planes, if :attr:`scene_blockers` has any | refused |
+    | :meth:`free_basis_of_shell` | light from a shell that a call gives | refused |
+    | :attr:`scene_blockers` | planes and convex parts | spheres, and self-visibility by rays |
+    | :attr:`emitter_cells` | lamps, past the self-visibility of receivers | None: without it |
+    | :meth:`share_of_sharpest_light` | adaptive receivers | None: no shadow is sharp |
+
+    :class:`PortionedShading` calls them in the order find_visibility, find_visibility_past_planes, and transfer and
+    shade_transfer, or shade_transmittance.
 
     Attributes:
         free_basis: The basis in which the method projects any free light, of the scene's shell if it has one.
         why_no_shadows: Why the method has no shadows, in words; empty if it has.
         adds_cached_rows: Whether visibility combines cached rows with moving blockers.
-        shades_transmittance: Whether known light is summed from transmittance at once (:meth:`shade_transmittance`);
-            transfer vectors are then made only with cached rows, and for light from a shell.
+        shades_transmittance: Whether known light is summed from transmittance directly (:meth:`shade_transmittance`).
+            No transfer vectors are then stored, but for cached rows and light from a shell.
     """
 
     free_basis: Projected
@@ -83,6 +104,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         """Visibility of a group past the flat bodies around it, given its visibility past all other blockers."""
         raise NotImplementedError
 
+    @abc.abstractmethod
     def project_light(self, light: KnownLight, shell: wp.array | None = None) -> Projected:
         """Project known light for the method: its coefficients, and the cells or bands they belong to.
 
@@ -91,7 +113,6 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
             shell: Center and radius of the sphere that sends it, vec4 of shape [batch]; None for light infinitely far.
         Differentiable: shell.
         """
-        raise NotImplementedError
 
     def free_basis_of_shell(self, shell: wp.array) -> Projected:
         """The basis in which the method projects free light of another shell than the scene's."""
@@ -125,29 +146,30 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         """Project given free light for the method. Differentiable: light."""
         return free_basis.with_coefficients(change_basis(light, self.native_from_basis))
 
+    @abc.abstractmethod
     def coefficient_count(self, light: Input | None) -> int:
         """Number of light coefficients that shading uses; all of them where the light is None, not known yet."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def self_lookups(self, bodies: tuple[int, ...], rotations: wp.array, projected_light: Projected) -> dict[int, Any]:
         """Self-visibility of receivers of some bodies, :attr:`.OwnBody.lookup` by body. Differentiable: rotations."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def find_visibility(self, group: Group, projected_light: Projected) -> FoundVisibility:
         """Visibility, or transmittance, past a group's spheres, convex parts and its own body."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def transfer(self, visibility: FoundVisibility, group: Group, projected_light: Projected) -> wp.array:
         """Transfer vectors of a group."""
-        raise NotImplementedError
 
     def shade_transfer(self, transfer: wp.array, group: Group, projected_light: Projected) -> wp.array:
-        """Shading of a group in known light."""
+        """Shading of a group in known light, given its transfer vectors."""
         return shade(transfer, projected_light.coefficients, maximum=LARGEST_COEFFICIENT)
 
     def shade_transmittance(self, visibility: FoundVisibility, group: Group, projected_light: Projected) -> wp.array:
-        """Shading of a group in known light."""
-        raise NotImplementedError
+        """Shading of a group in known light, given its visibility."""
+        transfer = self.transfer(visibility, group, projected_light)
+        return self.shade_transfer(transfer, group, projected_light)
 
     def find_squares(self, blocker_kinds: BlockerKinds, surfaces: VisibleSurfaces) -> Quadtree:
         """Find the squares in which samples of adaptive bodies interpolate."""
@@ -164,9 +186,9 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         """
         return None
 
+    @abc.abstractmethod
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """Rows of transmittance past static bodies, for known light or for any."""
-        raise NotImplementedError
 
     def emitted_light(self, points: LitPoints, materials: Materials) -> Node:
         """Direct light of emitters on points, by the same blockers."""
@@ -331,17 +353,17 @@ class PortionedShading(Node):
         self, call: Call, group: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
     ) -> LitPortion:
         """From the blockers of a portion to its light, step by step."""
-        method, note_time, light = self.method, functools.partial(self.timed, call), None
-        with note_time(self._visibility):
+        method, step, light = self.method, functools.partial(self.timed, call), None
+        with step(self._visibility):
             visibility = method.find_visibility(group, projected_light)
         if group.planes is not None:
-            with note_time(self._planes):
+            with step(self._planes):
                 visibility = method.find_visibility_past_planes(group, visibility, projected_light)
         if self._needs_transfer:
-            with note_time(self._transfer):
+            with step(self._transfer):
                 light = method.transfer(visibility, group, projected_light)
         if self._end == "shading":
-            with note_time(self._shading):
+            with step(self._shading):
                 light = (
                     method.shade_transmittance(visibility, group, projected_light)
                     if light is None

@@ -5,7 +5,8 @@ distance d below the receiver:
 
     c = −N·ω                                  cosine
     c′ = ρ s(c/ρ)                             mean cosine of the part of the cell that is below the plane's horizon:
-                                              s(z) = z from z = 1 on, 1/3 + 2/3 ((z + 1)/2)³ below
+                                              s(z) = z from z = 1 on; below 1/3 + 2/3 ((z + 1)/2)³, a cubic that
+                                              joins with slope 1, and has slope 0 at z = −1, the cell's other edge
     t = d / c′                                distance
     y = x + t ω                               where, in the plane
 

@@ -1,0 +1,46 @@
+"""Methods of visibility: the members that one gives, and their tables."""
+
+import inspect
+import re
+
+import pytest
+
+from warpshadow.pipeline.methods.directional import Directional
+from warpshadow.pipeline.methods.log_sh import LogSH
+from warpshadow.pipeline.methods.none import NoShadows
+from warpshadow.pipeline.methods.ray_traced import Rays
+from warpshadow.pipeline.shading.method import Method
+from warpshadow.pipeline.shading.sphere_method import SphereMethod
+
+
+def table(kind):
+    """Rows of the table in the docstring of a class: members, and the default."""
+    rows = [line.strip(" |").split(" | ") for line in inspect.getdoc(kind).splitlines() if line.startswith("| :")]
+    return [(re.findall(r":\w+:`(\w+)`", members), default) for members, _, default in rows]
+
+
+def refuses(function):
+    return "raise NotImplementedError" in inspect.getsource(function)
+
+
+@pytest.mark.parametrize("kind", [Method, SphereMethod])
+def test_the_table_of_members_says_which_have_a_default(kind):
+    rows = table(kind)
+    defaults = {name: default for names, default in rows for name in names}
+    own = {name for name in kind.__abstractmethods__ if name in vars(kind)} | {"free_basis"} & set(defaults)
+    assert len(rows) > 9 and {name for name, default in defaults.items() if default == "–"} == own
+    refused = {name for name, function in vars(kind).items() if inspect.isfunction(function) and refuses(function)}
+    assert {name for name, default in defaults.items() if default == "refused"} == refused
+
+
+@pytest.mark.parametrize("kind", [Directional, LogSH, NoShadows, Rays])
+def test_each_method_gives_what_is_always_needed(kind):
+    assert not kind.__abstractmethods__
+
+
+def test_a_method_that_lacks_a_member_is_refused_when_it_is_made():
+    class Half(Rays):
+        emitted_light = Method.emitted_light
+
+    with pytest.raises(TypeError, match="emitted_light"):
+        Half(None, None)
