@@ -129,7 +129,12 @@ def test_in_a_white_furnace_all_is_as_bright_as_the_light(method, bounces):
 
 
 def test_light_at_the_foot_of_a_ball_is_that_of_paths():
-    """At 0.4, 0.6 and 0.8 radii: measured 0.96, 0.94 and 0.97, and 1.7, 1.3 and 1.2 with one sphere for all."""
+    """At 0.1 to 0.8 radii. Measured 1.21, 1.28, 1.12, 0.94, 0.97 and 0.98.
+
+    Before patches and texels were finer there, 7.4, 3.8 and 2.2 at the first three, where all light is a twenty-seventh
+    to a seventh of that far from the ball.
+    """
+    radii, tolerances = np.array([0.1, 0.15, 0.2, 0.4, 0.6, 0.8]), np.array([0.35, 0.35, 0.2, 0.1, 0.1, 0.1])
     ball = ws.Body(
         ws.icosphere(1.0, 4), (0.8, 0.8, 0.8), blockers=ws.Spheres([(0, 0, 0)], [1.0]), translation=(0, 1, 0)
     )
@@ -137,23 +142,23 @@ def test_light_at_the_foot_of_a_ball_is_that_of_paths():
     sky = ws.synthetic_sky((-0.7, 0.5, 0.2), sun_radius=12, sun_strength=3, height=32)
     scene = ws.Scene([ball, ground], sky, ON_BOTH, bounces=12)
     angles = 2 * np.pi * (np.arange(8) + 0.5) / 8
-    places = np.stack([np.cos(angles), 0 * angles, np.sin(angles)], axis=-1) * np.array([0.4, 0.6, 0.8])[:, None, None]
+    places = np.stack([np.cos(angles), 0 * angles, np.sin(angles)], axis=-1) * radii[:, None, None]
     corners = ground.mesh.positions[ground.mesh.faces]
     edges = np.concatenate([corners[..., [0, 2]], np.ones((2, 3, 1))], axis=-1)  # barycentrics add up to 1
-    places = np.concatenate([places[..., [0, 2]], np.ones((3, 8, 1))], axis=-1).reshape(-1, 3)
+    places = np.concatenate([places[..., [0, 2]], np.ones((6, 8, 1))], axis=-1).reshape(-1, 3)
     both = np.stack([np.linalg.solve(edge.T, places.T).T for edge in edges])
     face = both.min(axis=2).argmax(axis=0)
-    given = len(ball.mesh.faces) + face, both[face, np.arange(24)].astype(np.float32)
+    given = len(ball.mesh.faces) + face, both[face, np.arange(48)].astype(np.float32)
 
     def bounced_light(visibility: ws.Visibility) -> np.ndarray:
         shadings = []
         for bounces in (12, 0):
             renderer = ws.Renderer(dataclasses.replace(scene, visibility=visibility, bounces=bounces))
             shadings.append(renderer.shade(view=renderer.on_faces(*given)).numpy()[0])
-        return (shadings[0] - shadings[1]).reshape(3, -1).mean(axis=1)
+        return (shadings[0] - shadings[1]).reshape(6, -1).mean(axis=1)
 
     ratios = bounced_light(ws.Visibility()) / bounced_light(ws.Visibility("ray-traced", samples=4096))
-    np.testing.assert_allclose(ratios, 1, atol=0.1)
+    assert (np.abs(ratios - 1) < tolerances).all(), ratios
 
 
 def box(size: tuple[float, float, float], segments: int = 6) -> ws.Mesh:

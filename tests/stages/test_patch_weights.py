@@ -29,7 +29,7 @@ def twin_shares(normals, past_self, past_all):
 def twin_weights(normals, past_self, past_all):
     of_self, of_all = (np.bincount(PATCHES, WEIGHTS * each) for each in sums(normals, past_self, past_all))
     ratio = np.divide(of_all, of_self, out=np.zeros(3), where=of_self > 0)
-    return np.repeat((ratio**8 / (ratio**8 + 0.06**8))[:, None], 3, axis=1)
+    return np.repeat((ratio**8 / (ratio**8 + 0.04**8))[:, None], 3, axis=1)
 
 
 def find(normals, past_self, past_all, device):
@@ -47,7 +47,7 @@ def test_shares_of_patch_samples_and_weights_of_patches_are_those_of_the_twin(na
     normals = rng.normal(size=(5, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     past_self = rng.random((5, 32))
-    values = [normals, past_self, 0.12 * past_self * rng.random((5, 32))]
+    values = [normals, past_self, 0.08 * past_self * rng.random((5, 32))]
     compare(
         lambda *arrays: getattr(find(*arrays, device), name), twin, values, (wp.vec3, wp.float32, wp.float32), device
     )

@@ -5,6 +5,7 @@ import pytest
 
 import warpshadow as ws
 from demos.scenes import shipped_mesh
+from warpshadow.maths.contacts import Contact
 from warpshadow.stages.bounces.form_factors import patch_mesh, trace_form_factors
 from warpshadow.stages.bounces.patches import find_patches, find_plane_patches
 from warpshadow.stages.planes.grid import squeezed, stretched
@@ -189,6 +190,27 @@ def test_a_grid_is_finer_near_other_bodies():
     assert np.linalg.norm(middles.reshape(-1, 2)[sizes.argmin()]) < 0.5
     assert sizes.sum() == pytest.approx(400)
     assert sizes.max() > 20 * sizes.min()
+
+
+def test_a_grid_is_finest_at_a_contact():
+    mesh, others = ws.plane(20.0, 1), np.array([[-4.0, 0, 2], [-2, 3, 4]])
+    foot, contact = [-3.5, 0, 3], Contact(np.array([[-3.5, 0, 2.9], [-3.5, 0, 3.1]]), 0.5)
+    before, patches = flat_patches_of(mesh, others=others), flat_patches_of(mesh, others=others, contact=contact)
+    assert patches.grid.covered.shape == (28, 28) and patches.grid.covered.min() == 1
+    np.testing.assert_allclose(patch_sample_points(patches, mesh), patches.centers, atol=1e-4)
+    near = [each.areas[np.linalg.norm(each.centers - foot, axis=1) < 0.2].max() for each in (before, patches)]
+    assert near[1] < 0.01 and near[1] < near[0] / 4
+
+
+def test_patches_are_smaller_at_a_contact_and_no_more_in_all():
+    mesh, foot = ws.icosphere(1.0, 4), np.array([[0.0, -1, 0]])
+    before, patches = patches_of(mesh), patches_of(mesh, contacts=[Contact(foot, 1.0)])
+    assert 250 <= patches.count <= before.count == 256
+    np.testing.assert_allclose(patches.areas.sum(), area_of(mesh), rtol=ROUNDING)
+    for distance, least in ((0.1, 15), (0.3, 5)):
+        near = [np.linalg.norm(each.centers - foot, axis=1) < distance for each in (before, patches)]
+        assert near[1].sum() > least * max(near[0].sum(), 1)
+    assert patches.areas.max() < 3.5 * before.areas.max()
 
 
 def test_a_square_that_is_turned_has_a_grid_of_its_own_size():

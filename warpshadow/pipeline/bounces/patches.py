@@ -10,10 +10,12 @@ import warp as wp
 
 from warpshadow.assets.mesh import Mesh
 from warpshadow.device.batch import rows
+from warpshadow.maths.contacts import Contact
 from warpshadow.maths.plane import plane_normal
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.planes import ScenePlanes
 from warpshadow.pipeline.bodies.reflectance import Materials
+from warpshadow.pipeline.bounces.contacts import find_contacts
 from warpshadow.pipeline.node import Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.stages.bounces.albedo import mean_over_texels, mean_over_vertices
@@ -35,6 +37,7 @@ OF_PATCH_SAMPLES = " of patch samples"  # suffix of the names of stages
 
 _SCENE_PATCHES = 2048  # patches of a scene of more than 8 bodies, but no fewer than _MIN_BODY_PATCHES of each
 _MIN_BODY_PATCHES = 32  # patches of each of many bodies, at least: a side of a box has some
+_MIN_CONTACT_SIZE = 0.25  # of a body around whose contact texels are small, in units of the size of all bodies
 _SCENE_PATCH_SAMPLES = 4096  # patch samples of the patches of a scene, but at least one of each
 
 
@@ -78,13 +81,39 @@ class ScenePatches:
                 # nobody sees the back of a ground
                 is_two_sided = is_two_sided and (not others or bool(min(map(np.mean, heights)) < 0))
                 points = np.concatenate(others) if others else None
-                self._of_body[number] = find_plane_patches(*corners, is_two_sided=is_two_sided, others=points)
+                self._of_body[number] = find_plane_patches(
+                    *corners, is_two_sided=is_two_sided, others=points, contact=self._contact_of_grid(number)
+                )
             else:
                 counts = self._counts
                 patch_samples = max(1, min(SAMPLES_PER_PATCH, _SCENE_PATCH_SAMPLES // sum(counts.values())))
-                options = {"count": counts[number], "patch_samples": patch_samples, "device": self.merged_scene.device}
-                self._of_body[number] = find_patches(*corners, is_two_sided=is_two_sided, **options)
+                self._of_body[number] = find_patches(
+                    *corners,
+                    is_two_sided=is_two_sided,
+                    count=counts[number],
+                    patch_samples=patch_samples,
+                    contacts=self._contacts[number],
+                    device=self.merged_scene.device,
+                )
         return self._of_body[number]
+
+    @functools.cached_property
+    def _contacts(self) -> list[list[Contact]]:
+        """Where the scene's bodies touch each other."""
+        return find_contacts(self.merged_scene)
+
+    def _contact_of_grid(self, number: int) -> Contact | None:
+        """The contact of a flat body around which its texels are small.
+
+        There is one such place at most, so texels stay small around all bodies where several touch it, or a small one.
+        """
+        contacts = [contact for contact in self._contacts[number] if contact.is_point]
+        if len(contacts) != 1:
+            return None
+        bodies = self.merged_scene.scene.bodies
+        points = np.concatenate([body.world_points() for n, body in enumerate(bodies) if n not in self.planes])
+        is_large = contacts[0].size * bodies[number].scale >= _MIN_CONTACT_SIZE * np.ptp(points, axis=0).max() / 2
+        return contacts[0] if is_large else None
 
     @functools.cached_property
     def _counts(self) -> dict[int, int]:

@@ -1,7 +1,7 @@
 """Weights of patch samples in their patches, and of patches among others, by how open they are.
 
     f_s = o_s / Σ_r w_pr o_r,  o_s = ⟨T⟩_s + ε,  ⟨T⟩ = 4/Q Σ_q max(n·ω_q, 0) T_q
-    v_p = r_p⁸ / (r_p⁸ + 0.06⁸),  r_p = Σ_s w_ps (⟨T⟩_s + ε) / Σ_s w_ps (⟨T_self⟩_s + ε)
+    v_p = r_p⁸ / (r_p⁸ + 0.04⁸),  r_p = Σ_s w_ps (⟨T⟩_s + ε) / Σ_s w_ps (⟨T_self⟩_s + ε)
 
 with s a patch sample of patch p, T the transmittance past all bodies but planes, T_self that past its own body, and w
 the weights of patch samples by area. The light of a patch is Σ_s w_ps f_s L_s: samples that lie inside another body, or
@@ -28,7 +28,9 @@ from warpshadow.stages.sparse import SparseMatrix, multiply
 
 _CELL_COST = 2.5  # time of a cell of a patch sample [ns]
 _MIN_OPEN = wp.constant(0.01)  # ε, by which patch samples count of a patch that is buried wholly
-_BURIED_RATIO = wp.constant(0.06)  # r of a patch that counts half
+_BURIED_RATIO = wp.constant(0.04)
+"""r of a patch that counts half. Of the ground 0.1 radii from a ball's foot r is 0.02: bounced light there was 36% too
+bright with 0.06, and is 18% with 0.04; with 0.03 nested boxes, which bury parts of a ground, are 2.5% off, not 2.3%."""
 
 
 @wp.kernel(enable_backward=False)

@@ -1,9 +1,10 @@
 """Patches: the parts of a body's surface that send light as one, and the patch samples at which they are lit.
 
 Faces are cut at their longest edges into pieces of about one size, and patches are clusters of pieces by position and
-normal (k-means): 256 at most, of 8 pieces or more. A body that lies in a plane has a grid of texels instead, which are
-small near the other bodies, whose shadows it shows (:mod:`warpshadow.stages.planes.grid`). A patch has up to four patch
-samples, with weights by area. Pieces inside another part of the body belong to no patch.
+normal (k-means): 256 at most, of 8 pieces or more. They are smaller where the body touches another
+(:mod:`warpshadow.maths.contacts`). A body that lies in a plane has a grid of texels instead, which are small near the
+other bodies, whose shadows it shows (:mod:`warpshadow.stages.planes.grid`). A patch has up to four patch samples, with
+weights by area. Pieces inside another part of the body belong to no patch.
 
 All is found once, in the body's own frame and at rest; patches move with the body. The patches of an open surface's
 backs follow those of its fronts.
@@ -11,13 +12,14 @@ backs follow those of its fronts.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
+from warpshadow.maths.contacts import Contact, contact_density
 from warpshadow.maths.spatial_sort import compact_order
 from warpshadow.stages.planes.grid import PlaneTexture, find_grid
 from warpshadow.stages.self_visibility.buried import find_buried
@@ -50,6 +52,9 @@ where two parts touch, each is inside the other."""
 _INWARD_SHARE = 0.1  # how far from a corner towards the middle a piece is looked at, to see whether it reaches out
 
 _LLOYD_STEPS = 8
+
+_CONTACT_WEIGHT = 2.0  # w of :mod:`warpshadow.maths.contacts`, at most …
+_CONTACT_SHARE = 2.0  # … and patches that contacts add, in units of those without: a third are left elsewhere
 
 _MAX_CLUSTERED_PIECES = 20_000  # pieces that k-means looks at, at most
 
@@ -120,6 +125,7 @@ def find_patches(
     is_two_sided: bool,
     count: int = MAX_PATCHES,
     patch_samples: int = SAMPLES_PER_PATCH,
+    contacts: Sequence[Contact] = (),
     device: wp.DeviceLike = None,
 ) -> Patches:
     """Find the patches of a body, by k-means of position and normal.
@@ -133,6 +139,7 @@ def find_patches(
         is_two_sided: Whether the backs of faces send light, too: each side then has half of the patches.
         count: Number of patches, at most.
         patch_samples: Number of patch samples of each, at most.
+        contacts: Where the body touches others, in its own frame: patches are smaller there.
     Returns:
         Patches; none where no face has an area.
     """
@@ -141,6 +148,14 @@ def find_patches(
     total_area = np.linalg.norm(_area_vectors(positions.astype(np.float64)[faces]), axis=1).sum()
     max_edge = 2 * np.sqrt(total_area / (PIECES_PER_PATCH * count))  # as in right triangles
     piece_mesh = _cut_faces(positions, faces, lambda points: points / max_edge)
+    contact_weight = _contact_weight(piece_mesh, contacts)
+    if contact_weight > 0:
+
+        def to_unit_lengths(points: np.ndarray) -> np.ndarray:
+            density = 1 + contact_weight * contact_density(*_bounding_spheres(points), contacts)
+            return points * np.sqrt(density)[:, None, None] / max_edge
+
+        piece_mesh = _cut_faces(positions, faces, to_unit_lengths)
     areas = np.linalg.norm(piece_mesh.area_vectors, axis=1)
     half_size = np.linalg.norm(np.ptp(piece_mesh.centroids, axis=0)) / 2 if len(areas) else 1.0
     unit_normals = piece_mesh.area_vectors / areas[:, None]
@@ -153,7 +168,8 @@ def find_patches(
             mesh, piece_mesh.pieces.positions(positions, faces), float(_LIFT * half_size)
         )
     labels = np.full(len(areas), -1)
-    labels[is_outside] = _cluster(features[is_outside], areas[is_outside], count)
+    density = 1 + contact_weight * contact_density(piece_mesh.centroids, 0.0, contacts)
+    labels[is_outside] = _cluster(features[is_outside], areas[is_outside], density[is_outside], count)
     front_samples: list[tuple[int, np.ndarray, int, float]] = []
     for patch, members in enumerate(_cluster_members(labels)):
         for sample_pieces in _split_evenly(members, piece_mesh.centroids, areas, patch_samples):
@@ -200,16 +216,21 @@ def find_patches(
 
 
 def find_plane_patches(
-    positions: np.ndarray, faces: np.ndarray, *, is_two_sided: bool, others: np.ndarray | None = None
+    positions: np.ndarray,
+    faces: np.ndarray,
+    *,
+    is_two_sided: bool,
+    others: np.ndarray | None = None,
+    contact: Contact | None = None,
 ) -> Patches:
     """Find the patches of a body that lies in a plane: the texels of a grid over its smallest rectangle.
 
     Args:
-        positions, faces, is_two_sided, others: As for :func:`warpshadow.stages.planes.grid.find_grid`.
+        positions, faces, is_two_sided, others, contact: As for :func:`warpshadow.stages.planes.grid.find_grid`.
     Returns:
         Patches, row by row: texels off the mesh have no area and no patch sample.
     """
-    grid, texel_points = find_grid(positions, faces, is_two_sided=is_two_sided, others=others)
+    grid, texel_points = find_grid(positions, faces, is_two_sided=is_two_sided, others=others, contact=contact)
     frame, origin = grid.frame, grid.origin
     texel_sizes = grid.texel_sizes().reshape(-1, 2)
 
@@ -279,6 +300,21 @@ def _cut_faces(
     return _PieceMesh(pieces, piece_corners.mean(axis=1), _area_vectors(piece_corners))
 
 
+def _contact_weight(piece_mesh: _PieceMesh, contacts: Sequence[Contact]) -> float:
+    """Find w of :mod:`warpshadow.maths.contacts`: how many patches contacts add, before there are fewer elsewhere."""
+    areas = np.linalg.norm(piece_mesh.area_vectors, axis=1)
+    if not len(contacts) or not len(areas):
+        return 0.0
+    mean_density = np.average(contact_density(piece_mesh.centroids, 0.0, contacts), weights=areas)
+    return min(_CONTACT_WEIGHT, _CONTACT_SHARE / mean_density)
+
+
+def _bounding_spheres(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centers and radii of spheres around triangles [piece, 3, 3]."""
+    centroids = corners.mean(axis=1)
+    return centroids, np.linalg.norm(corners - centroids[:, None], axis=2).max(axis=1)
+
+
 def _find_outside(mesh: wp.Mesh, corners: np.ndarray, lift: float) -> tuple[np.ndarray, np.ndarray]:
     """Find pieces outside of all parts of their body, and pieces inside that reach out.
 
@@ -314,10 +350,14 @@ def _find_outside(mesh: wp.Mesh, corners: np.ndarray, lift: float) -> tuple[np.n
 # ---------------------------------------------------------------------------------------------------- clusters
 
 
-def _cluster(features: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:
-    """K-means [Lloyd 1982], from halves of halves: the cluster of each item, none empty."""
+def _cluster(features: np.ndarray, areas: np.ndarray, density: np.ndarray, count: int) -> np.ndarray:
+    """K-means [Lloyd 1982], from halves of halves: the cluster of each item, none empty.
+
+    Clusters get as dense as the square root of the weights, in surfaces [Gersho 1979].
+    """
     subset = np.arange(0, len(features), max(1, len(features) // _MAX_CLUSTERED_PIECES))
-    subset_groups = _split_evenly(subset, features, weights, count)
+    subset_groups = _split_evenly(subset, features, areas * density, count)
+    weights = areas * density**2
     centers = np.array([np.average(features[group], axis=0, weights=weights[group]) for group in subset_groups])
     if not len(centers):
         return np.zeros(0, int)

@@ -6,10 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from warpshadow.maths.contacts import Contact
 from warpshadow.maths.outline import find_outline
 from warpshadow.maths.plane import plane_normal
 
-_GRID = 24  # texels along a grid's longer side
+_GRID = 24  # texels along a grid's longer side …
+_GRID_OF_CONTACT = 28  # … and of a grid around a contact
+_CONTACT_SPREAD = 0.05  # within how far of a contact texels are about even, in units of its size
 _EVEN_SPREAD = 100.0  # spread of a grid that is even, in sizes of its body
 _ROUNDING = 1e-6  # how far off a face a point may lie and still count as on it, as a part of the face or texel
 _WHOLE = 1e-4  # share of its rectangle up to which gaps of a mesh do not count
@@ -111,7 +114,12 @@ class CoveredPoints(NamedTuple):
 
 
 def find_grid(
-    positions: np.ndarray, faces: np.ndarray, *, is_two_sided: bool, others: np.ndarray | None = None
+    positions: np.ndarray,
+    faces: np.ndarray,
+    *,
+    is_two_sided: bool,
+    others: np.ndarray | None = None,
+    contact: Contact | None = None,
 ) -> tuple[PlaneTexture, CoveredPoints]:
     """Find the grid of a body that lies in a plane, over its smallest rectangle.
 
@@ -121,6 +129,7 @@ def find_grid(
         is_two_sided: Whether the back sends light, too.
         others: Points of the scene's other bodies, in this body's frame, shape [point, 3]: texels are small near them.
             None for an even grid.
+        contact: Where another body touches this one, in its frame, if texels are to be smallest there.
     Returns:
         The grid, and a point in each texel of which the mesh covers some.
     Raises:
@@ -139,9 +148,13 @@ def find_grid(
         nearby_radius = np.ptp(nearby_points, axis=0).max() / 2
         if nearby_radius > 0:
             center, spread = (nearby_points.min(axis=0) + nearby_points.max(axis=0)) / 2, min(nearby_radius, spread)
+    count = _GRID
+    if contact is not None:
+        center, count = contact.points.mean(axis=0) @ frame.T[:, :2], _GRID_OF_CONTACT
+        spread = min(_CONTACT_SPREAD * contact.size, spread)
     origin = frame.T @ [*center, points[:, 2].mean()]
     low, high = squeezed((low - center) / spread), squeezed((high - center) / spread)
-    width, height = np.maximum(np.rint(_GRID * (high - low) / (high - low).max()), 1).astype(int)
+    width, height = np.maximum(np.rint(count * (high - low) / (high - low).max()), 1).astype(int)
     sides = 2 if is_two_sided else 1
     corners = ((corners - origin) @ frame.T)[..., :2]
     _, unique_vertices, vertex_index = np.unique(positions, axis=0, return_index=True, return_inverse=True)
