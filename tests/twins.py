@@ -596,8 +596,9 @@ def transmittance_near(transmittance, normals, directions, cells, reach):
 
 def may_light(beam, area, normal, is_two_sided=False):
     """Whether a part of a sample may light a receiver, given the way to it."""
-    facing = -beam @ area / np.linalg.norm(area) / np.linalg.norm(beam)
-    return beam @ normal > 0 and (facing > -0.3 or is_two_sided)
+    size = np.linalg.norm(area)
+    facing = -beam @ area / size / np.linalg.norm(beam)
+    return beam @ normal > -np.sqrt(size) and (facing > -0.3 or is_two_sided)
 
 
 def light_of_samples(points, normals, samples, areas, softness, radiance, transmittance, is_two_sided=False):

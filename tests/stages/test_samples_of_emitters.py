@@ -5,6 +5,7 @@ import pytest
 import trimesh
 import twins
 import warp as wp
+from scipy.spatial.transform import Rotation
 
 import warpshadow as ws
 from warpshadow.device.tape import recorded
@@ -139,9 +140,14 @@ def test_a_ceiling_that_a_panel_nearly_touches_has_its_light(device):
     """A centimeter above the panel, along its edge and away from it, where samples are 2 to 50 cm long."""
     along = [(0.52, 0.03, z) for z in np.linspace(-0.45, 0.45, 9)]
     away = [(x, 0.03, 0.1) for x in (0.2, 0.505, 0.55, 0.6, 0.8, 1.2)]
-    tilted = [(0.6, 0.01, 0.2)]  # a side is cut by the horizon
-    points = np.array([*along, *away, *tilted])
-    normals = np.array([(0, -1.0, 0)] * (len(points) - 1) + [(-0.8, 0.6, 0)])
+    down = [*along, *away, (0.2, 0.025, 0.1)]
+    cut = [
+        (0.6, 0.01, 0.2),
+        (0.52, -0.01, 0.0),
+        (0.2, 0.03, 0.1),
+    ]  # by their horizons, below which middles of samples are
+    points = np.array([*down, *cut])
+    normals = np.array([(0, -1.0, 0)] * len(down) + [(-0.8, 0.6, 0), (0, -1, 0), (0.8, -0.6, 0)])
     arrays = [wp.array(item[None], dtype=wp.vec3, device=device) for item in (points, normals)]
     mesh = ws.Mesh(np.float32(PANEL.vertices), np.int32(PANEL.faces))
     samples = samples_of(mesh, device)
@@ -149,6 +155,35 @@ def test_a_ceiling_that_a_panel_nearly_touches_has_its_light(device):
     ones = wp.full((1, span.size), wp.vec3(1.0), dtype=wp.vec3, device=device)
     got = light.sum_light(*arrays, placed(samples, mesh.positions, device), ones, span).numpy()[0, :, 0]
     np.testing.assert_allclose(got, light_of_panel(points, normals), rtol=NEAR)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e8])
+def test_light_near_a_lamp_and_its_gradients_know_no_scale(scale, device):
+    points, normals = np.array([[0, -0.55, 0], [0, -0.7, 0.1]]), np.array([[0, 1.0, 0], [0.6, 0.8, 0]])
+    samples, found = samples_of(BALL, device), []
+    span = next(samples.spans())
+    ones = wp.full((1, span.size), wp.vec3(1.0), dtype=wp.vec3, device=device)
+    for factor in (1.0, scale):
+        inputs = (factor * points, normals, factor * BALL.positions)
+        arrays = [wp.array(item[None], dtype=wp.vec3, device=device, requires_grad=True) for item in inputs]
+        with recorded() as tape:
+            result = light.sum_light(*arrays[:2], place_samples(arrays[2], samples), ones, span)
+        tape.backward(grads={result: wp.ones_like(result)})
+        found.append(
+            [
+                result.numpy(),
+                *(array.grad.numpy() * size for array, size in zip(arrays, (factor, 1, factor), strict=True)),
+            ]
+        )
+    for own, scaled in zip(*found, strict=True):
+        np.testing.assert_allclose(scaled, own, atol=50 * FLOAT32 * np.abs(own).max())
+
+
+def test_flat_lamps_are_not_soft_however_they_lie_in_their_mesh(device):
+    for turn in Rotation.random(8, random_state=0).as_matrix():
+        turned = np.float32(SQUARE.positions @ turn.T)
+        weights = find_sample_weights(turned, SQUARE.surface.faces, is_two_sided=False, device=device)
+        assert (weights.softness < 1e-3).all() and np.isfinite(weights.faces.data).all()
 
 
 @pytest.mark.parametrize("is_two_sided", [False, True])

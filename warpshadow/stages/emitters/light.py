@@ -116,10 +116,11 @@ def find_transmittance_to_samples(
 
 
 @wp.func
-def nearness(beam: wp.vec3, size2: float, normal: wp.vec3):
-    """How much a receiver sees a sample's pieces: 1 up to 1.9 half diagonals away, 0 from 4 on and at the horizon."""
-    near = 1.0 - wp.smoothstep(3.5 * size2, 16.0 * size2, wp.length_sq(beam))
-    return near * wp.smoothstep(0.0, 0.03 * wp.sqrt(size2), wp.dot(beam, normal))
+def nearness(beam: wp.vec3, area: wp.vec3, elongation: float, normal: wp.vec3):
+    """How much a receiver sees a sample's pieces: 1 up to 1.9 half diagonals away, 0 from 4 on or below its horizon."""
+    size = wp.length(area)
+    near = 1.0 - wp.smoothstep(3.5, 16.0, wp.length_sq(beam) / (elongation * size))
+    return near * wp.smoothstep(-1.0, -0.5, wp.dot(beam, normal) / wp.sqrt(size))
 
 
 @wp.func
@@ -176,9 +177,11 @@ def _sum_light(
         area = sample_areas[sample_batch, first_sample + i]
         if may_light(beam, area, normal, is_two_sided):
             distance2 = wp.length_sq(beam)
-            factor = wp.dot(beam, normal) * facing_area(beam, area, softness[first_sample + i], is_two_sided)
+            factor = wp.max(wp.dot(beam, normal), 0.0) * facing_area(
+                beam, area, softness[first_sample + i], is_two_sided
+            )
             factor = factor / (distance2 * wp.sqrt(wp.pi * wp.pi * distance2 * distance2 + wp.length_sq(area)))
-            near = nearness(beam, elongations[first_sample + i] * wp.length(area), normal)
+            near = nearness(beam, area, elongations[first_sample + i], normal)
             if near > 0.0:
                 factor = factor * (1.0 - near)
                 factor += near * _light_of_pieces(

@@ -8,10 +8,10 @@ move with the body: of pieces p of faces f, with middles z_p,
 A receiver in the direction ω has f = A_k·ω of it, if the patch is flat. Of one that is bent, such as a cap of a ball, a
 part looks beyond its horizon, so around 0 f is soft:
 
-    f → (f + w_k |A_k|)² / (4 w_k |A_k|) for |f| < w_k |A_k|,   1 + w_k² / 3 = S_k / |A_k|,   w_k ≤ 0.3
+    f → (f + w_k |A_k|)² / (4 w_k |A_k|) for |f| < w_k |A_k|,   1 + w_k² / 3 = S_k / |A_k|
 
-S_k is the area of the patch at rest: the mean of f over all directions is then that of the surface. s_k, which is 1
-elsewhere, gives patches that are bent more their area.
+S_k is the area of the patch at rest: the mean of f over all directions is then that of the surface. Patches that are
+bent by more than w_k = 0.3, such as those around edges, have w_k = 0 and, in place of it, s_k = S_k / |A_k|.
 
 Receivers close by see the pieces themselves (:mod:`.light`).
 """
@@ -99,7 +99,8 @@ def find_sample_weights(
     of_vertices = csr_matrix(
         (middles.ravel(), (np.repeat(labels, 3), faces[owners].ravel())), shape=(patch_count, len(positions))
     )
-    softness = np.minimum(np.sqrt(3 * np.maximum(stretch - 1, 0)), _MAX_SOFTNESS)
+    softness = np.sqrt(3 * np.maximum(stretch - 1, 0))
+    softness[softness > _MAX_SOFTNESS] = 0
     of_faces = diags(stretch / (1 + softness**2 / 3)) @ csr_matrix(
         (shares, (labels, owners)), shape=(patch_count, len(faces))
     )
@@ -373,10 +374,10 @@ def _soft_positive(value: float, width: float):
 
 @wp.func
 def may_light(beam: wp.vec3, area: wp.vec3, normal: wp.vec3, is_two_sided: int):
-    """Whether a part of a sample may light a receiver; a bent one does by its rim where its middle just faces away."""
-    facing = wp.dot(beam, area)
-    rim = _MAX_SOFTNESS * wp.length(beam) * wp.length(area)
-    return wp.dot(beam, normal) > 0.0 and (facing < rim or is_two_sided == 1)
+    """Whether a part of a sample may light a receiver, which its middle need not: near its horizon, or at its rim."""
+    size = wp.length(area)
+    is_above = wp.dot(beam, normal) > -wp.sqrt(size)
+    return is_above and (wp.dot(beam, area) < _MAX_SOFTNESS * size * wp.length(beam) or is_two_sided == 1)
 
 
 @wp.func

@@ -178,8 +178,10 @@ class EmitterSurface:
 
 
 @wp.func
-def _beam_to_point(surface: EmitterSurface, sample: int, index: int, point: wp.vec3, is_two_sided: int):
-    """The way from a receiver to a point of a sample, and how much the point faces the receiver, above 0 if it does."""
+def _beam_to_point(
+    surface: EmitterSurface, sample: int, index: int, point: wp.vec3, normal: wp.vec3, is_two_sided: int
+):
+    """The way from a receiver to a point of a sample, and how much this faces it, above 0 if both face each other."""
     corners = surface.faces[surface.point_faces[sample, index]]
     a = surface.positions[corners[0]]
     face_normal = wp.normalize(wp.cross(surface.positions[corners[1]] - a, surface.positions[corners[2]] - a))
@@ -187,18 +189,22 @@ def _beam_to_point(surface: EmitterSurface, sample: int, index: int, point: wp.v
     facing = -wp.dot(wp.normalize(beam), face_normal)
     if is_two_sided == 1:
         facing = wp.abs(facing)
+    if wp.dot(beam, normal) <= 0.0:
+        facing = 0.0
     return beam, facing
 
 
 @wp.func
-def _beam_to_facing_point(surface: EmitterSurface, sample: int, start: int, point: wp.vec3, is_two_sided: int):
-    """Likewise, of the first point from a start on that faces the receiver."""
+def _beam_to_facing_point(
+    surface: EmitterSurface, sample: int, start: int, point: wp.vec3, normal: wp.vec3, is_two_sided: int
+):
+    """Likewise, of the first point from a start on that faces the receiver, above its horizon."""
     point_count = surface.point_faces.shape[1]
     beam = wp.vec3()
     facing = float(0.0)
     for k in range(point_count):
         if facing <= 0.0:
-            beam, facing = _beam_to_point(surface, sample, (start + k) % point_count, point, is_two_sided)
+            beam, facing = _beam_to_point(surface, sample, (start + k) % point_count, point, normal, is_two_sided)
     return beam, facing
 
 
@@ -234,7 +240,7 @@ def _trace_transmittance(
         first_point = int(float(point_count) * wp.frac(turn + _GOLDEN_SHARE * float(i)))
         for ray in range(wp.where(is_sending, ray_count, 0)):
             start = (first_point + ray * point_count // ray_count) % point_count
-            beam, facing = _beam_to_facing_point(surface, sample, start, point, is_two_sided)
+            beam, facing = _beam_to_facing_point(surface, sample, start, point, normal, is_two_sided)
             if facing > 0.0:
                 total_weight += facing
                 if sees_point(mesh, point, normal, wp.normalize(beam), wp.length(beam)):

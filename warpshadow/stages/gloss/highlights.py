@@ -73,7 +73,7 @@ def _sum_highlights(
     for i in range(sample_count):
         beam = sample_points[sample_batch, first_sample + i] - point
         area = sample_areas[sample_batch, first_sample + i]
-        if may_light(beam, area, normal, is_two_sided):
+        if wp.dot(beam, normal) > 0.0 and may_light(beam, area, normal, is_two_sided):
             distance2 = wp.length_sq(beam)
             distance = wp.sqrt(distance2)
             # pi d² facing / √(π² d⁴ + |A|²), as for diffuse light
