@@ -26,7 +26,7 @@ from warpshadow.stages.gloss.reflection import LobeLight, mix_reflection, number
 from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import Receivers
-from warpshadow.stages.sample_receivers import Span
+from warpshadow.stages.sample_receivers import Span, places_in_pixels
 from warpshadow.stages.shell.beams import exits_from_shell
 from warpshadow.stages.textures.footprint import Footprints
 from warpshadow.stages.textures.numbers import as_colors, as_scalars, means_of_receivers
@@ -87,8 +87,8 @@ class GlossyPoints(LitPoints):
 
         def lobes() -> Node:
             spread = Node("", self._spread, self.receivers_node, self.normals, self._clip_positions, self._fragments)
-            inputs = self.receivers_node, roughness, self._cameras, self.method.lobe_samples, spread
-            return Node("lobes", _sample, *inputs, items=item_text)
+            inputs = self.receivers_node, roughness, self._cameras, spread, self._fragments
+            return Node("lobes", self._sample_lobes, *inputs, items=item_text)
 
         sampled = self.cached("lobes", key, lobes)
         directions, filters = field_of(sampled, "directions"), field_of(sampled, "filters")
@@ -148,11 +148,21 @@ class GlossyPoints(LitPoints):
         self, receivers: Receivers, normals: wp.array, clip_positions: wp.array, seen: Fragments
     ) -> NormalSpread:
         """How normals vary over the receivers. Differentiable: all but seen."""
-        supersampling = self.merged_scene.scene.supersampling
+        supersampling = self.merged_scene.scene.supersampling if self.method.shares_lobes else 1
         _, height, width = seen.face_ids.shape
         fragments, size = receivers.sample_fragments, (width // supersampling, height // supersampling)
         assert fragments is not None
         return find_normal_spread(fragments, self.merged_scene.side_faces, normals, clip_positions, size, supersampling)
+
+    def _sample_lobes(
+        self, receivers: Receivers, roughness: wp.array, cameras: wp.array, spread: NormalSpread, seen: Fragments
+    ) -> LobeSamples:
+        """Samples of the lobes of the receivers. Differentiable: all but seen."""
+        places, supersampling = None, 1 if self.method.shares_lobes else self.merged_scene.scene.supersampling
+        if supersampling > 1 and receivers.samples is not None:
+            places = places_in_pixels(receivers.samples, seen.face_ids.shape[2], supersampling)
+        arguments = receivers.points, receivers.normals, roughness, cameras, self.method.lobe_samples_of_receiver()
+        return sample_lobes(*arguments, spread, places, supersampling**2)
 
     def _sample(self, fragments: Fragments, values: wp.array, textures: Textures, footprints: Footprints) -> wp.array:
         """Numbers of the view's samples: of textures and, on bodies without one, of vertices."""
@@ -187,12 +197,6 @@ def _exits(receivers: Receivers, directions: wp.array, shell: wp.array) -> wp.ar
 def _add(lobe_light: LobeLight, highlights: LobeLight) -> LobeLight:
     """Light in lobes, of emitters, too. Differentiable: all."""
     return LobeLight(*(add_light(*pair) for pair in zip(lobe_light, highlights, strict=True)))
-
-
-def _sample(
-    receivers: Receivers, roughness: wp.array, cameras: wp.array, sample_count: int, spread: NormalSpread
-) -> LobeSamples:
-    return sample_lobes(receivers.points, receivers.normals, roughness, cameras, sample_count, spread)
 
 
 def _means(receivers: Receivers, samples: wp.array) -> wp.array:
@@ -239,7 +243,10 @@ def _glossy_receivers(is_glossy: np.ndarray, receivers: Receivers) -> Receivers:
         device = receivers.points.device
         samples = Fragments(*(wp.empty((1, 0), dtype=dtype, device=device) for dtype in (wp.int32, wp.vec3)))
     fragments = Fragments(*(_of_spans(array, spans, at_vertices) for array in (samples.face_ids, samples.barycentrics)))
+    numbers = None if receivers.samples is None else _of_spans(receivers.samples, spans, at_vertices)
     none = constant(np.empty(0, int), wp.int32, receivers.points.device)
     points, normals = (_of_spans(array, spans, 0) for array in (receivers.points, receivers.normals))
     arguments = points, normals, receivers.faces, none, fragments
-    return Receivers(*arguments, spans=tuple(renumbered), vertices=none, sample_fragments=fragments)
+    return Receivers(
+        *arguments, spans=tuple(renumbered), vertices=none, sample_fragments=fragments, samples=numbers
+    )
