@@ -44,7 +44,9 @@ class Receivers(NamedTuple):
     spans: tuple[Span, ...] = ()  # of the others, where bodies are told apart; () for one group
     vertices: wp.array | None = None  # int32, the vertex or back of each vertex receiver, [vertex receiver]
     sample_fragments: Fragments | None = None  # side and barycentrics of each sample receiver, [batch, sample receiver]
-    samples: wp.array | None = None  # [batch, sample receiver] int32, the sample of the view that owns each, −1 for none
+    samples: wp.array | None = (
+        None  # [batch, sample receiver] int32, the sample of the view that owns each, −1 for none
+    )
     has_mean_slope: wp.array | None = None  # [view, sample] bool, samples whose receivers do not move over the screen
 
     def without_bodies(self) -> "Receivers":
@@ -286,9 +288,7 @@ def find_receivers(
         return receivers
     if sample_fragments and not sample_fragments.face_ids.size:
         sample_fragments = samples = None
-    return receivers._replace(
-        spans=spans, vertices=vertices, sample_fragments=sample_fragments, samples=samples
-    )
+    return receivers._replace(spans=spans, vertices=vertices, sample_fragments=sample_fragments, samples=samples)
 
 
 def _gather_receiver_points(

@@ -247,6 +247,4 @@ def _glossy_receivers(is_glossy: np.ndarray, receivers: Receivers) -> Receivers:
     none = constant(np.empty(0, int), wp.int32, receivers.points.device)
     points, normals = (_of_spans(array, spans, 0) for array in (receivers.points, receivers.normals))
     arguments = points, normals, receivers.faces, none, fragments
-    return Receivers(
-        *arguments, spans=tuple(renumbered), vertices=none, sample_fragments=fragments, samples=numbers
-    )
+    return Receivers(*arguments, spans=tuple(renumbered), vertices=none, sample_fragments=fragments, samples=numbers)

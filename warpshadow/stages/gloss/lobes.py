@@ -58,7 +58,9 @@ def hemisphere_points(count: int, sample_count: int, place_count: int = 1) -> np
     """
     i = np.minimum(np.arange(count), sample_count - 1)
     azimuth = np.pi * (1 + np.sqrt(5)) * i + 2 * np.pi / place_count * np.arange(place_count)[:, None]
-    return np.stack([np.broadcast_to((i + 0.5) / sample_count, azimuth.shape), np.cos(azimuth), np.sin(azimuth)], axis=2)
+    return np.stack(
+        [np.broadcast_to((i + 0.5) / sample_count, azimuth.shape), np.cos(azimuth), np.sin(azimuth)], axis=2
+    )
 
 
 @wp.func
