@@ -44,9 +44,7 @@ class Receivers(NamedTuple):
     spans: tuple[Span, ...] = ()  # of the others, where bodies are told apart; () for one group
     vertices: wp.array | None = None  # int32, the vertex or back of each vertex receiver, [vertex receiver]
     sample_fragments: Fragments | None = None  # side and barycentrics of each sample receiver, [batch, sample receiver]
-    samples: wp.array | None = (
-        None  # [batch, sample receiver] int32, the sample of the view that owns each, −1 for none
-    )
+    samples: wp.array | None = None  # [view, sample receiver] int32, the sample that owns each, −1 for none
     has_mean_slope: wp.array | None = None  # [view, sample] bool, samples whose receivers do not move over the screen
 
     def without_bodies(self) -> "Receivers":
