@@ -503,10 +503,10 @@ def eye_of(clip_matrix):
     return -np.linalg.solve(rows[:, :3], rows[:, 3])
 
 
-def lobe_samples(points, normals, roughness, clip_matrix, count, spread=None):
+def lobe_samples(points, normals, roughness, clip_matrix, count, spread=None, turns=0.0):
     """Directions, (w, w', σ) and cosines of visible normals on a spiral over their cap (Dupuy and Benyoub 2023).
 
-    A spread is (a, b), by which mirrors are wider.
+    A spread is (a, b), by which mirrors are wider; spirals are turned about the cap's axis.
     """
     view = unit(eye_of(clip_matrix) - points)
     mu = (view * normals).sum(axis=-1)
@@ -527,7 +527,7 @@ def lobe_samples(points, normals, roughness, clip_matrix, count, spread=None):
     slant, axis = np.linalg.norm(stretched(local), axis=-1), unit(stretched(local))
     directions, weights = [], []
     for i in range(count):
-        share, turn = (i + 0.5) / count, np.pi * (1 + np.sqrt(5)) * i
+        share, turn = (i + 0.5) / count, np.pi * (1 + np.sqrt(5)) * i + turns
         z = (1 - share) * (1 + axis[..., 2]) - axis[..., 2]
         ring = np.sqrt(1 - z**2)
         mirror = unit(stretched(np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=-1) + axis))

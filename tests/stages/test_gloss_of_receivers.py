@@ -50,6 +50,12 @@ def spreads(normals, seed=5):
     return vectors - (vectors * normals).sum(axis=-1, keepdims=True) * normals
 
 
+def places_of(points, device):
+    """Places of receivers in their pixels, of 2 × 2, and the angles by which samples are turned there."""
+    places = np.arange(points[..., 0].size).reshape(points.shape[:2]) % 4
+    return wp.array(places, dtype=wp.int32, device=device), np.pi / 2 * places
+
+
 @pytest.mark.parametrize("varies", [False, True])
 def test_samples_of_lobes_are_those_of_the_twin(device, varies):
     points, normals, roughness = receivers()
@@ -60,19 +66,30 @@ def test_samples_of_lobes_are_those_of_the_twin(device, varies):
         assert np.abs(result.numpy() - expected).max() < 20 * FLOAT32 * np.abs(expected).max()
 
 
+def test_samples_of_lobes_are_turned_by_the_places_of_receivers_in_pixels(device):
+    points, normals, roughness = receivers()
+    places, turns = places_of(points, device)
+    got = lobes.sample_lobes(*arrays(device, points, normals, roughness, CAMERA[None]), 8, None, places, 4)
+    expected_samples = twins.lobe_samples(points, normals, roughness, CAMERA, 8, None, turns)
+    for result, expected in zip(got, expected_samples, strict=True):
+        assert np.abs(result.numpy() - expected).max() < 20 * FLOAT32 * np.abs(expected).max()
+
+
 @pytest.mark.parametrize("count", [32, 7])
-def test_samples_of_lobes_have_the_gradients_of_the_twin(device, count):
+@pytest.mark.parametrize("is_turned", [False, True])
+def test_samples_of_lobes_have_the_gradients_of_the_twin(device, count, is_turned):
     points, normals, roughness = receivers()
     values = [points, normals, roughness, CAMERA[None], *spreads(normals)]
     variables = arrays(device, *values, requires_grad=True)
     rng = np.random.default_rng(7)
+    places, turns = places_of(points, device) if is_turned else (None, 0.0)
     with wp.Tape() as tape:
-        samples = lobes.sample_lobes(*variables[:4], count, NormalSpread(*variables[4:]))
+        samples = lobes.sample_lobes(*variables[:4], count, NormalSpread(*variables[4:]), places, 4)
     weights = [rng.normal(size=result.shape + (3,) * (result.dtype == wp.vec3)) for result in samples]
     tape.backward(grads=dict(zip(samples, arrays(device, *weights), strict=True)))
 
     def loss(values):
-        results = twins.lobe_samples(*values[:3], values[3][0], count, values[4:])
+        results = twins.lobe_samples(*values[:3], values[3][0], count, values[4:], turns)
         return sum((weight * result).sum() for weight, result in zip(weights, results, strict=True))
 
     for number, variable in enumerate(variables):

@@ -27,7 +27,7 @@ from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.receivers.find import Receivers
-from warpshadow.stages.receivers.sample_receivers import Span
+from warpshadow.stages.receivers.sample_receivers import Span, places_in_pixels
 from warpshadow.stages.shell.beams import exits_from_shell
 from warpshadow.stages.textures.footprint import Footprints
 from warpshadow.stages.textures.numbers import as_colors, as_scalars, average_over_receivers
@@ -93,8 +93,8 @@ class GlossyPoints(LitPoints):
             spread = Node(
                 "", self._find_normal_spread, self.receivers_node, self.normals, self._clip_positions, self._fragments
             )
-            inputs = self.receivers_node, roughness, self._cameras, self.method.lobe_samples, spread
-            return Node("lobes", _sample_lobes, *inputs, items=item_text)
+            inputs = self.receivers_node, roughness, self._cameras, spread, self._fragments
+            return Node("lobes", self._sample_lobes, *inputs, items=item_text)
 
         sampled = self.cached("lobes", key, lobes)
         directions, filters = field_of(sampled, "directions"), field_of(sampled, "filters")
@@ -154,11 +154,21 @@ class GlossyPoints(LitPoints):
         self, receivers: Receivers, normals: wp.array, clip_positions: wp.array, seen: Fragments
     ) -> NormalSpread:
         """Find how normals vary over the receivers. Differentiable: all but seen."""
-        supersampling = self.merged_scene.scene.supersampling
+        supersampling = self.merged_scene.scene.supersampling if self.method.shares_lobes else 1
         _, height, width = seen.face_ids.shape
         fragments, size = receivers.sample_fragments, (width // supersampling, height // supersampling)
         assert fragments is not None
         return find_normal_spread(fragments, self.merged_scene.side_faces, normals, clip_positions, size, supersampling)
+
+    def _sample_lobes(
+        self, receivers: Receivers, roughness: wp.array, cameras: wp.array, spread: NormalSpread, seen: Fragments
+    ) -> LobeSamples:
+        """Samples of the lobes of the receivers. Differentiable: all but seen."""
+        places, supersampling = None, 1 if self.method.shares_lobes else self.merged_scene.scene.supersampling
+        if supersampling > 1 and receivers.samples is not None:
+            places = places_in_pixels(receivers.samples, seen.face_ids.shape[2], supersampling)
+        arguments = receivers.points, receivers.normals, roughness, cameras, self.method.lobe_samples_of_receiver()
+        return sample_lobes(*arguments, spread, places, supersampling**2)
 
     def _sample_textures(
         self, fragments: Fragments, values: wp.array, textures: Textures, footprints: Footprints
@@ -197,12 +207,6 @@ def _find_exits(receivers: Receivers, directions: wp.array, shell: wp.array) -> 
 def _add_highlights(lobe_light: LobeLight, highlights: LobeLight) -> LobeLight:
     """Add the highlights of emitters to other light in lobes. Differentiable: all."""
     return LobeLight(*(add_light(*pair) for pair in zip(lobe_light, highlights, strict=True)))
-
-
-def _sample_lobes(
-    receivers: Receivers, roughness: wp.array, cameras: wp.array, sample_count: int, spread: NormalSpread
-) -> LobeSamples:
-    return sample_lobes(receivers.points, receivers.normals, roughness, cameras, sample_count, spread)
 
 
 def _average_samples(receivers: Receivers, samples: wp.array) -> wp.array:
@@ -251,7 +255,8 @@ def _select_glossy_receivers(is_glossy: np.ndarray, receivers: Receivers) -> Rec
     fragments = Fragments(
         *(_cut_spans(array, spans, at_vertices) for array in (samples.face_ids, samples.barycentrics))
     )
+    numbers = None if receivers.samples is None else _cut_spans(receivers.samples, spans, at_vertices)
     none = constant(np.empty(0, int), wp.int32, receivers.points.device)
     points, normals = (_cut_spans(array, spans, 0) for array in (receivers.points, receivers.normals))
     arguments = points, normals, receivers.faces, none, fragments
-    return Receivers(*arguments, spans=tuple(renumbered), vertices=none, sample_fragments=fragments)
+    return Receivers(*arguments, spans=tuple(renumbered), vertices=none, sample_fragments=fragments, samples=numbers)

@@ -64,6 +64,9 @@ class LightInput(Input):
         return self.shell if self.is_free else self
 
 
+_MIN_LOBE_SAMPLES = 8  # of a receiver, however many receivers a pixel has: as many as a processor finds at once
+
+
 class Method(abc.ABC):
     """How light is blocked: a method of visibility.
 
@@ -82,7 +85,7 @@ class Method(abc.ABC):
     | :meth:`along_paths` | light that bounces along paths (:func:`.choose_bouncing`) | refused |
     | :meth:`blocker_kinds` | planes, convex parts, traced self-visibility | spheres alone |
     | :meth:`find_squares` | adaptive receivers | None, where every sample receives light |
-    | the four fields below | as they say | False; 32 |
+    | the five fields below | as they say | False; 32 |
 
     A scene is refused whose bodies shine, or whose light bounces, where the method's row of ``METHOD_TRAITS``
     (:mod:`warpshadow.scene.visibility`) says no: the method then needs no member for that.
@@ -103,6 +106,10 @@ class Method(abc.ABC):
     lobe_samples = 32
     """Samples of a lobe of a body that shines. Light without shadows of an indoor map is 2.1% off with 32, 3.5% with 16
     (roughness 0.35)."""
+
+    shares_lobes = False
+    """Whether samples of a pixel on one face of a body that shines share a receiver. Else each is one, with its part of
+    the lobe's samples, so that the image is continuous in poses."""
 
     def __init__(self, merged_scene: MergedScene, native_basis: Basis, basis: Basis | None, *, progress: bool = False):
         self.merged_scene, self.native_basis, self.progress = merged_scene, native_basis, progress
@@ -299,6 +306,13 @@ class Method(abc.ABC):
 
     def _prefilter(self, light: KnownLight) -> wp.array:
         return constant(prefilter(light.radiance)[None], wp.vec3, self.merged_scene.device)
+
+    def lobe_samples_of_receiver(self) -> int:
+        """Number of samples of the lobe of a receiver."""
+        if self.shares_lobes:
+            return self.lobe_samples
+        supersampling = self.merged_scene.scene.supersampling
+        return max(self.lobe_samples // supersampling**2, min(self.lobe_samples, _MIN_LOBE_SAMPLES))
 
     def lobe_transmittance(
         self, points: LitPoints, directions: Node, light: LightInput, shaded_points: LitPoints

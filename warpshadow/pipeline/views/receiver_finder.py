@@ -85,6 +85,7 @@ class ReceiverFinder:
             rises=method.every_sample_receives,
             smooth_pieces=merged_scene.smooth_pieces if self._shares_surfaces else None,
             has_mean_slope=has_mean_slope,
+            shares_receivers=None if self._method.shares_lobes else ~merged_scene.is_glossy[merged_scene.body_of_face],
         )
 
     def _number_seen(self, is_seen: np.ndarray, has_cached_rows: np.ndarray) -> Numbering:

@@ -50,14 +50,17 @@ _SHAPE_COST, _COST = 50.0, 15.0  # nanoseconds that a lobe takes, and a sample
 wp.set_module_options({"max_unroll": 1})
 
 
-def hemisphere_points(count: int, sample_count: int) -> np.ndarray:
-    """Height in the cap and cosine and sine of the azimuth of samples, on a spiral: shape [sample, 3].
+def hemisphere_points(count: int, sample_count: int, place_count: int = 1) -> np.ndarray:
+    """Height in the cap and cosine and sine of the azimuth of samples, on spirals: shape [place, sample, 3].
 
-    Those past the last, up to a count, are all the same.
+    The spiral of each place is turned, so that together they sample a lobe better. Those past the last, up to a count,
+    are all the same.
     """
     i = np.minimum(np.arange(count), sample_count - 1)
-    azimuth = np.pi * (1 + np.sqrt(5)) * i
-    return np.stack([(i + 0.5) / sample_count, np.cos(azimuth), np.sin(azimuth)], axis=1)
+    azimuth = np.pi * (1 + np.sqrt(5)) * i + 2 * np.pi / place_count * np.arange(place_count)[:, None]
+    return np.stack(
+        [np.broadcast_to((i + 0.5) / sample_count, azimuth.shape), np.cos(azimuth), np.sin(azimuth)], axis=2
+    )
 
 
 @wp.func
@@ -191,7 +194,8 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         views: wp.array2d(dtype=wp.vec3),
         caps: wp.array2d(dtype=wp.vec3),
         widths: wp.array2d(dtype=wp.vec3),
-        sample_points: wp.array2d(dtype=Lane),
+        places: wp.array2d(dtype=wp.int32),
+        sample_points: wp.array3d(dtype=Lane),
         # out
         directions: wp.array3d(dtype=wp.vec3),
         filters: wp.array3d(dtype=wp.vec3),
@@ -206,10 +210,14 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         width = widths[batch, receiver]
         weight_scale = (cosine + slant) / float(directions.shape[2])
         blur_scale = wp.sqrt(weight_scale * (width[0] * width[2] - width[1] * width[1]))
-        for block in range(sample_points.shape[1]):
-            cap, _radius = find_cap(
-                caps[batch, receiver], sample_points[0, block], sample_points[1, block], sample_points[2, block]
-            )
+        place = int(0)
+        if places:
+            place = places[instance_in(batch, places.shape[0]), receiver]
+        for block in range(sample_points.shape[2]):
+            height_share = sample_points[place, 0, block]
+            azimuth_cosine = sample_points[place, 1, block]
+            azimuth_sine = sample_points[place, 2, block]
+            cap, _radius = find_cap(caps[batch, receiver], height_share, azimuth_cosine, azimuth_sine)
             mirror_x, mirror_y = stretch(width, cap.x, cap.y)
             upright = wp.cw_mul(cap.z, cap.z)
             square = wp.cw_mul(mirror_x, mirror_x) + wp.cw_mul(mirror_y, mirror_y) + upright
@@ -249,7 +257,8 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         views: wp.array2d(dtype=wp.vec3),
         caps: wp.array2d(dtype=wp.vec3),
         widths: wp.array2d(dtype=wp.vec3),
-        sample_points: wp.array2d(dtype=Lane),
+        places: wp.array2d(dtype=wp.int32),
+        sample_points: wp.array3d(dtype=Lane),
         adj_directions: wp.array3d(dtype=wp.vec3),
         adj_filters: wp.array3d(dtype=wp.vec3),
         # out
@@ -284,10 +293,13 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         adj_tangent = wp.vec3()
         adj_bitangent = wp.vec3()
         adj_normal = wp.vec3()
-        for block in range(sample_points.shape[1]):
-            height_share = sample_points[0, block]
-            azimuth_cosine = sample_points[1, block]
-            azimuth_sine = sample_points[2, block]
+        place = int(0)
+        if places:
+            place = places[instance_in(batch, places.shape[0]), receiver]
+        for block in range(sample_points.shape[2]):
+            height_share = sample_points[place, 0, block]
+            azimuth_cosine = sample_points[place, 1, block]
+            azimuth_sine = sample_points[place, 2, block]
             cap, radius = find_cap(caps[batch, receiver], height_share, azimuth_cosine, azimuth_sine)
             long_x, long_y = stretch(width, cap.x, cap.y)
             upright = wp.cw_mul(cap.z, cap.z)
@@ -393,6 +405,8 @@ def sample_lobes(
     clip_matrices: wp.array,
     sample_count: int,
     spread: NormalSpread | None = None,
+    places: wp.array | None = None,
+    place_count: int = 1,
 ) -> LobeSamples:
     """Sample the lobes of receivers.
 
@@ -404,6 +418,8 @@ def sample_lobes(
             Any batch may be 1 and then serves every instance.
         sample_count: Number of samples.
         spread: How normals vary over the receivers; None for not at all.
+        places: Place of each in its pixel, of a number of places, int32 of shape [batch, receiver]: samples of each are
+            turned by another angle; None for one place.
 
     Differentiable: points, normals, roughness, clip_matrices, spread.
     """
@@ -424,8 +440,9 @@ def sample_lobes(
         cost=_SHAPE_COST,
     )
     lanes = lane_count(device)
-    sample_points = hemisphere_points(-(-sample_count // lanes) * lanes, sample_count)
-    sampled = [*lobes, constant(sample_points.T.reshape(3, -1, lanes), lane_type(lanes), device)]
+    sample_points = hemisphere_points(-(-sample_count // lanes) * lanes, sample_count, place_count)
+    sample_points = np.swapaxes(sample_points, 1, 2).reshape(place_count, 3, -1, lanes)
+    sampled = [*lobes, places, constant(sample_points, lane_type(lanes), device)]
     sample, sample_adjoint = _make_sample_lobes(lanes)
     results = [wp.empty((*shape, sample_count), dtype=wp.vec3, device=device) for _ in range(2)]
     if varies(lobes):

@@ -44,11 +44,12 @@ class Receivers(NamedTuple):
     spans: tuple[Span, ...] = ()  # of the others, where bodies are told apart; () for one group
     vertices: wp.array | None = None  # int32, the vertex or back of each vertex receiver, [vertex receiver]
     sample_fragments: Fragments | None = None  # side and barycentrics of each sample receiver, [batch, sample receiver]
+    samples: wp.array | None = None  # [view, sample receiver] int32, the sample that owns each, −1 for none
     has_mean_slope: wp.array | None = None  # [view, sample] bool, samples whose receivers do not move over the screen
 
     def without_bodies(self) -> "Receivers":
         """Drop the bodies of receivers."""
-        return self._replace(spans=(), vertices=None, sample_fragments=None)
+        return self._replace(spans=(), vertices=None, sample_fragments=None, samples=None)
 
 
 _FULL_RISE_COSINE, _NO_RISE_COSINE = 0.866, 0.707
@@ -219,6 +220,7 @@ def find_receivers(
     smooth_pieces: wp.array | None = None,
     rises: bool = False,
     has_mean_slope: wp.array | None = None,
+    shares_receivers: np.ndarray | None = None,
 ) -> Receivers:
     """Gather the points at which light is evaluated.
 
@@ -238,7 +240,7 @@ def find_receivers(
             share a receiver, too; None where they do not.
         rises: Whether receivers of samples, from which rays leave, are lifted from their flat faces onto the curved
             surface that the vertex normals describe.
-        has_mean_slope: As for :func:`.sample_receivers.find_sample_receivers`.
+        has_mean_slope, shares_receivers: As for :func:`.sample_receivers.find_sample_receivers`.
     Returns:
         Receivers; where no face wants samples, many views of one geometry share them. While a graph is captured every
         sample has room for one.
@@ -248,7 +250,8 @@ def find_receivers(
     vertices, static_vertices, receiver_of_vertex, spans = numbering
     sides = fragments.face_ids if fragments.sides is None else fragments.sides
     receiver_fragments = fragments if fragments.sides is None else Fragments(sides, fragments.barycentrics)
-    batch_count, sample_fragments, triangles = len(positions), None, np.empty((0, 3), np.int32)
+    batch_count, sample_fragments, samples = len(positions), None, None
+    triangles = np.empty((0, 3), np.int32)
     side_count, receiver_count = receiver_of_vertex.size // positions.shape[1] * len(faces), numbering.receiver_count
     count = side_count
     if wants_samples.any():
@@ -259,14 +262,14 @@ def find_receivers(
             visible_points = points_of_fragments(positions, normals, faces, Fragments(*receiver_fragments.rows))
             surface = VisibleSurface(*visible_points, positions[0], faces, smooth_pieces)
         arguments = receiver_fragments, side_count, wants_samples, body_keys, supersampling, quadtree, surface
-        sample_receivers = find_sample_receivers(*arguments, has_mean_slope)
+        sample_receivers = find_sample_receivers(*arguments, has_mean_slope, shares_receivers)
         receiver_fragments, sample_fragments = sample_receivers.fragments, sample_receivers.sample_fragments
         moving_count = numbering.moving_count
         spans += tuple(
             Span(body, moving_count + first, moving_count + end) for body, first, end in sample_receivers.spans
         )
         count += sample_fragments.face_ids.shape[1]
-        triangles = sample_receivers.triangles
+        samples, triangles = sample_receivers.samples, sample_receivers.triangles
     elif vertices is None:
         return Receivers(positions, normals, faces, receiver_of_vertex, receiver_fragments)
     receiver_faces = empty(count + len(triangles), dtype=wp.vec3i, device=device)
@@ -282,8 +285,8 @@ def find_receivers(
     if bodies is None:
         return receivers
     if sample_fragments and not sample_fragments.face_ids.size:
-        sample_fragments = None
-    return receivers._replace(spans=spans, vertices=vertices, sample_fragments=sample_fragments)
+        sample_fragments = samples = None
+    return receivers._replace(spans=spans, vertices=vertices, sample_fragments=sample_fragments, samples=samples)
 
 
 def _gather_receiver_points(

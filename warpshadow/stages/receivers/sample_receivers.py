@@ -1,9 +1,10 @@
 """Sample receivers: points that samples see, at which light is evaluated for them.
 
 Samples of a pixel that see the same side share one, at the mean of their points: of four samples, 1.1 to 1.5 receivers
-a pixel. In stills samples of different faces share one, too, if these belong to one smooth piece and the surface is
-even: shared by two slats of a bench, it would lie in the gap. In squares of a quadtree there is one at each corner, and
-samples interpolate in triangles of these.
+a pixel. On bodies that shine each sample has its own: means leap as samples pass to the next face, and narrow
+highlights with them. In stills samples of different faces share one, too, if these belong to one smooth piece and the
+surface is even: shared by two slats of a bench, it would lie in the gap. In squares of a quadtree there is one at each
+corner, and samples interpolate in triangles of these.
 """
 
 import functools
@@ -51,6 +52,7 @@ class SampleReceivers(NamedTuple):
 
     fragments: Fragments  # of the mesh's sides, then of a face for each receiver, then of triangles
     sample_fragments: Fragments  # sides and barycentrics that receivers see, [view, receiver]; −1 for none
+    samples: wp.array  # [view, receiver] int32, the sample that owns each, −1 for none
     triangles: np.ndarray  # [triangle, 3], the receivers in which others interpolate
     spans: tuple[Span, ...]
 
@@ -76,6 +78,7 @@ def _find_owner_samples(
     pieces: wp.array(dtype=wp.int32),
     barycentrics: wp.array2d(dtype=wp.vec3),
     wants_samples: wp.array(dtype=wp.bool),
+    shares_receivers: wp.array(dtype=wp.bool),
     sizes: wp.array3d(dtype=wp.int32),
     receiver_numbers: wp.array3d(dtype=wp.int32),
     is_corner: wp.array2d(dtype=wp.bool),
@@ -144,7 +147,10 @@ def _find_owner_samples(
                 elif side >= 0 and wants_samples[side % wants_samples.shape[0]]:
                     owner_sample = sample
                     weight = wp.vec3(1.0, 0.0, 0.0)
-                    for k in range(i * supersampling + j):
+                    other_count = i * supersampling + j
+                    if shares_receivers:
+                        other_count = wp.where(shares_receivers[side % shares_receivers.shape[0]], other_count, 0)
+                    for k in range(other_count):
                         other = sample_of_pixel(corner, k, width, supersampling)
                         if owner_sample == sample and sides[view, other] == side:
                             owner_sample = owner_samples[view, other]
@@ -215,6 +221,7 @@ def find_sample_receivers(
     quadtree: Quadtree | None = None,
     surface: VisibleSurface | None = None,
     has_mean_slope: wp.array | None = None,
+    shares_receivers: np.ndarray | None = None,
 ) -> SampleReceivers:
     """Find the receivers of samples.
 
@@ -232,6 +239,7 @@ def find_sample_receivers(
             of one smooth surface, too; None where they do not.
         has_mean_slope: Samples whose motion over the screen :mod:`.slopes` follows, bool of shape [view, sample]; None
             for none. Their receivers do not move with it.
+        shares_receivers: Faces whose samples of a pixel share a receiver, bool of shape [face]; None for all.
     Differentiable: barycentrics, where receivers see them.
     """
     shape, device = fragments.face_ids.shape, fragments.face_ids.device
@@ -254,6 +262,7 @@ def find_sample_receivers(
             *((surface.points, surface.normals, surface.pieces) if surface else (None, None, None)),
             barycentrics,
             constant(wants_samples, wp.bool, device),
+            None if shares_receivers is None else constant(shares_receivers, wp.bool, device),
             sizes,
             squares,
             is_corner,
@@ -295,6 +304,7 @@ def find_sample_receivers(
     return SampleReceivers(
         Fragments(reshaped(receiver_sides, shape), reshaped(weights, shape)),
         sample_fragments,
+        samples,
         triangles,
         tuple(
             Span(body_id, first, end)
@@ -302,6 +312,35 @@ def find_sample_receivers(
             if end > first
         ),
     )
+
+
+@wp.kernel(enable_backward=False)
+def _find_places(
+    # in
+    samples: wp.array2d(dtype=wp.int32),
+    width: int,
+    supersampling: int,
+    # out
+    places: wp.array2d(dtype=wp.int32),
+):
+    """A thread owns a receiver."""
+    batch, receiver = wp.tid()
+    sample = wp.max(samples[batch, receiver], 0)
+    row = sample // width
+    places[batch, receiver] = row % supersampling * supersampling + (sample - row * width) % supersampling
+
+
+def places_in_pixels(samples: wp.array, width: int, supersampling: int) -> wp.array:
+    """Find where in their pixels samples are, row by row: int32 of their shape.
+
+    Args:
+        samples: The samples, int32 of shape [batch, receiver].
+        width: Samples of an image in a row.
+        supersampling: Samples of a pixel across and down.
+    """
+    places = empty(samples.shape, dtype=wp.int32, device=samples.device)
+    launch(_find_places, samples.shape, inputs=[samples, width, supersampling], outputs=[places])
+    return places
 
 
 @cached_by_values
