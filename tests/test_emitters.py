@@ -160,7 +160,7 @@ def test_a_lamp_in_a_bowl_changes_no_other_image_of_a_batch():
         image.square().sum().backward()
         images.append(image.detach().numpy().reshape(-1, *image.shape[-3:]))
         gradients.append(moved.grad.numpy().reshape(-1, 3, 3))
-    assert unlike(images[0], images[1]) > 0.1
+    assert unlike(images[0][..., :3], images[1][..., :3]) > 0.1
     for found in (images, gradients):
         np.testing.assert_allclose(found[2], np.concatenate(found[:2]), atol=1e-5 * np.abs(found[2]).max())
 
