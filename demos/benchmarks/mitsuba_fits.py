@@ -32,7 +32,7 @@ from demos.mitsuba_gloss import color_of, surface
 from demos.problems import Case
 from demos.scenes import image_error, shipped_mesh
 from warpshadow import inverse
-from warpshadow.inverse.target import stacked
+from warpshadow.inverse.target import stack_targets
 from warpshadow.scene.material import GLOSS_ARGUMENTS
 
 SAMPLES = 64  # a pixel, for the image and again for its gradient
@@ -85,7 +85,7 @@ def fit_by_mitsuba(case: Case, iterations: int | None = None) -> tuple[ws.Scene,
     stage = inverse.Stage(count, method.stage.learning_rate)
     setting = problem.setting(torch.device("cpu"))
     tracer = RayTracer(setting.scene, method.integrator)
-    targets, weights = stacked(problem.targets, 1.0, setting.device)
+    targets, weights = stack_targets(problem.targets, 1.0, setting.device)
     values = {key: tensor.requires_grad_() for key, tensor in free.start(setting).items()}
     optimizer = inverse.short_adam(list(values.values()), lr=stage.learning_rate)
     durations = []
