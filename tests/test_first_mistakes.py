@@ -160,6 +160,18 @@ def test_a_map_in_place_of_coefficients_gets_the_way_to_them():
     renderer(torch.as_tensor(coefficients, dtype=torch.float32))
 
 
+def test_a_geometry_in_the_place_of_the_light_is_named():
+    renderer = TorchRenderer(SCENE)
+    geometry = renderer.placed(*renderer.scene_poses())
+    for call in (
+        lambda: renderer(geometry),
+        lambda: ws.Renderer(SCENE).draw(ws.Renderer(SCENE).placed()),
+        lambda: MIXED([0], [geometry]),
+    ):
+        with pytest.raises(ValueError, match="light: got a Geometry, expected light first: .* geometry=…"):
+            call()
+
+
 @pytest.mark.parametrize(
     ("value", "field", "message"),
     [
