@@ -275,6 +275,12 @@ def test_files_that_are_no_fits_are_refused_before_any_starts(scene, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_fit_in_the_place_of_a_scene_is_named(tmp_path):
+    (tmp_path / "fit.toml").write_text('scene = "start.toml"\n[[target]]\nimage = "truth.png"\n[free]\n')
+    named = "fit.toml: got a fit file, expected a scene file, such as the one that it names, start.toml"
+    fails("render", tmp_path / "fit.toml", "-o", tmp_path / "out.png", parts=(named, "warpshadow fit fit.toml"))
+
+
 def test_a_turntable_goes_around_at_one_exposure(scene, tmp_path):
     from PIL import Image, ImageSequence
 
