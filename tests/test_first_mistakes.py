@@ -45,6 +45,9 @@ MIXED = MixedRenderer([TorchRenderer(SCENE)])
             lambda: ws.render(SCENE, samples=16),
             r"\(write Scene\(…, visibility=Visibility\('ray-traced', samples=…\)\)\)",
         ),
+        (lambda: ws.render(SCENE, spp=16), r"\(write Scene\(…, visibility=Visibility\('ray-traced', samples=…\)\)\)"),
+        (lambda: ws.Visibility("ray-traced", spp=16), r"Visibility: unknown argument 'spp' \(write samples\)"),
+        (lambda: ws.Picture([[1.0]], gamma=2.2), r"Picture: unknown argument 'gamma' \(write exposure=… in stops"),
         (lambda: ws.Renderer(SCENE, softness=1.0), r"\(write Scene\(…, visibility=Visibility\(…\)\)\)"),
         (lambda: TorchRenderer(SCENE)(emision=None), r"unknown argument 'emision' \(did you mean 'emission'\?\)"),
         (lambda: MIXED([0], emision=None), r"MixedRenderer.forward: unknown .* \(did you mean 'emission'\?\)"),
@@ -208,6 +211,14 @@ def test_functions_that_are_looked_for_in_the_wrong_place_are_named():
         ws.fit  # noqa: B018
     with pytest.raises(AttributeError, match=r"has no attribute 'TorchRenderer' \(write warpshadow.torch.TorchR"):
         ws.TorchRenderer  # noqa: B018
+    for name, remedy in (
+        ("look_at", r"Camera.look_at\(eye, target"),
+        ("Light", "EnvironmentMap"),
+        ("cube", r"Body\(trimesh.creation.box\("),
+        ("cylinder", r"Body\(trimesh.creation.cylinder\("),
+    ):
+        with pytest.raises(AttributeError, match=rf"has no attribute '{name}' \(write {remedy}"):
+            getattr(ws, name)
     with pytest.raises(AttributeError, match=r"has no attribute 'rendr' \(did you mean 'render'\?\)"):
         ws.rendr  # noqa: B018
     assert not hasattr(SCENE, "__array__") and (copy.deepcopy(SCENE).bodies[0].mesh.faces == BALL.mesh.faces).all()
