@@ -682,7 +682,7 @@ def test_an_interrupted_fit_says_how_to_go_on_and_ends_where_it_would_have(fit_f
     assert last == f"interrupted; the same command goes on from {state}"
     assert not (tmp_path / "out" / "scene.toml").exists()
     result = run("fit", fit_file, "-o", tmp_path / "out")
-    assert result.exit_code == 0 and f"going on from iteration 2, of {state}\n" in result.stdout
+    assert result.exit_code == 0 and f"going on from iteration 2, of {state}\n" in result.stderr
     assert_same(parameters(tmp_path / "out"), parameters(tmp_path / "whole"))
 
 
@@ -723,7 +723,7 @@ def test_a_fit_whose_process_was_killed_ends_where_it_would_have(fit_file, tmp_p
         process.kill()
     assert process.returncode == -signal.SIGKILL, "the fit was over before it could be killed"
     assert not (folder / "scene.toml").exists()
-    assert "going on" in run("fit", fit_file, "-o", folder).stdout
+    assert "going on" in run("fit", fit_file, "-o", folder).stderr
     run("fit", fit_file, "-o", tmp_path / "whole")
     assert_same(parameters(folder), parameters(tmp_path / "whole"))
 
