@@ -434,7 +434,7 @@ def fit(
     seconds = statistics.median(durations) if durations else math.nan
     values = descent.best if descent.reason else descent.best_so_far()
     if reason in GOOD_ENDINGS and durations:  # not of one that had ended before
-        warn_of(problem, descent.setting, values, descent.losses[-1], reason)
+        warn_of(problem, descent.setting, values, descent.stages[-1], descent.losses[-1], reason)
     return Result(problem, descent.setting, values, descent.losses, reason, seconds)
 
 
