@@ -21,6 +21,8 @@ import warpshadow as ws
 from warpshadow.assets.image import exr_bytes
 from warpshadow.cli import app
 from warpshadow.maths import sh
+from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
+from warpshadow.scene.visibility import METHODS
 
 PROGRAM = [sys.executable, "-c", "from warpshadow.cli import app; app(prog_name='warpshadow')"]
 """What the command that is installed runs."""
@@ -869,6 +871,23 @@ def test_warmup_says_when_a_device_is_ready():
     result = run("warmup")
     assert result.exit_code == 0, result.output
     assert re.search(r"cpu: ready in \d+\.\d s", result.stdout)
+
+
+def test_warmup_renders_as_stills_and_renderers_do(monkeypatch):
+    rendered = []
+
+    class Recorder:
+        def __init__(self, scene, device):
+            rendered.append(scene.visibility)
+
+        def render(self):
+            pass
+
+    monkeypatch.setattr("warpshadow.pipeline.renderer.SceneRenderer", Recorder)
+    assert run("warmup").exit_code == 0
+    still = for_picture(ws.Scene([ws.Body(ws.icosphere(1.0, 0))], np.ones((4, 3)))).visibility
+    assert {visibility.method for visibility in rendered} == {*METHODS}
+    assert (still.method, still.sampling) in [(visibility.method, visibility.sampling) for visibility in rendered]
 
 
 def test_a_picture_of_spheres_needs_matplotlib_which_is_said_before_the_fit(tmp_path, monkeypatch):
