@@ -67,7 +67,7 @@ def exposure_gaps(model: Model, images: torch.Tensor) -> dict[int, float]:
 
 
 def image_error(model: Model, images: torch.Tensor) -> float:
-    """Root mean square of what images differ from the targets, as a part of that of the targets.
+    """Root mean square of the differences from the targets, as a part of that of the targets.
 
     Pixels count as in the end of the fit: by their masks, and less where a robust loss takes them for an occluder's.
     """

@@ -59,8 +59,8 @@ def misplacements(scene: Scene) -> list[str]:
 
     grounds = {number for number, body in enumerate(scene.bodies) if _is_ground(body, boxes[number])}
     lamps = [box for body, box in zip(scene.bodies, boxes, strict=True) if body.is_emitter]
-    standing = [box for k, box in enumerate(boxes) if k not in grounds and not scene.bodies[k].is_emitter]
-    has_nothing_on = not any(box.is_over(boxes[ground]) for ground in grounds for box in standing)
+    solid_boxes = [box for k, box in enumerate(boxes) if k not in grounds and not scene.bodies[k].is_emitter]
+    has_nothing_on = not any(box.is_over(boxes[ground]) for ground in grounds for box in solid_boxes)
     remarks = []
     for number, (body, box) in enumerate(zip(scene.bodies, boxes, strict=True)):
         level = [other for other in grounds - {number} if has_nothing_on or box.is_over(boxes[other])]
