@@ -143,6 +143,28 @@ def test_gradients_of_images_agree_with_differences(blocker, bounces):
         assert np.linalg.norm(gradient - differences) < SMOOTH * np.linalg.norm(differences), name
 
 
+def test_a_lamp_in_a_bowl_changes_no_other_image_of_a_batch():
+    ball = ws.icosphere(0.5, 3)
+    low = ball.surface.faces[ball.positions[ball.surface.faces].mean(axis=1)[:, 1] < 0.1]
+    used, faces = np.unique(low, return_inverse=True)
+    bowl = ws.Body(ws.Mesh(ball.positions[used], faces.reshape(-1, 3)), translation=(0.9, 0.5, 0.4), name="bowl")
+    lamp = dataclasses.replace(LAMP, mesh=ws.icosphere(0.08, 2), blockers=0, translation=(-1.3, 1.2, 0.6))
+    renderer = TorchRenderer(scene_of(lamp, bowl, GROUND, light=DARK), progress=False)
+    rotations, translations, scales = renderer.scene_poses()
+    shifts = torch.zeros(2, 3, 3)
+    shifts[1, 0] = torch.tensor([2.2, -0.7, -0.2])  # into the bowl
+    images, gradients = [], []
+    for shift in (*shifts, shifts):
+        moved = shift.clone().requires_grad_()
+        image = renderer(geometry=renderer.placed(rotations, translations + moved, scales))
+        image.square().sum().backward()
+        images.append(image.detach().numpy().reshape(-1, *image.shape[-3:]))
+        gradients.append(moved.grad.numpy().reshape(-1, 3, 3))
+    assert unlike(images[0][..., :3], images[1][..., :3]) > 0.1
+    for found in (images, gradients):
+        np.testing.assert_allclose(found[2], np.concatenate(found[:2]), atol=1e-5 * np.abs(found[2]).max())
+
+
 def test_emission_takes_a_batch_and_vertices_and_rays_have_its_gradient():
     for visibility in (ws.Visibility("directional"), ws.Visibility("ray-traced", samples=64)):
         renderer = TorchRenderer(scene_of(visibility=visibility), progress=False)

@@ -28,7 +28,12 @@ from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.stages.bounces.albedo import mean_over_texels
 from warpshadow.stages.emitters.beams import find_axis_weights, weigh_by_beam
 from warpshadow.stages.emitters.convex import find_log_transmittance_of_parts
-from warpshadow.stages.emitters.light import find_directions_to_samples, find_transmittance_to_samples, sum_light
+from warpshadow.stages.emitters.light import (
+    find_directions_to_samples,
+    find_transmittance_to_samples,
+    replace_instances,
+    sum_light,
+)
 from warpshadow.stages.emitters.planes import find_log_transmittance_of_planes
 from warpshadow.stages.emitters.samples import (
     EmitterBeams,
@@ -367,14 +372,16 @@ def _find_transmittances(
         skipped = own_spheres, merged_scene.spheres_among(sphere_bodies, body)
         transmittance_self = None
         if cells is not None and not is_own:
-            if _is_within(blockers, body, group.body):
+            is_within = _find_within(blockers, body, group.body)
+            if not is_within.all():
+                towards = find_directions_to_samples(points, placed_samples, span)
+                transmittance_self = interpolate_transmittance(cells, normals, towards, EMITTER_CELLS)
+            if is_within.any():
                 # cells look to infinity: a bulb in a shade would be hidden by the shade's other side
                 with unrecorded():
                     arguments = own_meshes(), points, normals, emitters, blockers.positions, placed_samples, span
-                    transmittance_self = trace_transmittances(*arguments, rays=1)
-            else:
-                towards = find_directions_to_samples(points, placed_samples, span)
-                transmittance_self = interpolate_transmittance(cells, normals, towards, EMITTER_CELLS)
+                    traced = trace_transmittances(*arguments, rays=1)
+                transmittance_self = replace_instances(transmittance_self, traced, is_within)
         transmittance_of_emitter = None
         if hidden_by_itself is not None:
             lookup = points, placed_samples, span, hidden_by_itself
@@ -391,13 +398,13 @@ def _find_transmittances(
         )
 
 
-def _is_within(blockers: Blockers, emitter: int, body: int | None) -> bool:
-    """Whether an emitter is within the bounds of a body, so that parts of the body may be behind it.
+def _find_within(blockers: Blockers, emitter: int, body: int | None) -> np.ndarray:
+    """Find the geometries in which an emitter is within the bounds of a body, parts of which may be behind it, bool.
 
     Where arrays cannot be read, the scene's own bodies tell.
     """
     if body is None:
-        return False
+        return np.zeros(1, bool)
     starts = blockers.merged_scene.first_vertex
     if is_readable(blockers.positions.device):
         positions = blockers.positions.numpy()
@@ -406,7 +413,8 @@ def _is_within(blockers: Blockers, emitter: int, body: int | None) -> bool:
         bodies = blockers.merged_scene.scene.bodies
         of_emitter, of_body = (bodies[number].world_points()[None] for number in (emitter, body))
     middle = (of_emitter.min(axis=1) + of_emitter.max(axis=1)) / 2
-    return bool(((of_body.min(axis=1) < middle) & (middle < of_body.max(axis=1))).all(axis=1).any())
+    is_within: np.ndarray = ((of_body.min(axis=1) < middle) & (middle < of_body.max(axis=1))).all(axis=1)
+    return is_within
 
 
 def trace_transmittances(

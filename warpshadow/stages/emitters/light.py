@@ -12,6 +12,7 @@ Receivers closer than about three times its half diagonal see a sample as its pi
 form factors (:mod:`.form_factors`) are in place of the fraction.
 """
 
+import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import common_batch, expand, expand_rows, instance_in
@@ -113,6 +114,37 @@ def find_transmittance_to_samples(
         cost=_COST * first.shape[2],
     )
     return transmittance
+
+
+@wp.kernel
+def _replace_instances(
+    # in
+    transmittance: wp.array3d(dtype=wp.float32),
+    other: wp.array3d(dtype=wp.float32),
+    is_replaced: wp.array(dtype=wp.int32),
+    # out
+    replaced: wp.array3d(dtype=wp.float32),
+):
+    """A thread owns a receiver and a sample."""
+    batch, receiver, i = wp.tid()
+    if is_replaced[instance_in(batch, is_replaced.shape[0])] == 1:
+        replaced[batch, receiver, i] = other[instance_in(batch, other.shape[0]), receiver, i]
+    else:
+        replaced[batch, receiver, i] = transmittance[instance_in(batch, transmittance.shape[0]), receiver, i]
+
+
+def replace_instances(transmittance: wp.array | None, other: wp.array, is_replaced: np.ndarray) -> wp.array:
+    """Take transmittance of other instances, float32 of shape [batch, receiver, sample], where told to, bool [batch].
+
+    Without any transmittance the other is taken everywhere. Differentiable: transmittance, other.
+    """
+    if transmittance is None:
+        return other
+    count = common_batch({"cells": transmittance, "rays": other})
+    replaced = empty((count, *other.shape[1:]), dtype=wp.float32, device=other.device)
+    flags = wp.array(is_replaced, dtype=wp.int32, device=other.device)
+    launch(_replace_instances, replaced.shape, inputs=[transmittance, other, flags], outputs=[replaced])
+    return replaced
 
 
 @wp.func

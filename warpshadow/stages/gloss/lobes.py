@@ -45,6 +45,11 @@ MIN_ROUGHNESS = 0.1  # roughness of the smoothest surface; maps of 128 rows have
 MIN_COSINE = 0.02  # cosine between a receiver's normal and its viewer, of those whose interpolated normal turns away
 MAX_COSINE = 0.99999
 
+_BLUR_POWER = 0.2
+"""Power of the number of places by which blur is narrower, as samples of other places lie between those of one: with 4
+places and 8 samples a metal of roughness 0.4 in a room with windows is 2.9% off, 4.2% with 0 and 2.8% with 0.5; but
+under a sun 16, 10 and 33%."""
+
 _SHAPE_COST, _COST = 50.0, 15.0  # nanoseconds that a lobe takes, and a sample
 
 wp.set_module_options({"max_unroll": 1})
@@ -194,6 +199,7 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         views: wp.array2d(dtype=wp.vec3),
         caps: wp.array2d(dtype=wp.vec3),
         widths: wp.array2d(dtype=wp.vec3),
+        blur_share: float,
         places: wp.array2d(dtype=wp.int32),
         sample_points: wp.array3d(dtype=Lane),
         # out
@@ -209,7 +215,7 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         sine, cosine, slant = view[0], view[1], view[2]
         width = widths[batch, receiver]
         weight_scale = (cosine + slant) / float(directions.shape[2])
-        blur_scale = wp.sqrt(weight_scale * (width[0] * width[2] - width[1] * width[1]))
+        blur_scale = blur_share * wp.sqrt(weight_scale * (width[0] * width[2] - width[1] * width[1]))
         place = int(0)
         if places:
             place = places[instance_in(batch, places.shape[0]), receiver]
@@ -257,6 +263,7 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         views: wp.array2d(dtype=wp.vec3),
         caps: wp.array2d(dtype=wp.vec3),
         widths: wp.array2d(dtype=wp.vec3),
+        blur_share: float,
         places: wp.array2d(dtype=wp.int32),
         sample_points: wp.array3d(dtype=Lane),
         adj_directions: wp.array3d(dtype=wp.vec3),
@@ -278,7 +285,7 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         width = widths[batch, receiver]
         weight_scale = (cosine + slant) / float(adj_directions.shape[2])
         determinant = width[0] * width[2] - width[1] * width[1]
-        blur_scale = wp.sqrt(weight_scale * determinant)
+        blur_scale = blur_share * wp.sqrt(weight_scale * determinant)
         adj_sine = Lane(0.0)
         adj_cosine = Lane(0.0)
         adj_slant = Lane(0.0)
@@ -442,7 +449,7 @@ def sample_lobes(
     lanes = lane_count(device)
     sample_points = hemisphere_points(-(-sample_count // lanes) * lanes, sample_count, place_count)
     sample_points = np.swapaxes(sample_points, 1, 2).reshape(place_count, 3, -1, lanes)
-    sampled = [*lobes, places, constant(sample_points, lane_type(lanes), device)]
+    sampled = [*lobes, place_count**-_BLUR_POWER, places, constant(sample_points, lane_type(lanes), device)]
     sample, sample_adjoint = _make_sample_lobes(lanes)
     results = [wp.empty((*shape, sample_count), dtype=wp.vec3, device=device) for _ in range(2)]
     if varies(lobes):
