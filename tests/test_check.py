@@ -145,6 +145,18 @@ def test_a_missing_file_is_named_with_the_folder_that_it_is_looked_for_in(tmp_pa
         check.file("mesh", tmp_path / "b.obj")
 
 
+def test_a_missing_file_is_named_with_one_of_nearly_the_same_name(tmp_path):
+    for name in ("scene.toml", "bunny.obj", "sky.exr"):
+        (tmp_path / name).touch()
+    for call, name in (
+        (lambda: ws.load_scene(tmp_path / "scene.tml"), "scene.toml"),
+        (lambda: ws.Body(tmp_path / "buny.obj"), "bunny.obj"),
+        (lambda: ws.read_image(tmp_path / "skys.exr"), "sky.exr"),
+    ):
+        with pytest.raises(FileNotFoundError, match=rf"no such .* \(did you mean '{name}'\?\)$"):
+            call()
+
+
 def test_a_string_in_an_expected_shape_stands_for_any_length():
     check.shape("positions", (2, 3, 3), (2, "vertex", 3))
     check.shape("positions", (2, 0, 3), (2, "vertex", 3))

@@ -45,6 +45,9 @@ MIXED = MixedRenderer([TorchRenderer(SCENE)])
             lambda: ws.render(SCENE, samples=16),
             r"\(write Scene\(…, visibility=Visibility\('ray-traced', samples=…\)\)\)",
         ),
+        (lambda: ws.render(SCENE, spp=16), r"\(write Scene\(…, visibility=Visibility\('ray-traced', samples=…\)\)\)"),
+        (lambda: ws.Visibility("ray-traced", spp=16), r"Visibility: unknown argument 'spp' \(write samples\)"),
+        (lambda: ws.Picture([[1.0]], gamma=2.2), r"Picture: unknown argument 'gamma' \(write exposure=… in stops"),
         (lambda: ws.Renderer(SCENE, softness=1.0), r"\(write Scene\(…, visibility=Visibility\(…\)\)\)"),
         (lambda: TorchRenderer(SCENE)(emision=None), r"unknown argument 'emision' \(did you mean 'emission'\?\)"),
         (lambda: MIXED([0], emision=None), r"MixedRenderer.forward: unknown .* \(did you mean 'emission'\?\)"),
@@ -160,6 +163,18 @@ def test_a_map_in_place_of_coefficients_gets_the_way_to_them():
     renderer(torch.as_tensor(coefficients, dtype=torch.float32))
 
 
+def test_a_geometry_in_the_place_of_the_light_is_named():
+    renderer = TorchRenderer(SCENE)
+    geometry = renderer.placed(*renderer.scene_poses())
+    for call in (
+        lambda: renderer(geometry),
+        lambda: ws.Renderer(SCENE).draw(ws.Renderer(SCENE).placed()),
+        lambda: MIXED([0], [geometry]),
+    ):
+        with pytest.raises(ValueError, match="light: got a Geometry, expected light first: .* geometry=…"):
+            call()
+
+
 @pytest.mark.parametrize(
     ("value", "field", "message"),
     [
@@ -196,6 +211,14 @@ def test_functions_that_are_looked_for_in_the_wrong_place_are_named():
         ws.fit  # noqa: B018
     with pytest.raises(AttributeError, match=r"has no attribute 'TorchRenderer' \(write warpshadow.torch.TorchR"):
         ws.TorchRenderer  # noqa: B018
+    for name, remedy in (
+        ("look_at", r"Camera.look_at\(eye, target"),
+        ("Light", "EnvironmentMap"),
+        ("cube", r"Body\(trimesh.creation.box\("),
+        ("cylinder", r"Body\(trimesh.creation.cylinder\("),
+    ):
+        with pytest.raises(AttributeError, match=rf"has no attribute '{name}' \(write {remedy}"):
+            getattr(ws, name)
     with pytest.raises(AttributeError, match=r"has no attribute 'rendr' \(did you mean 'render'\?\)"):
         ws.rendr  # noqa: B018
     assert not hasattr(SCENE, "__array__") and (copy.deepcopy(SCENE).bodies[0].mesh.faces == BALL.mesh.faces).all()

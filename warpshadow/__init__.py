@@ -57,8 +57,20 @@ _MODULES = {
 }
 """Modules of the names that need kernels: each is imported on first use."""
 
-_ELSEWHERE = {"fit": "inverse", "TorchRenderer": "torch", "MixedRenderer": "torch"}
-"""Modules of names that are looked for here."""
+_SOLID = "Body(trimesh.creation.{}(…)).creased(), or Body(path) of a file"
+
+_ELSEWHERE = {
+    "fit": "warpshadow.inverse.fit",
+    "TorchRenderer": "warpshadow.torch.TorchRenderer",
+    "MixedRenderer": "warpshadow.torch.MixedRenderer",
+    "look_at": "Camera.look_at(eye, target, fov_y=…, size=…)",
+    "Light": "EnvironmentMap, or Body(…, emission=…) for a lamp",
+    "cube": _SOLID.format("box"),
+    "box": _SOLID.format("box"),
+    "cylinder": _SOLID.format("cylinder"),
+    "sphere": "icosphere",
+}
+"""Remedies for names that are looked for here."""
 
 __all__ = [
     "Body",
@@ -131,8 +143,8 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str) -> object:
     if name not in _MODULES:
-        module = _ELSEWHERE.get(name)
-        hint = f" (write warpshadow.{module}.{name})" if module else _check.suggestion(name, __all__)
+        remedy = _ELSEWHERE.get(name)
+        hint = f" (write {remedy})" if remedy else _check.suggestion(name, __all__)
         raise AttributeError(f"module 'warpshadow' has no attribute {name!r}{hint}")
     with _one_call:  # kernels must not be made while another thread loads some
         return getattr(_importlib.import_module(f"warpshadow.{_MODULES[name]}"), name)

@@ -225,8 +225,17 @@ def file(name: str, value: AnyPath) -> Path:
     result = Path(value)
     if not result.is_file():
         where = "" if result.is_absolute() else f" (in {Path.cwd()})"
-        raise FileNotFoundError(f"{name}: no such file: {result}{where}")
+        raise FileNotFoundError(f"{name}: no such file: {result}{where}{nearest_file(result)}")
     return result
+
+
+def nearest_file(missing_path: Path) -> str:
+    """Name the file of the same folder that has nearly the name of a missing one, for messages; empty without such."""
+    names: list[str] = []
+    with contextlib.suppress(OSError):  # no such folder, or one that may not be read
+        names = [item.name for item in missing_path.parent.iterdir() if item.is_file()]
+    near = difflib.get_close_matches(missing_path.name, names, n=1, cutoff=0.85)
+    return f" (did you mean {near[0]!r}?)" if near else ""
 
 
 def device(name: str, value: object) -> wp.Device:

@@ -1,12 +1,14 @@
 """Environment maps: which way is which, what is refused, and that moving light keeps its energy."""
 
 import functools
+import warnings
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import warpshadow as ws
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.harmonic_light import as_light
 from warpshadow.assets.image import ImageError, exr_bytes, write_image
@@ -164,6 +166,22 @@ def test_a_written_map_reads_back_bit_for_bit(tmp_path):
     np.testing.assert_array_equal(EnvironmentMap.read(tmp_path / "a.exr").radiance, environment.radiance)
     with pytest.raises(ImageError, match="expected .exr"):
         environment.write(tmp_path / "a.png")
+
+
+def test_a_file_of_integers_that_is_white_somewhere_cuts_a_sun_off_and_a_warning_says_so(tmp_path):
+    sky = np.full((4, 8, 3), 0.25)
+    write_image(tmp_path / "dim.png", sky)
+    sky[1, 2], sky[0, 0] = 60, (0.1, 0.1, 1.5)
+    for name in ("sky.png", "sky.jpg", "sky.exr"):
+        write_image(tmp_path / name, sky)
+    with pytest.warns(UserWarning, match=r"sky.png: 2 of its pixels .* a .png file holds: brighter light.* is cut off"):
+        assert EnvironmentMap.read(tmp_path / "sky.png").radiance.max() == 1
+    with pytest.warns(UserWarning, match="sky.jpg: .* is cut off"):
+        ws.Scene([ws.Body(ws.icosphere(1.0, 0))], tmp_path / "sky.jpg")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        EnvironmentMap.read(tmp_path / "dim.png")
+        EnvironmentMap.read(tmp_path / "sky.exr")
 
 
 MAPS = [

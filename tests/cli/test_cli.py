@@ -21,6 +21,8 @@ import warpshadow as ws
 from warpshadow.assets.image import exr_bytes
 from warpshadow.cli import app
 from warpshadow.maths import sh
+from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
+from warpshadow.scene.visibility import METHODS
 
 PROGRAM = [sys.executable, "-c", "from warpshadow.cli import app; app(prog_name='warpshadow')"]
 """What the command that is installed runs."""
@@ -273,6 +275,12 @@ def test_files_that_are_no_fits_are_refused_before_any_starts(scene, tmp_path):
     fails("fit", tmp_path / "a.toml", scene, *options, parts=(named,))
     fails("fit", tmp_path / "a.toml", tmp_path / "truth.png", *options, parts=("truth.png: got extension '.png'",))
     assert not (tmp_path / "out").exists()
+
+
+def test_a_fit_in_the_place_of_a_scene_is_named(tmp_path):
+    (tmp_path / "fit.toml").write_text('scene = "start.toml"\n[[target]]\nimage = "truth.png"\n[free]\n')
+    named = "fit.toml: got a fit file, expected a scene file, such as the one that it names, start.toml"
+    fails("render", tmp_path / "fit.toml", "-o", tmp_path / "out.png", parts=(named, "warpshadow fit fit.toml"))
 
 
 def test_a_turntable_goes_around_at_one_exposure(scene, tmp_path):
@@ -676,7 +684,7 @@ def test_an_interrupted_fit_says_how_to_go_on_and_ends_where_it_would_have(fit_f
     assert last == f"interrupted; the same command goes on from {state}"
     assert not (tmp_path / "out" / "scene.toml").exists()
     result = run("fit", fit_file, "-o", tmp_path / "out")
-    assert result.exit_code == 0 and f"going on from iteration 2, of {state}\n" in result.stdout
+    assert result.exit_code == 0 and f"going on from iteration 2, of {state}\n" in result.stderr
     assert_same(parameters(tmp_path / "out"), parameters(tmp_path / "whole"))
 
 
@@ -717,7 +725,7 @@ def test_a_fit_whose_process_was_killed_ends_where_it_would_have(fit_file, tmp_p
         process.kill()
     assert process.returncode == -signal.SIGKILL, "the fit was over before it could be killed"
     assert not (folder / "scene.toml").exists()
-    assert "going on" in run("fit", fit_file, "-o", folder).stdout
+    assert "going on" in run("fit", fit_file, "-o", folder).stderr
     run("fit", fit_file, "-o", tmp_path / "whole")
     assert_same(parameters(folder), parameters(tmp_path / "whole"))
 
@@ -863,6 +871,23 @@ def test_warmup_says_when_a_device_is_ready():
     result = run("warmup")
     assert result.exit_code == 0, result.output
     assert re.search(r"cpu: ready in \d+\.\d s", result.stdout)
+
+
+def test_warmup_renders_as_stills_and_renderers_do(monkeypatch):
+    rendered = []
+
+    class Recorder:
+        def __init__(self, scene, device):
+            rendered.append(scene.visibility)
+
+        def render(self):
+            pass
+
+    monkeypatch.setattr("warpshadow.pipeline.renderer.SceneRenderer", Recorder)
+    assert run("warmup").exit_code == 0
+    still = for_picture(ws.Scene([ws.Body(ws.icosphere(1.0, 0))], np.ones((4, 3)))).visibility
+    assert {visibility.method for visibility in rendered} == {*METHODS}
+    assert (still.method, still.sampling) in [(visibility.method, visibility.sampling) for visibility in rendered]
 
 
 def test_a_picture_of_spheres_needs_matplotlib_which_is_said_before_the_fit(tmp_path, monkeypatch):

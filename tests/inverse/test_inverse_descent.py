@@ -539,6 +539,20 @@ def test_a_fit_that_dies_after_every_iteration_has_the_result_of_one_that_does_n
     assert same(fit(problem, **options, checkpoint=path), whole)
 
 
+@pytest.mark.parametrize("progress", [True, False])
+def test_a_fit_that_goes_on_says_from_where(problem, tmp_path, monkeypatch, capsys, progress):
+    path = tmp_path / "fit.checkpoint"
+    with monkeypatch.context() as patch:
+        dies_after_each_save(patch)
+        with pytest.raises(Killed):
+            fit(problem, STAGES, checkpoint=path, checkpoint_seconds=0.0)
+    assert "going on" not in capsys.readouterr().err
+    fit(problem, STAGES, checkpoint=path, progress=progress)
+    assert (f"going on from iteration 1, of {path}\n" in capsys.readouterr().err) == progress
+    fit(problem, STAGES, checkpoint=path)  # which had ended
+    assert "going on" not in capsys.readouterr().err
+
+
 def test_a_fit_that_has_ended_is_not_computed_again(tmp_path):
     loss = Recorded()
     path = tmp_path / "fit.checkpoint"

@@ -4,10 +4,12 @@ import functools
 
 import numpy as np
 import pytest
+import trimesh
 import warp.examples
 
 import warpshadow as ws
 from demos import shapes
+from warpshadow.cli.mesh_options import NO_OPTIONS, load
 from warpshadow.scene.mesh_scene import guess_up
 
 TO_Z_UP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -83,7 +85,20 @@ def test_a_mesh_stands_on_the_ground_upright_and_is_framed():
     assert points[:, 1].min() == pytest.approx(0, abs=1e-6) and np.ptp(points, axis=0).max() == pytest.approx(2)
     pixels = turned.camera.project(points)
     assert pixels.min() >= 0 and pixels.max() <= 256
-    assert ws.default_scene(chair, up="guess").bodies[0].rotation[0] == 0
+
+
+def test_a_mesh_stands_as_the_command_has_it_and_a_warning_says_that_z_is_up(tmp_path):
+    chair = MESHES["chair"]()
+    assert ws.default_scene(chair).bodies[0].rotation[0] == 0  # and no warning
+    chair.transformed(rotation=TO_Z_UP).write(tmp_path / "chair.obj")
+    trimesh.creation.icosphere().export(tmp_path / "ball.stl")
+    with pytest.warns(UserWarning, match=r"chair: z is taken to be up \(it stands firmer than on y\); up='y' says"):
+        turned = ws.default_scene(tmp_path / "chair.obj")
+    with pytest.warns(UserWarning, match=r"ball: z is taken to be up \(as .stl files often have it\)"):
+        ball = ws.default_scene(tmp_path / "ball.stl")
+    assert turned.bodies[0].rotation[0] == ball.bodies[0].rotation[0] == -90
+    assert load(tmp_path / "chair.obj", NO_OPTIONS, is_quiet=True).bodies[0].rotation[0] == -90
+    assert ws.default_scene(tmp_path / "chair.obj", up="z").bodies[0].rotation[0] == -90
 
 
 def test_sharp_edges_are_parted_and_a_body_keeps_its_color():

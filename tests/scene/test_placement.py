@@ -133,6 +133,18 @@ def test_a_body_that_is_broader_than_the_ground_is_remarked_on():
         assert not misplacements(ws.Scene([GROUND, ground, large], LIGHT))
 
 
+def test_a_body_in_other_units_beside_the_ground_is_remarked_on():
+    mug = ws.Body(ws.icosphere(50.0, 1), translation=(1200, 50, 0), name="mug")
+    (remark,) = misplacements(ws.Scene([mug, GROUND], LIGHT))
+    assert re.match(
+        r"body 0 \('mug'\) is 100 broad, and body 1 \('ground'\) beside it 20; on_ground\(size=…\) st", remark
+    )
+    lamp = ws.Body(ws.icosphere(0.1, 1), translation=(0, 3, 0), emission=(9, 9, 9))
+    assert len(misplacements(ws.Scene([mug, lamp, GROUND], LIGHT))) == 1
+    assert not misplacements(ws.Scene([mug, ball(0.0), GROUND], LIGHT))  # such as a mountain behind it
+    assert not misplacements(ws.Scene([dataclasses.replace(mug, scale=0.1), GROUND], LIGHT))
+
+
 def camera_at(*eye):
     return ws.Camera.look_at(eye, (9, 9, 9), size=(8, 8))
 

@@ -60,7 +60,7 @@ def read_image(
     if reader is None:
         raise ImageError(f"{path}: got extension {path.suffix!r}, expected one of {', '.join(_READERS)}")
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such image file")
+        raise FileNotFoundError(f"{path}: no such image file{check.nearest_file(path)}")
     if part is not None and reader is not _read_exr:
         raise ImageError(f"{path}: got part {part!r}, but only .exr files have parts")
     try:

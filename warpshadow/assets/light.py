@@ -21,7 +21,7 @@ import numpy.typing as npt
 from warpshadow import check
 from warpshadow.assets.cells import CellLight, gather_cells
 from warpshadow.assets.color import LUMINANCE
-from warpshadow.assets.image import ImageError, read_rgb, write_image
+from warpshadow.assets.image import INTEGER_SUFFIXES, ImageError, read_rgb, write_image
 from warpshadow.assets.picture import Picture
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
@@ -39,6 +39,16 @@ _ORIGIN = np.zeros(3)
 
 _MAX_SUN_ROWS = 4096  # of a map that gets a sun
 _DRAWN_ROWS = 256  # of a map in a notebook, and less than twice as many
+
+
+def _warn_of_white(path: Path, pixels: np.ndarray) -> None:
+    """Warn of a file of integers whose brightest pixels are as bright as it can tell."""
+    white_count = int((pixels >= 1).any(axis=2).sum()) if path.suffix.lower() in INTEGER_SUFFIXES else 0
+    if white_count:
+        check.warn(
+            f"{path}: {white_count} of its pixels have a channel at 1.0, the most that a {path.suffix} file holds: "
+            "brighter light, such as a sun's, is cut off; an .exr or .hdr file holds it"
+        )
 
 
 def check_coefficients(name: str, values: np.ndarray) -> None:
@@ -115,7 +125,8 @@ class EnvironmentMap:
         """Read a map; gray becomes RGB and alpha is dropped.
 
         Args:
-            path: An .exr or .hdr file, or any other that :func:`warpshadow.read_image` reads.
+            path: An .exr or .hdr file, or any other that :func:`warpshadow.read_image` reads: of a .png, .jpg or .tif
+                that is white somewhere, where a sun would be cut off, a warning says so.
             sanitize: How to treat NaN, Inf, negative values and values beyond 1e18: None raises, "zero" makes them 0,
                 "neighbors" takes the mean of the good values among the eight pixels around, spreading inward.
             part: Name or index of the part of a multi-part OpenEXR file.
@@ -132,6 +143,7 @@ class EnvironmentMap:
         pixels = read_rgb(path, part=part)
         try:
             _check_aspect(pixels)
+            _warn_of_white(Path(path), pixels)
             if sanitize:
                 pixels = _sanitized(pixels, sanitize)
             return cls(pixels, radius=radius, center=center).rotated(CONVENTIONS[convention])

@@ -160,7 +160,7 @@ def _read(source: MeshSource) -> JoinedMesh:
     if reader is None:
         raise MeshError(f"{path}: got extension {path.suffix!r}, expected one of {', '.join(_READERS)}")
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such mesh file")
+        raise FileNotFoundError(f"{path}: no such mesh file{check.nearest_file(path)}")
     try:
         return join_parts(reader(path), path.stem)
     except (MeshError, ImportError) as error:

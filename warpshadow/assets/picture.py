@@ -48,6 +48,7 @@ class Picture:
     exposure: float
     tone: str
 
+    @check.keywords(gamma="exposure=… in stops; the curve is that of sRGB")
     def __init__(
         self,
         image: npt.ArrayLike,

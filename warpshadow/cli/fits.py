@@ -78,10 +78,7 @@ def fit(
         output.mkdir(exist_ok=True)
         state = checkpoints.load(output / CHECKPOINT)
         was_over = state is not None and state["reason"] is not None
-        if state is not None and not was_over:
-            iteration = sum(map(len, state["losses"]))
-            note(f"going on from iteration {iteration}, of {output / CHECKPOINT}", is_quiet)
-        elif state is None and (output / PREVIEW).exists():
+        if state is None and (output / PREVIEW).exists():
             note(f"no checkpoint in {output} yet; the fit begins anew", is_quiet)
         viewer = FitViewer(port=port) if view else None
         if viewer is not None:

@@ -138,7 +138,7 @@ def _size(paths: list[Path]) -> str:
 
 @app.command()
 def warmup(device: Device = "cpu", is_quiet: Quiet = False) -> None:
-    """Compile every kernel that rendering needs, so that the first render need not."""
+    """Compile the kernels of stills and of renderers, so that the first image need not; gradients have more."""
     from warpshadow.assets.camera import Camera
     from warpshadow.assets.light import EnvironmentMap
     from warpshadow.assets.primitives import icosphere
@@ -153,15 +153,17 @@ def warmup(device: Device = "cpu", is_quiet: Quiet = False) -> None:
         warp_device = device_of(device)
         mesh = icosphere(subdivisions=1)
         start = time.perf_counter()
-        with progress_bar(len(METHODS) + 1, "compiling", "stage", stays=True) as bar:
+        by_method = [Visibility.of({"method": method, "samples": 16}) for method in METHODS]
+        of_stills = Visibility("ray-traced", samples=16, sampling="shared")
+        with progress_bar(len(METHODS) + 2, "compiling", "stage", stays=True) as bar:
             fit_spheres(mesh, 1, steps=100, device=warp_device, cache=False, progress=False)
             bar.update()
-            for method in METHODS:
+            for visibility in (*by_method, of_stills):
                 scene = Scene(
                     (Body(mesh, blockers=1),),
                     EnvironmentMap.constant(1.0),
                     Camera.look_at((0, 0, 5), (0, 0, 0), size=(8, 8)),
-                    Visibility.of({"method": method, "samples": 16}),
+                    visibility,
                 )
                 SceneRenderer(scene, device=warp_device).render()
                 bar.update()

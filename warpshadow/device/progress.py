@@ -63,6 +63,12 @@ def say(text: str) -> None:
         sys.stderr.flush()
 
 
+def remark(text: str, *, shows: bool = True) -> None:
+    """Write a line to stderr, unless progress is hidden."""
+    if shows and _bars_show:
+        say(text)
+
+
 def announce(work: str, seconds: float, alternative: str, *, shows: bool = True) -> None:
     """Announce work of more than half a minute: its time, and a setting that avoids it.
 
@@ -73,8 +79,8 @@ def announce(work: str, seconds: float, alternative: str, *, shows: bool = True)
         shows: Whether to say it.
     """
     seconds /= thread_count()
-    if shows and _bars_show and seconds > ANNOUNCED_SECONDS:
-        say(f"{work} takes about {show_time(seconds)}, {alternative}")
+    if seconds > ANNOUNCED_SECONDS:
+        remark(f"{work} takes about {show_time(seconds)}, {alternative}", shows=shows)
 
 
 def show_time(seconds: float) -> str:

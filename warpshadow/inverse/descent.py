@@ -15,7 +15,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.check import AnyPath
-from warpshadow.device.progress import progress_bar
+from warpshadow.device.progress import progress_bar, remark
 from warpshadow.inverse import checkpoint as checkpoints
 from warpshadow.inverse.diagnostics import warn_of
 from warpshadow.inverse.free.base import Free, Values
@@ -393,7 +393,7 @@ def fit(
         tolerance: A stage has converged when over 25 iterations, or by the last and the next step of a QuasiNewton, its
             loss falls by less than this part.
         checkpoint: File to which the state is written, and from which a fit goes on where one that was interrupted left
-            off, with the result that it would have had (on a CPU, to the bit).
+            off, with the result that it would have had (on a CPU, to the bit). A line says from which iteration.
         checkpoint_seconds: Time between checkpoints [s].
         preview: PNG that shows targets, images and their difference while the fit runs.
         preview_seconds: Time between previews [s].
@@ -434,7 +434,7 @@ def fit(
     seconds = statistics.median(durations) if durations else math.nan
     values = descent.best if descent.reason else descent.best_so_far()
     if reason in GOOD_ENDINGS and durations:  # not of one that had ended before
-        warn_of(problem, descent.setting, values, descent.losses[-1], reason)
+        warn_of(problem, descent.setting, values, descent.stages[-1], descent.losses[-1], reason)
     return Result(problem, descent.setting, values, descent.losses, reason, seconds)
 
 
@@ -461,6 +461,8 @@ def _descend(
     save_time = preview_time = time.perf_counter()
     durations: list[float] = []
     done = sum(map(len, descent.losses))
+    if state is not None and state["reason"] is None:
+        remark(f"going on from iteration {done}, of {checkpoint}", shows=progress)
     total, label = done + descent.iterations_left(), "preparing: kernels, shadows, form factors"
     with progress_bar(total, label, "it", done=done, shows=progress, stays=True) as bar:
         start = time.perf_counter()

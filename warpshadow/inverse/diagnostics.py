@@ -1,4 +1,6 @@
-"""Diagnostics of a fit that has ended: pixels without a body, wrong exposure, a loss that was still falling."""
+"""Diagnostics of a fit that has ended: pixels without a body, wrong exposure, images that are not explained, a loss
+that was still falling.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +12,7 @@ import torch
 from warpshadow import check
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.free.views import Exposure
+from warpshadow.inverse.loss import clip_saturated
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
@@ -23,6 +26,9 @@ MAX_EXPLAINED_SHARE = 0.5  # part of the residual's squares that a factor of an 
 
 MIN_EXPOSURE_GAP = 0.2
 """Logarithm to the base 2 of the factor from which that is of interest; a wrong pose has one, too."""
+
+MAX_IMAGE_ERROR = 0.25
+"""Error of images that is poor: a pose in a wrong minimum has 0.34, and where it is found 0.02."""
 
 _WINDOW = 20  # iterations, of which the second half is compared with the first
 _SIDE = 96  # shorter side of small images [pixels]
@@ -60,6 +66,18 @@ def exposure_gaps(model: Model, images: torch.Tensor) -> dict[int, float]:
     return gaps
 
 
+def image_error(model: Model, images: torch.Tensor) -> float:
+    """Root mean square of the differences from the targets, as a part of that of the targets.
+
+    Pixels count as in the end of the fit: by their masks, and less where a robust loss takes them for an occluder's.
+    """
+    weight = model.pixel_weights(images)[..., None]
+    targets = model.targets[..., :3]
+    differences = clip_saturated(images, model.targets, model.saturated)[..., :3] - targets
+    squares, unit = ((weight * item.square()).sum() for item in (differences, targets))
+    return math.sqrt(float(squares / unit.clamp_min(1e-30)))
+
+
 def gain_of_last(losses: Sequence[float]) -> float:
     """Part of its loss that a descent gained over its last iterations, by the means of ten and of the ten before."""
     half = _WINDOW // 2
@@ -70,35 +88,38 @@ def gain_of_last(losses: Sequence[float]) -> float:
 
 
 def warn_of(
-    problem: Problem, setting: Setting, values: Mapping[str, Values], losses: Sequence[float], end: str
+    problem: Problem, setting: Setting, values: Mapping[str, Values], stage: Stage, losses: Sequence[float], end: str
 ) -> None:
     """Warn of reasons to doubt a result.
 
     Args:
         problem, setting, values: Of the result.
+        stage: The last one.
         losses: Of the last descent.
         end: Why it ended.
     """
     is_exposure_known = problem.basis is None and not problem.free_of(Exposure)
     has_coverage = problem.targets[0].image.shape[2] == 4
-    if is_exposure_known or not has_coverage:
-        model = Model(problem, setting, small_stage(problem))
-        with torch.no_grad():
-            images = model.images(values)
-        if not has_coverage:
-            _warn_of_unseen(model, images)
-        if is_exposure_known:
-            _warn_of_exposures(model, images)
+    model = Model(problem, setting, small_stage(problem))
+    with torch.no_grad():
+        images = model.images(values)
+    is_doubted = not has_coverage and _warn_of_unseen(model, images)
+    is_doubted |= is_exposure_known and _warn_of_exposures(model, images)
     gain = gain_of_last(losses)
-    if end == "finished" and problem.basis is not None and gain > MAX_LAST_GAIN:
+    is_falling = end == "finished" and gain > MAX_LAST_GAIN
+    if is_falling and problem.basis is not None:
+        is_doubted = True
         check.warn(
             f"light has not converged: the loss still fell by {gain:.1%} over the last {_WINDOW // 2} iterations; "
             'give the last stage more iterations, or stages = "photograph", which solves for the light',
             DiagnosticWarning,
         )
+    if stage.compares == "all" and not is_doubted:
+        _warn_of_error(model, images, is_falling)
 
 
-def _warn_of_unseen(model: Model, images: torch.Tensor) -> None:
+def _warn_of_unseen(model: Model, images: torch.Tensor) -> bool:
+    """Warn of pixels without a body; return whether there are."""
     share = unseen_share(model, images)
     if share > MAX_UNSEEN_SHARE:
         check.warn(
@@ -106,13 +127,32 @@ def _warn_of_unseen(model: Model, images: torch.Tensor) -> None:
             "ground larger",
             DiagnosticWarning,
         )
+    return share > MAX_UNSEEN_SHARE
 
 
-def _warn_of_exposures(model: Model, images: torch.Tensor) -> None:
-    for view, stops in exposure_gaps(model, images).items():
+def _warn_of_exposures(model: Model, images: torch.Tensor) -> bool:
+    """Warn of targets of other exposures than the images; return whether there are."""
+    gaps = exposure_gaps(model, images)
+    for view, stops in gaps.items():
         check.warn(
             f"targets[{view}] is {2**stops:.3g} times as bright as the fitted image, which is most of the residual, "
             "and may have led poses and colors astray: set exposure = true in [free], inverse.Exposure(), or the "
             f"target's exposure = {stops:+.2f} [stops]",
+            DiagnosticWarning,
+        )
+    return bool(gaps)
+
+
+def _warn_of_error(model: Model, images: torch.Tensor, is_falling: bool) -> None:
+    error = image_error(model, images)
+    if error > MAX_IMAGE_ERROR:
+        reason = (
+            "the loss was still falling: give the last stage more iterations"
+            if is_falling
+            else "a pose may be in another minimum, which other starts or candidates leave; or light, reflectance, "
+            "shapes or the camera are not those of the targets"
+        )
+        check.warn(
+            f"the fit explains the targets poorly: images are off by {error:.0%} of their root mean square; {reason}",
             DiagnosticWarning,
         )

@@ -67,6 +67,11 @@ class ImageInputs(Generic[Array, Placed]):
     geometry: Placed | None = None
     clip_matrices: Array | None = None
 
+    def __post_init__(self) -> None:
+        items = self.light if isinstance(self.light, (tuple, list)) else [self.light]
+        if any(isinstance(item, Geometry) for item in items):
+            raise ValueError("light: got a Geometry, expected light first: renderer(light, geometry=…), or geometry=…")
+
     @property
     def of_bodies(self) -> dict[str, PerBody[Array] | None]:
         """The materials of bodies, by name."""

@@ -16,7 +16,7 @@ from warpshadow.tuning import tune
 
 _IN_SCENES = {
     **dict.fromkeys(METHODS_OF_SETTING, "Scene(…, visibility=Visibility(…))"),
-    "samples": "Scene(…, visibility=Visibility('ray-traced', samples=…))",
+    **dict.fromkeys(("samples", "spp"), "Scene(…, visibility=Visibility('ray-traced', samples=…))"),
     "method": "Scene(…, visibility=Visibility(method))",
     "bounces": "Scene(…, bounces=…)",
 }

@@ -77,7 +77,13 @@ def load_scene(path: AnyPath, *, bounces: Bounces | None = None, **settings: obj
             "default_scene(path) makes a scene of it alone, as the commands render and view do"
         )
     with check.located(str(path), SceneError):
-        return _scene(toml_tables.read(path, "scene file"), path.parent, bounces, settings)
+        table = toml_tables.read(path, "scene file")
+        if "scene" in table and not {"camera", "body"} & {*table}:
+            raise ValueError(
+                f"got a fit file, expected a scene file, such as the one that it names, {table['scene']}; "
+                f"warpshadow fit {path.name} -o FOLDER runs it, and FOLDER/scene.toml is the result"
+            )
+        return _scene(table, path.parent, bounces, settings)
 
 
 def _scene(scene: Table, folder: Path, bounces: Bounces | None, settings: Table) -> Scene:

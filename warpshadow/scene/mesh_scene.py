@@ -80,7 +80,7 @@ def guess_up(mesh: Mesh, suffix: str = "") -> UpGuess:
 def default_scene(
     body: Body | Mesh | MeshSource,
     *,
-    up: str = "y",
+    up: str = GUESSED_AXIS,
     size: tuple[int, int] = (256, 256),
     light: EnvironmentMap | AnyPath | None = None,
     direction: npt.ArrayLike = DIRECTION,
@@ -91,7 +91,8 @@ def default_scene(
         body: A body, or a source of one: a mesh, or any source that :func:`warpshadow.load_mesh` reads. It becomes 2
             units large. Where it has many sharp edges that its normals round, they are parted, :meth:`Body.creased`.
             Where it is a metal, light bounces once, so that it reflects the ground.
-        up: Axis of the mesh that points up, "y" or "z", or "guess", which :func:`guess_up` finds by its shape.
+        up: Axis of the mesh that points up, "y" or "z"; by default "guess", which :func:`guess_up` finds by its shape
+            and its file, as the commands do. A warning says so where that is z.
         size: Width and height of the image [pixels].
         light: In place of the sky: an environment map, or the file of one.
         direction: From the body's middle to the camera, in the world, whose y is up, shape [3], any length.
@@ -99,7 +100,9 @@ def default_scene(
     check.choice("up", up, (*_AXES, GUESSED_AXIS))
     suffix = Path(body).suffix.lower() if check.is_path(body) else ""
     body = body if isinstance(body, Body) else Body(body)
-    axis = guess_up(body.mesh, suffix).axis if up == GUESSED_AXIS else up
+    axis, reason = guess_up(body.mesh, suffix) if up == GUESSED_AXIS else (up, "")
+    if reason and axis == "z":
+        check.warn(f"{body.name}: z is taken to be up ({reason}); up='y' says otherwise, and up='z' the same")
     body = body.creased() if body.mesh.rounds_edges else body
     body = replace(body, rotation=np.array([-90.0 if axis == "z" else 0.0, 0.0, 0.0])).on_ground(size=2)
     ground = Body(infinite_ground(GROUND_SIZE), albedo=(0.4, 0.4, 0.4))

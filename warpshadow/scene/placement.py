@@ -44,6 +44,9 @@ class _Box(NamedTuple):
 def misplacements(scene: Scene) -> list[str]:
     """Say which bodies are broader than any ground below, or above or below it by more than their size.
 
+    Where nothing stands on any ground, it is said of bodies beside that are broader, too: they may be in other units.
+
+
     Grounds are flat, face +y and emit no light; the size is the longest edge of the bounds. A body over another that is
     near enough, a cup on a table, does not float; nor does a lamp, or a body whose bounds meet those of a lamp, such as
     its shade. A body over one ground does not lie below another, such as the board of a table.
@@ -56,18 +59,23 @@ def misplacements(scene: Scene) -> list[str]:
 
     grounds = {number for number, body in enumerate(scene.bodies) if _is_ground(body, boxes[number])}
     lamps = [box for body, box in zip(scene.bodies, boxes, strict=True) if body.is_emitter]
+    solid_boxes = [box for k, box in enumerate(boxes) if k not in grounds and not scene.bodies[k].is_emitter]
+    has_nothing_on = not any(box.is_over(boxes[ground]) for ground in grounds for box in solid_boxes)
     remarks = []
     for number, (body, box) in enumerate(zip(scene.bodies, boxes, strict=True)):
-        level = [other for other in grounds - {number} if box.is_over(boxes[other])]
+        level = [other for other in grounds - {number} if has_nothing_on or box.is_over(boxes[other])]
         if number in grounds or not level or body.is_emitter:
             continue
         broadest = max(level, key=lambda other: boxes[other].breadth)
         if box.breadth > _CEILING_RATIO * boxes[broadest].breadth:
+            place, remedy = ("beside", "stands it there") if has_nothing_on else ("below", "makes it smaller")
             remarks.append(
                 f"body {number} ({body.name!r}) is {box.breadth:.3g} broad, and body {broadest} "
-                f"({scene.bodies[broadest].name!r}) below it {boxes[broadest].breadth:.3g}; on_ground(size=…) makes "
-                "it smaller"
+                f"({scene.bodies[broadest].name!r}) {place} it {boxes[broadest].breadth:.3g}; on_ground(size=…) "
+                f"{remedy}"
             )
+            continue
+        if has_nothing_on:
             continue
         size = box.size
         below = [other for other in level if boxes[other].low[1] <= box.low[1]]

@@ -25,7 +25,7 @@ def read(path: Path, kind: str) -> Table:
         import tomli as tomllib
 
     if not path.is_file():
-        raise FileNotFoundError(f"no such {kind}")
+        raise FileNotFoundError(f"no such {kind}{check.nearest_file(path)}")
     try:
         return tomllib.loads(path.read_bytes().decode("utf-8-sig"))  # editors on Windows begin files with a mark
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as cause:

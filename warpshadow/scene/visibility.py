@@ -72,7 +72,7 @@ NARROW_ROUGHNESS = 0.3
 _INDEPENDENT_RAYS = 1024  # rays unless ``samples`` says how many, where each receiver has its own
 
 
-@check.frozen()
+@check.frozen(spp="samples", rays="samples")
 @dataclass(frozen=True)
 class Visibility:
     """How visibility is computed. A setting that the method does not read is refused unless it is the default.
