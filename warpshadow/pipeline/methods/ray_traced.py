@@ -34,7 +34,7 @@ _RAYS_OF_CELL = 4
 _EVEN_RAYS = 128  # directions in which receivers that shine look for how much of the hemisphere is open
 
 
-class Rays(Method):
+class RayTraced(Method):
     """Visibility of the meshes."""
 
     every_sample_receives = True
@@ -290,4 +290,4 @@ def _refuse(*_: object) -> None:
     raise ValueError("light: got free light for moving geometry, which rays cannot shade; expected known light")
 
 
-METHOD = Rays
+METHOD = RayTraced
