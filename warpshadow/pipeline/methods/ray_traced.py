@@ -270,7 +270,8 @@ def _checked_points(points: wp.array) -> wp.array:
     """Points, which may require no gradient."""
     if points.requires_grad:
         raise ValueError(
-            "geometry: got arrays that require a gradient, which rays do not have; expected none, or another method"
+            "geometry, clip_matrices: got arrays that require a gradient, which rays do not have; expected none, or "
+            "another method"
         )
     return points
 
