@@ -289,6 +289,15 @@ def test_figures_of_the_first_page_are_those_that_were_measured():
     assert f"without shadows by {means[0]}% and {worst[0]}%" in stated
     count, means, worst = summaries("Scenes of all kinds", 1)
     assert f"on {count} scenes, by {means[0]}% and {worst[0]}%" in stated
+    stills = (ROOT / "warpshadow" / "pipeline" / "README.md").read_text("utf-8")
+    assert f"[off by {means[0]}%]" in stills and f"on average, renderers' images by {means[2]}%" in stills
+    bunny, ball = (row_of("Set-up", mesh) for mesh in ("bunny", "ball"))
+    assert f"{bunny[4]:.0f} s for {bunny[0]:.0f},000 vertices, {ball[4]:.0f} s for {ball[0]:.0f},000" in stated
+    shiny, diffuse = map(
+        float, re.search(r"([\d.]+) s of CPU time in place of ([\d.]+) of a diffuse", MEASUREMENTS).groups()
+    )
+    narrow = re.search(r"takes [\d.]+ times as long, with a bounce ([\d.]+)\.", MEASUREMENTS)[1]
+    assert f"in {shiny / diffuse:.1f} to {narrow} times the time" in stated
     image, light, texture, pose = (
         row_of("Speed", label)[1]
         for label in (
