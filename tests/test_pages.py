@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import importlib
+import itertools
 import re
 import sys
 from pathlib import Path
@@ -201,7 +202,35 @@ DEFINED = {name for file in SOURCES for name in (file.stem, file.parent.name)} |
     if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.arg) or isinstance(getattr(node, "ctx", None), ast.Store)
     if hasattr(node, key)
 }
+CLASSES = {
+    node.name: node for text in SOURCES.values() for node in ast.walk(ast.parse(text)) if isinstance(node, ast.ClassDef)
+}
 ROLES = re.compile(r":(func|class|meth|data|mod|attr):`~?([\w.]+)`")
+
+
+def is_stored(node):
+    return isinstance(node.ctx, ast.Store)
+
+
+def members(name):
+    """Methods, fields and attributes of a class of the package, inherited ones included; none of others."""
+    if name not in CLASSES:
+        return set()
+    found = {node.name for node in CLASSES[name].body if isinstance(node, ast.FunctionDef)}
+    fields = [node for node in CLASSES[name].body if isinstance(node, ast.Assign | ast.AnnAssign)]
+    found |= {part.attr for part in ast.walk(CLASSES[name]) if isinstance(part, ast.Attribute) and is_stored(part)}
+    found |= {part.id for field in fields for part in ast.walk(field) if isinstance(part, ast.Name) and is_stored(part)}
+    bases = [base.value if isinstance(base, ast.Subscript) else base for base in CLASSES[name].bases]
+    return found.union(*(members(getattr(base, "id", None) or getattr(base, "attr", "")) for base in bases))
+
+
+def test_members_are_those_of_the_class():
+    assert {"white_samples", "image", "cached"} <= members("View") and "white" not in members("View")
+
+
+def unknown_members(parts):
+    """Names after that of a class which it does not have."""
+    return [name for owner, name in itertools.pairwise(parts) if owner in CLASSES and name not in members(owner)]
 
 
 @pytest.mark.parametrize("file", SOURCES, ids=name_of)
@@ -211,14 +240,15 @@ def test_names_that_docstrings_refer_to_exist(file):
             assert resolved(path), path
             assert (path in sys.modules) == (role == "mod"), path
         else:
-            assert DEFINED.issuperset(path.strip(".").split(".")), path
+            parts = path.strip(".").split(".")
+            assert DEFINED.issuperset(parts) and not unknown_members(parts), path
 
 
 @each_page_of_today
 def test_methods_and_constants_that_a_page_names_exist(page):
     texts = code(page)
     for owner, name in (match.groups() for text in texts if (match := re.match(r"([A-Z]\w*)\.(\w+)(?:$|\()", text))):
-        assert owner not in DEFINED or name in DEFINED, f"{owner}.{name}"
+        assert not unknown_members((owner, name)), f"{owner}.{name}"
     for name in (text for text in texts if re.fullmatch(r"(?!WARP_|MALLOC_|G?OMP_)_?[A-Z]+(?:_[A-Z]+)+", text)):
         assert any(name in text for text in SOURCES.values()), name
 
@@ -259,6 +289,15 @@ def test_figures_of_the_first_page_are_those_that_were_measured():
     assert f"without shadows by {means[0]}% and {worst[0]}%" in stated
     count, means, worst = summaries("Scenes of all kinds", 1)
     assert f"on {count} scenes, by {means[0]}% and {worst[0]}%" in stated
+    stills = (ROOT / "warpshadow" / "pipeline" / "README.md").read_text("utf-8")
+    assert f"[off by {means[0]}%]" in stills and f"on average, renderers' images by {means[2]}%" in stills
+    bunny, ball = (row_of("Set-up", mesh) for mesh in ("bunny", "ball"))
+    assert f"{bunny[4]:.0f} s for {bunny[0]:.0f},000 vertices, {ball[4]:.0f} s for {ball[0]:.0f},000" in stated
+    shiny, diffuse = map(
+        float, re.search(r"([\d.]+) s of CPU time in place of ([\d.]+) of a diffuse", MEASUREMENTS).groups()
+    )
+    narrow = re.search(r"takes [\d.]+ times as long, with a bounce ([\d.]+)\.", MEASUREMENTS)[1]
+    assert f"in {shiny / diffuse:.1f} to {narrow} times the time" in stated
     image, light, texture, pose = (
         row_of("Speed", label)[1]
         for label in (

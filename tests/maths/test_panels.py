@@ -6,7 +6,7 @@ import trimesh
 
 import warpshadow as ws
 from warpshadow.maths.convex import find_convex_parts
-from warpshadow.maths.panels import MAX_LEAVES, TOLERANCES, find_panels
+from warpshadow.maths.panels import MAX_LEAVES, MAX_PANELS_OF, find_panels
 
 TOLERANCE = 0.02
 
@@ -88,12 +88,12 @@ def test_domes_have_panels_and_deep_ones_coarser_ones(height):
     ball = trimesh.creation.icosphere(4)
     faces = np.asarray(ball.faces)[ball.triangles_center[:, 1] > 1 - height]
     parts = find_convex_parts(np.asarray(ball.vertices, np.float32), faces)
-    assert 16 <= len(parts) <= max(TOLERANCES.values())
+    assert 16 <= len(parts) <= max(MAX_PANELS_OF.values())
     polygons = [part.corners for part in parts]
     share = areas(ball.vertices, polygons).sum() / area(ball.vertices, faces)
     assert 0.9 < share < 1  # chords are shorter
     middles = np.array([ball.vertices[polygon].mean(axis=0) for polygon in polygons])
-    assert 1 - np.linalg.norm(middles, axis=1).min() < max(TOLERANCES) * 2
+    assert 1 - np.linalg.norm(middles, axis=1).min() < max(MAX_PANELS_OF) * 2
 
 
 SHELLS = {

@@ -207,6 +207,15 @@ def test_light_is_that_of_the_twin(is_two_sided, device):
     np.testing.assert_allclose(got, expected, atol=FLOAT32 * expected.max())
 
 
+def test_batches_that_differ_are_named_by_their_blockers(device):
+    transmittance = {
+        name: wp.zeros((count, 3, 64), dtype=wp.float32, device=device)
+        for name, count in (("log_of_spheres", 2), ("transmittance_self", 3))
+    }
+    with pytest.raises(ValueError, match="^own body: got a batch of 3, expected 1 or 2, as spheres has"):
+        light.find_transmittance_to_samples(**transmittance)
+
+
 def test_spheres_block_as_the_twin_does(device):
     points, normals, arrays = receivers(device)
     samples = samples_of(BALL, device)

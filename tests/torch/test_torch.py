@@ -467,11 +467,14 @@ def test_a_tensor_that_changes_before_backward_is_noticed(renderer):
         loss.backward()
 
 
-def test_geometry_that_rays_would_have_to_follow_is_refused():
+def test_geometry_and_cameras_that_rays_would_have_to_follow_are_refused():
     renderer = TorchRenderer(small_scene("ray-traced"))
     rotations, translations, scales = renderer.scene_poses()
-    with pytest.raises(ValueError, match="geometry: got arrays that require a gradient"):
-        renderer(geometry=renderer.placed(rotations, translations.requires_grad_(), scales))
+    clip_matrix = torch.tensor(renderer.scene.camera.clip_matrix(), dtype=torch.float32, requires_grad=True)
+    geometry = renderer.placed(rotations, translations.requires_grad_(), scales)
+    for inputs in ({"geometry": geometry}, {"clip_matrices": clip_matrix}):
+        with pytest.raises(ValueError, match="^geometry, clip_matrices: got arrays that require a gradient"):
+            renderer(**inputs)
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,7 @@ def find_convex_parts(
         is cut if it is one, with holes or without, or the segments of a bent tube; panels for each open one. They come
         by pieces, and in each the seams come last. Panels of sheets that share edges are of one piece. None where a
         closed piece is hollow or curved otherwise, where a part has more than 64 faces, or where there are more than 32
-        prisms of a piece, 128 segments or 144 panels, 256 of leaves.
+        prisms of a piece, 128 segments of all tubes, or 144 panels (256 of leaves, 64 flat ones).
     """
     _, first, vertex = np.unique(positions, axis=0, return_index=True, return_inverse=True)
     triangles = vertex.reshape(-1)[faces]

@@ -7,7 +7,10 @@ import numpy as np
 from warpshadow.maths.adjacency import edges_of
 
 _MAX_TURN = 0.5  # cosine of the angle, 60°, by which a collapse may turn a triangle
-_SLIVER = 0.1  # height over the longest side of triangles that no collapse makes half as thick
+_SLIVER = 0.1
+"""Height over the longest side of a triangle below which a collapse may leave it only if it is more than half of that
+before."""
+
 _RIM_WEIGHT = 0.1
 """Weight of planes upright on the rim. With 1 a shell whose rim has many teeth has a panel at each."""
 
@@ -23,9 +26,10 @@ def decimate(points: np.ndarray, triangles: np.ndarray, tolerance: float) -> np.
 
     Vertices go to neighbors, so that those that are left do not move. The cost of a collapse is the mean squared
     distance of where the vertex goes to from the planes of the triangles around all vertices that have come there
-    [Garland and Heckbert 1997: quadric error metrics]. At the rim, planes upright on it count a tenth, and the area
-    that is taken away counts over the length of the rim, but for the area that is added: teeth are cut at their middle.
-    Many edges collapse at once, far from each other. Of a large mesh a sample is taken first: the triangles between the
+    [Garland and Heckbert 1997: quadric error metrics]. At the rim, planes upright on it count a tenth, and a
+    collapse along it also costs (A / l)²: A is the area that it and earlier ones took from the surface there, less the
+    area that they added, l the length of the rim at both vertices. So a row of teeth is cut at its mean height. Many
+    edges collapse at once, far from each other. Of a large mesh a sample is taken first: the triangles between the
     Voronoi cells of some vertices.
 
     Args:
@@ -53,24 +57,26 @@ def decimate(points: np.ndarray, triangles: np.ndarray, tolerance: float) -> np.
         new_areas = _removed_areas(positions, faces, begin, end)
         shifts = removed_areas[begin] + removed_areas[end] + new_areas
         costs += (shifts / np.maximum(rim_lengths[begin] + rim_lengths[end], 1e-30)) ** 2 * (new_areas != 0)
-        cheap = np.flatnonzero(costs <= tolerance**2)
-        cheap = cheap[np.argsort(costs[cheap], kind="stable")]
-        best = _first_of_each(begin, cheap)
-        valid = best[_keeps_sides(positions, faces, begin[best], end[best])]
-        if 2 * len(valid) < len(best):
-            valid = _first_of_each(begin, cheap[_keeps_sides(positions, faces, begin[cheap], end[cheap])])
-        if not len(valid):
+        affordable = np.flatnonzero(costs <= tolerance**2)
+        affordable = affordable[np.argsort(costs[affordable], kind="stable")]
+        cheapest = _first_of_each(begin, affordable)
+        allowed = cheapest[_keeps_sides(positions, faces, begin[cheapest], end[cheapest])]
+        if 2 * len(allowed) < len(cheapest):
+            allowed = _first_of_each(
+                begin, affordable[_keeps_sides(positions, faces, begin[affordable], end[affordable])]
+            )
+        if not len(allowed):
             return used_points[faces]
-        valid = valid[: max(len(valid) // 2, 32)]
-        chosen = valid[_far_apart(faces, begin[valid], generator.permutation(len(valid)), len(positions))]
+        allowed = allowed[: max(len(allowed) // 2, 32)]
+        chosen = allowed[_far_apart(faces, begin[allowed], generator.permutation(len(allowed)), len(positions))]
         begin, end, new_areas = begin[chosen], end[chosen], new_areas[chosen]
         quadrics[end] += quadrics[begin]
         areas[end] += areas[begin]
         rim_lengths[end] += rim_lengths[begin]
         removed_areas[end] += removed_areas[begin] + new_areas
-        place = np.arange(len(positions))
-        place[begin] = end
-        faces = place[faces]
+        moved_to = np.arange(len(positions))
+        moved_to[begin] = end
+        faces = moved_to[faces]
         faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
 
 
@@ -180,14 +186,14 @@ def _collapses(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     adjacency = csr_matrix((np.ones(len(begin), np.int32), (begin, end)), (count, count))
     common_neighbors = np.asarray((adjacency @ adjacency)[begin, end]).ravel()
     counts = np.tile(counts, 2)
-    stays = (
+    is_barred = (
         np.tile(is_lone, 2)
         | is_fixed[begin]
         | is_fixed[end]
         | (common_neighbors != counts)
         | ((borders_at[begin] > 0) & (counts != 1))
     )
-    return begin[~stays], end[~stays]
+    return begin[~is_barred], end[~is_barred]
 
 
 def _keeps_sides(positions: np.ndarray, faces: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -198,8 +204,8 @@ def _keeps_sides(positions: np.ndarray, faces: np.ndarray, begin: np.ndarray, en
     collapse = np.repeat(np.arange(len(begin)), counts)
     item = np.arange(len(collapse)) - np.repeat(np.cumsum(counts) - counts, counts)
     before = faces[permutation[first[begin[collapse]] + item] // 3]
-    stays = (before != end[collapse, None]).all(axis=1)
-    before, collapse = before[stays], collapse[stays]
+    is_left = (before != end[collapse, None]).all(axis=1)
+    before, collapse = before[is_left], collapse[is_left]
     after = np.where(before == begin[collapse, None], end[collapse, None], before)
     normals, new_normals = _normals(positions, before), _normals(positions, after)
     doubles, new_doubles = np.linalg.norm(normals, axis=1), np.linalg.norm(new_normals, axis=1)

@@ -13,11 +13,12 @@ from warpshadow.maths.outline import cut_outline, find_outline
 from warpshadow.maths.plane import is_flat, principal_axes
 from warpshadow.maths.polygons import join_triangles
 
-TOLERANCES = {0.007: 40, 0.02: 64, 0.03: 96, 0.04: 144}
-"""Thickness and mean gap of a panel at most, over the scale of its sheet, and panels of a mesh at most: the first with
-which there are no more. An icosphere without a fifth has 90 to 120; a bunny would have 190, and has spheres."""
+MAX_PANELS_OF = {0.007: 40, 0.02: 64, 0.03: 96, 0.04: 144}
+"""How many panels a mesh may have, by their tolerance: thickness and mean gap to the mesh at most, over the scale of
+their sheet. They are tried in order, until the mesh has no more. An icosphere without a fifth has 90 to 120; a bunny
+would have 190, and has spheres."""
 
-FLAT = {1e-3: 64}
+MAX_FLAT_PANELS_OF = {1e-3: 64}
 """The same for flat panels, which shade nothing that lies on the mesh."""
 
 MAX_LEAVES = 256
@@ -65,7 +66,9 @@ def find_panels(
                 exact, maximum = exact + polygons, maximum - len(polygons)
                 del regions[number], deviations[number]
         if max(deviations, default=0.0) <= tolerance:
-            return exact + [_outline(points, panel, tolerance / 2) for panel in _joined(points, regions, tolerance)]
+            return exact + [
+                _outline(points, panel, tolerance / 2) for panel in _join_regions(points, regions, tolerance)
+            ]
         triangles = np.concatenate(regions)
     if not decimates:
         return None
@@ -87,14 +90,14 @@ def find_panels_of_sheets(
 
     Returns:
         Corners of the panels of each sheet, as of :func:`find_panels`; None where there are more than 144, or 256 where
-        no sheet is decimated.
+        no sheet is decimated; of flat ones than 64.
     """
     size = np.ptp(points, axis=0).max()
     extents = np.array([np.ptp(points[sheet.ravel()], axis=0).max() for sheet in sheets])
     scales = np.minimum(np.sqrt(extents * size), _MAX_SCALE * extents).tolist()
-    trials = [(*item, not flat) for item in (FLAT if flat else TOLERANCES).items()]
+    trials = [(*item, not flat) for item in (MAX_FLAT_PANELS_OF if flat else MAX_PANELS_OF).items()]
     if not flat:
-        trials.append((max(TOLERANCES), MAX_LEAVES, False))
+        trials.append((max(MAX_PANELS_OF), MAX_LEAVES, False))
     for tolerance, maximum, decimates in trials:
         panels: list[list[np.ndarray]] = []
         for sheet, scale in zip(sheets, scales, strict=True):
@@ -144,7 +147,7 @@ def _deviation(points: np.ndarray, region: np.ndarray) -> float:
     return float(max(np.ptp(local_points[..., 2]), (outline.volume - area) / np.ptp(flat[..., 0])))
 
 
-def _joined(points: np.ndarray, regions: list[np.ndarray], tolerance: float) -> list[np.ndarray]:
+def _join_regions(points: np.ndarray, regions: list[np.ndarray], tolerance: float) -> list[np.ndarray]:
     """Join regions that share an edge and make one panel."""
     panels: list[np.ndarray] = []
     for region in regions:

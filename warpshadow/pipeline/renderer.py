@@ -325,7 +325,7 @@ class SceneRenderer:
             inputs: All that an image takes.
         Returns:
             Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]; the background is 0.
-        Differentiable: all; not by "ray-traced": geometry, shell.
+        Differentiable: all; not by "ray-traced": geometry, clip_matrices, shell.
         """
         return self.draw_inputs(inputs, inputs.view)
 
@@ -468,7 +468,7 @@ class SceneRenderer:
             inputs: All that an image takes.
         Returns:
             The stages, which print as a table: whether each runs and on how many items, how long it took last, and why
-            it does or does not run; then the same of the adjoints. Nothing is computed.
+            it does or does not run; then the same of the adjoints. Nothing of the call is computed.
         """
         return self.explain_inputs(inputs, inputs.view)
 

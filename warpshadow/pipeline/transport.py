@@ -13,9 +13,10 @@ and where bodies and cameras are:
 | free | some | any | the scene's | static patches | static patches |
 | free | some | any | given | moving patches | static patches |
 
-The first two rows are :meth:`.Method.direct_shading`, the others :func:`choose_bouncing`. Static patches cache form
-factors, after which an iteration is small matrices; moving ones find all but cached visibility in each call. A shell is
-part of the light. Light of emitters is added here; the radiance that they show, and gloss, in :meth:`.View.image`.
+Cameras are the scene's where a call gives none and the renderer has one. The first two rows are
+:meth:`.Method.direct_shading`, the others :func:`choose_bouncing`. Static patches cache form factors, after which an
+iteration is small matrices; moving ones find all but cached visibility in each call. A shell is part of the light.
+Light of emitters is added here; the radiance that they show, and gloss, in :meth:`.View.image`.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def choose_bouncing(
     Args:
         is_free: Whether the light is free.
         is_given: Whether some reflectance is given in place of the scene's.
-        is_of_scene: Whether bodies and cameras are where the scene has them, for good, and no shell moves.
+        is_of_scene: Whether bodies and the only camera are where the scene has them, for good, and no shell moves.
         spheres_stand_in, shares_directions: Of the method.
     """
     if spheres_stand_in:

@@ -61,18 +61,12 @@ class Renderer(renderer.SceneRenderer):
 def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = True) -> np.ndarray:
     """Render a scene once; for several images of it, keep a :class:`Renderer`.
 
-    Where the scene names no method, and no settings or spheres that "directional" alone reads, this is by rays that all
-    pixels share (:func:`.receivers.choice_of_receivers.for_picture`): nothing is fitted or tabulated first,
-    and the image does not depend on the content of the cache. Light that bounces goes between patches, by rays, too. A
-    :class:`Renderer` is by "directional" then, and its images differ from this by that method's error, of which
-    pipeline/README.md has figures. A method that is named gives the same method in both: ``Visibility("directional")``,
-    or ``Visibility("ray-traced", sampling="shared")``, which this takes.
-
-    By "directional" flat bodies, such as grounds, are shaded by pixel unless they say otherwise, so that shadows have
-    smooth edges there; under a sun so are all, and their pixels find by rays where they lie in their own body's shadow.
-    A renderer has vertices, which take less time, where faces are small: its own :meth:`Renderer.render`
-    is the image to compare with its others. With ``Body(…, receivers="pixel")`` and ``Visibility(self_shadows="rays")``
-    both are the same.
+    This is a still: by rays that all pixels share, unless the scene names another method; a :class:`Renderer` is by
+    "directional" then. "Stills and renderers" in pipeline/README.md says when, and by how much both images differ. A
+    method that is named gives the same method in both: ``Visibility("directional")``, or ``Visibility("ray-traced",
+    sampling="shared")``, which this takes. By "directional" receivers differ still
+    (:func:`.receivers.choice_of_receivers.for_picture`): with ``Body(…, receivers="pixel")`` and
+    ``Visibility(self_shadows="rays")`` both are the same.
 
     Returns:
         Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4]; the background is 0.

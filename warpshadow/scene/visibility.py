@@ -82,7 +82,7 @@ class Visibility:
             visibility of the meshes, the reference. "auto" leaves the choice to
             :func:`warpshadow.tuning.tune.resolved`. None, where nothing is named: "directional" for renderers, fits and
             data sets, and for stills, as by :func:`warpshadow.render`, rays that all receivers share, which need
-            neither spheres nor tables. A setting that "directional" alone reads names it.
+            neither spheres nor tables. A setting that "ray-traced" does not read names "directional".
         directions: Number of direction cells of "directional", a multiple of 16. None, the default, for 128, and for
             256 in scenes with narrow lobes (:attr:`.Scene.direction_count`).
         softness: κ of "directional": half-width of a shadow's soft edge in cell radii.

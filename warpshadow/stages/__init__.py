@@ -1,4 +1,4 @@
-"""The paper's stages: functions of Warp's arrays, to be composed as :class:`warpshadow.Renderer` composes them.
+"""Stages of an image: functions of Warp's arrays, to be composed as :class:`warpshadow.Renderer` composes them.
 
 A module here is a stage, or code that stages share; README.md lists them in their order, and ``facade.py`` the names
 that this package exports. All of them are imported when the first is asked for: a stage alone costs its own module.

@@ -19,11 +19,14 @@ from warpshadow.pipeline.image_inputs import ImageInputs
 from warpshadow.torch.autograd import apply, as_array, check_float32, is_capturing
 from warpshadow.torch.replay import Replays
 
-_REUSED = ("geometry.", "clip_matrices")  # tensors about which a renderer caches results while they stay the same
+_CACHED_BY_VALUE = (
+    "geometry.",
+    "clip_matrices",
+)  # tensors about which a renderer caches results while they stay the same
 
 
 class Slot(NamedTuple):
-    """Place of a tensor in an input of a function, which its array takes."""
+    """Stands for the tensor of this number until its array is put there."""
 
     number: int
 
@@ -71,17 +74,19 @@ class Arguments:
         count = self._common_batch()
         self.tensors = [tensor.expand(count, *tensor.shape[1:]) for tensor in self.tensors]
 
-    def add_geometry(self, name: str, geometry: Geometry[torch.Tensor], like: Geometry[wp.array]) -> Geometry[Slot]:
-        """Add the tensors of a geometry, of which arrays there are as many items as of another."""
-        geometry, like_arrays = as_geometry(name, geometry), like.arrays()
+    def add_geometry(
+        self, name: str, geometry: Geometry[torch.Tensor], own_geometry: Geometry[wp.array]
+    ) -> Geometry[Slot]:
+        """Add the tensors of a geometry, which has as many items as the scene's own geometry."""
+        geometry, own_arrays = as_geometry(name, geometry), own_geometry.arrays()
         slots = {
-            part: self.add(f"{name}.{part}", tensor, GEOMETRY_DTYPES[part], like_arrays[part].shape[1:], PLACED)
+            part: self.add(f"{name}.{part}", tensor, GEOMETRY_DTYPES[part], own_arrays[part].shape[1:], PLACED)
             for part, tensor in geometry.arrays().items()
         }
         rotations = None
         if geometry.rotations is not None:
-            assert like.rotations is not None
-            rotations = self.add(f"{name}.rotations", geometry.rotations, wp.mat33, like.rotations.shape[1:])
+            assert own_geometry.rotations is not None
+            rotations = self.add(f"{name}.rotations", geometry.rotations, wp.mat33, own_geometry.rotations.shape[1:])
         return Geometry(**slots, rotations=rotations, moving=geometry.moving, deformed=geometry.deformed)
 
     def filled(self, value: Any) -> Any:
@@ -106,7 +111,7 @@ class Arguments:
         self._common_batch()
         find_capture = None
         if replays is not None:
-            reused = [number for number, name in enumerate(self.names) if name.startswith(_REUSED)]
+            reused = [number for number, name in enumerate(self.names) if name.startswith(_CACHED_BY_VALUE)]
             find_capture = functools.partial(replays.find, tuple(map(_key, inputs)), reused)
         results = apply(
             lambda *arrays: function(*(_filled(value, arrays) for value in inputs)),
@@ -144,14 +149,14 @@ class Arguments:
         return common_batch({"cameras": self._cameras, **dict(zip(self.names, self.tensors, strict=True))})
 
 
-class _Same:
+class _ById:
     """A value that equals itself alone."""
 
     def __init__(self, value: object):
         self._value = value
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and self._value is other._value
+        return isinstance(other, _ById) and self._value is other._value
 
     def __hash__(self) -> int:
         return id(self._value)
@@ -165,7 +170,7 @@ def _key(value: Any) -> Hashable:
         return *value.arrays().values(), value.rotations, value.moving, value.deformed
     if isinstance(value, ImageInputs):
         return tuple(map(_key, vars(value).values()))
-    return tuple(map(_key, value)) if isinstance(value, list) else _Same(value)
+    return tuple(map(_key, value)) if isinstance(value, list) else _ById(value)
 
 
 def _filled(value: Any, arrays: Sequence[wp.array]) -> Any:

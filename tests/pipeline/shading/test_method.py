@@ -8,7 +8,7 @@ import pytest
 from warpshadow.pipeline.methods.directional import Directional
 from warpshadow.pipeline.methods.log_sh import LogSH
 from warpshadow.pipeline.methods.none import NoShadows
-from warpshadow.pipeline.methods.ray_traced import Rays
+from warpshadow.pipeline.methods.ray_traced import RayTraced
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.pipeline.shading.sphere_method import SphereMethod
 
@@ -33,13 +33,13 @@ def test_the_table_of_members_says_which_have_a_default(kind):
     assert {name for name, default in defaults.items() if default == "refused"} == refused
 
 
-@pytest.mark.parametrize("kind", [Directional, LogSH, NoShadows, Rays])
+@pytest.mark.parametrize("kind", [Directional, LogSH, NoShadows, RayTraced])
 def test_each_method_gives_what_is_always_needed(kind):
     assert not kind.__abstractmethods__
 
 
 def test_a_method_that_lacks_a_member_is_refused_when_it_is_made():
-    class Half(Rays):
+    class Half(RayTraced):
         emitted_light = Method.emitted_light
 
     with pytest.raises(TypeError, match="emitted_light"):

@@ -47,7 +47,7 @@ class Sun(Free):
     Args:
         direction: Towards the sun, of any length, shape [3].
         irradiance: Of a surface that faces it, one number or RGB, positive.
-        angular_radius: Of the disc [degrees]; kept where it is below the resolution and so is the fitted one.
+        angular_radius: Of the disc [degrees]; kept, up to the resolution, where the fitted one is below 1.2 times that.
         directions: Number of cells.
     """
 

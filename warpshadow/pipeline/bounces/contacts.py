@@ -8,7 +8,7 @@ import itertools
 import numpy as np
 import warp as wp
 
-from warpshadow.maths.contacts import MAX_GAP, Contact, touching_points
+from warpshadow.maths.contacts import MAX_GAP, Contact, touching_numbers
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.scene.body import Body
 from warpshadow.stages.bounces.gaps import find_gaps
@@ -58,10 +58,10 @@ def find_contacts(merged_scene: MergedScene) -> list[list[Contact]]:
     for pair in itertools.combinations(range(len(bodies)), 2):
         if is_flat[list(pair)].all():
             continue
-        # distances are of the vertices of the finer one
+        # distances are from the vertices of the one that is not flat; of two such, of the one with more
         first, second = sorted(pair, key=lambda number: (is_flat[number], -len(surfaces[number].points)))
         half_size = min(surfaces[number].half_size for number in pair if not is_flat[number])
-        points = _touching_points(surfaces[first], surfaces[second], half_size)
+        points = _find_touching_points(surfaces[first], surfaces[second], half_size)
         if len(points):
             for number in pair:
                 body = bodies[number]
@@ -69,7 +69,7 @@ def find_contacts(merged_scene: MergedScene) -> list[list[Contact]]:
     return contacts
 
 
-def _touching_points(surface: _Surface, other: _Surface, half_size: float) -> np.ndarray:
+def _find_touching_points(surface: _Surface, other: _Surface, half_size: float) -> np.ndarray:
     """Vertices of a surface that touch another one, [point, 3]."""
     margin = MAX_GAP * half_size
     if not ((surface.low <= other.high + margin) & (other.low <= surface.high + margin)).all():
@@ -77,4 +77,4 @@ def _touching_points(surface: _Surface, other: _Surface, half_size: float) -> np
     is_near = ((surface.points >= other.low - margin) & (surface.points <= other.high + margin)).all(axis=1)
     gaps = np.full(len(surface.points), np.inf)
     gaps[is_near] = find_gaps(other.mesh, surface.points[is_near], surface.normals[is_near], margin)
-    return surface.points[touching_points(gaps, surface.areas, half_size)]
+    return surface.points[touching_numbers(gaps, surface.areas, half_size)]

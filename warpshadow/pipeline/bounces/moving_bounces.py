@@ -61,7 +61,7 @@ class PortionDirectLight(NamedTuple):
 def _visibility_of(method: SphereMethod, portion: LitPortion) -> PortionVisibility:
     """Visibility of a portion for direct and bounced light, given its transfer vectors."""
     cells = find_cell_transmittance(method, portion.group, portion.visibility, portion.spheres)
-    return PortionVisibility(portion.light, portion.group, cells)
+    return PortionVisibility(portion.result, portion.group, cells)
 
 
 class PortionedDirectLight(Node):

@@ -112,7 +112,7 @@ class ScenePatches:
             return None
         bodies = self.merged_scene.scene.bodies
         points = np.concatenate([body.world_points() for n, body in enumerate(bodies) if n not in self.planes])
-        is_large = contacts[0].size * bodies[number].scale >= _MIN_CONTACT_SIZE * np.ptp(points, axis=0).max() / 2
+        is_large = contacts[0].half_size * bodies[number].scale >= _MIN_CONTACT_SIZE * np.ptp(points, axis=0).max() / 2
         return contacts[0] if is_large else None
 
     @functools.cached_property

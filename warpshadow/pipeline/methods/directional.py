@@ -403,7 +403,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         """Shading of a portion, and the transmittance of its cells if its body shines."""
         body = portion.group.body
         is_glossy = body is not None and self.merged_scene.is_glossy[body]
-        return portion.light, _transmittance_of(portion) if is_glossy else None
+        return portion.result, _transmittance_of(portion) if is_glossy else None
 
     def _cell_transmittance(
         self, points: LitPoints, light: LightInput, shaded_points: LitPoints

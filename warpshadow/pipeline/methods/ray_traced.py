@@ -34,7 +34,7 @@ _RAYS_OF_CELL = 4
 _EVEN_RAYS = 128  # directions in which receivers that shine look for how much of the hemisphere is open
 
 
-class Rays(Method):
+class RayTraced(Method):
     """Visibility of the meshes."""
 
     every_sample_receives = True
@@ -270,7 +270,8 @@ def _checked_points(points: wp.array) -> wp.array:
     """Points, which may require no gradient."""
     if points.requires_grad:
         raise ValueError(
-            "geometry: got arrays that require a gradient, which rays do not have; expected none, or another method"
+            "geometry, clip_matrices: got arrays that require a gradient, which rays do not have; expected none, or "
+            "another method"
         )
     return points
 
@@ -290,4 +291,4 @@ def _refuse(*_: object) -> None:
     raise ValueError("light: got free light for moving geometry, which rays cannot shade; expected known light")
 
 
-METHOD = Rays
+METHOD = RayTraced

@@ -1,8 +1,8 @@
 """Adaptive receivers: on flat bodies, close to each other where shadows have edges, far apart elsewhere.
 
 Edges of shadows are sharp where light comes from few cells: a sun's, or else the brightest. Only these cells are found
-at the probes of a quadtree (:mod:`warpshadow.stages.receivers.quadtree`), an eighth of all cells at a quarter of the
-pixels.
+at the probes of a quadtree (:mod:`warpshadow.stages.receivers.quadtree`): 16 of them at a quarter of the pixels, or in
+small images at all.
 """
 
 import functools

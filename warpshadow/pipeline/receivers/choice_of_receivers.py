@@ -163,11 +163,11 @@ def for_picture(scene: Scene) -> Scene:
 
     By other methods flat bodies that leave their receivers open are shaded by pixel, unless spheres bulge out of them.
 
-    Interpolation between the vertices of a ground makes shadows' edges jagged. Under a sun so are all other bodies, and
-    where their shadows on themselves are "traced", a sun's are found by "rays", as nobody asks for a gradient: edges
-    are as clean as of ``ray-traced``. At 768 × 768 pixels, under a sun of 1° radius, at vertices, by pixel, and by
-    pixel with rays, the cow of 2930 vertices is 3.4, 2.0 and 1.2% off (0.13, 0.31 and 0.35 s), a bear of 1986 vertices
-    7.3, 3.6 and 1.9% (0.11, 0.20 and 0.34 s).
+    Interpolation between the vertices of a ground makes shadows' edges jagged. Under a sun all other bodies are shaded
+    by pixel, too, and ``self_shadows`` "traced" becomes "rays", which have no gradient: of a still nobody asks for one.
+    Edges are as clean as of ``ray-traced``. At 768 × 768 pixels, under a sun of 1° radius, at vertices, by pixel, and
+    by pixel with rays, the cow of 2930 vertices is 3.4, 2.0 and 1.2% off (0.13, 0.31 and 0.35 s), a bear of 1986
+    vertices 7.3, 3.6 and 1.9% (0.11, 0.20 and 0.34 s).
     """
     if scene.visibility.method is None:
         if not any(isinstance(body.blockers, Spheres) or body.self_shadows for body in scene.bodies):

@@ -343,7 +343,7 @@ def _find_transmittances(
 ) -> Iterator[tuple[EmitterSpan, wp.array | None]]:
     """Samples of all emitters that light a portion of receivers, and the transmittance to them.
 
-    The receivers' own body is among them if it is not convex.
+    An emitter lights itself, too, unless it hides nothing of itself: then no part of it faces another.
     """
     merged_scene, points, normals = blockers.merged_scene, group.points, group.normals
     if not points.size:
@@ -377,7 +377,7 @@ def _find_transmittances(
                 towards = find_directions_to_samples(points, placed_samples, span)
                 transmittance_self = interpolate_transmittance(cells, normals, towards, EMITTER_CELLS)
             if is_within.any():
-                # cells look to infinity: a bulb in a shade would be hidden by the shade's other side
+                # cells tell whether rays leave the body: a bulb in a shade would be hidden by the shade's far side
                 with unrecorded():
                     arguments = own_meshes(), points, normals, emitters, blockers.positions, placed_samples, span
                     traced = trace_transmittances(*arguments, rays=1)

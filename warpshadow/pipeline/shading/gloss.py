@@ -85,8 +85,8 @@ class GlossyPoints(LitPoints):
             openness: Of the view, as of :meth:`.LightTransport.openness`.
         """
         item_text = functools.partial(receiver_text, self.weak)
-        numbers = {name: self._find_numbers(materials, name) for name in GLOSS_ARGUMENTS}
-        roughness = numbers["roughness"]
+        values = {name: self._find_values(materials, name) for name in GLOSS_ARGUMENTS}
+        roughness = values["roughness"]
         key = materials.roughness
 
         def lobes() -> Node:
@@ -98,18 +98,20 @@ class GlossyPoints(LitPoints):
 
         sampled = self.cached("lobes", key, lobes)
         directions, filters = field_of(sampled, "directions"), field_of(sampled, "filters")
-        source = self.method.light_input(self, light)
-        texels = self.cached("prefiltered", source, lambda: self._prefilter(source))
-        shell, towards = self.method.shell_of(source), directions
+        light_input = self.method.light_input(self, light)
+        texels = self.cached("prefiltered", light_input, lambda: self._prefilter(light_input))
+        shell, exits = self.method.shell_of(light_input), directions
         if shell is not None:
-            towards = Node("", _find_exits, self.receivers_node, directions, shell)
-        radiance = Node("prefiltered light", look_up_light, texels, towards, filters, items=item_text)
-        through = self.method.lobe_transmittance(self, directions, source, view)
+            exits = Node("", _find_exits, self.receivers_node, directions, shell)
+        radiance = Node("prefiltered light", look_up_light, texels, exits, filters, items=item_text)
+        transmittance = self.method.lobe_transmittance(self, directions, light_input, view)
         blocked = None
         if self.merged_scene.scene.bounces:
-            opennesses = None if openness is None else self.select(openness)
-            blocked = self.method.blocked_radiance(self, self.select(bounced), source, view, self.select, opennesses)
-        sums = Node("gloss", sum_lobes, filters, radiance, through, blocked, items=item_text)
+            own_openness = None if openness is None else self.select(openness)
+            blocked = self.method.blocked_radiance(
+                self, self.select(bounced), light_input, view, self.select, own_openness
+            )
+        sums = Node("gloss", sum_lobes, filters, radiance, transmittance, blocked, items=item_text)
         if materials.emission:
             sums = Node("", _add_highlights, sums, self.method.highlights(self, materials, roughness, self._cameras))
         lobe_light = field_of(sums, "straight"), field_of(sums, "grazing")
@@ -118,8 +120,8 @@ class GlossyPoints(LitPoints):
             diffuse,
             *lobe_light,
             field_of(sampled, "cosines"),
-            numbers["metallic"],
-            numbers["specular"],
+            values["metallic"],
+            values["specular"],
         )
         mix = Node("reflection", mix_reflection, *arguments, items=item_text)
         return field_of(mix, "colored"), field_of(mix, "white")
@@ -128,7 +130,7 @@ class GlossyPoints(LitPoints):
         """Select the light on these receivers from that on all receivers of the view; a node."""
         return Node("", _select_glossy, light, detached(self._all_receivers), self.merged_scene.is_glossy)
 
-    def _find_numbers(self, materials: Materials, name: str) -> Node:
+    def _find_values(self, materials: Materials, name: str) -> Node:
         """Node of roughness or the like at the receivers, float32 of shape [batch, receiver]."""
         of_vertices, textures = materials.of_vertices(name), materials.textures_of[name]
         if not textures.images:

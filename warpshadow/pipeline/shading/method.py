@@ -140,7 +140,8 @@ class Method(abc.ABC):
     def is_adaptive(self) -> np.ndarray:
         """Flat bodies on which samples interpolate between receivers, bool of shape [body].
 
-        No body where one emits or light is near: where shadows have edges, nobody knows.
+        No body where one emits or light is near: probes look at the brightest cells of the map, which tell nothing of
+        the shadows of such light.
         """
         adaptive = np.array([body.receivers == "adaptive" for body in self.merged_scene.scene.bodies])
         is_known = not (self.every_sample_receives or self.has_emitters or self.shell is not None)

@@ -243,7 +243,10 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         )
 
     def transfers(self, points: LitPoints, shell: Input | None) -> Node:
-        """Transfer vectors of points to :attr:`basis`; where they vary, to the method's native basis."""
+        """Transfer vectors of points to :attr:`basis`; where they require a gradient, to the method's native basis.
+
+        The product with the matrix between both is NumPy's; :meth:`_free_shading` converts the light instead.
+        """
         matrix, visibility_light = self.native_from_basis, self.free_basis_of(points, shell)
         transfers = PortionedShading(self, points, visibility_light, None, list, caches=matrix is None)
         if matrix is None or transfers.requires_grad:
@@ -260,23 +263,23 @@ class LitPortion(NamedTuple):
 
     group: Group
     visibility: CellVisibility | HarmonicVisibility
-    light: wp.array | None  # shading, or transfer vectors where these are the end; None where visibility is
+    result: wp.array | None  # shading, or transfer vectors where these are the end; None where visibility is
     spheres: tuple[wp.array, wp.array]  # centers and radii of all spheres
 
 
 class PortionedShading(Node):
     """Shading or transfer vectors of receivers, found group by group and portion by portion.
 
-    Its program is :meth:`_light`; each step is a function of the method. Without a gradient, transfer vectors of all
-    receivers are in memory at once only where they are the result: for free light, and in the visibility that bounces
-    cache while colors vary. Receivers with cached rows are one portion.
+    Its program is :meth:`_light_portion`; each step is a function of the method. Without a gradient, transfer vectors
+    of all receivers are in memory at once only where they are the result: for free light, and in the visibility that
+    bounces cache while colors vary. Receivers with cached rows are one portion.
 
     Args:
         points: The receivers.
         projected_light: The light projected for the method.
         light: Known or free light; None where it is not given yet: portions end with transfer vectors.
         finish: Combines the list of results of all portions.
-        result_of: The result of a portion; by default its light.
+        result_of: Takes its part of the results of a portion; by default the last step's.
         end: The last step.
         caches: As for :class:`Node`.
         suffix: Ends the names of its stages, such as " of patch samples"; by default the suffix of the points.
@@ -291,7 +294,7 @@ class PortionedShading(Node):
         light: Input | None,
         finish: Callable[[list[Any]], Any],
         *,
-        result_of: Callable[[LitPortion], Any] = operator.attrgetter("light"),
+        result_of: Callable[[LitPortion], Any] = operator.attrgetter("result"),
         end: Literal["visibility", "transfer", "shading"] = "shading",
         caches: bool = True,
         suffix: str | None = None,
@@ -346,14 +349,14 @@ class PortionedShading(Node):
         total = len(receivers.static_vertices) + receivers.points.shape[1]
         with progress_bar(total, "shading", "receiver", shows=self._progress) as bar:
             for portion in (portion for group in groups for portion in group.portions()):
-                yield self._result_of(self._light(call, portion, projected_light, blockers.spheres))
+                yield self._result_of(self._light_portion(call, portion, projected_light, blockers.spheres))
                 bar.update(portion.points.shape[1])
 
-    def _light(
+    def _light_portion(
         self, call: Call, group: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
     ) -> LitPortion:
-        """From the blockers of a portion to its light, step by step."""
-        method, step, light = self.method, functools.partial(self.timed, call), None
+        """From the blockers of a portion to the result of the last step."""
+        method, step, result = self.method, functools.partial(self.timed, call), None
         with step(self._visibility):
             visibility = method.find_visibility(group, projected_light)
         if group.planes is not None:
@@ -361,15 +364,15 @@ class PortionedShading(Node):
                 visibility = method.find_visibility_past_planes(group, visibility, projected_light)
         if self._needs_transfer:
             with step(self._transfer):
-                light = method.transfer(visibility, group, projected_light)
+                result = method.transfer(visibility, group, projected_light)
         if self._end == "shading":
             with step(self._shading):
-                light = (
+                result = (
                     method.shade_transmittance(visibility, group, projected_light)
-                    if light is None
-                    else method.shade_transfer(light, group, projected_light)
+                    if result is None
+                    else method.shade_transfer(result, group, projected_light)
                 )
-        return LitPortion(group, visibility, light, spheres)
+        return LitPortion(group, visibility, result, spheres)
 
 
 def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:

@@ -47,7 +47,7 @@ class CatchersAlone:
         return self._merged_scene.part(geometry, self._numbers) if has_moved else None
 
     def light(self, inputs: ImageArrays, light: Light | None, view: View) -> wp.array:
-        """Light received by samples of catchers, and whether they see one; vec4, as of :meth:`.view.View.white`.
+        """Light received by samples of catchers, and whether they see one; vec4, as of :meth:`.View.white_samples`.
 
         Args:
             inputs: Of the whole scene, but for the geometry, which is that of the catchers, from

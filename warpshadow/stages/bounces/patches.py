@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.maths.contacts import Contact, contact_density
+from warpshadow.maths.contacts import Contact, contact_excess
 from warpshadow.maths.spatial_sort import compact_order
 from warpshadow.stages.planes.grid import PlaneTexture, find_grid
 from warpshadow.stages.self_visibility.buried import find_buried
@@ -152,7 +152,7 @@ def find_patches(
     if contact_weight > 0:
 
         def to_unit_lengths(points: np.ndarray) -> np.ndarray:
-            density = 1 + contact_weight * contact_density(*_bounding_spheres(points), contacts)
+            density = 1 + contact_weight * contact_excess(*_bounding_spheres(points), contacts)
             return points * np.sqrt(density)[:, None, None] / max_edge
 
         piece_mesh = _cut_faces(positions, faces, to_unit_lengths)
@@ -168,7 +168,7 @@ def find_patches(
             mesh, piece_mesh.pieces.positions(positions, faces), float(_LIFT * half_size)
         )
     labels = np.full(len(areas), -1)
-    density = 1 + contact_weight * contact_density(piece_mesh.centroids, 0.0, contacts)
+    density = 1 + contact_weight * contact_excess(piece_mesh.centroids, 0.0, contacts)
     labels[is_outside] = _cluster(features[is_outside], areas[is_outside], density[is_outside], count)
     front_samples: list[tuple[int, np.ndarray, int, float]] = []
     for patch, members in enumerate(_cluster_members(labels)):
@@ -305,8 +305,8 @@ def _contact_weight(piece_mesh: _PieceMesh, contacts: Sequence[Contact]) -> floa
     areas = np.linalg.norm(piece_mesh.area_vectors, axis=1)
     if not len(contacts) or not len(areas):
         return 0.0
-    mean_density = np.average(contact_density(piece_mesh.centroids, 0.0, contacts), weights=areas)
-    return min(_CONTACT_WEIGHT, _CONTACT_SHARE / mean_density)
+    mean_excess = np.average(contact_excess(piece_mesh.centroids, 0.0, contacts), weights=areas)
+    return min(_CONTACT_WEIGHT, _CONTACT_SHARE / mean_excess)
 
 
 def _bounding_spheres(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

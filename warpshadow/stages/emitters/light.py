@@ -100,7 +100,7 @@ def find_transmittance_to_samples(
     Differentiable: all.
     """
     factors = {"spheres": log_of_spheres, "planes": log_of_planes, "parts": log_of_parts}
-    factors |= {"others": transmittance_self, "emitter": transmittance_of_emitter}
+    factors |= {"own body": transmittance_self, "emitter": transmittance_of_emitter}
     first = next((item for item in factors.values() if item is not None), None)
     if first is None:
         return None
@@ -120,7 +120,7 @@ def find_transmittance_to_samples(
 def _replace_instances(
     # in
     transmittance: wp.array3d(dtype=wp.float32),
-    other: wp.array3d(dtype=wp.float32),
+    replacement: wp.array3d(dtype=wp.float32),
     is_replaced: wp.array(dtype=wp.int32),
     # out
     replaced: wp.array3d(dtype=wp.float32),
@@ -128,28 +128,31 @@ def _replace_instances(
     """A thread owns a receiver and a sample."""
     batch, receiver, i = wp.tid()
     if is_replaced[instance_in(batch, is_replaced.shape[0])] == 1:
-        replaced[batch, receiver, i] = other[instance_in(batch, other.shape[0]), receiver, i]
+        replaced[batch, receiver, i] = replacement[instance_in(batch, replacement.shape[0]), receiver, i]
     else:
         replaced[batch, receiver, i] = transmittance[instance_in(batch, transmittance.shape[0]), receiver, i]
 
 
-def replace_instances(transmittance: wp.array | None, other: wp.array, is_replaced: np.ndarray) -> wp.array:
-    """Take transmittance of other instances, float32 of shape [batch, receiver, sample], where told to, bool [batch].
+def replace_instances(transmittance: wp.array | None, replacement: wp.array, is_replaced: np.ndarray) -> wp.array:
+    """Replace transmittance, float32 of shape [batch, receiver, sample], in some instances, bool of shape [batch].
 
-    Without any transmittance the other is taken everywhere. Differentiable: transmittance, other.
+    Without any transmittance the replacement is taken everywhere. Differentiable: transmittance, replacement.
     """
     if transmittance is None:
-        return other
-    count = common_batch({"cells": transmittance, "rays": other})
-    replaced = empty((count, *other.shape[1:]), dtype=wp.float32, device=other.device)
-    flags = wp.array(is_replaced, dtype=wp.int32, device=other.device)
-    launch(_replace_instances, replaced.shape, inputs=[transmittance, other, flags], outputs=[replaced])
+        return replacement
+    count = common_batch({"cells": transmittance, "rays": replacement})
+    replaced = empty((count, *replacement.shape[1:]), dtype=wp.float32, device=replacement.device)
+    flags = wp.array(is_replaced, dtype=wp.int32, device=replacement.device)
+    launch(_replace_instances, replaced.shape, inputs=[transmittance, replacement, flags], outputs=[replaced])
     return replaced
 
 
 @wp.func
-def nearness(beam: wp.vec3, area: wp.vec3, elongation: float, normal: wp.vec3):
-    """How much a receiver sees a sample's pieces: 1 up to 1.9 half diagonals away, 0 from 4 on or below its horizon."""
+def weight_of_pieces(beam: wp.vec3, area: wp.vec3, elongation: float, normal: wp.vec3):
+    """Weight of a sample's pieces in its light: 1 up to 1.9 half diagonals away, 0 from 4 on.
+
+    It falls to 0, too, as the sample's middle sinks from √|A| / 2 to √|A| below the receiver's horizon.
+    """
     size = wp.length(area)
     near = 1.0 - wp.smoothstep(3.5, 16.0, wp.length_sq(beam) / (elongation * size))
     return near * wp.smoothstep(-1.0, -0.5, wp.dot(beam, normal) / wp.sqrt(size))
@@ -213,7 +216,7 @@ def _sum_light(
                 beam, area, softness[first_sample + i], is_two_sided
             )
             factor = factor / (distance2 * wp.sqrt(wp.pi * wp.pi * distance2 * distance2 + wp.length_sq(area)))
-            near = nearness(beam, area, elongations[first_sample + i], normal)
+            near = weight_of_pieces(beam, area, elongations[first_sample + i], normal)
             if near > 0.0:
                 factor = factor * (1.0 - near)
                 factor += near * _light_of_pieces(

@@ -51,7 +51,7 @@ _TRIANGLE_POINTS = np.full((3, 3), 1 / 6) + np.eye(3) / 2
 
 
 class SurfacePoints(NamedTuple):
-    """Points on the surface of an emitter, spread evenly over each sample, on a curve: so is every nth of them."""
+    """Points on the surface of an emitter, spread evenly over each sample, in Z-order: so is every nth of them."""
 
     faces: np.ndarray  # face of the emitter that each lies on, int32 of shape [sample, point]
     weights: np.ndarray  # barycentric coordinates in it, float32 of shape [sample, point, 3]
@@ -374,7 +374,11 @@ def _soft_positive(value: float, width: float):
 
 @wp.func
 def may_light(beam: wp.vec3, area: wp.vec3, normal: wp.vec3, is_two_sided: int):
-    """Whether a part of a sample may light a receiver, which its middle need not: near its horizon, or at its rim."""
+    """Whether a part of a sample may light a receiver, even if its middle does not.
+
+    Not if the middle is √|A| or more below the receiver's horizon, nor, unless two-sided, if the receiver is behind the
+    sample's plane by a sine of 0.3 or more.
+    """
     size = wp.length(area)
     is_above = wp.dot(beam, normal) > -wp.sqrt(size)
     return is_above and (wp.dot(beam, area) < _MAX_SOFTNESS * size * wp.length(beam) or is_two_sided == 1)

@@ -20,7 +20,9 @@ so that ∫ f L c dω = Σ w L, and the light of F₀ + (1 − F₀)(1 − v·h)
 for a solid angle of 1 / (N p), p = D / (2 (μ + Λ)), so it looks up light that is blurred by a Gaussian of as large
 a solid angle, 2π σ² [Křivánek and Colbert 2008, Real-time Shading with Filtered Importance Sampling]:
 
-    σ = (|W⁻¹h_t|² + (n·h)²) √(|W| (μ + Λ) / N).
+    σ = (|W⁻¹h_t|² + (n·h)²) √(|W| (μ + Λ) / N) K^(−1/5),
+
+where each of the K samples of a pixel may be a receiver, with N samples of the lobe each.
 """
 
 import functools

@@ -53,15 +53,15 @@ def _sum_lobes(
     filter_batch = instance_in(batch, filters.shape[0])
     light_batch = instance_in(batch, light.shape[0])
     transmittance_batch = instance_in(batch, transmittance.shape[0])
-    instead = wp.vec3()
+    blocked_radiance = wp.vec3()
     if blocked_light:
-        instead = blocked_light[instance_in(batch, blocked_light.shape[0]), receiver]
+        blocked_radiance = blocked_light[instance_in(batch, blocked_light.shape[0]), receiver]
     lobe_sum = wp.vec3()
     total_grazing = wp.vec3()
     for i in range(filters.shape[2]):
         weight = filters[filter_batch, receiver, i]
         share = transmittance[transmittance_batch, receiver, i]
-        radiance = share * light[light_batch, receiver, i] + (1.0 - share) * instead
+        radiance = share * light[light_batch, receiver, i] + (1.0 - share) * blocked_radiance
         lobe_sum += weight[0] * radiance
         total_grazing += weight[1] * radiance
     straight[batch, receiver] = lobe_sum

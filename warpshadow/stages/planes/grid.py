@@ -151,7 +151,7 @@ def find_grid(
     count = _GRID
     if contact is not None:
         center, count = contact.points.mean(axis=0) @ frame.T[:, :2], _GRID_OF_CONTACT
-        spread = min(_CONTACT_SPREAD * contact.size, spread)
+        spread = min(_CONTACT_SPREAD * contact.half_size, spread)
     origin = frame.T @ [*center, points[:, 2].mean()]
     low, high = squeezed((low - center) / spread), squeezed((high - center) / spread)
     width, height = np.maximum(np.rint(count * (high - low) / (high - low).max()), 1).astype(int)

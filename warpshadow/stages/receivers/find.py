@@ -29,10 +29,10 @@ _MARK_COST = 5.0  # nanoseconds that a sample takes, to mark the corners of its 
 class Receivers(NamedTuple):
     """Receivers of every instance.
 
-    The first receivers are vertices of static bodies: they have indices, but no points and normals here. A sample of a
-    pixel with a receiver r of its own sees a face (r, r, r), which follows the mesh's faces; after these come the
-    triangles of receivers in which samples interpolate. The others are vertex receivers, then sample receivers;
-    a side of −1 is no receiver.
+    The first receivers are vertices of static bodies: they have indices, but no points and normals here. The others are
+    vertex receivers, then sample receivers. ``faces`` has three receivers a row: rows of the mesh's faces, or sides; a
+    row (r, r, r) for each sample receiver r; the triangles in which samples interpolate. ``fragments`` name these rows
+    in place of the mesh's faces; a side of −1 is no receiver.
     """
 
     points: wp.array  # [batch, receiver − on static] vec3

@@ -9,7 +9,7 @@ two triangles a b c and d c b, in which samples interpolate linearly.
 A square is *accepted* if its corners see one side of one body, and samples within it would be off by less than the
 tolerance. Samples within it that see another side, or whose pixel is in no accepted square, are receivers themselves.
 
-With squares of a pixel in their place the ground of a barn was 26% off, so 12%.
+(Were these in squares of a pixel instead, the ground of a barn would be 26% off, not 12%.)
 """
 
 import functools

@@ -41,8 +41,8 @@ class Threshold(NamedTuple):
 
 THRESHOLDS = {"quadratic": Threshold(1.0, 1.0), "linear": Threshold(0.12, 1.0), "optimal_linear": Threshold(0.12, 2.0)}
 """Base approximations of the exponential. Beyond the limits, plain squaring explodes: for `quadratic` the error is
-3-fold at twice its limit and 200-fold at four times. At the defaults irradiance is within 0.1% (`quadratic`), 0.7%
-(`linear`) and 4% (`optimal_linear`, whose table of single caps fits a sum of many spheres badly) of the converged."""
+3-fold at twice its limit and 200-fold at four times. "Numbers" in stages/README.md has the errors at the defaults; that
+of `optimal_linear` is largest, as its table of single caps fits a sum of many spheres badly."""
 
 MIN_THRESHOLD = 0.01  # squarings amplify float32 rounding 2^p times; below this they cost more digits than they give
 MAX_SQUARINGS = 20  # limit of the squarings; a log that asks for more is cut down to it
