@@ -381,6 +381,16 @@ def test_explanations_tell_of_emitters():
     assert "64 samples" in str(ws.Renderer(scene_of()).explain())
 
 
+@pytest.mark.parametrize("method", ["directional", "ray-traced"])
+def test_samples_of_lamps_are_found_when_an_image_is_computed_not_while_its_nodes_are_made(method):
+    renderer = ws.Renderer(scene_of(visibility=ws.Visibility(method)))
+    view, emitters = renderer.view(), renderer._method.emitters
+    image = view.image(None, view.materials)
+    assert "samples" not in vars(emitters) and "self_visibility" not in vars(emitters)
+    image.value(view.call)
+    assert "samples" in vars(emitters)
+
+
 def test_the_shadow_of_a_scene_is_that_of_its_map():
     np.testing.assert_allclose(
         ws.Renderer(scene_of()).shadow(),

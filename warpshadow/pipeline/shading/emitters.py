@@ -138,8 +138,7 @@ class SceneEmitters:
 
     def shown(self, emission: Node, fragments: Node, vertices: Input, cameras: Input, placed: Node) -> Node:
         """Node of the emission that samples of an image show, given all of it, vec3 of shape [batch, height, width]."""
-        merged_scene, beams = self._merged_scene, self.samples.beams
-        assert beams is not None
+        merged_scene = self._merged_scene
 
         def show(
             emission: wp.array,
@@ -148,6 +147,8 @@ class SceneEmitters:
             cameras: wp.array,
             placed_samples: PlacedSamples,
         ) -> wp.array:
+            beams = self.samples.beams
+            assert beams is not None
             emitter_of_face = constant(merged_scene.emitter_of_face, wp.int32, merged_scene.device)
             seen = fragments, merged_scene.faces, vertices, cameras
             return show_beams(emission, *seen, placed_samples, emitter_of_face, beams.beams)
@@ -198,7 +199,11 @@ class SceneEmitters:
 
     def placed(self, points: LitPoints) -> Node:
         """Node of the samples among the bodies around points."""
-        return points.cached_of_bodies("emitters", None, lambda: Node("", place_samples, points.vertices, self.samples))
+
+        def place(vertices: wp.array) -> PlacedSamples:
+            return place_samples(vertices, self.samples)
+
+        return points.cached_of_bodies("emitters", None, lambda: Node("", place, points.vertices))
 
     def radiance(self, materials: Materials) -> Node:
         """Node of the samples' radiance, vec3 of shape [batch, sample]."""

@@ -205,14 +205,14 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     def _sum_over_emitters(
         self, name: str, find: Callable[..., Any], points: LitPoints, materials: Materials, *others: Node | Input
     ) -> Node:
-        emitters, weak_points = (self.emitters.samples, self.emitters.self_visibility), points.weak
+        emitters, weak_points = self.emitters, points.weak
         bodies_and_spheres = points.static_bodies, points.nearest_spheres
 
         def find_in_groups(
             receivers: Receivers, blockers: Blockers, self_lookups: dict[int, Any] | None, *arrays: Any
         ) -> Any:
             groups = find_groups(*bodies_and_spheres, receivers, blockers, self_lookups, None, None)
-            return find(*emitters, groups, blockers, *arrays)
+            return find(emitters.samples, emitters.self_visibility, groups, blockers, *arrays)
 
         def lookups() -> Node:
             if self.emitter_cells is None:
@@ -228,7 +228,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
             self.emitters.placed(points),
             self.emitters.radiance(materials),
             *others,
-            items=lambda: f"{receiver_text(weak_points)} × {emitters[0].first[-1]} samples",
+            items=lambda: f"{receiver_text(weak_points)} × {emitters.samples.first[-1]} samples",
         )
 
     def known_shading(self, points: LitPoints, light: LightInput) -> Node:
