@@ -7,7 +7,7 @@ import warpshadow as ws
 from demos.scenes import shipped_mesh
 from warpshadow.maths.contacts import Contact
 from warpshadow.stages.bounces.form_factors import patch_mesh, trace_form_factors
-from warpshadow.stages.bounces.patches import find_patches, find_plane_patches
+from warpshadow.stages.patches import find_patches, find_plane_patches
 from warpshadow.stages.planes.grid import squeezed, stretched
 
 ROUNDING = 1e-5

@@ -11,10 +11,10 @@ import warp as wp
 import warpshadow as ws
 from warpshadow.device.tape import recorded
 from warpshadow.maths.directions import cell_radius, fibonacci
-from warpshadow.stages.bounces.patches import find_plane_patches
 from warpshadow.stages.bounces.plane_light import plane_light as light_of_texels
 from warpshadow.stages.bounces.plane_texels import find_texels
 from warpshadow.stages.joint_coverage import transmittance_past
+from warpshadow.stages.patches import find_plane_patches
 from warpshadow.stages.planes import prepared
 from warpshadow.stages.planes.coverage import plane_coverage
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneBody

@@ -9,9 +9,9 @@ from demos.scenes import shipped_mesh
 from warpshadow.device.tape import recorded
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.bounces.form_factors import patch_mesh, trace_form_factors
-from warpshadow.stages.bounces.patches import find_patches
 from warpshadow.stages.bounces.self_light import self_light
 from warpshadow.stages.geometry.normals import vertex_normals
+from warpshadow.stages.patches import find_patches
 from warpshadow.stages.rays.ray_tracing import trace_visibility
 from warpshadow.stages.sparse import SparseMatrix
 
