@@ -9,7 +9,7 @@ import warp as wp
 
 from warpshadow.assets.basis import Basis, CellBasis
 from warpshadow.assets.color import LUMINANCE
-from warpshadow.assets.harmonic_light import KnownLight
+from warpshadow.assets.known_light import KnownLight
 from warpshadow.device.constants import constant
 from warpshadow.device.memory import empty, from_numpy
 from warpshadow.device.tape import unrecorded
