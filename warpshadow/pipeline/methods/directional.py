@@ -192,7 +192,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     @functools.cached_property
     def emitter_cells(self) -> ProjectedCells:
         """Even light in cells that are finer than those of the map: emitters are small."""
-        from warpshadow.pipeline.shading.emitters import EMITTER_CELLS
+        from warpshadow.pipeline.shading.emitted_light import EMITTER_CELLS
 
         return ProjectedCells(EMITTER_CELLS)
 

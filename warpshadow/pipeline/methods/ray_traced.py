@@ -92,7 +92,7 @@ class Rays(Method):
         self, positions: wp.array, receivers: Receivers, placed_samples: "PlacedSamples"
     ) -> list[wp.array]:
         """Transmittance to the samples of each emitter, float32 of shape [batch, receiver, sample]."""
-        from warpshadow.pipeline.shading.emitters import trace_transmittances
+        from warpshadow.pipeline.shading.emitted_light import trace_transmittances
         from warpshadow.stages.emitters.samples import SAMPLES
 
         lit, samples = (_checked_points(receivers.points), receivers.normals), self.emitters.samples

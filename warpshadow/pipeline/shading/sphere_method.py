@@ -192,13 +192,13 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
 
     def emitted_light(self, points: LitPoints, materials: Materials) -> Node:
         """Direct light of emitters on points, by the same blockers."""
-        from warpshadow.pipeline.shading.emitters import find_emitted_light
+        from warpshadow.pipeline.shading.emitted_light import find_emitted_light
 
         return self._sum_over_emitters("light of emitters", find_emitted_light, points, materials)
 
     def highlights(self, points: LitPoints, materials: Materials, roughness: Node, cameras: Input) -> Node:
         """Direct light of emitters in the lobes of points, by the same blockers."""
-        from warpshadow.pipeline.shading.emitters import find_highlights
+        from warpshadow.pipeline.shading.emitted_light import find_highlights
 
         return self._sum_over_emitters("highlights", find_highlights, points, materials, roughness, cameras)
 
