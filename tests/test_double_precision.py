@@ -274,7 +274,7 @@ def test_gradients_of_light_from_spheres_that_merge_are_exact(double, device, ch
 @pytest.fixture
 def planes(double, device):
     """A ground and a wall, each of two faces, whose frames are given as such."""
-    grids = double("stages.bounces.patches").find_plane_patches
+    grids = double("stages.patches").find_plane_patches
     square = np.array([[-2.0, 0, -2], [-2, 0, 2], [2, 0, 2], [2, 0, -2]])
     faces = np.int32([[0, 1, 2], [0, 2, 3]])
     near = np.array([[-0.5, 0, -0.5], [0.5, 1, 0.5]])
@@ -320,7 +320,7 @@ def test_gradients_of_transmittance_past_planes_are_exact(double, planes, check)
 def holed_planes(double, device):
     """A triangle, which leaves half of its rectangle open, and a square."""
     square = np.array([[-2.0, 0, -2], [-2, 0, 2], [2, 0, 2], [2, 0, -2]])
-    faces, find = np.int32([[0, 1, 2], [0, 2, 3]]), double("stages.bounces.patches").find_plane_patches
+    faces, find = np.int32([[0, 1, 2], [0, 2, 3]]), double("stages.patches").find_plane_patches
     module = double("stages.planes.prepared")
     bodies = []
     for number, own in enumerate((faces[:1], faces)):

@@ -58,7 +58,8 @@ def test_a_scene_without_emission_imports_and_computes_nothing_of_it():
     code = (
         "import sys, warpshadow as ws; renderer = ws.Renderer(ws.Scene([ws.Body(ws.plane(1.0))], "
         "ws.EnvironmentMap.constant(), visibility=ws.Visibility('directional'))); renderer.render(); "
-        "assert not [name for name in sys.modules if 'emitters' in name]; assert 'emit' not in str(renderer.explain())"
+        "assert not [name for name in sys.modules if 'emitters' in name or 'emitted' in name]; "
+        "assert 'emit' not in str(renderer.explain())"
     )
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
@@ -379,6 +380,16 @@ def test_explanations_tell_of_emitters():
     text = str(renderer.explain())
     assert "light of emitters" in text and "64 samples" not in text
     assert "64 samples" in str(ws.Renderer(scene_of()).explain())
+
+
+@pytest.mark.parametrize("method", ["directional", "ray-traced"])
+def test_samples_of_lamps_are_found_when_an_image_is_computed_not_while_its_nodes_are_made(method):
+    renderer = ws.Renderer(scene_of(visibility=ws.Visibility(method)))
+    view, emitters = renderer.view(), renderer._method.emitters
+    image = view.image(None, view.materials)
+    assert "samples" not in vars(emitters) and "self_visibility" not in vars(emitters)
+    image.value(view.call)
+    assert "samples" in vars(emitters)
 
 
 def test_the_shadow_of_a_scene_is_that_of_its_map():

@@ -7,7 +7,7 @@ import pytest
 
 import warpshadow as ws
 from warpshadow.scene.files import write_scene
-from warpshadow.stages.bounces.patches import find_plane_patches
+from warpshadow.stages.patches import find_plane_patches
 
 SIZE = 2.0
 SKY = ws.synthetic_sky()

@@ -120,6 +120,26 @@ def test_every_file_of_a_folder_stands_on_its_page(folder, files):
     assert not [name_of(file) for file in files if file.stem != "__init__" and f"`{file.name}`" not in page]
 
 
+def has_adjoint_by_hand(text):
+    """Whether a file of stages has a kernel that is an adjoint, a gradient of a function, or puts one on the tape."""
+    for node in ast.walk(ast.parse(text)):
+        for decorator in map(ast.unparse, getattr(node, "decorator_list", ())):
+            if decorator.startswith("wp.func_grad") or (decorator.startswith("wp.kernel") and "adjoint" in node.name):
+                return True
+    return bool(re.search(r"\b(launch_with_adjoint|differentiable|record_adjoint)\(", text))
+
+
+def test_every_adjoint_by_hand_stands_on_the_page_of_stages_with_its_reason_and_folder():
+    (table,) = re.findall(r"^\| why \|.*\n(?:\|.*\n)+", (STAGES / "README.md").read_text("utf-8"), re.MULTILINE)
+    named = set(re.findall(r"`([\w/]+(?:\.py|/))`", table))
+    assert not [name for name in named if not (STAGES / name).exists()]
+    texts = {file.relative_to(STAGES).as_posix(): file.read_text("utf-8") for file in STAGES.rglob("*.py")}
+    by_hand = {name for name, text in texts.items() if has_adjoint_by_hand(text)}
+    assert len(by_hand) > 20
+    assert not [name for name in by_hand if name not in named and f"{name.partition('/')[0]}/" not in named]
+    assert not [name for name in named if name in texts and "adjoint" not in texts[name]]
+
+
 def test_every_room_of_the_pipeline_stands_on_its_page_with_classes_that_it_has():
     pipeline = ROOT / "warpshadow" / "pipeline"
     (table,) = re.findall(r"^\| room \|.*\n(?:\|.*\n)+", (pipeline / "README.md").read_text("utf-8"), re.MULTILINE)
@@ -142,6 +162,8 @@ def test_the_page_of_tests_has_the_folders_shared_files_fixtures_and_tolerances_
         and not list((ROOT / "warpshadow").glob(f"{path.relative_to(tests)}/*.py"))
     ]
     assert not [path.name for path in tests.glob("*.py") if f"| `{path.name}`" not in text and path.stem[:5] != "test_"]
+    names = [path.name for path in tests.rglob("test_*.py")]
+    assert len(names) == len(set(names))
     fixtures = re.findall(
         r"^@pytest.fixture(?!.*autouse).*\ndef (\w+)", (tests / "conftest.py").read_text(), re.MULTILINE
     )

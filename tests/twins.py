@@ -349,6 +349,12 @@ def directional_transfer(visibility, normals, directions):
     return visibility * np.maximum(normals @ directions.T, 0) * 4 / len(directions)
 
 
+def form_factor_of_square(height):
+    """Form factor from below the middle of a square of 2 × 2 units to it, four quarters [Hottel's formula]."""
+    a = 1 / height
+    return 4 * 2 * a / np.sqrt(1 + a**2) * np.arctan(a / np.sqrt(1 + a**2)) / (2 * np.pi)
+
+
 # ------------------------------------------------------------------------------------------ triangles
 
 

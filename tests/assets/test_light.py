@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 import warpshadow as ws
 from warpshadow.assets.color import LUMINANCE
-from warpshadow.assets.harmonic_light import as_light
 from warpshadow.assets.image import ImageError, exr_bytes, write_image
+from warpshadow.assets.known_light import as_light
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.sky import synthetic_sky
 from warpshadow.maths import sh

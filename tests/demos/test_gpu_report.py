@@ -107,7 +107,7 @@ def test_without_a_gpu_it_says_so(monkeypatch, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_only_tests_that_take_a_device_run_and_those_not_reached_are_counted(tmp_path, monkeypatch):
-    monkeypatch.setenv("PYTEST_ADDOPTS", "tests/stages/test_film.py tests/maths/test_directions.py")  # of all tests
+    monkeypatch.setenv("PYTEST_ADDOPTS", "tests/stages/image/test_film.py tests/maths/test_directions.py")  # of all
     tests = gpu_report.run_tests("cpu", 0, tmp_path)
     assert tests["passed"] + len(tests["failed"]) + tests["skipped"] == 1  # the first one ends the time
     assert 5 < tests["not reached"] < 30  # those of films; directions take no device

@@ -2,23 +2,16 @@
 
 import numpy as np
 import pytest
+from meshes import box
 
 import warpshadow as ws
 from demos.scenes import shipped_mesh
 from warpshadow.maths.contacts import Contact
 from warpshadow.stages.bounces.form_factors import patch_mesh, trace_form_factors
-from warpshadow.stages.bounces.patches import find_patches, find_plane_patches
+from warpshadow.stages.patches import find_patches, find_plane_patches
 from warpshadow.stages.planes.grid import squeezed, stretched
 
 ROUNDING = 1e-5
-
-
-def box(size=(1.0, 1.0, 1.0)):
-    """A box of 12 large faces that look outward."""
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) * size
-    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]]
-    faces += [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
-    return ws.Mesh(corners, faces)
 
 
 def patches_of(mesh, **options):

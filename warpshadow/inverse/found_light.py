@@ -19,7 +19,7 @@ import torch
 
 from warpshadow.assets.basis import CellBasis
 from warpshadow.assets.color import auto_exposure
-from warpshadow.assets.harmonic_light import as_light
+from warpshadow.assets.known_light import as_light
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.picture import Picture
 from warpshadow.inverse.diagnostics import small_stage

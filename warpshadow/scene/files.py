@@ -15,8 +15,8 @@ from warpshadow import check
 from warpshadow.assets import files
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.camera_conventions import HALF_PIXEL
-from warpshadow.assets.harmonic_light import as_light
 from warpshadow.assets.image import write_image
+from warpshadow.assets.known_light import as_light
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.mesh_files import MESH_SUFFIXES

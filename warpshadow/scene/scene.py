@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from warpshadow import check
 from warpshadow.assets.camera import Camera
-from warpshadow.assets.harmonic_light import KnownLight, as_light
 from warpshadow.assets.image import ImageError
+from warpshadow.assets.known_light import KnownLight, as_light
 from warpshadow.assets.light import LIGHT, EnvironmentMap, check_coefficients
 from warpshadow.assets.mesh import Mesh
 from warpshadow.check import AnyPath

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from warpshadow import check
 from warpshadow.assets.camera import Camera, framed_points
 from warpshadow.assets.color import auto_exposure, linear_to_srgb
-from warpshadow.assets.harmonic_light import as_light
+from warpshadow.assets.known_light import as_light
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.pipeline.bodies.geometry import Geometry

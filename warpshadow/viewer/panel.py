@@ -12,7 +12,7 @@ import numpy as np
 import viser
 from scipy.spatial.transform import Rotation
 
-from warpshadow.assets.harmonic_light import as_light
+from warpshadow.assets.known_light import as_light
 from warpshadow.assets.primitives import icosphere
 from warpshadow.scene.body import RECEIVERS
 from warpshadow.viewer import gizmo

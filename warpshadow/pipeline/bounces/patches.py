@@ -19,8 +19,8 @@ from warpshadow.pipeline.bounces.contacts import find_contacts
 from warpshadow.pipeline.node import Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.stages.bounces.albedo import mean_over_texels, mean_over_vertices
-from warpshadow.stages.bounces.patches import MAX_PATCHES, SAMPLES_PER_PATCH, Patches, find_patches, find_plane_patches
 from warpshadow.stages.bounces.radiosity import mean_over_patch_samples
+from warpshadow.stages.patches import MAX_PATCHES, SAMPLES_PER_PATCH, Patches, find_patches, find_plane_patches
 from warpshadow.stages.receivers.find import Receivers, receivers_on_faces
 from warpshadow.stages.sparse import SparseMatrix, multiply
 

@@ -15,7 +15,7 @@ from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
 from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.stages.bounces.form_factors import patch_mesh, trace_form_factors
-from warpshadow.stages.bounces.patches import Patches
+from warpshadow.stages.patches import Patches
 from warpshadow.stages.sparse import SparseMatrix
 
 if TYPE_CHECKING:

@@ -8,14 +8,13 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import Basis, CellBasis
-from warpshadow.assets.color import LUMINANCE
-from warpshadow.assets.harmonic_light import KnownLight
-from warpshadow.device.constants import constant
+from warpshadow.assets.known_light import KnownLight
 from warpshadow.device.memory import empty, from_numpy
 from warpshadow.device.tape import unrecorded
-from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
+from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibilityLookup
+from warpshadow.pipeline.methods.sharpest_cells import SharpestCells, find_share_of_sharpest_light, find_sharpest_cells
 from warpshadow.pipeline.node import Input, Node, field_of
 from warpshadow.pipeline.receivers.groups import CellCoverages, CellVisibility, Group
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
@@ -50,16 +49,6 @@ from warpshadow.stages.visibility.sharp_cells import (
 )
 
 
-class SharpestCells(NamedTuple):
-    """Sixteen cells of the scene's light whose shadows are sharpest."""
-
-    directions: np.ndarray  # [16, 3]
-    light: wp.array  # luminance in channel 0, for cells of 4π/16, vec3 of shape [1, 16]
-    relative_radius: float  # of their cells, over that of cells of 4π/16
-    edge_radius: float  # of the disc by which planes and convex parts cover them [rad]
-    power: np.ndarray  # luminance of all cells [direction]
-
-
 class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     """Visibility for each cell of directions by itself."""
 
@@ -91,9 +80,6 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
             wants_sun=blockers.self_visibility.wants_rays,
             device=self.merged_scene.device,
         )
-
-    def _on_device(self, coefficients: np.ndarray) -> wp.array:
-        return constant(coefficients[None], wp.vec3, self.merged_scene.device)
 
     def free_basis_of_shell(self, shell: wp.array) -> ProjectedCells:
         """The basis of free light of another shell than the scene's. Differentiable: shell."""
@@ -192,7 +178,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     @functools.cached_property
     def emitter_cells(self) -> ProjectedCells:
         """Even light in cells that are finer than those of the map: emitters are small."""
-        from warpshadow.pipeline.shading.emitters import EMITTER_CELLS
+        from warpshadow.pipeline.shading.emitted_light import EMITTER_CELLS
 
         return ProjectedCells(EMITTER_CELLS)
 
@@ -282,53 +268,13 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         """Cells of the scene's light whose shadows are sharpest: sharp cells, or else the brightest."""
         with unrecorded():
             projected_light = self.project_light(self.light.value())
-        assert projected_light.coefficients is not None
-        power = projected_light.coefficients.numpy()[0] @ LUMINANCE
-        directions, light = np.empty((CHUNK, 3)), np.zeros(CHUNK)
-        if projected_light.sharp_cells_past_planes is None:
-            chosen = np.sort(np.argsort(-power, kind="stable")[:CHUNK])
-            directions, light = projected_light.blocking_directions[chosen], power[chosen]
-            relative_radius = cell_radius(len(power)) / cell_radius(CHUNK)
-            edge_radius = cell_radius(len(power))
-        else:
-            directions, slots, relative_radius = projected_light.sharp_cells_past_planes
-            light[slots[slots >= 0]] = power[slots >= 0]
-            edge_radius = self._edge_radius(projected_light.sharp_cells_past_planes)
-        light = light[:, None] * [CHUNK / len(power), 0, 0]
-        return SharpestCells(directions, self._on_device(light), relative_radius, edge_radius, power)
+        return find_sharpest_cells(projected_light, self._edge_radius)
 
     def share_of_sharpest_light(self, group: Group) -> np.ndarray | None:
         """Share of a group's unblocked light that still comes from the sharpest cells; None where nothing blocks."""
-        directions, light, relative_radius, edge_radius, power = self._sharpest_cells
-        points, normals, centers, radii = group[:4]
-        if not radii.shape[1] and group.planes is None and group.convex_parts_around is None:
-            return None
-        if radii.shape[1]:
-            transmittance = directional.transmittance(
-                points, normals, centers, radii, directions, **self._scales(relative_radius)
-            )
-        else:
-            transmittance = wp.full((*points.shape, CHUNK), 1.0, dtype=wp.float32, device=points.device)
-        coverages = []
-        if group.convex_parts_around is not None:
-            coverages.append(group.convex_parts_around.coverage(points, normals, directions, edge_radius))
-        planes = group.planes
-        if planes is not None and group.is_blocked_by_planes:
-            lifted, fronts = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
-            options: dict[str, Any] = {"radius": edge_radius, "horizon_normals": normals, "fronts": fronts}
-            coverages.append(
-                plane_coverage(lifted, planes.frames, planes.planes, directions, skip=planes.skip, **options)
-            )
-        if coverages:
-            transmittance = transmittance_past(transmittance, *coverages)
-        lit = shade_cells(transmittance, normals, directions, light, maximum=LARGEST_COEFFICIENT).numpy()[..., 0]
-        receiver_normals, towards = normals.numpy(), self.free_basis.blocking_directions
-        plane_normals = receiver_normals[:, :1]  # points of a plane have this normal or its opposite
-        facing = plane_normals @ towards.T  # [batch, 1, cell]
-        whole = [4 / len(power) * np.maximum(cosines, 0) @ power for cosines in (facing, -facing)]
-        is_front = (receiver_normals @ plane_normals.transpose(0, 2, 1))[..., 0] > 0
-        unblocked = np.where(is_front, *whole)
-        return np.divide(lit, unblocked, out=np.zeros_like(lit), where=unblocked > 0)
+        cells = self._sharpest_cells
+        towards, scales = self.free_basis.blocking_directions, self._scales(cells.relative_radius)
+        return find_share_of_sharpest_light(group, cells, towards, **scales)
 
     def lobe_transmittance(
         self, points: LitPoints, directions: Node, light: LightInput, shaded_points: LitPoints

@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import Basis, HarmonicBasis
-from warpshadow.assets.harmonic_light import KnownLight
+from warpshadow.assets.known_light import KnownLight
 from warpshadow.device.batch import expand_rows
 from warpshadow.device.constants import constant
 from warpshadow.device.memory import zeros

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import Basis
-from warpshadow.assets.harmonic_light import KnownLight
+from warpshadow.assets.known_light import KnownLight
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.methods.log_sh import LogSH, ProjectedBands
 from warpshadow.pipeline.node import Input

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from warpshadow.assets.harmonic_light import KnownLight
+from warpshadow.assets.known_light import KnownLight
 from warpshadow.device.batch import common_batch
 from warpshadow.device.memory import empty
 from warpshadow.pipeline.bodies.merged_scene import MergedScene

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import Basis, CellBasis, HarmonicBasis
-from warpshadow.assets.harmonic_light import KnownLight
+from warpshadow.assets.known_light import KnownLight
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node, NodeStage, detached
@@ -92,7 +92,7 @@ class RayTraced(Method):
         self, positions: wp.array, receivers: Receivers, placed_samples: "PlacedSamples"
     ) -> list[wp.array]:
         """Transmittance to the samples of each emitter, float32 of shape [batch, receiver, sample]."""
-        from warpshadow.pipeline.shading.emitters import trace_transmittances
+        from warpshadow.pipeline.shading.emitted_light import trace_transmittances
         from warpshadow.stages.emitters.samples import SAMPLES
 
         lit, samples = (_checked_points(receivers.points), receivers.normals), self.emitters.samples

@@ -13,7 +13,7 @@ import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.color import LUMINANCE
-from warpshadow.assets.harmonic_light import KnownLight
+from warpshadow.assets.known_light import KnownLight
 from warpshadow.maths.directions import fibonacci
 from warpshadow.maths.inset import inset_vertices
 from warpshadow.pipeline.bodies.merged_scene import MergedScene

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import Basis, HarmonicBasis, conversion
-from warpshadow.assets.harmonic_light import KnownLight, as_light
+from warpshadow.assets.known_light import KnownLight, as_light
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.constants import constant
 from warpshadow.pipeline.bodies.geometry import Geometry

@@ -10,7 +10,7 @@ import warp as wp
 
 from warpshadow.assets.cells import draw_in_cells, gather_cells, without_spots
 from warpshadow.assets.color import LUMINANCE
-from warpshadow.assets.harmonic_light import KnownLight
+from warpshadow.assets.known_light import KnownLight
 from warpshadow.device.constants import constant
 from warpshadow.pipeline.shading.shell import ShellPatches
 from warpshadow.stages.planes.partial_cells import SAMPLES

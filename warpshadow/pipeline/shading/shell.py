@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import CellBasis
-from warpshadow.assets.harmonic_light import KnownLight
+from warpshadow.assets.known_light import KnownLight
 from warpshadow.device.constants import constant
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.shell.beams import check_within

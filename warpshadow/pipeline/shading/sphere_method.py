@@ -11,7 +11,7 @@ from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeVar
 import numpy as np
 import warp as wp
 
-from warpshadow.assets.harmonic_light import KnownLight
+from warpshadow.assets.known_light import KnownLight
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.progress import progress_bar
 from warpshadow.pipeline.bodies.geometry import Geometry
@@ -192,27 +192,27 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
 
     def emitted_light(self, points: LitPoints, materials: Materials) -> Node:
         """Direct light of emitters on points, by the same blockers."""
-        from warpshadow.pipeline.shading.emitters import find_emitted_light
+        from warpshadow.pipeline.shading.emitted_light import find_emitted_light
 
         return self._sum_over_emitters("light of emitters", find_emitted_light, points, materials)
 
     def highlights(self, points: LitPoints, materials: Materials, roughness: Node, cameras: Input) -> Node:
         """Direct light of emitters in the lobes of points, by the same blockers."""
-        from warpshadow.pipeline.shading.emitters import find_highlights
+        from warpshadow.pipeline.shading.emitted_light import find_highlights
 
         return self._sum_over_emitters("highlights", find_highlights, points, materials, roughness, cameras)
 
     def _sum_over_emitters(
         self, name: str, find: Callable[..., Any], points: LitPoints, materials: Materials, *others: Node | Input
     ) -> Node:
-        emitters, weak_points = (self.emitters.samples, self.emitters.self_visibility), points.weak
+        emitters, weak_points = self.emitters, points.weak
         bodies_and_spheres = points.static_bodies, points.nearest_spheres
 
         def find_in_groups(
             receivers: Receivers, blockers: Blockers, self_lookups: dict[int, Any] | None, *arrays: Any
         ) -> Any:
             groups = find_groups(*bodies_and_spheres, receivers, blockers, self_lookups, None, None)
-            return find(*emitters, groups, blockers, *arrays)
+            return find(emitters.samples, emitters.self_visibility, groups, blockers, *arrays)
 
         def lookups() -> Node:
             if self.emitter_cells is None:
@@ -228,7 +228,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
             self.emitters.placed(points),
             self.emitters.radiance(materials),
             *others,
-            items=lambda: f"{receiver_text(weak_points)} × {emitters[0].first[-1]} samples",
+            items=lambda: f"{receiver_text(weak_points)} × {emitters.samples.first[-1]} samples",
         )
 
     def known_shading(self, points: LitPoints, light: LightInput) -> Node:

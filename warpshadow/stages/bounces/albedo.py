@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warpshadow.stages.bounces.patches import Patches
+from warpshadow.stages.patches import Patches
 from warpshadow.stages.textures.pyramid import level_matrices, level_sizes
 
 if TYPE_CHECKING:  # it is imported where a matrix is made

@@ -11,7 +11,7 @@ from warpshadow import check
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import zeros
 from warpshadow.stages.bounces.bright_patches import BrightPatches, hit_weight, point_of_bright_side
-from warpshadow.stages.bounces.patches import Patches
+from warpshadow.stages.patches import Patches
 from warpshadow.stages.rays.ray_tracing import RAY_COST, first_hit, progress_slices
 
 if TYPE_CHECKING:

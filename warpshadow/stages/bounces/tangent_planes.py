@@ -27,7 +27,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 
 if TYPE_CHECKING:
-    from warpshadow.stages.bounces.patches import Patches
+    from warpshadow.stages.patches import Patches
 
 _MIN_WIDTH = 0.05  # least w, in radii
 

@@ -9,7 +9,7 @@ becomes infinite. (The form factor of a disc on its axis has π d² + |A| in pla
 other.) An open body sends light to both sides: |A_k·ω_k| is in place of the maximum.
 
 Receivers closer than about three times its half diagonal see a sample as its pieces, triangles whose
-form factors (:mod:`.form_factors`) are in place of the fraction.
+form factors (:mod:`.triangles`) are in place of the fraction.
 """
 
 import numpy as np
@@ -19,8 +19,8 @@ from warpshadow.device.batch import common_batch, expand, expand_rows, instance_
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
-from warpshadow.stages.emitters.form_factors import form_factor_of_triangle
 from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, facing_area, may_light, sample_transmittance
+from warpshadow.stages.emitters.triangles import form_factor_of_triangle
 
 _COST = 6.0  # nanoseconds that a sample takes
 

@@ -29,7 +29,7 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.spatial_sort import compact_order, z_order
-from warpshadow.stages.bounces.patches import Patches, find_patches
+from warpshadow.stages.patches import Patches, find_patches
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
 if TYPE_CHECKING:

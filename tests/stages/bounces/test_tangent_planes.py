@@ -4,8 +4,8 @@ import numpy as np
 import trimesh
 
 import warpshadow as ws
-from warpshadow.stages.bounces.patches import find_patches
 from warpshadow.stages.bounces.tangent_planes import find_tolerances
+from warpshadow.stages.patches import find_patches
 
 
 def of_each(patches):

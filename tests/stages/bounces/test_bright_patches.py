@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+import twins
 
 import warpshadow as ws
-from tests.stages.test_self_light import of_square_above
 from warpshadow.stages.bounces.bright_patches import find_bright_patches
 from warpshadow.stages.bounces.form_factors import loose_mesh, trace_form_factors
 
@@ -33,7 +33,7 @@ def test_form_factors_of_a_bright_patch_are_right_on_average_and_vary_less(devic
     bright, sent = factors_of_square(device, radiosity=[1.0, 1e-6])
     assert bright.ray_count == 64
     noise = sent[:, 0].std() / np.sqrt(RECEIVERS)
-    assert sent[:, 0].mean() == pytest.approx(of_square_above(HEIGHT), abs=4 * noise + 1e-4)
+    assert sent[:, 0].mean() == pytest.approx(twins.form_factor_of_square(HEIGHT), abs=4 * noise + 1e-4)
     assert sent[:, 0].std() < 0.25 * plain[:, 0].std()
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import twins
 import warp as wp
 
 import warpshadow as ws
@@ -9,9 +10,9 @@ from demos.scenes import shipped_mesh
 from warpshadow.device.tape import recorded
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.bounces.form_factors import patch_mesh, trace_form_factors
-from warpshadow.stages.bounces.patches import find_patches
 from warpshadow.stages.bounces.self_light import self_light
 from warpshadow.stages.geometry.normals import vertex_normals
+from warpshadow.stages.patches import find_patches
 from warpshadow.stages.rays.ray_tracing import trace_visibility
 from warpshadow.stages.sparse import SparseMatrix
 
@@ -34,12 +35,6 @@ def factors_of(mesh, points, normals, device, *, sides=True, rays=1024):
     return patches, trace_form_factors(traced, patches.patch_of_pieces, patches.count, points, normals, rays=rays)
 
 
-def of_square_above(height):
-    """Form factor from below the middle of the square to it, four quarters [Hottel's formula]."""
-    a = 1 / height
-    return 4 * 2 * a / np.sqrt(1 + a**2) * np.arctan(a / np.sqrt(1 + a**2)) / (2 * np.pi)
-
-
 @pytest.mark.parametrize("height", [0.3, 1.0, 4.0])
 @pytest.mark.parametrize("faces_down", [True, False])
 def test_factors_are_those_of_a_square_and_on_the_side_that_is_seen(height, faces_down, device):
@@ -47,7 +42,7 @@ def test_factors_are_those_of_a_square_and_on_the_side_that_is_seen(height, face
     patches, factors = factors_of(square(height, faces_down), points, normals, device)
     front, back = factors.toarray()[0].reshape(2, -1).sum(axis=1)
     seen, other = (front, back) if faces_down else (back, front)
-    assert seen == pytest.approx(of_square_above(height), abs=LATTICE)
+    assert seen == pytest.approx(twins.form_factor_of_square(height), abs=LATTICE)
     assert other == 0
 
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from test_patches import box
+from meshes import box
 
-from warpshadow.stages.bounces.patches import find_patches
 from warpshadow.stages.bounces.proxies import find_depths
+from warpshadow.stages.patches import find_patches
 
 
 def depths_of(size, **options):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from test_plane_light import Setting, mesh_means
+from plane_settings import Setting, mesh_means
 
 from warpshadow.device.tape import recorded
 from warpshadow.stages.bounces.plane_texels import find_texels

@@ -5,7 +5,7 @@ import pytest
 
 import warpshadow as ws
 from warpshadow.stages.bounces.albedo import mean_over_texels, mean_over_vertices
-from warpshadow.stages.bounces.patches import find_patches, find_plane_patches
+from warpshadow.stages.patches import find_patches, find_plane_patches
 
 EXACT = 1e-6
 """Weights are float64, and barycentric coordinates of pieces float32."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from test_plane_light import Setting, ramp
+from plane_settings import Setting, ramp
 
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.bounces.projected_areas import find_projected_areas, tilt_normals_off_planes

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+import twins
 import warp as wp
 
 import warpshadow as ws
-from tests.stages.test_self_light import of_square_above
 from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.primitives import icosphere, plane
 from warpshadow.stages.light.light_samples import sample_map
@@ -132,7 +132,7 @@ def test_light_of_a_small_bright_face_is_right_on_average_and_varies_less(device
     receivers = np.zeros((512, 3)), np.tile([0.0, 1, 0], (512, 1))
     light = bounced(surfaces, *receivers, below, bounces=1, paths=256)
     noise = light.std() / np.sqrt(512)
-    assert light.mean() == pytest.approx(0.5 * of_square_above(8.0), abs=4 * noise + 1e-4)
+    assert light.mean() == pytest.approx(0.5 * twins.form_factor_of_square(8.0), abs=4 * noise + 1e-4)
     monkeypatch.setattr(path_tracing, "_MIN_BRIGHT_SHARE", 2)
     assert light.std() < 0.4 * bounced(surfaces, *receivers, below, bounces=1, paths=256).std()
 

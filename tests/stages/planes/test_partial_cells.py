@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_plane_light import DIRECTIONS, Setting
+from plane_settings import DIRECTIONS, Setting
 
 import warpshadow as ws
 from warpshadow.maths.directions import cell_radius

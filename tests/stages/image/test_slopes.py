@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from test_silhouettes import through_plane
+from meshes import through_plane
 
 import warpshadow as ws
 from warpshadow.maths.adjacency import edge_neighbors

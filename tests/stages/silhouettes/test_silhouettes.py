@@ -9,6 +9,7 @@ import warp as wp
 import warp.examples
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from meshes import through_plane
 
 import warpshadow as ws
 from warpshadow.maths.adjacency import edge_neighbors
@@ -109,15 +110,6 @@ def supersampled(found_at, supersampling):
     """Coverage by across² samples a pixel."""
     fine = mask(found_at(CAMERA.resized(supersampling)))[0]
     return fine.reshape(CAMERA.height, supersampling, CAMERA.width, supersampling).mean((1, 3))
-
-
-PLANE = np.array([[-1.7, -0.5, -1.1], [1.6, -0.9, -0.9], [1.5, 1.1, 0.9], [-1.4, 0.8, 1.2]])
-
-
-def through_plane(mesh):
-    """A body that pokes through a slanted plane: positions, faces and the body of each face."""
-    faces = np.concatenate([mesh.faces, np.array([[0, 1, 2], [0, 2, 3]]) + len(mesh.positions)])
-    return np.concatenate([mesh.positions, PLANE]), faces, np.repeat([0, 1], [len(mesh.faces), 2])
 
 
 # ------------------------------------------------------------------------------------------------- the float64 twin

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from test_plane_light import Setting, margin_of, ramp
+from plane_settings import Setting, margin_of, ramp
 
 from warpshadow.device.tape import recorded
 from warpshadow.stages.planes.fronts import NearestBlockers, find_fronts, lifted_points

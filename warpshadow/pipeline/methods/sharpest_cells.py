@@ -1,0 +1,98 @@
+"""Cells of the scene's light whose shadows are sharpest, by which receivers are chosen adaptively."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.assets.color import LUMINANCE
+from warpshadow.device.constants import constant
+from warpshadow.maths.directions import CHUNK, cell_radius
+from warpshadow.pipeline.receivers.groups import Group
+from warpshadow.pipeline.shading.projected_cells import ProjectedCells
+from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT
+from warpshadow.stages.joint_coverage import transmittance_past
+from warpshadow.stages.light.shading import shade_cells
+from warpshadow.stages.planes.coverage import plane_coverage
+from warpshadow.stages.visibility import directional
+from warpshadow.stages.visibility.sharp_cells import SharpCells
+
+
+class SharpestCells(NamedTuple):
+    """Sixteen cells of the scene's light whose shadows are sharpest."""
+
+    directions: np.ndarray  # [16, 3]
+    light: wp.array  # luminance in channel 0, for cells of 4π/16, vec3 of shape [1, 16]
+    relative_radius: float  # of their cells, over that of cells of 4π/16
+    edge_radius: float  # of the disc by which planes and convex parts cover them [rad]
+    power: np.ndarray  # luminance of all cells [direction]
+
+
+def find_sharpest_cells(
+    projected_light: ProjectedCells, edge_radius_of: Callable[[SharpCells], float]
+) -> SharpestCells:
+    """Find the cells of known light whose shadows are sharpest: sharp cells, or else the brightest.
+
+    Args:
+        projected_light: The light.
+        edge_radius_of: Finds the radius of the disc by which planes and convex parts cover sharp cells [rad].
+    """
+    assert projected_light.coefficients is not None
+    power = projected_light.coefficients.numpy()[0] @ LUMINANCE
+    directions, light = np.empty((CHUNK, 3)), np.zeros(CHUNK)
+    if projected_light.sharp_cells_past_planes is None:
+        chosen = np.sort(np.argsort(-power, kind="stable")[:CHUNK])
+        directions, light = projected_light.blocking_directions[chosen], power[chosen]
+        relative_radius = cell_radius(len(power)) / cell_radius(CHUNK)
+        edge_radius = cell_radius(len(power))
+    else:
+        directions, slots, relative_radius = projected_light.sharp_cells_past_planes
+        light[slots[slots >= 0]] = power[slots >= 0]
+        edge_radius = edge_radius_of(projected_light.sharp_cells_past_planes)
+    light = light[:, None] * [CHUNK / len(power), 0, 0]
+    on_device = constant(light[None], wp.vec3, projected_light.coefficients.device)
+    return SharpestCells(directions, on_device, relative_radius, edge_radius, power)
+
+
+def find_share_of_sharpest_light(
+    group: Group, cells: SharpestCells, towards: np.ndarray, *, softness: float, merging: float
+) -> np.ndarray | None:
+    """Share of a group's unblocked light that still comes from the sharpest cells.
+
+    Args:
+        group: The receivers, with the blockers around them.
+        cells: The sharpest cells.
+        towards: Directions of all cells, [direction, 3].
+        softness, merging: Of spheres' shadows, in radii of the sharpest cells.
+    Returns:
+        Shape [batch, receiver]; None where nothing blocks.
+    """
+    directions, light, _, edge_radius, power = cells
+    points, normals, centers, radii = group[:4]
+    if not radii.shape[1] and group.planes is None and group.convex_parts_around is None:
+        return None
+    if radii.shape[1]:
+        transmittance = directional.transmittance(
+            points, normals, centers, radii, directions, softness=softness, merging=merging
+        )
+    else:
+        transmittance = wp.full((*points.shape, CHUNK), 1.0, dtype=wp.float32, device=points.device)
+    coverages = []
+    if group.convex_parts_around is not None:
+        coverages.append(group.convex_parts_around.coverage(points, normals, directions, edge_radius))
+    planes = group.planes
+    if planes is not None and group.is_blocked_by_planes:
+        lifted, fronts = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
+        options: dict[str, Any] = {"radius": edge_radius, "horizon_normals": normals, "fronts": fronts}
+        coverages.append(plane_coverage(lifted, planes.frames, planes.planes, directions, skip=planes.skip, **options))
+    if coverages:
+        transmittance = transmittance_past(transmittance, *coverages)
+    lit = shade_cells(transmittance, normals, directions, light, maximum=LARGEST_COEFFICIENT).numpy()[..., 0]
+    receiver_normals = normals.numpy()
+    plane_normals = receiver_normals[:, :1]  # points of a plane have this normal or its opposite
+    facing = plane_normals @ towards.T  # [batch, 1, cell]
+    whole = [4 / len(power) * np.maximum(cosines, 0) @ power for cosines in (facing, -facing)]
+    is_front = (receiver_normals @ plane_normals.transpose(0, 2, 1))[..., 0] > 0
+    unblocked = np.where(is_front, *whole)
+    return np.divide(lit, unblocked, out=np.zeros_like(lit), where=unblocked > 0)

@@ -1,0 +1,250 @@
+"""Light of emitters on receivers past the blockers between: direct light, and highlights in lobes."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.batch import common_batch, cut
+from warpshadow.device.cuda_graph import is_readable
+from warpshadow.device.tape import unrecorded
+from warpshadow.maths.directions import fibonacci
+from warpshadow.pipeline.receivers.groups import Blockers, Group
+from warpshadow.pipeline.shading.transfers import join_portions
+from warpshadow.stages.emitters.beams import weigh_by_beam
+from warpshadow.stages.emitters.convex import find_log_transmittance_of_parts
+from warpshadow.stages.emitters.light import (
+    find_directions_to_samples,
+    find_transmittance_to_samples,
+    replace_instances,
+    sum_light,
+)
+from warpshadow.stages.emitters.planes import find_log_transmittance_of_planes
+from warpshadow.stages.emitters.samples import EmitterSamples, EmitterSpan, PlacedSamples
+from warpshadow.stages.emitters.self_visibility import EmitterSelfVisibility, look_up_self_visibility
+from warpshadow.stages.emitters.spheres import find_log_transmittance
+from warpshadow.stages.gloss.highlights import sum_highlights
+from warpshadow.stages.gloss.reflection import LobeLight
+from warpshadow.stages.gloss.transmittance import interpolate_transmittance
+from warpshadow.stages.joint_coverage import transmittance_past
+from warpshadow.stages.light.sums import add_light
+
+EMITTER_CELLS = fibonacci(512)
+"""Cells in which receivers look up the self-visibility of their body. With 128 in place of 512, a bear and a bunny at
+vertices in a room with a lamp were 16.6 and 3.2% off in direct light in place of 12.7 and 1.9%."""
+
+
+def find_emitted_light(
+    emitters: EmitterSamples,
+    self_visibility: Sequence[EmitterSelfVisibility | None],
+    groups: Iterable[Group],
+    blockers: Blockers,
+    placed_samples: PlacedSamples,
+    radiance: wp.array,
+) -> wp.array:
+    """Direct light of emitters on groups of receivers, vec3 of shape [batch, receiver].
+
+    Args:
+        emitters: Their samples.
+        self_visibility: Of each; None of one that hides nothing of itself.
+        groups: The receivers, with the self-visibility of their bodies in EMITTER_CELLS.
+        blockers: All of them.
+        placed_samples: Where the samples are.
+        radiance: Of the samples, vec3 of shape [batch, sample].
+    Differentiable: blockers, receivers of the groups, placed_samples, radiance.
+    """
+
+    def light_of(portion: Group) -> wp.array:
+        total = wp.zeros(portion.points.shape, dtype=wp.vec3, device=portion.points.device)
+        lit = portion.points, portion.normals, placed_samples, radiance
+        for pair in _find_transmittances(emitters, self_visibility, portion, blockers, placed_samples):
+            total = add_light(total, sum_light(*lit, *pair))
+        return total
+
+    return join_portions([light_of(portion) for group in groups for portion in group.portions()])
+
+
+def find_highlights(
+    emitters: EmitterSamples,
+    self_visibility: Sequence[EmitterSelfVisibility | None],
+    groups: Iterable[Group],
+    blockers: Blockers,
+    placed_samples: PlacedSamples,
+    radiance: wp.array,
+    roughness: wp.array,
+    clip_matrices: wp.array,
+) -> LobeLight:
+    """Direct light of emitters in the lobes of groups of receivers (:mod:`.stages.gloss.highlights`).
+
+    Args:
+        emitters, self_visibility, groups, blockers, placed_samples, radiance: As for :func:`find_emitted_light`.
+        roughness: Of all receivers of the groups, float32 of shape [batch, receiver].
+        clip_matrices: Cameras, mat44 of shape [batch].
+    Differentiable: as that, and roughness and clip_matrices.
+    """
+    lobe_sums, first = [], 0
+    for portion in (portion for group in groups for portion in group.portions()):
+        end = first + portion.points.shape[1]
+        seen = portion.points, portion.normals, cut(roughness, first, end), clip_matrices
+        zeros = wp.zeros(portion.points.shape, dtype=wp.vec3, device=portion.points.device)
+        of_emitters = [
+            sum_highlights(*seen, placed_samples, radiance, *pair)
+            for pair in _find_transmittances(emitters, self_visibility, portion, blockers, placed_samples)
+        ]
+        lobe_sums.append([add_light(zeros, *parts) for parts in zip(*of_emitters, strict=True)] or [zeros, zeros])
+        first = end
+    return LobeLight(*(join_portions(list(portions)) for portions in zip(*lobe_sums, strict=True)))
+
+
+def _find_transmittances(
+    emitters: EmitterSamples,
+    self_visibility: Sequence[EmitterSelfVisibility | None],
+    group: Group,
+    blockers: Blockers,
+    placed_samples: PlacedSamples,
+) -> Iterator[tuple[EmitterSpan, wp.array | None]]:
+    """Samples of all emitters that light a portion of receivers, and the transmittance to them.
+
+    An emitter lights itself, too, unless it hides nothing of itself: then no part of it faces another.
+    """
+    merged_scene, points, normals = blockers.merged_scene, group.points, group.normals
+    if not points.size:
+        return
+    cells = (
+        transmittance_past(None, group.own_coverage(EMITTER_CELLS))
+        if group.own_parts is not None
+        else group.looked_up_transmittance()
+    )
+    sphere_bodies = blockers.sphere_blockers(blockers.bodies)
+    spheres = merged_scene.spheres_of(sphere_bodies, blockers.spheres)
+    traced_body = group.body if group.body in blockers.blocker_kinds.self_traced else None
+    own_spheres = merged_scene.spheres_among(sphere_bodies, traced_body)
+
+    @functools.cache
+    def own_meshes() -> list[wp.Mesh | None]:
+        """The receivers' own body in each geometry, for all emitters within it."""
+        own = () if group.body is None else (group.body,)
+        positions = blockers.positions
+        return [merged_scene.casting_mesh(positions[geometry], own) for geometry in range(len(positions))]
+
+    for body, span, hidden_by_itself in zip(emitters.bodies, emitters.spans(), self_visibility, strict=True):
+        is_own = body == group.body
+        if is_own and hidden_by_itself is None:
+            continue
+        skipped = own_spheres, merged_scene.spheres_among(sphere_bodies, body)
+        transmittance_self = None
+        if cells is not None and not is_own:
+            is_within = _find_within(blockers, body, group.body)
+            if not is_within.all():
+                towards = find_directions_to_samples(points, placed_samples, span)
+                transmittance_self = interpolate_transmittance(cells, normals, towards, EMITTER_CELLS)
+            if is_within.any():
+                # cells tell whether rays leave the body: a bulb in a shade would be hidden by the shade's far side
+                with unrecorded():
+                    arguments = own_meshes(), points, normals, emitters, blockers.positions, placed_samples, span
+                    traced = trace_transmittances(*arguments, rays=1)
+                transmittance_self = replace_instances(transmittance_self, traced, is_within)
+        transmittance_of_emitter = None
+        if hidden_by_itself is not None:
+            lookup = points, placed_samples, span, hidden_by_itself
+            transmittance_of_emitter = look_up_self_visibility(*lookup, is_own=is_own)
+        yield (
+            span,
+            find_transmittance_to_samples(
+                log_of_spheres=find_log_transmittance(points, normals, placed_samples, span, *spheres, skipped),
+                log_of_planes=_log_of_planes(group, blockers, placed_samples, span, body),
+                log_of_parts=_log_of_parts(group, blockers, placed_samples, span, body),
+                transmittance_self=transmittance_self,
+                transmittance_of_emitter=weigh_by_beam(points, placed_samples, span, transmittance_of_emitter),
+            ),
+        )
+
+
+def _find_within(blockers: Blockers, emitter: int, body: int | None) -> np.ndarray:
+    """Find the geometries in which an emitter is within the bounds of a body, parts of which may be behind it, bool.
+
+    Where arrays cannot be read, the scene's own bodies tell.
+    """
+    if body is None:
+        return np.zeros(1, bool)
+    starts = blockers.merged_scene.first_vertex
+    if is_readable(blockers.positions.device):
+        positions = blockers.positions.numpy()
+        of_emitter, of_body = (positions[:, starts[number] : starts[number + 1]] for number in (emitter, body))
+    else:
+        bodies = blockers.merged_scene.scene.bodies
+        of_emitter, of_body = (bodies[number].world_points()[None] for number in (emitter, body))
+    middle = (of_emitter.min(axis=1) + of_emitter.max(axis=1)) / 2
+    is_within: np.ndarray = ((of_body.min(axis=1) < middle) & (middle < of_body.max(axis=1))).all(axis=1)
+    return is_within
+
+
+def trace_transmittances(
+    meshes: Sequence[wp.Mesh | None],
+    points: wp.array,
+    normals: wp.array,
+    emitters: EmitterSamples,
+    positions: wp.array,
+    placed_samples: PlacedSamples,
+    span: EmitterSpan,
+    *,
+    rays: int,
+    progress: bool = False,
+) -> wp.array:
+    """Trace the transmittance to the samples of an emitter in all instances.
+
+    Args:
+        meshes: The blockers of each geometry; None for none.
+        points, normals: Receivers, vec3 of shape [batch, receiver].
+        emitters, span: Samples of all emitters, and those of one.
+        positions: All vertices, vec3 of shape [geometry, vertex].
+        placed_samples: Where the samples are in each geometry.
+        rays: To each sample.
+    Returns:
+        Float32 of shape [batch, receiver, sample].
+    Differentiable: no.
+    """
+    from warpshadow.stages.emitters.traced import trace_transmittance
+
+    count = common_batch({"points": points, "geometry": positions})
+    traced = wp.empty((count, points.shape[1], span.size), dtype=wp.float32, device=points.device)
+    for instance in range(count if points.size else 0):
+        geometry, view = min(instance, len(positions) - 1), min(instance, len(points) - 1)
+        rows = trace_transmittance(
+            *(meshes[geometry], points[view], normals[view], emitters, positions[geometry]),
+            *(placed_samples.points[geometry], placed_samples.areas[geometry], span),
+            rays=rays,
+            progress=progress,
+        )
+        wp.copy(traced[instance], rows)
+    return traced
+
+
+def _log_of_planes(
+    group: Group, blockers: Blockers, placed_samples: PlacedSamples, span: EmitterSpan, body: int
+) -> wp.array | None:
+    """Logarithm of the transmittance of planes between a group and an emitter; None without any."""
+    planes, numbers = group.planes, blockers.blocker_kinds.planes
+    if planes is None or not group.is_blocked_by_planes:
+        return None
+    points, _ = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
+    skipped = -1 if planes.skip is None else planes.skip, numbers.index(body) if body in numbers else -1
+    return find_log_transmittance_of_planes(
+        points, group.normals, placed_samples, span, planes.frames, planes.planes, skipped
+    )
+
+
+def _log_of_parts(
+    group: Group, blockers: Blockers, placed_samples: PlacedSamples, span: EmitterSpan, body: int
+) -> wp.array | None:
+    """Logarithm of the transmittance of convex parts between a group and an emitter; None without any."""
+    parts, numbers = group.convex_parts_around, blockers.blocker_kinds.convex
+    if parts is None:
+        return None
+    skipped = -1 if parts.skip is None else parts.skip, numbers.index(body) if body in numbers else -1
+    return find_log_transmittance_of_parts(
+        group.points, group.normals, placed_samples, span, parts.placed, parts.blockers, skipped
+    )
