@@ -6,7 +6,7 @@ They are
     1 + w L² / (r² + s²),  s = 0.05 L
 
 times as dense as elsewhere, where L is half the size of the body; of two bodies that are not flat, of the smaller one.
-:func:`warpshadow.stages.bounces.patches.find_patches` chooses w. Faces that lie on each other, as a box's bottom on a
+:func:`warpshadow.stages.patches.find_patches` chooses w. Faces that lie on each other, as a box's bottom on a
 ground, have no such gap; nor has an edge that a box stands on, or a body that sticks in another: there surfaces are not
 parallel.
 """

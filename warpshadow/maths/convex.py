@@ -1,5 +1,6 @@
 """Convex parts of a mesh: its closed convex pieces, such as the boxes and rods of furniture, convex prisms into which
-other pieces are cut, such as a thick wall with a window, segments of bent rods, and panels of its sheets.
+other pieces are cut, such as a thick wall with a window, segments of bent rods, and panels of its sheets and of the
+outer layers of its thin walls.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ import numpy as np
 from warpshadow.maths.adjacency import edges_of
 from warpshadow.maths.components import connected_components
 from warpshadow.maths.outline import cut_outline, find_outline
-from warpshadow.maths.panels import find_panels_of_sheets
+from warpshadow.maths.panels import MAX_FLAT_PANELS_OF, MAX_PANELS_OF, MAX_SHELL_PANELS_OF, find_panels_of_sheets
+from warpshadow.maths.shells import find_layer
 from warpshadow.maths.tubes import MAX_SEGMENTS, find_tube
 
 MAX_FACES = 64
@@ -51,7 +53,7 @@ class ConvexPart(NamedTuple):
 
 
 def is_panel(part: ConvexPart) -> bool:
-    """Whether a part is a panel of a sheet, which encloses nothing."""
+    """Whether a part is a panel of a sheet or a thin wall, which encloses nothing."""
     return len(part.faces) == 2 and not part.is_seam
 
 
@@ -68,16 +70,19 @@ def find_convex_parts(
     Returns:
         The parts, which may touch and overlap: for each closed piece of the mesh a solid, or the prisms into which it
         is cut if it is one, with holes or without, or the segments of a bent tube; panels for each open one. They come
-        by pieces, and in each the seams come last. Panels of sheets that share edges are of one piece. None where a
-        closed piece is hollow or curved otherwise, where a part has more than 64 faces, or where there are more than 32
-        prisms of a piece, 128 segments of all tubes, or 144 panels (256 of leaves, 64 flat ones).
+        by pieces, and in each the seams come last. Panels of sheets that share edges are of one piece. A closed piece
+        around a thin wall (:mod:`.shells`) has one-sided panels: those for receivers outside are one piece, those for
+        receivers inside another, as a receiver may see both walls of a mug behind each other. None where a closed piece
+        is hollow or curved otherwise, where a part has more than 64 faces, or where there are more than 32 prisms of a
+        piece, 128 segments of all tubes, or 144 panels (256 of leaves, 64 flat ones, 160 of thin walls).
     """
     _, first, vertex = np.unique(positions, axis=0, return_index=True, return_inverse=True)
     triangles = vertex.reshape(-1)[faces]
     triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
     if not len(triangles):
         return None
-    points, pieces, sheets, segment_count = positions.astype(np.float64)[first], [], [], 0
+    points, pieces, sheets, layers = positions.astype(np.float64)[first], [], [], []
+    segment_count, max_panels_of = 0, MAX_FLAT_PANELS_OF if flat_panels else MAX_PANELS_OF
     piece = _pieces(triangles)
     for number in range(piece.max() + 1):
         piece_triangles = triangles[piece == number]
@@ -89,16 +94,23 @@ def find_convex_parts(
         if parts_of_piece is None:
             parts_of_piece = _segments(points, piece_triangles, MAX_SEGMENTS - segment_count)
             if parts_of_piece is None:
-                return None
+                layer = None if flat_panels else find_layer(points, piece_triangles)
+                if layer is None:
+                    return None
+                layers.append(layer)
+                max_panels_of = MAX_SHELL_PANELS_OF
+                continue
             segment_count += len(parts_of_piece) - sum(part.is_seam for part in parts_of_piece)
         pieces.append(parts_of_piece)
-    panels = find_panels_of_sheets(points, sheets, flat=flat_panels)
+    panels = find_panels_of_sheets(points, [*sheets, *layers], max_panels_of)
     if panels is None:
         return None
     panels_of_group: dict[int, list[ConvexPart]] = {}
-    for number, panels_of_sheet in zip(_groups(sheets).tolist(), panels, strict=True):
+    for number, panels_of_sheet in zip(_groups(sheets).tolist(), panels, strict=False):
         panels_of_group.setdefault(number, []).extend(map(_panel, panels_of_sheet))
     pieces += filter(None, panels_of_group.values())
+    for layer, polygons in zip(layers, panels[len(sheets) :], strict=True):
+        pieces += _one_sided_panels(points, layer, polygons)
     return [
         part._replace(corners=first[part.corners], piece=number)
         for number, parts in enumerate(pieces)
@@ -139,6 +151,26 @@ def _panel(corners: np.ndarray) -> ConvexPart:
     begin = np.arange(count)
     edges = np.stack([begin, np.roll(begin, -1), np.zeros(count, int), np.ones(count, int)], axis=1)
     return ConvexPart(corners, sides, edges)
+
+
+def _one_sided_panels(
+    points: np.ndarray, triangles: np.ndarray, polygons: Sequence[np.ndarray]
+) -> tuple[list[ConvexPart], list[ConvexPart]]:
+    """Panels that block light of receivers outside a layer alone, and others of receivers inside."""
+    corners = points[triangles]
+    normals = np.repeat(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), 3, axis=0)
+    vertex_normals = np.zeros_like(points)
+    np.add.at(vertex_normals, triangles.ravel(), normals)
+    panels: tuple[list[ConvexPart], list[ConvexPart]] = [], []
+    for polygon in polygons:
+        spokes = points[polygon] - points[polygon[0]]
+        normal = np.cross(spokes, np.roll(spokes, -1, axis=0)).sum(axis=0)
+        outside = polygon if normal @ vertex_normals[polygon].sum(axis=0) > 0 else polygon[::-1]
+        for side, corners_of_side in zip(panels, (outside, outside[::-1]), strict=True):
+            panel = _panel(corners_of_side)
+            panel.faces[1] = 0  # nobody sees it
+            side.append(panel)
+    return panels
 
 
 def _solid(points: np.ndarray, triangles: np.ndarray, flatness: float = _FLATNESS) -> ConvexPart | None:

@@ -159,11 +159,11 @@ def free_shape_remark(scene: Scene, number: int) -> str:
             f"{called} is flat, and one sphere behind it blocks light in its place, whatever its shape becomes; "
             "blockers = fit_spheres(mesh, 64).spheres follow its vertices"
         )
-    if body.mesh.surface.is_closed or number not in blocking_parts(scene):
+    if not any(map(is_panel, blocking_parts(scene).get(number, []))):
         return ""
     return (
-        f"{called} is a sheet: while its shape is free {SPHERES_BESIDE_PARTS} spheres block its light in place of its "
-        'convex parts, and darken it; self_shadows = "spheres" fits as many as blockers = "auto" finds'
+        f"{called} is a sheet or a thin wall: while its shape is free {SPHERES_BESIDE_PARTS} spheres block its light "
+        'in place of its convex parts, and darken it; self_shadows = "spheres" fits as many as blockers = "auto" finds'
     )
 
 

@@ -79,6 +79,17 @@ def basket():
 BASKET = basket()
 
 
+def mug():
+    """A closed body of a thin wall."""
+    profile = [(0, 0), (0.33, 0), (0.36, 0.03), (0.36, 0.75), (0.33, 0.75), (0.33, 0.04), (0, 0.04)]
+    whole = trimesh.creation.revolve(profile, sections=32)
+    whole.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
+    return ws.Mesh(whole.vertices, whole.faces).creased()
+
+
+MUG = mug()
+
+
 def scene_of(mesh=TABLE, *, method="directional", blockers="auto", bounces=0, **options):
     """A table, or an awning, beside a ball, over a ground."""
     table = ws.Body(mesh, albedo=(0.8, 0.5, 0.3), blockers=blockers, name="table", **options)
@@ -96,7 +107,7 @@ def covered(image):
     return image[image[..., 3] > 0.99][:, :3]
 
 
-MESHES = {"table": TABLE, "awning": AWNING, "umbrella": UMBRELLA, "window": WINDOW, "basket": BASKET}
+MESHES = {"table": TABLE, "awning": AWNING, "umbrella": UMBRELLA, "window": WINDOW, "basket": BASKET, "mug": MUG}
 
 
 @pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
@@ -107,7 +118,21 @@ def test_images_are_those_of_rays_and_spheres_are_farther_off(mesh):
         for blockers in ("auto", 32)
     ]
     assert errors[0] < 0.015
-    assert errors[1] > 1.8 * errors[0]  # measured: 1.96 and more; of a basket without its segments 1.5
+    # measured: 1.96 and more, of a mug 1.2; of a basket without its segments 1.5
+    assert errors[1] > (1.15 if mesh is MUG else 1.8) * errors[0]
+
+
+def test_no_light_of_a_sun_leaks_through_a_thin_wall():
+    """In the shadow of a mug on the ground, and around its foot."""
+    body, _ball, ground = (scene := scene_of(MUG)).bodies
+    camera = ws.Camera.look_at((-1.2, 1.3, 1.4), (-0.2, 0.2, 0), size=(96, 96))
+    sky = ws.synthetic_sky((0.6, 0.6, 0.3))
+    scene = dataclasses.replace(scene, bodies=(body, ground), light=sky, camera=camera)
+    renderer = ws.Renderer(scene)
+    truth = ws.render(dataclasses.replace(scene, visibility=ws.Visibility("ray-traced", sampling="shared")))
+    is_ground = (renderer.body_ids()[0].reshape(96, 2, 96, 2) == 1).all(axis=(1, 3))
+    ratios = renderer.render()[is_ground][:, :3].mean(axis=1) / truth[is_ground][:, :3].mean(axis=1)
+    assert np.count_nonzero(ratios > 1.5) < 3
 
 
 @pytest.mark.parametrize("bounces", [0, 1])
@@ -147,7 +172,7 @@ MOVES = {
 
 @pytest.mark.parametrize("bounces", [0, 1])
 @pytest.mark.parametrize("moving", [None, ["table"], ["ball"]], ids=["all", "table", "ball"])
-@pytest.mark.parametrize("mesh", [TABLE, AWNING], ids=["table", "awning"])
+@pytest.mark.parametrize("mesh", [TABLE, AWNING, MUG], ids=["table", "awning", "mug"])
 def test_gradients_of_the_ground_are_those_of_differences(mesh, moving, bounces):
     """No pixel shows another body, so no rasterizer takes part.
 
@@ -170,8 +195,10 @@ def test_gradients_of_the_ground_are_those_of_differences(mesh, moving, bounces)
     shift = torch.tensor(0.4, requires_grad=True)
     loss(shift).backward()
     with torch.no_grad():
-        ends = [float(loss(torch.tensor(0.4 + sign * STEP))) for sign in (1, -1)]
-    assert float(shift.grad) == pytest.approx((ends[0] - ends[1]) / (2 * STEP), rel=0.01)  # measured: 0.002
+        # of 0.001 differences of a mug that moves alone are 4% off, of 0.0003 and 0.003 0.5 and 0.3%
+        step_size = 3 * STEP if mesh is MUG and moving == ["table"] else STEP
+        ends = [float(loss(torch.tensor(0.4 + sign * step_size))) for sign in (1, -1)]
+    assert float(shift.grad) == pytest.approx((ends[0] - ends[1]) / (2 * step_size), rel=0.01)  # measured: 0.002
 
 
 def test_a_table_whose_shape_is_free_blocks_by_spheres():

@@ -363,6 +363,19 @@ def test_shares_of_panels_beside_each_other_add_up_as_those_of_the_twin(device):
     assert set(log_past(mesh, around, twins.unit(-around), device)[1].ravel().round(3)) == {0, np.log(1e-4).round(3)}
 
 
+def test_a_shell_hides_a_lamp_in_it_and_none_above_its_rim(device):
+    """A receiver sees panels of a mug from outside, or from within; their backs hide nothing."""
+    profile = np.array([(0, -0.7), (1, -0.7), (1, 0.7), (0.95, 0.7), (0.95, -0.65), (0, -0.65)])
+    lathed = trimesh.creation.revolve(profile, sections=16)
+    mug = ws.Mesh(lathed.vertices, lathed.faces)
+    assert not any(np.ptp(part.faces[1]) for part in mug.convex_parts)
+    points = np.array([[3.0, 0.2, -0.1], [0.1, -2.5, 0.1], [0.2, 0.1, -3.0], [0.2, 0.1, 3.0], [0.6, 0, 0]])
+    hidden = log_past(mug, points, twins.unit(-points), device)[1]
+    own = hidden[:, (hidden[:4] != 0).any(axis=0)]  # samples that light one of them
+    assert own[:3].min(axis=1) == pytest.approx(np.log(1e-4))
+    np.testing.assert_array_equal(hidden[3:], 0)
+
+
 def test_a_panel_that_is_not_quite_flat_hides_nothing_beside_it(device):
     """Panels that stand in for two quads of a cone each, from receivers in their planes that see all of the lamp."""
     mesh = cone(48)

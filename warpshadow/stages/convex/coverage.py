@@ -29,7 +29,7 @@ from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, scratch_slot
 from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.convex.joint_lanes import coverage_type, make_joint_functions, sums_type
-from warpshadow.stages.convex.prepared import ConvexArrays, ConvexBlockers, PlacedParts
+from warpshadow.stages.convex.prepared import UNSEEN, ConvexArrays, ConvexBlockers, PlacedParts
 from warpshadow.stages.convex.silhouette import (
     ADJOINT_LANES,
     EDGE_LANES,
@@ -220,6 +220,11 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         """Find the cones around a part, and where it may block light."""
         bound = task.bounds[part]
         result = find_cones(task, bound, inputs.radius)
+        face = inputs.parts.first_face[part]
+        if task.silhouette.face_planes[face + 1][3] == UNSEEN:  # it is one-sided
+            plane = task.silhouette.face_planes[face]
+            height = dot_direction(wp.vec3(plane[0], plane[1], plane[2]), task.points) - Lane(plane[3])
+            result.rise = wp.min(result.rise, height)
         if inputs.on_surface and is_any_above(result.rise, 0.0):
             depth = Lane(2.0 * bound[3] + find_margin(inputs.parts, part, bound)) - result.rise
             if is_any_above(depth, 0.0):  # else it is above tangent planes
@@ -396,7 +401,12 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
             affected_count = int(0)
             for k in range(covered_count):
                 q = task.covered[k]
-                adj_coverage = blocker_adjoint(task.sums[q], adj_sums[task.slot, q], task.coverage[q])
+                adj = adj_sums[task.slot, q]
+                adj_coverage = blocker_adjoint(task.sums[q], adj, task.coverage[q])
+                # of equal ones, as the front and the back of a mug at its outline, the first is the largest
+                difference = task.sums[q].largest - task.coverage[q].share
+                adj.largest = wp.cw_mul(adj.largest, is_positive(wp.max(difference, -difference)))
+                adj_sums[task.slot, q] = adj
                 task.coverage[q] = adj_coverage
                 if is_any(adj_coverage):
                     task.covered[affected_count] = q
@@ -418,10 +428,10 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
                                 for i in range(ADJOINT_STRIDE * count):
                                     silhouette.adj_edges[i] = Lane(0.0)
                             factor = parts.signs[part] * is_positive(reach)
-                            adj = Coverages(
+                            adj_cell = Coverages(
                                 wp.cw_mul(factor, task.coverage[q].share), scale(factor, task.coverage[q].moment)
                             )
-                            coverage_adjoint(parts, silhouette, direction, radius, adj)
+                            coverage_adjoint(parts, silhouette, direction, radius, adj_cell)
                     if is_found:
                         adj_point = add(adj_point, silhouette_adjoint(parts, silhouette, task.instance, adj_corners))
                 for k in range(affected_count):

@@ -29,6 +29,10 @@ class ConvexBody(NamedTuple):
     """Whether it casts shadows."""
 
 
+UNSEEN = wp.constant(1.0e30)
+"""Distance of the plane of a face without area, which nobody sees: the back of a one-sided panel."""
+
+
 @wp.struct
 class ConvexArrays:
     """Parts as kernels read them: corners, faces and edges of one part after another."""
@@ -144,7 +148,8 @@ def _bound_parts(
         normal = wp.normalize(
             wp.cross(corners[batch, parts.faces[face][1]] - a, corners[batch, parts.faces[face][2]] - a)
         )
-        face_planes[batch, face] = wp.vec4(normal[0], normal[1], normal[2], wp.dot(normal, a))
+        distance = wp.where(parts.faces[face][0] == parts.faces[face][1], UNSEEN, wp.dot(normal, a))
+        face_planes[batch, face] = wp.vec4(normal[0], normal[1], normal[2], distance)
 
 
 def _starts(counts: Sequence[int]) -> np.ndarray:

@@ -1,0 +1,83 @@
+"""Layers of thin walls."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from warpshadow.maths.convex import find_convex_parts, is_panel
+from warpshadow.maths.shells import find_layer
+
+WALL = 0.08
+
+
+def lathed(*profile, sections=32):
+    return trimesh.creation.revolve(np.array(profile, float), sections=sections)
+
+
+def mug(wall=WALL, sections=32):
+    """A mug of radius 1 and height 2 with a round lip."""
+    angles = np.linspace(0, np.pi, 7)
+    lip = np.stack([1 - wall / 2 + wall / 2 * np.cos(angles), 2 + wall / 2 * np.sin(angles)], axis=1)
+    return lathed((0, 0), (0.9, 0), (1, 0.1), *lip, (1 - wall, wall), (0, wall), sections=sections)
+
+
+def layer_of(mesh):
+    return find_layer(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+@pytest.mark.parametrize("mesh", [mug(), mug().subdivide(), mug(sections=96)], ids=["mug", "divided", "round"])
+def test_the_layer_of_a_mug_is_its_outside(mesh):
+    outside = trimesh.Trimesh(mesh.vertices, layer_of(mesh), process=False)
+    low = outside.triangles_center[:, 2] < 1.9
+    radii = np.linalg.norm(outside.triangles_center[low, :2], axis=1)
+    assert ((radii > 0.96) | (outside.triangles_center[low, 2] < 0.1)).all()  # neither the inside of its wall
+    assert (outside.face_normals[low, 2] < 0.1).all()  # nor of its bottom
+    exact = np.pi * (0.9**2 + 0.1 * 2**0.5 * 1.9 + 2 * 1.9)
+    assert outside.area == pytest.approx(exact, rel=0.03)
+
+
+def test_the_layer_is_the_same_of_a_mug_that_is_inside_out_and_turned():
+    mesh, turned = mug(), mug()
+    turned.invert()
+    turned.apply_transform(trimesh.transformations.euler_matrix(0.4, 1.1, 2.0))
+    areas = [trimesh.Trimesh(each.vertices, layer_of(each), process=False).area for each in (mesh, turned)]
+    assert areas[1] == pytest.approx(areas[0], rel=0.01)
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        mug(0.3),
+        trimesh.creation.icosphere(3),
+        trimesh.creation.torus(1, 0.05, 48, 12),
+        trimesh.creation.capsule(2, 0.05, count=[16, 16]),
+        lathed((0, 0), (1, 0), (1.1, 0.1), (1.05, 0.15), (0.98, 0.05), (0, 0.05)),
+        lathed((0, 0), (1, 0), (1.02, 0.04), (1, 0.08), (0, 0.08)),
+    ],
+    ids=["thick", "ball", "ring", "rod", "plate", "slab"],
+)
+def test_solids_rods_and_plates_have_no_layer(mesh):
+    assert layer_of(mesh) is None
+
+
+def test_a_mug_blocks_as_panels_for_receivers_outside_and_others_for_receivers_inside():
+    mesh = mug()
+    parts = find_convex_parts(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    assert all(map(is_panel, parts))
+    pieces = [[part for part in parts if part.piece == number] for number in (0, 1)]
+    assert len(pieces[0]) == len(pieces[1]) == len(parts) / 2 > 32
+    middle = np.array([0, 0, 1.0])
+    for sign, piece in zip((1, -1), pieces, strict=True):
+        for part in piece:
+            a, b, c = mesh.vertices[part.corners][part.faces[0]]
+            assert sign * (np.cross(b - a, c - a) @ (a - middle)) > 0
+            assert not np.ptp(part.faces[1])  # a face without area
+
+
+def test_a_mug_of_a_handle_and_a_spoon_has_their_parts_too():
+    handle = trimesh.creation.torus(0.4, 0.08, 24, 8).apply_translation((1.2, 0, 1))
+    spoon = trimesh.creation.box((0.05, 0.05, 2)).apply_translation((0.5, 0, 1.5))
+    mesh = trimesh.util.concatenate([mug(), handle, spoon])
+    parts = find_convex_parts(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    assert len({part.piece for part in parts}) == 4
+    assert len([part for part in parts if len(part.faces) > 2]) == 24 + 1
