@@ -95,7 +95,8 @@ def hit_weight(
         return 1.0
     a = corners[3 * face]
     face_normal = wp.normalize(wp.cross(corners[3 * face + 1] - a, corners[3 * face + 2] - a))
-    slope = wp.dot(face_normal, ray_direction)
-    distance = wp.dot(face_normal, a - point) / slope
-    rays = float(ray_count) * wp.dot(normal, ray_direction) * wp.abs(slope) / (wp.pi * distance * distance)
-    return rays / (rays + density)
+    slope = wp.abs(wp.dot(face_normal, ray_direction))
+    height = wp.dot(face_normal, a - point)  # d slope: 0 for a point in the face's plane
+    rays = float(ray_count) * wp.dot(normal, ray_direction) * slope * slope * slope
+    total = rays + wp.pi * height * height * density
+    return wp.where(total > 0.0, rays / total, 1.0)

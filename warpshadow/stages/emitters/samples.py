@@ -380,7 +380,7 @@ def may_light(beam: wp.vec3, area: wp.vec3, normal: wp.vec3, is_two_sided: int):
     sample's plane by a sine of 0.3 or more.
     """
     size = wp.length(area)
-    is_above = wp.dot(beam, normal) > -wp.sqrt(size)
+    is_above = wp.dot(beam, normal) > -wp.sqrt(size) and wp.length_sq(beam) > 0.0
     return is_above and (wp.dot(beam, area) < _MAX_SOFTNESS * size * wp.length(beam) or is_two_sided == 1)
 
 
