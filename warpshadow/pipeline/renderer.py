@@ -505,4 +505,4 @@ def _find_near_light(merged_scene: MergedScene) -> NearLight | None:
         return None
     from warpshadow.pipeline.shading.emitters import SceneEmitters
 
-    return SceneEmitters(merged_scene).unshadowed_luminance
+    return SceneEmitters(merged_scene).direct_luminance

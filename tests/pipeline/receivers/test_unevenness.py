@@ -135,6 +135,16 @@ def test_the_light_of_emitters_counts():
     assert kept == ["pixel", "vertex"]
 
 
+def test_shadows_in_the_light_of_emitters_count():
+    ball = ws.Body(ws.icosphere(0.5, 3), name="ball")
+    lamp = ws.Body(ws.icosphere(0.05, 2), (0, 0, 0), emission=(50, 50, 50), translation=(0.2, 1.6, 0.4), name="lamp")
+    slats = [ws.Body(ws.plane((0.05, 1.0)), translation=(x, 0.7, 0.1)) for x in np.linspace(-0.4, 0.4, 7)]
+    camera = ws.Camera.look_at((0, 1.5, 4.0), (0, 0, 0), fov_y=25, size=(40, 40))
+    for bodies, expected in (([ball, lamp], "vertex"), ([ball, lamp, *slats], "pixel")):
+        scene = ws.Scene(bodies, ws.EnvironmentMap.constant(0.0), camera)
+        assert ws.Renderer(scene).scene.bodies[0].receivers == expected
+
+
 def test_a_wall_that_a_lamp_nearly_touches_has_its_light():
     """1 cm behind the lamp; the truth has receivers at vertices 1 cm apart."""
     near = (0, 0, 0.03)

@@ -23,10 +23,11 @@ from warpshadow.stages.rays.ray_tracing import trace_visibility_on_host
 _CELLS = 128  # of directions; the default of "directional", which has them already
 _RAYS = 64  # from a point, to cells by their light
 _FACES = 256  # of a body that are looked at, at most
+_DARK = 1e-3  # of the brightest middle of a face, up to which a body's light is no matter
 
 
 NearLight: TypeAlias = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Gives the luminance of light of emitters past no blockers, at points with unit normals, [point, 3]."""
+"""Gives the luminance of light of emitters past all that blocks, at points with unit normals, [point, 3]."""
 
 
 def light_unevenness(
@@ -72,11 +73,11 @@ def light_unevenness(
     if near_light is not None:
         received += near_light(points.reshape(-1, 3), point_normals.reshape(-1, 3)).reshape(received.shape)
     at_middles, errors = received[:, 3], received[:, :3].mean(axis=1) - received[:, 3]
-    first = 0
+    dark, first = _DARK * at_middles.max(initial=0.0), 0
     for number, part in enumerate(chosen):
         items, weights = slice(first, first + len(part)), counts[part]
         power, first = (weights * at_middles[items] ** 2).sum(), first + len(part)
-        if power > 0:
+        if power > weights.sum() * dark**2:
             result[number] = np.sqrt((weights * errors[items] ** 2).sum() / power)
     return result
 

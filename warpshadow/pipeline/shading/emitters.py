@@ -159,18 +159,22 @@ class SceneEmitters:
         with unrecorded():
             return find_self_visibility(*surface, *samples, is_two_sided=is_open, device=device)
 
-    def unshadowed_luminance(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Luminance of their light past no blockers, at points with unit normals, [point, 3]."""
+    def direct_luminance(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Luminance of their light past the scene's meshes, at points of the scene with unit normals, [point, 3]."""
+        from warpshadow.stages.emitters.traced import trace_transmittance
+
         scene, samples = self._merged_scene, self.samples
         positions = np.concatenate([body.world_mesh().positions for body in scene.scene.bodies])
         vertices, at_points, along_normals = (
             wp.array(item[None], dtype=wp.vec3, device=scene.device) for item in (positions, points, normals)
         )
-        placed_samples = place_samples(vertices, samples)
+        placed_samples, mesh = place_samples(vertices, samples), scene.casting_mesh(vertices[0])
         radiance = self.radiance(Materials.of_scene(scene)).value(Call(Clock()))
         total = np.zeros(len(points))
         for span in samples.spans():
-            transmittance = weigh_by_beam(at_points, placed_samples, span, None)
+            at_samples = samples, vertices[0], placed_samples.points[0], placed_samples.areas[0], span
+            traced = trace_transmittance(mesh, at_points[0], along_normals[0], *at_samples, rays=1)
+            transmittance = weigh_by_beam(at_points, placed_samples, span, traced.reshape((1, *traced.shape)))
             light = sum_light(at_points, along_normals, placed_samples, radiance, span, transmittance)
             total += light.numpy()[0] @ LUMINANCE
         return total
