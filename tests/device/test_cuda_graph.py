@@ -324,7 +324,7 @@ def test_a_graph_holds_the_cached_values_that_it_reads(scene):
     step = Captured(with_gradients(lambda: squared_difference(draw(lights[0]), target), [texture]), "cpu")
     step()
     expected = step().numpy()[0]
-    _, white = renderer.view()._cached["white"]
+    _, white = renderer.view()._cached["white samples"]
     held = weakref.ref(white.value(renderer.view().call))
     del white
     draw(lights[1])

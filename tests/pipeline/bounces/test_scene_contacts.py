@@ -30,7 +30,7 @@ def test_a_ball_on_a_ground_touches_it_at_its_foot():
     foot = on_ground.from_world(np.array([1.0, 0, 3]))
     assert np.linalg.norm(of_ball.points - foot, axis=1).max() < 0.1
     assert np.linalg.norm(of_ground.points - [0.5, 0, 3], axis=1).max() < 0.2
-    assert of_ball.size == pytest.approx(1) and of_ground.size == pytest.approx(2)
+    assert of_ball.half_size == pytest.approx(1) and of_ground.half_size == pytest.approx(2)
 
 
 def test_two_balls_touch_between_them():
