@@ -73,11 +73,11 @@ def light_unevenness(
     if near_light is not None:
         received += near_light(points.reshape(-1, 3), point_normals.reshape(-1, 3)).reshape(received.shape)
     at_middles, errors = received[:, 3], received[:, :3].mean(axis=1) - received[:, 3]
-    least, first = _DARK * at_middles.max(initial=0.0), 0
+    threshold, first = _DARK * at_middles.max(initial=0.0), 0
     for number, part in enumerate(chosen):
         items, weights = slice(first, first + len(part)), counts[part]
         power, first = (weights * at_middles[items] ** 2).sum(), first + len(part)
-        if power > weights.sum() * least**2:
+        if power > weights.sum() * threshold**2:
             result[number] = np.sqrt((weights * errors[items] ** 2).sum() / power)
     return result
 
