@@ -31,6 +31,7 @@ from warpshadow.assets.topology import (
     smooth_pieces,
 )
 from warpshadow.check import AnyPath
+from warpshadow.maths.adjacency import area_normals
 from warpshadow.maths.convex import ConvexPart, find_convex_parts
 from warpshadow.maths.plane import plane_normal
 
@@ -182,8 +183,8 @@ class Mesh:
     @functools.cached_property
     def area(self) -> float:
         """Area of its surface [square of its units]."""
-        a, b, c = np.moveaxis(self.positions.astype(np.float64)[self.surface.faces], 1, 0)
-        return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+        normals = area_normals(self.positions.astype(np.float64)[self.surface.faces])
+        return float(np.linalg.norm(normals, axis=1).sum() / 2)
 
     @functools.cached_property
     def flat_parts(self) -> list[ConvexPart]:

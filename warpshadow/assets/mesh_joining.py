@@ -11,6 +11,7 @@ from warpshadow.assets.color import GRAY, srgb_to_linear
 from warpshadow.assets.gltf import emission_texels, gloss_texels
 from warpshadow.assets.mesh import DIFFUSE, BaseColor, Gloss, Mesh, MeshError, MeshPart, checked_indices
 from warpshadow.assets.topology import CREASE, first_at_positions, is_listed_first
+from warpshadow.maths.adjacency import area_normals
 
 
 class JoinedMesh(NamedTuple):
@@ -44,9 +45,9 @@ def join_parts(parts: list[MeshPart], name: str) -> JoinedMesh:
     own_uv_faces = None if uv_faces is None else uv_faces[is_first]
     mesh = Mesh(positions, faces[is_first], uvs, own_uv_faces, name, colors=_joined_colors(parts))
 
-    a, b, c = np.moveaxis(mesh.positions.astype(np.float64)[mesh.faces], 1, 0)
+    normals = area_normals(mesh.positions.astype(np.float64)[mesh.faces])
     counts = {
-        "degenerate faces (no area)": np.sum(~np.cross(b - a, c - a).any(axis=1)),
+        "degenerate faces (no area)": np.sum(~normals.any(axis=1)),
         "duplicate faces dropped": np.sum(~is_first),
         "unreferenced vertices": mesh.vertex_count - len(used) - sum(part.welded for part in parts),
     }

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from warpshadow.maths.adjacency import edge_neighbors, number_positions
+from warpshadow.maths.adjacency import area_normals, edge_neighbors, number_positions
 from warpshadow.maths.components import connected_components
 
 CREASE = 30.0  # edges whose faces bend by more are sharp [degrees]
@@ -224,8 +224,7 @@ def _is_parted(surface: MeshTopology, face: np.ndarray, edge: np.ndarray, neighb
 
 def face_normals(corners: np.ndarray) -> np.ndarray:
     """Unit normals of faces [face, corner, 3], float64 of shape [face, 3]; 0 where a face has no area."""
-    a, b, c = np.moveaxis(corners.astype(np.float64), 1, 0)
-    normals = np.cross(b - a, c - a)
+    normals = area_normals(corners.astype(np.float64))
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     return normals / np.where(lengths > 0, lengths, 1)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from warpshadow import check
 from warpshadow.assets.mesh import Mesh, MeshError
-from warpshadow.maths.adjacency import edge_neighbors
+from warpshadow.maths.adjacency import area_normals, edge_neighbors
 from warpshadow.maths.components import connected_components
 
 
@@ -70,8 +70,7 @@ def _pieces(corners: np.ndarray, neighbors: np.ndarray) -> list[np.ndarray]:
     It cuts nothing where neighbors are all but coplanar, and crashes where these close around a round, finely
     tessellated body. Such a mesh comes in six pieces, by the axis that a face looks along.
     """
-    a, b, c = np.moveaxis(corners.astype(np.float64), 1, 0)
-    normals = np.cross(b - a, c - a)
+    normals = area_normals(corners.astype(np.float64))
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     face, edge = np.nonzero(neighbors >= 0)
     other = neighbors[face, edge]

@@ -1,10 +1,15 @@
-"""Adjacency of triangles: their edges, which of them share one, and which vertices are at one place."""
+"""Triangles: their normals and edges, which of them share one, and which vertices are at one place."""
 
 import numpy as np
 
 from warpshadow import check
 
 _NOT_MANIFOLD = -2
+
+
+def area_normals(corners: np.ndarray) -> np.ndarray:
+    """Normals of triangles, twice as long as their areas, given their corners [triangle, 3, 3]; shape [triangle, 3]."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def edges_of(triangles: np.ndarray) -> np.ndarray:

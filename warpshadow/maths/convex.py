@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from warpshadow.maths.adjacency import edges_of
+from warpshadow.maths.adjacency import area_normals, edges_of
 from warpshadow.maths.components import connected_components
 from warpshadow.maths.outline import cut_outline, find_outline
 from warpshadow.maths.panels import MAX_FLAT_PANELS_OF, MAX_PANELS_OF, MAX_SHELL_PANELS_OF, find_panels_of_sheets
@@ -158,7 +158,7 @@ def _one_sided_panels(
 ) -> tuple[list[ConvexPart], list[ConvexPart]]:
     """Panels that block light of receivers outside a layer alone, and others of receivers inside."""
     corners = points[triangles]
-    normals = np.repeat(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), 3, axis=0)
+    normals = np.repeat(area_normals(corners), 3, axis=0)
     vertex_normals = np.zeros_like(points)
     np.add.at(vertex_normals, triangles.ravel(), normals)
     panels: tuple[list[ConvexPart], list[ConvexPart]] = [], []
@@ -183,7 +183,7 @@ def _solid(points: np.ndarray, triangles: np.ndarray, flatness: float = _FLATNES
         return None
     used_vertices = np.unique(triangles)
     corners = points[triangles] - points[used_vertices].mean(axis=0)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = area_normals(corners)
     volume, size = (normals * corners[:, 0]).sum() / 6, np.ptp(points[used_vertices], axis=0).max()
     if volume < 0:
         return _solid(points, triangles[:, ::-1], flatness)
@@ -229,7 +229,7 @@ def _solid(points: np.ndarray, triangles: np.ndarray, flatness: float = _FLATNES
 def _prisms(points: np.ndarray, triangles: np.ndarray) -> list[ConvexPart] | None:
     """The convex prisms into which the prism that triangles enclose is cut; None where they enclose none."""
     corners = points[triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = area_normals(corners)
     lengths = np.linalg.norm(normals, axis=1)
     permutation = np.argsort(-lengths)[: np.count_nonzero(lengths)]
     axes = normals[permutation] / lengths[permutation, None]

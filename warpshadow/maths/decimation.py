@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from warpshadow.maths.adjacency import edges_of
+from warpshadow.maths.adjacency import area_normals, edges_of
 
 _MAX_TURN = 0.5  # cosine of the angle, 60°, by which a collapse may turn a triangle
 _SLIVER = 0.1
@@ -45,16 +47,17 @@ def decimate(points: np.ndarray, triangles: np.ndarray, tolerance: float) -> np.
         triangles = _sampled(points, triangles)
         used_points = np.unique(triangles)
     positions, faces = points[used_points], np.searchsorted(used_points, triangles)
-    quadrics, areas = _quadrics(positions, faces)
-    rim_lengths, removed_areas = _rim_lengths(positions, faces), np.zeros(len(positions))
+    edges = _find_edges(faces, len(positions))
+    quadrics, areas = _quadrics(positions, faces, edges)
+    rim_lengths, removed_areas = _rim_lengths(positions, faces, edges), np.zeros(len(positions))
     generator = np.random.default_rng(0)
     while True:
-        begin, end = _collapses(faces, len(positions))
+        begin, end = _collapses(edges, len(positions))
         targets = np.concatenate([positions[end], np.ones((len(end), 1))], axis=1)[:, None]
         sums = (targets @ (quadrics[begin] + quadrics[end]) @ targets.swapaxes(1, 2)).ravel()
         lengths2 = ((positions[begin] - positions[end]) ** 2).sum(axis=1)
         costs = np.maximum(sums, 0) / (areas[begin] + areas[end]) + _TIE * lengths2
-        new_areas = _removed_areas(positions, faces, begin, end)
+        new_areas = _removed_areas(positions, faces, edges, begin, end)
         shifts = removed_areas[begin] + removed_areas[end] + new_areas
         costs += (shifts / np.maximum(rim_lengths[begin] + rim_lengths[end], 1e-30)) ** 2 * (new_areas != 0)
         affordable = np.flatnonzero(costs <= tolerance**2)
@@ -78,6 +81,7 @@ def decimate(points: np.ndarray, triangles: np.ndarray, tolerance: float) -> np.
         moved_to[begin] = end
         faces = moved_to[faces]
         faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+        edges = _find_edges(faces, len(positions))
 
 
 def _sampled(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -87,9 +91,7 @@ def _sampled(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
     used_points = np.unique(triangles)
     positions, faces = points[used_points], np.searchsorted(used_points, triangles)
-    count, edges = len(positions), edges_of(faces)
-    codes, counts = np.unique(np.sort(edges, axis=1) @ [count, 1], return_counts=True)
-    ends = np.stack([codes // count, codes % count])
+    count, (ends, _, counts) = len(positions), _find_edges(faces, len(positions))
     lengths = np.linalg.norm(positions[ends[0]] - positions[ends[1]], axis=1)
     graph = csr_matrix((lengths, tuple(ends)), (count, count))
     seeds = np.random.default_rng(0).choice(count, _MAX_POINTS, replace=False)
@@ -112,13 +114,13 @@ def _first_of_each(begin: np.ndarray, collapses: np.ndarray) -> np.ndarray:
     return collapses[np.sort(np.unique(begin[collapses], return_index=True)[1])]
 
 
-def _quadrics(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _quadrics(positions: np.ndarray, faces: np.ndarray, edges: _Edges) -> tuple[np.ndarray, np.ndarray]:
     """Sums over the planes around each vertex, of squared distances, [vertex, 4, 4], and of areas."""
     count = len(positions)
-    normals = _normals(positions, faces)
+    normals = area_normals(positions[faces])
     doubles = np.linalg.norm(normals, axis=1)
     units = normals / doubles[:, None]
-    border, triangle = _rim(faces, count)
+    border, triangle = _rim(faces, edges)
     sides = positions[border[:, 1]] - positions[border[:, 0]]
     upright = np.cross(sides, units[triangle])
     lengths = np.linalg.norm(upright, axis=1)
@@ -137,28 +139,41 @@ def _quadrics(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
     return result, areas
 
 
-def _rim(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+class _Edges(NamedTuple):
+    ends: np.ndarray  # [2, edge]
+    of_triangles: np.ndarray  # [3, triangle]
+    counts: np.ndarray  # triangles that have it, [edge]
+
+
+def _find_edges(faces: np.ndarray, count: int) -> _Edges:
+    codes, edge, counts = np.unique(
+        np.sort(edges_of(faces), axis=1) @ [count, 1], return_inverse=True, return_counts=True
+    )
+    return _Edges(np.stack([codes // count, codes % count]), edge.reshape(3, -1), counts)
+
+
+def _rim(faces: np.ndarray, edges: _Edges) -> tuple[np.ndarray, np.ndarray]:
     """Edges of one triangle, from its first corner first, shape [edge, 2], and the numbers of these triangles."""
-    edges = edges_of(faces)
-    _, edge, counts = np.unique(np.sort(edges, axis=1) @ [count, 1], return_inverse=True, return_counts=True)
-    on_rim = np.flatnonzero(counts[edge.reshape(-1)] == 1)
-    return edges[on_rim], on_rim % len(faces)
+    on_rim = np.flatnonzero(edges.counts[edges.of_triangles.ravel()] == 1)
+    return edges_of(faces)[on_rim], on_rim % len(faces)
 
 
-def _rim_lengths(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def _rim_lengths(positions: np.ndarray, faces: np.ndarray, edges: _Edges) -> np.ndarray:
     """Half the length of the edges of the rim at each vertex."""
-    rim, _ = _rim(faces, len(positions))
+    rim, _ = _rim(faces, edges)
     lengths = np.linalg.norm(positions[rim[:, 1]] - positions[rim[:, 0]], axis=1) / 2
     return np.bincount(rim.ravel(), np.repeat(lengths, 2), len(positions))
 
 
-def _removed_areas(positions: np.ndarray, faces: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+def _removed_areas(
+    positions: np.ndarray, faces: np.ndarray, edges: _Edges, begin: np.ndarray, end: np.ndarray
+) -> np.ndarray:
     """Area of the surface at the rim that collapses take away, below 0 where they add some."""
-    rim, triangle = _rim(faces, len(positions))
+    rim, triangle = _rim(faces, edges)
     before, after = np.full((2, len(positions)), -1)
     before[rim[:, 1]], after[rim[:, 0]] = rim.T
     normals = np.zeros((len(positions), 3))
-    np.add.at(normals, rim, _normals(positions, faces[triangle])[:, None])
+    np.add.at(normals, rim, area_normals(positions[faces[triangle]])[:, None])
     result = np.zeros(len(begin))
     at_rim = np.flatnonzero((before[begin] >= 0) & ((end == before[begin]) | (end == after[begin])))
     corner = begin[at_rim]
@@ -169,15 +184,12 @@ def _removed_areas(positions: np.ndarray, faces: np.ndarray, begin: np.ndarray, 
     return result
 
 
-def _collapses(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _collapses(edges: _Edges, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Vertices, and the neighbors to which they may go, such that the mesh stays a surface with the same border."""
     from scipy.sparse import csr_matrix
 
-    codes, edge, counts = np.unique(
-        np.sort(edges_of(faces), axis=1) @ [count, 1], return_inverse=True, return_counts=True
-    )
-    ends, edge = np.stack([codes // count, codes % count]), edge.reshape(3, -1)
-    is_lone = np.zeros(len(codes), bool)
+    ends, edge, counts = edges
+    is_lone = np.zeros(len(counts), bool)
     is_lone[edge[:, (counts[edge] == 1).all(axis=0)]] = True  # of triangles without neighbors, which would be gone
     borders_at = np.bincount(ends[:, counts == 1].ravel(), minlength=count)
     is_fixed = borders_at > 2  # where borders touch
@@ -207,7 +219,7 @@ def _keeps_sides(positions: np.ndarray, faces: np.ndarray, begin: np.ndarray, en
     is_left = (before != end[collapse, None]).all(axis=1)
     before, collapse = before[is_left], collapse[is_left]
     after = np.where(before == begin[collapse, None], end[collapse, None], before)
-    normals, new_normals = _normals(positions, before), _normals(positions, after)
+    normals, new_normals = area_normals(positions[before]), area_normals(positions[after])
     doubles, new_doubles = np.linalg.norm(normals, axis=1), np.linalg.norm(new_normals, axis=1)
     heights, new_heights = doubles / _longest2(positions, before), new_doubles / _longest2(positions, after)
     is_worse = (normals * new_normals).sum(axis=1) < _MAX_TURN * doubles * new_doubles
@@ -236,12 +248,6 @@ def _lowest_around(faces: np.ndarray, values: np.ndarray, steps: int) -> np.ndar
             np.minimum.at(result, column, lowest)
         values = result
     return values
-
-
-def _normals(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Normals of triangles, twice as long as their area."""
-    a, b, c = np.moveaxis(positions[faces], 1, 0)
-    return np.cross(b - a, c - a)
 
 
 def _longest2(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:

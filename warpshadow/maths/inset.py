@@ -6,6 +6,8 @@ there, would be a matter of rounding or of winding. A little farther inside its 
 
 import numpy as np
 
+from warpshadow.maths.adjacency import area_normals
+
 _SHARE = 1e-3  # of the way to the middles of the faces around a vertex
 _ROUNDING = 2.0**-16  # distance at least, as a share of the largest coordinate: rays take less for none
 _FLATNESS = 1e-6  # 1 − cosine between the faces around a vertex, up to which they are flat
@@ -22,7 +24,7 @@ def inset_vertices(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """
     points = np.asarray(positions, np.float64)
     corners = points[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = area_normals(corners)
     lengths = np.linalg.norm(normals, axis=1)
     has_area = lengths > 0
     faces, middles, normals = faces[has_area], corners[has_area].mean(axis=1), normals[has_area]

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from warpshadow.maths.adjacency import edge_neighbors
+from warpshadow.maths.adjacency import area_normals, edge_neighbors
 from warpshadow.maths.components import connected_components
 from warpshadow.maths.decimation import decimate
 from warpshadow.maths.outline import cut_outline, find_outline
@@ -118,7 +118,7 @@ def find_panels_of_sheets(
 def _smooth_regions(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Triangles that have an area, and numbers of their regions between creases, as edges of more than two are."""
     corners = points[triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = area_normals(corners)
     lengths = np.linalg.norm(normals, axis=1)
     has_area = lengths > 1e-10 * np.ptp(corners, axis=(0, 1)).max() ** 2
     triangles, normals = triangles[has_area], normals[has_area] / lengths[has_area, None]

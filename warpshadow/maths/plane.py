@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from warpshadow.maths.adjacency import area_normals
+
 _FLATNESS = 1e-4  # relative thickness below which a mesh counts as flat
 
 
@@ -13,7 +15,7 @@ def plane_normal(corners: np.ndarray) -> np.ndarray | None:
     Returns:
         Unit normal, their mean by area, shape [3]; None where they do not lie in one plane, or have no mean.
     """
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
+    normal = area_normals(corners).sum(axis=0)
     if not normal.any():
         return None
     normal = normal / np.linalg.norm(normal)

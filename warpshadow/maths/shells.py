@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from warpshadow.maths.adjacency import edge_neighbors
+from warpshadow.maths.adjacency import area_normals, edge_neighbors
 from warpshadow.maths.plane import principal_axes
 
 MAX_THICKNESS = 0.06
@@ -47,7 +47,7 @@ def find_layer(points: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
 
     count, corners = len(triangles), points[triangles]
     corners = corners - corners[0, 0]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = area_normals(corners)
     areas = np.linalg.norm(normals, axis=1) / 2
     area, size = areas.sum(), np.ptp(corners, axis=(0, 1)).max()
     volume = (normals * corners[:, 0]).sum() / 6

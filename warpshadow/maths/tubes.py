@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from warpshadow.maths.adjacency import edges_of
+from warpshadow.maths.adjacency import area_normals, edges_of
 
 SLACK = 0.2
 """Distance of a corner of a tube from its straight segments at most, over the radius of its section."""
@@ -136,7 +136,7 @@ def _hull(points: np.ndarray, sections: tuple[np.ndarray, np.ndarray]) -> np.nda
     vertices = np.unique(sections)
     hull = ConvexHull(points[vertices])
     corners = points[vertices[hull.simplices]]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = area_normals(corners)
     is_inward = (normals * hull.equations[:, :3]).sum(axis=1) < 0
     triangles: np.ndarray = vertices[np.where(is_inward[:, None], hull.simplices[:, ::-1], hull.simplices)]
     return triangles
@@ -149,7 +149,7 @@ def _quads(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.nd
         Numbers of the triangles, [quad, 2], and the corners, [quad, 4].
     """
     corners, edges, count = points[triangles], edges_of(triangles), len(triangles)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = area_normals(corners)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-30)
     longest = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).argmax(axis=1)
     diagonals = edges[longest * count + np.arange(count)].tolist()

@@ -12,7 +12,7 @@ import warp as wp
 
 from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.topology import welded
-from warpshadow.maths.adjacency import edges_of
+from warpshadow.maths.adjacency import area_normals, edges_of
 from warpshadow.scene.body import Body, into_own_space
 from warpshadow.stages.rays.ray_tracing import trace_visibility_on_host
 
@@ -71,7 +71,7 @@ def is_bowl(body: Body) -> bool:
 def _upward_axis(mesh: Mesh, up: np.ndarray) -> np.ndarray | None:
     """Mean normal of a mesh, turned to look up; None if it hardly does, or if some face looks against it."""
     corners = mesh.positions[mesh.surface.faces].astype(np.float64)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = area_normals(corners)
     mean = normals.sum(axis=0)
     heights = normals @ mean
     if (heights < 0).any() or abs(mean @ up) <= _UPWARD * np.linalg.norm(mean):
@@ -87,7 +87,7 @@ def _count_overlaps(mesh: Mesh, other: Mesh, axis: np.ndarray) -> int:
 def _count_hits(mesh: Mesh, other: Mesh, axis: np.ndarray) -> int:
     """How many rays along an axis, from points of a mesh that are spread evenly, meet another one."""
     corners = mesh.positions[mesh.surface.faces]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).cumsum()
+    areas = np.linalg.norm(area_normals(corners), axis=1).cumsum()
     chosen = np.searchsorted(areas, areas[-1] * (np.arange(_POINTS) + 0.5) / _POINTS)
     horizons = np.broadcast_to(axis, (_POINTS, 3))
     vertices = wp.array(other.positions, dtype=wp.vec3, device="cpu")
@@ -99,7 +99,7 @@ def _count_hits(mesh: Mesh, other: Mesh, axis: np.ndarray) -> int:
 def _close_height_field(mesh: Mesh, axis: np.ndarray) -> Mesh:
     """A height field that is seen from where an axis points, with walls and a bottom on the other side."""
     points, faces = welded(mesh.positions, mesh.surface.faces)
-    normals = np.cross(points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]])
+    normals = area_normals(points[faces])
     if normals.sum(axis=0) @ axis < 0:
         faces = faces[:, ::-1]
     heights = points.astype(np.float64) @ axis

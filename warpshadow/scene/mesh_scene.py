@@ -17,6 +17,7 @@ from warpshadow.assets.mesh_files import MeshSource
 from warpshadow.assets.primitives import infinite_ground
 from warpshadow.assets.sky import synthetic_sky
 from warpshadow.check import AnyPath
+from warpshadow.maths.adjacency import area_normals
 from warpshadow.scene.body import Body
 from warpshadow.scene.scene import Scene
 
@@ -159,7 +160,7 @@ def _mean_distance(points: np.ndarray, others: np.ndarray) -> float:
 def _draw_surface_points(mesh: Mesh, rng: np.random.Generator) -> np.ndarray:
     """Points of a mesh's surface, as many on equal areas, shape [sample, 3]."""
     corners = mesh.positions[mesh.faces].astype(np.float64)
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    areas = np.linalg.norm(area_normals(corners), axis=1)
     total = areas.sum()
     chosen = corners[rng.choice(len(corners), _SAMPLES, p=areas / total if total else None)]
     return np.einsum("sk,skd->sd", rng.dirichlet((1, 1, 1), _SAMPLES), chosen)

@@ -22,6 +22,7 @@ from warpshadow.assets.topology import welded
 from warpshadow.device.progress import progress_bar
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import one_at_a_time
+from warpshadow.maths.adjacency import area_normals
 from warpshadow.maths.spatial_sort import compact_order
 from warpshadow.spheres.cover import descend_cover, greedy_cover
 from warpshadow.spheres.enough import AUTO, MAX_SPHERES, enough_spheres
@@ -170,7 +171,7 @@ def _find_fit_key(mesh: Mesh, seed: int, steps: int, device: wp.Device) -> tuple
     positions, faces = welded(mesh.positions, mesh.faces)  # parted at creases or not, a mesh has the same spheres
     positions = positions.astype(np.float64)
     corners = positions[faces]
-    if not np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).any():
+    if not area_normals(corners).any():
         raise ValueError("mesh: got only faces without area, expected a surface")
     normalized, center, diagonal = normalize(positions)
     return _SphereFitKey(normalized, faces, seed, steps, device), center, diagonal

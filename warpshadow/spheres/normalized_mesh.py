@@ -10,6 +10,7 @@ import warp as wp
 from warpshadow.assets.topology import CREASE, join_faces, part_at_creases, rounds_edges
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
+from warpshadow.maths.adjacency import area_normals
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.geometry.normals import vertex_normals
 
@@ -120,7 +121,7 @@ class NormalizedMesh:
             points, wp.array(np.ravel(faces), dtype=wp.int32, device=device), support_winding_number=True
         )
         corners = positions[faces].astype(np.float64)
-        edges = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        edges = area_normals(corners)
         lengths = np.linalg.norm(edges, axis=1)
         self.face_areas = lengths / 2
         self.face_normals = edges / np.maximum(lengths, 1e-30)[:, None]

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from warpshadow.maths.adjacency import area_normals
 from warpshadow.maths.contacts import Contact, contact_excess
 from warpshadow.maths.spatial_sort import compact_order
 from warpshadow.stages.planes.grid import PlaneTexture, find_grid
@@ -266,7 +267,7 @@ class _PieceMesh(NamedTuple):
 
 def _area_vectors(corners: np.ndarray) -> np.ndarray:
     """Normals of triangles, as long as their areas are large."""
-    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    return area_normals(corners) / 2
 
 
 def _cut_faces(

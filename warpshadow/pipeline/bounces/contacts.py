@@ -8,6 +8,7 @@ import itertools
 import numpy as np
 import warp as wp
 
+from warpshadow.maths.adjacency import area_normals
 from warpshadow.maths.contacts import MAX_GAP, Contact, touching_numbers
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.scene.body import Body
@@ -27,8 +28,7 @@ class _Surface:
     @functools.cached_property
     def area_vectors(self) -> np.ndarray:
         """Normals of the faces, as long as their areas are large, [face, 3]."""
-        a, b, c = np.moveaxis(self.points[self.faces], 1, 0)
-        return np.cross(b - a, c - a) / 2
+        return area_normals(self.points[self.faces]) / 2
 
     @functools.cached_property
     def areas(self) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from warpshadow.maths.adjacency import area_normals
 from warpshadow.stages.patches import Patches
 from warpshadow.stages.textures.pyramid import level_matrices, level_sizes
 
@@ -73,8 +74,7 @@ def mean_over_texels(
 
 
 def _piece_areas(patches: Patches, positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    a, b, c = np.moveaxis(patches.pieces.positions(positions, faces), 1, 0)
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    return np.linalg.norm(area_normals(patches.pieces.positions(positions, faces)), axis=1) / 2
 
 
 def _mean(

@@ -13,6 +13,8 @@ m the normal of the patch and d the distance; of another patch q is 0, and each 
 import numpy as np
 import warp as wp
 
+from warpshadow.maths.adjacency import area_normals
+
 _BRIGHT = 8.0
 """Radiosity from which a patch is bright, in means of the scene: an evenly lit scene has none."""
 
@@ -46,7 +48,7 @@ def find_bright_patches(
         min_share: Part of all light that bright patches send at least; otherwise none is bright.
     """
     brightness = radiosity.mean(axis=-1)
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    areas = np.linalg.norm(area_normals(corners), axis=1) / 2
     areas, patches = np.tile(areas, 2), patch_of_sides.ravel()
     power = np.where(patches >= 0, areas * brightness[patches], 0)
     mean = power.sum() / max(areas[patches >= 0].sum(), 1e-30)

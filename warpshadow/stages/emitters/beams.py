@@ -17,6 +17,7 @@ from warpshadow.device.batch import common_batch, expand, expand_rows, instance_
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
+from warpshadow.maths.adjacency import area_normals
 from warpshadow.stages.emitters.samples import EVERYWHERE, EmitterSpan, PlacedSamples, sample_transmittance
 
 _COST = 4.0  # nanoseconds that a sample takes
@@ -46,8 +47,7 @@ def find_axis_weights(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndar
         Of shape [vertex] and [face].
     """
     positions = positions.astype(np.float64)
-    a, b, c = np.moveaxis(positions[faces], 1, 0)
-    vectors = np.cross(b - a, c - a)
+    vectors = area_normals(positions[faces])
     areas = np.linalg.norm(vectors, axis=1).sum()
     if np.linalg.norm(vectors.sum(axis=0)) > _MIN_FACING * areas:
         return np.zeros(len(positions)), np.full(len(faces), 1 / areas)

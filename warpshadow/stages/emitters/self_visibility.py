@@ -23,6 +23,7 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, from_numpy
 from warpshadow.device.parallel import split_row
+from warpshadow.maths.adjacency import area_normals
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.stages.cell_neighbors import KERNEL_RADIUS, cell_neighbors, texel_of
 from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, SurfacePoints
@@ -131,7 +132,7 @@ def find_self_visibility(
         return None
     corners = (positions.astype(np.float64)[faces] - sample_points.mean(axis=0)) / size
     points = np.einsum("spk,spkx->spx", surface_points.weights, corners[surface_points.faces])
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[surface_points.faces]
+    normals = area_normals(corners)[surface_points.faces]
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
     vertices = from_numpy(corners.reshape(-1, 3), dtype=wp.vec3, device=device)
     mesh = wp.Mesh(vertices, wp.array(np.arange(len(vertices)), dtype=wp.int32, device=device))

@@ -16,6 +16,7 @@ import warp as wp
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
+from warpshadow.maths.adjacency import area_normals
 from warpshadow.stages.emitters.beams import beam_share
 from warpshadow.stages.emitters.samples import SURFACE_POINTS, EmitterSamples, EmitterSpan, may_light
 from warpshadow.stages.raster.interpolation import interpolate_at
@@ -89,7 +90,7 @@ def emitting_faces(
     result.positions, result.emission, result.faces = positions, emission, faces
     corner_ids, device = faces.numpy(), positions.device
     corners = positions.numpy().astype(np.float64)[corner_ids]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    areas = np.linalg.norm(area_normals(corners), axis=1) / 2
     radiance = emission.numpy()[corner_ids].mean(axis=(1, 2))
     result.texture_of_face = constant(np.full(len(corner_ids), -1), wp.int32, device)
     if textures is not None:
