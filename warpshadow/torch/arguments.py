@@ -19,10 +19,8 @@ from warpshadow.pipeline.image_inputs import ImageInputs
 from warpshadow.torch.autograd import apply, as_array, check_float32, is_capturing
 from warpshadow.torch.replay import Replays
 
-_CACHED_BY_VALUE = (
-    "geometry.",
-    "clip_matrices",
-)  # tensors about which a renderer caches results while they stay the same
+# tensors about which a renderer caches results while they stay the same
+_CACHED_BY_VALUE = ("geometry.", "clip_matrices")
 
 
 class Slot(NamedTuple):

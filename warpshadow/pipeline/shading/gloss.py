@@ -156,21 +156,21 @@ class GlossyPoints(LitPoints):
         self, receivers: Receivers, normals: wp.array, clip_positions: wp.array, seen: Fragments
     ) -> NormalSpread:
         """Find how normals vary over the receivers. Differentiable: all but seen."""
-        supersampling = self.merged_scene.scene.supersampling if self.method.shares_lobes else 1
+        sharing = self.merged_scene.scene.supersampling // self.method.lobes_across  # samples of a receiver, across
         _, height, width = seen.face_ids.shape
-        fragments, size = receivers.sample_fragments, (width // supersampling, height // supersampling)
+        fragments, size = receivers.sample_fragments, (width // sharing, height // sharing)
         assert fragments is not None
-        return find_normal_spread(fragments, self.merged_scene.side_faces, normals, clip_positions, size, supersampling)
+        return find_normal_spread(fragments, self.merged_scene.side_faces, normals, clip_positions, size, sharing)
 
     def _sample_lobes(
         self, receivers: Receivers, roughness: wp.array, cameras: wp.array, spread: NormalSpread, seen: Fragments
     ) -> LobeSamples:
         """Samples of the lobes of the receivers. Differentiable: all but seen."""
-        places, supersampling = None, 1 if self.method.shares_lobes else self.merged_scene.scene.supersampling
-        if supersampling > 1 and receivers.samples is not None:
-            places = places_in_pixels(receivers.samples, seen.face_ids.shape[2], supersampling)
-        arguments = receivers.points, receivers.normals, roughness, cameras, self.method.lobe_samples_of_receiver()
-        return sample_lobes(*arguments, spread, places, supersampling**2)
+        places, lobes_across = None, self.method.lobes_across
+        if lobes_across > 1 and receivers.samples is not None:
+            places = places_in_pixels(receivers.samples, seen.face_ids.shape[2], lobes_across)
+        arguments = receivers.points, receivers.normals, roughness, cameras, self.method.lobe_samples_of_receiver
+        return sample_lobes(*arguments, spread, places, lobes_across**2)
 
     def _sample_textures(
         self, fragments: Fragments, values: wp.array, textures: Textures, footprints: Footprints

@@ -308,12 +308,15 @@ class Method(abc.ABC):
     def _prefilter(self, light: KnownLight) -> wp.array:
         return constant(prefilter(light.radiance)[None], wp.vec3, self.merged_scene.device)
 
+    @property
+    def lobes_across(self) -> int:
+        """How many receivers a pixel has across and down on a body that shines, if it sees one of its faces alone."""
+        return 1 if self.shares_lobes else self.merged_scene.scene.supersampling
+
+    @property
     def lobe_samples_of_receiver(self) -> int:
         """Number of samples of the lobe of a receiver."""
-        if self.shares_lobes:
-            return self.lobe_samples
-        supersampling = self.merged_scene.scene.supersampling
-        return max(self.lobe_samples // supersampling**2, min(self.lobe_samples, _MIN_LOBE_SAMPLES))
+        return max(self.lobe_samples // self.lobes_across**2, min(self.lobe_samples, _MIN_LOBE_SAMPLES))
 
     def lobe_transmittance(
         self, points: LitPoints, directions: Node, light: LightInput, shaded_points: LitPoints
