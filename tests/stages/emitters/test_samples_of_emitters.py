@@ -44,7 +44,7 @@ BALL, SQUARE = ws.icosphere(0.5, 3), ws.plane(1.0, 2)
 def samples_of(mesh, device, *, is_two_sided=False):
     weights = find_sample_weights(mesh.positions, mesh.surface.faces, is_two_sided=is_two_sided, device=device)
     matrices = [SparseMatrix.from_matrix(matrix, device=device) for matrix in weights[:2]]
-    pieces = SamplePieces.of_emitters([weights], weights.corners, device)
+    pieces = SamplePieces.of_emitters([weights], SparseMatrix.from_matrix(weights.corners, device=device))
     faces = wp.array(mesh.surface.faces, dtype=wp.vec3i, device=device)
     first = np.array([0, weights.vertices.shape[0]])
     return EmitterSamples(*matrices, pieces, weights.surface_points, faces, (0,), (is_two_sided,), first)

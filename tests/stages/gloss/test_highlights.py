@@ -24,7 +24,7 @@ def highlights(device, center, points, roughness, requires_grad=False):
     matrices = (SparseMatrix.from_matrix(weight, device=device) for weight in weights[:2])
     faces = wp.array(mesh.surface.faces, dtype=wp.vec3i, device=device)
     first = np.array([0, weights.vertices.shape[0]])
-    pieces = SamplePieces.of_emitters([weights], weights.corners, device)
+    pieces = SamplePieces.of_emitters([weights], SparseMatrix.from_matrix(weights.corners, device=device))
     samples = EmitterSamples(*matrices, pieces, weights.surface_points, faces, (0,), (False,), first)
     (span,) = samples.spans()
     placed = place_samples(wp.array((mesh.positions + center)[None], dtype=wp.vec3, device=device), samples)

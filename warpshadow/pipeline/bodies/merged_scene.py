@@ -23,6 +23,7 @@ from warpshadow.spheres import MANY, Spheres
 from warpshadow.stages.geometry.poses import Poses
 
 if TYPE_CHECKING:  # it is imported where a body emits
+    from warpshadow.stages.emitters.samples import SampleWeights
     from warpshadow.stages.emitters.traced import EmittingFaces
     from warpshadow.stages.textures.pyramid import Textures
 
@@ -149,6 +150,18 @@ class MergedScene:
     def is_emitter(self) -> np.ndarray:
         """Bodies that emit light, bool of shape [body]."""
         return np.array([body.is_emitter for body in self.scene.bodies])
+
+    @functools.cached_property
+    def emitter_sample_weights(self) -> "list[SampleWeights]":
+        """Samples of each emitter, at rest."""
+        from warpshadow.stages.emitters.samples import find_sample_weights
+
+        result = []
+        for number in np.flatnonzero(self.is_emitter).tolist():
+            mesh, is_open = self.scene.bodies[number].mesh, bool(self.is_two_sided[number])
+            arguments = mesh.positions, mesh.surface.faces
+            result.append(find_sample_weights(*arguments, is_two_sided=is_open, device=self.device))
+        return result
 
     @property
     def has_beams(self) -> bool:

@@ -26,8 +26,9 @@ _FACES = 256  # of a body that are looked at, at most
 _DARK = 1e-3  # of the brightest middle of a face, up to which a body's light is no matter
 
 
-NearLight: TypeAlias = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Gives the luminance of light of emitters past all that blocks, at points with unit normals, [point, 3]."""
+NearLight: TypeAlias = Callable[[wp.array, wp.Mesh | None, np.ndarray, np.ndarray], np.ndarray]
+"""Gives the luminance of light of emitters, given the vertices of all bodies, vec3 of shape [vertex], the mesh of all
+that block, None for none, and points with unit normals, [point, 3]."""
 
 
 def light_unevenness(
@@ -71,7 +72,8 @@ def light_unevenness(
     point_normals *= np.where(is_behind, -1, 1)[:, None, None] / lengths.clip(1e-30)
     received = _irradiance(mesh, points, point_normals, light, device)
     if near_light is not None:
-        received += near_light(points.reshape(-1, 3), point_normals.reshape(-1, 3)).reshape(received.shape)
+        receivers = points.reshape(-1, 3), point_normals.reshape(-1, 3)
+        received += near_light(vertices, mesh, *receivers).reshape(received.shape)
     at_middles, errors = received[:, 3], received[:, :3].mean(axis=1) - received[:, 3]
     threshold, first = _DARK * at_middles.max(initial=0.0), 0
     for number, part in enumerate(chosen):

@@ -8,7 +8,8 @@ its surface has its radiance beside the light that it reflects.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -32,7 +33,6 @@ from warpshadow.stages.emitters.samples import (
     SamplePieces,
     SampleWeights,
     SurfacePoints,
-    find_sample_weights,
     place_samples,
 )
 from warpshadow.stages.emitters.self_visibility import EmitterSelfVisibility, find_self_visibility
@@ -43,6 +43,9 @@ from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 
 class SceneEmitters:
@@ -59,60 +62,48 @@ class SceneEmitters:
     @functools.cached_property
     def samples(self) -> EmitterSamples:
         """Samples of all emitters."""
-        from scipy.sparse import block_diag, csr_matrix
+        from scipy.sparse import block_diag
 
-        merged_scene = self._merged_scene
+        merged_scene, weights = self._merged_scene, self._merged_scene.emitter_sample_weights
         bodies = np.flatnonzero(merged_scene.is_emitter).tolist()
-        weights = self._sample_weights
-        of_vertices = block_diag([item.vertices for item in weights], format="csr")
-        vertices = np.flatnonzero(np.isin(merged_scene.body_of_vertex, bodies))
-        shape = of_vertices.shape[0], int(merged_scene.first_vertex[-1])
-        of_vertices = csr_matrix((of_vertices.data, vertices[of_vertices.indices], of_vertices.indptr), shape)
         is_emitting = np.isin(merged_scene.body_of_face, bodies)
         first_faces = np.cumsum([0, *(item.faces.shape[1] for item in weights[:-1])])
         surface_faces = [item.surface_points.faces + first for item, first in zip(weights, first_faces, strict=True)]
         surface_weights = np.concatenate([item.surface_points.weights for item in weights])
         return EmitterSamples(
-            SparseMatrix.from_matrix(of_vertices, device=merged_scene.device),
+            self._over_all_vertices([item.vertices for item in weights]),
             SparseMatrix.from_matrix(block_diag([item.faces for item in weights]), device=merged_scene.device),
-            self._find_pieces(vertices),
+            SamplePieces.of_emitters(weights, self._over_all_vertices([item.corners for item in weights])),
             SurfacePoints(np.concatenate(surface_faces), surface_weights),
             wp.array(merged_scene.faces.numpy()[is_emitting], dtype=wp.vec3i, device=merged_scene.device),
             tuple(bodies),
             tuple(merged_scene.is_two_sided[bodies].tolist()),
             np.cumsum([0, *(item.vertices.shape[0] for item in weights)]),
-            self._find_beams(vertices),
+            self._find_beams(),
         )
 
-    def _find_pieces(self, vertices: np.ndarray) -> SamplePieces:
-        """Pieces of the samples of all emitters, whose vertices are some of all."""
+    def _over_all_vertices(self, weights: Sequence[np.ndarray | csr_matrix]) -> SparseMatrix:
+        """Weights of all vertices of the scene, given those of each emitter's, [row, vertex]."""
         from scipy.sparse import block_diag, csr_matrix
 
-        weights, device = self._sample_weights, self._merged_scene.device
-        of_emitters = block_diag([item.corners for item in weights], format="csr")
-        shape = of_emitters.shape[0], int(self._merged_scene.first_vertex[-1])
-        corners = csr_matrix((of_emitters.data, vertices[of_emitters.indices], of_emitters.indptr), shape)
-        return SamplePieces.of_emitters(weights, corners, device)
+        scene, matrix = self._merged_scene, block_diag(weights, format="csr")
+        vertices = np.flatnonzero(scene.is_emitter[scene.body_of_vertex])
+        shape = matrix.shape[0], int(scene.first_vertex[-1])
+        matrix = csr_matrix((matrix.data, vertices[matrix.indices], matrix.indptr), shape)
+        return SparseMatrix.from_matrix(matrix, device=scene.device)
 
-    def _find_beams(self, vertices: np.ndarray) -> EmitterBeams | None:
-        """Beams of the emitters, whose vertices are some of all; None where none has one."""
-        from scipy.sparse import block_diag, csr_matrix
+    def _find_beams(self) -> EmitterBeams | None:
+        """Beams of the emitters; None where none has one."""
+        from scipy.sparse import block_diag
 
         scene = self._merged_scene
         if not scene.has_beams:
             return None
         bodies = [body for body in scene.scene.bodies if body.is_emitter]
         weights = [find_axis_weights(body.mesh.positions, body.mesh.surface.faces) for body in bodies]
-        of_vertices, of_faces = (
-            block_diag([row[None] for row in rows], format="csr") for rows in zip(*weights, strict=True)
-        )
-        shape = len(bodies), int(scene.first_vertex[-1])
-        of_vertices = csr_matrix((of_vertices.data, vertices[of_vertices.indices], of_vertices.indptr), shape)
-        return EmitterBeams(
-            scene.emitter_beams,
-            SparseMatrix.from_matrix(of_vertices, device=scene.device),
-            SparseMatrix.from_matrix(of_faces, device=scene.device),
-        )
+        of_vertices, of_faces = ([row[None] for row in rows] for rows in zip(*weights, strict=True))
+        of_emitting_faces = SparseMatrix.from_matrix(block_diag(of_faces, format="csr"), device=scene.device)
+        return EmitterBeams(scene.emitter_beams, self._over_all_vertices(of_vertices), of_emitting_faces)
 
     def shown(self, emission: Node, fragments: Node, vertices: Input, cameras: Input, placed: Node) -> Node:
         """Node of the emission that samples of an image show, given all of it, vec3 of shape [batch, height, width]."""
@@ -134,18 +125,9 @@ class SceneEmitters:
         return Node("beams", show, emission, fragments, vertices, cameras, placed)
 
     @functools.cached_property
-    def _sample_weights(self) -> list[SampleWeights]:
-        scene, result = self._merged_scene, []
-        for body in np.flatnonzero(scene.is_emitter):
-            surface, is_open = scene.scene.bodies[body].mesh.surface, bool(scene.is_two_sided[body])
-            positions = scene.scene.bodies[body].mesh.positions
-            result.append(find_sample_weights(positions, surface.faces, is_two_sided=is_open, device=scene.device))
-        return result
-
-    @functools.cached_property
     def self_visibility(self) -> list[EmitterSelfVisibility | None]:
         """Self-visibility of each emitter; None of one that hides nothing of itself."""
-        pairs = zip(self.samples.bodies, self._sample_weights, strict=True)
+        pairs = zip(self.samples.bodies, self._merged_scene.emitter_sample_weights, strict=True)
         return [self._find_self_visibility(body, weights) for body, weights in pairs]
 
     def _find_self_visibility(self, body: int, weights: SampleWeights) -> EmitterSelfVisibility | None:
@@ -159,20 +141,21 @@ class SceneEmitters:
         with unrecorded():
             return find_self_visibility(*surface, *samples, is_two_sided=is_open, device=device)
 
-    def direct_luminance(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Luminance of their light past the scene's meshes, at points of the scene with unit normals, [point, 3]."""
+    def direct_luminance(
+        self, vertices: wp.array, mesh: wp.Mesh | None, points: np.ndarray, normals: np.ndarray
+    ) -> np.ndarray:
+        """Luminance of their light past the scene's meshes, a :data:`.NearLight`."""
         from warpshadow.stages.emitters.traced import trace_transmittance
 
         scene, samples = self._merged_scene, self.samples
-        positions = np.concatenate([body.world_mesh().positions for body in scene.scene.bodies])
-        vertices, at_points, along_normals = (
-            wp.array(item[None], dtype=wp.vec3, device=scene.device) for item in (positions, points, normals)
+        at_points, along_normals = (
+            wp.array(item[None], dtype=wp.vec3, device=scene.device) for item in (points, normals)
         )
-        placed_samples, mesh = place_samples(vertices, samples), scene.casting_mesh(vertices[0])
+        placed_samples = place_samples(vertices.reshape((1, -1)), samples)
         radiance = self.radiance(Materials.of_scene(scene)).value(Call(Clock()))
         total = np.zeros(len(points))
         for span in samples.spans():
-            at_samples = samples, vertices[0], placed_samples.points[0], placed_samples.areas[0], span
+            at_samples = samples, vertices, placed_samples.points[0], placed_samples.areas[0], span
             traced = trace_transmittance(mesh, at_points[0], along_normals[0], *at_samples, rays=1)
             transmittance = weigh_by_beam(at_points, placed_samples, span, traced.reshape((1, *traced.shape)))
             light = sum_light(at_points, along_normals, placed_samples, radiance, span, transmittance)
@@ -209,11 +192,11 @@ class SceneEmitters:
             from scipy.sparse import csr_matrix, vstack
 
             mesh = self._merged_scene.scene.bodies[self.samples.bodies[number]].mesh
-            counts = [item.vertices.shape[0] for item in self._sample_weights]
+            counts = [item.vertices.shape[0] for item in self._merged_scene.emitter_sample_weights]
             blocks = [csr_matrix((count, size[0] * size[1])) for count in counts]
             assert mesh.uvs is not None and mesh.surface.uv_faces is not None
             texture_space = mesh.positions, mesh.surface.faces, mesh.uvs, mesh.surface.uv_faces
-            weights = self._sample_weights[number]
+            weights = self._merged_scene.emitter_sample_weights[number]
             blocks[number] = mean_over_texels(weights.patches, *texture_space, size)[weights.patch_of_samples]
             matrix = SparseMatrix.from_matrix(vstack(blocks), device=self._merged_scene.device)
             self._texel_matrices[number, size] = matrix

@@ -28,6 +28,7 @@ import warp as wp
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
+from warpshadow.maths.adjacency import area_normals
 from warpshadow.maths.spatial_sort import compact_order, z_order
 from warpshadow.stages.patches import Patches, find_patches
 from warpshadow.stages.sparse import SparseMatrix, multiply
@@ -87,7 +88,7 @@ def find_sample_weights(
     patches = find_patches(positions, faces, is_two_sided=is_two_sided, count=count, patch_samples=1, device=device)
     pieces, labels = patches.pieces, patches.patch_of_pieces[0]
     corners = pieces.positions(positions, faces)
-    piece_vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    piece_vectors = area_normals(corners) / 2
     is_used = labels >= 0
     labels, owners, vectors = labels[is_used], pieces.faces[is_used], piece_vectors[is_used]
     areas, patch_count = np.linalg.norm(vectors, axis=1), int(labels.max(initial=-1)) + 1
@@ -221,16 +222,15 @@ class SamplePieces(NamedTuple):
     softness: wp.array
 
     @classmethod
-    def of_emitters(cls, weights: Sequence[SampleWeights], corners: csr_matrix, device: wp.DeviceLike) -> SamplePieces:
+    def of_emitters(cls, weights: Sequence[SampleWeights], corners: SparseMatrix) -> SamplePieces:
         """Of the samples of some emitters, given the weights of all vertices in the corners of their pieces."""
+        device = corners.rows.row_starts.device
         first = np.cumsum([0, *itertools.chain.from_iterable(np.diff(item.first_pieces) for item in weights)])
-        matrix, starts = (
-            SparseMatrix.from_matrix(corners, device=device),
-            wp.array(first, dtype=wp.int32, device=device),
-        )
         constants = zip(*((item.elongations, item.softness) for item in weights), strict=True)
         return cls(
-            matrix, starts, *(wp.array(np.concatenate(item), dtype=wp.float32, device=device) for item in constants)
+            corners,
+            wp.array(first, dtype=wp.int32, device=device),
+            *(wp.array(np.concatenate(item), dtype=wp.float32, device=device) for item in constants),
         )
 
 
