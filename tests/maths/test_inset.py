@@ -38,3 +38,16 @@ def test_vertices_of_bent_surfaces_and_of_no_face_stay():
     slivers = np.array([[0, 1, 1], [2, 2, 2]])
     np.testing.assert_array_equal(inset_vertices(positions, slivers), positions)
     assert inset_vertices(positions, np.zeros((0, 3), int)).shape == positions.shape
+
+
+def test_vertices_stay_on_the_faces_of_a_surface_that_is_all_but_flat():
+    mesh = ws.plane(1.0, 32)
+    positions = mesh.positions.astype(np.float64)
+    positions[:, 1] = 0.5 + 2e-3 * np.cos(9 * positions[:, 0]) * np.cos(7 * positions[:, 2])
+    points = inset_vertices(positions, mesh.faces)
+    corners = positions[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    heights = ((points[mesh.faces] - corners) * normals[:, None]).sum(axis=2)  # of vertices, over their own faces
+    assert np.abs(heights).max() < 2.0**-22  # rays take a height of 2^-21 for none
+    assert (points != positions.astype(np.float32)).any()
