@@ -394,7 +394,7 @@ def test_explanations_tell_of_emitters():
 def test_samples_of_lamps_are_found_when_an_image_is_computed_not_while_its_nodes_are_made(method):
     renderer = ws.Renderer(scene_of(visibility=ws.Visibility(method)))
     view, emitters = renderer.view(), renderer._method.emitters
-    image = view.image(None, view.materials)
+    image = view.image(view.method.light, view.materials)
     assert "samples" not in vars(emitters) and "self_visibility" not in vars(emitters)
     image.value(view.call)
     assert "samples" in vars(emitters)

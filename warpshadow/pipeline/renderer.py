@@ -32,7 +32,7 @@ from warpshadow.pipeline.node import Clock, Input, Node
 from warpshadow.pipeline.receivers.choice_of_receivers import choose_receivers, receiver_notes, with_receivers
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.receivers.unevenness import NearLight
-from warpshadow.pipeline.shading.transfers import Light, ShellLight, join_transfers
+from warpshadow.pipeline.shading.transfers import Light, join_transfers
 from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.catchers import CatchersAlone
 from warpshadow.pipeline.views.layers import LayerArrays, Layers, find_layer_arrays, find_layers
@@ -273,7 +273,8 @@ class SceneRenderer:
         images have by mean slopes of their colors (:mod:`warpshadow.stages.image.slopes`).
         """
         view = self._checked(view)
-        return self._transport.shading(view, light).value(self._views.call(view))
+        light_input = self._method.light_input(view, light)
+        return self._transport.shading(view, light_input).value(self._views.call(view))
 
     @announced
     def reflect(
@@ -335,7 +336,8 @@ class SceneRenderer:
         if view is None and not (inputs.geometry is None and inputs.clip_matrices is None):
             view = self.view(inputs.geometry, inputs.clip_matrices)
         view = self._checked(view)
-        return view.image(_light_of(inputs), self.materials(inputs.of_bodies)).value(self._views.call(view))
+        light = self._method.light_input(view, inputs.light, inputs.shell)
+        return view.image(light, self.materials(inputs.of_bodies)).value(self._views.call(view))
 
     @check.keywords(**dict.fromkeys(("camera", "cameras"), "renderer.with_cameras([camera]).render()"))
     def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:
@@ -383,14 +385,15 @@ class SceneRenderer:
         if photograph is not None:
             check.shape("photograph", photograph.shape, ("batch", *self._size))
             finite_arrays({"photograph": photograph})
-        catchers, materials, light = self._catchers_alone, self.materials(inputs.of_bodies), _light_of(inputs)
+        catchers, materials = self._catchers_alone, self.materials(inputs.of_bodies)
         geometry, alone = None, None
         if inputs.geometry is not None:
             geometry = as_geometry("geometry", inputs.geometry)
             alone = catchers.moved_geometry(geometry)
             geometry = replace(geometry, moving=None)  # else static catchers would be lit in another way than alone
         view = self.view(geometry, inputs.clip_matrices)
-        of_catchers = catchers.light(replace(inputs, geometry=alone), light, view)
+        light = self._method.light_input(view, inputs.light, inputs.shell)
+        of_catchers = catchers.light(replace(inputs, geometry=alone), view)
         unshadowed = Input("light without the others", of_catchers)
         photo_input = None if photograph is None else Input("photograph", photograph)
         arguments = photo_input, unshadowed, catchers.has_face, light, materials
@@ -483,7 +486,8 @@ class SceneRenderer:
             geometry = None if inputs.geometry is None else as_geometry("geometry", inputs.geometry)
             view = self._views.view(geometry, inputs.clip_matrices)
         preview = view.preview()  # which the nodes' words ask, so it stays meanwhile
-        light, materials = _light_of(inputs), self.materials(inputs.of_bodies)
+        light = self._method.light_input(preview, inputs.light, inputs.shell)
+        materials = self.materials(inputs.of_bodies)
         image = preview.image(light, materials)
         is_host = self.device.is_cpu or self.clock.waits
         of_receivers = receiver_notes(self._given_scene, self._choices, view.blocker_kinds.bulging_bodies)
@@ -492,11 +496,6 @@ class SceneRenderer:
         return Explanation(
             image, self._views.call(view), self.clock.timings, is_host=is_host, hidden=hidden, notes=notes
         )
-
-
-def _light_of(inputs: ImageArrays) -> Light | None:
-    """The light of an image, with its own shell where one is given."""
-    return inputs.light if inputs.shell is None else ShellLight(inputs.light, inputs.shell)
 
 
 def _find_near_light(merged_scene: MergedScene) -> NearLight | None:

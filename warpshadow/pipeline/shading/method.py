@@ -26,7 +26,7 @@ from warpshadow.pipeline.receivers.lit_points import (
     receiver_text,
 )
 from warpshadow.pipeline.receivers.static import StaticBodies
-from warpshadow.pipeline.shading.transfers import Light, ShellLight, check_light, shade_free
+from warpshadow.pipeline.shading.transfers import Light, check_light, shade_free
 from warpshadow.stages.gloss.prefilter import prefilter
 from warpshadow.stages.receivers.find import Numbering, number_receivers
 from warpshadow.stages.receivers.quadtree import Quadtree
@@ -216,21 +216,25 @@ class Method(abc.ABC):
             cameras: Clip matrices.
         """
 
-    def light_input(self, points: LitPoints, light: Light | None) -> LightInput:
-        """The light of points as an input; the same for the same known light of the same shell."""
+    def light_input(self, points: LitPoints, light: Light | None, shell: wp.array | None = None) -> LightInput:
+        """The light of an image, or of other points, as an input, checked; the same for the same known light and shell.
+
+        Args:
+            points: The receivers of the image.
+            light: None for the scene's.
+            shell: Center and radius of the sphere that sends it [scene units], vec4 of shape [batch]; None for that of
+                the light itself.
+        """
         check_light(light)
-        own_shell = None
-        if isinstance(light, ShellLight):
-            light, own_shell = light
         is_of_scene = light is None or light is self.merged_scene.scene.light
-        if is_of_scene and own_shell is None:
+        if is_of_scene and shell is None:
             return self.light
-        shell = self._shell_input(points, light, own_shell)
+        shell_input = self._shell_input(points, light, shell)
         if isinstance(light, wp.array):
-            return LightInput(light, shell, why_new="light is given")
+            return LightInput(light, shell_input, why_new="light is given")
         known = self.light.value() if light is None else as_light(light)
         why_new = "" if points.last_cached("light") is None else "light changed since the last call"
-        return points.cached("light", (known, shell), lambda: LightInput(known, shell, why_new=why_new))
+        return points.cached("light", (known, shell_input), lambda: LightInput(known, shell_input, why_new=why_new))
 
     def _shell_input(self, points: LitPoints, light: Light | None, shell: wp.array | None) -> Input | None:
         """The shell of light that is not the scene's, the same while its values are; None for the scene's."""

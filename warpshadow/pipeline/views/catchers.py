@@ -14,7 +14,6 @@ from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.image_inputs import ImageArrays
-from warpshadow.pipeline.shading.transfers import Light
 from warpshadow.pipeline.views.view import View
 
 
@@ -46,13 +45,12 @@ class CatchersAlone:
         has_moved = geometry.moving is None or set(geometry.moving) & set(self._numbers)
         return self._merged_scene.part(geometry, self._numbers) if has_moved else None
 
-    def light(self, inputs: ImageArrays, light: Light | None, view: View) -> wp.array:
+    def light(self, inputs: ImageArrays, view: View) -> wp.array:
         """Light received by samples of catchers, and whether they see one; vec4, as of :meth:`.View.white_samples`.
 
         Args:
             inputs: Of the whole scene, but for the geometry, which is that of the catchers, from
                 :meth:`moved_geometry`.
-            light: Of these, with its shell.
             view: The view of the whole scene.
         """
         renderer, scene = self._renderer, self._merged_scene.scene
@@ -61,4 +59,5 @@ class CatchersAlone:
         alone = renderer.view(inputs.geometry, inputs.clip_matrices)
         if renderer._method.every_sample_receives:  # rays are drawn by a receiver's number: the same for both views
             alone = alone.at_receivers_of(view)
+        light = renderer._method.light_input(alone, inputs.light, inputs.shell)
         return alone.white_samples(light, materials).value(renderer._views.call(alone))
