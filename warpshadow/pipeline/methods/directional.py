@@ -15,7 +15,7 @@ from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibilityLookup
 from warpshadow.pipeline.methods.sharpest_cells import SharpestCells, find_share_of_sharpest_light, find_sharpest_cells
-from warpshadow.pipeline.node import Input, Node, field_of
+from warpshadow.pipeline.node import Call, Input, Node, field_of
 from warpshadow.pipeline.receivers.groups import CellCoverages, CellVisibility, Group
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
@@ -23,7 +23,7 @@ from warpshadow.pipeline.shading.method import LightInput
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells, project_on_cells
 from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
 from warpshadow.pipeline.shading.shell import PATCHES, ShellPatches, project_on_shell
-from warpshadow.pipeline.shading.sphere_method import LitPortion, PortionedShading, SphereMethod
+from warpshadow.pipeline.shading.sphere_method import LitPortion, PortionedShading, PortionedVisibility, SphereMethod
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, join_portions
 from warpshadow.scene.blockers import blocking_planes
 from warpshadow.stages.gloss.reflection import find_blocked_radiance
@@ -341,15 +341,8 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
 
     def _shading_with_cells(self, points: LitPoints, light: LightInput) -> Node:
         """Node of the shading of points in known light, and of the transmittance of the glossy ones' cells."""
-        arguments = self, points, self.projected_light(points, light), light, _join_with_cells
-        make = functools.partial(PortionedShading, *arguments, result_of=self._shading_and_cells_of)
+        make = functools.partial(_ShadingWithCells, self, points, self.projected_light(points, light), light)
         return self.cached_for_light("direct with cells", points, light, make)
-
-    def _shading_and_cells_of(self, portion: LitPortion) -> tuple[wp.array | None, wp.array | None]:
-        """Shading of a portion, and the transmittance of its cells if its body shines."""
-        body = portion.group.body
-        is_glossy = body is not None and self.merged_scene.is_glossy[body]
-        return portion.result, _transmittance_of(portion) if is_glossy else None
 
     def _cell_transmittance(
         self, points: LitPoints, light: LightInput, shaded_points: LitPoints
@@ -363,12 +356,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
             return field_of(self._shading_with_cells(shaded_points, light), "cells"), visibility_light
 
         def in_cells() -> Node:
-            return PortionedShading(
-                *(self, points, visibility_light, None, list),
-                result_of=_transmittance_of,
-                end="visibility",
-                suffix=" of gloss",
-            )
+            return _TransmittanceOfCells(self, points, visibility_light, None, suffix=" of gloss")
 
         return points.cached("cells", light.visibility_key, in_cells), visibility_light
 
@@ -410,15 +398,34 @@ class _LightAndCells(NamedTuple):
     cells: list[wp.array]  # of portions of bodies that shine, float32 of shape [batch, receiver, direction]
 
 
+class _ShadingWithCells(PortionedShading):
+    """Shading of receivers, and the transmittance of cells at bodies that shine."""
+
+    def compute(self, call: Call) -> _LightAndCells:
+        """Shade all portions."""
+        portions = list(self.portions(call))
+        cells_of_glossy = [cells for _, cells in portions if cells is not None]
+        return _LightAndCells(join_portions([shading for shading, _ in portions]), cells_of_glossy)
+
+    def result_of(self, portion: LitPortion) -> tuple[wp.array, wp.array | None]:
+        """Shading of a portion, and the transmittance of its cells if its body shines."""
+        body = portion.group.body
+        is_glossy = body is not None and self.method.merged_scene.is_glossy[body]
+        return portion.result, _transmittance_of(portion) if is_glossy else None
+
+
+class _TransmittanceOfCells(PortionedVisibility):
+    """Transmittance of receivers towards cells."""
+
+    def result_of(self, portion: LitPortion) -> wp.array | None:
+        """Transmittance of the cells of a portion."""
+        return _transmittance_of(portion)
+
+
 def _transmittance_of(portion: LitPortion) -> wp.array | None:
     """Transmittance of a portion past all bodies, float32 of shape [batch, receiver, direction]."""
     assert isinstance(portion.visibility, CellVisibility)
     return portion.visibility.transmittance_total
-
-
-def _join_with_cells(portions: list[tuple[wp.array, wp.array | None]]) -> _LightAndCells:
-    cells_of_glossy = [cells for _, cells in portions if cells is not None]
-    return _LightAndCells(join_portions([shading for shading, _ in portions]), cells_of_glossy)
 
 
 def _lobe_transmittance(
