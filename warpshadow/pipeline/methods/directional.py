@@ -19,7 +19,7 @@ from warpshadow.pipeline.node import Call, Input, Node, field_of
 from warpshadow.pipeline.receivers.groups import CellCoverages, CellVisibility, Group
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
-from warpshadow.pipeline.shading.method import LightInput
+from warpshadow.pipeline.shading.method import LightInput, LitLobes
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells, project_on_cells
 from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
 from warpshadow.pipeline.shading.shell import PATCHES, ShellPatches, project_on_shell
@@ -276,36 +276,19 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         towards, scales = self.free_basis.blocking_directions, self._scales(cells.relative_radius)
         return find_share_of_sharpest_light(group, cells, towards, **scales)
 
-    def lobe_transmittance(
-        self, points: LitPoints, directions: Node, light: LightInput, shaded_points: LitPoints
-    ) -> Node:
+    def lobe_transmittance(self, lobes: LitLobes, directions: Node) -> Node:
         """Transmittance towards the samples of lobes, between cells; of known light, to where it comes from in them."""
-        cells, projected_light = self._cell_transmittance(points, light, shaded_points)
-        item_text = functools.partial(receiver_text, points.weak)
-        arguments = cells, points.receivers_node, directions, projected_light
+        cells, projected_light = self._cell_transmittance(lobes)
+        item_text = functools.partial(receiver_text, lobes.points.weak)
+        arguments = cells, lobes.points.receivers_node, directions, projected_light
         return Node("transmittance of lobes", _lobe_transmittance, *arguments, items=item_text)
 
-    def blocked_radiance(
-        self,
-        points: LitPoints,
-        diffuse: Node,
-        light: LightInput,
-        shaded_points: LitPoints,
-        choose: Callable[[Node], Node],
-        openness: Node | None,
-    ) -> Node:
-        """Mean radiance of the blockers of points, by their light with bounces and without."""
-        cells, projected_light = self._cell_transmittance(points, light, shaded_points)
-        free = light if light.is_free else None
-        return Node(
-            "light of blockers",
-            self._mean_radiance_of_blockers,
-            cells,
-            points.receivers_node,
-            projected_light,
-            diffuse,
-            free,
-        )
+    def blocked_radiance(self, lobes: LitLobes, diffuse: Node, openness: Node | None) -> Node:
+        """Mean radiance of the blockers of receivers, by their light with bounces and without."""
+        cells, projected_light = self._cell_transmittance(lobes)
+        free = lobes.light if lobes.light.is_free else None
+        arguments = cells, lobes.points.receivers_node, projected_light, diffuse, free
+        return Node("light of blockers", self._mean_radiance_of_blockers, *arguments)
 
     def _mean_radiance_of_blockers(
         self,
@@ -344,16 +327,15 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         make = functools.partial(_ShadingWithCells, self, points, self.projected_light(points, light), light)
         return self.cached_for_light("direct with cells", points, light, make)
 
-    def _cell_transmittance(
-        self, points: LitPoints, light: LightInput, shaded_points: LitPoints
-    ) -> tuple[Node, Node | ProjectedCells]:
+    def _cell_transmittance(self, lobes: LitLobes) -> tuple[Node, Node | ProjectedCells]:
         """Node of the transmittance of cells, in portions, and the projected light that says which.
 
         In known light that does not bounce the shading of the view has found it.
         """
+        points, light = lobes.points, lobes.light
         visibility_light = self.light_of_visibility(points, light)
-        if not light.is_free and self._shades_with_cells(shaded_points):
-            return field_of(self._shading_with_cells(shaded_points, light), "cells"), visibility_light
+        if not light.is_free and self._shades_with_cells(lobes.all_points):
+            return field_of(self._shading_with_cells(lobes.all_points, light), "cells"), visibility_light
 
         def in_cells() -> Node:
             return _TransmittanceOfCells(self, points, visibility_light, None, suffix=" of gloss")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import functools
 from collections.abc import Callable, Hashable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -62,6 +62,15 @@ class LightInput(Input):
         depends on the shell alone.
         """
         return self.shell if self.is_free else self
+
+
+class LitLobes(NamedTuple):
+    """Receivers on bodies that shine, and their light."""
+
+    points: LitPoints
+    light: LightInput  # known or free, which says where shadows have to be sharp
+    all_points: LitPoints  # the receivers of the image, among which they are
+    select: Callable[[Node], Node]  # makes a node of light on all these one of light on the points
 
 
 _MIN_LOBE_SAMPLES = 8  # of a receiver, however many receivers a pixel has: as many as a processor finds at once
@@ -322,38 +331,24 @@ class Method(abc.ABC):
         """Number of samples of the lobe of a receiver."""
         return max(self.lobe_samples // self.lobes_across**2, min(self.lobe_samples, _MIN_LOBE_SAMPLES))
 
-    def lobe_transmittance(
-        self, points: LitPoints, directions: Node, light: LightInput, shaded_points: LitPoints
-    ) -> Node:
-        """Transmittance towards the samples of lobes of points, float32 of shape [batch, receiver, sample].
+    def lobe_transmittance(self, lobes: LitLobes, directions: Node) -> Node:
+        """Transmittance towards the samples of lobes, float32 of shape [batch, receiver, sample].
 
         Args:
-            points: Receivers on bodies that shine.
+            lobes: The receivers.
             directions: Node of the samples' directions, vec3 of shape [batch, receiver, sample].
-            light: Known or free light, which says where shadows have to be sharp.
-            shaded_points: The receivers of the image, among which they are.
 
         Without shadows it is 1.
         """
         return Node("", lambda towards: wp.full(towards.shape, 1.0, wp.float32, device=towards.device), directions)
 
-    def blocked_radiance(
-        self,
-        points: LitPoints,
-        diffuse: Node,
-        light: LightInput,
-        shaded_points: LitPoints,
-        choose: Callable[[Node], Node],
-        openness: Node | None,
-    ) -> Node:
-        """Mean radiance of the blockers of points, where light bounces, vec3 of shape [batch, receiver].
+    def blocked_radiance(self, lobes: LitLobes, diffuse: Node, openness: Node | None) -> Node:
+        """Mean radiance of the blockers of receivers, where light bounces, vec3 of shape [batch, receiver].
 
         Args:
-            points, light: As for :meth:`lobe_transmittance`.
+            lobes: The receivers.
             diffuse: Node of their shading.
-            shaded_points: As for :meth:`lobe_transmittance`.
-            choose: Makes a node of light on all these one of light on the points.
-            openness: Of the points, as of :meth:`.LightTransport.openness`.
+            openness: Of them, as of :meth:`.LightTransport.openness`.
         """
         raise NotImplementedError
 
