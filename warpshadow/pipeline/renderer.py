@@ -16,7 +16,6 @@ from warpshadow.assets.basis import Basis, check_basis
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.array_checks import finite_arrays
-from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.progress import waiting
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import announced, one_at_a_time
@@ -39,7 +38,7 @@ from warpshadow.pipeline.views.layers import LayerArrays, Layers, find_layer_arr
 from warpshadow.pipeline.views.scene_views import SceneViews, camera_batch
 from warpshadow.pipeline.views.shading_ratio import shading_ratio
 from warpshadow.pipeline.views.view import View
-from warpshadow.pipeline.views.view_warnings import warn_of_vertex_receivers, warn_of_view
+from warpshadow.pipeline.views.view_warnings import warn_of_vertex_receivers
 from warpshadow.scene.scene import BodyLike, PerBody, Scene, check_scene
 from warpshadow.scene.visibility import METHODS
 
@@ -121,7 +120,6 @@ class SceneRenderer:
         self.basis = self._method.basis
         self._transport = LightTransport(self._method)
         self._views = SceneViews(self._transport, self._materials, self.cameras, self.clock)
-        self._has_warned = False
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.scene!r}, {self.device.alias})"
@@ -141,9 +139,8 @@ class SceneRenderer:
         other._arguments = self._arguments | {"cameras": cameras}
         other.cameras, other.has_camera_batch = camera_batch(cameras), True
         other._views = self._views.with_cameras(other.cameras)
-        other._has_warned = True
         if "_catchers_alone" in vars(self):
-            vars(other)["_catchers_alone"] = self._catchers_alone.with_cameras(cameras)
+            vars(other)["_catchers_alone"] = self._catchers_alone.with_cameras(other.cameras)
         return other
 
     def moved(self: RendererType, device: wp.DeviceLike) -> RendererType:
@@ -195,20 +192,7 @@ class SceneRenderer:
                 :func:`warpshadow.stages.raster.project.compose_clip_matrices`.
         Differentiable: geometry, clip_matrices.
         """
-        view = self._views.view(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
-        if view in self._views.last:
-            return view
-        for node in (view.receivers_node, view.silhouettes):
-            node.value(view.call)
-        self._warn_once(view)
-        self._views.keep(view)
-        return view
-
-    def _warn_once(self, view: View) -> None:
-        """Say once why an image shows nothing, and the likely mistakes in the scene itself."""
-        is_of_scene, device = self._views.is_of_scene(view), self.device
-        if not self._has_warned and (is_readable(device) or (is_of_scene and not device.is_capturing)):
-            self._has_warned = warn_of_view(view, self.cameras if is_of_scene else None)
+        return self._views.find(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
 
     at_points = delegated("_views", SceneViews.at_points)
     on_faces = delegated("_views", SceneViews.on_faces)
@@ -406,7 +390,7 @@ class SceneRenderer:
 
     @functools.cached_property
     def _catchers_alone(self) -> CatchersAlone:
-        return CatchersAlone(self._of_bodies_alone(self.scene.catchers), self.merged_scene)
+        return CatchersAlone(self._of_bodies_alone(self.scene.catchers)._views, self.merged_scene)
 
     def _of_bodies_alone(self, numbers: tuple[int, ...]) -> "SceneRenderer":
         """Make a renderer of some bodies alone, with the receivers and spheres that they have here; it never warns."""
@@ -415,7 +399,7 @@ class SceneRenderer:
         alone = SceneRenderer(**arguments)
         alone.merged_scene.take_spheres(self.merged_scene, numbers)
         alone.merged_scene.has_chosen_receivers = self.merged_scene.has_chosen_receivers[list(numbers)]
-        alone._has_warned = True
+        alone._views.has_warned = True
         return alone
 
     @one_at_a_time
