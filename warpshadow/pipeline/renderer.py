@@ -303,6 +303,7 @@ class SceneRenderer:
     # ------------------------------------------------------------------------------------------ image
 
     @takes(ViewArrays)
+    @one_at_a_time
     def draw(self, inputs: ViewArrays) -> wp.array:
         """Draw images.
 
@@ -312,14 +313,14 @@ class SceneRenderer:
             Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]; the background is 0.
         Differentiable: all; not by "ray-traced": geometry, clip_matrices, shell.
         """
+        if inputs.view is None and inputs.geometry is None and inputs.clip_matrices is None:
+            return self.draw_inputs(inputs, self._scene_view)
         return self.draw_inputs(inputs, inputs.view)
 
     @announced
     def draw_inputs(self, inputs: ImageArrays, view: View | None = None) -> wp.array:
-        """Draw images, as :meth:`draw` does, by a record of its arguments."""
-        if view is None and not (inputs.geometry is None and inputs.clip_matrices is None):
-            view = self.view(inputs.geometry, inputs.clip_matrices)
-        view = self._checked(view)
+        """Draw images, as :meth:`draw` does, by a record of its arguments; it does not warn of coarse faces."""
+        view = self.view(inputs.geometry, inputs.clip_matrices) if view is None else self._checked(view)
         light = self._method.light_input(view, inputs.light, inputs.shell)
         return view.image(light, self.materials(inputs.of_bodies)).value(self._views.call(view))
 
