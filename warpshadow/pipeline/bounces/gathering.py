@@ -143,7 +143,7 @@ class Gathering:
         planes = outgoing.proxies.planes
         assert planes is not None
         skip = planes.index_of_body.get(group.body)
-        points, fronts = group.lifted_points_and_fronts(outgoing.frames, planes.blockers, skip)
+        points, fronts = group.beside(outgoing.frames, planes.blockers, skip)
         # Cells look to where the light of the sky is, above horizons; light of planes is found around their middles. A
         # ball on a ground lost 4% of the ground's light by the former.
         middles = fibonacci(len(cells.directions))

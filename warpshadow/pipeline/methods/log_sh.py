@@ -69,11 +69,11 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
 
     def find_visibility(self, group: Group, projected_light: ProjectedBands) -> HarmonicVisibility:
         """Visibility, float32 of shape [batch, receiver, order²]; None where nothing blocks."""
-        points, _, _, radii, cached_rows = group[:5]
+        points, radii, cached_rows = group.points, group.radii, group.cached_rows
         if not points.size or (cached_rows is None and not radii.shape[1]):
             return HarmonicVisibility(None)
         if radii.shape[1]:
-            log = self._logs(*group[:4], skip=group.skip, clusters=group.clusters)
+            log = self._logs(points, group.normals, group.centers, radii, skip=group.skip, clusters=group.clusters)
         else:
             log = zeros((*points.shape, self._order**2), dtype=wp.float32, device=points.device)
         if cached_rows is not None:

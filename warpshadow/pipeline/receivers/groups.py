@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,7 +45,8 @@ class OwnBody(NamedTuple):
         return self._replace(probe_weights=self.probe_weights.cut(receivers))
 
 
-class Group(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Group:
     """Receivers whose light the same blockers block: of all bodies, all but their own, or those that move."""
 
     points: wp.array  # [batch, receiver] vec3
@@ -84,9 +87,13 @@ class Group(NamedTuple):
             return None
         return self.own.lookup.transmittance(self.normals, self.own.probe_weights)
 
-    def lifted_points_and_fronts(
-        self, frames: wp.array, planes: PlaneBlockers, skip: int | None
-    ) -> tuple[wp.array, wp.array]:
+    @functools.cached_property
+    def beside_planes(self) -> tuple[wp.array, wp.array]:
+        """As :meth:`beside`, of the planes around the group."""
+        assert self.planes is not None
+        return self.beside(self.planes.frames, self.planes.planes, self.planes.skip)
+
+    def beside(self, frames: wp.array, planes: PlaneBlockers, skip: int | None) -> tuple[wp.array, wp.array]:
         """Positions, lifted off planes that they lie in, and the part of each front that the receivers see."""
         corners = None if self.own is None else self.own.corners
         fronts = find_fronts(self.points, self.normals, corners, self.nearest_blockers, frames, planes)
@@ -103,7 +110,7 @@ class Group(NamedTuple):
         frames = None if planes is None else planes.frames
         parts = self.convex_parts_around or (None if own is None else own.parts)
         part_corners = None if parts is None else parts.placed.corners
-        arguments = points, normals, centers, radii = self[:4]
+        arguments = points, normals, centers, radii = self.points, self.normals, self.centers, self.radii
         if radii.shape[1] or any(array is not None for array in (rotation_data, frames, part_corners)):
             arrays = {
                 "points": points,
@@ -121,11 +128,12 @@ class Group(NamedTuple):
             or size <= RECEIVERS_AT_ONCE
             or varies([*arguments, rotation_data, frames, part_corners, body_corners])
         ):
-            yield self._replace(points=points, normals=normals, centers=centers, radii=radii, clusters=clusters)
+            yield replace(self, points=points, normals=normals, centers=centers, radii=radii, clusters=clusters)
             return
         for start in range(0, size, RECEIVERS_AT_ONCE):
             portion = slice(start, min(start + RECEIVERS_AT_ONCE, size))
-            yield self._replace(
+            yield replace(
+                self,
                 points=points[:, portion].contiguous(),
                 normals=normals[:, portion].contiguous(),
                 centers=centers,
@@ -284,7 +292,7 @@ def _groups_that_move(
         group = Group(points, normals, *others, planes=planes, convex_parts_around=parts)
         if others is spheres:
             clusters = clusters or find_clusters(*spheres, blockers.merging)
-            group = group._replace(skip=skip, clusters=clusters)
+            group = replace(group, skip=skip, clusters=clusters)
         if span.body >= 0:
             own = OwnBody(
                 span.body,
@@ -296,9 +304,9 @@ def _groups_that_move(
             if corners is not None:
                 bounds = blockers.planes.first_corner[span.body : span.body + 2].tolist()
                 own = own._replace(corners=cut(corners, *bounds))
-            group = group._replace(own=own)
+            group = replace(group, own=own)
         if nearest_blockers is not None:
-            group = group._replace(nearest_blockers=nearest_blockers.cut(slice(span.first, span.end)))
+            group = replace(group, nearest_blockers=nearest_blockers.cut(slice(span.first, span.end)))
         yield group
 
 
