@@ -61,7 +61,7 @@ class RayTraced(Method):
         """Shading of points in known light that bounces along paths, which have no gradient."""
         from warpshadow.pipeline.methods.paths import path_traced
 
-        emitters = self.emitters.placed(points) if self.merged_scene.has_beams else None
+        emitters = self.emitters.samples_node(points) if self.merged_scene.has_beams else None
         arguments = direct, self._meshes(points), points, light, self.shell_of(light), materials, emitters
         return path_traced(*arguments, samples=self._sample_count, progress=self.progress)
 
@@ -77,15 +77,15 @@ class RayTraced(Method):
 
     def _rays_to_emitters(self, points: LitPoints, materials: Materials) -> tuple[Node, Node, Node, Node]:
         """Receivers, samples, their radiance, and the transmittance between."""
-        receivers, placed = points.receivers_node, self.emitters.placed(points)
+        receivers, samples = points.receivers_node, self.emitters.samples_node(points)
 
         def traced() -> Node:
             name, items = f"rays to emitters{points.suffix}", functools.partial(receiver_text, points.weak)
-            arguments = points.vertices, receivers, placed
+            arguments = points.vertices, receivers, samples
             return Node(name, self._trace_emitters, *arguments, items=items, has_adjoint=False)
 
         transmittance = points.cached("rays to emitters", None, traced)
-        return receivers, placed, self.emitters.radiance(materials), transmittance
+        return receivers, samples, self.emitters.radiance(materials), transmittance
 
     def _trace_emitters(
         self, positions: wp.array, receivers: Receivers, placed_samples: "PlacedSamples"

@@ -109,7 +109,7 @@ class Group:
         body_corners = None if own is None else own.corners
         frames = None if planes is None else planes.frames
         parts = self.convex_parts_around or (None if own is None else own.parts)
-        part_corners = None if parts is None else parts.placed.corners
+        part_corners = None if parts is None else parts.placed_parts.corners
         arguments = points, normals, centers, radii = self.points, self.normals, self.centers, self.radii
         if radii.shape[1] or any(array is not None for array in (rotation_data, frames, part_corners)):
             arrays = {
@@ -182,7 +182,7 @@ class Blockers(NamedTuple):
     positions: wp.array  # of all vertices, vec3 [batch, vertex]
     spheres: tuple[wp.array, wp.array]  # centers and radii of all spheres, blocking or not
     frames: wp.array | None  # where bodies are that block as planes, vec3 [batch, 3 · plane]; None without any
-    placed: PlacedParts | None  # where convex parts are; None without any
+    placed_parts: PlacedParts | None  # where convex parts are; None without any
 
     def sphere_blockers(self, bodies: Iterable[int]) -> list[int]:
         """Bodies among some that block light by their spheres."""
@@ -211,16 +211,16 @@ class Blockers(NamedTuple):
         """Convex parts of bodies around receivers of one body: all that block, or some."""
         bodies = self.blocker_kinds.convex
         chosen, skip = _blocking(bodies, body, of_bodies)
-        if self.placed is None or not chosen:
+        if self.placed_parts is None or not chosen:
             return None
-        return GroupConvexParts(self.parts.blockers(bodies, chosen), self.placed, skip)
+        return GroupConvexParts(self.parts.blockers(bodies, chosen), self.placed_parts, skip)
 
     def own_parts(self, body: int) -> GroupConvexParts | None:
         """The convex parts of a body, where they block its own light: one alone does not."""
         bodies = self.blocker_kinds.convex
-        if self.placed is None or body not in self.blocker_kinds.solids or len(self.parts.parts[body]) == 1:
+        if self.placed_parts is None or body not in self.blocker_kinds.solids or len(self.parts.parts[body]) == 1:
             return None
-        return GroupConvexParts(self.parts.blockers(bodies, (body,)), self.placed, on_surface=True)
+        return GroupConvexParts(self.parts.blockers(bodies, (body,)), self.placed_parts, on_surface=True)
 
     def around_plane(self, points: wp.array, normals: wp.array, body: int) -> Group:
         """The group of points of a flat body."""

@@ -246,5 +246,5 @@ def _log_of_parts(
         return None
     skipped = -1 if parts.skip is None else parts.skip, numbers.index(body) if body in numbers else -1
     return find_log_transmittance_of_parts(
-        group.points, group.normals, placed_samples, span, parts.placed, parts.blockers, skipped
+        group.points, group.normals, placed_samples, span, parts.placed_parts, parts.blockers, skipped
     )

@@ -174,7 +174,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         """Find the squares in which samples of adaptive bodies interpolate."""
         from warpshadow.pipeline.receivers.adaptive import find_squares
 
-        place = functools.partial(self.scene_blockers.placed, blocker_kinds)
+        place = functools.partial(self.scene_blockers.place_blockers, blocker_kinds)
         return find_squares(place, self.share_of_sharpest_light, surfaces)
 
     def share_of_sharpest_light(self, group: Group) -> np.ndarray | None:
@@ -222,9 +222,9 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
             name,
             find_in_groups,
             points.receivers_node,
-            placed_blockers(self, points),
+            blockers_node(self, points),
             points.cached_of_bodies("self-visibility towards emitters", None, lookups),
-            self.emitters.placed(points),
+            self.emitters.samples_node(points),
             self.emitters.radiance(materials),
             *others,
             items=lambda: f"{receiver_text(weak_points)} × {emitters.samples.first[-1]} samples",
@@ -317,10 +317,10 @@ class PortionedVisibility(Node):
             "",
             None,
             points.receivers_node,
-            placed_blockers(method, points),
+            blockers_node(method, points),
             projected_light,
             self_visibility_node(method, points, projected_light),
-            _static_shadows(method, points, light),
+            _static_shadows_node(method, points, light),
             None if points.static_bodies is None else points.static_bodies.normals,
             stages=steps[: self.step_count],
             caches=caches,
@@ -418,9 +418,9 @@ def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
     return "no moving body has blockers" if static else "nothing is seen"
 
 
-def placed_blockers(method: SphereMethod, points: LitPoints) -> Node:
+def blockers_node(method: SphereMethod, points: LitPoints) -> Node:
     """Node of the blockers around points, where they are in the world."""
-    place = functools.partial(method.scene_blockers.placed, points.blocker_kinds)
+    place = functools.partial(method.scene_blockers.place_blockers, points.blocker_kinds)
     return points.cached_of_bodies("blockers", None, lambda: Node("", place, points.vertices, points.spheres))
 
 
@@ -444,7 +444,7 @@ def _self_visibility(method: SphereMethod, blocker_kinds: BlockerKinds, projecte
     return Node("self-shadows", functools.partial(method.self_lookups, bodies), rotations, projected_light, items=state)
 
 
-def _static_shadows(method: SphereMethod, points: LitPoints, light: Input | None) -> Node:
+def _static_shadows_node(method: SphereMethod, points: LitPoints, light: Input | None) -> Node:
     """Node of cached transmittance past static bodies; its value is None if there are none."""
     static_bodies, weak_points = points.static_bodies, points.weak
     if static_bodies is None or not static_bodies.spheres[1].shape[1]:

@@ -112,8 +112,17 @@ class View(LitPoints):
             )
         fragments = Node("rasterization", rasterize, clip, faces, *self._size, items=samples)
         if two_sided.size:
-            placed = detached(vertices), detached(cameras)
-            sides = Node("sides", find_sides, fragments, faces, two_sided, *placed, items=samples, has_adjoint=False)
+            vertices_and_cameras = detached(vertices), detached(cameras)
+            sides = Node(
+                "sides",
+                find_sides,
+                fragments,
+                faces,
+                two_sided,
+                *vertices_and_cameras,
+                items=samples,
+                has_adjoint=False,
+            )
         else:
             sides = Node("sides", identity, fragments, idle="every body is closed: none is seen from behind")
         edge_inputs = merged_scene.edges, clip, merged_scene.face_bodies, merged_scene.creases
@@ -220,7 +229,9 @@ class View(LitPoints):
         if not self.merged_scene.has_beams:
             return emission
         emitters = self.method.emitters
-        return emitters.shown(emission, self.fragments_node, self.vertices, self.cameras, emitters.placed(self))
+        return emitters.emission_towards_cameras(
+            emission, self.fragments_node, self.vertices, self.cameras, emitters.samples_node(self)
+        )
 
     def _sum_of(self, first: Node, second: Node) -> Node:
         """Node of the samples, of light of two kinds."""
