@@ -53,7 +53,7 @@ class PortionVisibility(NamedTuple):
 
     transfer: wp.array  # of direct light, [batch, receiver, coefficient]
     group: Group
-    cells: CellTransmittance
+    transmittance: CellTransmittance
 
 
 class PortionDirectLight(NamedTuple):
@@ -61,7 +61,7 @@ class PortionDirectLight(NamedTuple):
 
     direct: wp.array  # vec3 of shape [batch, receiver]
     group: Group
-    cells: CellTransmittance
+    transmittance: CellTransmittance
 
 
 class VisibilityWithBounces(PortionedTransfer):
@@ -69,8 +69,8 @@ class VisibilityWithBounces(PortionedTransfer):
 
     def result_of(self, portion: LitPortion) -> PortionVisibility:
         """Visibility of a portion."""
-        cells = find_cell_transmittance(self.method, portion.group, portion.visibility, portion.spheres)
-        return PortionVisibility(portion.result, portion.group, cells)
+        transmittance = find_cell_transmittance(self.method, portion.group, portion.visibility, portion.spheres)
+        return PortionVisibility(portion.result, portion.group, transmittance)
 
 
 class PortionedDirectLight(Node):
@@ -107,7 +107,7 @@ class PortionedDirectLight(Node):
     def _light(self, call: Call, portion: PortionVisibility, projected_light: ProjectedLight) -> PortionDirectLight:
         with self.timed(call, self._shading):
             direct = self._visibility.method.shade_transfer(portion.transfer, portion.group, projected_light)
-        return PortionDirectLight(direct, portion.group, portion.cells)
+        return PortionDirectLight(direct, portion.group, portion.transmittance)
 
 
 def _patch_weights(senders: Senders, visibility: list[PortionVisibility]) -> PatchWeights:
@@ -115,9 +115,9 @@ def _patch_weights(senders: Senders, visibility: list[PortionVisibility]) -> Pat
     portions = [
         find_mean_transmittance(
             portion.group.normals,
-            portion.cells.transmittance_self,
-            portion.cells.transmittance_nonplanar,
-            portion.cells.directions,
+            portion.transmittance.transmittance_self,
+            portion.transmittance.transmittance_nonplanar,
+            portion.transmittance.directions,
         )
         for portion in visibility
     ]
@@ -208,7 +208,7 @@ class Radiosity(Node):
 
     def _light(self, call: Call, portion: PortionDirectLight, outgoing: OutgoingRadiance) -> wp.array:
         """Light of a portion of the patch samples past its own body, from the sky and from others."""
-        bounced = self._gathering.lights(self, call, portion.group, portion.cells, outgoing)
+        bounced = self._gathering.lights(self, call, portion.group, portion.transmittance, outgoing)
         return add_light(portion.direct, *bounced)
 
 
@@ -243,7 +243,7 @@ class BouncedShading(PortionedDirectLight):
         )
 
     def _bounced(self, call: Call, portion: PortionDirectLight, outgoing: OutgoingRadiance) -> wp.array:
-        bounced = self._gathering.lights(self, call, portion.group, portion.cells, outgoing)
+        bounced = self._gathering.lights(self, call, portion.group, portion.transmittance, outgoing)
         return add_light(portion.direct, *bounced)
 
 
@@ -301,7 +301,9 @@ class MovingBounces:
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
 
         def project(patch_samples: Receivers, visibility: list[PortionVisibility], *arguments: Any) -> ProjectedPatches:
-            return proxies.projected_patches(patch_samples, [portion.cells for portion in visibility], *arguments)
+            return proxies.projected_patches(
+                patch_samples, [portion.transmittance for portion in visibility], *arguments
+            )
 
         arguments = senders, points, proxies.nearest_spheres
         lit_samples = points.cached("patch samples beside proxies", proxies, lambda: lit_patch_samples(*arguments))

@@ -159,7 +159,7 @@ class Proxies:
     def projected_patches(
         self,
         patch_samples: Receivers,
-        cells: list[CellTransmittance],
+        transmittances: list[CellTransmittance],
         spheres: tuple[wp.array, wp.array],
         frames: wp.array | None,
     ) -> ProjectedPatches:
@@ -167,7 +167,7 @@ class Proxies:
 
         Args:
             patch_samples: Where they are lit.
-            cells: Transmittance of the patch samples, in portions.
+            transmittances: Of the patch samples, in portions.
             spheres: Centers and radii of all spheres.
             frames: Where flat bodies are.
         """
@@ -184,10 +184,10 @@ class Proxies:
             wp.full_like(portion.transmittance_nonplanar, 1.0, requires_grad=False)
             if portion.transmittance_self is None
             else portion.transmittance_self
-            for portion in cells
+            for portion in transmittances
         ]
         transmittance = join_portions([row.reshape((len(row), -1)) for row in rows])
-        directions = cells[0].directions
+        directions = transmittances[0].directions
         transmittance = transmittance.reshape((len(transmittance), len(senders.sides), len(directions)))
         mean_points = multiply(senders.mean, patch_samples.points)
         mean_normals = multiply(senders.mean, patch_samples.normals)

@@ -56,19 +56,19 @@ def find_sharpest_cells(
 
 
 def find_share_of_sharpest_light(
-    group: Group, cells: SharpestCells, towards: np.ndarray, *, softness: float, merging: float
+    group: Group, sharpest: SharpestCells, towards: np.ndarray, *, softness: float, merging: float
 ) -> np.ndarray | None:
     """Share of a group's unblocked light that still comes from the sharpest cells.
 
     Args:
         group: The receivers, with the blockers around them.
-        cells: The sharpest cells.
+        sharpest: The sharpest cells.
         towards: Directions of all cells, [direction, 3].
         softness, merging: Of spheres' shadows, in radii of the sharpest cells.
     Returns:
         Shape [batch, receiver]; None where nothing blocks.
     """
-    directions, light, _, edge_radius, power = cells
+    directions, light, _, edge_radius, power = sharpest
     points, normals, centers, radii = group.points, group.normals, group.centers, group.radii
     if not radii.shape[1] and group.planes is None and group.convex_parts_around is None:
         return None

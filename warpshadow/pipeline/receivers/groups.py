@@ -147,7 +147,7 @@ class Group:
 class CellCoverages(NamedTuple):
     """Coverage (h, μ) of cells by blockers, vec4 of shape [batch, receiver, direction]."""
 
-    cells: wp.array
+    all_cells: wp.array
     sharp_cells: wp.array | None = None  # [batch, receiver, 16]; None where no cell is sharp
 
 

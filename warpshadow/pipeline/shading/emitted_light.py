@@ -113,7 +113,7 @@ def _find_transmittances(
     merged_scene, points, normals = blockers.merged_scene, group.points, group.normals
     if not points.size:
         return
-    cells = (
+    transmittance_of_cells = (
         transmittance_past(None, group.own_coverage(EMITTER_CELLS))
         if group.own_parts is not None
         else group.looked_up_transmittance()
@@ -136,11 +136,11 @@ def _find_transmittances(
             continue
         skipped = own_spheres, merged_scene.spheres_among(sphere_bodies, body)
         transmittance_self = None
-        if cells is not None and not is_own:
+        if transmittance_of_cells is not None and not is_own:
             is_within = _find_within(blockers, body, group.body)
             if not is_within.all():
                 towards = find_directions_to_samples(points, placed_samples, span)
-                transmittance_self = interpolate_transmittance(cells, normals, towards, EMITTER_CELLS)
+                transmittance_self = interpolate_transmittance(transmittance_of_cells, normals, towards, EMITTER_CELLS)
             if is_within.any():
                 # cells tell whether rays leave the body: a bulb in a shade would be hidden by the shade's far side
                 with unrecorded():

@@ -31,7 +31,7 @@ class ShellPatches(NamedTuple):
     directions: np.ndarray = PATCHES.directions  # from the center to their light [patch, 3]
 
     def transfer(
-        self, points: wp.array, normals: wp.array, transmittance: wp.array | None, cells: np.ndarray
+        self, points: wp.array, normals: wp.array, transmittance: wp.array | None, cell_directions: np.ndarray
     ) -> wp.array:
         """Transfer vectors of receivers, float32 of shape [batch, receiver, patch], given transmittance in cells.
 
@@ -40,10 +40,10 @@ class ShellPatches(NamedTuple):
         Differentiable: points, normals, transmittance, and the shell.
         """
         check_within(points, self.shell)
-        return shell_transfer(points, normals, transmittance, cells, self.shell, self.directions)
+        return shell_transfer(points, normals, transmittance, cell_directions, self.shell, self.directions)
 
 
 def project_on_shell(light: KnownLight, shell: wp.array) -> tuple[ShellPatches, wp.array]:
     """Project known light on the patches of a shell: the patches, and their radiance, vec3 of shape [1, patch]."""
-    cells = light.cells(PATCHES.directions)
-    return ShellPatches(shell, cells.directions), constant(cells.radiance[None], wp.vec3, shell.device)
+    cell_light = light.cells(PATCHES.directions)
+    return ShellPatches(shell, cell_light.directions), constant(cell_light.radiance[None], wp.vec3, shell.device)
