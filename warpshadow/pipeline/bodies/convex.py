@@ -16,8 +16,8 @@ import warp as wp
 from warpshadow.maths.convex import ConvexPart
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.scene.blockers import blocking_parts, find_solids
+from warpshadow.stages.convex.convex_blockers import ConvexBlockers, ConvexBody, PlacedParts
 from warpshadow.stages.convex.coverage import part_coverage
-from warpshadow.stages.convex.prepared import ConvexBlockers, ConvexBody, PlacedParts
 
 
 class GroupConvexParts(NamedTuple):

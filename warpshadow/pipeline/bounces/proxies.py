@@ -14,15 +14,15 @@ import warp as wp
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
 from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance
-from warpshadow.pipeline.bounces.overlays import find_overlays
 from warpshadow.pipeline.bounces.patches import Senders
+from warpshadow.pipeline.bounces.scene_overlays import find_overlays
 from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.stages.bounces.projected_areas import find_projected_areas, tilt_normals_off_planes
 from warpshadow.stages.bounces.proxies import find_depths, place_proxies
 from warpshadow.stages.bounces.proxy_radiance import patches_of_clusters
 from warpshadow.stages.bounces.tangent_planes import TangentPlanes, find_tangent_planes, find_tolerances
 from warpshadow.stages.planes.fronts import NearestBlockers, find_fronts
-from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneBody
+from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneBody
 from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters

@@ -22,7 +22,7 @@ from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.shading.method import LightInput, LitLobes
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells, project_on_cells
 from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
-from warpshadow.pipeline.shading.shell import PATCHES, ShellPatches, project_on_shell
+from warpshadow.pipeline.shading.shell_patches import PATCHES, ShellPatches, project_on_shell
 from warpshadow.pipeline.shading.sphere_method import LitPortion, PortionedShading, PortionedVisibility, SphereMethod
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, join_portions
 from warpshadow.scene.blockers import blocking_planes

@@ -17,7 +17,7 @@ from warpshadow.pipeline.node import Input
 from warpshadow.pipeline.receivers.groups import Group, HarmonicVisibility
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
-from warpshadow.pipeline.shading.shell import ShellPatches
+from warpshadow.pipeline.shading.shell_patches import ShellPatches
 from warpshadow.pipeline.shading.sphere_method import SphereMethod
 from warpshadow.stages.light.cached_cells import add_rows
 from warpshadow.stages.light.transfer import sh_product, sh_transfer

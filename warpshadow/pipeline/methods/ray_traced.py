@@ -14,7 +14,7 @@ from warpshadow.pipeline.node import Input, Node, NodeStage, detached
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.shading.method import LightInput, LitLobes, Method
 from warpshadow.stages.gloss.reflection import find_blocked_radiance
-from warpshadow.stages.gloss.traced import trace_lobes
+from warpshadow.stages.gloss.traced_lobes import trace_lobes
 from warpshadow.stages.light.light_samples import cut_map, sample_map
 from warpshadow.stages.ray_traced.shared_rays import find_corners, find_shares, trace_shared
 from warpshadow.stages.ray_traced.traced_transfer import trace_transfer

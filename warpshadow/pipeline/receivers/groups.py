@@ -15,14 +15,14 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import varies
 from warpshadow.pipeline.bodies.convex import GroupConvexParts, SceneConvexParts
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
-from warpshadow.pipeline.bodies.planes import GroupPlanes, ScenePlanes
+from warpshadow.pipeline.bodies.scene_planes import GroupPlanes, ScenePlanes
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
-from warpshadow.stages.convex.prepared import PlacedParts
+from warpshadow.stages.convex.convex_blockers import PlacedParts
 from warpshadow.stages.light.cached_cells import CachedRows
 from warpshadow.stages.planes.fronts import NearestBlockers, find_fronts, lifted_points
-from warpshadow.stages.planes.prepared import PlaneBlockers
+from warpshadow.stages.planes.plane_blockers import PlaneBlockers
 from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters

@@ -15,17 +15,17 @@ from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.receivers.groups import Blockers, Group
 from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.stages.emitters.beams import weigh_by_beam
-from warpshadow.stages.emitters.convex import find_log_transmittance_of_parts
+from warpshadow.stages.emitters.convex_transmittance import find_log_transmittance_of_parts
+from warpshadow.stages.emitters.emitter_self_visibility import EmitterSelfVisibility, look_up_self_visibility
 from warpshadow.stages.emitters.light import (
     find_directions_to_samples,
     find_transmittance_to_samples,
     replace_instances,
     sum_light,
 )
-from warpshadow.stages.emitters.planes import find_log_transmittance_of_planes
+from warpshadow.stages.emitters.plane_transmittance import find_log_transmittance_of_planes
 from warpshadow.stages.emitters.samples import EmitterSamples, EmitterSpan, PlacedSamples
-from warpshadow.stages.emitters.self_visibility import EmitterSelfVisibility, look_up_self_visibility
-from warpshadow.stages.emitters.spheres import find_log_transmittance
+from warpshadow.stages.emitters.sphere_transmittance import find_log_transmittance
 from warpshadow.stages.gloss.highlights import sum_highlights
 from warpshadow.stages.gloss.reflection import LobeLight
 from warpshadow.stages.gloss.transmittance import interpolate_transmittance
@@ -207,7 +207,7 @@ def trace_transmittances(
         Float32 of shape [batch, receiver, sample].
     Differentiable: no.
     """
-    from warpshadow.stages.emitters.traced import trace_transmittance
+    from warpshadow.stages.emitters.traced_transmittance import trace_transmittance
 
     count = common_batch({"points": points, "geometry": positions})
     traced = wp.empty((count, points.shape[1], span.size), dtype=wp.float32, device=points.device)

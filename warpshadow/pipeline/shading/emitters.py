@@ -24,6 +24,7 @@ from warpshadow.pipeline.node import Call, Clock, Input, Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.stages.bounces.albedo import mean_over_texels
 from warpshadow.stages.emitters.beams import find_axis_weights, weigh_by_beam
+from warpshadow.stages.emitters.emitter_self_visibility import EmitterSelfVisibility, find_self_visibility
 from warpshadow.stages.emitters.light import sum_light
 from warpshadow.stages.emitters.samples import (
     EmitterBeams,
@@ -35,7 +36,6 @@ from warpshadow.stages.emitters.samples import (
     SurfacePoints,
     place_samples,
 )
-from warpshadow.stages.emitters.self_visibility import EmitterSelfVisibility, find_self_visibility
 from warpshadow.stages.emitters.shown_beams import show_beams
 from warpshadow.stages.gloss.highlights import sum_highlights
 from warpshadow.stages.gloss.reflection import LobeLight
@@ -147,7 +147,7 @@ class SceneEmitters:
         self, vertices: wp.array, mesh: wp.Mesh | None, points: np.ndarray, normals: np.ndarray
     ) -> np.ndarray:
         """Luminance of their light past the scene's meshes, a :data:`.NearLight`."""
-        from warpshadow.stages.emitters.traced import trace_transmittance
+        from warpshadow.stages.emitters.traced_transmittance import trace_transmittance
 
         scene, samples = self._merged_scene, self.samples
         at_points, along_normals = (

@@ -12,7 +12,7 @@ from warpshadow.assets.cells import draw_in_cells, gather_cells, without_spots
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.known_light import KnownLight
 from warpshadow.device.constants import constant
-from warpshadow.pipeline.shading.shell import ShellPatches
+from warpshadow.pipeline.shading.shell_patches import ShellPatches
 from warpshadow.stages.planes.partial_cells import SAMPLES
 from warpshadow.stages.self_visibility.sun_cells import SunCells, find_sun_cells
 from warpshadow.stages.visibility.sharp_cells import MAX_RADIUS_PAST_PLANES, SharpCells, find_sharp_cells

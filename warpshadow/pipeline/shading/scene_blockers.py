@@ -11,7 +11,7 @@ import warp as wp
 from warpshadow.pipeline.bodies.convex import SceneConvexParts
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
-from warpshadow.pipeline.bodies.planes import ScenePlanes
+from warpshadow.pipeline.bodies.scene_planes import ScenePlanes
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.pipeline.node import Input
 from warpshadow.pipeline.receivers.groups import Blockers
