@@ -137,7 +137,7 @@ def _find_transmittances(
         skipped = own_spheres, merged_scene.spheres_among(sphere_bodies, body)
         transmittance_self = None
         if transmittance_of_cells is not None and not is_own:
-            is_within = _find_within(blockers, body, group.body)
+            is_within = _find_where_enclosed(blockers, body, group.body)
             if not is_within.all():
                 towards = find_directions_to_samples(points, placed_samples, span)
                 transmittance_self = interpolate_transmittance(transmittance_of_cells, normals, towards, EMITTER_CELLS)
@@ -163,7 +163,7 @@ def _find_transmittances(
         )
 
 
-def _find_within(blockers: Blockers, emitter: int, body: int | None) -> np.ndarray:
+def _find_where_enclosed(blockers: Blockers, emitter: int, body: int | None) -> np.ndarray:
     """Find the geometries in which an emitter is within the bounds of a body, parts of which may be behind it, bool.
 
     Where arrays cannot be read, the scene's own bodies tell.
