@@ -10,8 +10,8 @@ import warp as wp
 import warpshadow as ws
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.stages.patches import find_plane_patches
-from warpshadow.stages.planes import prepared
-from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneBody
+from warpshadow.stages.planes import plane_blockers
+from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneBody
 
 DIRECTIONS = fibonacci(64)
 
@@ -164,7 +164,7 @@ def met_sides(point, omega, disc, radius, frames, grids, radiosity, skip, fronts
             rise = np.clip(side * height / margin, 0, 2)
             above = margin * (1 + rise**2 / 4) + max(side * height - 2 * margin, 0)
             footprint = functools.partial(footprint_along, place, above, axes, away, radius)
-            is_exact = len(grid.outline) <= prepared.MAX_EDGES
+            is_exact = len(grid.outline) <= plane_blockers.MAX_EDGES
             at, toward = np.array([*place, above]), np.array([*(axes @ omega), away @ omega])
             local = share_in_view(grid.outline if is_exact else grid.rectangle(), at, toward, disc)
             coverage = side_weight * np.array([local[0], *(local[1:3] @ axes + local[3] * away)])

@@ -279,7 +279,7 @@ def planes(double, device):
     faces = np.int32([[0, 1, 2], [0, 2, 3]])
     near = np.array([[-0.5, 0, -0.5], [0.5, 1, 0.5]])
     found = [grids(square, faces, is_two_sided=is_two_sided, others=near) for is_two_sided in (False, True)]
-    module = double("stages.planes.prepared")
+    module = double("stages.planes.plane_blockers")
     count = found[0].count
     bodies = [
         module.PlaneBody(patches.grid, square, faces, 4 * number, number * count, True)
@@ -321,7 +321,7 @@ def holed_planes(double, device):
     """A triangle, which leaves half of its rectangle open, and a square."""
     square = np.array([[-2.0, 0, -2], [-2, 0, 2], [2, 0, 2], [2, 0, -2]])
     faces, find = np.int32([[0, 1, 2], [0, 2, 3]]), double("stages.patches").find_plane_patches
-    module = double("stages.planes.prepared")
+    module = double("stages.planes.plane_blockers")
     bodies = []
     for number, own in enumerate((faces[:1], faces)):
         patches = find(square, own, is_two_sided=False)
@@ -341,7 +341,7 @@ def test_gradients_of_coverage_of_light_in_cells_are_exact(name, double, request
 
 def test_gradients_of_coverage_by_convex_parts_are_exact(double, check, device):
     """A wedge and a tetrahedron, which share a body, and a second tetrahedron."""
-    module, find = double("stages.convex.prepared"), double("maths.convex").find_convex_parts
+    module, find = double("stages.convex.convex_blockers"), double("maths.convex").find_convex_parts
     cover = double("stages.convex.coverage").part_coverage
     directions = double("maths.directions").fibonacci(32)
     wedge = np.array([[0, 0, 0], [2, 0, 0.1], [0.1, 1, 0], [0, 0, 1], [2, 0, 1.1], [0.1, 1, 1]])
@@ -368,8 +368,8 @@ def test_gradients_of_coverage_by_convex_parts_are_exact(double, check, device):
 
 def test_gradients_of_transmittance_past_parts_to_samples_are_exact(double, check, device):
     """Two walls of a tube of four panels, past whose edges and seams receivers see a lamp, and a tetrahedron."""
-    module, find = double("stages.convex.prepared"), double("maths.convex").find_convex_parts
-    emitters, past = double("stages.emitters.samples"), double("stages.emitters.convex")
+    module, find = double("stages.convex.convex_blockers"), double("maths.convex").find_convex_parts
+    emitters, past = double("stages.emitters.samples"), double("stages.emitters.convex_transmittance")
     angles = np.pi / 2 * np.arange(4)
     ring = np.stack([np.cos(angles), 0 * angles, np.sin(angles)], axis=1)
     tube = np.concatenate([ring, 1.2 * ring + [0, 0.8, 0]])
@@ -748,7 +748,7 @@ def test_gradients_of_reflection_are_exact(quantity, double, device, check):
 
 @pytest.mark.parametrize("is_blocked", [False, True])
 def test_gradients_of_transfer_from_a_shell_are_exact(is_blocked, double, check):
-    find, fibonacci = double("stages.shell.transfer").shell_transfer, double("maths.directions").fibonacci
+    find, fibonacci = double("stages.shell.shell_transfer").shell_transfer, double("maths.directions").fibonacci
     cells, patches = fibonacci(16), fibonacci(32)
     rng = np.random.default_rng(4)
     given = [(wp.vec3d, 0.4 * random(5, 1, 3, 3)), (wp.vec3d, unit(random(6, 1, 3, 3)))]

@@ -13,6 +13,7 @@ import twins
 
 import warpshadow as ws
 from warpshadow import inverse
+from warpshadow.pipeline.receivers import groups
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
 # Relative L2 of gradients against differences of images, where nothing moves at a silhouette. Measured 1e-4 to 2e-3.
@@ -394,7 +395,7 @@ def test_explanations_tell_of_emitters():
 def test_samples_of_lamps_are_found_when_an_image_is_computed_not_while_its_nodes_are_made(method):
     renderer = ws.Renderer(scene_of(visibility=ws.Visibility(method)))
     view, emitters = renderer.view(), renderer._method.emitters
-    image = view.image(None, view.materials)
+    image = view.image(view.method.light, view.materials)
     assert "samples" not in vars(emitters) and "self_visibility" not in vars(emitters)
     image.value(view.call)
     assert "samples" in vars(emitters)
@@ -422,3 +423,19 @@ def test_a_fit_finds_emission(free):
     problem = inverse.Problem(start, inverse.Target(target), parameters, still=still)
     result = inverse.fit(problem, [inverse.Stage(80)], progress=False)
     np.testing.assert_allclose(result.scene.bodies[0].emission, (6, 5, 4), rtol=0.05)
+
+
+def test_receivers_are_lifted_off_planes_once_however_many_lamps_there_are(monkeypatch):
+    find, calls, counts = groups.find_fronts, [], []
+    monkeypatch.setattr(groups, "find_fronts", lambda *arguments: calls.append(1) or find(*arguments))
+    for number in (1, 3):
+        lamps = [ws.Body(ws.icosphere(0.1, 1), emission=(3, 3, 3), translation=(x, 2, 0)) for x in range(number)]
+        flat = [ws.Body(ws.plane(size, 2), translation=(0, height, 0)) for size, height in ((4.0, 0), (0.5, 1))]
+        camera = ws.Camera.look_at((0, 3, 4), (0, 0, 0), size=(8, 8))
+        renderer = ws.Renderer(ws.Scene([*flat, *lamps], ws.EnvironmentMap.constant(), camera))
+        renderer.render()
+        materials, points = renderer._materials, renderer.view()
+        calls.clear()
+        renderer._method.emitted_light(points, materials).value(points.call)
+        counts.append(len(calls))
+    assert counts == [2, 2]  # of the receivers of each flat body

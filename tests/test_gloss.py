@@ -14,6 +14,7 @@ from warpshadow import inverse
 from warpshadow.inverse.uncertainty import NormalMatrix
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bounces import static_bounces
+from warpshadow.pipeline.methods.directional import Directional
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
 # Interpolation between texels is linear piece by piece, and steps of differences go over some. Measured 0.1 to 1.2%.
@@ -70,6 +71,20 @@ def test_shadows_in_known_light_are_found_once_for_diffuse_light_and_gloss():
     free = torch.tensor(np.repeat(light[..., None], 3, axis=2)).float()
     assert "visibility of gloss" not in str(renderer.explain())
     assert "visibility of gloss" in str(renderer.explain(free))
+
+
+def test_shadows_in_light_that_a_call_gives_are_found_once_for_diffuse_light_and_gloss(monkeypatch):
+    groups, find = [], Directional.find_visibility
+    monkeypatch.setattr(
+        Directional,
+        "find_visibility",
+        lambda self, group, light: groups.append(group.points) or find(self, group, light),
+    )
+    renderer = ws.Renderer(scene_of())
+    renderer.render()
+    count = len(groups)
+    renderer.render(ws.EnvironmentMap.constant())
+    assert len(groups) == 2 * count
 
 
 @pytest.mark.parametrize("bounces", [0, 1])

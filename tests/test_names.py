@@ -45,12 +45,21 @@ BANNED = {
     *("turn_from_planes", "unblocked_batch", "with_rows", "with_tail", "without_owners"),
     *("find_openness", "HIT_ROWS", "load_hit", "node_centers", "open_shares", "open_weights", "Openness", "SIDE_ROWS"),
     *("BeamAdjoint", "NearestBorder", "on_static"),
+    *("placed_blockers", "ShellLight"),
     *("contact_density", "FLAT", "Rays", "TOLERANCES", "touching_points"),
 }
 BANNED_EVERYWHERE = {
     *("bulging", "decide", "emitter_projection", "free_projection", "free_projection_of", "has_proxies", "in_words"),
     *("is_before_planes", "joins_cached", "last_light", "last_shell", "lights_samples", "news", "one_transfer"),
     *("project_free_light", "sharp_share", "solid_bodies", "total_light", "_blocked", "_blurred", "_exits"),
+    *(
+        "apply_geometry",
+        "lifted_points_and_fronts",
+        "shaded_points",
+        "_LightAndCells",
+        "_static_shadows",
+        "_visibility_of",
+    ),
     *("_find_numbers", "_lobe_cells", "_projected_from_scene", "_projected_if_given", "_REUSED", "_Same", "_shining"),
     *("_touching_points", "_towards", "_warn_of_nothing"),
 }

@@ -15,7 +15,7 @@ from warpshadow.spheres import refine
 from warpshadow.stages.bounces import sphere_light
 from warpshadow.stages.convex import coverage as convex
 from warpshadow.stages.gloss import lobes as glossy_lobes
-from warpshadow.stages.gloss import prefilter, traced
+from warpshadow.stages.gloss import prefilter, traced_lobes
 from warpshadow.stages.light import transfer
 from warpshadow.stages.raster.interpolation import _make_interpolate
 from warpshadow.stages.ray_traced import shared_rays, traced_transfer
@@ -79,7 +79,7 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
     "sun_cells._make_trace": sun_cells._make_trace,
     "shared_rays._make_trace False": partial(shared_rays._make_trace, False),
     "shared_rays._make_trace True": partial(shared_rays._make_trace, True),
-    "gloss.traced._make_trace": traced._make_trace,
+    "gloss.traced_lobes._make_trace": traced_lobes._make_trace,
     "_make_trace_cosines False": partial(traced_transfer._make_trace_cosines, False),
     "_make_trace_cosines True": partial(traced_transfer._make_trace_cosines, True),
     "_make_empty": partial(lanes._make_empty, ""),

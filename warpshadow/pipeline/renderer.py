@@ -16,7 +16,6 @@ from warpshadow.assets.basis import Basis, check_basis
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.array_checks import finite_arrays
-from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.progress import waiting
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import announced, one_at_a_time
@@ -32,14 +31,14 @@ from warpshadow.pipeline.node import Clock, Input, Node
 from warpshadow.pipeline.receivers.choice_of_receivers import choose_receivers, receiver_notes, with_receivers
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.receivers.unevenness import NearLight
-from warpshadow.pipeline.shading.transfers import Light, ShellLight, join_transfers
+from warpshadow.pipeline.shading.transfers import Light, join_transfers
 from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.catchers import CatchersAlone
 from warpshadow.pipeline.views.layers import LayerArrays, Layers, find_layer_arrays, find_layers
 from warpshadow.pipeline.views.scene_views import SceneViews, camera_batch
 from warpshadow.pipeline.views.shading_ratio import shading_ratio
 from warpshadow.pipeline.views.view import View
-from warpshadow.pipeline.views.view_warnings import warn_of_vertex_receivers, warn_of_view
+from warpshadow.pipeline.views.view_warnings import warn_of_vertex_receivers
 from warpshadow.scene.scene import BodyLike, PerBody, Scene, check_scene
 from warpshadow.scene.visibility import METHODS
 
@@ -121,7 +120,6 @@ class SceneRenderer:
         self.basis = self._method.basis
         self._transport = LightTransport(self._method)
         self._views = SceneViews(self._transport, self._materials, self.cameras, self.clock)
-        self._has_warned = False
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.scene!r}, {self.device.alias})"
@@ -141,9 +139,8 @@ class SceneRenderer:
         other._arguments = self._arguments | {"cameras": cameras}
         other.cameras, other.has_camera_batch = camera_batch(cameras), True
         other._views = self._views.with_cameras(other.cameras)
-        other._has_warned = True
         if "_catchers_alone" in vars(self):
-            vars(other)["_catchers_alone"] = self._catchers_alone.with_cameras(cameras)
+            vars(other)["_catchers_alone"] = self._catchers_alone.with_cameras(other.cameras)
         return other
 
     def moved(self: RendererType, device: wp.DeviceLike) -> RendererType:
@@ -195,20 +192,7 @@ class SceneRenderer:
                 :func:`warpshadow.stages.raster.project.compose_clip_matrices`.
         Differentiable: geometry, clip_matrices.
         """
-        view = self._views.view(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
-        if view in self._views.last:
-            return view
-        for node in (view.receivers_node, view.silhouettes):
-            node.value(view.call)
-        self._warn_once(view)
-        self._views.keep(view)
-        return view
-
-    def _warn_once(self, view: View) -> None:
-        """Say once why an image shows nothing, and the likely mistakes in the scene itself."""
-        is_of_scene, device = self._views.is_of_scene(view), self.device
-        if not self._has_warned and (is_readable(device) or (is_of_scene and not device.is_capturing)):
-            self._has_warned = warn_of_view(view, self.cameras if is_of_scene else None)
+        return self._views.find(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
 
     at_points = delegated("_views", SceneViews.at_points)
     on_faces = delegated("_views", SceneViews.on_faces)
@@ -273,7 +257,8 @@ class SceneRenderer:
         images have by mean slopes of their colors (:mod:`warpshadow.stages.image.slopes`).
         """
         view = self._checked(view)
-        return self._transport.shading(view, light).value(self._views.call(view))
+        light_input = self._method.light_input(view, light)
+        return self._transport.shading(view, light_input).value(self._views.call(view))
 
     @announced
     def reflect(
@@ -318,6 +303,7 @@ class SceneRenderer:
     # ------------------------------------------------------------------------------------------ image
 
     @takes(ViewArrays)
+    @one_at_a_time
     def draw(self, inputs: ViewArrays) -> wp.array:
         """Draw images.
 
@@ -327,15 +313,16 @@ class SceneRenderer:
             Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]; the background is 0.
         Differentiable: all; not by "ray-traced": geometry, clip_matrices, shell.
         """
+        if inputs.view is None and inputs.geometry is None and inputs.clip_matrices is None:
+            return self.draw_inputs(inputs, self._scene_view)
         return self.draw_inputs(inputs, inputs.view)
 
     @announced
     def draw_inputs(self, inputs: ImageArrays, view: View | None = None) -> wp.array:
-        """Draw images, as :meth:`draw` does, by a record of its arguments."""
-        if view is None and not (inputs.geometry is None and inputs.clip_matrices is None):
-            view = self.view(inputs.geometry, inputs.clip_matrices)
-        view = self._checked(view)
-        return view.image(_light_of(inputs), self.materials(inputs.of_bodies)).value(self._views.call(view))
+        """Draw images, as :meth:`draw` does, by a record of its arguments; it does not warn of coarse faces."""
+        view = self.view(inputs.geometry, inputs.clip_matrices) if view is None else self._checked(view)
+        light = self._method.light_input(view, inputs.light, inputs.shell)
+        return view.image(light, self.materials(inputs.of_bodies)).value(self._views.call(view))
 
     @check.keywords(**dict.fromkeys(("camera", "cameras"), "renderer.with_cameras([camera]).render()"))
     def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:
@@ -383,14 +370,15 @@ class SceneRenderer:
         if photograph is not None:
             check.shape("photograph", photograph.shape, ("batch", *self._size))
             finite_arrays({"photograph": photograph})
-        catchers, materials, light = self._catchers_alone, self.materials(inputs.of_bodies), _light_of(inputs)
+        catchers, materials = self._catchers_alone, self.materials(inputs.of_bodies)
         geometry, alone = None, None
         if inputs.geometry is not None:
             geometry = as_geometry("geometry", inputs.geometry)
             alone = catchers.moved_geometry(geometry)
             geometry = replace(geometry, moving=None)  # else static catchers would be lit in another way than alone
         view = self.view(geometry, inputs.clip_matrices)
-        of_catchers = catchers.light(replace(inputs, geometry=alone), light, view)
+        light = self._method.light_input(view, inputs.light, inputs.shell)
+        of_catchers = catchers.light(replace(inputs, geometry=alone), view)
         unshadowed = Input("light without the others", of_catchers)
         photo_input = None if photograph is None else Input("photograph", photograph)
         arguments = photo_input, unshadowed, catchers.has_face, light, materials
@@ -403,7 +391,7 @@ class SceneRenderer:
 
     @functools.cached_property
     def _catchers_alone(self) -> CatchersAlone:
-        return CatchersAlone(self._of_bodies_alone(self.scene.catchers), self.merged_scene)
+        return CatchersAlone(self._of_bodies_alone(self.scene.catchers)._views, self.merged_scene)
 
     def _of_bodies_alone(self, numbers: tuple[int, ...]) -> "SceneRenderer":
         """Make a renderer of some bodies alone, with the receivers and spheres that they have here; it never warns."""
@@ -412,7 +400,7 @@ class SceneRenderer:
         alone = SceneRenderer(**arguments)
         alone.merged_scene.take_spheres(self.merged_scene, numbers)
         alone.merged_scene.has_chosen_receivers = self.merged_scene.has_chosen_receivers[list(numbers)]
-        alone._has_warned = True
+        alone._views.has_warned = True
         return alone
 
     @one_at_a_time
@@ -483,7 +471,8 @@ class SceneRenderer:
             geometry = None if inputs.geometry is None else as_geometry("geometry", inputs.geometry)
             view = self._views.view(geometry, inputs.clip_matrices)
         preview = view.preview()  # which the nodes' words ask, so it stays meanwhile
-        light, materials = _light_of(inputs), self.materials(inputs.of_bodies)
+        light = self._method.light_input(preview, inputs.light, inputs.shell)
+        materials = self.materials(inputs.of_bodies)
         image = preview.image(light, materials)
         is_host = self.device.is_cpu or self.clock.waits
         of_receivers = receiver_notes(self._given_scene, self._choices, view.blocker_kinds.bulging_bodies)
@@ -492,11 +481,6 @@ class SceneRenderer:
         return Explanation(
             image, self._views.call(view), self.clock.timings, is_host=is_host, hidden=hidden, notes=notes
         )
-
-
-def _light_of(inputs: ImageArrays) -> Light | None:
-    """The light of an image, with its own shell where one is given."""
-    return inputs.light if inputs.shell is None else ShellLight(inputs.light, inputs.shell)
 
 
 def _find_near_light(merged_scene: MergedScene) -> NearLight | None:

@@ -29,7 +29,6 @@ from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.shading.method import LightInput, Method
-from warpshadow.pipeline.shading.transfers import Light
 from warpshadow.stages.light.sums import add_light
 
 if TYPE_CHECKING:  # they are imported where light bounces
@@ -72,31 +71,30 @@ class LightTransport:
     def __init__(self, method: Method):
         self.method = method
 
-    def shading(self, points: LitPoints, light: Light | None, materials: Materials | None = None) -> Node:
+    def shading(self, points: LitPoints, light: LightInput, materials: Materials | None = None) -> Node:
         """Light reflected by points as white surfaces, vec3 of shape [batch, receiver].
 
         Results for the scene's light and the last other known light are cached.
 
         Args:
             points: The receivers.
-            light: None for the scene's.
+            light: From :meth:`.Method.light_input`.
             materials: They matter where light bounces, and where bodies emit; None for the scene's.
         """
         without_emitters = self.shading_without_emitters(points, light, materials)
         return self._with_emitters(without_emitters, points, materials or points.materials)
 
     def shading_without_emitters(
-        self, points: LitPoints, light: Light | None, materials: Materials | None = None
+        self, points: LitPoints, light: LightInput, materials: Materials | None = None
     ) -> Node:
         """The same without direct light of emitters, but with that which bounces."""
-        light_input = self.method.light_input(points, light)
         if not self.method.merged_scene.scene.bounces:
-            return self.method.direct_shading(points, light_input)
+            return self.method.direct_shading(points, light)
         materials = materials or points.materials
-        bounce = functools.partial(self._bounced, points, light_input, materials)
-        if light_input.is_free or materials is not points.materials:
+        bounce = functools.partial(self._bounced, points, light, materials)
+        if light.is_free or materials is not points.materials:
             return bounce()
-        return self.method.cached_for_light("shading", points, light_input, bounce)
+        return self.method.cached_for_light("shading", points, light, bounce)
 
     def bouncing(self, points: LitPoints, light: LightInput, materials: Materials) -> Bouncing:
         """How light bounces onto points."""
@@ -109,14 +107,13 @@ class LightTransport:
             shares_directions=self.method.shares_directions,
         )
 
-    def notes(self, points: LitPoints, light: Light | None, materials: Materials) -> list[str]:
+    def notes(self, points: LitPoints, light: LightInput, materials: Materials) -> list[str]:
         """Say how often light bounces, and how, where it does."""
         count = self.method.merged_scene.scene.bounces
         if not count:
             return []
         times = "until none is left" if count == "all" else f"{count} time{'s' * (count != 1)}"
-        bouncing = self.bouncing(points, self.method.light_input(points, light), materials)
-        return [f"Light bounces {times}, {bouncing.value}."]
+        return [f"Light bounces {times}, {self.bouncing(points, light, materials).value}."]
 
     def _bounced(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
         """Shading of points, direct and bounced."""
@@ -142,17 +139,16 @@ class LightTransport:
         samples = self._static_bounces.patch_samples(points, materials)
         return self._with_emitters(self.method.direct_shading(samples, light), samples, materials)
 
-    def openness(self, points: LitPoints, light: Light | None, materials: Materials) -> Node | None:
+    def openness(self, points: LitPoints, light: LightInput, materials: Materials) -> Node | None:
         """Part of the hemispheres of points that no blocker takes, vec3 of shape [view, receiver].
 
         It is found by the rays along which light bounces between static patches; None where light bounces in another
         way, or not at all.
         """
-        light_input = self.method.light_input(points, light)
         has_bounces = bool(self.method.merged_scene.scene.bounces)
-        if not has_bounces or self.bouncing(points, light_input, materials) is not Bouncing.STATIC:
+        if not has_bounces or self.bouncing(points, light, materials) is not Bouncing.STATIC:
             return None
-        lit = None if light_input.is_free else self._lit_patch_samples(points, light_input, materials)
+        lit = None if light.is_free else self._lit_patch_samples(points, light, materials)
         return self._static_bounces.openness(points, materials, lit)
 
     def _with_emitters(self, light: Node, points: LitPoints, materials: Materials) -> Node:

@@ -104,13 +104,15 @@ def _scene(scene: Table, folder: Path, bounces: Bounces | None, settings: Table)
     with check.located("[camera]"):
         toml_tables.check_table(scene["camera"])
         _check_keys("[camera]", scene["camera"])
-        placed = dict(scene["camera"])
-        supersampling = placed.pop("supersampling", Scene.supersampling)
+        camera_table = dict(scene["camera"])
+        supersampling = camera_table.pop("supersampling", Scene.supersampling)
         check_supersampling(supersampling)
-        unframed_key = next((key for key in _FRAMING_KEYS if key in placed and "framing" not in placed), None)
+        unframed_key = next(
+            (key for key in _FRAMING_KEYS if key in camera_table and "framing" not in camera_table), None
+        )
         if unframed_key is not None:
             raise ValueError(f'{unframed_key} goes with framing = "auto", in place of eye and target')
-        camera = _framing(placed, bodies) if "framing" in placed else parse_camera(placed)
+        camera = _framing(camera_table, bodies) if "framing" in camera_table else parse_camera(camera_table)
     with check.located("[visibility]"):
         value = scene.get("visibility", {})
         toml_tables.check_table(value)

@@ -104,15 +104,25 @@ class Arguments:
     ) -> Any:
         """Apply a function of inputs, as :func:`~warpshadow.torch.apply` does, or replay it if there are replays.
 
-        It gets the inputs with arrays in the slots. Results lose a batch dimension that no tensor had.
+        It gets the inputs with arrays in the slots, and returns an array, a tuple of them or a :class:`.Geometry`.
+        Results lose a batch dimension that no tensor had.
         """
         self._common_batch()
         find_capture = None
         if replays is not None:
             reused = [number for number, name in enumerate(self.names) if name.startswith(_CACHED_BY_VALUE)]
             find_capture = functools.partial(replays.find, tuple(map(_key, inputs)), reused)
+        geometries: list[Geometry[wp.array]] = []
+
+        def call(*arrays: wp.array) -> Any:
+            result = function(*(_filled(value, arrays) for value in inputs))
+            if not isinstance(result, Geometry):
+                return result
+            geometries.append(result)
+            return result.all_arrays()
+
         results = apply(
-            lambda *arrays: function(*(_filled(value, arrays) for value in inputs)),
+            call,
             *self.tensors,
             dtypes=self.dtypes,
             device=self.device,
@@ -120,28 +130,9 @@ class Arguments:
             affine=affine,
             find_capture=find_capture,
         )
-        if self._has_batch:
-            return results
-        return tuple(result[0] for result in results) if isinstance(results, tuple) else results[0]
-
-    def apply_geometry(self, function: Callable[..., Geometry[wp.array]], *inputs: Any) -> Geometry[torch.Tensor]:
-        """Apply a function that makes a geometry."""
-        geometries: list[Geometry[wp.array]] = []
-
-        def make(*inputs: Any) -> tuple[wp.array, ...]:
-            geometries.append(function(*inputs))
-            rotations = geometries[0].rotations
-            return (*geometries[0].arrays().values(), *([] if rotations is None else [rotations]))
-
-        positions, centers, radii, *rotations = self.apply(make, *inputs)
-        return Geometry(
-            positions,
-            centers,
-            radii,
-            moving=geometries[0].moving,
-            rotations=rotations[0] if rotations else None,
-            deformed=geometries[0].deformed,
-        )
+        if not self._has_batch:
+            results = tuple(result[0] for result in results) if isinstance(results, tuple) else results[0]
+        return geometries[0].with_arrays(results) if geometries else results
 
     def _common_batch(self) -> int:
         return common_batch({"cameras": self._cameras, **dict(zip(self.names, self.tensors, strict=True))})

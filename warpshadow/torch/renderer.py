@@ -178,10 +178,6 @@ class TorchRenderer(torch.nn.Module):
             others raise NotImplementedError then.
         """
         arguments, slots = self._slots_of(inputs)
-
-        def draw(inputs: ImageArrays) -> wp.array:
-            return self.warp.draw_inputs(inputs, self.warp.view(inputs.geometry, inputs.clip_matrices))
-
         is_affine = {
             "light": True,
             "emission": True,
@@ -189,7 +185,7 @@ class TorchRenderer(torch.nn.Module):
             "textures": not self.scene.bounces,
         }
         affine = [name for name in arguments.names if is_affine.get(name.partition("[")[0])]
-        return arguments.apply(draw, slots, affine=affine, replays=self.replays)
+        return arguments.apply(self.warp.draw_inputs, slots, affine=affine, replays=self.replays)
 
     @uncompiled
     @one_at_a_time
@@ -354,7 +350,8 @@ class TorchRenderer(torch.nn.Module):
         def place(poses: list[wp.array], rest: Geometry[wp.array] | None, pivot: Pivot) -> Geometry[wp.array]:
             return self.warp.placed(Poses(*poses), rest, moving=moving, pivot=pivot)
 
-        return arguments.apply_geometry(place, pose_slots, rest_slots, pivot_slot)
+        placed: Geometry[torch.Tensor] = arguments.apply(place, pose_slots, rest_slots, pivot_slot)
+        return placed
 
     @uncompiled
     def scene_poses(
@@ -416,9 +413,10 @@ class TorchRenderer(torch.nn.Module):
             for name, tensor in parts.items()
         ]
         rest_slots = None if rest is None else arguments.add_geometry("rest", rest, self.warp.rest())
-        return arguments.apply_geometry(
+        deformed: Geometry[torch.Tensor] = arguments.apply(
             lambda rest, *arrays: self.warp.deformed(body, *arrays, rest=rest), rest_slots, *slots
         )
+        return deformed
 
     @uncompiled
     def deformation_graph(self, body: BodyLike, *, count: int = 4) -> DeformationGraph:

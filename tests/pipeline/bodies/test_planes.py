@@ -10,9 +10,9 @@ import warp as wp
 import warpshadow as ws
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
-from warpshadow.pipeline.bodies.planes import ScenePlanes
+from warpshadow.pipeline.bodies.scene_planes import ScenePlanes
 from warpshadow.scene.blockers import scene_blockers
-from warpshadow.stages.planes import prepared
+from warpshadow.stages.planes import plane_blockers
 from warpshadow.torch import TorchRenderer
 
 STEP = 1e-3
@@ -166,7 +166,7 @@ def window_wall(*, is_cut):
 def test_a_wall_with_a_window_blocks_as_the_four_planes_around_it_do(monkeypatch):
     """By texels the edges of the sun on the floor are blurred and elsewhere."""
     images = [ws.Renderer(window_wall(is_cut=is_cut), progress=False).render()[16:, :, :3] for is_cut in (False, True)]
-    monkeypatch.setattr(prepared, "MAX_EDGES", 0)
+    monkeypatch.setattr(plane_blockers, "MAX_EDGES", 0)
     by_texels = ws.Renderer(window_wall(is_cut=False), progress=False).render()[16:, :, :3]
     off, off_by_texels = (np.abs(image - images[1]).mean() / images[1].mean() for image in (images[0], by_texels))
     assert off < 0.015

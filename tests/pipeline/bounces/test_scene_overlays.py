@@ -6,8 +6,8 @@ import pytest
 import warpshadow as ws
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
-from warpshadow.pipeline.bounces.overlays import find_overlays
 from warpshadow.pipeline.bounces.patches import ScenePatches
+from warpshadow.pipeline.bounces.scene_overlays import find_overlays
 
 WHITE = (0.8, 0.8, 0.8)
 

@@ -173,7 +173,7 @@ def test_iterations_are_those_of_a_twin_in_float64(given, method, monkeypatch):
     if given == "light and colors":  # those that it has
         color = wp.array(np.atleast_2d(scene.bodies[2].albedo)[None], dtype=wp.vec3)
         materials = materials.replaced({"albedo": [None, None, color]})
-    shading = view.shading(light, materials).value(view.call).numpy()[0]
+    shading = view.shading(view.method.light_input(view, light), materials).value(view.call).numpy()[0]
     (factors,) = (node for name, (_, node) in view._cached.items() if name == "form factors")
     factors = factors.value(view.call)
     patches = ScenePatches(engine.merged_scene)
@@ -233,7 +233,7 @@ def test_what_sticks_out_of_another_body_has_the_light_of_patch_samples_outside(
     visibility = ws.Visibility("ray-traced", sampling="shared", samples=64)
     engine = ws.Renderer(ws.Scene(bodies, ws.EnvironmentMap.constant(1.0), camera, visibility, bounces=1))
     view = engine.view()
-    shading = view.shading(None)
+    shading = view.shading(view.method.light)
     shading.value(view.call)
     (factors,) = (node for name, (_, node) in view._cached.items() if name == "form factors")
     means = factors.value(view.call).patch_sample_means.to_scipy()

@@ -90,7 +90,9 @@ def test_several_cameras_and_poses_are_as_alone():
 
 def _groups(renderer: SceneRenderer) -> list:
     view = renderer.view()
-    blockers = renderer._method.scene_blockers.placed(view.blocker_kinds, view.vertices.value(), view.spheres.value())
+    blockers = renderer._method.scene_blockers.place_blockers(
+        view.blocker_kinds, view.vertices.value(), view.spheres.value()
+    )
     return find_groups(view.static_bodies, view.nearest_spheres, view.receivers, blockers, {}, None, None)
 
 

@@ -12,9 +12,9 @@ from warpshadow.stages.bounces.plane_light import plane_light as light_of_texels
 from warpshadow.stages.bounces.plane_texels import find_texels
 from warpshadow.stages.joint_coverage import transmittance_past
 from warpshadow.stages.patches import find_plane_patches
-from warpshadow.stages.planes import prepared
+from warpshadow.stages.planes import plane_blockers
 from warpshadow.stages.planes.coverage import plane_coverage
-from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneBody
+from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneBody
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -40,7 +40,7 @@ def passing_flats(points, transmittance, frames, planes, directions, **options):
 @pytest.mark.parametrize("coverage", ["outline", "texels"])
 def test_light_is_that_of_the_formula(names, skip, two_sided, coverage, device, monkeypatch):
     if coverage == "texels":
-        monkeypatch.setattr(prepared, "MAX_EDGES", 5)
+        monkeypatch.setattr(plane_blockers, "MAX_EDGES", 5)
     setting = Setting(device, names=names, two_sided=two_sided, batch=2)
     points, normals, transmittance, vertices, radiosity = setting.arrays()
     frames = setting.planes.frames(vertices)
@@ -71,7 +71,7 @@ def test_white_flats_send_what_they_block(skip, device):
 @pytest.mark.parametrize("coverage", ["outline", "texels"])
 def test_what_passes_is_that_of_the_formula(skip, coverage, device, monkeypatch):
     if coverage == "texels":
-        monkeypatch.setattr(prepared, "MAX_EDGES", 5)
+        monkeypatch.setattr(plane_blockers, "MAX_EDGES", 5)
     setting = Setting(device, blocks=(True, False, True))
     points, _, transmittance, vertices, _ = setting.arrays()
     frames = setting.planes.frames(vertices)
@@ -110,7 +110,7 @@ def random_steps(setting, number, size=1e-6):
 @pytest.mark.parametrize("coverage", ["outline", "texels"])
 def test_gradients_of_light_are_those_of_the_twin(names, two_sided, coverage, device, verified_tape, monkeypatch):
     if coverage == "texels":
-        monkeypatch.setattr(prepared, "MAX_EDGES", 5)
+        monkeypatch.setattr(plane_blockers, "MAX_EDGES", 5)
     setting = Setting(device, names=names, two_sided=two_sided)
     variables = setting.arrays()
     points, normals, transmittance, vertices, radiosity = variables

@@ -9,8 +9,8 @@ from scipy.spatial import ConvexHull
 
 from warpshadow.maths.convex import find_convex_parts
 from warpshadow.maths.directions import cell_radius, fibonacci
+from warpshadow.stages.convex.convex_blockers import ConvexBlockers, ConvexBody
 from warpshadow.stages.convex.coverage import part_coverage
-from warpshadow.stages.convex.prepared import ConvexBlockers, ConvexBody
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 

@@ -9,8 +9,15 @@ from scipy.spatial.transform import Rotation
 
 import warpshadow as ws
 from warpshadow.device.tape import recorded
-from warpshadow.stages.convex.prepared import ConvexBlockers, ConvexBody
-from warpshadow.stages.emitters import convex, light, planes, spheres, traced
+from warpshadow.stages.convex.convex_blockers import ConvexBlockers, ConvexBody
+from warpshadow.stages.emitters import (
+    convex_transmittance,
+    light,
+    plane_transmittance,
+    sphere_transmittance,
+    traced_transmittance,
+)
+from warpshadow.stages.emitters.emitter_self_visibility import find_self_visibility, look_up_self_visibility
 from warpshadow.stages.emitters.samples import (
     SAMPLE_BUNDLE,
     EmitterSamples,
@@ -19,9 +26,8 @@ from warpshadow.stages.emitters.samples import (
     find_sample_weights,
     place_samples,
 )
-from warpshadow.stages.emitters.self_visibility import find_self_visibility, look_up_self_visibility
 from warpshadow.stages.planes.grid import find_grid
-from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneBody
+from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneBody
 from warpshadow.stages.rays.ray_tracing import trace_visibility
 from warpshadow.stages.sparse import SparseMatrix
 
@@ -226,7 +232,7 @@ def test_spheres_block_as_the_twin_does(device):
     on_device = on_device[0], wp.array(radii[None], dtype=wp.float32, device=device)
     skipped = (0, 3), (10, 12)
     span = next(samples.spans())
-    got = numbers(spheres.find_log_transmittance(*arrays, own, span, *on_device, skipped))
+    got = numbers(sphere_transmittance.find_log_transmittance(*arrays, own, span, *on_device, skipped))
     sample_points, areas = numbers(own.points), numbers(own.areas)
     blocking = [sphere for sphere in range(20) if not (sphere < 3 or 10 <= sphere < 12)]
     expected = np.zeros((40, 64))
@@ -249,7 +255,7 @@ def test_a_sphere_behind_the_emitter_or_the_receiver_blocks_nothing(device):
     for height, is_blocking in ((1.5, False), (-1.2, True), (-3.0, False)):
         sphere = wp.array([[(0, height, 0)]], dtype=wp.vec3, device=device), wp.array([[0.5]], dtype=wp.float32)
         sphere = sphere[0], wp.full((1, 1), 0.5, dtype=wp.float32, device=device)
-        got = spheres.find_log_transmittance(*arrays, own, span, *sphere, ((0, 0), (0, 0))).numpy()
+        got = sphere_transmittance.find_log_transmittance(*arrays, own, span, *sphere, ((0, 0), (0, 0))).numpy()
         assert (got.min() < -1) == is_blocking
 
 
@@ -272,7 +278,7 @@ def test_planes_block_as_the_twin_does(device):
     samples = samples_of(BALL, device)
     own = placed(samples, BALL.positions + np.float32([0.2, 1.5, 0.1]), device)
     span = next(samples.spans())
-    got = numbers(planes.find_log_transmittance_of_planes(*arrays, own, span, frames, blockers, (-1, -1)))
+    got = numbers(plane_transmittance.find_log_transmittance_of_planes(*arrays, own, span, frames, blockers, (-1, -1)))
     sample_points, areas = numbers(own.points), numbers(own.areas)
     expected = np.zeros(got.shape)
     for receiver, sample in np.ndindex(*got.shape):
@@ -283,7 +289,7 @@ def test_planes_block_as_the_twin_does(device):
             expected[receiver, sample] = np.log(max(1 - share, 1e-4))
     assert (expected < -0.5).sum() > 200 and (expected == 0).sum() > 200
     np.testing.assert_allclose(np.exp(got), np.exp(expected), atol=50 * FLOAT32)
-    none = planes.find_log_transmittance_of_planes(*arrays, own, span, frames, blockers, (-1, 0))
+    none = plane_transmittance.find_log_transmittance_of_planes(*arrays, own, span, frames, blockers, (-1, 0))
     assert not none.numpy().any()
 
 
@@ -304,7 +310,7 @@ def test_convex_parts_block_as_the_twin_does(device):
     own = placed(samples, BALL.positions + np.float32([0.2, 1.3, 0.1]), device)
     parts = blockers.placed(wp.array(vertices[None], dtype=wp.vec3, device=device))
     span = next(samples.spans())
-    got = numbers(convex.find_log_transmittance_of_parts(*arrays, own, span, parts, blockers, (-1, -1)))
+    got = numbers(convex_transmittance.find_log_transmittance_of_parts(*arrays, own, span, parts, blockers, (-1, -1)))
     sample_points, areas = numbers(own.points), numbers(own.areas)
     expected = np.zeros(got.shape)
     for receiver, sample in np.ndindex(*got.shape):
@@ -314,7 +320,7 @@ def test_convex_parts_block_as_the_twin_does(device):
             expected[receiver, sample] = np.log(max(1 - share, 1e-4))
     assert (expected < -0.5).sum() > 100 and (expected == 0).sum() > 200
     np.testing.assert_allclose(np.exp(got), np.exp(expected), atol=100 * FLOAT32)
-    none = convex.find_log_transmittance_of_parts(*arrays, own, span, parts, blockers, (-1, 0))
+    none = convex_transmittance.find_log_transmittance_of_parts(*arrays, own, span, parts, blockers, (-1, 0))
     assert not none.numpy().any()
 
 
@@ -337,7 +343,9 @@ def log_past(mesh, points, normals, device):
     own = placed(samples, 0.5 * BALL.positions, device)
     arrays = [wp.array(item[None], dtype=wp.vec3, device=device) for item in (points, normals)]
     parts = blockers.placed(wp.array(mesh.positions[None], dtype=wp.vec3, device=device))
-    got = convex.find_log_transmittance_of_parts(*arrays, own, next(samples.spans()), parts, blockers, (-1, -1))
+    got = convex_transmittance.find_log_transmittance_of_parts(
+        *arrays, own, next(samples.spans()), parts, blockers, (-1, -1)
+    )
     return own, numbers(got)
 
 
@@ -396,7 +404,7 @@ def test_rays_meet_what_is_between_and_not_what_is_behind(device):
         vertices = wp.array(mesh.positions + np.float32([0, height, 0]), dtype=wp.vec3, device=device)
         wall = wp.Mesh(vertices, wp.array(mesh.surface.faces.ravel(), dtype=wp.int32, device=device))
         lamp = samples, wp.array(BALL.positions, dtype=wp.vec3, device=device), own.points[0], own.areas[0], span
-        got = traced.trace_transmittance(wall, *arrays, *lamp, rays=4).numpy()
+        got = traced_transmittance.trace_transmittance(wall, *arrays, *lamp, rays=4).numpy()
         faces_it = np.einsum("kx,kx->k", at[0] - numbers(own.points), numbers(own.areas)) > 0
         np.testing.assert_array_equal(got[0, faces_it], share)
         far = trace_visibility(wall, *(a.reshape((1, 1)) for a in arrays), wp.array([(0, 1.0, 0)], dtype=wp.vec3))
@@ -412,8 +420,8 @@ def test_rays_to_a_lamp_are_spread_over_each_sample_and_over_samples(device):
     vertices = wp.array(wall.positions + np.float32([1.03, 1.0, 0]), dtype=wp.vec3, device=device)
     hides = wp.Mesh(vertices, wp.array(wall.surface.faces.ravel(), dtype=wp.int32, device=device))
     lamp = samples, wp.array(panel.positions, dtype=wp.vec3, device=device), own.points[0], own.areas[0], span
-    share = traced.trace_transmittance(hides, points, normals, *lamp, rays=4).numpy()
-    exact = traced.trace_transmittance(hides, points, normals, *lamp, rays=32).numpy()
+    share = traced_transmittance.trace_transmittance(hides, points, normals, *lamp, rays=4).numpy()
+    exact = traced_transmittance.trace_transmittance(hides, points, normals, *lamp, rays=32).numpy()
     np.testing.assert_allclose(exact, np.broadcast_to(exact[0], exact.shape), atol=FLOAT32)
     p = exact[0]
     drawn = np.sqrt((p * (1 - p)).sum() / 4) / len(p)
@@ -448,14 +456,14 @@ def test_gradients_of_light_agree_with_differences(between, device):
         own = place_samples(arrays[2], samples)
         seen, logs = (*arrays[:2], own, span), {}
         if between == "spheres":
-            found = spheres.find_log_transmittance(*seen, arrays[4], radii, ((0, 0), (0, 0)))
+            found = sphere_transmittance.find_log_transmittance(*seen, arrays[4], radii, ((0, 0), (0, 0)))
             logs = {"log_of_spheres": found}
         if between == "planes":
-            found = planes.find_log_transmittance_of_planes(*seen, arrays[4], blockers, (-1, -1))
+            found = plane_transmittance.find_log_transmittance_of_planes(*seen, arrays[4], blockers, (-1, -1))
             logs = {"log_of_planes": found}
         if between in ("parts", "panels"):
             parts = box_blockers.placed(arrays[4])
-            found = convex.find_log_transmittance_of_parts(*seen, parts, box_blockers, (-1, -1))
+            found = convex_transmittance.find_log_transmittance_of_parts(*seen, parts, box_blockers, (-1, -1))
             logs = {"log_of_parts": found}
         return light.sum_light(*arrays[:2], own, arrays[3], span, light.find_transmittance_to_samples(**logs))
 

@@ -16,15 +16,15 @@ import warp as wp
 from warpshadow.maths.convex import ConvexPart
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.scene.blockers import blocking_parts, find_solids
+from warpshadow.stages.convex.convex_blockers import ConvexBlockers, ConvexBody, PlacedParts
 from warpshadow.stages.convex.coverage import part_coverage
-from warpshadow.stages.convex.prepared import ConvexBlockers, ConvexBody, PlacedParts
 
 
 class GroupConvexParts(NamedTuple):
     """Convex parts around some receivers."""
 
     blockers: ConvexBlockers
-    placed: PlacedParts
+    placed_parts: PlacedParts
     skip: int | None = None  # index, among the bodies of blockers, of the body that the receivers are part of
     on_surface: bool = False  # whether receivers lie on the parts, which are those of one body
 
@@ -34,7 +34,7 @@ class GroupConvexParts(NamedTuple):
         """Coverage of cells by them, see :func:`.part_coverage`. Differentiable: points."""
         return part_coverage(
             points,
-            self.placed,
+            self.placed_parts,
             self.blockers,
             directions,
             radius=radius,
@@ -78,6 +78,6 @@ class SceneConvexParts:
             self._blockers[key] = ConvexBlockers.from_bodies(chosen, int(starts[-1]), device=device)
         return self._blockers[key]
 
-    def placed(self, bodies: tuple[int, ...], positions: wp.array) -> PlacedParts:
-        """Where parts of some bodies are, of vertices [batch, vertex]. Differentiable in them."""
+    def place_parts(self, bodies: tuple[int, ...], positions: wp.array) -> PlacedParts:
+        """Place the parts of some bodies by all vertices, [batch, vertex]. Differentiable in them."""
         return self.blockers(bodies, bodies).placed(positions)

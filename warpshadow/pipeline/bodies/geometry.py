@@ -48,9 +48,16 @@ class Geometry(Generic[Array]):
 
     def map(self, function: Callable[[Array], Other]) -> "Geometry[Other]":
         """Apply a function to each array and return the geometry of the results."""
-        rotations = None if self.rotations is None else function(self.rotations)
-        arrays = map(function, self.arrays().values())
-        return Geometry(*arrays, moving=self.moving, rotations=rotations, deformed=self.deformed)
+        return self.with_arrays(tuple(map(function, self.all_arrays())))
+
+    def all_arrays(self) -> tuple[Array, ...]:
+        """The arrays of the bodies, and their rotations if these are known."""
+        return (*self.arrays().values(), *([] if self.rotations is None else [self.rotations]))
+
+    def with_arrays(self, arrays: "tuple[Other, ...]") -> "Geometry[Other]":
+        """The geometry with others in place of :meth:`all_arrays`."""
+        rotations = None if self.rotations is None else arrays[3]
+        return Geometry(*arrays[:3], moving=self.moving, rotations=rotations, deformed=self.deformed)
 
 
 PLACED = "placed(…) makes a geometry of poses"  # message for arrays that do not form a geometry

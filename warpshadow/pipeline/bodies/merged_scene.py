@@ -24,7 +24,7 @@ from warpshadow.stages.geometry.poses import Poses
 
 if TYPE_CHECKING:  # it is imported where a body emits
     from warpshadow.stages.emitters.samples import SampleWeights
-    from warpshadow.stages.emitters.traced import EmittingFaces
+    from warpshadow.stages.emitters.traced_transmittance import EmittingFaces
     from warpshadow.stages.textures.pyramid import Textures
 
 
@@ -196,7 +196,7 @@ class MergedScene:
             texture_of_face: The texture of each face, −1 for none, int32 of shape [face].
             axes: Of the emitters' beams, of one instance, vec3 of shape [emitter]; None where none has one.
         """
-        from warpshadow.stages.emitters.traced import EmissionTextures, FaceBeams, emitting_faces
+        from warpshadow.stages.emitters.traced_transmittance import EmissionTextures, FaceBeams, emitting_faces
 
         is_emitting = self.is_emitter[self.body_of_face]
         faces, uv_faces = (self._array(item.numpy()[is_emitting], wp.vec3i) for item in (self.faces, self.uv_faces))

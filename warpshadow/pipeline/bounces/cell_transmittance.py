@@ -46,7 +46,7 @@ def find_cell_transmittance(
     parts = None
     if isinstance(visibility, CellVisibility):
         directions, transmittance_self = visibility.directions, visibility.transmittance_self
-        parts = None if visibility.part_coverages is None else visibility.part_coverages.cells
+        parts = None if visibility.part_coverages is None else visibility.part_coverages.all_cells
         transmittance_nonplanar = (
             visibility.transmittance_total
             if visibility.transmittance_nonplanar is None

@@ -120,7 +120,7 @@ class Gathering:
         self.stages, self._functions = stages[first:], functions[first:]
 
     def lights(
-        self, node: Node, call: Call, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance
+        self, node: Node, call: Call, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance
     ) -> list[wp.array]:
         """Bounced light of a group by each path: its own body, planes, spheres; vec3 of shape [batch, receiver].
 
@@ -130,7 +130,7 @@ class Gathering:
         for stage, function in zip(self.stages, self._functions, strict=True):
             if not stage.idle:
                 with node.timed(call, stage):
-                    result.append(function(group, cells, outgoing))
+                    result.append(function(group, transmittance, outgoing))
         return [light for light in result if light is not None]
 
     def _from_itself(self, group: Group, _: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
@@ -139,25 +139,27 @@ class Gathering:
             return None
         return self_light(self._self_form_factors.of(own.number), outgoing.of_body(own.number), *own.probe_weights)
 
-    def _from_planes(self, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array:
+    def _from_planes(self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array:
         planes = outgoing.proxies.planes
         assert planes is not None
         skip = planes.index_of_body.get(group.body)
-        points, fronts = group.lifted_points_and_fronts(outgoing.frames, planes.blockers, skip)
+        points, fronts = group.beside(outgoing.frames, planes.blockers, skip)
         # Cells look to where the light of the sky is, above horizons; light of planes is found around their middles. A
         # ball on a ground lost 4% of the ground's light by the former.
-        middles = fibonacci(len(cells.directions))
+        middles = fibonacci(len(transmittance.directions))
         arguments = (
             points,
             group.normals,
-            cells.transmittance_nonplanar,
+            transmittance.transmittance_nonplanar,
             outgoing.frames,
             outgoing.texels,
             planes.blockers,
         )
-        return plane_light(*arguments, middles, coverages=cells.part_coverages, fronts=fronts, skip=skip)
+        return plane_light(*arguments, middles, coverages=transmittance.part_coverages, fronts=fronts, skip=skip)
 
-    def _from_spheres(self, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
+    def _from_spheres(
+        self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance
+    ) -> wp.array | None:
         if not any(body != group.body and not self._is_flat[body] for body in outgoing.senders.bodies):
             return None
         projected_patches, proxy_radiance = outgoing.projected_patches, outgoing.proxy_radiance
@@ -173,9 +175,9 @@ class Gathering:
             centers,
             radii,
             proxy_radiance,
-            expand_rows(cells.transmittance_nonplanar, count),
-            cells.transmittance_self,
-            cells.directions,
+            expand_rows(transmittance.transmittance_nonplanar, count),
+            transmittance.transmittance_self,
+            transmittance.directions,
             softness=softness,
             merging=self._visibility.merging,
             skip=outgoing.proxies.span_of(group.body),

@@ -29,11 +29,17 @@ from warpshadow.pipeline.bounces.patches import OF_PATCH_SAMPLES, ScenePatches, 
 from warpshadow.pipeline.bounces.proxies import ProjectedPatches, Proxies
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
-from warpshadow.pipeline.node import Call, Node, NodeStage
+from warpshadow.pipeline.node import Call, Node, NodeStage, identity
 from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.shading.method import LightInput
-from warpshadow.pipeline.shading.sphere_method import LitPortion, PortionedShading, ProjectedLight, SphereMethod
+from warpshadow.pipeline.shading.sphere_method import (
+    LitPortion,
+    PortionedShading,
+    PortionedTransfer,
+    ProjectedLight,
+    SphereMethod,
+)
 from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.patch_weights import PatchWeights, find_mean_transmittance, find_patch_weights
@@ -47,7 +53,7 @@ class PortionVisibility(NamedTuple):
 
     transfer: wp.array  # of direct light, [batch, receiver, coefficient]
     group: Group
-    cells: CellTransmittance
+    transmittance: CellTransmittance
 
 
 class PortionDirectLight(NamedTuple):
@@ -55,13 +61,16 @@ class PortionDirectLight(NamedTuple):
 
     direct: wp.array  # vec3 of shape [batch, receiver]
     group: Group
-    cells: CellTransmittance
+    transmittance: CellTransmittance
 
 
-def _visibility_of(method: SphereMethod, portion: LitPortion) -> PortionVisibility:
-    """Visibility of a portion for direct and bounced light, given its transfer vectors."""
-    cells = find_cell_transmittance(method, portion.group, portion.visibility, portion.spheres)
-    return PortionVisibility(portion.result, portion.group, cells)
+class VisibilityWithBounces(PortionedTransfer):
+    """Visibility of receivers for direct and bounced light, a list of :class:`PortionVisibility`."""
+
+    def result_of(self, portion: LitPortion) -> PortionVisibility:
+        """Visibility of a portion."""
+        transmittance = find_cell_transmittance(self.method, portion.group, portion.visibility, portion.spheres)
+        return PortionVisibility(portion.result, portion.group, transmittance)
 
 
 class PortionedDirectLight(Node):
@@ -78,7 +87,7 @@ class PortionedDirectLight(Node):
 
     def __init__(
         self,
-        visibility: PortionedShading,
+        visibility: VisibilityWithBounces,
         projected_light: Node,
         item_text: str | Callable[[], str],
         where: str = "",
@@ -98,7 +107,7 @@ class PortionedDirectLight(Node):
     def _light(self, call: Call, portion: PortionVisibility, projected_light: ProjectedLight) -> PortionDirectLight:
         with self.timed(call, self._shading):
             direct = self._visibility.method.shade_transfer(portion.transfer, portion.group, projected_light)
-        return PortionDirectLight(direct, portion.group, portion.cells)
+        return PortionDirectLight(direct, portion.group, portion.transmittance)
 
 
 def _patch_weights(senders: Senders, visibility: list[PortionVisibility]) -> PatchWeights:
@@ -106,9 +115,9 @@ def _patch_weights(senders: Senders, visibility: list[PortionVisibility]) -> Pat
     portions = [
         find_mean_transmittance(
             portion.group.normals,
-            portion.cells.transmittance_self,
-            portion.cells.transmittance_nonplanar,
-            portion.cells.directions,
+            portion.transmittance.transmittance_self,
+            portion.transmittance.transmittance_nonplanar,
+            portion.transmittance.directions,
         )
         for portion in visibility
     ]
@@ -129,7 +138,7 @@ class PatchSampleNodes(NamedTuple):
     """Nodes of the points at which patches are lit."""
 
     points: LitPoints
-    visibility: PortionedShading  # of the patch samples, for any light
+    visibility: VisibilityWithBounces  # of the patch samples, for any light
     frames: Node  # of flat bodies
     projected_patches: Node  # patches as receivers see them
     weights: Node  # of patch samples and patches, by how open they are
@@ -199,7 +208,7 @@ class Radiosity(Node):
 
     def _light(self, call: Call, portion: PortionDirectLight, outgoing: OutgoingRadiance) -> wp.array:
         """Light of a portion of the patch samples past its own body, from the sky and from others."""
-        bounced = self._gathering.lights(self, call, portion.group, portion.cells, outgoing)
+        bounced = self._gathering.lights(self, call, portion.group, portion.transmittance, outgoing)
         return add_light(portion.direct, *bounced)
 
 
@@ -216,7 +225,7 @@ class BouncedShading(PortionedDirectLight):
 
     def __init__(
         self,
-        visibility: PortionedShading,
+        visibility: VisibilityWithBounces,
         projected_light: Node,
         item_text: Callable[[], str],
         radiosity: Radiosity,
@@ -234,7 +243,7 @@ class BouncedShading(PortionedDirectLight):
         )
 
     def _bounced(self, call: Call, portion: PortionDirectLight, outgoing: OutgoingRadiance) -> wp.array:
-        bounced = self._gathering.lights(self, call, portion.group, portion.cells, outgoing)
+        bounced = self._gathering.lights(self, call, portion.group, portion.transmittance, outgoing)
         return add_light(portion.direct, *bounced)
 
 
@@ -269,17 +278,11 @@ class MovingBounces:
             method.light_of_visibility(points, light),
         )
         if not senders.bodies:
-            idle = NodeStage("bounces", idle="every body is black")
-            return PortionedShading(method, points, projected_light, light, join_portions, stages=(idle,))
+            direct = PortionedShading(method, points, projected_light, light)
+            return Node("bounces", identity, direct, idle="every body is black")
         proxies = self._proxies.setdefault(senders, Proxies(senders, method.visibility.merging))
         make_visibility = functools.partial(
-            PortionedShading,
-            method,
-            projected_light=visibility_light,
-            light=light,
-            finish=list,
-            end="transfer",
-            result_of=functools.partial(_visibility_of, method),
+            VisibilityWithBounces, method, projected_light=visibility_light, light=light
         )
         key, is_cached = light.visibility_key, light.is_free or materials is not points.materials
         visibility = points.cached("visibility", (key, is_cached), lambda: make_visibility(points, caches=is_cached))
@@ -292,13 +295,15 @@ class MovingBounces:
         return BouncedShading(visibility, projected_light, item_text, radiosity, at_points)
 
     def _patch_samples(
-        self, make_visibility: Callable[..., PortionedShading], proxies: Proxies, points: LitPoints
+        self, make_visibility: Callable[..., VisibilityWithBounces], proxies: Proxies, points: LitPoints
     ) -> PatchSampleNodes:
         """Nodes of the patch samples of the bodies around points."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
 
         def project(patch_samples: Receivers, visibility: list[PortionVisibility], *arguments: Any) -> ProjectedPatches:
-            return proxies.projected_patches(patch_samples, [portion.cells for portion in visibility], *arguments)
+            return proxies.projected_patches(
+                patch_samples, [portion.transmittance for portion in visibility], *arguments
+            )
 
         arguments = senders, points, proxies.nearest_spheres
         lit_samples = points.cached("patch samples beside proxies", proxies, lambda: lit_patch_samples(*arguments))

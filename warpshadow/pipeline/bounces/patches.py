@@ -13,8 +13,8 @@ from warpshadow.device.batch import rows
 from warpshadow.maths.contacts import Contact
 from warpshadow.maths.plane import plane_normal
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
-from warpshadow.pipeline.bodies.planes import ScenePlanes
 from warpshadow.pipeline.bodies.reflectance import Materials
+from warpshadow.pipeline.bodies.scene_planes import ScenePlanes
 from warpshadow.pipeline.bounces.contacts import find_contacts
 from warpshadow.pipeline.node import Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints

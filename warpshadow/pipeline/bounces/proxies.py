@@ -14,15 +14,15 @@ import warp as wp
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
 from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance
-from warpshadow.pipeline.bounces.overlays import find_overlays
 from warpshadow.pipeline.bounces.patches import Senders
+from warpshadow.pipeline.bounces.scene_overlays import find_overlays
 from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.stages.bounces.projected_areas import find_projected_areas, tilt_normals_off_planes
 from warpshadow.stages.bounces.proxies import find_depths, place_proxies
 from warpshadow.stages.bounces.proxy_radiance import patches_of_clusters
 from warpshadow.stages.bounces.tangent_planes import TangentPlanes, find_tangent_planes, find_tolerances
 from warpshadow.stages.planes.fronts import NearestBlockers, find_fronts
-from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneBody
+from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneBody
 from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
@@ -159,7 +159,7 @@ class Proxies:
     def projected_patches(
         self,
         patch_samples: Receivers,
-        cells: list[CellTransmittance],
+        transmittances: list[CellTransmittance],
         spheres: tuple[wp.array, wp.array],
         frames: wp.array | None,
     ) -> ProjectedPatches:
@@ -167,7 +167,7 @@ class Proxies:
 
         Args:
             patch_samples: Where they are lit.
-            cells: Transmittance of the patch samples, in portions.
+            transmittances: Of the patch samples, in portions.
             spheres: Centers and radii of all spheres.
             frames: Where flat bodies are.
         """
@@ -184,10 +184,10 @@ class Proxies:
             wp.full_like(portion.transmittance_nonplanar, 1.0, requires_grad=False)
             if portion.transmittance_self is None
             else portion.transmittance_self
-            for portion in cells
+            for portion in transmittances
         ]
         transmittance = join_portions([row.reshape((len(row), -1)) for row in rows])
-        directions = cells[0].directions
+        directions = transmittances[0].directions
         transmittance = transmittance.reshape((len(transmittance), len(senders.sides), len(directions)))
         mean_points = multiply(senders.mean, patch_samples.points)
         mean_normals = multiply(senders.mean, patch_samples.normals)

@@ -15,15 +15,15 @@ from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibilityLookup
 from warpshadow.pipeline.methods.sharpest_cells import SharpestCells, find_share_of_sharpest_light, find_sharpest_cells
-from warpshadow.pipeline.node import Input, Node, field_of
+from warpshadow.pipeline.node import Call, Input, Node, field_of
 from warpshadow.pipeline.receivers.groups import CellCoverages, CellVisibility, Group
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
-from warpshadow.pipeline.shading.method import LightInput
+from warpshadow.pipeline.shading.method import LightInput, LitLobes
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells, project_on_cells
 from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
-from warpshadow.pipeline.shading.shell import PATCHES, ShellPatches, project_on_shell
-from warpshadow.pipeline.shading.sphere_method import LitPortion, PortionedShading, SphereMethod
+from warpshadow.pipeline.shading.shell_patches import PATCHES, ShellPatches, project_on_shell
+from warpshadow.pipeline.shading.sphere_method import LitPortion, PortionedShading, PortionedVisibility, SphereMethod
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, join_portions
 from warpshadow.scene.blockers import blocking_planes
 from warpshadow.stages.gloss.reflection import find_blocked_radiance
@@ -144,9 +144,9 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         of_others = (None, None) if others is None else others
         sharp_cells = projected_light.sharp_cells_past_planes
         if sharp_cells is None or coverages.sharp_cells is None:
-            return transmittance_past(transmittance, coverages.cells, of_others[0])
+            return transmittance_past(transmittance, coverages.all_cells, of_others[0])
         blended = blend_sharp_cells(
-            transmittance_past(None, coverages.cells, of_others[0]),
+            transmittance_past(None, coverages.all_cells, of_others[0]),
             transmittance_past(None, coverages.sharp_cells, of_others[1]),
             sharp_cells.slots,
             projected_light.spot_shares,
@@ -199,7 +199,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         if planes is None or not group.is_blocked_by_planes:
             return visibility
         horizon_normals = group.normals if group.cached_rows is None else None
-        points, fronts = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
+        points, fronts = group.beside_planes
         options: dict[str, Any] = {"horizon_normals": horizon_normals, "fronts": fronts, "skip": planes.skip}
         covered = self._coverages(
             functools.partial(plane_coverage, points, planes.frames, planes.planes, **options), projected_light
@@ -207,7 +207,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         if projected_light.samples is not None and planes.planes.has_holes:
             cells = projected_light.blocking_directions, projected_light.samples
             covered = covered._replace(
-                cells=coverage_of_light(points, covered.cells, planes.frames, planes.planes, *cells, **options)
+                all_cells=coverage_of_light(points, covered.all_cells, planes.frames, planes.planes, *cells, **options)
             )
         total = self._past_coverages(
             visibility.transmittance_self_and_spheres, covered, visibility.part_coverages, projected_light
@@ -272,44 +272,27 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
 
     def share_of_sharpest_light(self, group: Group) -> np.ndarray | None:
         """Share of a group's unblocked light that still comes from the sharpest cells; None where nothing blocks."""
-        cells = self._sharpest_cells
-        towards, scales = self.free_basis.blocking_directions, self._scales(cells.relative_radius)
-        return find_share_of_sharpest_light(group, cells, towards, **scales)
+        sharpest = self._sharpest_cells
+        towards, scales = self.free_basis.blocking_directions, self._scales(sharpest.relative_radius)
+        return find_share_of_sharpest_light(group, sharpest, towards, **scales)
 
-    def lobe_transmittance(
-        self, points: LitPoints, directions: Node, light: LightInput, shaded_points: LitPoints
-    ) -> Node:
+    def lobe_transmittance(self, lobes: LitLobes, directions: Node) -> Node:
         """Transmittance towards the samples of lobes, between cells; of known light, to where it comes from in them."""
-        cells, projected_light = self._cell_transmittance(points, light, shaded_points)
-        item_text = functools.partial(receiver_text, points.weak)
-        arguments = cells, points.receivers_node, directions, projected_light
+        transmittance, projected_light = self._cell_transmittance(lobes)
+        item_text = functools.partial(receiver_text, lobes.points.weak)
+        arguments = transmittance, lobes.points.receivers_node, directions, projected_light
         return Node("transmittance of lobes", _lobe_transmittance, *arguments, items=item_text)
 
-    def blocked_radiance(
-        self,
-        points: LitPoints,
-        diffuse: Node,
-        light: LightInput,
-        shaded_points: LitPoints,
-        choose: Callable[[Node], Node],
-        openness: Node | None,
-    ) -> Node:
-        """Mean radiance of the blockers of points, by their light with bounces and without."""
-        cells, projected_light = self._cell_transmittance(points, light, shaded_points)
-        free = light if light.is_free else None
-        return Node(
-            "light of blockers",
-            self._mean_radiance_of_blockers,
-            cells,
-            points.receivers_node,
-            projected_light,
-            diffuse,
-            free,
-        )
+    def blocked_radiance(self, lobes: LitLobes, diffuse: Node, openness: Node | None) -> Node:
+        """Mean radiance of the blockers of receivers, by their light with bounces and without."""
+        transmittance, projected_light = self._cell_transmittance(lobes)
+        free = lobes.light if lobes.light.is_free else None
+        arguments = transmittance, lobes.points.receivers_node, projected_light, diffuse, free
+        return Node("light of blockers", self._mean_radiance_of_blockers, *arguments)
 
     def _mean_radiance_of_blockers(
         self,
-        cells: list[wp.array],
+        portions: list[wp.array],
         receivers: Receivers,
         projected_light: ProjectedCells,
         diffuse: wp.array,
@@ -318,7 +301,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         if not diffuse.size:
             return diffuse
         count = len(projected_light.blocking_directions)
-        transmittance = _join_cells(cells, count)
+        transmittance = _join_transmittance(portions, count)
         of_cells = transfer = directional_transfer(transmittance, receivers.normals, projected_light.cosine_directions)
         if projected_light.patches is not None:
             arguments = receivers.points, receivers.normals, transmittance, projected_light.blocking_directions
@@ -341,34 +324,21 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
 
     def _shading_with_cells(self, points: LitPoints, light: LightInput) -> Node:
         """Node of the shading of points in known light, and of the transmittance of the glossy ones' cells."""
-        arguments = self, points, self.projected_light(points, light), light, _join_with_cells
-        make = functools.partial(PortionedShading, *arguments, result_of=self._shading_and_cells_of)
+        make = functools.partial(_ShadingWithCells, self, points, self.projected_light(points, light), light)
         return self.cached_for_light("direct with cells", points, light, make)
 
-    def _shading_and_cells_of(self, portion: LitPortion) -> tuple[wp.array | None, wp.array | None]:
-        """Shading of a portion, and the transmittance of its cells if its body shines."""
-        body = portion.group.body
-        is_glossy = body is not None and self.merged_scene.is_glossy[body]
-        return portion.result, _transmittance_of(portion) if is_glossy else None
-
-    def _cell_transmittance(
-        self, points: LitPoints, light: LightInput, shaded_points: LitPoints
-    ) -> tuple[Node, Node | ProjectedCells]:
+    def _cell_transmittance(self, lobes: LitLobes) -> tuple[Node, Node | ProjectedCells]:
         """Node of the transmittance of cells, in portions, and the projected light that says which.
 
         In known light that does not bounce the shading of the view has found it.
         """
+        points, light = lobes.points, lobes.light
         visibility_light = self.light_of_visibility(points, light)
-        if not light.is_free and self._shades_with_cells(shaded_points):
-            return field_of(self._shading_with_cells(shaded_points, light), "cells"), visibility_light
+        if not light.is_free and self._shades_with_cells(lobes.all_points):
+            return field_of(self._shading_with_cells(lobes.all_points, light), "transmittance"), visibility_light
 
         def in_cells() -> Node:
-            return PortionedShading(
-                *(self, points, visibility_light, None, list),
-                result_of=_transmittance_of,
-                end="visibility",
-                suffix=" of gloss",
-            )
+            return _TransmittanceOfCells(self, points, visibility_light, None, suffix=" of gloss")
 
         return points.cached("cells", light.visibility_key, in_cells), visibility_light
 
@@ -403,11 +373,35 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         return cell_samples(samples, self._directions, device=self.merged_scene.device)
 
 
-class _LightAndCells(NamedTuple):
-    """Light on receivers, and their transmittance towards cells."""
+class _ShadingAndTransmittance(NamedTuple):
+    """Shading of receivers, and their transmittance towards cells."""
 
     shading: wp.array  # vec3 of shape [batch, receiver]
-    cells: list[wp.array]  # of portions of bodies that shine, float32 of shape [batch, receiver, direction]
+    transmittance: list[wp.array]  # of portions of bodies that shine, float32 of shape [batch, receiver, direction]
+
+
+class _ShadingWithCells(PortionedShading):
+    """Shading of receivers, and the transmittance of cells at bodies that shine."""
+
+    def compute(self, call: Call) -> _ShadingAndTransmittance:
+        """Shade all portions."""
+        portions = list(self.portions(call))
+        of_glossy = [transmittance for _, transmittance in portions if transmittance is not None]
+        return _ShadingAndTransmittance(join_portions([shading for shading, _ in portions]), of_glossy)
+
+    def result_of(self, portion: LitPortion) -> tuple[wp.array, wp.array | None]:
+        """Shading of a portion, and the transmittance of its cells if its body shines."""
+        body = portion.group.body
+        is_glossy = body is not None and self.method.merged_scene.is_glossy[body]
+        return portion.result, _transmittance_of(portion) if is_glossy else None
+
+
+class _TransmittanceOfCells(PortionedVisibility):
+    """Transmittance of receivers towards cells."""
+
+    def result_of(self, portion: LitPortion) -> wp.array | None:
+        """Transmittance of the cells of a portion."""
+        return _transmittance_of(portion)
 
 
 def _transmittance_of(portion: LitPortion) -> wp.array | None:
@@ -416,24 +410,19 @@ def _transmittance_of(portion: LitPortion) -> wp.array | None:
     return portion.visibility.transmittance_total
 
 
-def _join_with_cells(portions: list[tuple[wp.array, wp.array | None]]) -> _LightAndCells:
-    cells_of_glossy = [cells for _, cells in portions if cells is not None]
-    return _LightAndCells(join_portions([shading for shading, _ in portions]), cells_of_glossy)
-
-
 def _lobe_transmittance(
-    cells: list[wp.array], receivers: Receivers, directions: wp.array, projected_light: ProjectedCells
+    portions: list[wp.array], receivers: Receivers, directions: wp.array, projected_light: ProjectedCells
 ) -> wp.array:
     count = len(projected_light.blocking_directions)
     if not directions.size:
         return wp.empty(directions.shape, dtype=wp.float32, device=directions.device)
-    transmittance = _join_cells(cells, count)
+    transmittance = _join_transmittance(portions, count)
     return interpolate_transmittance(transmittance, receivers.normals, directions, projected_light.cosine_directions)
 
 
-def _join_cells(cells: list[wp.array], count: int) -> wp.array:
+def _join_transmittance(portions: list[wp.array], count: int) -> wp.array:
     """Transmittance of all portions, [batch, receiver, direction]. Differentiable."""
-    rows = join_portions([portion.reshape((len(portion), -1)) for portion in cells])
+    rows = join_portions([portion.reshape((len(portion), -1)) for portion in portions])
     return rows.reshape((len(rows), -1, count))
 
 

@@ -17,7 +17,7 @@ from warpshadow.pipeline.node import Input
 from warpshadow.pipeline.receivers.groups import Group, HarmonicVisibility
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
-from warpshadow.pipeline.shading.shell import ShellPatches
+from warpshadow.pipeline.shading.shell_patches import ShellPatches
 from warpshadow.pipeline.shading.sphere_method import SphereMethod
 from warpshadow.stages.light.cached_cells import add_rows
 from warpshadow.stages.light.transfer import sh_product, sh_transfer
@@ -69,11 +69,11 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
 
     def find_visibility(self, group: Group, projected_light: ProjectedBands) -> HarmonicVisibility:
         """Visibility, float32 of shape [batch, receiver, order²]; None where nothing blocks."""
-        points, _, _, radii, cached_rows = group[:5]
+        points, radii, cached_rows = group.points, group.radii, group.cached_rows
         if not points.size or (cached_rows is None and not radii.shape[1]):
             return HarmonicVisibility(None)
         if radii.shape[1]:
-            log = self._logs(*group[:4], skip=group.skip, clusters=group.clusters)
+            log = self._logs(points, group.normals, group.centers, radii, skip=group.skip, clusters=group.clusters)
         else:
             log = zeros((*points.shape, self._order**2), dtype=wp.float32, device=points.device)
         if cached_rows is not None:

@@ -12,7 +12,7 @@ from warpshadow.pipeline.methods.log_sh import LogSH, ProjectedBands
 from warpshadow.pipeline.node import Input
 from warpshadow.pipeline.receivers.groups import Group, HarmonicVisibility
 from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
-from warpshadow.pipeline.shading.shell import PATCHES, ShellPatches, project_on_shell
+from warpshadow.pipeline.shading.shell_patches import PATCHES, ShellPatches, project_on_shell
 
 _NO_CELLS = np.empty((0, 3))
 

@@ -1,7 +1,6 @@
 """The ray-traced method: rays past the meshes themselves. It has no gradient to geometry."""
 
 import functools
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,9 +12,9 @@ from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node, NodeStage, detached
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
-from warpshadow.pipeline.shading.method import LightInput, Method
+from warpshadow.pipeline.shading.method import LightInput, LitLobes, Method
 from warpshadow.stages.gloss.reflection import find_blocked_radiance
-from warpshadow.stages.gloss.traced import trace_lobes
+from warpshadow.stages.gloss.traced_lobes import trace_lobes
 from warpshadow.stages.light.light_samples import cut_map, sample_map
 from warpshadow.stages.ray_traced.shared_rays import find_corners, find_shares, trace_shared
 from warpshadow.stages.ray_traced.traced_transfer import trace_transfer
@@ -62,7 +61,7 @@ class RayTraced(Method):
         """Shading of points in known light that bounces along paths, which have no gradient."""
         from warpshadow.pipeline.methods.paths import path_traced
 
-        emitters = self.emitters.placed(points) if self.merged_scene.has_beams else None
+        emitters = self.emitters.samples_node(points) if self.merged_scene.has_beams else None
         arguments = direct, self._meshes(points), points, light, self.shell_of(light), materials, emitters
         return path_traced(*arguments, samples=self._sample_count, progress=self.progress)
 
@@ -78,15 +77,15 @@ class RayTraced(Method):
 
     def _rays_to_emitters(self, points: LitPoints, materials: Materials) -> tuple[Node, Node, Node, Node]:
         """Receivers, samples, their radiance, and the transmittance between."""
-        receivers, placed = points.receivers_node, self.emitters.placed(points)
+        receivers, samples = points.receivers_node, self.emitters.samples_node(points)
 
         def traced() -> Node:
             name, items = f"rays to emitters{points.suffix}", functools.partial(receiver_text, points.weak)
-            arguments = points.vertices, receivers, placed
+            arguments = points.vertices, receivers, samples
             return Node(name, self._trace_emitters, *arguments, items=items, has_adjoint=False)
 
         transmittance = points.cached("rays to emitters", None, traced)
-        return receivers, placed, self.emitters.radiance(materials), transmittance
+        return receivers, samples, self.emitters.radiance(materials), transmittance
 
     def _trace_emitters(
         self, positions: wp.array, receivers: Receivers, placed_samples: "PlacedSamples"
@@ -105,10 +104,9 @@ class RayTraced(Method):
             for span in samples.spans()
         ]
 
-    def lobe_transmittance(
-        self, points: LitPoints, directions: Node, light: LightInput, shaded_points: LitPoints
-    ) -> Node:
+    def lobe_transmittance(self, lobes: LitLobes, directions: Node) -> Node:
         """Transmittance towards the samples of lobes: rays, each of its own."""
+        points = lobes.points
         item_text = functools.partial(receiver_text, points.weak)
         return Node(
             "transmittance of lobes",
@@ -119,20 +117,13 @@ class RayTraced(Method):
             items=item_text,
         )
 
-    def blocked_radiance(
-        self,
-        points: LitPoints,
-        diffuse: Node,
-        light: LightInput,
-        shaded_points: LitPoints,
-        choose: Callable[[Node], Node],
-        openness: Node | None,
-    ) -> Node:
-        """Mean radiance of the blockers of points, by their light with bounces and without."""
-        direct, trees = self.direct_shading(shaded_points, light), self._trees_around(points)
+    def blocked_radiance(self, lobes: LitLobes, diffuse: Node, openness: Node | None) -> Node:
+        """Mean radiance of the blockers of receivers, by their light with bounces and without."""
+        points = lobes.points
+        direct, trees = self.direct_shading(lobes.all_points, lobes.light), self._trees_around(points)
         if openness is None:
             openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
-        return Node("light of blockers", find_blocked_radiance, diffuse, choose(direct), openness)
+        return Node("light of blockers", find_blocked_radiance, diffuse, lobes.select(direct), openness)
 
     def transfers(self, points: LitPoints, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""

@@ -56,20 +56,20 @@ def find_sharpest_cells(
 
 
 def find_share_of_sharpest_light(
-    group: Group, cells: SharpestCells, towards: np.ndarray, *, softness: float, merging: float
+    group: Group, sharpest: SharpestCells, towards: np.ndarray, *, softness: float, merging: float
 ) -> np.ndarray | None:
     """Share of a group's unblocked light that still comes from the sharpest cells.
 
     Args:
         group: The receivers, with the blockers around them.
-        cells: The sharpest cells.
+        sharpest: The sharpest cells.
         towards: Directions of all cells, [direction, 3].
         softness, merging: Of spheres' shadows, in radii of the sharpest cells.
     Returns:
         Shape [batch, receiver]; None where nothing blocks.
     """
-    directions, light, _, edge_radius, power = cells
-    points, normals, centers, radii = group[:4]
+    directions, light, _, edge_radius, power = sharpest
+    points, normals, centers, radii = group.points, group.normals, group.centers, group.radii
     if not radii.shape[1] and group.planes is None and group.convex_parts_around is None:
         return None
     if radii.shape[1]:
@@ -83,7 +83,7 @@ def find_share_of_sharpest_light(
         coverages.append(group.convex_parts_around.coverage(points, normals, directions, edge_radius))
     planes = group.planes
     if planes is not None and group.is_blocked_by_planes:
-        lifted, fronts = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
+        lifted, fronts = group.beside_planes
         options: dict[str, Any] = {"radius": edge_radius, "horizon_normals": normals, "fronts": fronts}
         coverages.append(plane_coverage(lifted, planes.frames, planes.planes, directions, skip=planes.skip, **options))
     if coverages:

@@ -190,10 +190,10 @@ def _has_sun(scene: Scene) -> bool:
     """Whether the directional method is to find shadows of a sun."""
     if scene.visibility.method != "directional" or scene.shell is not None:
         return False
-    cells = scene.known_light.cells(fibonacci(scene.direction_count))
-    if cells.spots is None or cells.half_angles is None:
+    cell_light = scene.known_light.cells(fibonacci(scene.direction_count))
+    if cell_light.spots is None or cell_light.half_angles is None:
         return False
-    return find_sharp_cells(cells.radiance @ LUMINANCE, cells.spots, cells.half_angles) is not None
+    return find_sharp_cells(cell_light.radiance @ LUMINANCE, cell_light.spots, cell_light.half_angles) is not None
 
 
 def receiver_notes(scene: Scene, choices: Sequence[ReceiverChoice], bulging_bodies: Collection[int] = ()) -> list[str]:

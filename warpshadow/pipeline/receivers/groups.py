@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,14 +15,14 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import varies
 from warpshadow.pipeline.bodies.convex import GroupConvexParts, SceneConvexParts
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
-from warpshadow.pipeline.bodies.planes import GroupPlanes, ScenePlanes
+from warpshadow.pipeline.bodies.scene_planes import GroupPlanes, ScenePlanes
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
-from warpshadow.stages.convex.prepared import PlacedParts
+from warpshadow.stages.convex.convex_blockers import PlacedParts
 from warpshadow.stages.light.cached_cells import CachedRows
 from warpshadow.stages.planes.fronts import NearestBlockers, find_fronts, lifted_points
-from warpshadow.stages.planes.prepared import PlaneBlockers
+from warpshadow.stages.planes.plane_blockers import PlaneBlockers
 from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
@@ -43,7 +45,8 @@ class OwnBody(NamedTuple):
         return self._replace(probe_weights=self.probe_weights.cut(receivers))
 
 
-class Group(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Group:
     """Receivers whose light the same blockers block: of all bodies, all but their own, or those that move."""
 
     points: wp.array  # [batch, receiver] vec3
@@ -84,9 +87,13 @@ class Group(NamedTuple):
             return None
         return self.own.lookup.transmittance(self.normals, self.own.probe_weights)
 
-    def lifted_points_and_fronts(
-        self, frames: wp.array, planes: PlaneBlockers, skip: int | None
-    ) -> tuple[wp.array, wp.array]:
+    @functools.cached_property
+    def beside_planes(self) -> tuple[wp.array, wp.array]:
+        """As :meth:`beside`, of the planes around the group."""
+        assert self.planes is not None
+        return self.beside(self.planes.frames, self.planes.planes, self.planes.skip)
+
+    def beside(self, frames: wp.array, planes: PlaneBlockers, skip: int | None) -> tuple[wp.array, wp.array]:
         """Positions, lifted off planes that they lie in, and the part of each front that the receivers see."""
         corners = None if self.own is None else self.own.corners
         fronts = find_fronts(self.points, self.normals, corners, self.nearest_blockers, frames, planes)
@@ -102,8 +109,8 @@ class Group(NamedTuple):
         body_corners = None if own is None else own.corners
         frames = None if planes is None else planes.frames
         parts = self.convex_parts_around or (None if own is None else own.parts)
-        part_corners = None if parts is None else parts.placed.corners
-        arguments = points, normals, centers, radii = self[:4]
+        part_corners = None if parts is None else parts.placed_parts.corners
+        arguments = points, normals, centers, radii = self.points, self.normals, self.centers, self.radii
         if radii.shape[1] or any(array is not None for array in (rotation_data, frames, part_corners)):
             arrays = {
                 "points": points,
@@ -121,11 +128,12 @@ class Group(NamedTuple):
             or size <= RECEIVERS_AT_ONCE
             or varies([*arguments, rotation_data, frames, part_corners, body_corners])
         ):
-            yield self._replace(points=points, normals=normals, centers=centers, radii=radii, clusters=clusters)
+            yield replace(self, points=points, normals=normals, centers=centers, radii=radii, clusters=clusters)
             return
         for start in range(0, size, RECEIVERS_AT_ONCE):
             portion = slice(start, min(start + RECEIVERS_AT_ONCE, size))
-            yield self._replace(
+            yield replace(
+                self,
                 points=points[:, portion].contiguous(),
                 normals=normals[:, portion].contiguous(),
                 centers=centers,
@@ -139,7 +147,7 @@ class Group(NamedTuple):
 class CellCoverages(NamedTuple):
     """Coverage (h, μ) of cells by blockers, vec4 of shape [batch, receiver, direction]."""
 
-    cells: wp.array
+    all_cells: wp.array
     sharp_cells: wp.array | None = None  # [batch, receiver, 16]; None where no cell is sharp
 
 
@@ -174,7 +182,7 @@ class Blockers(NamedTuple):
     positions: wp.array  # of all vertices, vec3 [batch, vertex]
     spheres: tuple[wp.array, wp.array]  # centers and radii of all spheres, blocking or not
     frames: wp.array | None  # where bodies are that block as planes, vec3 [batch, 3 · plane]; None without any
-    placed: PlacedParts | None  # where convex parts are; None without any
+    placed_parts: PlacedParts | None  # where convex parts are; None without any
 
     def sphere_blockers(self, bodies: Iterable[int]) -> list[int]:
         """Bodies among some that block light by their spheres."""
@@ -203,16 +211,16 @@ class Blockers(NamedTuple):
         """Convex parts of bodies around receivers of one body: all that block, or some."""
         bodies = self.blocker_kinds.convex
         chosen, skip = _blocking(bodies, body, of_bodies)
-        if self.placed is None or not chosen:
+        if self.placed_parts is None or not chosen:
             return None
-        return GroupConvexParts(self.parts.blockers(bodies, chosen), self.placed, skip)
+        return GroupConvexParts(self.parts.blockers(bodies, chosen), self.placed_parts, skip)
 
     def own_parts(self, body: int) -> GroupConvexParts | None:
         """The convex parts of a body, where they block its own light: one alone does not."""
         bodies = self.blocker_kinds.convex
-        if self.placed is None or body not in self.blocker_kinds.solids or len(self.parts.parts[body]) == 1:
+        if self.placed_parts is None or body not in self.blocker_kinds.solids or len(self.parts.parts[body]) == 1:
             return None
-        return GroupConvexParts(self.parts.blockers(bodies, (body,)), self.placed, on_surface=True)
+        return GroupConvexParts(self.parts.blockers(bodies, (body,)), self.placed_parts, on_surface=True)
 
     def around_plane(self, points: wp.array, normals: wp.array, body: int) -> Group:
         """The group of points of a flat body."""
@@ -284,7 +292,7 @@ def _groups_that_move(
         group = Group(points, normals, *others, planes=planes, convex_parts_around=parts)
         if others is spheres:
             clusters = clusters or find_clusters(*spheres, blockers.merging)
-            group = group._replace(skip=skip, clusters=clusters)
+            group = replace(group, skip=skip, clusters=clusters)
         if span.body >= 0:
             own = OwnBody(
                 span.body,
@@ -296,9 +304,9 @@ def _groups_that_move(
             if corners is not None:
                 bounds = blockers.planes.first_corner[span.body : span.body + 2].tolist()
                 own = own._replace(corners=cut(corners, *bounds))
-            group = group._replace(own=own)
+            group = replace(group, own=own)
         if nearest_blockers is not None:
-            group = group._replace(nearest_blockers=nearest_blockers.cut(slice(span.first, span.end)))
+            group = replace(group, nearest_blockers=nearest_blockers.cut(slice(span.first, span.end)))
         yield group
 
 

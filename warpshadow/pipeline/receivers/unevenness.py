@@ -97,10 +97,10 @@ def _irradiance(
     device: wp.Device,
 ) -> np.ndarray:
     """Luminance of the light that reaches points, [face, point], of rays that are shared out by the light of cells."""
-    cells = light.cells(fibonacci(_CELLS))
-    power = np.cumsum(np.maximum(cells.radiance @ LUMINANCE, 0))
+    cell_light = light.cells(fibonacci(_CELLS))
+    power = np.cumsum(np.maximum(cell_light.radiance @ LUMINANCE, 0))
     chosen, counts = np.unique(np.searchsorted(power, power[-1] * (np.arange(_RAYS) + 0.5) / _RAYS), return_counts=True)
-    directions = (cells.directions if cells.spots is None else cells.spots)[chosen]
+    directions = (cell_light.directions if cell_light.spots is None else cell_light.spots)[chosen]
     receivers = points.reshape(-1, 3), normals.reshape(-1, 3)
     visibility = trace_visibility_on_host(mesh, *receivers, directions, device)
     shaded = visibility.reshape(*points.shape[:2], -1) * np.maximum(normals @ directions.T, 0)

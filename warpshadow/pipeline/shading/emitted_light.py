@@ -15,17 +15,17 @@ from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.receivers.groups import Blockers, Group
 from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.stages.emitters.beams import weigh_by_beam
-from warpshadow.stages.emitters.convex import find_log_transmittance_of_parts
+from warpshadow.stages.emitters.convex_transmittance import find_log_transmittance_of_parts
+from warpshadow.stages.emitters.emitter_self_visibility import EmitterSelfVisibility, look_up_self_visibility
 from warpshadow.stages.emitters.light import (
     find_directions_to_samples,
     find_transmittance_to_samples,
     replace_instances,
     sum_light,
 )
-from warpshadow.stages.emitters.planes import find_log_transmittance_of_planes
+from warpshadow.stages.emitters.plane_transmittance import find_log_transmittance_of_planes
 from warpshadow.stages.emitters.samples import EmitterSamples, EmitterSpan, PlacedSamples
-from warpshadow.stages.emitters.self_visibility import EmitterSelfVisibility, look_up_self_visibility
-from warpshadow.stages.emitters.spheres import find_log_transmittance
+from warpshadow.stages.emitters.sphere_transmittance import find_log_transmittance
 from warpshadow.stages.gloss.highlights import sum_highlights
 from warpshadow.stages.gloss.reflection import LobeLight
 from warpshadow.stages.gloss.transmittance import interpolate_transmittance
@@ -113,7 +113,7 @@ def _find_transmittances(
     merged_scene, points, normals = blockers.merged_scene, group.points, group.normals
     if not points.size:
         return
-    cells = (
+    transmittance_of_cells = (
         transmittance_past(None, group.own_coverage(EMITTER_CELLS))
         if group.own_parts is not None
         else group.looked_up_transmittance()
@@ -136,11 +136,11 @@ def _find_transmittances(
             continue
         skipped = own_spheres, merged_scene.spheres_among(sphere_bodies, body)
         transmittance_self = None
-        if cells is not None and not is_own:
-            is_within = _find_within(blockers, body, group.body)
+        if transmittance_of_cells is not None and not is_own:
+            is_within = _find_where_enclosed(blockers, body, group.body)
             if not is_within.all():
                 towards = find_directions_to_samples(points, placed_samples, span)
-                transmittance_self = interpolate_transmittance(cells, normals, towards, EMITTER_CELLS)
+                transmittance_self = interpolate_transmittance(transmittance_of_cells, normals, towards, EMITTER_CELLS)
             if is_within.any():
                 # cells tell whether rays leave the body: a bulb in a shade would be hidden by the shade's far side
                 with unrecorded():
@@ -163,7 +163,7 @@ def _find_transmittances(
         )
 
 
-def _find_within(blockers: Blockers, emitter: int, body: int | None) -> np.ndarray:
+def _find_where_enclosed(blockers: Blockers, emitter: int, body: int | None) -> np.ndarray:
     """Find the geometries in which an emitter is within the bounds of a body, parts of which may be behind it, bool.
 
     Where arrays cannot be read, the scene's own bodies tell.
@@ -207,7 +207,7 @@ def trace_transmittances(
         Float32 of shape [batch, receiver, sample].
     Differentiable: no.
     """
-    from warpshadow.stages.emitters.traced import trace_transmittance
+    from warpshadow.stages.emitters.traced_transmittance import trace_transmittance
 
     count = common_batch({"points": points, "geometry": positions})
     traced = wp.empty((count, points.shape[1], span.size), dtype=wp.float32, device=points.device)
@@ -230,7 +230,7 @@ def _log_of_planes(
     planes, numbers = group.planes, blockers.blocker_kinds.planes
     if planes is None or not group.is_blocked_by_planes:
         return None
-    points, _ = group.lifted_points_and_fronts(planes.frames, planes.planes, planes.skip)
+    points, _ = group.beside_planes
     skipped = -1 if planes.skip is None else planes.skip, numbers.index(body) if body in numbers else -1
     return find_log_transmittance_of_planes(
         points, group.normals, placed_samples, span, planes.frames, planes.planes, skipped
@@ -246,5 +246,5 @@ def _log_of_parts(
         return None
     skipped = -1 if parts.skip is None else parts.skip, numbers.index(body) if body in numbers else -1
     return find_log_transmittance_of_parts(
-        group.points, group.normals, placed_samples, span, parts.placed, parts.blockers, skipped
+        group.points, group.normals, placed_samples, span, parts.placed_parts, parts.blockers, skipped
     )

@@ -24,6 +24,7 @@ from warpshadow.pipeline.node import Call, Clock, Input, Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.stages.bounces.albedo import mean_over_texels
 from warpshadow.stages.emitters.beams import find_axis_weights, weigh_by_beam
+from warpshadow.stages.emitters.emitter_self_visibility import EmitterSelfVisibility, find_self_visibility
 from warpshadow.stages.emitters.light import sum_light
 from warpshadow.stages.emitters.samples import (
     EmitterBeams,
@@ -35,7 +36,6 @@ from warpshadow.stages.emitters.samples import (
     SurfacePoints,
     place_samples,
 )
-from warpshadow.stages.emitters.self_visibility import EmitterSelfVisibility, find_self_visibility
 from warpshadow.stages.emitters.shown_beams import show_beams
 from warpshadow.stages.gloss.highlights import sum_highlights
 from warpshadow.stages.gloss.reflection import LobeLight
@@ -105,7 +105,9 @@ class SceneEmitters:
         of_emitting_faces = SparseMatrix.from_matrix(block_diag(of_faces, format="csr"), device=scene.device)
         return EmitterBeams(scene.emitter_beams, self._over_all_vertices(of_vertices), of_emitting_faces)
 
-    def shown(self, emission: Node, fragments: Node, vertices: Input, cameras: Input, placed: Node) -> Node:
+    def emission_towards_cameras(
+        self, emission: Node, fragments: Node, vertices: Input, cameras: Input, placed_samples: Node
+    ) -> Node:
         """Node of the emission that samples of an image show, given all of it, vec3 of shape [batch, height, width]."""
         merged_scene = self._merged_scene
 
@@ -122,7 +124,7 @@ class SceneEmitters:
             seen = fragments, merged_scene.faces, vertices, cameras
             return show_beams(emission, *seen, placed_samples, emitter_of_face, beams.beams)
 
-        return Node("beams", show, emission, fragments, vertices, cameras, placed)
+        return Node("beams", show, emission, fragments, vertices, cameras, placed_samples)
 
     @functools.cached_property
     def self_visibility(self) -> list[EmitterSelfVisibility | None]:
@@ -145,7 +147,7 @@ class SceneEmitters:
         self, vertices: wp.array, mesh: wp.Mesh | None, points: np.ndarray, normals: np.ndarray
     ) -> np.ndarray:
         """Luminance of their light past the scene's meshes, a :data:`.NearLight`."""
-        from warpshadow.stages.emitters.traced import trace_transmittance
+        from warpshadow.stages.emitters.traced_transmittance import trace_transmittance
 
         scene, samples = self._merged_scene, self.samples
         at_points, along_normals = (
@@ -162,7 +164,7 @@ class SceneEmitters:
             total += light.numpy()[0] @ LUMINANCE
         return total
 
-    def placed(self, points: LitPoints) -> Node:
+    def samples_node(self, points: LitPoints) -> Node:
         """Node of the samples among the bodies around points."""
 
         def place(vertices: wp.array) -> PlacedSamples:
@@ -202,7 +204,9 @@ class SceneEmitters:
             self._texel_matrices[number, size] = matrix
         return self._texel_matrices[number, size]
 
-    def traced_light(self, receivers: Node, placed: Node, radiance: Node, transmittance: Node, name: str) -> Node:
+    def traced_light(
+        self, receivers: Node, placed_samples: Node, radiance: Node, transmittance: Node, name: str
+    ) -> Node:
         """Node of their light on receivers, given the transmittance to the samples of each, a list."""
 
         def light(
@@ -212,10 +216,16 @@ class SceneEmitters:
             pairs = self._within_beams(receivers, placed_samples, transmittance)
             return add_light(*(sum_light(*lit, *pair) for pair in pairs))
 
-        return Node(name, light, receivers, placed, radiance, transmittance)
+        return Node(name, light, receivers, placed_samples, radiance, transmittance)
 
     def traced_highlights(
-        self, receivers: Node, placed: Node, radiance: Node, transmittance: Node, roughness: Node, cameras: Input
+        self,
+        receivers: Node,
+        placed_samples: Node,
+        radiance: Node,
+        transmittance: Node,
+        roughness: Node,
+        cameras: Input,
     ) -> Node:
         """Node of their light in the lobes of receivers, G and G', given transmittance as for :meth:`traced_light`."""
 
@@ -232,7 +242,7 @@ class SceneEmitters:
             of_emitters = [sum_highlights(*seen, *pair) for pair in pairs]
             return LobeLight(*(add_light(*parts) for parts in zip(*of_emitters, strict=True)))
 
-        return Node("highlights", highlights, receivers, placed, radiance, transmittance, roughness, cameras)
+        return Node("highlights", highlights, receivers, placed_samples, radiance, transmittance, roughness, cameras)
 
     def _within_beams(
         self, receivers: Receivers, placed_samples: PlacedSamples, transmittance: list[wp.array]

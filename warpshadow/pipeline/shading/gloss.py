@@ -16,8 +16,8 @@ from warpshadow.device.constants import constant
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node, detached, field_of
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
-from warpshadow.pipeline.shading.method import LightInput, Method
-from warpshadow.pipeline.shading.transfers import Light, change_basis
+from warpshadow.pipeline.shading.method import LightInput, LitLobes, Method
+from warpshadow.pipeline.shading.transfers import change_basis
 from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.stages.gloss.lobes import LobeSamples, sample_lobes
 from warpshadow.stages.gloss.normal_spread import NormalSpread, find_normal_spread
@@ -66,7 +66,7 @@ class GlossyPoints(LitPoints):
         self,
         view: LitPoints,
         diffuse: Node,
-        light: Light | None,
+        light: LightInput,
         materials: Materials,
         bounced: Node,
         openness: Node | None,
@@ -98,19 +98,17 @@ class GlossyPoints(LitPoints):
 
         sampled = self.cached("lobes", key, lobes)
         directions, filters = field_of(sampled, "directions"), field_of(sampled, "filters")
-        light_input = self.method.light_input(self, light)
-        texels = self.cached("prefiltered", light_input, lambda: self._prefilter(light_input))
-        shell, exits = self.method.shell_of(light_input), directions
+        texels = self.cached("prefiltered", light, lambda: self._prefilter(light))
+        shell, exits = self.method.shell_of(light), directions
         if shell is not None:
             exits = Node("", _find_exits, self.receivers_node, directions, shell)
         radiance = Node("prefiltered light", look_up_light, texels, exits, filters, items=item_text)
-        transmittance = self.method.lobe_transmittance(self, directions, light_input, view)
+        lit_lobes = LitLobes(self, light, view, self.select)
+        transmittance = self.method.lobe_transmittance(lit_lobes, directions)
         blocked = None
         if self.merged_scene.scene.bounces:
             own_openness = None if openness is None else self.select(openness)
-            blocked = self.method.blocked_radiance(
-                self, self.select(bounced), light_input, view, self.select, own_openness
-            )
+            blocked = self.method.blocked_radiance(lit_lobes, self.select(bounced), own_openness)
         sums = Node("gloss", sum_lobes, filters, radiance, transmittance, blocked, items=item_text)
         if materials.emission:
             sums = Node("", _add_highlights, sums, self.method.highlights(self, materials, roughness, self._cameras))

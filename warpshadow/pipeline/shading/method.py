@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import functools
 from collections.abc import Callable, Hashable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -26,7 +26,7 @@ from warpshadow.pipeline.receivers.lit_points import (
     receiver_text,
 )
 from warpshadow.pipeline.receivers.static import StaticBodies
-from warpshadow.pipeline.shading.transfers import Light, ShellLight, check_light, shade_free
+from warpshadow.pipeline.shading.transfers import Light, check_light, shade_free
 from warpshadow.stages.gloss.prefilter import prefilter
 from warpshadow.stages.receivers.find import Numbering, number_receivers
 from warpshadow.stages.receivers.quadtree import Quadtree
@@ -62,6 +62,15 @@ class LightInput(Input):
         depends on the shell alone.
         """
         return self.shell if self.is_free else self
+
+
+class LitLobes(NamedTuple):
+    """Receivers on bodies that shine, and their light."""
+
+    points: LitPoints
+    light: LightInput  # known or free, which says where shadows have to be sharp
+    all_points: LitPoints  # the receivers of the image, among which they are
+    select: Callable[[Node], Node]  # makes a node of light on all these one of light on the points
 
 
 _MIN_LOBE_SAMPLES = 8  # of a receiver, however many receivers a pixel has: as many as a processor finds at once
@@ -216,21 +225,25 @@ class Method(abc.ABC):
             cameras: Clip matrices.
         """
 
-    def light_input(self, points: LitPoints, light: Light | None) -> LightInput:
-        """The light of points as an input; the same for the same known light of the same shell."""
+    def light_input(self, points: LitPoints, light: Light | None, shell: wp.array | None = None) -> LightInput:
+        """The light of an image, or of other points, as an input, checked; the same for the same known light and shell.
+
+        Args:
+            points: The receivers of the image.
+            light: None for the scene's.
+            shell: Center and radius of the sphere that sends it [scene units], vec4 of shape [batch]; None for that of
+                the light itself.
+        """
         check_light(light)
-        own_shell = None
-        if isinstance(light, ShellLight):
-            light, own_shell = light
         is_of_scene = light is None or light is self.merged_scene.scene.light
-        if is_of_scene and own_shell is None:
+        if is_of_scene and shell is None:
             return self.light
-        shell = self._shell_input(points, light, own_shell)
+        shell_input = self._shell_input(points, light, shell)
         if isinstance(light, wp.array):
-            return LightInput(light, shell, why_new="light is given")
+            return LightInput(light, shell_input, why_new="light is given")
         known = self.light.value() if light is None else as_light(light)
         why_new = "" if points.last_cached("light") is None else "light changed since the last call"
-        return points.cached("light", (known, shell), lambda: LightInput(known, shell, why_new=why_new))
+        return points.cached("light", (known, shell_input), lambda: LightInput(known, shell_input, why_new=why_new))
 
     def _shell_input(self, points: LitPoints, light: Light | None, shell: wp.array | None) -> Input | None:
         """The shell of light that is not the scene's, the same while its values are; None for the scene's."""
@@ -318,38 +331,24 @@ class Method(abc.ABC):
         """Number of samples of the lobe of a receiver."""
         return max(self.lobe_samples // self.lobes_across**2, min(self.lobe_samples, _MIN_LOBE_SAMPLES))
 
-    def lobe_transmittance(
-        self, points: LitPoints, directions: Node, light: LightInput, shaded_points: LitPoints
-    ) -> Node:
-        """Transmittance towards the samples of lobes of points, float32 of shape [batch, receiver, sample].
+    def lobe_transmittance(self, lobes: LitLobes, directions: Node) -> Node:
+        """Transmittance towards the samples of lobes, float32 of shape [batch, receiver, sample].
 
         Args:
-            points: Receivers on bodies that shine.
+            lobes: The receivers.
             directions: Node of the samples' directions, vec3 of shape [batch, receiver, sample].
-            light: Known or free light, which says where shadows have to be sharp.
-            shaded_points: The receivers of the image, among which they are.
 
         Without shadows it is 1.
         """
         return Node("", lambda towards: wp.full(towards.shape, 1.0, wp.float32, device=towards.device), directions)
 
-    def blocked_radiance(
-        self,
-        points: LitPoints,
-        diffuse: Node,
-        light: LightInput,
-        shaded_points: LitPoints,
-        choose: Callable[[Node], Node],
-        openness: Node | None,
-    ) -> Node:
-        """Mean radiance of the blockers of points, where light bounces, vec3 of shape [batch, receiver].
+    def blocked_radiance(self, lobes: LitLobes, diffuse: Node, openness: Node | None) -> Node:
+        """Mean radiance of the blockers of receivers, where light bounces, vec3 of shape [batch, receiver].
 
         Args:
-            points, light: As for :meth:`lobe_transmittance`.
+            lobes: The receivers.
             diffuse: Node of their shading.
-            shaded_points: As for :meth:`lobe_transmittance`.
-            choose: Makes a node of light on all these one of light on the points.
-            openness: Of the points, as of :meth:`.LightTransport.openness`.
+            openness: Of them, as of :meth:`.LightTransport.openness`.
         """
         raise NotImplementedError
 

@@ -12,7 +12,7 @@ from warpshadow.assets.cells import draw_in_cells, gather_cells, without_spots
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.known_light import KnownLight
 from warpshadow.device.constants import constant
-from warpshadow.pipeline.shading.shell import ShellPatches
+from warpshadow.pipeline.shading.shell_patches import ShellPatches
 from warpshadow.stages.planes.partial_cells import SAMPLES
 from warpshadow.stages.self_visibility.sun_cells import SunCells, find_sun_cells
 from warpshadow.stages.visibility.sharp_cells import MAX_RADIUS_PAST_PLANES, SharpCells, find_sharp_cells
@@ -78,17 +78,17 @@ def project_on_cells(
         wants_sun: Whether bodies send rays to the brightest cells.
         device: Where the coefficients are.
     """
-    cells = light.cells(cell_directions)
-    coefficients = constant(cells.radiance[None], wp.vec3, device)
-    if cells.spots is None or cells.half_angles is None:
-        return ProjectedCells(cells.directions, coefficients, cells.directions)
-    power = cells.radiance @ LUMINANCE
-    find = functools.partial(find_sharp_cells, power, cells.spots, cells.half_angles, softness)
+    cell_light = light.cells(cell_directions)
+    coefficients = constant(cell_light.radiance[None], wp.vec3, device)
+    if cell_light.spots is None or cell_light.half_angles is None:
+        return ProjectedCells(cell_light.directions, coefficients, cell_light.directions)
+    power = cell_light.radiance @ LUMINANCE
+    find = functools.partial(find_sharp_cells, power, cell_light.spots, cell_light.half_angles, softness)
     sharp_cells, sharp_cells_past_planes = find(), find(MAX_RADIUS_PAST_PLANES)
-    rest, rest_light, directions, spot_shares = light.radiance, cells, cells.directions, np.ones(len(power))
+    rest, rest_light, directions, spot_shares = light.radiance, cell_light, cell_light.directions, np.ones(len(power))
     if sharp_cells is not None and sharp_cells_past_planes is not None:
         is_sharp = (sharp_cells.slots >= 0) & (sharp_cells_past_planes.slots >= 0)
-        rest = without_spots(light.radiance, cells.spots[is_sharp], _NEAR_SPOT * cells.half_angles[is_sharp])
+        rest = without_spots(light.radiance, cell_light.spots[is_sharp], _NEAR_SPOT * cell_light.half_angles[is_sharp])
         rest_light = gather_cells(rest, cell_directions)
         directions = np.where(is_sharp[:, None], rest_light.directions, directions)
         spot_shares[is_sharp] = 1 - (rest_light.radiance @ LUMINANCE)[is_sharp] / power[is_sharp]
@@ -96,9 +96,9 @@ def project_on_cells(
     return ProjectedCells(
         directions,
         coefficients,
-        cells.directions,
-        cells.spots,
-        cells.half_angles,
+        cell_light.directions,
+        cell_light.spots,
+        cell_light.half_angles,
         sharp_cells,
         sharp_cells_past_planes,
         spot_shares=spot_shares,

@@ -11,7 +11,7 @@ import warp as wp
 from warpshadow.pipeline.bodies.convex import SceneConvexParts
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
-from warpshadow.pipeline.bodies.planes import ScenePlanes
+from warpshadow.pipeline.bodies.scene_planes import ScenePlanes
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.pipeline.node import Input
 from warpshadow.pipeline.receivers.groups import Blockers
@@ -84,12 +84,12 @@ class SceneBlockers:
             for is_chosen, body in zip(are_chosen, self._merged_scene.scene.bodies, strict=True)
         ]
 
-    def placed(self, kinds: BlockerKinds, positions: wp.array, spheres: tuple[wp.array, wp.array]) -> Blockers:
+    def place_blockers(self, kinds: BlockerKinds, positions: wp.array, spheres: tuple[wp.array, wp.array]) -> Blockers:
         """Place the blockers among bodies, by their vertices and spheres. Differentiable: these."""
         owners = self.planes, self.parts, self.self_visibility, self._merged_scene.scene.visibility.merging
         frames = self.planes.frames(kinds.planes, positions) if kinds.planes else None
-        placed = self.parts.placed(kinds.convex, positions) if kinds.convex else None
-        return Blockers(self._merged_scene, kinds, *owners, positions, spheres, frames, placed)
+        placed_parts = self.parts.place_parts(kinds.convex, positions) if kinds.convex else None
+        return Blockers(self._merged_scene, kinds, *owners, positions, spheres, frames, placed_parts)
 
     def has_any(self, kinds: BlockerKinds, bodies: Iterable[int] | None = None) -> bool:
         """Whether some bodies, by default all, block light by spheres or convex parts."""

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import abc
 import functools
-import operator
 from collections.abc import Callable, Iterator
-from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import warp as wp
@@ -67,8 +66,8 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     | :attr:`emitter_cells` | lamps, past the self-visibility of receivers | None: without it |
     | :meth:`share_of_sharpest_light` | adaptive receivers | None: no shadow is sharp |
 
-    :class:`PortionedShading` calls them in the order find_visibility, find_visibility_past_planes, and transfer and
-    shade_transfer, or shade_transmittance.
+    :class:`PortionedVisibility` calls find_visibility, then find_visibility_past_planes; :class:`PortionedTransfer`
+    goes on with transfer, and :class:`PortionedShading` with that and shade_transfer, or with shade_transmittance.
 
     Attributes:
         free_basis: The basis in which the method projects any free light, of the scene's shell if it has one.
@@ -175,7 +174,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         """Find the squares in which samples of adaptive bodies interpolate."""
         from warpshadow.pipeline.receivers.adaptive import find_squares
 
-        place = functools.partial(self.scene_blockers.placed, blocker_kinds)
+        place = functools.partial(self.scene_blockers.place_blockers, blocker_kinds)
         return find_squares(place, self.share_of_sharpest_light, surfaces)
 
     def share_of_sharpest_light(self, group: Group) -> np.ndarray | None:
@@ -223,9 +222,9 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
             name,
             find_in_groups,
             points.receivers_node,
-            placed_blockers(self, points),
+            blockers_node(self, points),
             points.cached_of_bodies("self-visibility towards emitters", None, lookups),
-            self.emitters.placed(points),
+            self.emitters.samples_node(points),
             self.emitters.radiance(materials),
             *others,
             items=lambda: f"{receiver_text(weak_points)} × {emitters.samples.first[-1]} samples",
@@ -233,14 +232,12 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
 
     def known_shading(self, points: LitPoints, light: LightInput) -> Node:
         """Direct known light on points."""
-        return PortionedShading(self, points, self.projected_light(points, light), light, join_portions)
+        return PortionedShading(self, points, self.projected_light(points, light), light)
 
     def openness(self, points: LitPoints) -> Node:
         """Light that points reflect as white surfaces under an even sky of 1, vec3 of shape [batch, receiver]."""
         sky = LightInput(EnvironmentMap.constant(1.0))
-        return PortionedShading(
-            self, points, Node("", self.project_light, sky), sky, join_portions, suffix=" in an even sky"
-        )
+        return PortionedShading(self, points, Node("", self.project_light, sky), sky, suffix=" in an even sky")
 
     def transfers(self, points: LitPoints, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`; where they require a gradient, to the method's native basis.
@@ -248,7 +245,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         The product with the matrix between both is NumPy's; :meth:`_free_shading` converts the light instead.
         """
         matrix, visibility_light = self.native_from_basis, self.free_basis_of(points, shell)
-        transfers = PortionedShading(self, points, visibility_light, None, list, caches=matrix is None)
+        transfers = PortionedTransfer(self, points, visibility_light, None, caches=matrix is None)
         if matrix is None or transfers.requires_grad:
             return transfers
 
@@ -263,28 +260,27 @@ class LitPortion(NamedTuple):
 
     group: Group
     visibility: CellVisibility | HarmonicVisibility
-    result: wp.array | None  # shading, or transfer vectors where these are the end; None where visibility is
     spheres: tuple[wp.array, wp.array]  # centers and radii of all spheres
+    result: Any = None  # of the step after visibility: transfer vectors, or shading
 
 
-class PortionedShading(Node):
-    """Shading or transfer vectors of receivers, found group by group and portion by portion.
+class PortionedVisibility(Node):
+    """Visibility of receivers, found group by group and portion by portion; classes below add steps.
 
-    Its program is :meth:`_light_portion`; each step is a function of the method. Without a gradient, transfer vectors
-    of all receivers are in memory at once only where they are the result: for free light, and in the visibility that
-    bounces cache while colors vary. Receivers with cached rows are one portion.
+    Each step is a function of the method. The value is a list of the results of all portions. Without a gradient,
+    transfer vectors of all receivers are in memory at once only where they are the result: for free light, and in the
+    visibility that bounces cache while colors vary. Receivers with cached rows are one portion.
 
     Args:
+        method: How light is blocked.
         points: The receivers.
         projected_light: The light projected for the method.
-        light: Known or free light; None where it is not given yet: portions end with transfer vectors.
-        finish: Combines the list of results of all portions.
-        result_of: Takes its part of the results of a portion; by default the last step's.
-        end: The last step.
+        light: Known or free light; None where it is not given yet.
         caches: As for :class:`Node`.
         suffix: Ends the names of its stages, such as " of patch samples"; by default the suffix of the points.
-        stages: Further ones, as for :class:`Node`.
     """
+
+    step_count = 2  # visibility, planes, transfer vectors, shading
 
     def __init__(
         self,
@@ -292,22 +288,14 @@ class PortionedShading(Node):
         points: LitPoints,
         projected_light: Node | ProjectedLight,
         light: Input | None,
-        finish: Callable[[list[Any]], Any],
         *,
-        result_of: Callable[[LitPortion], Any] = operator.attrgetter("result"),
-        end: Literal["visibility", "transfer", "shading"] = "shading",
         caches: bool = True,
         suffix: str | None = None,
-        stages: tuple[NodeStage, ...] = (),
     ):
         self.method, self._bodies_and_spheres = method, (points.static_bodies, points.nearest_spheres)
-        self._finish, self._result_of, self._progress = finish, result_of, method.progress and light is not None
-        self._end = "transfer" if light is None and end == "shading" else end
-        self._needs_transfer = self._end == "transfer" or (self._end == "shading" and not method.shades_transmittance)
-        receivers, weak_points = points.receivers_node, points.weak
-        suffix = points.suffix if suffix is None else suffix
+        self._progress, weak_points = method.progress and light is not None, points.weak
+        suffix, planes = points.suffix if suffix is None else suffix, points.blocker_kinds.planes
         item_text = functools.partial(receiver_text, weak_points)
-        planes = points.blocker_kinds.planes
         self._visibility = NodeStage(
             f"visibility{suffix}",
             lambda: method.scene_blockers.pairs_with(weak_points),
@@ -321,26 +309,31 @@ class PortionedShading(Node):
         self._transfer = NodeStage(
             f"transfer{suffix}",
             lambda: f"{item_text()} × {method.coefficient_count(light)} coefficients",
-            "" if self._needs_transfer else "shading takes transmittance at once",
+            "" if self.needs_transfer else "shading takes transmittance at once",
         )
         self._shading = NodeStage(f"shading{suffix}", item_text)
         steps = self._visibility, self._planes, self._transfer, self._shading
         super().__init__(
             "",
             None,
-            receivers,
-            placed_blockers(method, points),
+            points.receivers_node,
+            blockers_node(method, points),
             projected_light,
             self_visibility_node(method, points, projected_light),
-            _static_shadows(method, points, light),
+            _static_shadows_node(method, points, light),
             None if points.static_bodies is None else points.static_bodies.normals,
-            stages=(*steps[: {"visibility": 2, "transfer": 3, "shading": 4}[self._end]], *stages),
+            stages=steps[: self.step_count],
             caches=caches,
         )
 
+    @property
+    def needs_transfer(self) -> bool:
+        """Whether transfer vectors are found."""
+        return self.step_count > 2
+
     def compute(self, call: Call) -> Any:
         """Find it for all portions."""
-        return self._finish(list(self.portions(call)))
+        return list(self.portions(call))
 
     def portions(self, call: Call) -> Iterator[Any]:
         """Find it for one portion after another."""
@@ -348,31 +341,67 @@ class PortionedShading(Node):
         groups = find_groups(*self._bodies_and_spheres, receivers, blockers, *cached)
         total = len(receivers.static_vertices) + receivers.points.shape[1]
         with progress_bar(total, "shading", "receiver", shows=self._progress) as bar:
-            for portion in (portion for group in groups for portion in group.portions()):
-                yield self._result_of(self._light_portion(call, portion, projected_light, blockers.spheres))
-                bar.update(portion.points.shape[1])
+            for part in (part for group in groups for part in group.portions()):
+                portion = LitPortion(part, self._find_visibility(call, part, projected_light), blockers.spheres)
+                yield self.result_of(self.add_step(call, portion, projected_light))
+                bar.update(part.points.shape[1])
 
-    def _light_portion(
-        self, call: Call, group: Group, projected_light: ProjectedLight, spheres: tuple[wp.array, wp.array]
-    ) -> LitPortion:
-        """From the blockers of a portion to the result of the last step."""
-        method, step, result = self.method, functools.partial(self.timed, call), None
-        with step(self._visibility):
-            visibility = method.find_visibility(group, projected_light)
+    def _find_visibility(
+        self, call: Call, group: Group, projected_light: ProjectedLight
+    ) -> CellVisibility | HarmonicVisibility:
+        with self.timed(call, self._visibility):
+            visibility: CellVisibility | HarmonicVisibility = self.method.find_visibility(group, projected_light)
         if group.planes is not None:
-            with step(self._planes):
-                visibility = method.find_visibility_past_planes(group, visibility, projected_light)
-        if self._needs_transfer:
-            with step(self._transfer):
-                result = method.transfer(visibility, group, projected_light)
-        if self._end == "shading":
-            with step(self._shading):
-                result = (
-                    method.shade_transmittance(visibility, group, projected_light)
-                    if result is None
-                    else method.shade_transfer(result, group, projected_light)
-                )
-        return LitPortion(group, visibility, result, spheres)
+            with self.timed(call, self._planes):
+                visibility = self.method.find_visibility_past_planes(group, visibility, projected_light)
+        return visibility
+
+    def add_step(self, call: Call, portion: LitPortion, projected_light: ProjectedLight) -> LitPortion:
+        """The portion with the result of the steps after visibility; none here."""
+        return portion
+
+    def result_of(self, portion: LitPortion) -> Any:
+        """Its part of the results of a portion; by default the last step's."""
+        return portion.result
+
+
+class PortionedTransfer(PortionedVisibility):
+    """Transfer vectors of receivers."""
+
+    step_count = 3
+
+    def add_step(self, call: Call, portion: LitPortion, projected_light: ProjectedLight) -> LitPortion:
+        """The portion with its transfer vectors, if they are needed."""
+        if not self.needs_transfer:
+            return portion
+        with self.timed(call, self._transfer):
+            return portion._replace(result=self.method.transfer(portion.visibility, portion.group, projected_light))
+
+
+class PortionedShading(PortionedTransfer):
+    """Shading of receivers, vec3 of shape [batch, receiver]."""
+
+    step_count = 4
+
+    @property
+    def needs_transfer(self) -> bool:
+        """Whether the method shades by transfer vectors."""
+        return not self.method.shades_transmittance
+
+    def compute(self, call: Call) -> Any:
+        """Shade all portions."""
+        return join_portions(list(self.portions(call)))
+
+    def add_step(self, call: Call, portion: LitPortion, projected_light: ProjectedLight) -> LitPortion:
+        """The portion with its shading."""
+        transfer = super().add_step(call, portion, projected_light).result
+        with self.timed(call, self._shading):
+            result = (
+                self.method.shade_transmittance(portion.visibility, portion.group, projected_light)
+                if transfer is None
+                else self.method.shade_transfer(transfer, portion.group, projected_light)
+            )
+        return portion._replace(result=result)
 
 
 def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
@@ -389,9 +418,9 @@ def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
     return "no moving body has blockers" if static else "nothing is seen"
 
 
-def placed_blockers(method: SphereMethod, points: LitPoints) -> Node:
+def blockers_node(method: SphereMethod, points: LitPoints) -> Node:
     """Node of the blockers around points, where they are in the world."""
-    place = functools.partial(method.scene_blockers.placed, points.blocker_kinds)
+    place = functools.partial(method.scene_blockers.place_blockers, points.blocker_kinds)
     return points.cached_of_bodies("blockers", None, lambda: Node("", place, points.vertices, points.spheres))
 
 
@@ -415,7 +444,7 @@ def _self_visibility(method: SphereMethod, blocker_kinds: BlockerKinds, projecte
     return Node("self-shadows", functools.partial(method.self_lookups, bodies), rotations, projected_light, items=state)
 
 
-def _static_shadows(method: SphereMethod, points: LitPoints, light: Input | None) -> Node:
+def _static_shadows_node(method: SphereMethod, points: LitPoints, light: Input | None) -> Node:
     """Node of cached transmittance past static bodies; its value is None if there are none."""
     static_bodies, weak_points = points.static_bodies, points.weak
     if static_bodies is None or not static_bodies.spheres[1].shape[1]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import warp as wp
@@ -13,22 +13,8 @@ from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
 from warpshadow.stages.light.shading import shade
 
-
-class ShellLight(NamedTuple):
-    """Light from a shell that a call gives.
-
-    Args:
-        light: A map, or free coefficients; None for the scene's.
-        shell: Center and radius of the sphere that sends it [scene units], vec4 of shape [batch].
-    """
-
-    light: EnvironmentMap | np.ndarray | wp.array | None
-    shell: wp.array
-
-
-Light: TypeAlias = EnvironmentMap | np.ndarray | wp.array | ShellLight
-"""A map, SH coefficients [order², 3], or free coefficients in the renderer's basis, vec3 [batch, coefficient]; or one
-of these from a shell that a call gives."""
+Light: TypeAlias = EnvironmentMap | np.ndarray | wp.array
+"""A map, SH coefficients [order², 3], or free coefficients in the renderer's basis, vec3 [batch, coefficient]."""
 
 LARGEST_COEFFICIENT = 1e3 * check.LARGEST
 """Light is larger in another basis than it was given in: 64 harmonics add up in a direction."""
@@ -36,8 +22,6 @@ LARGEST_COEFFICIENT = 1e3 * check.LARGEST
 
 def check_light(light: object) -> None:
     """Raise ValueError for a value that is neither light nor None."""
-    if isinstance(light, ShellLight):
-        light = light.light
     expected = f"{LIGHT}, or free coefficients in renderer.basis as a tensor"
     check.instance("light", light, (EnvironmentMap, np.ndarray, wp.array, type(None)), expected)
     if isinstance(light, np.ndarray):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -14,7 +13,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.image_inputs import ImageArrays
-from warpshadow.pipeline.shading.transfers import Light
+from warpshadow.pipeline.views.scene_views import SceneViews
 from warpshadow.pipeline.views.view import View
 
 
@@ -22,17 +21,17 @@ class CatchersAlone:
     """The catchers of a scene as a scene of their own, with the same receivers and spheres.
 
     Args:
-        renderer: ``SceneRenderer`` of the catchers alone.
+        views: Of the catchers alone.
         merged_scene: All bodies.
     """
 
-    def __init__(self, renderer: Any, merged_scene: MergedScene):
-        self._renderer, self._merged_scene, self._numbers = renderer, merged_scene, merged_scene.scene.catchers
+    def __init__(self, views: SceneViews, merged_scene: MergedScene):
+        self._views, self._merged_scene, self._numbers = views, merged_scene, merged_scene.scene.catchers
 
     def with_cameras(self, cameras: Sequence[Camera]) -> CatchersAlone:
         """The same for other cameras."""
         alone = copy.copy(self)
-        alone._renderer = self._renderer.with_cameras(cameras)
+        alone._views = self._views.with_cameras(cameras)
         return alone
 
     @functools.cached_property
@@ -46,19 +45,20 @@ class CatchersAlone:
         has_moved = geometry.moving is None or set(geometry.moving) & set(self._numbers)
         return self._merged_scene.part(geometry, self._numbers) if has_moved else None
 
-    def light(self, inputs: ImageArrays, light: Light | None, view: View) -> wp.array:
+    def light(self, inputs: ImageArrays, view: View) -> wp.array:
         """Light received by samples of catchers, and whether they see one; vec4, as of :meth:`.View.white_samples`.
 
         Args:
             inputs: Of the whole scene, but for the geometry, which is that of the catchers, from
                 :meth:`moved_geometry`.
-            light: Of these, with its shell.
             view: The view of the whole scene.
         """
-        renderer, scene = self._renderer, self._merged_scene.scene
+        views, scene = self._views, self._merged_scene.scene
         of_scene = {name: scene.per_body(inputs.of_bodies[name], name) for name in ("albedo", "textures")}
-        materials = renderer.materials({name: [items[n] for n in self._numbers] for name, items in of_scene.items()})
-        alone = renderer.view(inputs.geometry, inputs.clip_matrices)
-        if renderer._method.every_sample_receives:  # rays are drawn by a receiver's number: the same for both views
+        alone = views.find(inputs.geometry, inputs.clip_matrices)
+        of_catchers = {name: [items[number] for number in self._numbers] for name, items in of_scene.items()}
+        materials = alone.materials.replaced(of_catchers)
+        if alone.method.every_sample_receives:  # rays are drawn by a receiver's number: the same for both views
             alone = alone.at_receivers_of(view)
-        return alone.white_samples(light, materials).value(renderer._views.call(alone))
+        light = alone.method.light_input(alone, inputs.light, inputs.shell)
+        return alone.white_samples(light, materials).value(views.call(alone))

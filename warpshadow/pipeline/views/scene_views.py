@@ -1,4 +1,8 @@
-"""Views of a scene: its geometries seen by cameras, which are used again while their inputs stay the same."""
+"""Views of a scene: its geometries seen by cameras, which are used again while their inputs stay the same.
+
+Two views are kept: the last one of the scene itself, and the last of another geometry or by other cameras. A view is
+kept once its receivers and silhouettes are found, unless a graph is captured, whose memory their values are.
+"""
 
 import copy
 from collections.abc import Sequence
@@ -11,6 +15,7 @@ from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.device.batch import common_batch
 from warpshadow.device.constants import use
+from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.bodies.geometry import PLACED, Geometry
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Call, Clock, Input, Node, identity
@@ -18,6 +23,7 @@ from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.view import View
+from warpshadow.pipeline.views.view_warnings import warn_of_view
 from warpshadow.stages.geometry.normals import vertex_normals
 from warpshadow.stages.raster.project import check_clip_space
 from warpshadow.stages.receivers.find import Receivers, receivers_on_faces
@@ -32,6 +38,7 @@ class SceneViews:
         cameras: The cameras that see the scene, of one size and near plane.
         clock: Where times are noted.
     Attributes:
+        has_warned: Whether a view has warned of an image that shows nothing, and the like; set it to draw no warning.
         clip_matrices: The cameras.
         last: The last views that were cached: of the scene itself, and of another geometry or by other cameras.
     """
@@ -43,6 +50,7 @@ class SceneViews:
         self.vertices = Input("vertices", lambda: scene.scene_geometry.positions)
         self._spheres = Input("spheres", lambda: (scene.scene_geometry.centers, scene.scene_geometry.radii))
         self._rotations = Input("rotations", lambda: scene.scene_geometry.rotations)
+        self.has_warned = False
         self._static: dict[tuple[int, ...], StaticBodies] = {}  # by moving bodies
         self._see_by(cameras)
 
@@ -54,8 +62,9 @@ class SceneViews:
         self._last_cameras: Input | None = None
 
     def with_cameras(self, cameras: Sequence[Camera]) -> "SceneViews":
-        """Views by other cameras of the same bodies."""
+        """Views by other cameras of the same bodies, which draw no warning."""
         other = copy.copy(self)
+        other.has_warned = True
         other._see_by(cameras)
         return other
 
@@ -63,22 +72,38 @@ class SceneViews:
         """A call, with the cached values of points."""
         return Call(self._clock, points.call if points else None, caches=not self._merged_scene.device.is_capturing)
 
-    def is_of_scene(self, view: View) -> bool:
+    def find(self, geometry: Geometry | None = None, clip_matrices: wp.array | None = None) -> View:
+        """The view of a geometry, with its receivers and silhouettes, which are found unless it is kept."""
+        view = self.view(geometry, clip_matrices)
+        if view not in self.last:
+            for node in (view.receivers_node, view.silhouettes):
+                node.value(view.call)
+            self._warn_once(view)
+            self._keep(view)
+        return view
+
+    def _warn_once(self, view: View) -> None:
+        """Say once why an image shows nothing, and the likely mistakes in the scene itself."""
+        is_of_scene, device = self._is_of_scene(view), self._merged_scene.device
+        if not self.has_warned and (is_readable(device) or (is_of_scene and not device.is_capturing)):
+            self.has_warned = warn_of_view(view, self._cameras if is_of_scene else None)
+
+    def _is_of_scene(self, view: View) -> bool:
         """Whether a view is of the bodies where the scene has them, by its cameras."""
         return view.vertices is self.vertices and view.cameras is self.clip_matrices
 
-    def keep(self, view: View) -> None:
-        """Cache a view whose receivers are found, to be used again, unless its values belong to a graph."""
+    def _keep(self, view: View) -> None:
+        """Keep a view whose receivers are found, unless its values belong to a graph."""
         if self._merged_scene.device.is_capturing:
             return
         self._last_cameras = view.cameras
         if view.static_bodies is not None:
             self._static[view.static_bodies.moving] = view.static_bodies
         if view.receivers_node.is_cached:
-            self.last = (view, self.last[1]) if self.is_of_scene(view) else (self.last[0], view)
+            self.last = (view, self.last[1]) if self._is_of_scene(view) else (self.last[0], view)
 
     def view(self, geometry: Geometry | None = None, clip_matrices: wp.array | None = None) -> View:
-        """Build a lazy view, or reuse a cached one whose inputs match."""
+        """Build a lazy view, or reuse one that is kept if its inputs match."""
         vertices, spheres, cameras, static_bodies = self.vertices, self._spheres, self.clip_matrices, None
         last, poses, matrices = self.last[1], [None], self._cameras
         if geometry is not None:

@@ -10,8 +10,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.bodies.reflectance import Materials, SampleReflectance
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached, field_of, identity
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
-from warpshadow.pipeline.shading.method import Method
-from warpshadow.pipeline.shading.transfers import Light
+from warpshadow.pipeline.shading.method import LightInput, Method
 from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.receiver_finder import ReceiverFinder
 from warpshadow.stages.geometry.normals import vertex_normals
@@ -113,8 +112,17 @@ class View(LitPoints):
             )
         fragments = Node("rasterization", rasterize, clip, faces, *self._size, items=samples)
         if two_sided.size:
-            placed = detached(vertices), detached(cameras)
-            sides = Node("sides", find_sides, fragments, faces, two_sided, *placed, items=samples, has_adjoint=False)
+            vertices_and_cameras = detached(vertices), detached(cameras)
+            sides = Node(
+                "sides",
+                find_sides,
+                fragments,
+                faces,
+                two_sided,
+                *vertices_and_cameras,
+                items=samples,
+                has_adjoint=False,
+            )
         else:
             sides = Node("sides", identity, fragments, idle="every body is closed: none is seen from behind")
         edge_inputs = merged_scene.edges, clip, merged_scene.face_bodies, merged_scene.creases
@@ -136,7 +144,7 @@ class View(LitPoints):
         self.clip_positions, self.fragments_node, self.silhouettes = clip, sides, silhouettes
         return normals, receivers
 
-    def shading(self, light: Light | None, materials: Materials | None = None) -> Node:
+    def shading(self, light: LightInput, materials: Materials | None = None) -> Node:
         """Light on the receivers: :meth:`.LightTransport.shading`."""
         return self.transport.shading(self, light, materials)
 
@@ -145,7 +153,7 @@ class View(LitPoints):
         """Transfer vectors of the receivers: :meth:`.Method.cached_transfers`."""
         return self.method.cached_transfers(self)
 
-    def image(self, light: Light | None, materials: Materials) -> Node:
+    def image(self, light: LightInput, materials: Materials) -> Node:
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""
         item_text, clip, fragments = self._samples, self.clip_positions, self.fragments_node
         shading, reflectance = self.shading(light, materials), self.reflectance(materials)
@@ -194,9 +202,7 @@ class View(LitPoints):
         textures, footprints = (node.value(self.call) for node in (reflectance.pyramids, reflectance.footprints))
         return seen_texels(textures, footprints)[sum(has_texture[:number])].sum(axis=0)
 
-    def _reflected_and_emitted(
-        self, shading: Node, light: Light | None, materials: Materials, reflectance: Node
-    ) -> Node:
+    def _reflected_and_emitted(self, shading: Node, light: LightInput, materials: Materials, reflectance: Node) -> Node:
         """Node of the samples, of bodies that may shine and emit."""
         if materials.roughness:
             reflected = self._glossy(shading, light, materials, reflectance)
@@ -223,14 +229,16 @@ class View(LitPoints):
         if not self.merged_scene.has_beams:
             return emission
         emitters = self.method.emitters
-        return emitters.shown(emission, self.fragments_node, self.vertices, self.cameras, emitters.placed(self))
+        return emitters.emission_towards_cameras(
+            emission, self.fragments_node, self.vertices, self.cameras, emitters.samples_node(self)
+        )
 
     def _sum_of(self, first: Node, second: Node) -> Node:
         """Node of the samples, of light of two kinds."""
         add = _sum_moving if self._is_moving else sum_radiance
         return Node("radiance", add, first, second, caches=False)
 
-    def _glossy(self, shading: Node, light: Light | None, materials: Materials, reflectance: Node) -> Node:
+    def _glossy(self, shading: Node, light: LightInput, materials: Materials, reflectance: Node) -> Node:
         """Node of the samples where bodies shine: of light in the surface's color, and of light that has its own."""
         from warpshadow.pipeline.shading.gloss import GlossyPoints
 
@@ -254,7 +262,7 @@ class View(LitPoints):
         return wp.full((1, height, width), wp.vec3(1.0), dtype=wp.vec3, device=self.merged_scene.device)
 
     def in_photograph(
-        self, photograph: Input | None, unshadowed: Input, catches: wp.array, light: Light | None, materials: Materials
+        self, photograph: Input | None, unshadowed: Input, catches: wp.array, light: LightInput, materials: Materials
     ) -> Node:
         """The image in a photograph that the catchers model: linear RGB, vec3 of shape [batch, height, width].
 
@@ -287,7 +295,7 @@ class View(LitPoints):
             return Node("photograph", composite_alone, *films, caches=False)
         return Node("photograph", compose, photograph, *films, caches=False)
 
-    def white_samples(self, light: Light | None, materials: Materials) -> Node:
+    def white_samples(self, light: LightInput, materials: Materials) -> Node:
         """Light received by the samples, and coverage, vec4 of shape [batch, sample row, sample column].
 
         Materials matter where light bounces.

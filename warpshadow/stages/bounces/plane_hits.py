@@ -48,7 +48,7 @@ from warpshadow.stages.planes.cells import (
     scatter,
     smoothstep_slope,
 )
-from warpshadow.stages.planes.prepared import PlaneBlockers
+from warpshadow.stages.planes.plane_blockers import PlaneBlockers
 from warpshadow.stages.planes.sides import (
     PlaneReceiver,
     PlaneSide,

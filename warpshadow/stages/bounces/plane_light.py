@@ -32,7 +32,7 @@ from warpshadow.stages.bounces.plane_hits import (
 )
 from warpshadow.stages.cell_coverage import ViewedEdge
 from warpshadow.stages.planes.cells import check_planes, plane_arrays
-from warpshadow.stages.planes.prepared import PlaneBlockers
+from warpshadow.stages.planes.plane_blockers import PlaneBlockers
 from warpshadow.stages.planes.sides import (
     PlaneInputs,
     StoredSide,

@@ -14,7 +14,7 @@ import warp as wp
 from warpshadow.device.batch import instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.stages.planes.prepared import PlaneBlockers
+from warpshadow.stages.planes.plane_blockers import PlaneBlockers
 from warpshadow.stages.sparse import multiply
 
 

@@ -29,7 +29,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import run_length, split_row
 from warpshadow.maths.directions import check_directions
-from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
+from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneGrid
 from warpshadow.stages.sparse import SparseMatrix
 
 _CELL_COST = 10.0  # time of a cell of a patch [ns]

@@ -28,8 +28,8 @@ from warpshadow.device.launch import launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, scratch_slot
 from warpshadow.maths.directions import BUNDLE, cell_radius
+from warpshadow.stages.convex.convex_blockers import UNSEEN, ConvexArrays, ConvexBlockers, PlacedParts
 from warpshadow.stages.convex.joint_lanes import coverage_type, make_joint_functions, sums_type
-from warpshadow.stages.convex.prepared import UNSEEN, ConvexArrays, ConvexBlockers, PlacedParts
 from warpshadow.stages.convex.silhouette import (
     ADJOINT_LANES,
     EDGE_LANES,

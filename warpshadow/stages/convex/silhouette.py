@@ -13,8 +13,8 @@ import warp as wp
 from warpshadow.device.lane_code import ANGLE
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 from warpshadow.stages.cell_coverage import MIN_DISTANCE
+from warpshadow.stages.convex.convex_blockers import ConvexArrays
 from warpshadow.stages.convex.joint_lanes import coverage_type
-from warpshadow.stages.convex.prepared import ConvexArrays
 
 EDGE_LANES = 5
 """Lanes of an edge: its normal m towards the part, three; its sign, 1 where a receiver sees the face to its right

@@ -239,7 +239,7 @@ class EmitterSamples(NamedTuple):
 
     Args:
         vertices: Weights of all vertices in the samples' middles, [sample, vertex].
-        face_shares: Weights of the emitting faces in the samples' area vectors, [sample, face].
+        face_weights: Weights of the emitting faces in the samples' area vectors, [sample, face].
         pieces: Pieces of each sample.
         surface_points: Points of the samples, on ``faces``.
         faces: Emitting faces, vec3i of shape [face].
@@ -250,7 +250,7 @@ class EmitterSamples(NamedTuple):
     """
 
     vertices: SparseMatrix
-    face_shares: SparseMatrix
+    face_weights: SparseMatrix
     pieces: SamplePieces
     surface_points: SurfacePoints
     faces: wp.array
@@ -403,7 +403,7 @@ def place_samples(positions: wp.array, samples: EmitterSamples) -> PlacedSamples
     count, device = len(positions), positions.device
     vectors = empty((count, len(samples.faces)), dtype=wp.vec3, device=device)
     launch(_find_area_vectors, vectors.shape, inputs=[positions, samples.faces], outputs=[vectors])
-    points, areas = multiply(samples.vertices, positions), multiply(samples.face_shares, vectors)
+    points, areas = multiply(samples.vertices, positions), multiply(samples.face_weights, vectors)
     bundles = empty((count, points.shape[1] // SAMPLE_BUNDLE), dtype=wp.vec4, device=device)
     launch(_find_bundles, bundles.shape, inputs=[points, areas], outputs=[bundles])
     balls = empty((count, len(samples.bodies)), dtype=wp.vec4, device=device)

@@ -29,7 +29,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
+from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneGrid
 
 
 @wp.struct

@@ -27,7 +27,7 @@ from warpshadow.stages.planes.cells import (
     is_covered_by_texels,
     plane_arrays,
 )
-from warpshadow.stages.planes.prepared import PlaneBlockers
+from warpshadow.stages.planes.plane_blockers import PlaneBlockers
 from warpshadow.stages.planes.sides import (
     PlaneInputs,
     PlaneReceiver,

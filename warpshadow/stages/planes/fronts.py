@@ -35,7 +35,7 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
+from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneGrid
 
 _FRONT_RADIUS_RATIO = wp.constant(1.25)
 """A patch sample is wholly in front of a plane where its height and its sphere's add up to 1/1.25 of the sphere's

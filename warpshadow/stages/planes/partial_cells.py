@@ -29,7 +29,7 @@ from warpshadow.stages.planes.coverage import (
     side_coverage,
     side_coverage_adjoint,
 )
-from warpshadow.stages.planes.prepared import PlaneBlockers
+from warpshadow.stages.planes.plane_blockers import PlaneBlockers
 from warpshadow.stages.planes.sides import (
     PlaneInputs,
     PlaneReceiver,

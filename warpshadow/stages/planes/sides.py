@@ -21,7 +21,7 @@ from warpshadow.stages.planes.cells import (
     front_of,
     front_of_adjoint,
 )
-from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
+from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneGrid
 
 _SIDES = wp.constant(2)  # a plane's front and its back
 

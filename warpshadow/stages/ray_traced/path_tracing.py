@@ -29,7 +29,7 @@ from warpshadow.stages.bounces.bright_patches import (
     hit_weight,
     point_of_bright_side,
 )
-from warpshadow.stages.emitters.traced import EmittingFaces, light_of_point
+from warpshadow.stages.emitters.traced_transmittance import EmittingFaces, light_of_point
 from warpshadow.stages.light.light_samples import LightSamples
 from warpshadow.stages.raster.interpolation import interpolate_at
 from warpshadow.stages.rays.ray_tracing import RAY_COST, escapes, first_hit, mesh_id, progress_slices

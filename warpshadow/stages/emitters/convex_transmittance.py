@@ -19,9 +19,9 @@ from warpshadow.device.batch import common_batch, expand, instance_in
 from warpshadow.device.launch import launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, scratch_slot, split_row
-from warpshadow.stages.convex.prepared import ConvexArrays, ConvexBlockers, PlacedParts
+from warpshadow.stages.convex.convex_blockers import ConvexArrays, ConvexBlockers, PlacedParts
 from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, may_light, sample_radius
-from warpshadow.stages.emitters.spheres import MIN_TRANSMITTANCE, log_transmittance, reaches_ball
+from warpshadow.stages.emitters.sphere_transmittance import MIN_TRANSMITTANCE, log_transmittance, reaches_ball
 
 _COST = 40.0  # nanoseconds that a part takes
 _ON_FACE = 1.0e-3  # height over a face, in radii of its part, from which below a receiver still sees the face
@@ -336,7 +336,7 @@ def find_log_transmittance_of_parts(
     """Logarithm of the transmittance of convex parts between receivers and an emitter.
 
     Args:
-        points, normals, samples, span: As for :func:`.spheres.find_log_transmittance`.
+        points, normals, samples, span: As for :func:`.sphere_transmittance.find_log_transmittance`.
         placed: Where the parts are.
         blockers: The bodies that consist of them.
         skipped: Indices of bodies among these that do not block, −1 for none: the receivers' and the emitter's.

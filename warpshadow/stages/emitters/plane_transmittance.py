@@ -16,8 +16,8 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import zeros
 from warpshadow.device.parallel import split_row
 from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, may_light, sample_radius
-from warpshadow.stages.emitters.spheres import log_transmittance
-from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
+from warpshadow.stages.emitters.sphere_transmittance import log_transmittance
+from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneGrid
 
 _COST = 5.0  # nanoseconds that a plane takes for a sample
 _MIN_WIDTH = 1.0e-6  # least half-width of an edge, in distances of the sample
@@ -146,7 +146,7 @@ def find_log_transmittance_of_planes(
 
     Args:
         points: Receivers, lifted off the planes that they lie in, vec3 of shape [batch, receiver].
-        normals, samples, span: As for :func:`.spheres.find_log_transmittance`.
+        normals, samples, span: As for :func:`.sphere_transmittance.find_log_transmittance`.
         frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`.PlaneBlockers.frames`.
         skipped: Planes that do not block, −1 for none: the receivers' and the emitter's.
     Returns:

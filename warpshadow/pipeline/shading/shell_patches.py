@@ -1,8 +1,8 @@
 """Light from a shell: an environment at a finite distance, as the patches of a sphere around the scene.
 
 The light of a shell is known or free radiance of its patches, :data:`PATCHES`: a basis of cells, of directions from its
-center. Transfer vectors are to these (:mod:`.stages.shell.transfer`), and depend on where the receivers are; all that
-is linear in light stays so. Visibility does not depend on the shell, so it is that of any light in cells.
+center. Transfer vectors are to these (:mod:`.stages.shell.shell_transfer`), and depend on where the receivers are; all
+that is linear in light stays so. Visibility does not depend on the shell, so it is that of any light in cells.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from warpshadow.assets.known_light import KnownLight
 from warpshadow.device.constants import constant
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.shell.beams import check_within
-from warpshadow.stages.shell.transfer import shell_transfer
+from warpshadow.stages.shell.shell_transfer import shell_transfer
 
 PATCHES = CellBasis(fibonacci(512))
 """Patches of a shell. Under even light, receivers at up to 0.9 radii from its center are 1% off on average; with 1024
@@ -31,7 +31,7 @@ class ShellPatches(NamedTuple):
     directions: np.ndarray = PATCHES.directions  # from the center to their light [patch, 3]
 
     def transfer(
-        self, points: wp.array, normals: wp.array, transmittance: wp.array | None, cells: np.ndarray
+        self, points: wp.array, normals: wp.array, transmittance: wp.array | None, cell_directions: np.ndarray
     ) -> wp.array:
         """Transfer vectors of receivers, float32 of shape [batch, receiver, patch], given transmittance in cells.
 
@@ -40,10 +40,10 @@ class ShellPatches(NamedTuple):
         Differentiable: points, normals, transmittance, and the shell.
         """
         check_within(points, self.shell)
-        return shell_transfer(points, normals, transmittance, cells, self.shell, self.directions)
+        return shell_transfer(points, normals, transmittance, cell_directions, self.shell, self.directions)
 
 
 def project_on_shell(light: KnownLight, shell: wp.array) -> tuple[ShellPatches, wp.array]:
     """Project known light on the patches of a shell: the patches, and their radiance, vec3 of shape [1, patch]."""
-    cells = light.cells(PATCHES.directions)
-    return ShellPatches(shell, cells.directions), constant(cells.radiance[None], wp.vec3, shell.device)
+    cell_light = light.cells(PATCHES.directions)
+    return ShellPatches(shell, cell_light.directions), constant(cell_light.radiance[None], wp.vec3, shell.device)

@@ -15,7 +15,7 @@ import warp as wp
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.stages.planes.grid import find_grid
-from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneBody
+from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneBody
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
 _CORNERS = 64  # directions in which the vertices of a body are sought that are farthest out
