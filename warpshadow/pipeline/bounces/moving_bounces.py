@@ -172,6 +172,8 @@ class Radiosity(Node):
             if self._self_reflection.idle
             else self._self_form_factors.between_patches(senders, [portion.group for portion in lit])
         )
+        if between is not None and between.is_zero:
+            between = None
 
         def sent(radiosity: wp.array) -> OutgoingRadiance:
             return OutgoingRadiance(self._proxies, radiosity, projected_patches, frames, weights.weights)

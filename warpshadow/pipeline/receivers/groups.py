@@ -19,13 +19,32 @@ from warpshadow.pipeline.receivers.lit_points import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.stages.convex.prepared import PlacedParts
 from warpshadow.stages.light.cached_cells import CachedRows
-from warpshadow.stages.planes.fronts import NearestBlockers, find_fronts, lifted_points
+from warpshadow.stages.planes.fronts import Fronts, NearestBlockers, find_body_sides, find_fronts
 from warpshadow.stages.planes.prepared import PlaneBlockers
 from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 
 RECEIVERS_AT_ONCE = 1 << 13  # receivers of each instance that are lit at once where no gradient is asked for
+
+
+class BodyExtents:
+    """How far out bodies reach, and so on which side of planes each lies.
+
+    Args:
+        corners: Vertices of all bodies that are farthest out, vec3 of shape [batch, corner].
+        first_corner: Where each body's begin, and the end of the last, shape [body + 1].
+    """
+
+    def __init__(self, corners: wp.array, first_corner: np.ndarray):
+        self.corners, self._first_corner = corners, first_corner
+        self._sides: dict[int, tuple[wp.array, wp.array]] = {}
+
+    def sides_of(self, frames: wp.array, planes: PlaneBlockers) -> wp.array:
+        """The side of each plane on which each body lies, [batch, body, plane], found once for all receivers."""
+        if id(frames) not in self._sides:  # frames are held, so that no others get their id
+            self._sides[id(frames)] = frames, find_body_sides(self.corners, self._first_corner, frames, planes)
+        return self._sides[id(frames)][1]
 
 
 class OwnBody(NamedTuple):
@@ -36,7 +55,7 @@ class OwnBody(NamedTuple):
     lookup: Any  # traced self-visibility, of the method's kind; None where there is none, or its spheres block
     is_solid: bool  # whether it blocks its own light as its convex parts do
     parts: GroupConvexParts | None  # these, two or more: one alone never shades itself; else None
-    corners: wp.array | None = None  # vertices farthest out, vec3 of shape [batch, corner]; None without planes
+    extents: BodyExtents | None = None  # of all bodies; None without planes
 
     def cut(self, receivers: slice) -> OwnBody:
         """Select some receivers."""
@@ -84,13 +103,13 @@ class Group(NamedTuple):
             return None
         return self.own.lookup.transmittance(self.normals, self.own.probe_weights)
 
-    def lifted_points_and_fronts(
-        self, frames: wp.array, planes: PlaneBlockers, skip: int | None
-    ) -> tuple[wp.array, wp.array]:
-        """Positions, lifted off planes that they lie in, and the part of each front that the receivers see."""
-        corners = None if self.own is None else self.own.corners
-        fronts = find_fronts(self.points, self.normals, corners, self.nearest_blockers, frames, planes)
-        return lifted_points(self.points, fronts, frames, planes, skip), fronts
+    def fronts(self, frames: wp.array, planes: PlaneBlockers, skip: int | None) -> Fronts:
+        """Which part of each plane's front the receivers see, and the receivers lifted off planes they lie in."""
+        extents = None if self.own is None else self.own.extents
+        sides = None if extents is None else extents.sides_of(frames, planes)
+        body = 0 if self.own is None else self.own.number
+        arguments = self.points, self.normals, sides, self.nearest_blockers, frames, planes
+        return find_fronts(*arguments, body=body, skip=skip)
 
     def portions(self) -> Iterator[Group]:
         """Portions of the receivers, with as many instances in all arrays where there are spheres.
@@ -99,7 +118,7 @@ class Group(NamedTuple):
         """
         own, planes, clusters = self.own, self.planes, self.clusters
         rotation_data = None if own is None or own.lookup is None else own.lookup.turned
-        body_corners = None if own is None else own.corners
+        body_corners = None if own is None or own.extents is None else own.extents.corners
         frames = None if planes is None else planes.frames
         parts = self.convex_parts_around or (None if own is None else own.parts)
         part_corners = None if parts is None else parts.placed.corners
@@ -266,7 +285,9 @@ def _groups_that_move(
     sphere_bodies = blockers.sphere_blockers(blockers.bodies)
     spheres, none = blockers.spheres_of(sphere_bodies), blockers.spheres_of([])
     has_planes = blockers.blocker_kinds.planes or (blockers.planes.numbers and blockers.merged_scene.scene.bounces)
-    corners = blockers.planes.corners(blockers.positions) if has_planes and receivers.spans else None
+    extents = None
+    if has_planes and receivers.spans:
+        extents = BodyExtents(blockers.planes.corners(blockers.positions), blockers.planes.first_corner)
     clusters, nearest_blockers = None, _nearest_blockers(nearest_spheres, blockers)
     if not receivers.spans:
         points_and_normals = receivers.points, receivers.normals
@@ -292,10 +313,8 @@ def _groups_that_move(
                 self_lookups.get(span.body),
                 span.body in blockers.blocker_kinds.solids,
                 blockers.own_parts(span.body),
+                extents,
             )
-            if corners is not None:
-                bounds = blockers.planes.first_corner[span.body : span.body + 2].tolist()
-                own = own._replace(corners=cut(corners, *bounds))
             group = group._replace(own=own)
         if nearest_blockers is not None:
             group = group._replace(nearest_blockers=nearest_blockers.cut(slice(span.first, span.end)))
