@@ -142,10 +142,12 @@ class Gathering:
             return None
         return self_light(form_factors, outgoing.of_body(own.number), *own.probe_weights)
 
-    def _from_planes(self, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array:
+    def _from_planes(self, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
         planes = outgoing.proxies.planes
         assert planes is not None
         skip = planes.index_of_body.get(group.body)
+        if planes.blockers.count == (skip is not None):
+            return None
         fronts = group.fronts(outgoing.frames, planes.blockers, skip)
         # Cells look to where the light of the sky is, above horizons; light of planes is found around their middles. A
         # ball on a ground lost 4% of the ground's light by the former.

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +25,7 @@ from warpshadow.stages.light.cached_cells import CachedRows
 from warpshadow.stages.planes.fronts import Fronts, NearestBlockers, find_body_sides, find_fronts
 from warpshadow.stages.planes.prepared import PlaneBlockers
 from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.sample_receivers import Span
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 
@@ -47,19 +51,34 @@ class BodyExtents:
         return self._sides[id(frames)][1]
 
 
-class OwnBody(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class OwnBody:
     """The body on which the receivers of a group lie, which may block their light."""
 
-    number: int
-    probe_weights: ProbeWeights  # where on it they lie
+    span: Span  # which receivers these are
+    receivers: Receivers  # among all
+    self_visibility: SelfVisibility
     lookup: Any  # traced self-visibility, of the method's kind; None where there is none, or its spheres block
     is_solid: bool  # whether it blocks its own light as its convex parts do
     parts: GroupConvexParts | None  # these, two or more: one alone never shades itself; else None
-    extents: BodyExtents | None = None  # of all bodies; None without planes
+    extents: BodyExtents | None  # of all bodies; None without planes
+
+    @property
+    def number(self) -> int:
+        """Of the body."""
+        return self.span.body
+
+    @functools.cached_property
+    def probe_weights(self) -> ProbeWeights:
+        """Where on it they lie."""
+        return self.self_visibility.probe_weights(self.receivers, self.span)
 
     def cut(self, receivers: slice) -> OwnBody:
         """Select some receivers."""
-        return self._replace(probe_weights=self.probe_weights.cut(receivers))
+        first = self.span.first
+        return dataclasses.replace(
+            self, span=self.span._replace(first=first + receivers.start, end=first + receivers.stop)
+        )
 
 
 class Group(NamedTuple):
@@ -308,8 +327,9 @@ def _groups_that_move(
             group = group._replace(skip=skip, clusters=clusters)
         if span.body >= 0:
             own = OwnBody(
-                span.body,
-                blockers.self_visibility.probe_weights(receivers, span),
+                span,
+                receivers,
+                blockers.self_visibility,
                 self_lookups.get(span.body),
                 span.body in blockers.blocker_kinds.solids,
                 blockers.own_parts(span.body),

@@ -54,7 +54,7 @@ def _bound_clusters(
     cluster_bounds: wp.array2d(dtype=wp.vec4),
     run_bounds: wp.array2d(dtype=wp.vec4),
 ):
-    """A thread owns a cluster or a run of them: center and radius of a sphere around all of theirs, below 0 for none."""
+    """A thread owns a cluster, or a run: center and radius of a sphere around its spheres, below 0 for none."""
     batch, thread = wp.tid()
     cluster_count = int(1)
     run = thread
