@@ -43,7 +43,7 @@ from warpshadow.stages.receivers.find import Receivers
 
 
 class PortionVisibility(NamedTuple):
-    """Some receivers, and their visibility, which holds for any light."""
+    """Some receivers, and their visibility, which holds for any free light."""
 
     transfer: wp.array  # of direct light, [batch, receiver, coefficient]
     group: Group
@@ -58,18 +58,20 @@ class PortionDirectLight(NamedTuple):
     cells: CellTransmittance
 
 
-def _visibility_of(method: SphereMethod, portion: LitPortion) -> PortionVisibility:
-    """Visibility of a portion for direct and bounced light, given its transfer vectors."""
+def _result_of(
+    kind: type[PortionVisibility] | type[PortionDirectLight], method: SphereMethod, portion: LitPortion
+) -> PortionVisibility | PortionDirectLight:
+    """Transfer vectors or direct light of a portion, and its visibility of bounced light."""
     cells = find_cell_transmittance(method, portion.group, portion.visibility, portion.spheres)
-    return PortionVisibility(portion.result, portion.group, cells)
+    return kind(portion.result, portion.group, cells)
 
 
 class PortionedDirectLight(Node):
     """Direct light, in portions.
 
     Args:
-        visibility: Visibility of the receivers.
-        projected_light: The light projected for the method.
+        visibility: Visibility of the receivers in free light, or their direct light if it is known.
+        free_light: Free light projected for the method; None if light is known.
         item_text: Number of receivers, in words.
         where: Put after the name of its stage.
         others: More that it depends on.
@@ -79,29 +81,35 @@ class PortionedDirectLight(Node):
     def __init__(
         self,
         visibility: PortionedShading,
-        projected_light: Node,
+        free_light: Node | None,
         item_text: str | Callable[[], str],
         where: str = "",
-        others: tuple[Node, ...] = (),
+        others: tuple[Node | None, ...] = (),
         stages: tuple[NodeStage, ...] = (),
     ):
         self._visibility = visibility
-        self._shading = NodeStage(f"shading{where}", item_text, inputs=(visibility, projected_light))
-        stages = self._shading, *stages
-        super().__init__("", None, projected_light, *others, extra_inputs=(visibility,), stages=stages)
+        if free_light is not None:
+            self._shading = NodeStage(f"shading{where}", item_text, inputs=(visibility, free_light))
+            stages = self._shading, *stages
+        super().__init__("", None, free_light, *others, extra_inputs=(visibility,), stages=stages)
 
     def compute(self, call: Call) -> Any:
         """Light all portions."""
-        (projected_light,) = self.values(call)
-        return [self._light(call, portion, projected_light) for portion in self._visibility.value(call)]
+        (free_light,) = self.values(call)
+        return [self._light(call, portion, free_light) for portion in self._visibility.value(call)]
 
-    def _light(self, call: Call, portion: PortionVisibility, projected_light: ProjectedLight) -> PortionDirectLight:
+    def _light(
+        self, call: Call, portion: PortionVisibility | PortionDirectLight, free_light: ProjectedLight | None
+    ) -> PortionDirectLight:
+        if isinstance(portion, PortionDirectLight):
+            return portion
+        assert free_light is not None
         with self.timed(call, self._shading):
-            direct = self._visibility.method.shade_transfer(portion.transfer, portion.group, projected_light)
+            direct = self._visibility.method.shade_transfer(portion.transfer, portion.group, free_light)
         return PortionDirectLight(direct, portion.group, portion.cells)
 
 
-def _patch_weights(senders: Senders, visibility: list[PortionVisibility]) -> PatchWeights:
+def _patch_weights(senders: Senders, visibility: list[PortionVisibility | PortionDirectLight]) -> PatchWeights:
     """Weights of patch samples and patches by how open they are."""
     portions = [
         find_mean_transmittance(
@@ -129,7 +137,7 @@ class PatchSampleNodes(NamedTuple):
     """Nodes of the points at which patches are lit."""
 
     points: LitPoints
-    visibility: PortionedShading  # of the patch samples, for any light
+    visibility: PortionedShading  # of the patch samples in free light, or their direct light if it is known
     frames: Node  # of flat bodies
     projected_patches: Node  # patches as receivers see them
     weights: Node  # of patch samples and patches, by how open they are
@@ -209,9 +217,7 @@ class BouncedShading(PortionedDirectLight):
     """Shading of receivers, direct and bounced.
 
     Args:
-        visibility: Visibility; one portion after another where none of it is cached.
-        projected_light: The light projected for the method.
-        item_text: Number of receivers, in words.
+        visibility, free_light, item_text: As above; one portion after another where nothing is cached.
         radiosity: Radiosity of the patches.
         gathering: Gathers it at receivers.
     """
@@ -219,20 +225,20 @@ class BouncedShading(PortionedDirectLight):
     def __init__(
         self,
         visibility: PortionedShading,
-        projected_light: Node,
+        free_light: Node | None,
         item_text: Callable[[], str],
         radiosity: Radiosity,
         gathering: Gathering,
     ):
         self._gathering = gathering
-        super().__init__(visibility, projected_light, item_text, others=(radiosity,), stages=gathering.stages)
+        super().__init__(visibility, free_light, item_text, others=(radiosity,), stages=gathering.stages)
 
     def compute(self, call: Call) -> wp.array:
         """Light all portions, directly and by the patches' radiosity."""
-        projected_light, outgoing = self.values(call)
+        free_light, outgoing = self.values(call)
         portions = self._visibility.value(call) if self._visibility.caches else self._visibility.portions(call)
         return join_portions(
-            [self._bounced(call, self._light(call, portion, projected_light), outgoing) for portion in portions]
+            [self._bounced(call, self._light(call, portion, free_light), outgoing) for portion in portions]
         )
 
     def _bounced(self, call: Call, portion: PortionDirectLight, outgoing: OutgoingRadiance) -> wp.array:
@@ -280,18 +286,19 @@ class MovingBounces:
             projected_light=visibility_light,
             light=light,
             finish=list,
-            end="transfer",
-            result_of=functools.partial(_visibility_of, method),
+            end="transfer" if light.is_free else "shading",
+            result_of=functools.partial(_result_of, PortionVisibility if light.is_free else PortionDirectLight, method),
         )
+        free_light = projected_light if light.is_free else None
         key, is_cached = light.visibility_key, light.is_free or materials is not points.materials
         visibility = points.cached("visibility", (key, is_cached), lambda: make_visibility(points, caches=is_cached))
         of_patch_samples = points.cached(
             "of patch samples", (key, senders), lambda: self._patch_samples(make_visibility, proxies, points)
         )
-        radiosity = self._radiosity(of_patch_samples, projected_light, proxies, materials)
+        radiosity = self._radiosity(of_patch_samples, free_light, proxies, materials)
         item_text = functools.partial(receiver_text, points.weak)
         at_points = self._gathering(senders, item_text)
-        return BouncedShading(visibility, projected_light, item_text, radiosity, at_points)
+        return BouncedShading(visibility, free_light, item_text, radiosity, at_points)
 
     def _patch_samples(
         self, make_visibility: Callable[..., PortionedShading], proxies: Proxies, points: LitPoints
@@ -299,7 +306,9 @@ class MovingBounces:
         """Nodes of the patch samples of the bodies around points."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
 
-        def project(patch_samples: Receivers, visibility: list[PortionVisibility], *arguments: Any) -> ProjectedPatches:
+        def project(
+            patch_samples: Receivers, visibility: list[PortionVisibility | PortionDirectLight], *arguments: Any
+        ) -> ProjectedPatches:
             return proxies.projected_patches(patch_samples, [portion.cells for portion in visibility], *arguments)
 
         arguments = senders, points, proxies.nearest_spheres
@@ -311,12 +320,14 @@ class MovingBounces:
         return PatchSampleNodes(lit_samples, visibility, frames, projected_patches, weights)
 
     def _radiosity(
-        self, patch_samples: PatchSampleNodes, projected_light: Node, proxies: Proxies, materials: Materials
+        self, patch_samples: PatchSampleNodes, free_light: Node | None, proxies: Proxies, materials: Materials
     ) -> Radiosity:
         """Radiosity of the patches, given the light at their patch samples."""
         senders, why_not = proxies.senders, "light bounces once" if self._count == 1 else ""
         arguments = f"{len(senders.sides):,} patch samples", OF_PATCH_SAMPLES
-        lit: Node = PortionedDirectLight(patch_samples.visibility, projected_light, *arguments)
+        lit: Node = patch_samples.visibility
+        if free_light is not None:
+            lit = PortionedDirectLight(patch_samples.visibility, free_light, *arguments)
         if materials.emission:
             lit = Node("", _add_emitted, lit, self._method.light_of_emitters(patch_samples.points, materials))
         albedo = self._patches.albedo(materials, senders.bodies)
