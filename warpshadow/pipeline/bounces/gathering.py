@@ -43,6 +43,7 @@ class OutgoingRadiance:
         projected_patches: The patches as receivers see them.
         frames: Where flat bodies are, vec3 of shape [batch, 3 · plane].
         patch_weights: Of the patches, vec3 of shape [batch, patch].
+        texel_weights: Their sums of each texel of flat bodies, vec3 of shape [batch, texel]; None without any.
     """
 
     def __init__(
@@ -52,9 +53,11 @@ class OutgoingRadiance:
         projected_patches: ProjectedPatches,
         frames: wp.array,
         patch_weights: wp.array,
+        texel_weights: wp.array | None,
     ):
         self.proxies, self.senders, self.radiosity = proxies, proxies.senders, radiosity
-        self.projected_patches, self.frames, self.patch_weights = projected_patches, frames, patch_weights
+        self.projected_patches, self.frames = projected_patches, frames
+        self.patch_weights, self.texel_weights = patch_weights, texel_weights
 
     def of_body(self, body: int) -> wp.array:
         """Radiosity of the patches of a body, vec3 of shape [batch, patch]."""
@@ -75,7 +78,7 @@ class OutgoingRadiance:
     def texels(self) -> wp.array:
         """Radiosity of the flat bodies, vec3 of shape [batch, texel]."""
         assert self.proxies.planes is not None
-        return find_texels(self.radiosity, self.patch_weights, self.proxies.planes.blockers)
+        return find_texels(self.radiosity, self.patch_weights, self.proxies.planes.blockers, self.texel_weights)
 
 
 class Gathering:

@@ -37,6 +37,7 @@ from warpshadow.pipeline.shading.sphere_method import LitPortion, PortionedShadi
 from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.patch_weights import PatchWeights, find_mean_transmittance, find_patch_weights
+from warpshadow.stages.bounces.plane_texels import sum_weights
 from warpshadow.stages.bounces.radiosity import patch_radiosity
 from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.receivers.find import Receivers
@@ -183,8 +184,11 @@ class Radiosity(Node):
         if between is not None and between.is_zero:
             between = None
 
+        planes = self._proxies.planes
+        texel_weights = None if planes is None else sum_weights(weights.weights, planes.blockers)
+
         def sent(radiosity: wp.array) -> OutgoingRadiance:
-            return OutgoingRadiance(self._proxies, radiosity, projected_patches, frames, weights.weights)
+            return OutgoingRadiance(self._proxies, radiosity, projected_patches, frames, weights.weights, texel_weights)
 
         def radiosity_by_others(radiosity: wp.array | None) -> wp.array:
             """Radiosity of patches by light from the sky and from other bodies."""

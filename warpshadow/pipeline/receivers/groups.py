@@ -42,13 +42,17 @@ class BodyExtents:
 
     def __init__(self, corners: wp.array, first_corner: np.ndarray):
         self.corners, self._first_corner = corners, first_corner
+        self._is_captured = corners.device.is_capturing
         self._sides: dict[int, tuple[wp.array, wp.array]] = {}
 
     def sides_of(self, frames: wp.array, planes: PlaneBlockers) -> wp.array:
         """The side of each plane on which each body lies, [batch, body, plane], found once for all receivers."""
-        if id(frames) not in self._sides:  # frames are held, so that no others get their id
-            self._sides[id(frames)] = frames, find_body_sides(self.corners, self._first_corner, frames, planes)
-        return self._sides[id(frames)][1]
+        if id(frames) in self._sides:  # frames are held, so that no others get their id
+            return self._sides[id(frames)][1]
+        sides = find_body_sides(self.corners, self._first_corner, frames, planes)
+        if frames.device.is_capturing == self._is_captured:  # else only a replay of a graph fills them
+            self._sides[id(frames)] = frames, sides
+        return sides
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,6 +217,7 @@ class Blockers(NamedTuple):
     spheres: tuple[wp.array, wp.array]  # centers and radii of all spheres, blocking or not
     frames: wp.array | None  # where bodies are that block as planes, vec3 [batch, 3 · plane]; None without any
     placed: PlacedParts | None  # where convex parts are; None without any
+    extents: BodyExtents | None  # how far out bodies reach; None where there are no planes
 
     def sphere_blockers(self, bodies: Iterable[int]) -> list[int]:
         """Bodies among some that block light by their spheres."""
@@ -303,10 +308,6 @@ def _groups_that_move(
     """Groups of receivers that may move."""
     sphere_bodies = blockers.sphere_blockers(blockers.bodies)
     spheres, none = blockers.spheres_of(sphere_bodies), blockers.spheres_of([])
-    has_planes = blockers.blocker_kinds.planes or (blockers.planes.numbers and blockers.merged_scene.scene.bounces)
-    extents = None
-    if has_planes and receivers.spans:
-        extents = BodyExtents(blockers.planes.corners(blockers.positions), blockers.planes.first_corner)
     clusters, nearest_blockers = None, _nearest_blockers(nearest_spheres, blockers)
     if not receivers.spans:
         points_and_normals = receivers.points, receivers.normals
@@ -333,7 +334,7 @@ def _groups_that_move(
                 self_lookups.get(span.body),
                 span.body in blockers.blocker_kinds.solids,
                 blockers.own_parts(span.body),
-                extents,
+                blockers.extents,
             )
             group = group._replace(own=own)
         if nearest_blockers is not None:
