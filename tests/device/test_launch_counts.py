@@ -17,10 +17,10 @@ from warpshadow.tuning.timing import whole_image
 MOST = {
     "image": (40, 8),
     "pose iteration": (63, 5),
-    "image with two bounces": (92, 11),
-    "pose iteration with two bounces": (163, 14),
+    "image with two bounces": (85, 11),
+    "pose iteration with two bounces": (152, 13),
 }
-MOST_OF_A_BOX = 40  # kernels that a box more takes where light bounces twice, for its receivers and its patch samples
+MOST_OF_A_BOX = 38  # kernels that a box more takes where light bounces twice, for its receivers and its patch samples
 
 
 @pytest.fixture(scope="module")

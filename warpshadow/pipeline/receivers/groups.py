@@ -36,20 +36,21 @@ class BodyExtents:
     """How far out bodies reach, and so on which side of planes each lies.
 
     Args:
-        corners: Vertices of all bodies that are farthest out, vec3 of shape [batch, corner].
-        first_corner: Where each body's begin, and the end of the last, shape [body + 1].
+        planes: Of the scene.
+        positions: Vertices of all bodies, vec3 of shape [batch, vertex].
     """
 
-    def __init__(self, corners: wp.array, first_corner: np.ndarray):
-        self.corners, self._first_corner = corners, first_corner
-        self._is_captured = corners.device.is_capturing
+    def __init__(self, planes: ScenePlanes, positions: wp.array):
+        self._planes, self.positions = planes, positions
+        self._is_captured = positions.device.is_capturing
         self._sides: dict[int, tuple[wp.array, wp.array]] = {}
 
     def sides_of(self, frames: wp.array, planes: PlaneBlockers) -> wp.array:
         """The side of each plane on which each body lies, [batch, body, plane], found once for all receivers."""
         if id(frames) in self._sides:  # frames are held, so that no others get their id
             return self._sides[id(frames)][1]
-        sides = find_body_sides(self.corners, self._first_corner, frames, planes)
+        corners, first_corner = self._planes.corners(self.positions), self._planes.first_corner
+        sides = find_body_sides(corners, first_corner, frames, planes)
         if frames.device.is_capturing == self._is_captured:  # else only a replay of a graph fills them
             self._sides[id(frames)] = frames, sides
         return sides
@@ -141,7 +142,7 @@ class Group(NamedTuple):
         """
         own, planes, clusters = self.own, self.planes, self.clusters
         rotation_data = None if own is None or own.lookup is None else own.lookup.turned
-        body_corners = None if own is None or own.extents is None else own.extents.corners
+        positions = None if own is None or own.extents is None else own.extents.positions
         frames = None if planes is None else planes.frames
         parts = self.convex_parts_around or (None if own is None else own.parts)
         part_corners = None if parts is None else parts.placed.corners
@@ -154,14 +155,14 @@ class Group(NamedTuple):
                 "rotations": rotation_data,
                 "planes": frames,
             }
-            count = common_batch(arrays | {"corners": body_corners, "parts": part_corners})
+            count = common_batch(arrays | {"positions": positions, "parts": part_corners})
             points, normals, centers, radii = [expand(array, count) for array in arguments]
             clusters = clusters if radii is self.radii and centers is self.centers else None
         size = points.shape[1]
         if (
             self.cached_rows is not None
             or size <= RECEIVERS_AT_ONCE
-            or varies([*arguments, rotation_data, frames, part_corners, body_corners])
+            or varies([*arguments, rotation_data, frames, part_corners, positions])
         ):
             yield self._replace(points=points, normals=normals, centers=centers, radii=radii, clusters=clusters)
             return

@@ -91,7 +91,7 @@ class SceneBlockers:
         placed = self.parts.placed(kinds.convex, positions) if kinds.convex else None
         extents = None
         if kinds.planes or (self.planes.numbers and self._merged_scene.scene.bounces):
-            extents = BodyExtents(self.planes.corners(positions), self.planes.first_corner)
+            extents = BodyExtents(self.planes, positions)
         return Blockers(self._merged_scene, kinds, *owners, positions, spheres, frames, placed, extents)
 
     def has_any(self, kinds: BlockerKinds, bodies: Iterable[int] | None = None) -> bool:
