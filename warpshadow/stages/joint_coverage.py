@@ -77,7 +77,10 @@ def _attenuate(
     for q in range(attenuated.shape[2]):
         share = wp.max(0.0, 1.0 - coverages[batch, receiver, q][0])
         if others and share > 0.0:
-            share = _open_share(coverages[batch, receiver, q], others[batch, receiver, q])
+            if share < 1.0 and others[batch, receiver, q][0] > 0.0:
+                share = _open_share(coverages[batch, receiver, q], others[batch, receiver, q])
+            else:
+                share = wp.min(share, wp.max(0.0, 1.0 - others[batch, receiver, q][0]))
         if transmittance:
             share *= transmittance[batch, receiver, q]
         attenuated[batch, receiver, q] = share

@@ -43,6 +43,11 @@ class SparseMatrix:
     rows: Entries
     columns: Entries
 
+    @property
+    def is_zero(self) -> bool:
+        """Whether it has no entries."""
+        return not self.rows.columns.size
+
     @staticmethod
     def from_matrix(matrix: np.ndarray | spmatrix | sparray, *, device: wp.DeviceLike) -> SparseMatrix:
         """Copy a matrix of SciPy or NumPy to a device, without its zeros."""

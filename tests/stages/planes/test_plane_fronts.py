@@ -6,7 +6,7 @@ import warp as wp
 from plane_settings import Setting, margin_of, ramp
 
 from warpshadow.device.tape import recorded
-from warpshadow.stages.planes.fronts import NearestBlockers, find_fronts, lifted_points
+from warpshadow.stages.planes.fronts import NearestBlockers, find_body_sides, find_fronts
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -31,7 +31,7 @@ def twin_fronts(points, normals, corners, centers, radii, frames, grids, heights
     for f, grid in enumerate(grids):
         origin, u, v = frames[3 * f : 3 * f + 3]
         up, margin = np.cross(u, v) / np.linalg.norm(np.cross(u, v)), np.linalg.norm(u) * margin_of(grid)
-        of_corners = (corners - origin) @ up
+        of_corners = (corners[4:] - origin) @ up  # of the second body
         span = max(np.ptp(of_corners), margin)
         leaning = np.clip((of_corners.min() + of_corners.max()) / span, -1, 1)
         for point, (place, number) in enumerate(zip(points, NUMBERS, strict=True)):
@@ -52,7 +52,7 @@ def test_fronts_and_their_gradients_are_those_of_the_twin(device):
     values = [
         setting.points[0],
         setting.normals[0],
-        rng.uniform([-0.4, -0.1, -0.4], [0.4, 1.5, 0.4], size=(9, 3)),
+        np.concatenate([np.zeros((4, 3)), rng.uniform([-0.4, -0.1, -0.4], [0.4, 1.5, 0.4], size=(9, 3))]),
         setting.points[0, :4] + rng.uniform(-0.2, 0.2, size=(4, 3)),
         np.array([1.6, 2.5, 3.0, 0.0]),
         setting.frames(setting.vertices[0]),
@@ -66,8 +66,8 @@ def test_fronts_and_their_gradients_are_those_of_the_twin(device):
     numbers = wp.array(NUMBERS, device=device)
     with recorded() as tape:
         spheres = NearestBlockers(centers, radii, numbers)
-        fronts = find_fronts(points, normals, corners, spheres, frames, setting.planes)
-        lifted = lifted_points(points, fronts, frames, setting.planes, None)
+        sides = find_body_sides(corners, np.array([0, 4, 13], np.int32), frames, setting.planes)
+        fronts, lifted = find_fronts(points, normals, sides, spheres, frames, setting.planes, body=1)
     heights = over_margin(values[0], values[-1], setting.grids)
     expected = twin_fronts(*values, setting.grids, heights)
     np.testing.assert_allclose(fronts.numpy()[0], expected[:, :3], atol=5e-3)  # of a margin near float32's rounding
@@ -95,10 +95,8 @@ def test_a_patch_sample_is_on_the_side_on_which_its_sphere_is(center, at_ground,
     centers = wp.array([[[0.1, center, 0.1]]], dtype=wp.vec3, device=device)
     radii, numbers = wp.full((1, 1), 0.2, dtype=wp.float32, device=device), wp.zeros(2, wp.int32, device=device)
     frames = wp.array([setting.frames(setting.vertices[0])], dtype=wp.vec3, device=device)
-    found = find_fronts(points, points, None, NearestBlockers(centers, radii, numbers), frames, setting.planes).numpy()[
-        0, :, 0
-    ]
-    np.testing.assert_allclose(found, [at_ground, deep], atol=1e-6)
+    fronts = find_fronts(points, points, None, NearestBlockers(centers, radii, numbers), frames, setting.planes)
+    np.testing.assert_allclose(fronts.weights.numpy()[0, :, 0], [at_ground, deep], atol=1e-6)
 
 
 @pytest.mark.parametrize("size", [1e-18, 1e-30, 1e18])
@@ -110,7 +108,7 @@ def test_any_size_gives_finite_fronts_and_gradients(size, device):
     numbers = wp.zeros(2, wp.int32, device=device)
     frames = wp.array([setting.frames(setting.vertices[0])], dtype=wp.vec3, device=device, requires_grad=True)
     with recorded() as tape:
-        fronts = find_fronts(points, points, None, NearestBlockers(centers, radii, numbers), frames, setting.planes)
+        fronts, _ = find_fronts(points, points, None, NearestBlockers(centers, radii, numbers), frames, setting.planes)
     tape.backward(grads={fronts: wp.full(fronts.shape, 1.0, dtype=wp.float32, device=device)})
     for array in (fronts, *(given.grad for given in (points, centers, radii, frames))):
         assert np.isfinite(array.numpy()).all()

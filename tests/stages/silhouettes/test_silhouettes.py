@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from meshes import through_plane
 
 import warpshadow as ws
+from warpshadow.device.warp_internals import check_strides
 from warpshadow.maths.adjacency import edge_neighbors
 from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.project import to_clip
@@ -439,6 +440,12 @@ def test_more_samples_than_int32_counts_are_refused(device, monkeypatch):
     mesh = ws.icosphere(1.0, 1)
     with pytest.raises(ValueError, match="fragments: got 7857 samples in all, expected at most 7856"):
         setup(mesh.positions, mesh.faces, device)
+
+
+def test_as_many_samples_are_accepted_as_strides_of_int32_reach():
+    check_strides((4, find.MAX_SAMPLES), wp.int32)
+    with pytest.raises(MemoryError):
+        check_strides((4, find.MAX_SAMPLES + 1), wp.int32)
 
 
 def test_several_threads_that_follow_an_edge_find_the_same(device, monkeypatch):

@@ -43,6 +43,7 @@ class OutgoingRadiance:
         projected_patches: The patches as receivers see them.
         frames: Where flat bodies are, vec3 of shape [batch, 3 · plane].
         patch_weights: Of the patches, vec3 of shape [batch, patch].
+        texel_weights: Their sums of each texel of flat bodies, vec3 of shape [batch, texel]; None without any.
     """
 
     def __init__(
@@ -52,9 +53,11 @@ class OutgoingRadiance:
         projected_patches: ProjectedPatches,
         frames: wp.array,
         patch_weights: wp.array,
+        texel_weights: wp.array | None,
     ):
         self.proxies, self.senders, self.radiosity = proxies, proxies.senders, radiosity
-        self.projected_patches, self.frames, self.patch_weights = projected_patches, frames, patch_weights
+        self.projected_patches, self.frames = projected_patches, frames
+        self.patch_weights, self.texel_weights = patch_weights, texel_weights
 
     def of_body(self, body: int) -> wp.array:
         """Radiosity of the patches of a body, vec3 of shape [batch, patch]."""
@@ -75,7 +78,7 @@ class OutgoingRadiance:
     def texels(self) -> wp.array:
         """Radiosity of the flat bodies, vec3 of shape [batch, texel]."""
         assert self.proxies.planes is not None
-        return find_texels(self.radiosity, self.patch_weights, self.proxies.planes.blockers)
+        return find_texels(self.radiosity, self.patch_weights, self.proxies.planes.blockers, self.texel_weights)
 
 
 class Gathering:
@@ -137,25 +140,33 @@ class Gathering:
         own = group.own
         if own is None or own.number not in outgoing.senders.bodies or self._is_flat[own.number]:
             return None
-        return self_light(self._self_form_factors.of(own.number), outgoing.of_body(own.number), *own.probe_weights)
+        form_factors = self._self_form_factors.of(own.number)
+        if form_factors.is_zero:  # a convex body sends itself nothing
+            return None
+        return self_light(form_factors, outgoing.of_body(own.number), *own.probe_weights)
 
-    def _from_planes(self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array:
+    def _from_planes(
+        self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance
+    ) -> wp.array | None:
         planes = outgoing.proxies.planes
         assert planes is not None
         skip = planes.index_of_body.get(group.body)
-        points, fronts = group.beside(outgoing.frames, planes.blockers, skip)
+        if planes.blockers.count == (skip is not None):
+            return None
+        fronts = group.beside(outgoing.frames, planes.blockers, skip)
         # Cells look to where the light of the sky is, above horizons; light of planes is found around their middles. A
         # ball on a ground lost 4% of the ground's light by the former.
         middles = fibonacci(len(transmittance.directions))
         arguments = (
-            points,
+            fronts.lifted,
             group.normals,
             transmittance.transmittance_nonplanar,
             outgoing.frames,
             outgoing.texels,
             planes.blockers,
         )
-        return plane_light(*arguments, middles, coverages=transmittance.part_coverages, fronts=fronts, skip=skip)
+        coverages, weights = transmittance.part_coverages, fronts.weights
+        return plane_light(*arguments, middles, coverages=coverages, fronts=weights, skip=skip)
 
     def _from_spheres(
         self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance

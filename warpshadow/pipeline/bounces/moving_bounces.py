@@ -43,13 +43,14 @@ from warpshadow.pipeline.shading.sphere_method import (
 from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.patch_weights import PatchWeights, find_mean_transmittance, find_patch_weights
+from warpshadow.stages.bounces.plane_texels import sum_weights
 from warpshadow.stages.bounces.radiosity import patch_radiosity
 from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.receivers.find import Receivers
 
 
 class PortionVisibility(NamedTuple):
-    """Some receivers, and their visibility, which holds for any light."""
+    """Some receivers, and their visibility, which holds for any free light."""
 
     transfer: wp.array  # of direct light, [batch, receiver, coefficient]
     group: Group
@@ -65,20 +66,35 @@ class PortionDirectLight(NamedTuple):
 
 
 class VisibilityWithBounces(PortionedTransfer):
-    """Visibility of receivers for direct and bounced light, a list of :class:`PortionVisibility`."""
+    """Visibility of receivers for direct and bounced light, a list of :class:`PortionVisibility`: in free light."""
 
     def result_of(self, portion: LitPortion) -> PortionVisibility:
         """Visibility of a portion."""
-        transmittance = find_cell_transmittance(self.method, portion.group, portion.visibility, portion.spheres)
-        return PortionVisibility(portion.result, portion.group, transmittance)
+        return PortionVisibility(portion.result, portion.group, _find_transmittance(self.method, portion))
+
+
+class ShadingWithVisibility(PortionedShading):
+    """Direct light of receivers, and their visibility of bounced light, a list of :class:`PortionDirectLight`."""
+
+    def compute(self, call: Call) -> Any:
+        """Shade all portions."""
+        return list(self.portions(call))
+
+    def result_of(self, portion: LitPortion) -> PortionDirectLight:
+        """Light and visibility of a portion."""
+        return PortionDirectLight(portion.result, portion.group, _find_transmittance(self.method, portion))
+
+
+def _find_transmittance(method: SphereMethod, portion: LitPortion) -> CellTransmittance:
+    return find_cell_transmittance(method, portion.group, portion.visibility, portion.spheres)
 
 
 class PortionedDirectLight(Node):
     """Direct light, in portions.
 
     Args:
-        visibility: Visibility of the receivers.
-        projected_light: The light projected for the method.
+        visibility: Visibility of the receivers in free light, or their direct light if it is known.
+        free_light: Free light projected for the method; None if light is known.
         item_text: Number of receivers, in words.
         where: Put after the name of its stage.
         others: More that it depends on.
@@ -87,30 +103,36 @@ class PortionedDirectLight(Node):
 
     def __init__(
         self,
-        visibility: VisibilityWithBounces,
-        projected_light: Node,
+        visibility: VisibilityWithBounces | ShadingWithVisibility,
+        free_light: Node | None,
         item_text: str | Callable[[], str],
         where: str = "",
-        others: tuple[Node, ...] = (),
+        others: tuple[Node | None, ...] = (),
         stages: tuple[NodeStage, ...] = (),
     ):
         self._visibility = visibility
-        self._shading = NodeStage(f"shading{where}", item_text, inputs=(visibility, projected_light))
-        stages = self._shading, *stages
-        super().__init__("", None, projected_light, *others, extra_inputs=(visibility,), stages=stages)
+        if free_light is not None:
+            self._shading = NodeStage(f"shading{where}", item_text, inputs=(visibility, free_light))
+            stages = self._shading, *stages
+        super().__init__("", None, free_light, *others, extra_inputs=(visibility,), stages=stages)
 
     def compute(self, call: Call) -> Any:
         """Light all portions."""
-        (projected_light,) = self.values(call)
-        return [self._light(call, portion, projected_light) for portion in self._visibility.value(call)]
+        (free_light,) = self.values(call)
+        return [self._light(call, portion, free_light) for portion in self._visibility.value(call)]
 
-    def _light(self, call: Call, portion: PortionVisibility, projected_light: ProjectedLight) -> PortionDirectLight:
+    def _light(
+        self, call: Call, portion: PortionVisibility | PortionDirectLight, free_light: ProjectedLight | None
+    ) -> PortionDirectLight:
+        if isinstance(portion, PortionDirectLight):
+            return portion
+        assert free_light is not None
         with self.timed(call, self._shading):
-            direct = self._visibility.method.shade_transfer(portion.transfer, portion.group, projected_light)
+            direct = self._visibility.method.shade_transfer(portion.transfer, portion.group, free_light)
         return PortionDirectLight(direct, portion.group, portion.transmittance)
 
 
-def _patch_weights(senders: Senders, visibility: list[PortionVisibility]) -> PatchWeights:
+def _patch_weights(senders: Senders, visibility: list[PortionVisibility | PortionDirectLight]) -> PatchWeights:
     """Weights of patch samples and patches by how open they are."""
     portions = [
         find_mean_transmittance(
@@ -138,7 +160,7 @@ class PatchSampleNodes(NamedTuple):
     """Nodes of the points at which patches are lit."""
 
     points: LitPoints
-    visibility: VisibilityWithBounces  # of the patch samples, for any light
+    visibility: VisibilityWithBounces | ShadingWithVisibility  # of the patch samples
     frames: Node  # of flat bodies
     projected_patches: Node  # patches as receivers see them
     weights: Node  # of patch samples and patches, by how open they are
@@ -181,9 +203,14 @@ class Radiosity(Node):
             if self._self_reflection.idle
             else self._self_form_factors.between_patches(senders, [portion.group for portion in lit])
         )
+        if between is not None and between.is_zero:
+            between = None
+
+        planes = self._proxies.planes
+        texel_weights = None if planes is None else sum_weights(weights.weights, planes.blockers)
 
         def sent(radiosity: wp.array) -> OutgoingRadiance:
-            return OutgoingRadiance(self._proxies, radiosity, projected_patches, frames, weights.weights)
+            return OutgoingRadiance(self._proxies, radiosity, projected_patches, frames, weights.weights, texel_weights)
 
         def radiosity_by_others(radiosity: wp.array | None) -> wp.array:
             """Radiosity of patches by light from the sky and from other bodies."""
@@ -216,30 +243,28 @@ class BouncedShading(PortionedDirectLight):
     """Shading of receivers, direct and bounced.
 
     Args:
-        visibility: Visibility; one portion after another where none of it is cached.
-        projected_light: The light projected for the method.
-        item_text: Number of receivers, in words.
+        visibility, free_light, item_text: As above; one portion after another where nothing is cached.
         radiosity: Radiosity of the patches.
         gathering: Gathers it at receivers.
     """
 
     def __init__(
         self,
-        visibility: VisibilityWithBounces,
-        projected_light: Node,
+        visibility: VisibilityWithBounces | ShadingWithVisibility,
+        free_light: Node | None,
         item_text: Callable[[], str],
         radiosity: Radiosity,
         gathering: Gathering,
     ):
         self._gathering = gathering
-        super().__init__(visibility, projected_light, item_text, others=(radiosity,), stages=gathering.stages)
+        super().__init__(visibility, free_light, item_text, others=(radiosity,), stages=gathering.stages)
 
     def compute(self, call: Call) -> wp.array:
         """Light all portions, directly and by the patches' radiosity."""
-        projected_light, outgoing = self.values(call)
+        free_light, outgoing = self.values(call)
         portions = self._visibility.value(call) if self._visibility.caches else self._visibility.portions(call)
         return join_portions(
-            [self._bounced(call, self._light(call, portion, projected_light), outgoing) for portion in portions]
+            [self._bounced(call, self._light(call, portion, free_light), outgoing) for portion in portions]
         )
 
     def _bounced(self, call: Call, portion: PortionDirectLight, outgoing: OutgoingRadiance) -> wp.array:
@@ -282,25 +307,34 @@ class MovingBounces:
             return Node("bounces", identity, direct, idle="every body is black")
         proxies = self._proxies.setdefault(senders, Proxies(senders, method.visibility.merging))
         make_visibility = functools.partial(
-            VisibilityWithBounces, method, projected_light=visibility_light, light=light
+            VisibilityWithBounces if light.is_free else ShadingWithVisibility,
+            method,
+            projected_light=visibility_light,
+            light=light,
         )
+        free_light = projected_light if light.is_free else None
         key, is_cached = light.visibility_key, light.is_free or materials is not points.materials
         visibility = points.cached("visibility", (key, is_cached), lambda: make_visibility(points, caches=is_cached))
         of_patch_samples = points.cached(
             "of patch samples", (key, senders), lambda: self._patch_samples(make_visibility, proxies, points)
         )
-        radiosity = self._radiosity(of_patch_samples, projected_light, proxies, materials)
+        radiosity = self._radiosity(of_patch_samples, free_light, proxies, materials)
         item_text = functools.partial(receiver_text, points.weak)
         at_points = self._gathering(senders, item_text)
-        return BouncedShading(visibility, projected_light, item_text, radiosity, at_points)
+        return BouncedShading(visibility, free_light, item_text, radiosity, at_points)
 
     def _patch_samples(
-        self, make_visibility: Callable[..., VisibilityWithBounces], proxies: Proxies, points: LitPoints
+        self,
+        make_visibility: Callable[..., VisibilityWithBounces | ShadingWithVisibility],
+        proxies: Proxies,
+        points: LitPoints,
     ) -> PatchSampleNodes:
         """Nodes of the patch samples of the bodies around points."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
 
-        def project(patch_samples: Receivers, visibility: list[PortionVisibility], *arguments: Any) -> ProjectedPatches:
+        def project(
+            patch_samples: Receivers, visibility: list[PortionVisibility | PortionDirectLight], *arguments: Any
+        ) -> ProjectedPatches:
             return proxies.projected_patches(
                 patch_samples, [portion.transmittance for portion in visibility], *arguments
             )
@@ -314,12 +348,14 @@ class MovingBounces:
         return PatchSampleNodes(lit_samples, visibility, frames, projected_patches, weights)
 
     def _radiosity(
-        self, patch_samples: PatchSampleNodes, projected_light: Node, proxies: Proxies, materials: Materials
+        self, patch_samples: PatchSampleNodes, free_light: Node | None, proxies: Proxies, materials: Materials
     ) -> Radiosity:
         """Radiosity of the patches, given the light at their patch samples."""
         senders, why_not = proxies.senders, "light bounces once" if self._count == 1 else ""
         arguments = f"{len(senders.sides):,} patch samples", OF_PATCH_SAMPLES
-        lit: Node = PortionedDirectLight(patch_samples.visibility, projected_light, *arguments)
+        lit: Node = patch_samples.visibility
+        if free_light is not None:
+            lit = PortionedDirectLight(patch_samples.visibility, free_light, *arguments)
         if materials.emission:
             lit = Node("", _add_emitted, lit, self._method.light_of_emitters(patch_samples.points, materials))
         albedo = self._patches.albedo(materials, senders.bodies)

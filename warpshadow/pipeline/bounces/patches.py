@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import warp as wp
@@ -65,6 +66,7 @@ class ScenePatches:
         self._of_body: dict[int, Patches] = {}
         self._means: dict[tuple, SparseMatrix] = {}
         self._senders: dict[tuple[int, ...], Senders] = {}
+        self._albedo: WeakKeyDictionary[Materials, dict[tuple[int, ...], Node]] = WeakKeyDictionary()
 
     def of_body(self, number: int) -> Patches:
         """Patches of a body in its own frame; a flat body has a grid of them."""
@@ -146,8 +148,17 @@ class ScenePatches:
 
     # ------------------------------------------------------------------------------------------ albedo
 
-    def albedo(self, materials: Materials, bodies: Sequence[int]) -> Node:
-        """Node of the mean reflectance of the patches of some bodies, vec3 of shape [batch, patch]."""
+    def albedo(self, materials: Materials, bodies: tuple[int, ...]) -> Node:
+        """Node of the mean reflectance of the patches of some bodies, vec3 of shape [batch, patch].
+
+        It stays with the materials, so that of the scene's is computed once.
+        """
+        nodes = self._albedo.setdefault(materials, {})
+        if bodies not in nodes:
+            nodes[bodies] = self._make_albedo(materials, bodies)
+        return nodes[bodies]
+
+    def _make_albedo(self, materials: Materials, bodies: tuple[int, ...]) -> Node:
         counts = [self.of_body(number).count for number in bodies]
 
         def means(colors: Sequence[wp.array], images: Sequence[wp.array | None]) -> wp.array:

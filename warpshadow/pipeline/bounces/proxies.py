@@ -176,19 +176,11 @@ class Proxies:
         if planes is not None:
             numbers, points, device = self.nearest_spheres, patch_samples.points, normals.device
             of_patch_samples = NearestBlockers(centers, radii, constant(numbers, wp.int32, device))
-            fronts = find_fronts(points, normals, None, of_patch_samples, frames, planes.blockers)
+            fronts = find_fronts(points, normals, None, of_patch_samples, frames, planes.blockers).weights
             if self.overlays is not None:
                 numbers = np.where(self.overlays[1][senders.patch_of_sample] > 0, np.int32(-1), numbers)
             normals = tilt_normals_off_planes(points, normals, radii, numbers, fronts, frames, planes.blockers)
-        rows = [
-            wp.full_like(portion.transmittance_nonplanar, 1.0, requires_grad=False)
-            if portion.transmittance_self is None
-            else portion.transmittance_self
-            for portion in transmittances
-        ]
-        transmittance = join_portions([row.reshape((len(row), -1)) for row in rows])
-        directions = transmittances[0].directions
-        transmittance = transmittance.reshape((len(transmittance), len(senders.sides), len(directions)))
+        directions, transmittance = transmittances[0].directions, _self_transmittance(transmittances)
         mean_points = multiply(senders.mean, patch_samples.points)
         mean_normals = multiply(senders.mean, patch_samples.normals)
         placed = place_proxies(mean_points, mean_normals, radii, *self._blockers, self._depths)
@@ -201,3 +193,17 @@ class Proxies:
         proxies = clusters.nodes.centers, *self.patches_of_clusters, self._tolerances
         tangent_planes = find_tangent_planes(mean_points, mean_normals, *proxies)
         return ProjectedPatches(areas, *placed, clusters, tangent_planes)
+
+
+def _self_transmittance(transmittances: list[CellTransmittance]) -> wp.array | None:
+    """Transmittance of patch samples past their own bodies, of all portions; None where that is 1."""
+    if all(portion.transmittance_self is None for portion in transmittances):
+        return None
+    rows = [
+        wp.full_like(portion.transmittance_nonplanar, 1.0, requires_grad=False)
+        if portion.transmittance_self is None
+        else portion.transmittance_self
+        for portion in transmittances
+    ]
+    joined = join_portions([row.reshape((len(row), -1)) for row in rows])
+    return joined.reshape((len(joined), -1, rows[0].shape[2]))

@@ -199,7 +199,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         if planes is None or not group.is_blocked_by_planes:
             return visibility
         horizon_normals = group.normals if group.cached_rows is None else None
-        points, fronts = group.beside_planes
+        fronts, points = group.beside_planes
         options: dict[str, Any] = {"horizon_normals": horizon_normals, "fronts": fronts, "skip": planes.skip}
         covered = self._coverages(
             functools.partial(plane_coverage, points, planes.frames, planes.planes, **options), projected_light

@@ -21,28 +21,66 @@ from warpshadow.pipeline.receivers.lit_points import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.stages.convex.convex_blockers import PlacedParts
 from warpshadow.stages.light.cached_cells import CachedRows
-from warpshadow.stages.planes.fronts import NearestBlockers, find_fronts, lifted_points
+from warpshadow.stages.planes.fronts import Fronts, NearestBlockers, find_body_sides, find_fronts
 from warpshadow.stages.planes.plane_blockers import PlaneBlockers
 from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.sample_receivers import Span
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 
 RECEIVERS_AT_ONCE = 1 << 13  # receivers of each instance that are lit at once where no gradient is asked for
 
 
-class OwnBody(NamedTuple):
+class BodyExtents:
+    """How far out bodies reach, and so on which side of planes each lies.
+
+    Args:
+        planes: Of the scene.
+        positions: Vertices of all bodies, vec3 of shape [batch, vertex].
+    """
+
+    def __init__(self, planes: ScenePlanes, positions: wp.array):
+        self._planes, self.positions = planes, positions
+        self._is_captured = positions.device.is_capturing
+        self._sides: dict[int, tuple[wp.array, wp.array]] = {}
+
+    def sides_of(self, frames: wp.array, planes: PlaneBlockers) -> wp.array:
+        """The side of each plane on which each body lies, [batch, body, plane], found once for all receivers."""
+        if id(frames) in self._sides:  # frames are held, so that no others get their id
+            return self._sides[id(frames)][1]
+        corners, first_corner = self._planes.corners(self.positions), self._planes.first_corner
+        sides = find_body_sides(corners, first_corner, frames, planes)
+        if frames.device.is_capturing == self._is_captured:  # else only a replay of a graph fills them
+            self._sides[id(frames)] = frames, sides
+        return sides
+
+
+@dataclass(frozen=True, eq=False)
+class OwnBody:
     """The body on which the receivers of a group lie, which may block their light."""
 
-    number: int
-    probe_weights: ProbeWeights  # where on it they lie
+    span: Span  # which receivers these are
+    receivers: Receivers  # among all
+    self_visibility: SelfVisibility
     lookup: Any  # traced self-visibility, of the method's kind; None where there is none, or its spheres block
     is_solid: bool  # whether it blocks its own light as its convex parts do
     parts: GroupConvexParts | None  # these, two or more: one alone never shades itself; else None
-    corners: wp.array | None = None  # vertices farthest out, vec3 of shape [batch, corner]; None without planes
+    extents: BodyExtents | None  # of all bodies; None without planes
+
+    @property
+    def number(self) -> int:
+        """Of the body."""
+        return self.span.body
+
+    @functools.cached_property
+    def probe_weights(self) -> ProbeWeights:
+        """Where on it they lie."""
+        return self.self_visibility.probe_weights(self.receivers, self.span)
 
     def cut(self, receivers: slice) -> OwnBody:
         """Select some receivers."""
-        return self._replace(probe_weights=self.probe_weights.cut(receivers))
+        first = self.span.first
+        return replace(self, span=self.span._replace(first=first + receivers.start, end=first + receivers.stop))
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,16 +126,18 @@ class Group:
         return self.own.lookup.transmittance(self.normals, self.own.probe_weights)
 
     @functools.cached_property
-    def beside_planes(self) -> tuple[wp.array, wp.array]:
+    def beside_planes(self) -> Fronts:
         """As :meth:`beside`, of the planes around the group."""
         assert self.planes is not None
         return self.beside(self.planes.frames, self.planes.planes, self.planes.skip)
 
-    def beside(self, frames: wp.array, planes: PlaneBlockers, skip: int | None) -> tuple[wp.array, wp.array]:
-        """Positions, lifted off planes that they lie in, and the part of each front that the receivers see."""
-        corners = None if self.own is None else self.own.corners
-        fronts = find_fronts(self.points, self.normals, corners, self.nearest_blockers, frames, planes)
-        return lifted_points(self.points, fronts, frames, planes, skip), fronts
+    def beside(self, frames: wp.array, planes: PlaneBlockers, skip: int | None) -> Fronts:
+        """Which part of each plane's front the receivers see, and the receivers lifted off planes they lie in."""
+        extents = None if self.own is None else self.own.extents
+        sides = None if extents is None else extents.sides_of(frames, planes)
+        body = 0 if self.own is None else self.own.number
+        arguments = self.points, self.normals, sides, self.nearest_blockers, frames, planes
+        return find_fronts(*arguments, body=body, skip=skip)
 
     def portions(self) -> Iterator[Group]:
         """Portions of the receivers, with as many instances in all arrays where there are spheres.
@@ -106,7 +146,7 @@ class Group:
         """
         own, planes, clusters = self.own, self.planes, self.clusters
         rotation_data = None if own is None or own.lookup is None else own.lookup.turned
-        body_corners = None if own is None else own.corners
+        positions = None if own is None or own.extents is None else own.extents.positions
         frames = None if planes is None else planes.frames
         parts = self.convex_parts_around or (None if own is None else own.parts)
         part_corners = None if parts is None else parts.placed_parts.corners
@@ -119,14 +159,14 @@ class Group:
                 "rotations": rotation_data,
                 "planes": frames,
             }
-            count = common_batch(arrays | {"corners": body_corners, "parts": part_corners})
+            count = common_batch(arrays | {"positions": positions, "parts": part_corners})
             points, normals, centers, radii = [expand(array, count) for array in arguments]
             clusters = clusters if radii is self.radii and centers is self.centers else None
         size = points.shape[1]
         if (
             self.cached_rows is not None
             or size <= RECEIVERS_AT_ONCE
-            or varies([*arguments, rotation_data, frames, part_corners, body_corners])
+            or varies([*arguments, rotation_data, frames, part_corners, positions])
         ):
             yield replace(self, points=points, normals=normals, centers=centers, radii=radii, clusters=clusters)
             return
@@ -183,6 +223,7 @@ class Blockers(NamedTuple):
     spheres: tuple[wp.array, wp.array]  # centers and radii of all spheres, blocking or not
     frames: wp.array | None  # where bodies are that block as planes, vec3 [batch, 3 · plane]; None without any
     placed_parts: PlacedParts | None  # where convex parts are; None without any
+    extents: BodyExtents | None  # how far out bodies reach; None where there are no planes
 
     def sphere_blockers(self, bodies: Iterable[int]) -> list[int]:
         """Bodies among some that block light by their spheres."""
@@ -273,8 +314,6 @@ def _groups_that_move(
     """Groups of receivers that may move."""
     sphere_bodies = blockers.sphere_blockers(blockers.bodies)
     spheres, none = blockers.spheres_of(sphere_bodies), blockers.spheres_of([])
-    has_planes = blockers.blocker_kinds.planes or (blockers.planes.numbers and blockers.merged_scene.scene.bounces)
-    corners = blockers.planes.corners(blockers.positions) if has_planes and receivers.spans else None
     clusters, nearest_blockers = None, _nearest_blockers(nearest_spheres, blockers)
     if not receivers.spans:
         points_and_normals = receivers.points, receivers.normals
@@ -295,15 +334,14 @@ def _groups_that_move(
             group = replace(group, skip=skip, clusters=clusters)
         if span.body >= 0:
             own = OwnBody(
-                span.body,
-                blockers.self_visibility.probe_weights(receivers, span),
+                span,
+                receivers,
+                blockers.self_visibility,
                 self_lookups.get(span.body),
                 span.body in blockers.blocker_kinds.solids,
                 blockers.own_parts(span.body),
+                blockers.extents,
             )
-            if corners is not None:
-                bounds = blockers.planes.first_corner[span.body : span.body + 2].tolist()
-                own = own._replace(corners=cut(corners, *bounds))
             group = replace(group, own=own)
         if nearest_blockers is not None:
             group = replace(group, nearest_blockers=nearest_blockers.cut(slice(span.first, span.end)))

@@ -141,39 +141,30 @@ def find_mean_transmittance(
 
 
 @wp.kernel
-def _find_shares(
+def _find_weights(
     # in
     mean_transmittance: wp.array2d(dtype=wp.vec3),
     means: wp.array2d(dtype=wp.vec3),
     patch_of_sample: wp.array(dtype=wp.int32),
     # out
     shares: wp.array2d(dtype=wp.vec3),
-):
-    """A thread owns a patch sample of an instance: f, in three channels."""
-    batch, patch_sample = wp.tid()
-    shares[batch, patch_sample] = wp.vec3(
-        mean_transmittance[batch, patch_sample][0] / means[batch, patch_of_sample[patch_sample]][0]
-    )
-
-
-@wp.kernel
-def _find_weights(
-    # in
-    means: wp.array2d(dtype=wp.vec3),
-    # out
     weights: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a patch of an instance: v, in three channels, 0 for a patch without patch samples."""
-    batch, patch = wp.tid()
-    mean = means[batch, patch]
-    weight = float(0.0)
-    if mean[1] > 0.0:
-        ratio = mean[0] / (_BURIED_RATIO * mean[1])
-        square = ratio * ratio
-        fourth = square * square
-        power = fourth * fourth
-        weight = power / (power + 1.0)
-    weights[batch, patch] = wp.vec3(weight)
+    """A thread owns a patch sample of an instance: f; or a patch: v, 0 for one without samples; in three channels."""
+    batch, item = wp.tid()
+    patch = item - shares.shape[1]
+    if patch < 0:
+        shares[batch, item] = wp.vec3(mean_transmittance[batch, item][0] / means[batch, patch_of_sample[item]][0])
+    else:
+        mean = means[batch, patch]
+        weight = float(0.0)
+        if mean[1] > 0.0:
+            ratio = mean[0] / (_BURIED_RATIO * mean[1])
+            square = ratio * ratio
+            fourth = square * square
+            power = fourth * fourth
+            weight = power / (power + 1.0)
+        weights[batch, patch] = wp.vec3(weight)
 
 
 class PatchWeights(NamedTuple):
@@ -198,6 +189,6 @@ def find_patch_weights(mean_transmittance: wp.array, mean: SparseMatrix, patch_o
     means = multiply(mean, mean_transmittance)
     shares = empty(mean_transmittance.shape, dtype=wp.vec3, device=mean_transmittance.device)
     weights = empty(means.shape, dtype=wp.vec3, device=mean_transmittance.device)
-    launch(_find_shares, shares.shape, inputs=[mean_transmittance, means, patch_indices], outputs=[shares])
-    launch(_find_weights, weights.shape, inputs=[means], outputs=[weights])
+    dim, inputs = (len(shares), shares.shape[1] + weights.shape[1]), [mean_transmittance, means, patch_indices]
+    launch(_find_weights, dim, inputs=inputs, outputs=[shares, weights])
     return PatchWeights(shares, weights)

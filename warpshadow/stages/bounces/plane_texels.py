@@ -35,20 +35,30 @@ def _divide(
     texels[batch, texel] = mean_radiosity
 
 
-def find_texels(radiosity: wp.array, patch_weights: wp.array, planes: PlaneBlockers) -> wp.array:
+def sum_weights(patch_weights: wp.array, planes: PlaneBlockers) -> wp.array:
+    """Sum up the weights of the patches of each texel: Σ k v, vec3 of shape [batch, texel]. Differentiable in them."""
+    assert planes.texels_of_patches is not None
+    return multiply(planes.texels_of_patches, patch_weights)
+
+
+def find_texels(
+    radiosity: wp.array, patch_weights: wp.array, planes: PlaneBlockers, weight_sums: wp.array | None = None
+) -> wp.array:
     """Find the radiosity of texels in all mip levels of planes.
 
     Args:
         radiosity: Of the patches of all bodies, vec3 of shape [batch, patch].
         patch_weights: v of each patch, in three equal channels, vec3 of shape [batch, patch]. Either batch may be 1.
         planes: The planes.
+        weight_sums: From :func:`sum_weights`, where they are found already.
     Returns:
         vec3 of shape [batch, texel].
-    Differentiable: radiosity, patch_weights.
+    Differentiable: radiosity, patch_weights, weight_sums.
     """
     assert planes.texels_of_patches is not None
     radiosity_sums = multiply(planes.texels_of_patches, radiosity, column_scales=patch_weights)
-    weight_sums = multiply(planes.texels_of_patches, patch_weights)
+    if weight_sums is None:
+        weight_sums = sum_weights(patch_weights, planes)
     texels = empty(radiosity_sums.shape, dtype=wp.vec3, device=radiosity.device)
     launch(_divide, radiosity_sums.shape, inputs=[radiosity_sums, weight_sums], outputs=[texels])
     return texels

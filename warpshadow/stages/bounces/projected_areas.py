@@ -153,7 +153,9 @@ def _project(
         projected_area = float(0.0)
         for k in range(starts[patch], starts[patch + 1]):
             cosine = wp.max(-wp.dot(normals[normal_batch, patch_samples[k]], directions[direction]), 0.0)
-            opposite_transmittance = transmittance[transmittance_batch, patch_samples[k], opposite[direction]]
+            opposite_transmittance = float(1.0)
+            if transmittance:
+                opposite_transmittance = transmittance[transmittance_batch, patch_samples[k], opposite[direction]]
             projected_area += weights[k] * cosine * (_HIDDEN + (1.0 - _HIDDEN) * opposite_transmittance)
         projected_areas[batch, patch, direction] = projected_area
 
@@ -167,13 +169,14 @@ def _directions_and_opposites(directions: np.ndarray, device: wp.Device) -> tupl
 
 
 def find_projected_areas(
-    normals: wp.array, transmittance: wp.array, mean: SparseMatrix, directions: np.ndarray
+    normals: wp.array, transmittance: wp.array | None, mean: SparseMatrix, directions: np.ndarray
 ) -> wp.array:
     """Projected areas of patches towards cells, for :func:`.proxy_radiance.find_proxy_radiance`.
 
     Args:
         normals: Of the patch samples, n′, vec3 of shape [batch, patch sample], from :func:`tilt_normals_off_planes`.
-        transmittance: T, self-transmittance of each patch sample, float32 of shape [batch, patch sample, direction].
+        transmittance: T, self-transmittance of each patch sample, float32 of shape [batch, patch sample, direction];
+            None for 1.
         mean: The matrix w, [patch, patch sample], from :func:`.radiosity.mean_over_patch_samples`.
         directions: Unit vectors ω of the cells, from a receiver towards the patch, NumPy of shape [direction, 3].
     Returns:
@@ -182,7 +185,8 @@ def find_projected_areas(
     """
     direction_arrays = _directions_and_opposites(directions, normals.device)
     check.shape("normals", normals.shape, ("batch", mean.shape[1]))
-    check.shape("transmittance", transmittance.shape, ("batch", mean.shape[1], len(directions)))
+    if transmittance is not None:
+        check.shape("transmittance", transmittance.shape, ("batch", mean.shape[1], len(directions)))
     batch_count = common_batch({"normals": normals, "transmittance": transmittance})
     device = normals.device
     projected_areas = empty((batch_count, mean.shape[0], len(directions)), dtype=wp.float32, device=device)

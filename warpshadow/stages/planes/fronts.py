@@ -29,10 +29,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneGrid
@@ -80,25 +82,27 @@ def _over_margin_adjoint(height: float, margin: float, adj_result: float):
 def _find_extremes(
     # in
     corners: wp.array2d(dtype=wp.vec3),
+    first_corners: wp.array(dtype=wp.int32),
     frames: wp.array2d(dtype=wp.vec3),
     # out
-    extremes: wp.array2d(dtype=wp.vec2i),
+    extremes: wp.array3d(dtype=wp.vec2i),
 ):
-    """A thread owns an instance and a plane."""
-    batch, plane = wp.tid()
+    """A thread owns an instance, a body and a plane."""
+    batch, body, plane = wp.tid()
     frame_batch = instance_in(batch, frames.shape[0])
     plane_normal = wp.cross(frames[frame_batch, 3 * plane + 1], frames[frame_batch, 3 * plane + 2])
-    lowest_corner, highest_corner = int(0), int(0)
+    first = first_corners[body]
+    lowest_corner, highest_corner = int(first), int(first)
     corner_batch = instance_in(batch, corners.shape[0])
-    first_corner = corners[corner_batch, 0]
+    first_corner = corners[corner_batch, first]
     minimum, maximum = float(0.0), float(0.0)
-    for corner in range(1, corners.shape[1]):
+    for corner in range(first + 1, first_corners[body + 1]):
         height = wp.dot(corners[corner_batch, corner] - first_corner, plane_normal)
         if height < minimum:
             lowest_corner, minimum = corner, height
         if height > maximum:
             highest_corner, maximum = corner, height
-    extremes[batch, plane] = wp.vec2i(lowest_corner, highest_corner)
+    extremes[batch, body, plane] = wp.vec2i(lowest_corner, highest_corner)
 
 
 @wp.kernel
@@ -107,22 +111,66 @@ def _find_body_sides(
     corners: wp.array2d(dtype=wp.vec3),
     frames: wp.array2d(dtype=wp.vec3),
     grids: wp.array(dtype=PlaneGrid),
-    extremes: wp.array2d(dtype=wp.vec2i),
+    extremes: wp.array3d(dtype=wp.vec2i),
     # out
-    body_sides: wp.array2d(dtype=wp.float32),
+    body_sides: wp.array3d(dtype=wp.float32),
 ):
-    """A thread owns an instance and a plane."""
-    batch, plane = wp.tid()
+    """A thread owns an instance, a body and a plane."""
+    batch, body, plane = wp.tid()
     frame_batch = instance_in(batch, frames.shape[0])
     side_of_body = float(0.0)
     if wp.length_sq(frames[frame_batch, 3 * plane + 1]) > 0.0:
         corner_batch = instance_in(batch, corners.shape[0])
-        min_height = _height(corners[corner_batch, extremes[batch, plane][0]], frames, frame_batch, plane)
-        max_height = _height(corners[corner_batch, extremes[batch, plane][1]], frames, frame_batch, plane)
+        min_height = _height(corners[corner_batch, extremes[batch, body, plane][0]], frames, frame_batch, plane)
+        max_height = _height(corners[corner_batch, extremes[batch, body, plane][1]], frames, frame_batch, plane)
         side_of_body = wp.clamp(
             (max_height + min_height) / wp.max(max_height - min_height, grids[plane].margin), -1.0, 1.0
         )
-    body_sides[batch, plane] = side_of_body
+    body_sides[batch, body, plane] = side_of_body
+
+
+def find_body_sides(corners: wp.array, first_corners: np.ndarray, frames: wp.array, planes: PlaneBlockers) -> wp.array:
+    """Find the side b of each plane on which each body lies.
+
+    Args:
+        corners: Vertices of all bodies that are farthest out [scene units], vec3 of shape [batch, corner].
+        first_corners: Where each body's begin, and the end of the last, shape [body + 1].
+        frames, planes: As for :func:`find_fronts`.
+    Returns:
+        Float32 of shape [batch, body, plane], −1 to 1.
+    Differentiable: corners, frames.
+    """
+    check.shape("frames", frames.shape, ("batch", 3 * planes.count))
+    shape = common_batch({"corners": corners, "frames": frames}), len(first_corners) - 1, planes.count
+    extremes = empty(shape, dtype=wp.vec2i, device=corners.device)
+    starts = constant(first_corners, wp.int32, corners.device)
+    launch(_find_extremes, shape, inputs=[corners, starts, frames], outputs=[extremes])
+    body_sides = empty(shape, dtype=wp.float32, device=corners.device)
+    inputs = [corners, frames, planes.grids, extremes]
+    launch(_find_body_sides, shape, inputs=inputs, outputs=[body_sides])
+    return body_sides
+
+
+@wp.func
+def _front_by_sphere(height: float, center_height: float, radius: float):
+    """Front of a patch sample beside a sphere of this height and radius."""
+    front = wp.where(height + center_height > 0.0, 1.0, 0.0)
+    if _FRONT_RADIUS_RATIO * wp.abs(height + center_height) < radius:
+        front = wp.smoothstep(-1.0, 1.0, _FRONT_RADIUS_RATIO * (height + center_height) / radius)
+    return front
+
+
+@wp.func
+def _front_by_height(height: float, margin: float, side_of_body: float, facing_cosine: float):
+    """Front of a receiver."""
+    front = wp.where(height > 0.0, 1.0, 0.0)
+    if wp.abs(height) < 2.0 * margin:
+        front = wp.smoothstep(
+            -1.0,
+            1.0,
+            side_of_body + (1.0 - side_of_body * side_of_body) * facing_cosine + _over_margin(height, margin),
+        )
+    return front
 
 
 @wp.kernel
@@ -130,75 +178,86 @@ def _find_fronts(
     # in
     points: wp.array2d(dtype=wp.vec3),
     normals: wp.array2d(dtype=wp.vec3),
-    body_sides: wp.array2d(dtype=wp.float32),
+    body_sides: wp.array3d(dtype=wp.float32),
+    body: int,
     centers: wp.array2d(dtype=wp.vec3),
     radii: wp.array2d(dtype=wp.float32),
     blocker_indices: wp.array(dtype=wp.int32),
     frames: wp.array2d(dtype=wp.vec3),
     grids: wp.array(dtype=PlaneGrid),
+    skip: int,
     # out
     fronts: wp.array3d(dtype=wp.float32),
+    lifted: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a point of an instance and a plane."""
-    batch, receiver, plane = wp.tid()
+    """A thread owns a point of an instance."""
+    batch, receiver = wp.tid()
     frame_batch = instance_in(batch, frames.shape[0])
-    axis_u = frames[frame_batch, 3 * plane + 1]
-    front = float(0.0)
-    if wp.length_sq(axis_u) > 0.0:
-        height = _height(points[instance_in(batch, points.shape[0]), receiver], frames, frame_batch, plane)
-        blocker_index = int(-1)
-        if blocker_indices:
-            blocker_index = blocker_indices[receiver]
-        radius = float(0.0)
-        if blocker_index >= 0:
-            radius = radii[instance_in(batch, radii.shape[0]), blocker_index] / wp.length(axis_u)
-        if radius > _MIN_BLOCKER_RADIUS:
-            center_height = _height(
-                centers[instance_in(batch, centers.shape[0]), blocker_index], frames, frame_batch, plane
-            )
-            if _FRONT_RADIUS_RATIO * wp.abs(height + center_height) < radius:
-                front = wp.smoothstep(-1.0, 1.0, _FRONT_RADIUS_RATIO * (height + center_height) / radius)
-            else:
-                front = wp.where(height + center_height > 0.0, 1.0, 0.0)
-        elif wp.abs(height) < 2.0 * grids[plane].margin:
-            side_of_body = float(1.0)
-            if body_sides:
-                side_of_body = body_sides[instance_in(batch, body_sides.shape[0]), plane]
+    point = points[instance_in(batch, points.shape[0]), receiver]
+    normal = normals[instance_in(batch, normals.shape[0]), receiver]
+    blocker_index = int(-1)
+    if blocker_indices:
+        blocker_index = blocker_indices[receiver]
+    radius = float(0.0)
+    if blocker_index >= 0:
+        radius = radii[instance_in(batch, radii.shape[0]), blocker_index]
+    offset = wp.vec3()
+    for plane in range(grids.shape[0]):
+        axis_u = frames[frame_batch, 3 * plane + 1]
+        front = float(0.0)
+        if wp.length_sq(axis_u) > 0.0:
+            margin = grids[plane].margin
+            height = _height(point, frames, frame_batch, plane)
             plane_normal = wp.normalize(wp.cross(axis_u, frames[frame_batch, 3 * plane + 2]))
-            facing_cosine = wp.dot(normals[instance_in(batch, normals.shape[0]), receiver], plane_normal)
-            front = wp.smoothstep(
-                -1.0,
-                1.0,
-                side_of_body
-                + (1.0 - side_of_body * side_of_body) * facing_cosine
-                + _over_margin(height, grids[plane].margin),
-            )
-        else:
-            front = wp.where(height > 0.0, 1.0, 0.0)
-    fronts[batch, receiver, plane] = front
+            if radius / wp.length(axis_u) > _MIN_BLOCKER_RADIUS:
+                center = centers[instance_in(batch, centers.shape[0]), blocker_index]
+                center_height = _height(center, frames, frame_batch, plane)
+                front = _front_by_sphere(height, center_height, radius / wp.length(axis_u))
+            else:
+                side_of_body = float(1.0)
+                if body_sides:
+                    side_of_body = body_sides[instance_in(batch, body_sides.shape[0]), body, plane]
+                front = _front_by_height(height, margin, side_of_body, wp.dot(normal, plane_normal))
+            relative_height = height / (2.0 * _LIFT_IN_MARGINS * margin)
+            if plane != skip and wp.abs(relative_height) < 1.0:
+                nearness = 1.0 - relative_height * relative_height
+                lift = (2.0 * front - 1.0) * nearness * nearness * _LIFT_IN_MARGINS * margin
+                offset += lift * wp.length(axis_u) * plane_normal
+        fronts[batch, receiver, plane] = front
+    lifted[batch, receiver] = point + offset
+
+
+class Fronts(NamedTuple):
+    """On which side of planes receivers are."""
+
+    weights: wp.array  # float32 of shape [batch, receiver, plane], 0 to 1: of the front; the back has the rest
+    lifted: wp.array  # the receivers, lifted off the planes in which they lie, vec3 of shape [batch, receiver]
 
 
 def find_fronts(
     points: wp.array,
     normals: wp.array,
-    corners: wp.array | None,
+    body_sides: wp.array | None,
     spheres: NearestBlockers | None,
     frames: wp.array,
     planes: PlaneBlockers,
-) -> wp.array:
-    """Weight of each plane's front for each receiver; its back has the rest, 1 minus that weight.
+    *,
+    body: int = 0,
+    skip: int | None = None,
+) -> Fronts:
+    """Weight of each plane's front for each receiver, and receivers lifted off planes in which they lie.
 
     Args:
         points: The receivers [scene units], vec3 of shape [batch, receiver].
         normals: Their unit normals, vec3 of shape [batch, receiver].
-        corners: Vertices of their body that are farthest out [scene units], vec3 of shape [batch, corner]. None
-            where it is not known: receivers are in front down to the plane itself.
+        body_sides: From :func:`find_body_sides`, float32 of shape [batch, body, plane]. None where it is not known:
+            receivers are in front down to the plane itself.
         spheres: The blockers nearest to patch samples; None where no receiver is one.
         frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`.PlaneBlockers.frames`. Any batch
             may be 1.
-    Returns:
-        Float32 of shape [batch, receiver, plane], 0 to 1.
-    Differentiable: points, normals, corners, centers and radii of spheres, frames.
+        body: Number of the receivers' body.
+        skip: Number of the plane that the receivers are part of, off which none is lifted; None for none.
+    Differentiable: points, normals, body_sides, centers and radii of spheres, frames.
     """
     centers, radii, blocker_indices = (None, None, None) if spheres is None else spheres
     check.shape("normals", normals.shape, ("batch", points.shape[1]))
@@ -206,75 +265,9 @@ def find_fronts(
     if blocker_indices is not None:
         check.shape("blocker_indices", blocker_indices.shape, (points.shape[1],))
     arguments = {"points": points, "normals": normals, "centers": centers, "radii": radii, "frames": frames}
-    count = common_batch({**arguments, "corners": corners})
-    body_sides = None if corners is None else _body_sides(corners, frames, planes)
-    fronts = empty((count, points.shape[1], planes.count), dtype=wp.float32, device=points.device)
-    inputs = [points, normals, body_sides, centers, radii, blocker_indices, frames, planes.grids]
-    launch(_find_fronts, fronts.shape, inputs=inputs, outputs=[fronts])
-    return fronts
-
-
-def _body_sides(corners: wp.array, frames: wp.array, planes: PlaneBlockers) -> wp.array:
-    """Find the side b of each plane on which a body lies, [batch, plane]. Differentiable: corners, frames."""
-    count = common_batch({"corners": corners, "frames": frames})
-    extremes = empty((count, planes.count), dtype=wp.vec2i, device=corners.device)
-    launch(_find_extremes, extremes.shape, inputs=[corners, frames], outputs=[extremes])
-    body_sides = empty((count, planes.count), dtype=wp.float32, device=corners.device)
-    inputs = [corners, frames, planes.grids, extremes]
-    launch(_find_body_sides, body_sides.shape, inputs=inputs, outputs=[body_sides])
-    return body_sides
-
-
-@wp.kernel
-def _lift_points(
-    # in
-    points: wp.array2d(dtype=wp.vec3),
-    fronts: wp.array3d(dtype=wp.float32),
-    frames: wp.array2d(dtype=wp.vec3),
-    grids: wp.array(dtype=PlaneGrid),
-    skip: int,
-    # out
-    lifted: wp.array2d(dtype=wp.vec3),
-):
-    """A thread owns a point of an instance."""
-    batch, receiver = wp.tid()
-    frame_batch = instance_in(batch, frames.shape[0])
-    point = points[instance_in(batch, points.shape[0]), receiver]
-    lifted_point = point
-    for plane in range(grids.shape[0]):
-        axis_u = frames[frame_batch, 3 * plane + 1]
-        if plane != skip and wp.length_sq(axis_u) > 0.0:
-            height = _height(point, frames, frame_batch, plane) / (2.0 * _LIFT_IN_MARGINS * grids[plane].margin)
-            if wp.abs(height) < 1.0:
-                nearness = 1.0 - height * height
-                plane_normal = wp.normalize(wp.cross(axis_u, frames[frame_batch, 3 * plane + 2]))
-                side = 2.0 * fronts[batch, receiver, plane] - 1.0
-                lifted_point += (
-                    side
-                    * nearness
-                    * nearness
-                    * _LIFT_IN_MARGINS
-                    * grids[plane].margin
-                    * wp.length(axis_u)
-                    * plane_normal
-                )
-    lifted[batch, receiver] = lifted_point
-
-
-def lifted_points(
-    points: wp.array, fronts: wp.array, frames: wp.array, planes: PlaneBlockers, skip: int | None
-) -> wp.array:
-    """Lift receivers off the planes in which they lie.
-
-    Args:
-        points, frames, planes: As for :func:`find_fronts`.
-        fronts: Found by it.
-        skip: Number of the plane that the receivers are part of; None for none.
-    Returns:
-        Points, vec3 of shape [batch, receiver].
-    Differentiable: points, fronts, frames.
-    """
-    lifted = empty(fronts.shape[:2], dtype=wp.vec3, device=points.device)
-    inputs = [points, fronts, frames, planes.grids, -1 if skip is None else skip]
-    launch(_lift_points, lifted.shape, inputs=inputs, outputs=[lifted])
-    return lifted
+    shape = common_batch({**arguments, "body_sides": body_sides}), points.shape[1]
+    weights = empty((*shape, planes.count), dtype=wp.float32, device=points.device)
+    lifted = empty(shape, dtype=wp.vec3, device=points.device)
+    inputs = [points, normals, body_sides, body, centers, radii, blocker_indices, frames, planes.grids]
+    launch(_find_fronts, shape, inputs=[*inputs, -1 if skip is None else skip], outputs=[weights, lifted])
+    return Fronts(weights, lifted)

@@ -46,10 +46,6 @@ class ProbeWeights(NamedTuple):
     rows: wp.array  # [batch, receiver] vec3i, probes and then their backs; a vertex has one thrice
     weights: wp.array  # [batch, receiver] vec3 with sum 1
 
-    def cut(self, receivers: slice) -> "ProbeWeights":
-        """Select the weights of some receivers, without a gradient."""
-        return ProbeWeights(self.rows[:, receivers].contiguous(), self.weights[:, receivers].contiguous())
-
 
 class VisibilityProbes(NamedTuple):
     """The probes of a body in its own space.

@@ -45,17 +45,22 @@ def find_node(cluster: int, item: int, sphere_count: int, node_count: int):
 
 
 @wp.kernel(enable_backward=False)
-def _bound_runs(
+def _bound_clusters(
     # in
     centers: wp.array2d(dtype=wp.vec3),
     radii: wp.array2d(dtype=wp.float32),
     sphere_count: int,
-    cluster_count: int,
     # out
-    bounds: wp.array2d(dtype=wp.vec4),
+    cluster_bounds: wp.array2d(dtype=wp.vec4),
+    run_bounds: wp.array2d(dtype=wp.vec4),
 ):
-    """A thread owns a run of clusters: center and radius of a sphere around all of theirs, negative for none."""
-    batch, run = wp.tid()
+    """A thread owns a cluster, or a run: center and radius of a sphere around its spheres, below 0 for none."""
+    batch, thread = wp.tid()
+    cluster_count = int(1)
+    run = thread
+    if thread >= cluster_bounds.shape[1]:
+        cluster_count = CLUSTERS_PER_RUN
+        run = thread - cluster_bounds.shape[1]
     lower = wp.vec3(wp.inf)
     upper = wp.vec3(-wp.inf)
     for k in range(cluster_count * NODES_PER_CLUSTER):
@@ -76,7 +81,11 @@ def _bound_runs(
             radius_of_bound = wp.max(radius_of_bound, wp.length(centers[batch, node] - center) + radii[batch, node])
     if radius_of_bound < 0.0:
         center = wp.vec3(0.0)
-    bounds[batch, run] = wp.vec4(center[0], center[1], center[2], radius_of_bound)
+    bound = wp.vec4(center[0], center[1], center[2], radius_of_bound)
+    if thread < cluster_bounds.shape[1]:
+        cluster_bounds[batch, run] = bound
+    else:
+        run_bounds[batch, run] = bound
 
 
 class ClusterTree(NamedTuple):
@@ -95,8 +104,12 @@ def find_clusters(centers: wp.array, radii: wp.array, merging: float) -> Cluster
         merging: τ, 0 for never.
     Differentiable: centers, radii to the nodes.
     """
-    nodes, count = merge_if_many(centers, radii, merging), radii.shape[1]
-    return ClusterTree(nodes, _find_bounds(nodes, count, 1), _find_bounds(nodes, count, CLUSTERS_PER_RUN))
+    nodes, (batch_count, sphere_count), device = merge_if_many(centers, radii, merging), radii.shape, radii.device
+    counts = [-(-sphere_count // (CLUSTER_SIZE * clusters)) for clusters in (1, CLUSTERS_PER_RUN)]
+    bounds = [empty((batch_count, count), dtype=wp.vec4, device=device) for count in counts]
+    inputs = [nodes.centers, nodes.radii, sphere_count]
+    launch(_bound_clusters, (batch_count, sum(counts)), inputs=inputs, outputs=bounds)
+    return ClusterTree(nodes, *bounds)
 
 
 @wp.struct
@@ -154,14 +167,6 @@ def prepare_traversal(
     inputs = TraversalInputs()
     inputs.points, inputs.normals, inputs.spheres = points, normals, spheres
     return SphereTraversal(inputs, nodes, lanes, points.shape[0] * block_count(points.shape[1], lanes))
-
-
-def _find_bounds(nodes: ClusterNodes, sphere_count: int, cluster_count: int) -> wp.array:
-    """Spheres around runs of clusters, vec4 of shape [batch, run]."""
-    shape = nodes.radii.shape[0], -(-sphere_count // (CLUSTER_SIZE * cluster_count))
-    bounds = empty(shape, dtype=wp.vec4, device=nodes.radii.device)
-    launch(_bound_runs, shape, inputs=[nodes.centers, nodes.radii, sphere_count, cluster_count], outputs=[bounds])
-    return bounds
 
 
 @functools.cache
