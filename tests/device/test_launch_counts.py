@@ -20,7 +20,7 @@ MOST = {
     "image with two bounces": (85, 11),
     "pose iteration with two bounces": (152, 13),
 }
-MOST_OF_A_BOX = 38  # kernels that a box more takes where light bounces twice, for its receivers and its patch samples
+MOST_OF_A_BOX = 39  # kernels that a box more takes where light bounces twice, for its receivers and its patch samples
 
 
 @pytest.fixture(scope="module")
