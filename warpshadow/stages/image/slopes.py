@@ -55,7 +55,7 @@ from warpshadow.stages.silhouettes.lines import (
 
 MIN_DISTANCE = 0.02  # distance of an edge [samples] below which rounding outweighs how color changes on the way to it
 
-_COST = 20.0  # nanoseconds that a sample takes
+_COST, _MEAN_SLOPE_COST = 20.0, 4.0  # nanoseconds that a sample takes, and one that is far from silhouettes
 
 
 @wp.func
@@ -99,8 +99,20 @@ def _distance_to_end(
     return wp.where(fragments.face_ids[neighbor(sample, k, fragments.width)] >= 0, -1.0, -2.0)
 
 
+@wp.func
+def _is_near_silhouette(fragments: FragmentArrays, entries: wp.array(dtype=wp.int32), sample: int):
+    """Whether a sample or a neighbor has an entry among the silhouettes."""
+    width = fragments.width
+    last = entries.shape[0] - 1
+    beside = wp.max(entries[wp.max(sample - 1, 0)], entries[wp.min(sample + 1, last)])
+    above_or_below = wp.max(entries[wp.max(sample - width, 0)], entries[wp.min(sample + width, last)])
+    return wp.max(entries[sample], wp.max(beside, above_or_below)) >= 0
+
+
 @wp.kernel(enable_backward=False)
 def _find_mean_slopes(
+    first_row: int,
+    worker: int,
     # in
     fragments: FragmentArrays,
     entries: wp.array(dtype=wp.int32),
@@ -111,11 +123,11 @@ def _find_mean_slopes(
     has_mean_slope: wp.array(dtype=wp.bool),
 ):
     """A thread owns a sample: whether its surface ends beside it, or beside a neighbor, and both slopes are known."""
-    sample = wp.tid()
+    sample = first_row + wp.tid()
     side = sides[sample]
     is_at_outline = bool(False)
-    has_slopes = side >= 0
-    if keys and side >= 0:
+    has_slopes = side >= 0 and _is_near_silhouette(fragments, entries, sample)  # nearly all samples end here
+    if keys and has_slopes:
         has_slopes = keys[side] < 0
     if has_slopes:
         for axis in range(2):
@@ -151,7 +163,9 @@ def find_mean_slopes(silhouettes: Silhouettes, clip_positions: wp.array, quadtre
     arrays = make_fragment_arrays(fragments, silhouettes.faces, clip_positions)
     keys = None if quadtree is None else quadtree.square_key_of_side
     inputs = [arrays, silhouettes.entries, silhouettes.edges, reshaped(sides, (-1,)), keys]
-    launch(_find_mean_slopes, sides.size, inputs=inputs, outputs=[reshaped(has_mean_slope, (-1,))])
+    launch(
+        _find_mean_slopes, sides.size, inputs=inputs, outputs=[reshaped(has_mean_slope, (-1,))], cost=_MEAN_SLOPE_COST
+    )
     return has_mean_slope
 
 
