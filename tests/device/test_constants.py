@@ -6,7 +6,7 @@ import pytest
 from warpshadow.device.constants import cached_by_values, immutable, values_of_owners
 
 
-def arrays_are_compared_by_values_and_immutable_ones_by_identity():
+def test_arrays_are_compared_by_values_and_immutable_ones_by_identity():
     calls = []
 
     @cached_by_values
@@ -25,7 +25,7 @@ def arrays_are_compared_by_values_and_immutable_ones_by_identity():
         first[0] = 10.0
 
 
-def values_of_owners_are_made_once_for_equal_values():
+def test_values_of_owners_are_made_once_for_equal_values():
     owners = immutable(np.array([0, 0, 2, 1]))
     values = values_of_owners(np.array([5, 6, 7]), owners)
     assert values.tolist() == [5, 5, 7, 6] and values_of_owners(np.array([5, 6, 7]), owners) is values
