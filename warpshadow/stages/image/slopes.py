@@ -19,6 +19,7 @@ match the colors at the edges: gradients of a mirroring ball are half of the dif
 the samples along an outline, and of their neighbors, the colors of edges cancel.
 """
 
+import math
 from dataclasses import replace
 
 import warp as wp
@@ -304,7 +305,7 @@ def moving_radiance(
         run = run_length(samples.device, samples.shape[2])
         launch(
             _add_shading_gradients,
-            light[0].size // run,
+            math.prod(light.shape[1:]) // run,
             cost=_COST * run * samples.shape[0],
             inputs=[
                 rows(samples),
