@@ -105,9 +105,9 @@ def _is_near_silhouette(fragments: FragmentArrays, entries: wp.array(dtype=wp.in
     """Whether a sample or a neighbor has an entry among the silhouettes."""
     width = fragments.width
     last = entries.shape[0] - 1
-    beside = wp.max(entries[wp.max(sample - 1, 0)], entries[wp.min(sample + 1, last)])
-    above_or_below = wp.max(entries[wp.max(sample - width, 0)], entries[wp.min(sample + width, last)])
-    return wp.max(entries[sample], wp.max(beside, above_or_below)) >= 0
+    entry_in_row = wp.max(entries[wp.max(sample - 1, 0)], entries[wp.min(sample + 1, last)])
+    entry_in_column = wp.max(entries[wp.max(sample - width, 0)], entries[wp.min(sample + width, last)])
+    return wp.max(entries[sample], wp.max(entry_in_row, entry_in_column)) >= 0
 
 
 @wp.kernel(enable_backward=False)
