@@ -5,6 +5,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from warpshadow.device.cuda_graph import is_readable
@@ -75,13 +76,15 @@ def concatenate(parts: Sequence[wp.array], counts: Sequence[int], *, instances: 
 
     def copy(joined: wp.array) -> None:
         """By NumPy, ten times as fast as the kernel."""
+        joined_values = np.asarray(joined)  # which takes half the time of numpy()
         for part, (first, end) in zip(parts, places, strict=True):
-            joined.numpy()[:, first:end] = part.numpy()
+            joined_values[:, first:end] = np.asarray(part)
 
     def add(adj_joined: wp.array) -> None:
+        adj_values = np.asarray(adj_joined)
         for part, (first, end) in zip(parts, places, strict=True):
             if part.requires_grad:
-                gradient, values = part.grad.numpy(), adj_joined.numpy()[:, first:end]
+                gradient, values = np.asarray(part.grad), adj_values[:, first:end]
                 summed_axes = tuple(axis for axis in range(2) if gradient.shape[axis] < values.shape[axis])
                 gradient += values.sum(axis=summed_axes, keepdims=True) if summed_axes else values
 
@@ -143,7 +146,8 @@ def _make_add(dtype: type) -> wp.Kernel:
 def accumulate(values: wp.array, totals: wp.array) -> None:
     """Add values [item] or [batch, item] to totals, off the tape; on a CPU NumPy does, twice as fast as a kernel."""
     if is_readable(totals.device):
-        totals.numpy()[...] += values.numpy()
+        sums = np.asarray(totals)
+        sums += np.asarray(values)
         return
     if totals.ndim == 1:
         values, totals = values.reshape((1, -1)), totals.reshape((1, -1))

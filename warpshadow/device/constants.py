@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import weakref
 from collections.abc import Callable, Hashable, Iterator
 from typing import Any, ParamSpec, TypeVar
 
@@ -14,6 +15,8 @@ R = TypeVar("R")
 _MAX_RESULTS = 256  # results of a function that are cached; the oldest go first
 
 _collections: dict[int, list[Any]] = {}  # by their identity
+
+_immutable: "weakref.WeakValueDictionary[int, np.ndarray]" = weakref.WeakValueDictionary()  # likewise
 
 
 @contextlib.contextmanager
@@ -55,8 +58,32 @@ def cached_by_values(function: Callable[P, R]) -> Callable[P, R]:
     return cached
 
 
+def immutable(values: np.ndarray) -> np.ndarray:
+    """Make a long array that is used again read-only, for good: caches then compare its identity, not its values."""
+    values.flags.writeable = False
+    _immutable[id(values)] = values
+    return values
+
+
+class _Identity:
+    """A key that equals those of the same object only, which it holds."""
+
+    __slots__ = ("_value",)
+
+    def __init__(self, value: object):
+        self._value = value
+
+    def __hash__(self) -> int:
+        return id(self._value)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Identity) and self._value is other._value
+
+
 def _key(value: Any) -> Hashable:
     if isinstance(value, np.ndarray):
+        if _immutable.get(id(value)) is value:
+            return _Identity(value)
         return value.tobytes(), value.dtype.str, value.shape
     return str(value) if isinstance(value, wp.Device) else value
 
@@ -65,6 +92,12 @@ def use(*values: Any) -> None:
     """Note that constants or cached values are used: arrays, or objects that hold some."""
     for collection in list(_collections.values()):
         collection.extend(values)
+
+
+@cached_by_values
+def values_of_owners(values: np.ndarray, owners: np.ndarray) -> np.ndarray:
+    """The value of each item's owner, as of a face's body, given one for each owner; made once, and immutable."""
+    return immutable(values[owners])
 
 
 @cached_by_values

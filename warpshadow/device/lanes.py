@@ -62,7 +62,8 @@ def _diagnostics() -> dict[str, Any]:
     """Warp's report about the machine; empty where it fails."""
     try:
         with contextlib.redirect_stdout(None):
-            return wp.print_diagnostics()
+            report = wp.print_diagnostics()
+            return report | {"cpu_features": frozenset(report.get("cpu_features", ()))}
     except Exception:  # nothing but speed depends on it
         return {}
 
@@ -74,7 +75,7 @@ def cpu_name() -> str:
 
 def _cpu_features() -> frozenset[str]:
     """CPU features that LLVM detects, by its names; empty where Warp does not tell."""
-    return frozenset(_diagnostics().get("cpu_features", ()))
+    return _diagnostics().get("cpu_features", frozenset())
 
 
 def _own_flags() -> str:

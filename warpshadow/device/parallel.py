@@ -22,6 +22,7 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import warp as wp
 
 from warpshadow.device import warp_internals
@@ -229,11 +230,13 @@ def _launch_slices(
     }
     kernel.module.load(device, 1)  # compiled here, not by each thread
     for argument_index, parts in slice_sums.items():
+        view = warp_internals.contiguous_view(parts, parts.shape[1:], parts.dtype)
+        first_part = parts[0] if view is None else view
         if gradients is None:
-            arguments[argument_index] = parts[0]
+            arguments[argument_index] = first_part
         else:
-            arguments[argument_index] = _with_gradient(arguments[argument_index], parts[0])
-            gradients[argument_index] = parts[0]
+            arguments[argument_index] = _with_gradient(arguments[argument_index], first_part)
+            gradients[argument_index] = first_part
     launch = warp_internals.bound_kernel(kernel, arguments, device, gradients=gradients)
     starts = [dim[0] * k // slice_count for k in range(slice_count + 1)]
 
@@ -243,10 +246,11 @@ def _launch_slices(
 
     _share(run, slice_count, workers)
     for argument_index, parts in slice_sums.items():
-        total, *others = parts.numpy()
+        total, *others = np.asarray(parts)
         for other in others:
             total += other
-        summed_arguments[argument_index].numpy()[...] += total
+        sums = np.asarray(summed_arguments[argument_index])
+        sums += total
 
 
 def _with_gradient(array: wp.array, gradient: wp.array) -> wp.array:

@@ -8,10 +8,12 @@ import contextlib
 import ctypes
 import functools
 import inspect
+import itertools
 import os
+import struct
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -73,64 +75,98 @@ BLOCK_DIM = 64
 
 _MAX_STRIDE = 2**31 - 1  # bytes from one item of an axis to the next
 
-_NO_ARRAY = _types.array_t()  # the descriptor of an argument None
+_SCALAR_CODES = {
+    wp.bool: "?",
+    wp.int32: "i",
+    wp.uint32: "I",
+    wp.int64: "q",
+    wp.uint64: "Q",
+    wp.float32: "f",
+    wp.float64: "d",
+}
+"""Letters of the module ``struct``."""
+
+
+class _Argument(NamedTuple):
+    """An argument of a CPU kernel, as it lies in the struct that the kernel gets."""
+
+    pack: Callable[[Any], Any] | None  # a value's bytes, up to the next argument; None of an array
+    dtype: Any  # of an array
+    ndim: int
+    zeros: bytes
+
+
+class _CpuSignature(NamedTuple):
+    """Calling convention of a CPU kernel."""
+
+    arguments: list[_Argument]
+    gradients: list[_Argument]
+    loaded_hooks: dict[str, Any]  # the loaded module with its entry points, as soon as one is
 
 
 @functools.cache
-def _cpu_signature(kernel: wp.Kernel) -> tuple[Any, Any, list[Any], dict] | None:
-    """Calling convention of a CPU kernel.
-
-    Returns:
-        Structs of the arguments and of their gradients; dtype and dimensions of each array, None of a struct, and ()
-        of other values; and the loaded module with its entry points, as soon as one is. None for a kernel that Warp
-        itself has to launch.
-    """
+def _cpu_signature(kernel: wp.Kernel) -> _CpuSignature | None:
+    """Calling convention of a CPU kernel; None for a kernel that Warp itself has to launch."""
     if kernel.is_generic or not kernel.uses_warp_entry_point_abi:
         return None
+    kinds = [argument.type for argument in kernel.adj.args]
     fields: list[tuple[str, Any]] = []
-    argument_types: list[Any] = []
-    for number, argument in enumerate(kernel.adj.args):
-        kind = argument.type
+    for number, kind in enumerate(kinds):
         if _types.is_array(kind):
             if type(kind) is not wp.array:
                 return None
             field = _types.array_t
-            argument_types.append((kind.dtype, kind.ndim))
         elif isinstance(kind, wp._src.codegen.Struct):
             field = kind.ctype
-            argument_types.append(None)
         elif isinstance(kind, type) and issubclass(kind, ctypes.Array):
             field = kind
-            argument_types.append(())
-        elif kind in (wp.bool, wp.int32, wp.uint32, wp.int64, wp.uint64, wp.float32, wp.float64):
+        elif kind in _SCALAR_CODES:
             field = kind._type_
-            argument_types.append(())
         else:
             return None
         fields.append((f"argument_{number}", field))
-    arguments, gradients = (type(name, (ctypes.Structure,), {"_fields_": fields}) for name in ("Values", "Gradients"))
-    return arguments, gradients, argument_types, {}
+    layout = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
+    starts = [getattr(layout, name).offset for name, _ in fields]
+    sizes = [end - start for start, end in itertools.pairwise([*starts, ctypes.sizeof(layout)])]
+    arguments = [_argument(kind, *of) for kind, *of in zip(kinds, (field for _, field in fields), sizes, strict=True)]
+    return _CpuSignature(arguments, [item._replace(pack=_or_zeros(item)) for item in arguments], {})
 
 
-def _packed(argument_types: Sequence[Any], values: Sequence[Any]) -> list[Any]:
-    """Values as fields of a struct of arguments.
+def _argument(kind: Any, field: Any, size: int) -> _Argument:
+    """An argument of a type of Warp's, by the type and number of bytes that it has in the struct."""
+    zeros, padding = bytes(size), bytes(size - ctypes.sizeof(field))
+    if _types.is_array(kind):
+        return _Argument(None, kind.dtype, kind.ndim, zeros)
+    if kind in _SCALAR_CODES:
+        return _Argument(struct.Struct(f"{_SCALAR_CODES[kind]}{len(padding)}x").pack, None, 0, zeros)
+    if isinstance(kind, wp._src.codegen.Struct):
+        return _Argument(lambda value: bytes(value.__ctype__()) + padding, None, 0, zeros)
+    return _Argument(lambda value: bytes(value if type(value) is field else field(*value)) + padding, None, 0, zeros)
+
+
+def _or_zeros(argument: _Argument) -> Callable[[Any], Any] | None:
+    """The function that packs the gradient of an argument, which may have none."""
+    pack, zeros = argument.pack, argument.zeros
+    return None if pack is None else lambda value: zeros if value is None else pack(value)
+
+
+def _packed(arguments: Sequence[_Argument], values: Sequence[Any]) -> list[Any]:
+    """Parts of the struct of a kernel's arguments, one for each.
 
     Raises:
         TypeError: for an array that is not of the dtype and dimensions.
     """
-    fields = []
-    for kind, value in zip(argument_types, values, strict=True):
-        if kind is None:
-            fields.append(value.__ctype__())
-        elif not kind:
-            fields.append(value)
+    parts = []
+    for (pack, dtype, ndim, zeros), value in zip(arguments, values, strict=True):
+        if pack is not None:
+            parts.append(pack(value))
         elif value is None:
-            fields.append(_NO_ARRAY)
-        elif type(value) is wp.array and value.dtype is kind[0] and value.ndim == kind[1]:
-            fields.append(value.ctype or value.__ctype__())
+            parts.append(zeros)
+        elif type(value) is wp.array and value.dtype is dtype and value.ndim == ndim:
+            parts.append(value.ctype or value.__ctype__())
         else:
             raise TypeError
-    return fields
+    return parts
 
 
 @functools.lru_cache(maxsize=4096)
@@ -167,28 +203,26 @@ def bound_kernel(
     """
     signature = _cpu_signature(kernel) if device.is_cpu else None
     is_plain = wp._src.context.runtime._apic_capture is None and not wp.config.print_launches
-    if signature is not None and is_plain and (fields := _fields(signature, arguments, gradients)) is not None:
-        (values, *others), (_, _, _, loaded_hooks), names = fields, signature, signature[0]._fields_
+    if signature is not None and is_plain and (structs := _structs(signature, arguments, gradients)) is not None:
+        fields, _, loaded_hooks = signature
 
         def run_plainly(
             dim: Sequence[int], *first: Any, offsets: Mapping[int, int] = {}, holds: Any = (arguments, gradients)
         ) -> None:
-            copied_values, adjoints = values, others
+            values, *others = structs
             if first:
-                copied_values = type(values).from_buffer_copy(values)
-                for (name, _), value in zip(names, first, strict=False):
-                    setattr(copied_values, name, value)
+                values = [*_packed(fields[: len(first)], first), *values[len(first) :]]
             if offsets:
-                adjoints = [type(other).from_buffer_copy(other) for other in others]
+                values, others = list(values), [list(other) for other in others]
                 for argument_index, offset in offsets.items():
-                    name = names[argument_index][0]
-                    if adjoints:
-                        getattr(copied_values, name).grad += offset
-                    getattr(adjoints[0] if adjoints else copied_values, name).data += offset
+                    if others:
+                        values[argument_index] = _moved_part(values[argument_index], gradient=offset)
+                    moved = others[0] if others else values
+                    moved[argument_index] = _moved_part(moved[argument_index], data=offset)
             if 0 not in dim:
                 hooks, bounds = _cpu_hooks(kernel, loaded_hooks, device), _cpu_bounds(tuple(dim), kernel.adj.kernel_dim)
-                structs = map(ctypes.byref, (copied_values, *adjoints))
-                (hooks.backward if adjoints else hooks.forward)(bounds, *structs)
+                hook = hooks.backward if others else hooks.forward
+                hook(bounds, b"".join(values), *map(b"".join, others))
 
         return run_plainly
 
@@ -214,20 +248,27 @@ def _moved(array: wp.array, offset: int, gradient: wp.array | None = None) -> wp
     return wp.array(ptr=array.ptr + offset, dtype=array.dtype, shape=array.shape, device=array.device, grad=gradient)
 
 
-def _fields(signature: tuple, arguments: Sequence[Any], gradients: Sequence[Any] | None) -> list[Any] | None:
-    """Structs of arguments, and of their gradients if there are any; None where they are not as the kernel's are."""
-    arguments_type, gradients_type, argument_types, _ = signature
-    if len(arguments) != len(argument_types):
+def _moved_part(part: Any, *, data: int = 0, gradient: int = 0) -> Any:
+    """The descriptor of an array that begins some bytes after another, as does its gradient."""
+    moved = _types.array_t.from_buffer_copy(part)
+    moved.data += data
+    moved.grad += gradient
+    return moved
+
+
+def _structs(
+    signature: _CpuSignature, arguments: Sequence[Any], gradients: Sequence[Any] | None
+) -> list[list[Any]] | None:
+    """Parts of the structs of arguments, and of gradients if there are any; None where they are not the kernel's."""
+    if len(arguments) != len(signature.arguments):
         return None
     try:
-        fields = [arguments_type(*_packed(argument_types, arguments))]
+        structs = [_packed(signature.arguments, arguments)]
         if gradients is not None:
-            pairs = zip(argument_types, gradients_type._fields_, gradients, strict=True)
-            values = [field() if not kind and value is None else value for kind, (_, field), value in pairs]
-            fields.append(gradients_type(*_packed(argument_types, values)))
-    except (TypeError, AttributeError):
+            structs.append(_packed(signature.gradients, gradients))
+    except (TypeError, AttributeError, struct.error):
         return None
-    return fields
+    return structs
 
 
 @functools.lru_cache(maxsize=4096)

@@ -11,7 +11,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import concatenate
-from warpshadow.device.constants import constant
+from warpshadow.device.constants import constant, immutable
 from warpshadow.device.memory import empty
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.maths.spatial_sort import z_order
@@ -72,17 +72,18 @@ class MergedScene:
     def vertex_order(self) -> np.ndarray:
         """Order in which neighboring vertices of a body follow each other, shape [vertex]."""
         orders = [z_order(body.mesh.positions.astype(np.float64)) for body in self.scene.bodies]
-        return np.concatenate([first + order for first, order in zip(self.first_vertex[:-1], orders, strict=True)])
+        starts = zip(self.first_vertex[:-1], orders, strict=True)
+        return immutable(np.concatenate([first + order for first, order in starts]))
 
     @functools.cached_property
     def body_of_face(self) -> np.ndarray:
         """Body that each face belongs to, shape [face]."""
-        return np.repeat(np.arange(len(self.scene.bodies)), np.diff(self.first_face))
+        return immutable(np.repeat(np.arange(len(self.scene.bodies)), np.diff(self.first_face)))
 
     @functools.cached_property
     def body_of_vertex(self) -> np.ndarray:
         """Body that each vertex belongs to, shape [vertex]."""
-        return np.repeat(np.arange(len(self.scene.bodies)), np.diff(self.first_vertex))
+        return immutable(np.repeat(np.arange(len(self.scene.bodies)), np.diff(self.first_vertex)))
 
     @functools.cached_property
     def face_bodies(self) -> wp.array | None:

@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
+from warpshadow.device.constants import immutable
 from warpshadow.device.launch import without_gradient
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.receivers.groups import Blockers, Group
@@ -69,7 +70,7 @@ def _find_keys_of_sides(is_adaptive: bytes, first_face: bytes) -> tuple[np.ndarr
     adaptive, starts = np.frombuffer(is_adaptive, bool), np.frombuffer(first_face, int)
     bodies = np.repeat(np.where(adaptive, np.arange(len(adaptive), dtype=np.int32), -1), np.diff(starts))
     keys = np.concatenate([bodies, np.where(bodies < 0, -1, len(adaptive) + bodies)])
-    return keys.astype(np.int32), np.concatenate([bodies, bodies, [-1]])
+    return immutable(keys.astype(np.int32)), np.concatenate([bodies, bodies, [-1]])
 
 
 @functools.lru_cache(maxsize=16)

@@ -321,7 +321,8 @@ def _groups_that_move(
     for span in receivers.spans:
         points_and_normals = receivers.points, receivers.normals
         assert receivers.vertices is not None
-        if span.first < receivers.vertices.size and len(blockers.positions) == 1:  # all cameras see the same vertices
+        is_at_vertices = span.first < receivers.vertices.size
+        if is_at_vertices and len(blockers.positions) == 1 < len(receivers.points):  # all cameras see the same vertices
             points_and_normals = receivers.points[:1], receivers.normals[:1]
         is_traced = span.body in blockers.blocker_kinds.self_traced
         skip = blockers.merged_scene.spheres_among(sphere_bodies, span.body) if is_traced else (0, 0)

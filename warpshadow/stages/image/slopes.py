@@ -19,6 +19,7 @@ match the colors at the edges: gradients of a mirroring ball are half of the dif
 the samples along an outline, and of their neighbors, the colors of edges cancel.
 """
 
+import math
 from dataclasses import replace
 
 import warp as wp
@@ -55,7 +56,7 @@ from warpshadow.stages.silhouettes.lines import (
 
 MIN_DISTANCE = 0.02  # distance of an edge [samples] below which rounding outweighs how color changes on the way to it
 
-_COST = 20.0  # nanoseconds that a sample takes
+_COST, _MEAN_SLOPE_COST = 20.0, 4.0  # nanoseconds that a sample takes, and one that is far from silhouettes
 
 
 @wp.func
@@ -99,8 +100,20 @@ def _distance_to_end(
     return wp.where(fragments.face_ids[neighbor(sample, k, fragments.width)] >= 0, -1.0, -2.0)
 
 
+@wp.func
+def _is_near_silhouette(fragments: FragmentArrays, entries: wp.array(dtype=wp.int32), sample: int):
+    """Whether a sample or a neighbor has an entry among the silhouettes."""
+    width = fragments.width
+    last = entries.shape[0] - 1
+    entry_in_row = wp.max(entries[wp.max(sample - 1, 0)], entries[wp.min(sample + 1, last)])
+    entry_in_column = wp.max(entries[wp.max(sample - width, 0)], entries[wp.min(sample + width, last)])
+    return wp.max(entries[sample], wp.max(entry_in_row, entry_in_column)) >= 0
+
+
 @wp.kernel(enable_backward=False)
 def _find_mean_slopes(
+    first_row: int,
+    worker: int,
     # in
     fragments: FragmentArrays,
     entries: wp.array(dtype=wp.int32),
@@ -111,11 +124,11 @@ def _find_mean_slopes(
     has_mean_slope: wp.array(dtype=wp.bool),
 ):
     """A thread owns a sample: whether its surface ends beside it, or beside a neighbor, and both slopes are known."""
-    sample = wp.tid()
+    sample = first_row + wp.tid()
     side = sides[sample]
     is_at_outline = bool(False)
-    has_slopes = side >= 0
-    if keys and side >= 0:
+    has_slopes = side >= 0 and _is_near_silhouette(fragments, entries, sample)  # nearly all samples end here
+    if keys and has_slopes:
         has_slopes = keys[side] < 0
     if has_slopes:
         for axis in range(2):
@@ -151,7 +164,9 @@ def find_mean_slopes(silhouettes: Silhouettes, clip_positions: wp.array, quadtre
     arrays = make_fragment_arrays(fragments, silhouettes.faces, clip_positions)
     keys = None if quadtree is None else quadtree.square_key_of_side
     inputs = [arrays, silhouettes.entries, silhouettes.edges, reshaped(sides, (-1,)), keys]
-    launch(_find_mean_slopes, sides.size, inputs=inputs, outputs=[reshaped(has_mean_slope, (-1,))])
+    launch(
+        _find_mean_slopes, sides.size, inputs=inputs, outputs=[reshaped(has_mean_slope, (-1,))], cost=_MEAN_SLOPE_COST
+    )
     return has_mean_slope
 
 
@@ -290,7 +305,7 @@ def moving_radiance(
         run = run_length(samples.device, samples.shape[2])
         launch(
             _add_shading_gradients,
-            light[0].size // run,
+            math.prod(light.shape[1:]) // run,
             cost=_COST * run * samples.shape[0],
             inputs=[
                 rows(samples),

@@ -1,5 +1,7 @@
 """Barycentrics: where on its face the center of each sample lies, and how that changes with the vertices."""
 
+import math
+
 import warp as wp
 
 from warpshadow import check
@@ -117,7 +119,7 @@ def find_barycentrics(face_ids: wp.array, faces: wp.array, clip_positions: wp.ar
     check.shape("clip_positions", clip_positions.shape, (face_ids.shape[0], "vertex"))
     device, width = clip_positions.device, face_ids.shape[2]
     run = run_length(device, width)
-    barycentrics = empty((len(face_ids), face_ids[0].size), dtype=wp.vec3, device=device)
+    barycentrics = empty((len(face_ids), math.prod(face_ids.shape[1:])), dtype=wp.vec3, device=device)
     launch(
         _find_barycentrics,
         face_ids.size // run,

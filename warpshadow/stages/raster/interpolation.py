@@ -5,6 +5,7 @@ corner the part w of the point's gradient ā, and each barycentric ā · a of it
 """
 
 import functools
+import math
 from typing import Any
 
 import warp as wp
@@ -109,10 +110,11 @@ def interpolate(fragments: Fragments, faces: wp.array, attributes: wp.array) -> 
         raise ValueError(f"attributes: got dtype {attributes.dtype.__name__}, expected float32 or a vector of them")
     device, width = face_ids.device, face_ids.shape[2]
     run = run_length(device, width)
-    image = empty((batch_count, face_ids[0].size), dtype=attributes.dtype, device=device)
+    sample_count = math.prod(face_ids.shape[1:])
+    image = empty((batch_count, sample_count), dtype=attributes.dtype, device=device)
     launch(
         _make_interpolate(attributes.dtype),
-        run_dimensions(device, face_ids[0].size // run, batch_count),
+        run_dimensions(device, sample_count // run, batch_count),
         cost=_COST * run,
         inputs=[*fragments.rows, faces, attributes, run],
         outputs=[image],

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import common_batch, instance_in
-from warpshadow.device.constants import constant
+from warpshadow.device.constants import cached_by_values, constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, from_numpy, reshaped, zeros
 from warpshadow.device.parallel import run_length
@@ -188,23 +188,34 @@ def number_receivers(
     if side_count == 1 and keeps_vertex.all() and is_static is None and sequence is None and bodies is None:
         receiver_of_vertex = constant(np.arange(vertex_count), wp.int32, device)
         return Numbering(None, np.empty(0, int), receiver_of_vertex)
-    is_static = np.zeros(vertex_count, bool) if is_static is None else is_static
-    sequence = np.arange(vertex_count) if sequence is None else sequence
-    side_offsets = vertex_count * np.arange(side_count)
-    sequence = (sequence + side_offsets[:, None]).ravel()
-    if bodies is not None:
-        bodies = np.tile(bodies, side_count)
-        sequence = sequence[np.argsort(bodies[sequence], kind="stable")]
-    is_static_receiver, is_moving_receiver = (keeps_vertex & is_static).ravel(), (keeps_vertex & ~is_static).ravel()
-    static_vertices, vertices = sequence[is_static_receiver[sequence]], sequence[is_moving_receiver[sequence]]
+    sequence, bodies = _order_sides(vertex_count, side_count, sequence, bodies)
+    is_moving_receiver, static_vertices = keeps_vertex.ravel(), np.empty(0, int)
+    if is_static is not None:
+        is_moving_receiver, is_static_receiver = (keeps_vertex & ~is_static).ravel(), (keeps_vertex & is_static).ravel()
+        static_vertices = sequence[is_static_receiver[sequence]]
+    vertices = sequence[is_moving_receiver[sequence]]
     receiver_of_vertex = np.full(keeps_vertex.size, -1, np.int32)
-    receiver_of_vertex[np.concatenate([static_vertices, vertices])] = np.arange(len(static_vertices) + len(vertices))
+    receiver_of_vertex[static_vertices] = np.arange(len(static_vertices))
+    receiver_of_vertex[vertices] = len(static_vertices) + np.arange(len(vertices))
     return Numbering(
         from_numpy(vertices, dtype=wp.int32, device=device),
         static_vertices,
         from_numpy(receiver_of_vertex, dtype=wp.int32, device=device),
         () if bodies is None else spans_of(bodies[vertices]),
     )
+
+
+@cached_by_values
+def _order_sides(
+    vertex_count: int, side_count: int, sequence: np.ndarray | None, bodies: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Order vertices, and then their backs, body by body: their sequence, and the body of each vertex and back."""
+    sequence = np.arange(vertex_count) if sequence is None else sequence
+    sequence = (sequence + vertex_count * np.arange(side_count)[:, None]).ravel()
+    if bodies is not None:
+        bodies = np.tile(bodies, side_count)
+        sequence = sequence[np.argsort(bodies[sequence], kind="stable")]
+    return sequence, bodies
 
 
 def find_receivers(

@@ -277,12 +277,11 @@ def find_sample_receivers(
     triangles = np.empty((0, 3), np.int32)
     receiver_numbers, ends = None, sample_count * np.arange(len(body_ids) + 1)
     if not device.is_capturing:
-        if quadtree is None:
-            owner_indices = np.flatnonzero(is_owner.numpy())
-        else:  # in tiles: light is found fastest where neighbors follow each other
-            sequence = _by_tiles(shape[1], width, TILE * supersampling)
-            view, item = np.divmod(np.flatnonzero(is_owner.numpy()[:, sequence]), sample_count)
-            owner_indices = view * sample_count + sequence[item]
+        owner_indices = np.flatnonzero(is_owner.numpy())
+        if quadtree is not None:  # in tiles: light is found fastest where neighbors follow each other
+            positions = _positions_in_tiles(shape[1], width, TILE * supersampling)
+            view, sample = np.divmod(owner_indices, sample_count)
+            owner_indices = owner_indices[np.argsort(view * sample_count + positions[sample])]
         ranks = body_ranks[sides.numpy().ravel()[owner_indices] % len(bodies)]
         owner_numbers, ends = _number_by_body(owner_indices // sample_count, ranks, view_count, len(body_ids))
         number_of_samples = np.empty(sides.size, np.int32)
@@ -354,10 +353,10 @@ def _body_ranks(
 
 
 @functools.lru_cache(maxsize=16)
-def _by_tiles(height: int, width: int, tile: int) -> np.ndarray:
-    """The samples of an image, tile by tile."""
+def _positions_in_tiles(height: int, width: int, tile: int) -> np.ndarray:
+    """Where each sample of an image comes, tile by tile."""
     row, column = np.divmod(np.arange(height * width), width)
-    return np.lexsort((column // tile, row // tile))
+    return np.argsort(np.lexsort((column // tile, row // tile)))
 
 
 def _number_by_body(

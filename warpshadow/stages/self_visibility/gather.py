@@ -33,7 +33,7 @@ from warpshadow.stages.self_visibility.lookup import ResamplingKernels, Resampli
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.self_visibility.trace import VisibilityRows
 
-_LOOKUP_COST = 0.2  # nanoseconds that a lookup takes
+_LOOKUP_COST, _ADJ_LOOKUP_COST = 0.6, 0.4  # nanoseconds that a lookup takes
 _MEAN_LOOKUPS = 6  # lookups of a cell, for the cost
 _CELLS_PER_WORD = 4  # coarse cells of a word of 32 bits
 
@@ -320,6 +320,7 @@ def gather_self_transmittance(
     inputs.directions, inputs.uses_rays = kernels.directions, kernels.uses_rays
     inputs.counts, inputs.indices, inputs.weights = resampling_weights
     inputs.bits, inputs.words = rows.bits, words
+    lookup_count = _MEAN_LOOKUPS * direction_count * lanes
     cell_count = max(_CELLS_PER_WORD * words.shape[1], direction_count) if lanes > 1 else 1
     return launch_with_adjoint(
         _make_gather(lanes),
@@ -330,7 +331,8 @@ def gather_self_transmittance(
         variables=[probe_weights.weights],
         shared=[resampling_weights.weights],
         scratch=[Scratch((2, cell_count), lane_type(lanes))],
-        cost=_LOOKUP_COST * _MEAN_LOOKUPS * direction_count * lanes,
+        cost=_LOOKUP_COST * lookup_count,
+        adj_cost=_ADJ_LOOKUP_COST * lookup_count,
     )
 
 

@@ -33,7 +33,7 @@ at κ = 0.35."""
 _MIN_RADIUS = cell_radius(2048)
 """Radius [rad] down to which cells are sharp: an edge of ±0.9° at κ = 0.35, sharper than shadows of spheres are."""
 
-_CELL_COST = 5.0  # nanoseconds that a sharp cell takes
+_RECEIVER_COST, _CELL_COST = 40.0, 5.0  # nanoseconds that the cells of a receiver take to be fetched, and a sharp one
 
 
 class SharpCells(NamedTuple):
@@ -150,7 +150,7 @@ def blend_sharp_cells(
     if is_copied:
         blended = copied(transmittance)
         blended.grad = transmittance.grad  # which is changed in place, as the values else are
-    inputs, cost = [pairs, spot_shares], _CELL_COST * pairs.size
+    inputs, cost = [pairs, spot_shares], _RECEIVER_COST + _CELL_COST * pairs.size
     return differentiable(
         lambda result: launch(
             _blend_sharp_cells, row_count, inputs=[sharp_cells, *inputs], outputs=[result], cost=cost

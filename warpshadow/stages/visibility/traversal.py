@@ -159,13 +159,13 @@ def prepare_traversal(
     if not 0 <= skip[0] <= skip[1] <= count:
         raise ValueError(f"skip: got {skip!r}, expected a first and an end of {count} spheres")
     nodes, *bounds = find_clusters(centers, radii, merging) if clusters is None else clusters
-    spheres = SphereClusters()
+    inputs = TraversalInputs()
+    inputs.points, inputs.normals = points, normals
+    spheres = inputs.spheres  # filled in place: a struct that is assigned is copied field by field
     spheres.centers, spheres.radii, spheres.extents = nodes
     spheres.count, spheres.merging_angle = count, merging * cell_radius
     spheres.skip_begin, spheres.skip_end = skip
     spheres.cluster_bounds, spheres.run_bounds = bounds
-    inputs = TraversalInputs()
-    inputs.points, inputs.normals, inputs.spheres = points, normals, spheres
     return SphereTraversal(inputs, nodes, lanes, points.shape[0] * block_count(points.shape[1], lanes))
 
 
