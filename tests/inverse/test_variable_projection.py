@@ -14,8 +14,9 @@ from warpshadow.inverse.variable_projection import ProjectedModel, make_model, n
 
 CPU = torch.device("cpu")
 SOLVED = Stage(solves_light=True)
-# Central differences of a float32 loss, whose soft shadows have corners in their second derivatives.
-DIFFERENCE = 0.03
+# Central differences of a float32 loss, whose soft shadows have corners in their second derivatives, over which edges
+# pass pixels' centers: measured 3.2%; over 12 poses 3.4%, root mean square.
+DIFFERENCE = 0.05
 SIXTH_OF_A_PIXEL = 0.02
 CELLS = Light(None, directions=64, smoothness=1e-3)
 

@@ -87,6 +87,33 @@ def test_shadows_of_slats_are_those_of_rays():
     assert error < 0.04 < at_vertices
 
 
+def wedge_on_ground(height=0.0):
+    """A wedge whose toe points to the eye, on a ground whose faces are smaller than two pixels."""
+    profile = [(-0.3, 0, -0.3), (-0.3, 0, 0.3), (-0.3, 0.4, -0.3)]
+    hull = trimesh.convex.convex_hull(np.array(profile + [(-x, y, z) for x, y, z in profile]))
+    wedge = ws.Body(ws.Mesh(hull.vertices, hull.faces).creased(), translation=(0, height, 0.5), name="wedge")
+    camera = ws.Camera.look_at((1.4, 1.7, 3.6), (0, 0.5, 0.1), fov_y=32, size=(64, 64))
+    bodies = [ws.Body(ws.plane(5.0, 64), name="ground"), wedge]
+    return ws.Scene(bodies, ws.synthetic_sky((0.3, 0.9, 0.8)), camera)
+
+
+@pytest.mark.parametrize(("height", "expected"), [(0.0, "adaptive"), (-0.03, "adaptive"), (0.3, "vertex")])
+def test_grounds_with_vertices_inside_a_body_are_not_interpolated_from_these(height, expected):
+    ground, _ = chosen(wedge_on_ground(height))
+    assert ground.size.area < 2 and ground.unevenness < UNEVEN and ground.receivers == expected
+    notes = " ".join(ws.Renderer(wedge_on_ground(height)).explain().notes)
+    assert ("vertices inside other bodies" in notes) == (expected == "adaptive")
+
+
+def test_no_dark_line_is_along_the_toe_of_a_wedge():
+    """Pixels had 0.61 of the light there, interpolated from vertices inside the wedge, and have 0.96."""
+    scene = wedge_on_ground()
+    truth = ws.render(dataclasses.replace(scene, visibility=ws.Visibility("ray-traced", samples=512)))[..., 1]
+    renderer = ws.Renderer(scene)
+    shows = (renderer.layers().bodies == 0) & (truth > 0.7 * np.median(truth))
+    assert (renderer.render()[..., 1][shows] / truth[shows]).min() > 0.85
+
+
 def waves(**options):
     """A body of waves that are high enough for a low sun to leave their backs dark."""
     grid = ws.plane(4.0, 48)

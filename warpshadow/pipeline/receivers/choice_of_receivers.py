@@ -22,6 +22,7 @@ from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
+from warpshadow.pipeline.receivers.buried_vertices import show_buried_vertices
 from warpshadow.pipeline.receivers.unevenness import NearLight, light_unevenness
 from warpshadow.scene.body import Body
 from warpshadow.scene.scene import Scene, change_bodies
@@ -92,6 +93,7 @@ class ReceiverChoice(NamedTuple):
     receivers: str  # at every "vertex", at every "pixel" that shows the body, or "adaptive"
     size: FaceSize | None  # of its faces; None where nobody had to know
     unevenness: float = 0.0  # relative L2 error of light between its vertices; 0 where nobody had to know
+    shows_buried: bool = False  # whether it is flat, and pixels would have light of vertices inside other bodies
 
 
 def choose_receivers(
@@ -133,17 +135,24 @@ def choose_receivers(
     where_edges_are = "pixel" if is_near else "adaptive"
     chosen = np.where(merged_scene.is_flat & is_sharp & is_seen_large, where_edges_are, chosen)
     is_open = (chosen == "vertex") & (np.array(requested) == AUTO) & (~merged_scene.is_flat | is_sharp)
-    unevenness = np.zeros(len(chosen))
+    unevenness, shows_buried = np.zeros(len(chosen)), np.zeros(len(chosen), bool)
     if is_open.any() and merged_scene.scene.visibility.method != "none":
         faces = [np.unique(face_ids[face_ids >= 0], return_counts=True) for face_ids, _ in images]
         seen = [(camera, *counted) for camera, counted in zip(cameras, faces, strict=True)]
         light = EnvironmentMap.constant() if is_light_free else merged_scene.scene.known_light
         bodies = np.flatnonzero(is_open).tolist()
         unevenness[is_open] = light_unevenness(merged_scene, positions, seen, bodies, light, near_light)
-    chosen = np.where(unevenness > UNEVEN, np.where(merged_scene.is_flat, where_edges_are, "pixel"), chosen)
+        flat_bodies = np.flatnonzero(is_open & merged_scene.is_flat & (unevenness <= UNEVEN)).tolist()
+        seen_faces = [seen for seen, _ in faces]
+        shows_buried[flat_bodies] = show_buried_vertices(merged_scene, positions, seen_faces, flat_bodies)
+    chosen = np.where(
+        shows_buried | (unevenness > UNEVEN), np.where(merged_scene.is_flat, where_edges_are, "pixel"), chosen
+    )
     return [
-        ReceiverChoice(choice if receivers == AUTO else receivers, size, float(error))
-        for choice, receivers, size, error in zip(chosen.tolist(), requested, sizes, unevenness, strict=True)
+        ReceiverChoice(choice if receivers == AUTO else receivers, size, float(error), bool(buried))
+        for choice, receivers, size, error, buried in zip(
+            chosen.tolist(), requested, sizes, unevenness, shows_buried, strict=True
+        )
     ]
 
 
@@ -217,6 +226,8 @@ def receiver_notes(scene: Scene, choices: Sequence[ReceiverChoice], bulging_bodi
 def _reason(choice: ReceiverChoice) -> str:
     if choice.unevenness > UNEVEN:
         return f"between its vertices light is off by {choice.unevenness:.0%}, more than {UNEVEN:.0%}"
+    if choice.shows_buried:
+        return "vertices inside other bodies are dark, beside pixels that are not"
     return str(choice.size)
 
 

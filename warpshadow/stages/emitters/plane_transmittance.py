@@ -1,12 +1,18 @@
 """Transmittance of plane blockers, such as walls, between receivers and the samples of an emitter.
 
-The line from a receiver x to a sample meets a plane in h, if both are on different sides of it. There the beam of the
+The line from a receiver x to a sample meets a plane in h, if they are on different sides of it. There the beam of the
 sample, a disc of radius R at a distance d, has the radius b = R |h − x| / d, and with s the distance of h from the
 outline of the plane, positive inside, along m, the plane takes the share
 
     a = S((s / w + 1) / 2),   w² = b² (1 + (ω·m / ω·n)²)
 
-of it, S the smoothstep and n the plane's normal: the projection of the beam reaches w along m.
+of it, S the smoothstep and n the plane's normal: the projection of the beam reaches w along m. The disc itself, with a
+normal k, reaches r = R √(1 − (k·n)²) off its middle along n; if that is at a height h_y < r on the receiver's side, a
+part of the sample lies beyond the plane, as of a lamp that is half in the ground:
+
+    a S((1 − h_y / r) / 2)
+
+With samples that lay beyond wholly or not at all a lamp that was half in the ground was off by −7 to +7%.
 """
 
 import warp as wp
@@ -67,18 +73,26 @@ def _covered_share(
     axis_v: wp.vec3,
     point: wp.vec3,
     beam: wp.vec3,
-    disc_radius: float,
+    area: wp.vec3,
 ):
-    """The share a, given the plane's frame, x, y − x and R; 0 where the line does not meet the plane."""
+    """The share a, given the plane's frame, x, y − x and the area vector A of the sample."""
     normal = wp.normalize(wp.cross(axis_u, axis_v))
     scale = wp.length(axis_u)
     distance = wp.length(beam)
     height = wp.dot(point - origin, normal)
     rise = wp.dot(beam, normal)
-    end_height = height + rise
+    margin = grid.margin * scale
+    disc_radius = sample_radius(area)
+    cosine = wp.dot(normal, area) / wp.max(wp.length(area), 1.0e-30)
+    reach = wp.max(disc_radius * wp.sqrt(wp.max(1.0 - cosine * cosine, 1.0e-6)), margin)
+    end_height = wp.where(height < 0.0, -height - rise, height + rise)
+    share_beyond = 1.0 - wp.smoothstep(-1.0, 1.0, (end_height + 2.0 * margin) / reach)
     share = float(0.0)
-    if height * end_height < 0.0 and wp.abs(end_height) > grid.margin * scale:
-        position = -height / rise
+    if height != 0.0 and share_beyond > 0.0:
+        height_change = wp.max(wp.abs(rise), reach)
+        position = float(1.0)
+        if end_height < 0.0:
+            position = wp.abs(height) / height_change
         hit = point + position * beam - origin
         u = wp.dot(hit, axis_u) / (scale * scale)
         v = wp.dot(hit, axis_v) / (scale * scale)
@@ -86,10 +100,10 @@ def _covered_share(
         edge = edges[grid.first_edge + wp.abs(number) - 1]
         gap = _gap_to_edge(edge, u, v)
         outward = wp.normalize(gap)
-        slope = (outward[0] * wp.dot(beam, axis_u) + outward[1] * wp.dot(beam, axis_v)) / (scale * rise)
+        slope = (outward[0] * wp.dot(beam, axis_u) + outward[1] * wp.dot(beam, axis_v)) / (scale * height_change)
         width = wp.max(disc_radius * position, _MIN_WIDTH * distance) * wp.sqrt(1.0 + slope * slope)
         signed_distance = wp.where(number > 0, 1.0, -1.0) * scale * wp.length(gap)
-        share = wp.smoothstep(-1.0, 1.0, signed_distance / width)
+        share = share_beyond * wp.smoothstep(-1.0, 1.0, signed_distance / width)
     return share
 
 
@@ -128,7 +142,7 @@ def _block_by_planes(
                 area = sample_areas[sample_batch, first_sample + i]
                 beam = sample_points[sample_batch, first_sample + i] - point
                 if may_light(beam, area, normal, is_two_sided):
-                    share = _covered_share(grid, edges, origin, axis_u, axis_v, point, beam, sample_radius(area))
+                    share = _covered_share(grid, edges, origin, axis_u, axis_v, point, beam, area)
                     if share > 0.0:
                         wp.atomic_add(log_transmittances, batch, receiver, i, log_transmittance(share))
 

@@ -8,9 +8,15 @@ lies beyond it
         0                         t ≥ (1 + m)/2
 
 The line of an edge with ends a, b is ℓ = a × b, and that where two faces intersect ℓ = n − n′, the difference of their
-planes. In a row, where ℓ·(x, y, 1) = 0, lines move by
+planes. If the outline of a surface moves by v(s), an integral of w over it changes by ∮ w (v_x dy − v_y dx). So the
+derivative of an edge counts the motion of its points along rows in rows, and along columns in columns, where ω is 1:
 
-    dx = (α ℓ·da + β ℓ·db) / ℓ_x                            α, β: the point on the edge is α a + β b, with w = 1
+    dx = α da_x + β db_x, on screen                         α, β: the point on the edge is α a + β b, with w = 1
+
+Two neighbors of which one sees the surface have an odd number of edges between them, and one of these is found; the
+others cancel, since they move alike. By the edge's normal, dx = (α ℓ·da + β ℓ·db) / ℓ_x, they would not: along a border
+with teeth of a sample gradients had the wrong sign. Where faces intersect there is the line's normal alone:
+
     dx = Σ_i (λ_i u n·dv_i − λ′_i u′ n′·dv′_i) / ℓ_x        λ: barycentrics of the fragments, u: its 1/w
 
 The change of m is left out: on balance it hardly matters to the exchange between two samples (1e-4 of the gradient by a
@@ -108,7 +114,9 @@ def _measure_areas_adjoint(
             offset_a = relative_to_ray(clip[edge[0]], center)[1 - axis]
             offset_b = relative_to_ray(clip[edge[1]], center)[1 - axis]
             cross_component = wp.where(axis == 0, -line[0], line[1])
-            adj_clip = adj_position * relative_to_ray_adjoint(center, line / line[axis])
+            point = line / line[axis]
+            point[1 - axis] = 0.0
+            adj_clip = adj_position * relative_to_ray_adjoint(center, point)
             wp.atomic_add(adj_clip_positions, batch, edge[0], (offset_b / cross_component) * adj_clip)
             wp.atomic_add(adj_clip_positions, batch, edge[1], (-offset_a / cross_component) * adj_clip)
         else:

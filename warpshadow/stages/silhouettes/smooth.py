@@ -25,7 +25,7 @@ from warpshadow.stages.raster.interpolation import inner_product
 from warpshadow.stages.raster.screen import neighbor, opposite
 from warpshadow.stages.silhouettes.areas import measure_areas_adjoint
 from warpshadow.stages.silhouettes.find import Silhouettes
-from warpshadow.stages.silhouettes.lines import make_fragment_arrays
+from warpshadow.stages.silhouettes.lines import INTERSECTION, make_fragment_arrays
 
 
 @wp.func
@@ -86,6 +86,7 @@ def _make_blend_adjoint(dtype: type) -> wp.Kernel:
         shares: wp.array2d(dtype=wp.vec3),
         width: int,
         entries: wp.array(dtype=wp.int32),
+        edges: wp.array2d(dtype=wp.vec2i),
         edge_colors: wp.array3d(dtype=dtype),
         adj_smoothed: wp.array2d(dtype=dtype),
         # out
@@ -116,11 +117,8 @@ def _make_blend_adjoint(dtype: type) -> wp.Kernel:
                             neighbor_color = edge_colors[instance, entries[other], opposite(direction)]
                             contrast = neighbor_color - edge_colors[instance, entry, direction]
                         adj_area = inner_product(adj, contrast)
-                        wp.atomic_add(adj_areas, entry, direction, weight * adj_area)
-                        perpendicular = wp.where(direction < 2, 2, 0)
-                        for k in range(2):
-                            loss = _overlap_loss(share, sample_shares[perpendicular + k]) * share[0]
-                            wp.atomic_sub(adj_areas, entry, perpendicular + k, loss * adj_area)
+                        line_weight = wp.where(edges[entry, direction][0] == INTERSECTION, share[1], 1.0)
+                        wp.atomic_add(adj_areas, entry, direction, line_weight * adj_area)
 
     return blend_adjoint
 
@@ -142,9 +140,11 @@ def smooth_silhouettes(
             go; by default the colors of samples.
     Returns:
         Smoothed image, like ``image``; a sample lies within the range of itself and its four neighbors.
-    Differentiable: image, clip_positions. Without edge colors an edge has the colors of the samples beside it: where
-    shading changes by δ over a sample there, its gradient is δ/2 off. Excluded are intersections within one surface,
-    cuts by the near plane, and surfaces that leave the image: there is no neighbor to take from.
+    Differentiable: image, clip_positions, by these on average over positions: an edge counts by the motion of its
+    points (:mod:`warpshadow.stages.silhouettes.areas`), without overlaps. Without edge colors an edge has the colors of
+    the samples beside it: where shading changes by δ over a sample there, its gradient is δ/2 off. Excluded are
+    intersections within one surface, cuts by the near plane, and surfaces that leave the image: there is no neighbor to
+    take from.
     """
     fragments = silhouettes.fragments
     batch_count, height, width = fragments.face_ids.shape
@@ -168,7 +168,7 @@ def smooth_silhouettes(
         launch(
             _make_blend_adjoint(image.dtype),
             dim,
-            inputs=[*inputs, silhouettes.entries, edge_colors, adj_smoothed],
+            inputs=[*inputs, silhouettes.entries, silhouettes.edges, edge_colors, adj_smoothed],
             outputs=[adj_image, adj_areas],
         )
         if adj_areas is not None:

@@ -1,0 +1,54 @@
+"""Buried vertices: corners of visible faces that lie inside another body, as below a box on a ground.
+
+They are dark, and pixels beside the other body would interpolate between them and vertices in the open: a dark line one
+pixel high along the toe of a wedge, 0.58 of the light there, which is too little of the ground to count as uneven.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
+from warpshadow.stages.geometry.normals import vertex_normals
+from warpshadow.stages.self_visibility.buried import find_buried
+
+_ROUNDING = 1e-5  # of the largest coordinate, by which a vertex may lie outside the bounds of a body that it touches
+
+
+def show_buried_vertices(
+    merged_scene: MergedScene, positions: np.ndarray, face_ids: Sequence[np.ndarray], bodies: Sequence[int]
+) -> np.ndarray:
+    """Find the bodies of which images show a face from a buried vertex to one in the open.
+
+    Args:
+        merged_scene: All bodies.
+        positions: Vertices of all [scene units], float32 of shape [vertex, 3].
+        face_ids: Faces that each image shows.
+        bodies: Bodies to look at.
+    Returns:
+        Bool of shape [body], of these bodies.
+    """
+    result, faces = np.zeros(len(bodies), bool), merged_scene.faces.numpy()
+    seen = np.unique(np.concatenate([*face_ids, np.empty(0, int)])).astype(int)
+    margin = _ROUNDING * np.abs(positions).max(initial=0.0)
+    runs = [slice(*merged_scene.first_vertex[number : number + 2]) for number in merged_scene.casting]
+    bounds = [(positions[run].min(axis=0) - margin, positions[run].max(axis=0) + margin) for run in runs]
+    mesh = normals = None
+    for number, body in enumerate(bodies):
+        corners = faces[seen[merged_scene.body_of_face[seen] == body]]
+        vertices = np.unique(corners)
+        points, is_within = positions[vertices], np.zeros(len(vertices), bool)
+        for casting, (low, high) in zip(merged_scene.casting, bounds, strict=True):
+            if casting != body:
+                is_within |= ((points >= low) & (points <= high)).all(axis=1)
+        candidates = vertices[is_within]
+        if len(candidates):
+            if mesh is None or normals is None:
+                placed = wp.array(positions, dtype=wp.vec3, device=merged_scene.device)
+                mesh = merged_scene.casting_mesh(placed)
+                normals = vertex_normals(placed.reshape((1, -1)), merged_scene.faces).numpy()[0]
+            is_buried = np.zeros(len(positions), bool)
+            is_buried[candidates] = find_buried(mesh, positions[candidates], normals[candidates])
+            result[number] = (is_buried[corners].any(axis=1) & ~is_buried[corners].all(axis=1)).any()
+    return result
