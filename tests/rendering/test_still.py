@@ -249,3 +249,25 @@ def test_more_samples_a_pixel_resolve_bumps_and_edges():
     rays = dataclasses.replace(given, visibility=ws.Visibility("ray-traced", samples=65536))
     still, reference = ws.render(given), ws.render(rays)
     assert np.linalg.norm(still - reference) < 0.01 * np.linalg.norm(reference)
+
+
+def test_a_still_of_a_post_has_the_light_of_a_finer_one():
+    """Its faces are narrower than a sample, and light jumps between them: without smooth creases it is 9.8% off."""
+    turns = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    rims = [np.stack([np.cos(turns), 0 * turns + height, -np.sin(turns)], axis=1) for height in (-20, 20)]
+    first, second = np.arange(12), (np.arange(12) + 1) % 12
+    triangles = [(first, second, first + 12), (second, second + 12, first + 12)]
+    faces = np.concatenate([np.stack(corners, axis=1) for corners in triangles])
+    mesh = ws.Mesh(np.concatenate(rims).astype(np.float32), faces.astype(np.int32)).creased(20.0)
+    light = ws.synthetic_sky((0.8, 0.3, 0.35))
+
+    def still(size, shift):
+        post = ws.Body(mesh, scale=0.05, translation=(shift, 0, 0))
+        camera = ws.Camera.look_at((0, 0, 5), (0, 0, 0), fov_y=18, size=(size, size))
+        return ws.render(ws.Scene([post], light, camera), progress=False)
+
+    errors = []
+    for shift in np.linspace(0, 0.05, 5, endpoint=False):
+        fine = still(320, shift).reshape(32, 10, 32, 10, 4).mean(axis=(1, 3))
+        errors.append(error(still(32, shift), fine))
+    assert np.mean(errors) < 0.02

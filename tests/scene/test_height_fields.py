@@ -60,8 +60,8 @@ def test_land_is_closed_on_the_side_where_no_body_stands(winds_down, rotation):
     assert {tuple(point) for point in mesh.positions} <= {tuple(point) for point in solid.positions}
     lowest = mesh.positions[:, 1].min()
     assert solid.positions[:, 1].max() == mesh.positions[:, 1].max()  # nothing before it
-    assert solid.positions[:, 1].min() == pytest.approx(lowest - 4 / 16, abs=0.02)  # the mean normal leans a little
-    assert volume(solid) == pytest.approx(16 * (mesh.positions[:, 1].mean() - lowest + 4 / 16), rel=0.05)
+    assert solid.positions[:, 1].min() == pytest.approx(lowest - 4 / 4, abs=0.02)  # the mean normal leans a little
+    assert volume(solid) == pytest.approx(16 * (mesh.positions[:, 1].mean() - lowest + 4 / 4), rel=0.05)
 
 
 @pytest.mark.parametrize(
@@ -125,6 +125,51 @@ def test_panels_do_not_stand_over_land(mesh, at, expected):
     assert (0 in blocking_parts(scene)) is expected
     assert fitted_meshes(scene)[0][0].surface.is_closed is not expected
     assert (fitted_counts(scene)[0] == SPHERES_BESIDE_PARTS) is expected
+
+
+def basin() -> ws.Mesh:
+    """A sheet as deep as a bowl, whose panels are far from it at the bottom."""
+    grid = ws.plane(6.0, 32)
+    heights = 0.12 * (grid.positions[:, 0] ** 2 + grid.positions[:, 2] ** 2)
+    return ws.Mesh(grid.positions + np.outer(heights, (0, 1, 0)).astype(np.float32), grid.faces, name="basin")
+
+
+@pytest.mark.parametrize(("at", "expected"), [((0.2, 0.1, 0.1), False), ((0.2, 1.0, 0.1), True)])
+def test_a_basin_has_panels_where_no_body_stands_behind_them(at, expected):
+    scene = ws.Scene([ws.Body(basin()), ball(at)], ws.EnvironmentMap.constant(), CAMERA)
+    assert (0 in blocking_parts(scene)) is expected
+
+
+@pytest.mark.slow
+def test_a_ball_at_the_bottom_of_a_basin_is_as_bright_as_by_rays():
+    camera = ws.Camera.look_at((0, 3.0, 2.6), (0.2, 0.1, 0.1), fov_y=14, size=(48, 48))
+    scene = ws.Scene([ws.Body(basin()), ball((0.2, 0.1, 0.1))], ws.EnvironmentMap.constant(), camera)
+    renderer = ws.Renderer(scene)
+    traced = ws.Renderer(dataclasses.replace(scene, visibility=ws.Visibility("ray-traced", samples=256)))
+    shows_ball = renderer.layers().bodies == 1
+    light, expected = (each.render()[shows_ball][:, :3].mean() for each in (renderer, traced))
+    assert light == pytest.approx(expected, rel=0.03)  # past panels 3.4% brighter
+
+
+def test_spheres_of_land_lie_where_it_is_seen():
+    """Fitted to the whole solid, half of them cover its bottom, and gaps below the land are 1.5 times as deep."""
+    mesh = land(24)
+    request = fitted_meshes(ws.Scene([ws.Body(mesh), ball()], ws.EnvironmentMap.constant(), CAMERA))[0]
+    assert request.seen_from == pytest.approx((0, 1, 0), abs=0.1)
+
+    def mean_gap(**options):
+        spheres = ws.fit_spheres(
+            request.mesh, 128, steps=40, progress=False, warns=False, cache=False, **options
+        ).spheres
+        gaps = np.linalg.norm(mesh.positions[:, None] - spheres.centers, axis=2) - spheres.radii
+        return np.maximum(gaps.min(axis=1), 0).mean()
+
+    assert mean_gap(seen_from=request.seen_from) < 0.8 * mean_gap()
+
+
+def test_a_side_that_is_no_direction_is_refused():
+    with pytest.raises(ValueError, match="seen_from: got a zero vector"):
+        ws.fit_spheres(land(), 8, seen_from=(0, 0, 0))
 
 
 @pytest.mark.slow

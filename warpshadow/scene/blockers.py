@@ -12,7 +12,7 @@ from warpshadow.maths.convex import ConvexPart, is_panel
 from warpshadow.maths.plane import plane_normal
 from warpshadow.maths.solid_angle import solid_angles
 from warpshadow.scene.body import Body, into_own_space
-from warpshadow.scene.height_fields import is_bowl, solid_behind
+from warpshadow.scene.height_fields import Land, solid_behind
 from warpshadow.scene.scene import Scene
 from warpshadow.scene.visibility import SPHERE_METHODS
 from warpshadow.spheres import Spheres, fit_spheres
@@ -33,6 +33,7 @@ class FitRequest(NamedTuple):
     mesh: Mesh
     sphere_count: int | str
     steps: int = STEPS
+    seen_from: tuple[float, float, float] | None = None
 
 
 def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> list[Spheres]:
@@ -52,7 +53,8 @@ def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: boo
             steps=fits[number].steps,
             device=device,
             progress=progress,
-            warns=number not in parts,
+            warns=number not in parts and fits[number].seen_from is None,
+            seen_from=fits[number].seen_from,
         ).spheres
         if number in fits
         else _given_spheres(body, ground)
@@ -81,8 +83,8 @@ def blocking_parts(scene: Scene) -> dict[int, list[ConvexPart]]:
 
     By method "directional" these are those of all bodies that consist of some, unless how many spheres they have, or
     that these block their own light, was asked for. Panels are chords of bent sheets. Over land they would shade the
-    air behind them; so a body with a solid behind it (:mod:`.scene.height_fields`) that is no bowl
-    has panels only where it is flat, such as the walls of a room.
+    air behind them; so a body with a solid behind it (:mod:`.scene.height_fields`) that is no bowl,
+    or one in which a body stands so low, has panels only where it is flat, such as the walls of a room.
     """
     visibility = scene.visibility.with_method()
     if visibility.method != "directional":
@@ -90,8 +92,9 @@ def blocking_parts(scene: Scene) -> dict[int, list[ConvexPart]]:
     result = {}
     for number, body in enumerate(scene.bodies):
         if isinstance(body.blockers, str) and body.self_shadows_in(visibility) != "spheres":
-            is_land = _solid_behind(scene, number) is not None and not is_bowl(body)
-            result[number] = body.mesh.flat_parts if is_land else body.mesh.convex_parts
+            land = _solid_behind(scene, number)
+            has_all = land is None or land.is_bowl
+            result[number] = body.mesh.convex_parts if has_all else body.mesh.flat_parts
     return {number: parts for number, parts in result.items() if parts}
 
 
@@ -136,14 +139,15 @@ def fitted_meshes(scene: Scene) -> dict[int, FitRequest]:
     """
     parts, result = blocking_parts(scene), {}
     for number, count in _fitted_counts(scene, parts).items():
-        solid = None if number in parts else _solid_behind(scene, number)
+        land = None if number in parts else _solid_behind(scene, number)
         steps = STEPS_BESIDE_PARTS if number in parts else STEPS
-        result[number] = FitRequest(scene.bodies[number].mesh if solid is None else solid, count, steps)
+        mesh, side = (scene.bodies[number].mesh, None) if land is None else (land.solid, land.seen_from)
+        result[number] = FitRequest(mesh, count, steps, side)
     return result
 
 
-def _solid_behind(scene: Scene, number: int) -> Mesh | None:
-    """The solid behind a body that is land, in its own space; None if it is none."""
+def _solid_behind(scene: Scene, number: int) -> Land | None:
+    """The solid behind a body that is land; None if it is none."""
     body = scene.bodies[number]
     return solid_behind(body, tuple(other for other in scene.bodies if other is not body))
 

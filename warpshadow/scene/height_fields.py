@@ -6,6 +6,7 @@ Spheres in a sheet bulge out of both sides. Where nobody sees one side, they may
 from __future__ import annotations
 
 import functools
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -16,9 +17,9 @@ from warpshadow.maths.adjacency import area_normals, edges_of
 from warpshadow.scene.body import Body, into_own_space
 from warpshadow.stages.rays.ray_tracing import trace_visibility_on_host
 
-DEPTH = 1 / 16
-"""How far the solid reaches beyond the mesh, over the longest side of its bounds: that land is 6.1% off with 1/4, of
-fewer and larger spheres, and 4.2% with 1/32."""
+DEPTH = 1 / 4
+"""How far the solid reaches beyond the mesh, over the longest side of its bounds. Large spheres leave narrow
+gaps: with 1/16 the land of demos/kinds.py is 4.1% off, and a bottle on it 5% too bright in place of 2%."""
 
 _POINTS = 1024  # of meshes, from which rays tell which bodies lie before the field, and which behind
 
@@ -29,12 +30,24 @@ So do rocks and water in land; a ground that a tent stands on does not."""
 
 _DEEP = 0.25
 """Depth of bowls, over the longest side of their bounds. A ball in half a shell (0.5) is 18% too bright past spheres of
-the solid under an even sky, 2% too dark past panels; in a shell of 0.29 4% and 1%. That land has 0.1."""
+the solid under an even sky, 2% too dark past panels; in a shell of 0.35 5% and 0%. That land has 0.1."""
+
+_BEHIND = 0.1
+"""Share of a body behind panels from which it stands between a bowl and these, which shade it from above: a slab that
+lies in a basin is 24% too dark past panels, and 1% past spheres. A ball that touches half a shell has 0.01."""
 
 _UPWARD = 0.5  # cosine of the angle to +y up to which land leans
 
 
-def solid_behind(body: Body, others: tuple[Body, ...]) -> Mesh | None:
+class Land(NamedTuple):
+    """The solid that stands in for land."""
+
+    solid: Mesh  # the land, with walls from its rim to a bottom behind it, in its own space
+    seen_from: tuple[float, float, float]  # unit vector to the side from which bodies see it
+    is_bowl: bool  # whether panels are better blockers: it is deep, and no body stands between it and its panels
+
+
+def solid_behind(body: Body, others: tuple[Body, ...]) -> Land | None:
     """Close a body that is land behind.
 
     Args:
@@ -42,7 +55,7 @@ def solid_behind(body: Body, others: tuple[Body, ...]) -> Mesh | None:
         others: The other bodies.
 
     Returns:
-        Its mesh with walls from its rim to a bottom behind it, in its own space. None where it is no land: its mesh is
+        The solid. None where it is no land: its mesh is
         closed or flat, faces look to both sides of any plane or lie above each other; others stand on both sides, as of
         a tent, or on none; or the side on which they stand does not look up, as under a roof, past which light comes.
     """
@@ -50,7 +63,7 @@ def solid_behind(body: Body, others: tuple[Body, ...]) -> Mesh | None:
 
 
 @functools.lru_cache(128)  # a scene asks several times of each open body
-def _solid_behind(body: Body, others: tuple[Body, ...]) -> Mesh | None:
+def _solid_behind(body: Body, others: tuple[Body, ...]) -> Land | None:
     """The solid behind an open, bent body, if it is land."""
     mesh, to_own = body.mesh, into_own_space(body)
     axis = _upward_axis(mesh, to_own["rotation"][:, 1])
@@ -58,14 +71,28 @@ def _solid_behind(body: Body, others: tuple[Body, ...]) -> Mesh | None:
         return None
     meshes = [other.world_mesh().transformed(**to_own) for other in others]
     above, below = (np.array([_count_overlaps(mesh, other, side) for other in meshes]) for side in (axis, -axis))
-    return _close_height_field(mesh, axis) if above.any() and (above >= _STUCK * below).all() else None
+    if not above.any() or (above < _STUCK * below).any():
+        return None
+    x, y, z = axis.tolist()
+    is_deep = np.ptp(mesh.positions @ axis) > _DEEP * np.ptp(mesh.positions, axis=0).max()
+    is_bowl = bool(is_deep) and max(_share_behind_panels(mesh, axis, _spread(other)) for other in meshes) <= _BEHIND
+    return Land(_close_height_field(mesh, axis), (x, y, z), is_bowl)
 
 
-def is_bowl(body: Body) -> bool:
-    """Whether a body that is land is as deep as a bowl, whose panels are better blockers than the solid behind."""
-    axis = _upward_axis(body.mesh, into_own_space(body)["rotation"][:, 1])
-    depth = 0.0 if axis is None else np.ptp(body.mesh.positions @ axis)
-    return bool(depth > _DEEP * np.ptp(body.mesh.positions, axis=0).max())
+def _share_behind_panels(mesh: Mesh, axis: np.ndarray, points: np.ndarray) -> float:
+    """Share of some points before a mesh that are behind its panels, which are chords of it, as an axis looks."""
+    is_behind = np.zeros(len(points), bool)
+    for panel in mesh.convex_parts:
+        corners = mesh.positions[panel.corners].astype(np.float64)
+        middle, sides = corners.mean(axis=0), np.roll(corners, -1, axis=0) - corners
+        spokes = corners - middle
+        normal = np.cross(spokes, np.roll(spokes, -1, axis=0)).sum(axis=0)
+        normal /= np.linalg.norm(normal)
+        outlines = ((points[:, None] - corners) * np.cross(normal, sides)).sum(axis=-1)
+        depths = -np.sign(normal @ axis) * ((points - middle) @ normal)
+        radius = np.linalg.norm(spokes, axis=1).max()
+        is_behind |= (outlines >= 0).all(axis=1) & (depths > 0) & (depths < radius)
+    return float(is_behind.mean())
 
 
 def _upward_axis(mesh: Mesh, up: np.ndarray) -> np.ndarray | None:
@@ -86,14 +113,19 @@ def _count_overlaps(mesh: Mesh, other: Mesh, axis: np.ndarray) -> int:
 
 def _count_hits(mesh: Mesh, other: Mesh, axis: np.ndarray) -> int:
     """How many rays along an axis, from points of a mesh that are spread evenly, meet another one."""
-    corners = mesh.positions[mesh.surface.faces]
-    areas = np.linalg.norm(area_normals(corners), axis=1).cumsum()
-    chosen = np.searchsorted(areas, areas[-1] * (np.arange(_POINTS) + 0.5) / _POINTS)
     horizons = np.broadcast_to(axis, (_POINTS, 3))
     vertices = wp.array(other.positions, dtype=wp.vec3, device="cpu")
     blocker = wp.Mesh(vertices, wp.array(other.faces.ravel(), dtype=wp.int32, device="cpu"))
-    visibility = trace_visibility_on_host(blocker, corners[chosen].mean(axis=1), horizons, axis[None], "cpu")
+    visibility = trace_visibility_on_host(blocker, _spread(mesh), horizons, axis[None], "cpu")
     return int((~visibility).sum())
+
+
+def _spread(mesh: Mesh) -> np.ndarray:
+    """Points of a mesh that are spread evenly, [point, 3]."""
+    corners = mesh.positions[mesh.surface.faces]
+    areas = np.linalg.norm(area_normals(corners), axis=1).cumsum()
+    chosen = np.searchsorted(areas, areas[-1] * (np.arange(_POINTS) + 0.5) / _POINTS)
+    return corners[chosen].mean(axis=1)
 
 
 def _close_height_field(mesh: Mesh, axis: np.ndarray) -> Mesh:

@@ -29,6 +29,7 @@ SAMPLES = 32  # points of each sphere whose distance to the mesh tells how much 
 _QUERY_COST = 2000.0  # nanoseconds that a signed distance takes
 
 SURFACE_POINTS = 1024
+SIDE_POINTS = 8192  # of the side from which a mesh is seen, and balls that touch it
 RATE = 0.003  # first learning rate of the centers of 64 spheres or fewer
 
 # ------------------------------------------------------------------------------------------------- start
@@ -59,8 +60,11 @@ def medial_balls(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> 
 def greedy_cover(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> np.ndarray:
     """Pick balls greedily until they cover volume and surface, [sphere, 4].
 
-    Balls of the medial axis fill solid parts, balls on the surface cover thin or open parts.
+    Balls of the medial axis fill solid parts, balls on the surface cover thin or open parts. Of a mesh that is seen
+    from one side they cover that side.
     """
+    if mesh.seen_from is not None:
+        return _cover_side(mesh, count, rng)
     spacing = np.sqrt(mesh.area / count)
     surface_samples, _ = mesh.sample(600 + 2 * count, rng)
     flat = np.column_stack([surface_samples, np.full(len(surface_samples), 0.35 * spacing)])
@@ -87,6 +91,19 @@ def greedy_cover(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> 
         gain -= 0.9 * left[covered_samples] @ is_covering[covered_samples]
         left[covered_samples] *= 0.1
     return balls[picked_balls]
+
+
+def _cover_side(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Pick balls that touch the side from which a mesh is seen, each where the gap before is widest, [sphere, 4]."""
+    points, _ = mesh.sample(SIDE_POINTS, rng)
+    balls = medial_balls(mesh, SIDE_POINTS, rng)
+    gaps, picked_balls = np.full(len(points), np.inf), []
+    for _ in range(count):
+        widest = points[np.argmax(gaps)]
+        ball = balls[np.argmin(np.linalg.norm(balls[:, :3] - widest, axis=1) - balls[:, 3])]
+        picked_balls.append(ball)
+        gaps = np.minimum(gaps, np.linalg.norm(points - ball[:3], axis=1) - ball[3])
+    return np.array(picked_balls)
 
 
 # ------------------------------------------------------------------------------------------------- descent

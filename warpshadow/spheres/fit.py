@@ -75,6 +75,7 @@ def fit_spheres(
     cache: bool = True,
     progress: bool = True,
     warns: bool = True,
+    seen_from: Sequence[float] | None = None,
 ) -> SphereFit:
     """Fit spheres to a mesh so that they cast its shadows.
 
@@ -95,6 +96,8 @@ def fit_spheres(
         cache: Read and write the fit in a cache on disk, by the mesh's shape and the arguments above. The
             folder is the user's cache folder, or WARPSHADOW_CACHE_DIR.
         warns: Warn of spheres that cast a bad shadow. False where something else blocks light in their place.
+        seen_from: Direction to the side from which alone the mesh is seen, such as land, whose other faces need no
+            spheres, shape [3]; None for all sides.
     Returns:
         The spheres in the mesh's coordinates, and a report. Spheres that shrank to nothing are left out.
     Warns: Once for each mesh, where 64 or more spheres cast a ragged shadow, as on thin legs, fill its cavities, or let
@@ -113,10 +116,11 @@ def fit_spheres(
     if error is not None:
         check.positive("error", error)
     fit_device = check.device("device", device)
-    key = count, error, seed, steps if refine else 0, fit_device.alias, cache_folder()
+    side = None if seen_from is None else _unit_vector(seen_from)
+    key = count, error, seed, steps if refine else 0, side, fit_device.alias, cache_folder()
     if cache and key in _FITS.get(mesh, ()):
         return _FITS[mesh][key]
-    fit_key, center, diagonal = _find_fit_key(mesh, seed, steps if refine else 0, fit_device)
+    fit_key, center, diagonal = _find_fit_key(mesh, seed, steps if refine else 0, fit_device, side)
     fit_count = partial(_cached_fit if cache else _fit, fit_key, progress)
     with unrecorded():
         balls, report = fit_count(count) if error is None else _search(fit_count, error)
@@ -155,9 +159,26 @@ def _warn_of_holes(mesh: Mesh, count: int | str, report: FitReport) -> None:
     )
 
 
-def is_fitted(mesh: Mesh, count: int | str, steps: int = STEPS, *, device: wp.DeviceLike = "cpu") -> bool:
-    """Whether the cache has the fit of :func:`fit_spheres` for a mesh, a count and a number of steps."""
-    fit_key, *_ = _find_fit_key(mesh, 0, steps, wp.get_device(device))
+def _unit_vector(direction: Sequence[float]) -> tuple[float, float, float]:
+    """A direction, checked, of length 1 to six digits."""
+    vector = check.array("seen_from", direction, (3,), "a direction (x, y, z)").astype(np.float64)
+    if not np.any(vector):
+        raise ValueError("seen_from: got a zero vector, expected a direction")
+    x, y, z = np.round(vector / np.linalg.norm(vector), 6).tolist()
+    return x, y, z
+
+
+def is_fitted(
+    mesh: Mesh,
+    count: int | str,
+    steps: int = STEPS,
+    seen_from: Sequence[float] | None = None,
+    *,
+    device: wp.DeviceLike = "cpu",
+) -> bool:
+    """Whether the cache has the fit of :func:`fit_spheres` for a mesh, a count, a number of steps and a side."""
+    side = None if seen_from is None else _unit_vector(seen_from)
+    fit_key, *_ = _find_fit_key(mesh, 0, steps, wp.get_device(device), side)
     return _cache_path(fit_key, count).exists()
 
 
@@ -166,7 +187,9 @@ def fit_seconds(count: int | str) -> float:
     return 8.4 if isinstance(count, str) else 1.3 + 0.013 * count
 
 
-def _find_fit_key(mesh: Mesh, seed: int, steps: int, device: wp.Device) -> tuple[_SphereFitKey, np.ndarray, float]:
+def _find_fit_key(
+    mesh: Mesh, seed: int, steps: int, device: wp.Device, side: tuple[float, float, float] | None
+) -> tuple[_SphereFitKey, np.ndarray, float]:
     """Key of a fit; the middle of the mesh's bounds and their diagonal."""
     positions, faces = welded(mesh.positions, mesh.faces)  # parted at creases or not, a mesh has the same spheres
     positions = positions.astype(np.float64)
@@ -174,7 +197,7 @@ def _find_fit_key(mesh: Mesh, seed: int, steps: int, device: wp.Device) -> tuple
     if not area_normals(corners).any():
         raise ValueError("mesh: got only faces without area, expected a surface")
     normalized, center, diagonal = normalize(positions)
-    return _SphereFitKey(normalized, faces, seed, steps, device), center, diagonal
+    return _SphereFitKey(normalized, faces, seed, steps, device, side), center, diagonal
 
 
 def _search(
@@ -209,11 +232,14 @@ class _SphereFitKey:
     seed: int
     steps: int
     device: wp.Device
+    side: tuple[float, float, float] | None  # from which alone the mesh is seen
 
     def key(self, count: int | str) -> str:
         """Hash of all of it."""
         kind = "cpu" if self.device.is_cpu else "cuda"
         key_numbers = [ALGORITHM_VERSION, count, self.seed, self.steps, kind, self.positions.shape]
+        if self.side is not None:
+            key_numbers.append(self.side)
         key = hashlib.sha256(json.dumps(key_numbers).encode())
         key.update(self.positions.tobytes())
         key.update(self.faces.tobytes())
@@ -228,7 +254,8 @@ def _fit(
 
     cached_arrays = {} if unfinished is None else unfinished.before
     began = time.perf_counter() - float(cached_arrays.get("seconds", 0.0))
-    mesh = NormalizedMesh(fit_key.positions, fit_key.faces, fit_key.device)
+    side = None if fit_key.side is None else np.array(fit_key.side)
+    mesh = NormalizedMesh(fit_key.positions, fit_key.faces, fit_key.device, side)
     spheres = cached_arrays.get("spheres", np.zeros((0, 4)))
     total, done_steps = (fit_key.steps or COVER_STEPS) if count else 0, int(cached_arrays.get("step_count", 0))
     label = f"fitting {'as many spheres as it takes' if count == AUTO else f'{count} spheres'}"

@@ -34,7 +34,8 @@ class FitReport:
     outside_volume: float
     """Share of the union's volume that lies outside the mesh, the air of a cavity included; 1 for a sheet."""
     ground_error: float
-    """Error on a square of 2.5 times the bounding box's longest side at the height of the lowest point, y up."""
+    """Error on a square of 2.5 times the bounding box's longest side at the height of the lowest point, y up;
+    in the air above a mesh that is seen from one side."""
     surface_error: float
     """Error on the mesh's own vertices, weighted by area; on both sides of an open mesh, for any winding."""
     nearby_error: float
@@ -86,6 +87,8 @@ def measure(mesh: NormalizedMesh, spheres: np.ndarray, seconds: float) -> FitRep
     grid = (np.arange(GROUND) + 0.5) / GROUND - 0.5
     x, z = np.meshgrid(2.5 * mesh.longest * grid, 2.5 * mesh.longest * grid)
     ground = np.column_stack([x.ravel(), np.full(x.size, mesh.low[1] - 1e-5), z.ravel()])
+    if mesh.seen_from is not None:  # then nobody sees a ground below
+        ground, _ = draw_points_around(mesh, x.size, rng)
     up_normals = np.tile([0.0, 1.0, 0.0], (len(ground), 1))
 
     outside_volume = 0.0

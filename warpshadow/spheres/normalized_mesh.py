@@ -18,6 +18,8 @@ ENCLOSED = 0.9
 """Of the points that an open mesh winds around, the share that sees next to nothing but the mesh if it is a solid with
 holes. Of a scan with holes in its foot it is 0.95, of a box without its front 0.1, of half a ball 0."""
 
+_MIN_SEEN_COSINE = 1e-3  # of faces that are seen from one side: walls of solids behind land do not look there
+
 _RAYS = 32  # rays that tell whether a point sees next to nothing but the mesh: all but one meet it
 
 
@@ -100,10 +102,14 @@ class NormalizedMesh:
     Args:
         positions: Vertex positions [diagonals of the bounding box], float32, shape [vertex, 3].
         faces: Indices of positions, int32, shape [face, 3].
+        seen_from: Unit vector to the side from which alone it is seen, such as land: faces that look elsewhere are not
+            sampled. None for all sides.
     """
 
-    def __init__(self, positions: np.ndarray, faces: np.ndarray, device: wp.Device):
-        self.device = device
+    def __init__(
+        self, positions: np.ndarray, faces: np.ndarray, device: wp.Device, seen_from: np.ndarray | None = None
+    ):
+        self.device, self.seen_from = device, seen_from
         surface = join_faces(positions, faces, None)
         faces = surface.faces
         self.is_open = bool((surface.neighbors == -1).any())
@@ -125,6 +131,8 @@ class NormalizedMesh:
         lengths = np.linalg.norm(edges, axis=1)
         self.face_areas = lengths / 2
         self.face_normals = edges / np.maximum(lengths, 1e-30)[:, None]
+        if seen_from is not None:
+            self.face_areas *= self.face_normals @ seen_from > _MIN_SEEN_COSINE
         self.area = self.face_areas.sum()
         areas = np.bincount(faces.ravel(), np.repeat(self.face_areas, 3), minlength=len(positions))
         self.vertex_shares = areas / areas.sum()

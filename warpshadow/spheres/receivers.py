@@ -62,18 +62,21 @@ class FitReceivers:
 
     A receiver sees 128 directions of a hemisphere. Receivers on a mesh look along its normals, to both sides of an open
     one. Of the receivers in the space around a body and within its bounds, half look toward the nearest surface, and
-    half anywhere: a sphere in the middle of a cavity is seen from all around it.
+    half anywhere: a sphere in the middle of a cavity is seen from all around it. Of a body that is seen from one side
+    they are on that side, and none on grounds below.
     """
 
     DIRECTIONS = 128
     GROUND, SURFACE = 0.55, 0.25  # shares of the receivers on grounds and on the mesh; the others lie around it
     VISIBLE_FLOOR = 0.2  # weight of receivers that nothing can see, next to 1 for receivers in the open
     SHEET = 0.05
-    """Weight of receivers on a sheet, next to 1 on a solid: spheres bulge out of it and darken it, and shrink for that
-    until light comes through. The shadow that 128 spheres of a tent cast is 8% off, with a weight of 1 40%."""
+    """Weight of receivers on a sheet or on land, next to 1 on a solid: spheres bulge out of it and darken it, and
+    shrink for that until light comes through. The shadow that 128 spheres of a tent cast is 8% off, with a weight of 1
+    40%."""
 
     def __init__(self, mesh: NormalizedMesh, count: int, rng: np.random.Generator, *, sharpness: float = SHARPNESS):
-        ground, surface = int(self.GROUND * count), int(self.SURFACE * count)
+        ground = int(self.GROUND * count) if mesh.seen_from is None else 0
+        surface = int(self.SURFACE * count)
         parts = [_on_surface(mesh, surface, rng), _on_grounds(mesh, ground, rng)]
         parts.append(_around(mesh, count - ground - surface, rng))
         points, normals = (np.concatenate(item) for item in zip(*parts, strict=True))
@@ -97,7 +100,7 @@ class FitReceivers:
         floor = self.VISIBLE_FLOOR
         self.weights = (floor + (1 - floor) * np.minimum(openness, 1)).astype(np.float32)[:, None]
         """Weights of the errors at receivers [receiver, 1]."""
-        if mesh.is_sheet:
+        if mesh.is_sheet or mesh.seen_from is not None:
             self.weights[:surface] *= self.SHEET
         self.off_surface = np.arange(surface, count)  # receivers that are not on the mesh
 
@@ -123,11 +126,17 @@ def _on_grounds(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> t
 
 
 def draw_points_around(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Draw points outside a body, most near it, a third anywhere within its bounds: positions, directions toward it."""
-    shell_count = count - count // 3
+    """Draw points outside a body, most near it, a third anywhere within its bounds: positions, directions toward it.
+
+    Where it is seen from one side all are near it, on that side.
+    """
+    box_count = count // 3 if mesh.seen_from is None else 0
+    shell_count = count - box_count
     away = rng.normal(size=(shell_count, 3))
     away *= rng.uniform(size=(shell_count, 1)) ** 2 * 0.5 * mesh.longest / np.linalg.norm(away, axis=1, keepdims=True)
-    box_points = mesh.low + rng.uniform(size=(count // 3, 3)) * (mesh.high - mesh.low)
+    if mesh.seen_from is not None:
+        away *= np.where(away @ mesh.seen_from < 0, -1.0, 1.0)[:, None]
+    box_points = mesh.low + rng.uniform(size=(box_count, 3)) * (mesh.high - mesh.low)
     points = np.concatenate([mesh.sample(shell_count, rng)[0] + away, box_points])
     distances, slopes = mesh.signed_distances(points)
     is_inside = distances < 0  # and from there out of it

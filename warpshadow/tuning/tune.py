@@ -404,7 +404,7 @@ def _settings_by_work(scene: Scene, sample: PointSample) -> Iterator[Scene]:
         yield replace(scene, visibility=scene.visibility.by("none"))
     yield from _all_directions(scene)
     counts = {
-        number: len(fit_spheres(fit.mesh, device=sample.device).spheres)
+        number: len(fit_spheres(fit.mesh, device=sample.device, seen_from=fit.seen_from).spheres)
         if fit.sphere_count == AUTO
         else int(fit.sphere_count)
         for number, fit in fitted_meshes(scene).items()
@@ -439,9 +439,11 @@ def _sphere_variants(scene: Scene, fits: bool, device: wp.DeviceLike) -> Iterato
     """The scene with its own spheres, and with other numbers of them for all bodies."""
     yield scene
     fitted = fitted_counts(scene)
-    meshes = [] if fits else [fit.mesh for fit in fitted_meshes(scene).values()]
+    requests = [] if fits else list(fitted_meshes(scene).values())
     for count in SPHERE_COUNTS if fitted else ():
-        is_at_hand = fits or all(is_fitted(mesh, count, device=device) for mesh in meshes)
+        is_at_hand = fits or all(
+            is_fitted(request.mesh, count, seen_from=request.seen_from, device=device) for request in requests
+        )
         if is_at_hand and set(fitted.values()) != {count}:
             yield change_bodies(scene, "blockers", dict.fromkeys(fitted, count))
 

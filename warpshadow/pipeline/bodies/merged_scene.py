@@ -110,7 +110,8 @@ class MergedScene:
 
         On bodies that are shaded at vertices mean slopes (:mod:`warpshadow.stages.image.slopes`) go across creases.
         """
-        is_by_pixel = [body.receivers == "pixel" for body in self.scene.bodies]
+        is_traced = self.scene.visibility.method == "ray-traced"  # which shades all by pixel
+        is_by_pixel = [is_traced or body.receivers == "pixel" for body in self.scene.bodies]
         result = np.zeros(self.first_face[-1], np.int32)
         for body in np.flatnonzero(is_by_pixel):
             result[self.first_face[body] : self.first_face[body + 1]] = self.scene.bodies[body].mesh.creases
