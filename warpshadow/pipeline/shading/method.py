@@ -28,6 +28,7 @@ from warpshadow.pipeline.receivers.lit_points import (
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.transfers import Light, ShellLight, check_light, shade_free
 from warpshadow.stages.gloss.prefilter import prefilter
+from warpshadow.stages.gloss.suns import Suns, separate_suns
 from warpshadow.stages.receivers.find import Numbering, number_receivers
 from warpshadow.stages.receivers.quadtree import Quadtree
 from warpshadow.stages.shell.beams import check_shell, shell_array
@@ -53,6 +54,11 @@ class LightInput(Input):
     def is_free(self) -> bool:
         """Whether it is free light, an array, and not known light."""
         return isinstance(self.value(), wp.array)
+
+    @functools.cached_property
+    def separated(self) -> tuple[Suns, np.ndarray]:
+        """The suns of known light, and its map without them."""
+        return separate_suns(self.value().radiance)
 
     @property
     def visibility_key(self) -> Input | None:
@@ -85,7 +91,7 @@ class Method(abc.ABC):
     | :meth:`along_paths` | light that bounces along paths (:func:`.choose_bouncing`) | refused |
     | :meth:`blocker_kinds` | planes, convex parts, traced self-visibility | spheres alone |
     | :meth:`find_squares` | adaptive receivers | None, where every sample receives light |
-    | the five fields below | as they say | False; 32 |
+    | the six fields below | as they say | False; 32; 1 |
 
     A scene is refused whose bodies shine, or whose light bounces, where the method's row of ``METHOD_TRAITS``
     (:mod:`warpshadow.scene.visibility`) says no: the method then needs no member for that.
@@ -106,6 +112,8 @@ class Method(abc.ABC):
     lobe_samples = 32
     """Samples of a lobe of a body that shines. Light without shadows of an indoor map is 2.1% off with 32, 3.5% with 16
     (roughness 0.35)."""
+
+    sun_samples = 1  # directions in which each sun is looked for from the lobe of a receiver
 
     shares_lobes = False
     """Whether samples of a pixel on one face of a body that shines share a receiver. Else each is one, with its part of
@@ -297,16 +305,26 @@ class Method(abc.ABC):
     def transfers(self, points: LitPoints, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`, an array for each group, for light from a shell."""
 
+    def suns(self, light: LightInput) -> Suns | None:
+        """Suns of known light, infinitely far away, which prefiltered light is without; None where it has none."""
+        if light.is_free or self.shell_of(light) is not None or not len(light.separated[0].directions):
+            return None
+        return light.separated[0]
+
     @functools.cached_property
     def _prefiltered_from_scene(self) -> Node:
-        return Node("prefiltering", self._prefilter, self.light)
+        return self._prefiltered(self.light)
 
     def prefiltered(self, light: LightInput) -> Node:
         """Node of known light, prefiltered for bodies that shine, vec3 [1, texel]; the scene's is cached."""
-        return self._prefiltered_from_scene if light is self.light else Node("prefiltering", self._prefilter, light)
+        return self._prefiltered_from_scene if light is self.light else self._prefiltered(light)
 
-    def _prefilter(self, light: KnownLight) -> wp.array:
-        return constant(prefilter(light.radiance)[None], wp.vec3, self.merged_scene.device)
+    def _prefiltered(self, light: LightInput) -> Node:
+        def find(known: KnownLight) -> wp.array:
+            radiance = known.radiance if self.suns(light) is None else light.separated[1]
+            return constant(prefilter(radiance)[None], wp.vec3, self.merged_scene.device)
+
+        return Node("prefiltering", find, light)
 
     @property
     def lobes_across(self) -> int:
