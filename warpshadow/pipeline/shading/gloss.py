@@ -11,7 +11,7 @@ import functools
 import numpy as np
 import warp as wp
 
-from warpshadow.device.batch import concatenate, cut, expand, rows
+from warpshadow.device.batch import concatenate, cut, rows
 from warpshadow.device.constants import constant
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node, detached, field_of
@@ -23,7 +23,7 @@ from warpshadow.stages.gloss.lobes import LobeSamples, sample_lobes
 from warpshadow.stages.gloss.normal_spread import NormalSpread, find_normal_spread
 from warpshadow.stages.gloss.prefilter import look_up_light, prefilter
 from warpshadow.stages.gloss.reflection import LobeLight, mix_reflection, number_runs, sum_lobes
-from warpshadow.stages.gloss.suns import Suns, add_suns, directions_in_suns
+from warpshadow.stages.gloss.suns import Suns, add_suns
 from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.rasterization import Fragments
@@ -115,9 +115,7 @@ class GlossyPoints(LitPoints):
         sums = Node("gloss", sum_lobes, filters, radiance, transmittance, blocked, items=item_text)
         suns = self.method.suns(light_input)
         if suns is not None:
-            towards = directions_in_suns(suns, self.method.sun_samples).reshape(1, -1, 3)
-            sun_directions = Node("", functools.partial(_repeat, towards), self.receivers_node)
-            past_blockers = self.method.lobe_transmittance(self, sun_directions, light_input, view)
+            past_blockers = self.method.sun_transmittance(self, suns, light_input, view)
             sums = Node("suns", _add_suns, sums, sampled, suns, past_blockers, items=item_text)
         if materials.emission:
             sums = Node("", _add_highlights, sums, self.method.highlights(self, materials, roughness, self._cameras))
@@ -211,14 +209,6 @@ def _prefilter_basis(basis: object) -> np.ndarray:
 def _find_exits(receivers: Receivers, directions: wp.array, shell: wp.array) -> wp.array:
     """Find directions from the center of a shell to where samples of lobes meet it. Differentiable: all."""
     return exits_from_shell(receivers.points, directions, shell)
-
-
-def _repeat(directions: np.ndarray, receivers: Receivers) -> wp.array:
-    """Repeat directions [1, direction, 3] for each receiver, vec3 of shape [1, receiver, direction]."""
-    count, device = receivers.points.shape[1], receivers.points.device
-    if not count:
-        return wp.empty((1, 0, directions.shape[1]), dtype=wp.vec3, device=device)
-    return expand(constant(directions, wp.vec3, device), count).reshape((1, count, -1))
 
 
 def _add_suns(lobe_light: LobeLight, samples: LobeSamples, suns: Suns, transmittance: wp.array) -> LobeLight:

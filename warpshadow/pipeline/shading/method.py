@@ -13,6 +13,7 @@ import warp as wp
 from warpshadow.assets.basis import Basis, HarmonicBasis, conversion
 from warpshadow.assets.known_light import KnownLight, as_light
 from warpshadow.assets.light import EnvironmentMap
+from warpshadow.device.batch import expand
 from warpshadow.device.constants import constant
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
@@ -28,8 +29,8 @@ from warpshadow.pipeline.receivers.lit_points import (
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.transfers import Light, ShellLight, check_light, shade_free
 from warpshadow.stages.gloss.prefilter import prefilter
-from warpshadow.stages.gloss.suns import Suns, separate_suns
-from warpshadow.stages.receivers.find import Numbering, number_receivers
+from warpshadow.stages.gloss.suns import Suns, directions_in_suns, separate_suns
+from warpshadow.stages.receivers.find import Numbering, Receivers, number_receivers
 from warpshadow.stages.receivers.quadtree import Quadtree
 from warpshadow.stages.shell.beams import check_shell, shell_array
 
@@ -68,6 +69,14 @@ class LightInput(Input):
         depends on the shell alone.
         """
         return self.shell if self.is_free else self
+
+
+def _repeat(directions: np.ndarray, receivers: Receivers) -> wp.array:
+    """Repeat directions [1, direction, 3] for each receiver, vec3 of shape [1, receiver, direction]."""
+    count, device = receivers.points.shape[1], receivers.points.device
+    if not count:
+        return wp.empty((1, 0, directions.shape[1]), dtype=wp.vec3, device=device)
+    return expand(constant(directions, wp.vec3, device), count).reshape((1, count, -1))
 
 
 _MIN_LOBE_SAMPLES = 8  # of a receiver, however many receivers a pixel has: as many as a processor finds at once
@@ -350,6 +359,19 @@ class Method(abc.ABC):
         Without shadows it is 1.
         """
         return Node("", lambda towards: wp.full(towards.shape, 1.0, wp.float32, device=towards.device), directions)
+
+    def sun_transmittance(self, points: LitPoints, suns: Suns, light: LightInput, shaded_points: LitPoints) -> Node:
+        """Transmittance towards suns, in as many directions for each as are of use, float32 [batch, receiver, direction].
+
+        Args:
+            points, light, shaded_points: As for :meth:`lobe_transmittance`.
+            suns: The suns of the light.
+
+        By default it is that towards samples of lobes, :attr:`sun_samples` of each sun.
+        """
+        directions = directions_in_suns(suns, self.sun_samples).reshape(1, -1, 3)
+        towards = Node("", functools.partial(_repeat, directions), points.receivers_node)
+        return self.lobe_transmittance(points, towards, light, shaded_points)
 
     def blocked_radiance(
         self,

@@ -27,6 +27,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 from warpshadow.maths import sh
+from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.gloss.lobes import Lobes
 from warpshadow.stages.gloss.reflection import LobeLight
 
@@ -36,6 +37,8 @@ _MIN_SHARE = 0.003  # … that has so much of all light at least …
 _MAX_RADIUS = np.radians(6.0)  # … within this radius
 _ISOLATION = 0.9  # part of the light within twice the radius that a sun has: other spots are larger
 _MAX_TRIALS = 32  # spots that are looked at
+
+_MIN_HORIZON_WEIGHT = 1.0e-7
 
 _COST = 20.0  # nanoseconds that a sun takes
 
@@ -104,6 +107,61 @@ def directions_in_suns(suns: Suns, count: int) -> np.ndarray:
     offsets = x[:, None] * tangents[:, None] + y[:, None] * bitangents[:, None] if count > 1 else np.zeros((1, 3))
     directions = suns.directions[:, None] + np.sqrt(suns.solid_angles / np.pi)[:, None, None] * offsets
     return directions / np.linalg.norm(directions, axis=2, keepdims=True)
+
+
+@wp.kernel
+def _find_transmittance_of_cells(
+    first_row: int,
+    worker: int,
+    # in
+    transmittance: wp.array3d(dtype=wp.float32),
+    normals: wp.array2d(dtype=wp.vec3),
+    cells: wp.array(dtype=wp.int32),
+    directions: wp.array(dtype=wp.vec3),
+    per_radius: float,
+    # out
+    of_suns: wp.array3d(dtype=wp.float32),
+):
+    """A thread owns a receiver."""
+    batch, receiver = split_row(first_row + wp.tid(), of_suns.shape[1])
+    normal = normals[instance_in(batch, normals.shape[0]), receiver]
+    transmittance_batch = instance_in(batch, transmittance.shape[0])
+    for i in range(cells.shape[0]):
+        height = wp.clamp(0.5 * per_radius * wp.dot(normal, directions[i]) + 0.5, 0.0, 1.0)
+        above = height * height * (3.0 - 2.0 * height) + _MIN_HORIZON_WEIGHT
+        of_suns[batch, receiver, i] = wp.min(transmittance[transmittance_batch, receiver, cells[i]] / above, 1.0)
+
+
+def transmittance_of_cells(
+    transmittance: wp.array, normals: wp.array, suns: Suns, middles: np.ndarray, directions: np.ndarray
+) -> wp.array:
+    """Transmittance towards suns: that of their cells, min(T / H, 1), with H of :mod:`.transmittance`.
+
+    Args:
+        transmittance: Towards cells, float32 of shape [batch, receiver, cell].
+        normals: Unit normals, vec3 of shape [batch, receiver].
+        suns: The suns.
+        middles: Of the cells, unit vectors [cell, 3].
+        directions: Where the light of cells comes from, unit vectors [cell, 3].
+
+    Returns:
+        Float32 of shape [batch, receiver, sun].
+
+    Differentiable: transmittance, normals.
+    """
+    count, device = common_batch({"transmittance": transmittance, "normals": normals}), normals.device
+    cells = (suns.directions @ middles.T).argmax(axis=1)
+    of_suns = empty((count, normals.shape[1], len(cells)), dtype=wp.float32, device=device)
+    constants = constant(cells, wp.int32, device), constant(directions[cells], wp.vec3, device)
+    launch(
+        _find_transmittance_of_cells,
+        count * normals.shape[1],
+        inputs=[transmittance, normals, *constants, 1 / float(cell_radius(len(middles)))],
+        outputs=[of_suns],
+        shared=[array for array in (transmittance, normals) if len(array) < count],
+        cost=_COST * len(cells),
+    )
+    return of_suns
 
 
 @wp.kernel
