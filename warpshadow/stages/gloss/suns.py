@@ -164,6 +164,36 @@ def transmittance_of_cells(
     return of_suns
 
 
+@wp.func
+def _disc_density(slope_square: float, disc: float):
+    """F, of d² and q²."""
+    beyond = slope_square + 1.0 - disc
+    root = wp.sqrt(beyond * beyond + 4.0 * disc)
+    if beyond > 0.0:
+        return 2.0 * disc / (root * (root + beyond))
+    return 0.5 - 0.5 * beyond / root
+
+
+@wp.func
+def _reflect_disc(view: wp.vec3, width: wp.vec3, towards: wp.vec3, solid_angle: float):
+    """f c of a disc, and that with (1 − v·h)⁵, in the frame of a lobe."""
+    towards_viewer = wp.vec3(view[0], 0.0, view[1])
+    mirror = wp.normalize(towards_viewer + towards)
+    view_cosine = wp.dot(towards_viewer, mirror)
+    area = width[0] * width[2] - width[1] * width[1]
+    slope_x = (width[2] * mirror[0] - width[1] * mirror[1]) / (area * mirror[2])
+    slope_y = (width[0] * mirror[1] - width[1] * mirror[0]) / (area * mirror[2])
+    disc = solid_angle / (4.0 * wp.pi * view_cosine * area * mirror[2] * mirror[2] * mirror[2])
+    density = _disc_density(slope_x * slope_x + slope_y * slope_y, disc)
+    density = density * 4.0 * view_cosine / (solid_angle * mirror[2])
+    spread_x = width[0] * towards[0] + width[1] * towards[1]
+    spread_y = width[1] * towards[0] + width[2] * towards[1]
+    slant = wp.sqrt(spread_x * spread_x + spread_y * spread_y + towards[2] * towards[2])
+    weight = 0.5 * density * towards[2] / (towards[2] * view[2] + view[1] * slant)
+    base = wp.max(1.0 - view_cosine, 0.0)
+    return wp.vec2(weight, weight * base * base * base * base * base)
+
+
 @wp.kernel
 def _reflect_suns(
     first_row: int,
@@ -192,40 +222,19 @@ def _reflect_suns(
     bitangent = wp.cross(normal, tangent)
     view = views[lobe_batch, receiver]
     width = widths[lobe_batch, receiver]
-    towards_viewer = wp.vec3(view[0], 0.0, view[1])
-    rays = transmittance.shape[2] / directions.shape[0]
+    count = transmittance.shape[2] / directions.shape[0]  # directions of each sun
     transmittance_batch = instance_in(batch, transmittance.shape[0])
     lobe_sum = wp.vec3()
     total_grazing = wp.vec3()
     for i in range(directions.shape[0]):
-        density = float(0.0)
         cosine = wp.dot(normal, directions[i])
         if cosine > 0.0:
-            towards_sun = wp.vec3(wp.dot(tangent, directions[i]), wp.dot(bitangent, directions[i]), cosine)
-            mirror = wp.normalize(towards_viewer + towards_sun)
-            view_cosine = wp.dot(towards_viewer, mirror)
-            area = width[0] * width[2] - width[1] * width[1]  # |W|
-            slope_x = (width[2] * mirror[0] - width[1] * mirror[1]) / (area * mirror[2])
-            slope_y = (width[0] * mirror[1] - width[1] * mirror[0]) / (area * mirror[2])
-            # q² and, of D without its numbers, the integral over the disc
-            disc = solid_angles[i] / (4.0 * wp.pi * view_cosine * area * mirror[2] * mirror[2] * mirror[2])
-            beyond = slope_x * slope_x + slope_y * slope_y + 1.0 - disc
-            root = wp.sqrt(beyond * beyond + 4.0 * disc)
-            if beyond > 0.0:
-                density = 2.0 * disc / (root * (root + beyond))
-            else:
-                density = 0.5 - 0.5 * beyond / root
-            density = density * 4.0 * view_cosine / (solid_angles[i] * mirror[2])
-            spread_x = width[0] * towards_sun[0] + width[1] * towards_sun[1]
-            spread_y = width[1] * towards_sun[0] + width[2] * towards_sun[1]
-            slant = wp.sqrt(spread_x * spread_x + spread_y * spread_y + cosine * cosine)
-            share = float(0.0)
-            for ray in range(rays):
-                share += transmittance[transmittance_batch, receiver, i * rays + ray]
-            weight = 0.5 * density * cosine / (cosine * view[2] + view[1] * slant) * share / float(rays)
-            base = wp.max(1.0 - view_cosine, 0.0)
-            lobe_sum += weight * irradiance[i]
-            total_grazing += weight * base * base * base * base * base * irradiance[i]
+            towards = wp.vec3(wp.dot(tangent, directions[i]), wp.dot(bitangent, directions[i]), cosine)
+            weights = _reflect_disc(view, width, towards, solid_angles[i]) / float(count)
+            for k in range(count):
+                light = transmittance[transmittance_batch, receiver, i * count + k] * irradiance[i]
+                lobe_sum += weights[0] * light
+                total_grazing += weights[1] * light
     straight_sum[batch, receiver] = straight[light_batch, receiver] + lobe_sum
     grazing_sum[batch, receiver] = grazing_light[light_batch, receiver] + total_grazing
 
