@@ -361,7 +361,7 @@ class Method(abc.ABC):
         return Node("", lambda towards: wp.full(towards.shape, 1.0, wp.float32, device=towards.device), directions)
 
     def sun_transmittance(self, points: LitPoints, suns: Suns, light: LightInput, shaded_points: LitPoints) -> Node:
-        """Transmittance towards suns, in as many directions for each as are of use, float32 [batch, receiver, direction].
+        """Transmittance towards directions in suns, as many in each, float32 of shape [batch, receiver, direction].
 
         Args:
             points, light, shaded_points: As for :meth:`lobe_transmittance`.

@@ -176,7 +176,7 @@ def _disc_density(slope_square: float, disc: float):
 
 @wp.func
 def _reflect_disc(view: wp.vec3, width: wp.vec3, towards: wp.vec3, solid_angle: float):
-    """f c of a disc, and that with (1 − v·h)⁵, in the frame of a lobe."""
+    """Reflection f c of a disc, and that with (1 − v·h)⁵, in the frame of a lobe."""
     towards_viewer = wp.vec3(view[0], 0.0, view[1])
     mirror = wp.normalize(towards_viewer + towards)
     view_cosine = wp.dot(towards_viewer, mirror)
