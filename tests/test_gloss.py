@@ -24,8 +24,8 @@ SMOOTH = 2e-2
 OUTLINES = 0.12
 
 # Of an image of 32² pixels of 2 × 2 samples under a sun. Measured 4.0% of plastic, 8.1 and 5.8% of metal of roughness
-# 0.4 and 0.2; 31% and 284% where samples on a face share a receiver. Most of it is that normal spread steps from face to
-# face: without it 4.9 and 1.2% of metal. Where samples of lobes looked for the sun, as stars, it was 3.4, 1.7 and 2.8%.
+# 0.4 and 0.2; 31% and 284% where samples on a face share a receiver. Most of it is that normal spread steps from face
+# to face: without it 4.9 and 1.2% of metal. Where samples of lobes looked for the sun, it was 3.4, 1.7 and 2.8%.
 SUN = 0.09
 
 SKY = ws.synthetic_sky((-0.7, 0.5, 0.2), sun_radius=12, sun_strength=3, height=32)

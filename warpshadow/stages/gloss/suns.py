@@ -20,7 +20,6 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.assets.color import LUMINANCE
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
@@ -63,20 +62,20 @@ def separate_suns(radiance: np.ndarray) -> tuple[Suns, np.ndarray]:
         The suns, and the map without their light, as bright there as the darkest that could be a sun.
     """
     solid_angles = np.repeat(sh.pixel_solid_angles(len(radiance)), 2 * len(radiance))
-    luminance = (radiance @ LUMINANCE).ravel().astype(np.float64)
-    total = luminance @ solid_angles
+    brightness = radiance.mean(axis=2, dtype=np.float64).ravel()
+    total = brightness @ solid_angles
     limit = _BRIGHTNESS * max(total, 0.0) / (4 * np.pi)
-    pixels = np.flatnonzero(luminance > limit)
+    pixels = np.flatnonzero(brightness > limit)
     directions = sh.equirectangular_directions(len(radiance)).reshape(-1, 3)[pixels]
-    shares = 1 - limit / luminance[pixels]
+    shares = 1 - limit / brightness[pixels]
     light = radiance.reshape(-1, 3)[pixels] * (shares * solid_angles[pixels])[:, None]
-    power = light @ LUMINANCE
+    power = light.mean(axis=1)
     is_candidate, is_sun = np.ones(len(pixels), bool), np.zeros(len(pixels), bool)
-    suns = []
+    suns: list[tuple[np.ndarray, np.ndarray, float]] = []
     for _ in range(_MAX_TRIALS):
         if not is_candidate.any() or len(suns) == _MAX_SUNS:
             break
-        brightest = np.argmax(np.where(is_candidate, luminance[pixels], -1))
+        brightest = np.argmax(np.where(is_candidate, brightness[pixels], -1))
         around = is_candidate & (directions @ directions[brightest] > np.cos(2 * _MAX_RADIUS))
         middle = power[around] @ directions[around]
         is_near = directions @ (middle / np.linalg.norm(middle))
