@@ -76,19 +76,19 @@ def separate_suns(radiance: np.ndarray) -> tuple[Suns, np.ndarray]:
         if not is_candidate.any() or len(suns) == _MAX_SUNS:
             break
         brightest = np.argmax(np.where(is_candidate, brightness[pixels], -1))
-        around = is_candidate & (directions @ directions[brightest] > np.cos(2 * _MAX_RADIUS))
-        middle = power[around] @ directions[around]
-        is_near = directions @ (middle / np.linalg.norm(middle))
-        inside = is_candidate & (is_near > np.cos(_MAX_RADIUS))
-        power_inside, power_around = power[inside].sum(), power[is_near > np.cos(2 * _MAX_RADIUS)].sum()
-        if power_inside > max(_MIN_SHARE * total, _ISOLATION * power_around):
-            mean = power[inside] @ directions[inside] / power_inside
+        is_close = is_candidate & (directions @ directions[brightest] > np.cos(2 * _MAX_RADIUS))
+        middle = power[is_close] @ directions[is_close]
+        cosines = directions @ (middle / np.linalg.norm(middle))
+        is_in_disc = is_candidate & (cosines > np.cos(_MAX_RADIUS))
+        disc_power, wider_power = power[is_in_disc].sum(), power[cosines > np.cos(2 * _MAX_RADIUS)].sum()
+        if disc_power > max(_MIN_SHARE * total, _ISOLATION * wider_power):
+            mean = power[is_in_disc] @ directions[is_in_disc] / disc_power
             length = np.linalg.norm(mean)
             # of a disc the mean square of angles to its middle is Ω / (2π); pixels have a size, too
-            size = 4 * np.pi * (1 - length) + power[inside] @ solid_angles[pixels[inside]] / power_inside
-            suns.append((mean / length, light[inside].sum(axis=0), size))
-            is_sun |= inside
-        is_candidate &= ~(around | inside)
+            size = 4 * np.pi * (1 - length) + power[is_in_disc] @ solid_angles[pixels[is_in_disc]] / disc_power
+            suns.append((mean / length, light[is_in_disc].sum(axis=0), size))
+            is_sun |= is_in_disc
+        is_candidate &= ~(is_close | is_in_disc)
     rest = radiance.reshape(-1, 3).copy()
     rest[pixels[is_sun]] *= (1 - shares[is_sun])[:, None]
     columns = np.array([[*direction, *irradiance, size] for direction, irradiance, size in suns]).reshape(-1, 7)
@@ -166,11 +166,11 @@ def transmittance_of_cells(
 @wp.func
 def _disc_density(slope_square: float, disc: float):
     """F, of d² and q²."""
-    beyond = slope_square + 1.0 - disc
-    root = wp.sqrt(beyond * beyond + 4.0 * disc)
-    if beyond > 0.0:
-        return 2.0 * disc / (root * (root + beyond))
-    return 0.5 - 0.5 * beyond / root
+    difference = slope_square + 1.0 - disc
+    root = wp.sqrt(difference * difference + 4.0 * disc)
+    if difference > 0.0:
+        return 2.0 * disc / (root * (root + difference))
+    return 0.5 - 0.5 * difference / root
 
 
 @wp.func
