@@ -725,6 +725,32 @@ def test_gradients_of_transmittance_of_lobes_are_exact(double, device, check, gl
 
 
 @pytest.mark.parametrize("quantity", [0, 1])
+def test_gradients_of_suns_in_lobes_are_exact(quantity, double, device, check, glossy):
+    """One in the middle of a lobe, one that is wide beside it, one at a slant."""
+    module, lobes = double("stages.gloss.suns"), double("stages.gloss.lobes")
+    views, (_, normals) = unit(twins.eye_of(EYE) - glossy[0][1])[0], glossy[1]
+    middle = 2 * (views[0] @ normals[0, 0]) * normals[0, 0] - views[0]
+    directions = unit(np.stack([middle, middle + 0.3 * random(5, 3), normals[0, 0] + 0.9 * views[1]]))
+    suns = module.Suns(directions, random(6, 3, 3) ** 2, np.array([0.01, 0.6, 0.001]))
+    spread = [(wp.vec3d, 0.2 * random(seed, 1, 2, 3)) for seed in (7, 8)]
+
+    def add(points, normals, roughness, cameras, along_x, along_y, transmittance, *lobe_light):
+        varied = lobes.NormalSpread(along_x, along_y)
+        shapes = lobes.sample_lobes(points, normals, roughness, cameras, 4, varied).lobes
+        return module.add_suns(module.LobeLight(*lobe_light), shapes, suns, transmittance)[quantity]
+
+    lights = [(wp.vec3d, random(seed, 1, 2, 3)) for seed in (9, 10)]
+    check(add, *glossy, (wp.mat44d, EYE[None]), *spread, (wp.float64, random(11, 1, 2, 6)), *lights)
+
+
+def test_gradients_of_transmittance_towards_suns_are_exact(double, device, check, glossy):
+    module, cells = double("stages.gloss.suns"), double("maths.directions").fibonacci(16)
+    suns = module.Suns(cells[[3, 9]], np.ones((2, 3)), np.ones(2))
+    values = (wp.float64, 0.1 + 0.5 * random(3, 1, 2, 16) ** 2)
+    check(lambda *arguments: module.transmittance_of_cells(*arguments, suns, cells, cells), values, glossy[1])
+
+
+@pytest.mark.parametrize("quantity", [0, 1])
 def test_gradients_of_sums_of_lobes_are_exact(quantity, double, device, check):
     sums = double("stages.gloss.reflection").sum_lobes
     weights, light = (wp.vec3d, random(0, 1, 2, 3, 3)), (wp.vec3d, random(1, 2, 2, 3, 3))

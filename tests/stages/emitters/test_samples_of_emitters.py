@@ -305,7 +305,7 @@ def test_planes_hide_the_part_of_a_lamp_that_lies_beyond_them(height, device):
     points = np.stack([1.5 * np.cos(angles), np.linspace(0.05, 0.8, 24), 1.5 * np.sin(angles)], axis=1)
     normals = twins.unit(-points * (1, 0, 1))
     arrays = [wp.array(item[None], dtype=wp.vec3, device=device) for item in (points, normals)]
-    log = planes.find_log_transmittance_of_planes(*arrays, own, span, frames, blockers, (-1, -1))
+    log = plane_transmittance.find_log_transmittance_of_planes(*arrays, own, span, frames, blockers, (-1, -1))
     ones = wp.full((1, span.size), wp.vec3(1.0), dtype=wp.vec3, device=device)
     through = light.find_transmittance_to_samples(log_of_planes=log)
     got = numbers(light.sum_light(*arrays, own, ones, span, through))[:, 0]

@@ -62,7 +62,8 @@ def test_samples_of_lobes_are_those_of_the_twin(device, varies):
     spread = spreads(normals) if varies else None
     arguments = arrays(device, points, normals, roughness, CAMERA[None])
     got = lobes.sample_lobes(*arguments, 32, NormalSpread(*arrays(device, *spread)) if varies else None)
-    for result, expected in zip(got, twins.lobe_samples(points, normals, roughness, CAMERA, 32, spread), strict=True):
+    expected_samples = twins.lobe_samples(points, normals, roughness, CAMERA, 32, spread)
+    for result, expected in zip(got[:3], expected_samples, strict=True):
         assert np.abs(result.numpy() - expected).max() < 20 * FLOAT32 * np.abs(expected).max()
 
 
@@ -72,7 +73,7 @@ def test_samples_of_lobes_are_turned_by_the_places_of_receivers_in_pixels(device
     got = lobes.sample_lobes(*arrays(device, points, normals, roughness, CAMERA[None]), 8, None, places, 4)
     expected_samples = twins.lobe_samples(points, normals, roughness, CAMERA, 8, None, turns)
     expected_samples[1][..., 2] *= 4**-0.2  # narrower blur
-    for result, expected in zip(got, expected_samples, strict=True):
+    for result, expected in zip(got[:3], expected_samples, strict=True):
         assert np.abs(result.numpy() - expected).max() < 20 * FLOAT32 * np.abs(expected).max()
 
 
@@ -86,6 +87,7 @@ def test_samples_of_lobes_have_the_gradients_of_the_twin(device, count, is_turne
     places, turns = places_of(points, device) if is_turned else (None, 0.0)
     with wp.Tape() as tape:
         samples = lobes.sample_lobes(*variables[:4], count, NormalSpread(*variables[4:]), places, 4 if is_turned else 1)
+    samples = samples[:3]
     weights = [rng.normal(size=result.shape + (3,) * (result.dtype == wp.vec3)) for result in samples]
     tape.backward(grads=dict(zip(samples, arrays(device, *weights), strict=True)))
 
@@ -143,7 +145,7 @@ def test_lobes_take_as_much_even_light_as_the_surface_reflects(device, roughness
     normal = np.array([0.0, 0.0, 1.0])
     point = twins.eye_of(CAMERA) - 2 * np.array([np.sqrt(1 - cosine**2), 0, cosine])
     values = point[None, None], normal[None, None], np.array([[roughness]]), CAMERA[None]
-    _, filters, _ = lobes.sample_lobes(*arrays(device, *values), 32)
+    _, filters, *_ = lobes.sample_lobes(*arrays(device, *values), 32)
     got = filters.numpy()[0, 0].sum(axis=0)
     for part, expected in zip(got, twins.lobe_energy(cosine, roughness), strict=False):
         assert part == pytest.approx(expected, abs=ENERGY)
@@ -154,7 +156,7 @@ def test_lobes_that_are_seen_from_straight_above_are_as_wide_around_any_normal(d
     normal = twins.unit(np.array(normal, float))
     point = twins.eye_of(CAMERA) - 2 * normal
     values = point[None, None], normal[None, None], np.array([[0.7]]), CAMERA[None]
-    directions, _, _ = lobes.sample_lobes(*arrays(device, *values), 32)
+    directions, *_ = lobes.sample_lobes(*arrays(device, *values), 32)
     got = directions.numpy()[0, 0]
     spread = np.linalg.eigvalsh(got.T @ got / len(got))
     assert spread[0] > 0.05 and np.abs(got @ normal - np.sort(got @ normal)[::-1]).max() < 0.1

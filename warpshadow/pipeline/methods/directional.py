@@ -27,6 +27,7 @@ from warpshadow.pipeline.shading.sphere_method import LitPortion, PortionedShadi
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, join_portions
 from warpshadow.scene.blockers import blocking_planes
 from warpshadow.stages.gloss.reflection import find_blocked_radiance
+from warpshadow.stages.gloss.suns import Suns, transmittance_of_cells
 from warpshadow.stages.gloss.transmittance import interpolate_transmittance
 from warpshadow.stages.joint_coverage import transmittance_past
 from warpshadow.stages.light.cached_cells import CachedRows, cell_transfer, shade_cached_cells
@@ -290,6 +291,13 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         arguments = transmittance, lobes.points.receivers_node, projected_light, diffuse, free
         return Node("light of blockers", self._mean_radiance_of_blockers, *arguments)
 
+    def sun_transmittance(self, lobes: LitLobes, suns: Suns) -> Node:
+        """Transmittance towards suns, of their cells."""
+        transmittance, projected_light = self._cell_transmittance(lobes)
+        arguments = transmittance, lobes.points.receivers_node, suns, self._directions, projected_light
+        item_text = functools.partial(receiver_text, lobes.points.weak)
+        return Node("transmittance of suns", _sun_transmittance, *arguments, items=item_text)
+
     def _mean_radiance_of_blockers(
         self,
         portions: list[wp.array],
@@ -418,6 +426,19 @@ def _lobe_transmittance(
         return wp.empty(directions.shape, dtype=wp.float32, device=directions.device)
     transmittance = _join_transmittance(portions, count)
     return interpolate_transmittance(transmittance, receivers.normals, directions, projected_light.cosine_directions)
+
+
+def _sun_transmittance(
+    portions: list[wp.array],
+    receivers: Receivers,
+    suns: Suns,
+    middles: np.ndarray,
+    projected_light: ProjectedCells,
+) -> wp.array:
+    if not receivers.points.size:
+        return wp.empty((1, 0, len(suns.directions)), dtype=wp.float32, device=receivers.points.device)
+    transmittance = _join_transmittance(portions, len(middles))
+    return transmittance_of_cells(transmittance, receivers.normals, suns, middles, projected_light.cosine_directions)
 
 
 def _join_transmittance(portions: list[wp.array], count: int) -> wp.array:

@@ -38,6 +38,7 @@ class RayTraced(Method):
 
     every_sample_receives = True
     shares_lobes = True
+    sun_samples = 16
     lobe_samples = 64  # each is blocked or not: with 32, reflected edges show as many edges
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):

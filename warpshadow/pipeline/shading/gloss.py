@@ -23,6 +23,7 @@ from warpshadow.stages.gloss.lobes import LobeSamples, sample_lobes
 from warpshadow.stages.gloss.normal_spread import NormalSpread, find_normal_spread
 from warpshadow.stages.gloss.prefilter import look_up_light, prefilter
 from warpshadow.stages.gloss.reflection import LobeLight, mix_reflection, number_runs, sum_lobes
+from warpshadow.stages.gloss.suns import Suns, add_suns
 from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.rasterization import Fragments
@@ -110,6 +111,10 @@ class GlossyPoints(LitPoints):
             own_openness = None if openness is None else self.select(openness)
             blocked = self.method.blocked_radiance(lit_lobes, self.select(bounced), own_openness)
         sums = Node("gloss", sum_lobes, filters, radiance, transmittance, blocked, items=item_text)
+        suns = self.method.suns(light)
+        if suns is not None:
+            past_blockers = self.method.sun_transmittance(lit_lobes, suns)
+            sums = Node("suns", _add_suns, sums, sampled, suns, past_blockers, items=item_text)
         if materials.emission:
             sums = Node("", _add_highlights, sums, self.method.highlights(self, materials, roughness, self._cameras))
         lobe_light = field_of(sums, "straight"), field_of(sums, "grazing")
@@ -202,6 +207,11 @@ def _prefilter_basis(basis: object) -> np.ndarray:
 def _find_exits(receivers: Receivers, directions: wp.array, shell: wp.array) -> wp.array:
     """Find directions from the center of a shell to where samples of lobes meet it. Differentiable: all."""
     return exits_from_shell(receivers.points, directions, shell)
+
+
+def _add_suns(lobe_light: LobeLight, samples: LobeSamples, suns: Suns, transmittance: wp.array) -> LobeLight:
+    """Add the light of suns to other light in lobes. Differentiable: all but suns."""
+    return add_suns(lobe_light, samples.lobes, suns, transmittance)
 
 
 def _add_highlights(lobe_light: LobeLight, highlights: LobeLight) -> LobeLight:

@@ -13,6 +13,7 @@ import warp as wp
 from warpshadow.assets.basis import Basis, HarmonicBasis, conversion
 from warpshadow.assets.known_light import KnownLight, as_light
 from warpshadow.assets.light import EnvironmentMap
+from warpshadow.device.batch import expand
 from warpshadow.device.constants import constant
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
@@ -28,7 +29,8 @@ from warpshadow.pipeline.receivers.lit_points import (
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.transfers import Light, check_light, shade_free
 from warpshadow.stages.gloss.prefilter import prefilter
-from warpshadow.stages.receivers.find import Numbering, number_receivers
+from warpshadow.stages.gloss.suns import Suns, directions_in_suns, separate_suns
+from warpshadow.stages.receivers.find import Numbering, Receivers, number_receivers
 from warpshadow.stages.receivers.quadtree import Quadtree
 from warpshadow.stages.shell.beams import check_shell, shell_array
 
@@ -54,6 +56,11 @@ class LightInput(Input):
         """Whether it is free light, an array, and not known light."""
         return isinstance(self.value(), wp.array)
 
+    @functools.cached_property
+    def separated(self) -> tuple[Suns, np.ndarray]:
+        """The suns of known light, and its map without them."""
+        return separate_suns(self.value().radiance)
+
     @property
     def visibility_key(self) -> Input | None:
         """The input on which visibility depends besides points and blockers.
@@ -71,6 +78,14 @@ class LitLobes(NamedTuple):
     light: LightInput  # known or free, which says where shadows have to be sharp
     all_points: LitPoints  # the receivers of the image, among which they are
     select: Callable[[Node], Node]  # makes a node of light on all these one of light on the points
+
+
+def _repeat(directions: np.ndarray, receivers: Receivers) -> wp.array:
+    """Repeat directions [1, direction, 3] for each receiver, vec3 of shape [1, receiver, direction]."""
+    count, device = receivers.points.shape[1], receivers.points.device
+    if not count:
+        return wp.empty((1, 0, directions.shape[1]), dtype=wp.vec3, device=device)
+    return expand(constant(directions, wp.vec3, device), count).reshape((1, count, -1))
 
 
 _MIN_LOBE_SAMPLES = 8  # of a receiver, however many receivers a pixel has: as many as a processor finds at once
@@ -94,7 +109,7 @@ class Method(abc.ABC):
     | :meth:`along_paths` | light that bounces along paths (:func:`.choose_bouncing`) | refused |
     | :meth:`blocker_kinds` | planes, convex parts, traced self-visibility | spheres alone |
     | :meth:`find_squares` | adaptive receivers | None, where every sample receives light |
-    | the five fields below | as they say | False; 32 |
+    | the six fields below | as they say | False; 32; 1 |
 
     A scene is refused whose bodies shine, or whose light bounces, where the method's row of ``METHOD_TRAITS``
     (:mod:`warpshadow.scene.visibility`) says no: the method then needs no member for that.
@@ -115,6 +130,8 @@ class Method(abc.ABC):
     lobe_samples = 32
     """Samples of a lobe of a body that shines. Light without shadows of an indoor map is 2.1% off with 32, 3.5% with 16
     (roughness 0.35)."""
+
+    sun_samples = 1  # directions in which each sun is looked for from the lobe of a receiver
 
     shares_lobes = False
     """Whether samples of a pixel on one face of a body that shines share a receiver. Else each is one, with its part of
@@ -310,16 +327,26 @@ class Method(abc.ABC):
     def transfers(self, points: LitPoints, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`, an array for each group, for light from a shell."""
 
+    def suns(self, light: LightInput) -> Suns | None:
+        """Suns of known light, infinitely far away, which prefiltered light is without; None where it has none."""
+        if light.is_free or self.shell_of(light) is not None or not len(light.separated[0].directions):
+            return None
+        return light.separated[0]
+
     @functools.cached_property
     def _prefiltered_from_scene(self) -> Node:
-        return Node("prefiltering", self._prefilter, self.light)
+        return self._prefiltered(self.light)
 
     def prefiltered(self, light: LightInput) -> Node:
         """Node of known light, prefiltered for bodies that shine, vec3 [1, texel]; the scene's is cached."""
-        return self._prefiltered_from_scene if light is self.light else Node("prefiltering", self._prefilter, light)
+        return self._prefiltered_from_scene if light is self.light else self._prefiltered(light)
 
-    def _prefilter(self, light: KnownLight) -> wp.array:
-        return constant(prefilter(light.radiance)[None], wp.vec3, self.merged_scene.device)
+    def _prefiltered(self, light: LightInput) -> Node:
+        def find(known: KnownLight) -> wp.array:
+            radiance = known.radiance if self.suns(light) is None else light.separated[1]
+            return constant(prefilter(radiance)[None], wp.vec3, self.merged_scene.device)
+
+        return Node("prefiltering", find, light)
 
     @property
     def lobes_across(self) -> int:
@@ -341,6 +368,19 @@ class Method(abc.ABC):
         Without shadows it is 1.
         """
         return Node("", lambda towards: wp.full(towards.shape, 1.0, wp.float32, device=towards.device), directions)
+
+    def sun_transmittance(self, lobes: LitLobes, suns: Suns) -> Node:
+        """Transmittance towards directions in suns, as many in each, float32 of shape [batch, receiver, direction].
+
+        Args:
+            lobes: The receivers.
+            suns: The suns of their light.
+
+        By default it is that towards samples of lobes, :attr:`sun_samples` of each sun.
+        """
+        directions = directions_in_suns(suns, self.sun_samples).reshape(1, -1, 3)
+        towards = Node("", functools.partial(_repeat, directions), lobes.points.receivers_node)
+        return self.lobe_transmittance(lobes, towards)
 
     def blocked_radiance(self, lobes: LitLobes, diffuse: Node, openness: Node | None) -> Node:
         """Mean radiance of the blockers of receivers, where light bounces, vec3 of shape [batch, receiver].

@@ -139,7 +139,7 @@ def _shape_lobes(
     cosines[batch, receiver] = cosine
 
 
-class _Lobes(NamedTuple):
+class Lobes(NamedTuple):
     """Lobes of receivers, vec3 of shape [batch, receiver]."""
 
     normals: wp.array
@@ -405,6 +405,7 @@ class LobeSamples(NamedTuple):
     directions: wp.array  # unit vectors, vec3 of shape [batch, receiver, sample]
     filters: wp.array  # w, w' and the blur σ [radians], vec3 of the same shape
     cosines: wp.array  # μ between normals and viewers, float32 of shape [batch, receiver]
+    lobes: Lobes
 
 
 def sample_lobes(
@@ -437,7 +438,7 @@ def sample_lobes(
     count = common_batch({"points": points, "roughness": roughness, "clip_matrices": clip_matrices})
     device, shape = points.device, (count, points.shape[1])
     cosines = empty(shape, dtype=wp.float32, device=device)
-    lobes = _Lobes(*(empty(shape, dtype=wp.vec3, device=device) for _ in _Lobes._fields))
+    lobes = Lobes(*(empty(shape, dtype=wp.vec3, device=device) for _ in Lobes._fields))
     inputs = [points, normals, roughness, clip_matrices, *(spread or (None, None))]
     rows, cost = count * points.shape[1], _COST * sample_count
     launch(
@@ -465,4 +466,4 @@ def sample_lobes(
         launch(sample_adjoint, rows, inputs=[*sampled, *gradients], outputs=outputs, cost=2 * cost)
 
     record_adjoint(adjoint, [*lobes, *results])
-    return LobeSamples(results[0], results[1], cosines)
+    return LobeSamples(results[0], results[1], cosines, lobes)

@@ -1,0 +1,273 @@
+"""Suns: the light of small bright discs of a map in lobes, one by one.
+
+A sun that is narrower than the gap between samples of a lobe would show as a star. So suns are taken out of the map
+that samples look up, and each, of irradiance E and solid angle Ω around ω, adds to a lobe's light G and G'
+
+    f c T E,   f c T E (1 − v·h)⁵,   f = D V,   c = n·ω,
+
+with the transmittance T towards it, the reflection f and the widths W of :mod:`.lobes`, and the mean of D over the
+disc: it is reflected by mirrors whose slopes h_t / n·h, as W sees them, are about a disc of radius q at a distance d
+from the lobe's middle, and over a disc D has an integral (it is an area of a sphere, projected from its pole):
+
+    D = 4 (v·h) F / (Ω n·h),   F = 2 q² / (B (B + d² + 1 − q²)),   B² = (d² + 1 − q²)² + 4 q²,
+    d = |W⁻¹h_t| / n·h,        q² = Ω / (4π (v·h) (n·h)³ |W|).
+
+For Ω → 0 this is D of :mod:`.lobes`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.constants import constant
+from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
+from warpshadow.device.parallel import split_row
+from warpshadow.maths import sh
+from warpshadow.maths.directions import cell_radius
+from warpshadow.stages.gloss.lobes import Lobes
+from warpshadow.stages.gloss.reflection import LobeLight
+
+_MAX_SUNS = 4
+_BRIGHTNESS = 10.0  # times as bright as all on average is a sun …
+_MIN_SHARE = 0.003  # … that has so much of all light at least …
+_MAX_RADIUS = np.radians(6.0)  # … within this radius
+_ISOLATION = 0.9  # part of the light within twice the radius that a sun has: other spots are larger
+_MAX_TRIALS = 32  # spots that are looked at
+
+_MIN_HORIZON_WEIGHT = 1.0e-7
+
+_COST = 20.0  # nanoseconds that a sun takes
+
+wp.set_module_options({"max_unroll": 1})
+
+
+class Suns(NamedTuple):
+    """Suns of a map, float64."""
+
+    directions: np.ndarray  # unit vectors towards their middles, [sun, 3]
+    irradiance: np.ndarray  # E of a surface that faces them, linear RGB, [sun, 3]
+    solid_angles: np.ndarray  # Ω [sr], [sun]
+
+
+def separate_suns(radiance: np.ndarray) -> tuple[Suns, np.ndarray]:
+    """Separate suns from a map, at most 4: discs of up to 6° in radius that are much brighter than all on average.
+
+    Args:
+        radiance: Linear RGB, shape [height, 2·height, 3].
+
+    Returns:
+        The suns, and the map without their light, as bright there as the darkest that could be a sun.
+    """
+    solid_angles = np.repeat(sh.pixel_solid_angles(len(radiance)), 2 * len(radiance))
+    brightness = radiance.mean(axis=2, dtype=np.float64).ravel()
+    total = brightness @ solid_angles
+    limit = _BRIGHTNESS * max(total, 0.0) / (4 * np.pi)
+    pixels = np.flatnonzero(brightness > limit)
+    directions = sh.equirectangular_directions(len(radiance)).reshape(-1, 3)[pixels]
+    shares = 1 - limit / brightness[pixels]
+    light = radiance.reshape(-1, 3)[pixels] * (shares * solid_angles[pixels])[:, None]
+    power = light.mean(axis=1)
+    is_candidate, is_sun = np.ones(len(pixels), bool), np.zeros(len(pixels), bool)
+    suns: list[tuple[np.ndarray, np.ndarray, float]] = []
+    for _ in range(_MAX_TRIALS):
+        if not is_candidate.any() or len(suns) == _MAX_SUNS:
+            break
+        brightest = np.argmax(np.where(is_candidate, brightness[pixels], -1))
+        is_close = is_candidate & (directions @ directions[brightest] > np.cos(2 * _MAX_RADIUS))
+        middle = power[is_close] @ directions[is_close]
+        cosines = directions @ (middle / np.linalg.norm(middle))
+        is_in_disc = is_candidate & (cosines > np.cos(_MAX_RADIUS))
+        disc_power, wider_power = power[is_in_disc].sum(), power[cosines > np.cos(2 * _MAX_RADIUS)].sum()
+        if disc_power > max(_MIN_SHARE * total, _ISOLATION * wider_power):
+            mean = power[is_in_disc] @ directions[is_in_disc] / disc_power
+            length = np.linalg.norm(mean)
+            # of a disc the mean square of angles to its middle is Ω / (2π); pixels have a size, too
+            size = 4 * np.pi * (1 - length) + power[is_in_disc] @ solid_angles[pixels[is_in_disc]] / disc_power
+            suns.append((mean / length, light[is_in_disc].sum(axis=0), size))
+            is_sun |= is_in_disc
+        is_candidate &= ~(is_close | is_in_disc)
+    rest = radiance.reshape(-1, 3).copy()
+    rest[pixels[is_sun]] *= (1 - shares[is_sun])[:, None]
+    columns = np.array([[*direction, *irradiance, size] for direction, irradiance, size in suns]).reshape(-1, 7)
+    return Suns(columns[:, :3], columns[:, 3:6], columns[:, 6]), rest.reshape(radiance.shape)
+
+
+def directions_in_suns(suns: Suns, count: int) -> np.ndarray:
+    """Directions that are even over each sun; unit vectors, [sun, direction, 3]."""
+    i = np.arange(count)
+    x, y = np.sqrt((i + 0.5) / count) * [np.cos(np.pi * (1 + np.sqrt(5)) * i), np.sin(np.pi * (1 + np.sqrt(5)) * i)]
+    axes = np.eye(3)[np.abs(suns.directions).argmin(axis=1)]
+    tangents = np.cross(suns.directions, axes)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    bitangents = np.cross(suns.directions, tangents)
+    offsets = x[:, None] * tangents[:, None] + y[:, None] * bitangents[:, None] if count > 1 else np.zeros((1, 3))
+    directions = suns.directions[:, None] + np.sqrt(suns.solid_angles / np.pi)[:, None, None] * offsets
+    return directions / np.linalg.norm(directions, axis=2, keepdims=True)
+
+
+@wp.kernel
+def _find_transmittance_of_cells(
+    first_row: int,
+    worker: int,
+    # in
+    transmittance: wp.array3d(dtype=wp.float32),
+    normals: wp.array2d(dtype=wp.vec3),
+    cells: wp.array(dtype=wp.int32),
+    directions: wp.array(dtype=wp.vec3),
+    per_radius: float,
+    # out
+    of_suns: wp.array3d(dtype=wp.float32),
+):
+    """A thread owns a receiver."""
+    batch, receiver = split_row(first_row + wp.tid(), of_suns.shape[1])
+    normal = normals[instance_in(batch, normals.shape[0]), receiver]
+    transmittance_batch = instance_in(batch, transmittance.shape[0])
+    for i in range(cells.shape[0]):
+        height = wp.clamp(0.5 * per_radius * wp.dot(normal, directions[i]) + 0.5, 0.0, 1.0)
+        above = height * height * (3.0 - 2.0 * height) + _MIN_HORIZON_WEIGHT
+        of_suns[batch, receiver, i] = wp.min(transmittance[transmittance_batch, receiver, cells[i]] / above, 1.0)
+
+
+def transmittance_of_cells(
+    transmittance: wp.array, normals: wp.array, suns: Suns, middles: np.ndarray, directions: np.ndarray
+) -> wp.array:
+    """Transmittance towards suns: that of their cells, min(T / H, 1), with H of :mod:`.transmittance`.
+
+    Args:
+        transmittance: Towards cells, float32 of shape [batch, receiver, cell].
+        normals: Unit normals, vec3 of shape [batch, receiver].
+        suns: The suns.
+        middles: Of the cells, unit vectors [cell, 3].
+        directions: Where the light of cells comes from, unit vectors [cell, 3].
+
+    Returns:
+        Float32 of shape [batch, receiver, sun].
+
+    Differentiable: transmittance, normals.
+    """
+    count, device = common_batch({"transmittance": transmittance, "normals": normals}), normals.device
+    cells = (suns.directions @ middles.T).argmax(axis=1)
+    of_suns = empty((count, normals.shape[1], len(cells)), dtype=wp.float32, device=device)
+    constants = constant(cells, wp.int32, device), constant(directions[cells], wp.vec3, device)
+    launch(
+        _find_transmittance_of_cells,
+        count * normals.shape[1],
+        inputs=[transmittance, normals, *constants, 1 / float(cell_radius(len(middles)))],
+        outputs=[of_suns],
+        shared=[array for array in (transmittance, normals) if len(array) < count],
+        cost=_COST * len(cells),
+    )
+    return of_suns
+
+
+@wp.func
+def _disc_density(slope_square: float, disc: float):
+    """F, of d² and q²."""
+    difference = slope_square + 1.0 - disc
+    root = wp.sqrt(difference * difference + 4.0 * disc)
+    if difference > 0.0:
+        return 2.0 * disc / (root * (root + difference))
+    return 0.5 - 0.5 * difference / root
+
+
+@wp.func
+def _reflect_disc(view: wp.vec3, width: wp.vec3, towards: wp.vec3, solid_angle: float):
+    """Reflection f c of a disc, and that with (1 − v·h)⁵, in the frame of a lobe."""
+    towards_viewer = wp.vec3(view[0], 0.0, view[1])
+    mirror = wp.normalize(towards_viewer + towards)
+    view_cosine = wp.dot(towards_viewer, mirror)
+    area = width[0] * width[2] - width[1] * width[1]
+    slope_x = (width[2] * mirror[0] - width[1] * mirror[1]) / (area * mirror[2])
+    slope_y = (width[0] * mirror[1] - width[1] * mirror[0]) / (area * mirror[2])
+    disc = solid_angle / (4.0 * wp.pi * view_cosine * area * mirror[2] * mirror[2] * mirror[2])
+    density = _disc_density(slope_x * slope_x + slope_y * slope_y, disc)
+    density = density * 4.0 * view_cosine / (solid_angle * mirror[2])
+    spread_x = width[0] * towards[0] + width[1] * towards[1]
+    spread_y = width[1] * towards[0] + width[2] * towards[1]
+    slant = wp.sqrt(spread_x * spread_x + spread_y * spread_y + towards[2] * towards[2])
+    weight = 0.5 * density * towards[2] / (towards[2] * view[2] + view[1] * slant)
+    base = wp.max(1.0 - view_cosine, 0.0)
+    return wp.vec2(weight, weight * base * base * base * base * base)
+
+
+@wp.kernel
+def _reflect_suns(
+    first_row: int,
+    worker: int,
+    # in
+    normals: wp.array2d(dtype=wp.vec3),
+    tangents: wp.array2d(dtype=wp.vec3),
+    views: wp.array2d(dtype=wp.vec3),
+    widths: wp.array2d(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    irradiance: wp.array(dtype=wp.vec3),
+    solid_angles: wp.array(dtype=wp.float32),
+    transmittance: wp.array3d(dtype=wp.float32),
+    straight: wp.array2d(dtype=wp.vec3),
+    grazing_light: wp.array2d(dtype=wp.vec3),
+    # out
+    straight_sum: wp.array2d(dtype=wp.vec3),
+    grazing_sum: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a receiver: G and G'."""
+    batch, receiver = split_row(first_row + wp.tid(), straight_sum.shape[1])
+    lobe_batch = instance_in(batch, normals.shape[0])
+    light_batch = instance_in(batch, straight.shape[0])
+    normal = normals[lobe_batch, receiver]
+    tangent = tangents[lobe_batch, receiver]
+    bitangent = wp.cross(normal, tangent)
+    view = views[lobe_batch, receiver]
+    width = widths[lobe_batch, receiver]
+    count = transmittance.shape[2] / directions.shape[0]  # directions of each sun
+    transmittance_batch = instance_in(batch, transmittance.shape[0])
+    lobe_sum = wp.vec3()
+    total_grazing = wp.vec3()
+    for i in range(directions.shape[0]):
+        cosine = wp.dot(normal, directions[i])
+        if cosine > 0.0:
+            towards = wp.vec3(wp.dot(tangent, directions[i]), wp.dot(bitangent, directions[i]), cosine)
+            weights = _reflect_disc(view, width, towards, solid_angles[i]) / float(count)
+            for k in range(count):
+                light = transmittance[transmittance_batch, receiver, i * count + k] * irradiance[i]
+                lobe_sum += weights[0] * light
+                total_grazing += weights[1] * light
+    straight_sum[batch, receiver] = straight[light_batch, receiver] + lobe_sum
+    grazing_sum[batch, receiver] = grazing_light[light_batch, receiver] + total_grazing
+
+
+def add_suns(lobe_light: LobeLight, lobes: Lobes, suns: Suns, transmittance: wp.array) -> LobeLight:
+    """Add the light of suns in lobes.
+
+    Args:
+        lobe_light: Other light in them.
+        lobes: Of :func:`.lobes.sample_lobes`.
+        suns: The suns.
+        transmittance: Towards as many directions of each sun, the last index of the sun, float32 of shape [batch,
+            receiver, direction].
+
+    Differentiable: all but suns.
+    """
+    device = transmittance.device
+    if transmittance.shape[2] % len(suns.directions):
+        raise ValueError(f"transmittance: got {transmittance.shape[2]} directions of {len(suns.directions)} suns")
+    arrays = {"lobe_light": lobe_light.straight, "lobes": lobes.normals, "transmittance": transmittance}
+    count, receiver_count = common_batch(arrays), lobe_light.straight.shape[1]
+    sums = LobeLight(*(empty((count, receiver_count), dtype=wp.vec3, device=device) for _ in range(2)))
+    of_lobes = [lobes.normals, lobes.tangents, lobes.views, lobes.widths]
+    of_suns = [
+        constant(suns.directions, wp.vec3, device),
+        constant(suns.irradiance, wp.vec3, device),
+        constant(suns.solid_angles, wp.float32, device),
+    ]
+    launch(
+        _reflect_suns,
+        count * receiver_count,
+        inputs=[*of_lobes, *of_suns, transmittance, *lobe_light],
+        outputs=[*sums],
+        shared=[array for array in (*of_lobes, transmittance, *lobe_light) if len(array) < count],
+        cost=_COST * len(suns.directions),
+    )
+    return sums
