@@ -9,8 +9,8 @@ INSTALLED := $(VENV)/installed
 demo: $(INSTALLED)
 	$(BIN)/python demos/examples/bunny.py
 
-# a process a core; those of a file share its kernels
-PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist loadfile
+# a process a core; those of a file share its kernels. Threads of torch and NumPy would wait for those of other processes
+PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist loadfile
 
 test: $(INSTALLED)
 	$(PYTEST)

@@ -12,6 +12,7 @@ import warpshadow as ws
 from demos import kinds, shapes
 from demos.benchmarks import scenes_of_all_kinds as bench
 from demos.references import Reference, Request, turned
+from warpshadow.pipeline.bounces import self_form_factors
 
 SMALL = 40  # pixels across
 
@@ -154,10 +155,11 @@ def test_scenes_have_all_that_they_are_about_in_sight():
 
 @pytest.mark.slow
 def test_four_scenes_are_measured_and_drawn(tmp_path, monkeypatch, capsys):
-    """In this process, with spheres that need no fit, so that it takes seconds."""
+    """In this process, with spheres that need no fit and form factors of few rays, so that it takes seconds."""
     monkeypatch.setattr(bench, "SCENES", {name: with_quick_spheres(kinds.SCENES[name]) for name in BOUNDS})
     monkeypatch.setattr(bench, "ProcessPoolExecutor", Here)
     monkeypatch.setattr(bench, "MOVED_RUNS", 1)
+    monkeypatch.setattr(self_form_factors, "_RAYS", 64)
     settings = ("still-direct", "renderer-full")
     options = bench.Options(
         size=SMALL, samples=128, settings=settings, output=tmp_path / "out", references=tmp_path / "references"

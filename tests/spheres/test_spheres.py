@@ -497,12 +497,9 @@ def test_a_mesh_without_surface_is_refused():
 # ------------------------------------------------------------------------------ cache and picture
 
 
-@pytest.mark.parametrize(
-    ("stop", "kept", "known"),
-    [(15, "1 short fits", 10), (70, "50 of 100 steps", 70)],
-    ids=["in the second short fit", "in the descent"],
-)
-def test_a_fit_goes_on_where_an_interrupt_left_it_to_the_same_bits(tmp_path, monkeypatch, stop, kept, known):
+@pytest.mark.slow
+def test_a_fit_goes_on_where_an_interrupt_left_it_to_the_same_bits(tmp_path, monkeypatch):
+    """In the second short fit, and in the descent, before it draws receivers once more (after 32 batches)."""
     steps, limit, gradient = [], [np.inf], stage_2.Refinement.gradient
 
     def counted(self, *args):
@@ -514,25 +511,26 @@ def test_a_fit_goes_on_where_an_interrupt_left_it_to_the_same_bits(tmp_path, mon
     def fit(folder):
         monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path / folder))
         steps.clear()
-        return fit_spheres(bumpy(), **{**QUICK, "cache": True, "steps": 100})
+        return fit_spheres(bumpy(), **{**QUICK, "cache": True, "steps": 40})
 
     monkeypatch.setattr(stage_2.Refinement, "gradient", counted)
     monkeypatch.setattr(enough, "TRIED_COUNTS", (2, 4))
     monkeypatch.setattr(enough, "_MAX_ERROR", 0.0)
     monkeypatch.setattr(enough, "_STEPS", 10)
     whole = fit("whole").spheres
-    assert len(steps) == 120  # of two short fits, and the descent
-    limit[0] = stop
-    with pytest.raises(KeyboardInterrupt, match=f"^{kept} of the fit are cached"):
-        fit("interrupted")
-    (part,) = cached_files("spheres")
-    assert part.name.endswith(".part.npz")
-    limit[0] = np.inf
-    resumed = fit("interrupted").spheres
-    np.testing.assert_array_equal(resumed.centers, whole.centers)
-    np.testing.assert_array_equal(resumed.radii, whole.radii)
-    assert len(steps) == 120 - known
-    assert [path.name for path in cached_files("spheres")] == [part.name.replace(".part", "")]
+    assert len(steps) == 60  # of two short fits, and the descent
+    for stop, kept, known in ((15, "1 short fits", 10), (40, "20 of 40 steps", 40)):
+        limit[0] = stop
+        with pytest.raises(KeyboardInterrupt, match=f"^{kept} of the fit are cached"):
+            fit(kept)
+        (part,) = cached_files("spheres")
+        assert part.name.endswith(".part.npz")
+        limit[0] = np.inf
+        resumed = fit(kept).spheres
+        np.testing.assert_array_equal(resumed.centers, whole.centers)
+        np.testing.assert_array_equal(resumed.radii, whole.radii)
+        assert len(steps) == 60 - known
+        assert [path.name for path in cached_files("spheres")] == [part.name.replace(".part", "")]
 
 
 @pytest.mark.slow
