@@ -456,7 +456,8 @@ class SceneRenderer:
             inputs: All that an image takes.
         Returns:
             The stages, which print as a table: whether each runs and on how many items, how long it took last, and why
-            it does or does not run; then the same of the adjoints. Nothing of the call is computed.
+            it does or does not run; then the same of the adjoints. Nothing of the call is computed, but where
+            bodies shine the suns of a map that it gives.
         """
         return self.explain_inputs(inputs, inputs.view)
 

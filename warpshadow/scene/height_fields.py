@@ -43,7 +43,7 @@ class Land(NamedTuple):
     """The solid that stands in for land."""
 
     solid: Mesh  # the land, with walls from its rim to a bottom behind it, in its own space
-    seen_from: tuple[float, float, float]  # unit vector to the side from which bodies see it
+    seen_from: tuple[float, float, float]  # unit vector, in its own space, to the side on which bodies are
     is_bowl: bool  # whether panels are better blockers: it is deep, and no body stands between it and its panels
 
 

@@ -93,11 +93,11 @@ def fit_spheres(
         refine: Refine the spheres until they cast the mesh's shadows (stage 2). False keeps the spheres of stage 1,
             which cover the mesh, the paper's fit.
         steps: Steps of gradient descent of the refinement.
+        seen_from: Direction, in the mesh's axes, to the side from which alone it is seen, as land is; its other faces
+            need no spheres. Shape [3]; None for all sides.
         cache: Read and write the fit in a cache on disk, by the mesh's shape and the arguments above. The
             folder is the user's cache folder, or WARPSHADOW_CACHE_DIR.
         warns: Warn of spheres that cast a bad shadow. False where something else blocks light in their place.
-        seen_from: Direction to the side from which alone the mesh is seen, such as land, whose other faces need no
-            spheres, shape [3]; None for all sides.
     Returns:
         The spheres in the mesh's coordinates, and a report. Spheres that shrank to nothing are left out.
     Warns: Once for each mesh, where 64 or more spheres cast a ragged shadow, as on thin legs, fill its cavities, or let

@@ -35,13 +35,13 @@ class FitReport:
     """Share of the union's volume that lies outside the mesh, the air of a cavity included; 1 for a sheet."""
     ground_error: float
     """Error on a square of 2.5 times the bounding box's longest side at the height of the lowest point, y up;
-    in the air above a mesh that is seen from one side."""
+    of a mesh that is seen from one side, at points near it on that side that look up, as there is no ground below."""
     surface_error: float
     """Error on the mesh's own vertices, weighted by area; on both sides of an open mesh, for any winding."""
     nearby_error: float
     """Error in the air around it and in its cavities, mostly close to the mesh, on receivers of random normals."""
     shadow_error: float
-    """The error on the ground relative to the shadow there, ‖E_spheres − E_mesh‖ / ‖E_unshadowed − E_mesh‖."""
+    """``ground_error`` relative to the shadow there, ‖E_spheres − E_mesh‖ / ‖E_unshadowed − E_mesh‖."""
     seconds: float
     """Time that the fit took when it was made."""
     cached: bool = False

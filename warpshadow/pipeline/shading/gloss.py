@@ -1,7 +1,9 @@
 """Gloss: the light of bodies that shine, at receivers that pixels see.
 
-Lobes are sampled at the receivers of glossy bodies; each sample looks up light without shadows in a prefiltered map,
-and its transmittance in the way of the method. Diffuse light is found as for all bodies, and mixed in at the end.
+Lobes are sampled at the receivers of glossy bodies; each sample looks up light without shadows, and without suns, in a
+prefiltered map, and its transmittance in the way of the method. Suns and emitters are added one by one
+(:mod:`.stages.gloss.suns`, :mod:`.stages.gloss.highlights`). Diffuse light is found as for all bodies, and mixed in at
+the end.
 """
 
 from __future__ import annotations

@@ -95,7 +95,8 @@ class Method(abc.ABC):
     """How light is blocked: a method of visibility.
 
     A method gives these members. A method by spheres derives from :class:`.SphereMethod`, which gives all but
-    :meth:`lobe_transmittance`, :meth:`blocked_radiance` and :meth:`along_paths`, and has a table of its own:
+    :meth:`lobe_transmittance`, :meth:`sun_transmittance`, :meth:`blocked_radiance` and :meth:`along_paths`, and has a
+    table of its own:
 
     | member | needed for | default |
     | --- | --- | --- |
@@ -104,6 +105,7 @@ class Method(abc.ABC):
     | :meth:`emitted_light` | lamps | – |
     | :meth:`highlights` | lamps, on bodies that shine | – |
     | :meth:`lobe_transmittance` | bodies that shine | 1: no shadows |
+    | :meth:`sun_transmittance` | suns, on bodies that shine | :meth:`lobe_transmittance` in :attr:`sun_samples` |
     | :meth:`blocked_radiance` | bodies that shine, where light bounces | refused |
     | :meth:`openness` | light that bounces between static patches | None: rays find it, as they find form factors |
     | :meth:`along_paths` | light that bounces along paths (:func:`.choose_bouncing`) | refused |
@@ -128,8 +130,8 @@ class Method(abc.ABC):
     """Whether all receivers look for light in the same directions, so that one is enough for a surface in a pixel."""
 
     lobe_samples = 32
-    """Samples of a lobe of a body that shines. Light without shadows of an indoor map is 2.1% off with 32, 3.5% with 16
-    (roughness 0.35)."""
+    """Samples of a lobe of a body that shines. Light without shadows, and without its suns, of an indoor map is
+    2.1% off with 32, 3.5% with 16 (roughness 0.35)."""
 
     sun_samples = 1  # directions in which each sun is looked for from the lobe of a receiver
 
@@ -338,7 +340,7 @@ class Method(abc.ABC):
         return self._prefiltered(self.light)
 
     def prefiltered(self, light: LightInput) -> Node:
-        """Node of known light, prefiltered for bodies that shine, vec3 [1, texel]; the scene's is cached."""
+        """Node of known light without its suns, prefiltered, vec3 [1, texel]; the scene's is cached."""
         return self._prefiltered_from_scene if light is self.light else self._prefiltered(light)
 
     def _prefiltered(self, light: LightInput) -> Node:

@@ -1,7 +1,8 @@
 """Views of a scene: its geometries seen by cameras, which are used again while their inputs stay the same.
 
-Two views are kept: the last one of the scene itself, and the last of another geometry or by other cameras. A view is
-kept once its receivers and silhouettes are found, unless a graph is captured, whose memory their values are.
+Two views are kept: the last one of the scene itself, and the last of another geometry or by other cameras, once their
+receivers and silhouettes are found. Not kept are views to whose geometry or cameras a gradient is asked for, as they
+never come again, and those of a graph that is captured, whose memory their values are.
 """
 
 import copy
@@ -93,7 +94,7 @@ class SceneViews:
         return view.vertices is self.vertices and view.cameras is self.clip_matrices
 
     def _keep(self, view: View) -> None:
-        """Keep a view whose receivers are found, unless its values belong to a graph."""
+        """Keep a view whose receivers are found, unless it has gradients or belongs to a graph."""
         if self._merged_scene.device.is_capturing:
             return
         self._last_cameras = view.cameras

@@ -7,12 +7,12 @@ outline of the plane, positive inside, along m, the plane takes the share
     a = S((s / w + 1) / 2),   w² = b² (1 + (ω·m / ω·n)²)
 
 of it, S the smoothstep and n the plane's normal: the projection of the beam reaches w along m. The disc itself, with a
-normal k, reaches r = R √(1 − (k·n)²) off its middle along n; if that is at a height h_y < r on the receiver's side, a
-part of the sample lies beyond the plane, as of a lamp that is half in the ground:
+normal k, reaches r = R √(1 − (k·n)²) off its middle along n, a margin at least; if that is less than r above the plane,
+on the receiver's side, a part of the sample lies beyond, as of a lamp that is half in the ground:
 
-    a S((1 − h_y / r) / 2)
+    a S((1 − h_y / r) / 2)      h_y: height over the plane, and two margins, so that a lamp in the plane is whole
 
-With samples that lay beyond wholly or not at all a lamp that was half in the ground was off by −7 to +7%.
+With samples that lay beyond wholly or not at all a lamp that was half in the ground was off by −7 to +8%.
 """
 
 import warp as wp

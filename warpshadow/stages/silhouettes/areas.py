@@ -8,8 +8,9 @@ lies beyond it
         0                         t ≥ (1 + m)/2
 
 The line of an edge with ends a, b is ℓ = a × b, and that where two faces intersect ℓ = n − n′, the difference of their
-planes. If the outline of a surface moves by v(s), an integral of w over it changes by ∮ w (v_x dy − v_y dx). So the
-derivative of an edge counts the motion of its points along rows in rows, and along columns in columns, where ω is 1:
+planes. If the outline of a surface moves by v(s), an integral of g over it changes by ∮ g (v_x dy − v_y dx). So the
+derivative of an edge counts the motion of its points along rows in rows and along columns in columns, both whole, where
+areas above share a sample between rows and columns by ω:
 
     dx = α da_x + β db_x, on screen                         α, β: the point on the edge is α a + β b, with w = 1
 

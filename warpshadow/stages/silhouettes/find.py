@@ -38,7 +38,7 @@ from warpshadow.stages.silhouettes.lines import (
 wp.set_module_options({"max_unroll": 1})  # it compiles in 2.2 s instead of 3.1 s, and runs as fast
 
 
-MAX_SAMPLES = 2**29 - 1  # samples of all images of a batch: strides of arrays of four numbers each are int32 [bytes]
+MAX_SAMPLES = 2**29 - 1  # samples of all images of a batch: int32 holds the stride, in bytes, of [4, sample]
 
 MIN_OPENING = 1e-4
 """Relative change of two surfaces' distance over a sample, below which rounding hides where they intersect."""
