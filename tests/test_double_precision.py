@@ -747,7 +747,7 @@ def test_gradients_of_transmittance_towards_suns_are_exact(double, device, check
     module, cells = double("stages.gloss.suns"), double("maths.directions").fibonacci(16)
     suns = module.Suns(cells[[3, 9]], np.ones((2, 3)), np.ones(2))
     values = (wp.float64, 0.1 + 0.5 * random(3, 1, 2, 16) ** 2)
-    check(lambda *arguments: module.transmittance_of_cells(*arguments, suns, cells, cells), values, glossy[1])
+    check(lambda *arguments: module.find_sun_transmittance(*arguments, suns, cells, cells), values, glossy[1])
 
 
 @pytest.mark.parametrize("quantity", [0, 1])

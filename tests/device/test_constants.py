@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from warpshadow.device.constants import cached_by_values, immutable, values_of_owners
+from warpshadow.device.constants import cached_by_values, gather_of_owners, immutable
 
 
 def test_arrays_are_compared_by_values_and_immutable_ones_by_identity():
@@ -27,6 +27,6 @@ def test_arrays_are_compared_by_values_and_immutable_ones_by_identity():
 
 def test_values_of_owners_are_made_once_for_equal_values():
     owners = immutable(np.array([0, 0, 2, 1]))
-    values = values_of_owners(np.array([5, 6, 7]), owners)
-    assert values.tolist() == [5, 5, 7, 6] and values_of_owners(np.array([5, 6, 7]), owners) is values
-    assert values_of_owners(np.array([True, False, True]), owners).tolist() == [True, True, True, False]
+    values = gather_of_owners(np.array([5, 6, 7]), owners)
+    assert values.tolist() == [5, 5, 7, 6] and gather_of_owners(np.array([5, 6, 7]), owners) is values
+    assert gather_of_owners(np.array([True, False, True]), owners).tolist() == [True, True, True, False]

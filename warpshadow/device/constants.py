@@ -95,7 +95,7 @@ def use(*values: Any) -> None:
 
 
 @cached_by_values
-def values_of_owners(values: np.ndarray, owners: np.ndarray) -> np.ndarray:
+def gather_of_owners(values: np.ndarray, owners: np.ndarray) -> np.ndarray:
     """The value of each item's owner, as of a face's body, given one for each owner; made once, and immutable."""
     return immutable(values[owners])
 

@@ -23,7 +23,7 @@ gaps: with 1/16 the land of demos/kinds.py is 4.1% off, and a bottle on it 5% to
 
 _POINTS = 1024  # of meshes, from which rays tell which bodies lie before the field, and which behind
 
-_STUCK = 0.1
+_MIN_SHARE_BEFORE = 0.1
 """Rays that meet a body before the field, over those that meet it behind, from which it sticks in the field.
 
 So do rocks and water in land; a ground that a tent stands on does not."""
@@ -32,7 +32,7 @@ _DEEP = 0.25
 """Depth of bowls, over the longest side of their bounds. A ball in half a shell (0.5) is 18% too bright past spheres of
 the solid under an even sky, 2% too dark past panels; in a shell of 0.35 5% and 0%. That land has 0.1."""
 
-_BEHIND = 0.1
+_MAX_SHARE_BEHIND = 0.1
 """Share of a body behind panels from which it stands between a bowl and these, which shade it from above: a slab that
 lies in a basin is 24% too dark past panels, and 1% past spheres. A ball that touches half a shell has 0.01."""
 
@@ -71,11 +71,14 @@ def _solid_behind(body: Body, others: tuple[Body, ...]) -> Land | None:
         return None
     meshes = [other.world_mesh().transformed(**to_own) for other in others]
     above, below = (np.array([_count_overlaps(mesh, other, side) for other in meshes]) for side in (axis, -axis))
-    if not above.any() or (above < _STUCK * below).any():
+    if not above.any() or (above < _MIN_SHARE_BEFORE * below).any():
         return None
     x, y, z = axis.tolist()
     is_deep = np.ptp(mesh.positions @ axis) > _DEEP * np.ptp(mesh.positions, axis=0).max()
-    is_bowl = bool(is_deep) and max(_share_behind_panels(mesh, axis, _spread(other)) for other in meshes) <= _BEHIND
+    is_bowl = (
+        bool(is_deep)
+        and max(_share_behind_panels(mesh, axis, _spread_points(other)) for other in meshes) <= _MAX_SHARE_BEHIND
+    )
     return Land(_close_height_field(mesh, axis), (x, y, z), is_bowl)
 
 
@@ -116,11 +119,11 @@ def _count_hits(mesh: Mesh, other: Mesh, axis: np.ndarray) -> int:
     horizons = np.broadcast_to(axis, (_POINTS, 3))
     vertices = wp.array(other.positions, dtype=wp.vec3, device="cpu")
     blocker = wp.Mesh(vertices, wp.array(other.faces.ravel(), dtype=wp.int32, device="cpu"))
-    visibility = trace_visibility_on_host(blocker, _spread(mesh), horizons, axis[None], "cpu")
+    visibility = trace_visibility_on_host(blocker, _spread_points(mesh), horizons, axis[None], "cpu")
     return int((~visibility).sum())
 
 
-def _spread(mesh: Mesh) -> np.ndarray:
+def _spread_points(mesh: Mesh) -> np.ndarray:
     """Points of a mesh that are spread evenly, [point, 3]."""
     corners = mesh.positions[mesh.surface.faces]
     areas = np.linalg.norm(area_normals(corners), axis=1).cumsum()

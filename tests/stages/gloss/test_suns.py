@@ -113,7 +113,7 @@ def test_suns_have_the_transmittance_of_their_cells_above_the_horizon(device):
         wp.array(array[None].astype(np.float32), dtype=dtype, device=device)
         for array, dtype in ((values, wp.float32), (normals, wp.vec3))
     ]
-    got = suns.transmittance_of_cells(*arrays, sun, cells, towards).numpy()[0]
+    got = suns.find_sun_transmittance(*arrays, sun, cells, towards).numpy()[0]
     height = np.clip(normals @ towards[[5, 40]].T / cell_radius(64) / 2 + 0.5, 0, 1)
     expected = np.minimum(values[:, [5, 40]] / (height**2 * (3 - 2 * height) + 1e-7), 1)
     np.testing.assert_allclose(got, expected, atol=FLOAT32)

@@ -11,7 +11,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.batch import concatenate
-from warpshadow.device.constants import constant, values_of_owners
+from warpshadow.device.constants import constant, gather_of_owners
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
@@ -64,7 +64,7 @@ class BodyTextures:
         has_texture = np.array([size is not None for size in self.sizes])
         texture_of_body = np.where(has_texture, np.cumsum(has_texture) - 1, -1)
         return constant(
-            values_of_owners(texture_of_body, self._merged_scene.body_of_face), wp.int32, self._merged_scene.device
+            gather_of_owners(texture_of_body, self._merged_scene.body_of_face), wp.int32, self._merged_scene.device
         )
 
     def pyramids_to(self, coarsest: Callable[[], int | None]) -> Node:

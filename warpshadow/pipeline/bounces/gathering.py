@@ -153,7 +153,7 @@ class Gathering:
         skip = planes.index_of_body.get(group.body)
         if planes.blockers.count == (skip is not None):
             return None
-        fronts = group.beside(outgoing.frames, planes.blockers, skip)
+        fronts = group.find_fronts(outgoing.frames, planes.blockers, skip)
         # Cells look to where the light of the sky is, above horizons; light of planes is found around their middles. A
         # ball on a ground lost 4% of the ground's light by the former.
         middles = fibonacci(len(transmittance.directions))

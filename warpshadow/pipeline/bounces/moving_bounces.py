@@ -49,7 +49,7 @@ from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.receivers.find import Receivers
 
 
-class PortionVisibility(NamedTuple):
+class VisibilityOfPortion(NamedTuple):
     """Some receivers, and their visibility, which holds for any free light."""
 
     transfer: wp.array  # of direct light, [batch, receiver, coefficient]
@@ -57,7 +57,7 @@ class PortionVisibility(NamedTuple):
     transmittance: CellTransmittance
 
 
-class PortionDirectLight(NamedTuple):
+class DirectLightOfPortion(NamedTuple):
     """Some receivers in direct light, and their visibility of bounced light."""
 
     direct: wp.array  # vec3 of shape [batch, receiver]
@@ -65,24 +65,24 @@ class PortionDirectLight(NamedTuple):
     transmittance: CellTransmittance
 
 
-class VisibilityWithBounces(PortionedTransfer):
-    """Visibility of receivers for direct and bounced light, a list of :class:`PortionVisibility`: in free light."""
+class TransferForBounces(PortionedTransfer):
+    """Visibility of receivers for direct and bounced light, a list of :class:`VisibilityOfPortion`: in free light."""
 
-    def result_of(self, portion: LitPortion) -> PortionVisibility:
+    def result_of(self, portion: LitPortion) -> VisibilityOfPortion:
         """Visibility of a portion."""
-        return PortionVisibility(portion.result, portion.group, _find_transmittance(self.method, portion))
+        return VisibilityOfPortion(portion.result, portion.group, _find_transmittance(self.method, portion))
 
 
-class ShadingWithVisibility(PortionedShading):
-    """Direct light of receivers, and their visibility of bounced light, a list of :class:`PortionDirectLight`."""
+class ShadingForBounces(PortionedShading):
+    """Direct light of receivers, and their visibility of bounced light, a list of :class:`DirectLightOfPortion`."""
 
     def compute(self, call: Call) -> Any:
         """Shade all portions."""
         return list(self.portions(call))
 
-    def result_of(self, portion: LitPortion) -> PortionDirectLight:
+    def result_of(self, portion: LitPortion) -> DirectLightOfPortion:
         """Light and visibility of a portion."""
-        return PortionDirectLight(portion.result, portion.group, _find_transmittance(self.method, portion))
+        return DirectLightOfPortion(portion.result, portion.group, _find_transmittance(self.method, portion))
 
 
 def _find_transmittance(method: SphereMethod, portion: LitPortion) -> CellTransmittance:
@@ -103,7 +103,7 @@ class PortionedDirectLight(Node):
 
     def __init__(
         self,
-        visibility: VisibilityWithBounces | ShadingWithVisibility,
+        visibility: TransferForBounces | ShadingForBounces,
         free_light: Node | None,
         item_text: str | Callable[[], str],
         where: str = "",
@@ -122,17 +122,17 @@ class PortionedDirectLight(Node):
         return [self._light(call, portion, free_light) for portion in self._visibility.value(call)]
 
     def _light(
-        self, call: Call, portion: PortionVisibility | PortionDirectLight, free_light: ProjectedLight | None
-    ) -> PortionDirectLight:
-        if isinstance(portion, PortionDirectLight):
+        self, call: Call, portion: VisibilityOfPortion | DirectLightOfPortion, free_light: ProjectedLight | None
+    ) -> DirectLightOfPortion:
+        if isinstance(portion, DirectLightOfPortion):
             return portion
         assert free_light is not None
         with self.timed(call, self._shading):
             direct = self._visibility.method.shade_transfer(portion.transfer, portion.group, free_light)
-        return PortionDirectLight(direct, portion.group, portion.transmittance)
+        return DirectLightOfPortion(direct, portion.group, portion.transmittance)
 
 
-def _patch_weights(senders: Senders, visibility: list[PortionVisibility | PortionDirectLight]) -> PatchWeights:
+def _patch_weights(senders: Senders, visibility: list[VisibilityOfPortion | DirectLightOfPortion]) -> PatchWeights:
     """Weights of patch samples and patches by how open they are."""
     portions = [
         find_mean_transmittance(
@@ -146,7 +146,7 @@ def _patch_weights(senders: Senders, visibility: list[PortionVisibility | Portio
     return find_patch_weights(join_portions(portions), senders.mean, senders.patch_of_sample)
 
 
-def _add_emitted(lit: list[PortionDirectLight], emitted: wp.array) -> list[PortionDirectLight]:
+def _add_emitted(lit: list[DirectLightOfPortion], emitted: wp.array) -> list[DirectLightOfPortion]:
     """Add direct light of emitters, vec3 of shape [batch, receiver], to that of portions."""
     result, first = [], 0
     for portion in lit:
@@ -160,7 +160,7 @@ class PatchSampleNodes(NamedTuple):
     """Nodes of the points at which patches are lit."""
 
     points: LitPoints
-    visibility: VisibilityWithBounces | ShadingWithVisibility  # of the patch samples
+    visibility: TransferForBounces | ShadingForBounces  # of the patch samples
     frames: Node  # of flat bodies
     projected_patches: Node  # patches as receivers see them
     weights: Node  # of patch samples and patches, by how open they are
@@ -233,7 +233,7 @@ class Radiosity(Node):
             after_bounces(count, radiosity_by_others, add_radiosity_by_self, senders.areas, self_bounces=self_bounces)
         )
 
-    def _light(self, call: Call, portion: PortionDirectLight, outgoing: OutgoingRadiance) -> wp.array:
+    def _light(self, call: Call, portion: DirectLightOfPortion, outgoing: OutgoingRadiance) -> wp.array:
         """Light of a portion of the patch samples past its own body, from the sky and from others."""
         bounced = self._gathering.lights(self, call, portion.group, portion.transmittance, outgoing)
         return add_light(portion.direct, *bounced)
@@ -250,7 +250,7 @@ class BouncedShading(PortionedDirectLight):
 
     def __init__(
         self,
-        visibility: VisibilityWithBounces | ShadingWithVisibility,
+        visibility: TransferForBounces | ShadingForBounces,
         free_light: Node | None,
         item_text: Callable[[], str],
         radiosity: Radiosity,
@@ -267,7 +267,7 @@ class BouncedShading(PortionedDirectLight):
             [self._bounced(call, self._light(call, portion, free_light), outgoing) for portion in portions]
         )
 
-    def _bounced(self, call: Call, portion: PortionDirectLight, outgoing: OutgoingRadiance) -> wp.array:
+    def _bounced(self, call: Call, portion: DirectLightOfPortion, outgoing: OutgoingRadiance) -> wp.array:
         bounced = self._gathering.lights(self, call, portion.group, portion.transmittance, outgoing)
         return add_light(portion.direct, *bounced)
 
@@ -307,7 +307,7 @@ class MovingBounces:
             return Node("bounces", identity, direct, idle="every body is black")
         proxies = self._proxies.setdefault(senders, Proxies(senders, method.visibility.merging))
         make_visibility = functools.partial(
-            VisibilityWithBounces if light.is_free else ShadingWithVisibility,
+            TransferForBounces if light.is_free else ShadingForBounces,
             method,
             projected_light=visibility_light,
             light=light,
@@ -325,7 +325,7 @@ class MovingBounces:
 
     def _patch_samples(
         self,
-        make_visibility: Callable[..., VisibilityWithBounces | ShadingWithVisibility],
+        make_visibility: Callable[..., TransferForBounces | ShadingForBounces],
         proxies: Proxies,
         points: LitPoints,
     ) -> PatchSampleNodes:
@@ -333,7 +333,7 @@ class MovingBounces:
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
 
         def project(
-            patch_samples: Receivers, visibility: list[PortionVisibility | PortionDirectLight], *arguments: Any
+            patch_samples: Receivers, visibility: list[VisibilityOfPortion | DirectLightOfPortion], *arguments: Any
         ) -> ProjectedPatches:
             return proxies.projected_patches(
                 patch_samples, [portion.transmittance for portion in visibility], *arguments

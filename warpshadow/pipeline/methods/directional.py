@@ -27,7 +27,7 @@ from warpshadow.pipeline.shading.sphere_method import LitPortion, PortionedShadi
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, join_portions
 from warpshadow.scene.blockers import blocking_planes
 from warpshadow.stages.gloss.reflection import find_blocked_radiance
-from warpshadow.stages.gloss.suns import Suns, transmittance_of_cells
+from warpshadow.stages.gloss.suns import Suns, find_sun_transmittance
 from warpshadow.stages.gloss.transmittance import interpolate_transmittance
 from warpshadow.stages.joint_coverage import transmittance_past
 from warpshadow.stages.light.cached_cells import CachedRows, cell_transfer, shade_cached_cells
@@ -200,7 +200,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         if planes is None or not group.is_blocked_by_planes:
             return visibility
         horizon_normals = group.normals if group.cached_rows is None else None
-        fronts, points = group.beside_planes
+        fronts, points = group.fronts_of_planes
         options: dict[str, Any] = {"horizon_normals": horizon_normals, "fronts": fronts, "skip": planes.skip}
         covered = self._coverages(
             functools.partial(plane_coverage, points, planes.frames, planes.planes, **options), projected_light
@@ -438,7 +438,7 @@ def _sun_transmittance(
     if not receivers.points.size:
         return wp.empty((1, 0, len(suns.directions)), dtype=wp.float32, device=receivers.points.device)
     transmittance = _join_transmittance(portions, len(middles))
-    return transmittance_of_cells(transmittance, receivers.normals, suns, middles, projected_light.cosine_directions)
+    return find_sun_transmittance(transmittance, receivers.normals, suns, middles, projected_light.cosine_directions)
 
 
 def _join_transmittance(portions: list[wp.array], count: int) -> wp.array:

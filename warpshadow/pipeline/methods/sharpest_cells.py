@@ -83,7 +83,7 @@ def find_share_of_sharpest_light(
         coverages.append(group.convex_parts_around.coverage(points, normals, directions, edge_radius))
     planes = group.planes
     if planes is not None and group.is_blocked_by_planes:
-        fronts, lifted = group.beside_planes
+        fronts, lifted = group.fronts_of_planes
         options: dict[str, Any] = {"radius": edge_radius, "horizon_normals": normals, "fronts": fronts}
         coverages.append(plane_coverage(lifted, planes.frames, planes.planes, directions, skip=planes.skip, **options))
     if coverages:

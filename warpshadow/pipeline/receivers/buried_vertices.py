@@ -16,7 +16,7 @@ from warpshadow.stages.self_visibility.buried import find_buried
 _ROUNDING = 1e-5  # of the largest coordinate, by which a vertex may lie outside the bounds of a body that it touches
 
 
-def show_buried_vertices(
+def find_bodies_with_buried_vertices(
     merged_scene: MergedScene, positions: np.ndarray, face_ids: Sequence[np.ndarray], bodies: Sequence[int]
 ) -> np.ndarray:
     """Find the bodies of which images show a face from a buried vertex to one in the open.

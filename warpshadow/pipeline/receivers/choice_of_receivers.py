@@ -22,7 +22,7 @@ from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
-from warpshadow.pipeline.receivers.buried_vertices import show_buried_vertices
+from warpshadow.pipeline.receivers.buried_vertices import find_bodies_with_buried_vertices
 from warpshadow.pipeline.receivers.unevenness import NearLight, light_unevenness
 from warpshadow.scene.body import Body
 from warpshadow.scene.scene import Scene, change_bodies
@@ -144,7 +144,7 @@ def choose_receivers(
         unevenness[is_open] = light_unevenness(merged_scene, positions, seen, bodies, light, near_light)
         flat_bodies = np.flatnonzero(is_open & merged_scene.is_flat & (unevenness <= UNEVEN)).tolist()
         seen_faces = [seen for seen, _ in faces]
-        shows_buried[flat_bodies] = show_buried_vertices(merged_scene, positions, seen_faces, flat_bodies)
+        shows_buried[flat_bodies] = find_bodies_with_buried_vertices(merged_scene, positions, seen_faces, flat_bodies)
     chosen = np.where(
         shows_buried | (unevenness > UNEVEN), np.where(merged_scene.is_flat, where_edges_are, "pixel"), chosen
     )

@@ -126,12 +126,12 @@ class Group:
         return self.own.lookup.transmittance(self.normals, self.own.probe_weights)
 
     @functools.cached_property
-    def beside_planes(self) -> Fronts:
-        """As :meth:`beside`, of the planes around the group."""
+    def fronts_of_planes(self) -> Fronts:
+        """As :meth:`find_fronts`, of the planes around the group."""
         assert self.planes is not None
-        return self.beside(self.planes.frames, self.planes.planes, self.planes.skip)
+        return self.find_fronts(self.planes.frames, self.planes.planes, self.planes.skip)
 
-    def beside(self, frames: wp.array, planes: PlaneBlockers, skip: int | None) -> Fronts:
+    def find_fronts(self, frames: wp.array, planes: PlaneBlockers, skip: int | None) -> Fronts:
         """Which part of each plane's front the receivers see, and the receivers lifted off planes they lie in."""
         extents = None if self.own is None else self.own.extents
         sides = None if extents is None else extents.sides_of(frames, planes)

@@ -57,7 +57,7 @@ class LightInput(Input):
         return isinstance(self.value(), wp.array)
 
     @functools.cached_property
-    def separated(self) -> tuple[Suns, np.ndarray]:
+    def suns_and_rest(self) -> tuple[Suns, np.ndarray]:
         """The suns of known light, and its map without them."""
         return separate_suns(self.value().radiance)
 
@@ -80,7 +80,7 @@ class LitLobes(NamedTuple):
     select: Callable[[Node], Node]  # makes a node of light on all these one of light on the points
 
 
-def _repeat(directions: np.ndarray, receivers: Receivers) -> wp.array:
+def _repeat_directions(directions: np.ndarray, receivers: Receivers) -> wp.array:
     """Repeat directions [1, direction, 3] for each receiver, vec3 of shape [1, receiver, direction]."""
     count, device = receivers.points.shape[1], receivers.points.device
     if not count:
@@ -331,9 +331,9 @@ class Method(abc.ABC):
 
     def suns(self, light: LightInput) -> Suns | None:
         """Suns of known light, infinitely far away, which prefiltered light is without; None where it has none."""
-        if light.is_free or self.shell_of(light) is not None or not len(light.separated[0].directions):
+        if light.is_free or self.shell_of(light) is not None or not len(light.suns_and_rest[0].directions):
             return None
-        return light.separated[0]
+        return light.suns_and_rest[0]
 
     @functools.cached_property
     def _prefiltered_from_scene(self) -> Node:
@@ -345,7 +345,7 @@ class Method(abc.ABC):
 
     def _prefiltered(self, light: LightInput) -> Node:
         def find(known: KnownLight) -> wp.array:
-            radiance = known.radiance if self.suns(light) is None else light.separated[1]
+            radiance = known.radiance if self.suns(light) is None else light.suns_and_rest[1]
             return constant(prefilter(radiance)[None], wp.vec3, self.merged_scene.device)
 
         return Node("prefiltering", find, light)
@@ -381,7 +381,7 @@ class Method(abc.ABC):
         By default it is that towards samples of lobes, :attr:`sun_samples` of each sun.
         """
         directions = directions_in_suns(suns, self.sun_samples).reshape(1, -1, 3)
-        towards = Node("", functools.partial(_repeat, directions), lobes.points.receivers_node)
+        towards = Node("", functools.partial(_repeat_directions, directions), lobes.points.receivers_node)
         return self.lobe_transmittance(lobes, towards)
 
     def blocked_radiance(self, lobes: LitLobes, diffuse: Node, openness: Node | None) -> Node:

@@ -280,7 +280,7 @@ class PortionedVisibility(Node):
         suffix: Ends the names of its stages, such as " of patch samples"; by default the suffix of the points.
     """
 
-    step_count = 2  # visibility, planes, transfer vectors, shading
+    step_count = 2  # of the four steps: visibility, planes, transfer vectors, shading
 
     def __init__(
         self,

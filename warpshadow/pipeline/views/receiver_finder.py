@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from warpshadow.device.constants import values_of_owners
+from warpshadow.device.constants import gather_of_owners
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, VisibleSurfaces
 from warpshadow.pipeline.receivers.static import StaticBodies
@@ -80,14 +80,14 @@ class ReceiverFinder:
             merged_scene.faces,
             fragments,
             numbering,
-            values_of_owners(at_samples, body_of_face),
-            bodies=None if separate is None else values_of_owners(separate, body_of_face),
+            gather_of_owners(at_samples, body_of_face),
+            bodies=None if separate is None else gather_of_owners(separate, body_of_face),
             supersampling=1 if method.shares_directions and not self._shares_surfaces else self._supersampling,
             quadtree=quadtree,
             rises=method.every_sample_receives,
             smooth_pieces=merged_scene.smooth_pieces if self._shares_surfaces else None,
             has_mean_slope=has_mean_slope,
-            shares_receivers=None if method.shares_lobes else values_of_owners(~merged_scene.is_glossy, body_of_face),
+            shares_receivers=None if method.shares_lobes else gather_of_owners(~merged_scene.is_glossy, body_of_face),
         )
 
     def _number_seen(self, is_seen: np.ndarray, has_cached_rows: np.ndarray) -> Numbering:
@@ -95,12 +95,12 @@ class ReceiverFinder:
         merged_scene, static_bodies, separate = self._merged_scene, self._static_bodies, self._separate_bodies
         keeps_vertex = self._method.can_receive(self._blocker_kinds)[: len(is_seen)] & is_seen
         if has_cached_rows.any():
-            keeps_vertex |= values_of_owners(has_cached_rows, merged_scene.body_of_vertex) & is_seen
+            keeps_vertex |= gather_of_owners(has_cached_rows, merged_scene.body_of_vertex) & is_seen
         return number_receivers(
             keeps_vertex,
             None if static_bodies is None else static_bodies.has_vertex,
             merged_scene.vertex_order,
-            None if separate is None else values_of_owners(separate, merged_scene.body_of_vertex),
+            None if separate is None else gather_of_owners(separate, merged_scene.body_of_vertex),
             device=merged_scene.device,
         )
 

@@ -109,7 +109,7 @@ def directions_in_suns(suns: Suns, count: int) -> np.ndarray:
 
 
 @wp.kernel
-def _find_transmittance_of_cells(
+def _find_sun_transmittance(
     first_row: int,
     worker: int,
     # in
@@ -119,19 +119,21 @@ def _find_transmittance_of_cells(
     directions: wp.array(dtype=wp.vec3),
     per_radius: float,
     # out
-    of_suns: wp.array3d(dtype=wp.float32),
+    sun_transmittance: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a receiver."""
-    batch, receiver = split_row(first_row + wp.tid(), of_suns.shape[1])
+    batch, receiver = split_row(first_row + wp.tid(), sun_transmittance.shape[1])
     normal = normals[instance_in(batch, normals.shape[0]), receiver]
     transmittance_batch = instance_in(batch, transmittance.shape[0])
     for i in range(cells.shape[0]):
         height = wp.clamp(0.5 * per_radius * wp.dot(normal, directions[i]) + 0.5, 0.0, 1.0)
         above = height * height * (3.0 - 2.0 * height) + _MIN_HORIZON_WEIGHT
-        of_suns[batch, receiver, i] = wp.min(transmittance[transmittance_batch, receiver, cells[i]] / above, 1.0)
+        sun_transmittance[batch, receiver, i] = wp.min(
+            transmittance[transmittance_batch, receiver, cells[i]] / above, 1.0
+        )
 
 
-def transmittance_of_cells(
+def find_sun_transmittance(
     transmittance: wp.array, normals: wp.array, suns: Suns, middles: np.ndarray, directions: np.ndarray
 ) -> wp.array:
     """Transmittance towards suns: that of their cells, min(T / H, 1), with H of :mod:`.transmittance`.
@@ -150,17 +152,17 @@ def transmittance_of_cells(
     """
     count, device = common_batch({"transmittance": transmittance, "normals": normals}), normals.device
     cells = (suns.directions @ middles.T).argmax(axis=1)
-    of_suns = empty((count, normals.shape[1], len(cells)), dtype=wp.float32, device=device)
+    sun_transmittance = empty((count, normals.shape[1], len(cells)), dtype=wp.float32, device=device)
     constants = constant(cells, wp.int32, device), constant(directions[cells], wp.vec3, device)
     launch(
-        _find_transmittance_of_cells,
+        _find_sun_transmittance,
         count * normals.shape[1],
         inputs=[transmittance, normals, *constants, 1 / float(cell_radius(len(middles)))],
-        outputs=[of_suns],
+        outputs=[sun_transmittance],
         shared=[array for array in (transmittance, normals) if len(array) < count],
         cost=_COST * len(cells),
     )
-    return of_suns
+    return sun_transmittance
 
 
 @wp.func
@@ -257,7 +259,7 @@ def add_suns(lobe_light: LobeLight, lobes: Lobes, suns: Suns, transmittance: wp.
     count, receiver_count = common_batch(arrays), lobe_light.straight.shape[1]
     sums = LobeLight(*(empty((count, receiver_count), dtype=wp.vec3, device=device) for _ in range(2)))
     of_lobes = [lobes.normals, lobes.tangents, lobes.views, lobes.widths]
-    of_suns = [
+    sun_transmittance = [
         constant(suns.directions, wp.vec3, device),
         constant(suns.irradiance, wp.vec3, device),
         constant(suns.solid_angles, wp.float32, device),
@@ -265,7 +267,7 @@ def add_suns(lobe_light: LobeLight, lobes: Lobes, suns: Suns, transmittance: wp.
     launch(
         _reflect_suns,
         count * receiver_count,
-        inputs=[*of_lobes, *of_suns, transmittance, *lobe_light],
+        inputs=[*of_lobes, *sun_transmittance, transmittance, *lobe_light],
         outputs=[*sums],
         shared=[array for array in (*of_lobes, transmittance, *lobe_light) if len(array) < count],
         cost=_COST * len(suns.directions),
