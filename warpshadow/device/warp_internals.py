@@ -206,6 +206,7 @@ def bound_kernel(
     if signature is not None and is_plain and (structs := _structs(signature, arguments, gradients)) is not None:
         fields, _, loaded_hooks = signature
 
+        # The parts of structs have addresses alone: the arrays are held for as long as the function.
         def run_plainly(
             dim: Sequence[int], *first: Any, offsets: Mapping[int, int] = {}, holds: Any = (arguments, gradients)
         ) -> None:

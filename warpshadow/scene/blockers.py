@@ -82,9 +82,9 @@ def blocking_parts(scene: Scene) -> dict[int, list[ConvexPart]]:
     """Find the convex parts as which bodies block the light of others, in place of their spheres, by their numbers.
 
     By method "directional" these are those of all bodies that consist of some, unless how many spheres they have, or
-    that these block their own light, was asked for. Panels are chords of bent sheets. Over land they would shade the
-    air behind them; so a body with a solid behind it (:mod:`.scene.height_fields`) that is no bowl,
-    or one in which a body stands so low, has panels only where it is flat, such as the walls of a room.
+    that these block their own light, was asked for. Panels are chords of bent sheets: over land they would shade the
+    air behind them. So a body with a solid behind it (:mod:`.scene.height_fields`) has flat panels alone, such as the
+    walls of a room, unless it is a bowl in which no body stands behind panels.
     """
     visibility = scene.visibility.with_method()
     if visibility.method != "directional":

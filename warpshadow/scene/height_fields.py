@@ -23,17 +23,17 @@ gaps: with 1/16 the land of demos/kinds.py is 4.1% off, and a bottle on it 5% to
 
 _POINTS = 1024  # of meshes, from which rays tell which bodies lie before the field, and which behind
 
-_MIN_SHARE_BEFORE = 0.1
-"""Rays that meet a body before the field, over those that meet it behind, from which it sticks in the field.
+_MIN_RATIO_BEFORE = 0.1
+"""Rays that meet a body before the field, over those that meet it behind: from this ratio on it sticks in the field.
 
 So do rocks and water in land; a ground that a tent stands on does not."""
 
 _DEEP = 0.25
 """Depth of bowls, over the longest side of their bounds. A ball in half a shell (0.5) is 18% too bright past spheres of
-the solid under an even sky, 2% too dark past panels; in a shell of 0.35 5% and 0%. That land has 0.1."""
+the solid under an even sky, 2% too dark past panels; in a shell of 0.35 5% and 0%. Land of demos/kinds.py has 0.1."""
 
 _MAX_SHARE_BEHIND = 0.1
-"""Share of a body behind panels from which it stands between a bowl and these, which shade it from above: a slab that
+"""Share of a body between panels and the bowl they stand for, above which panels would shade it: a slab that
 lies in a basin is 24% too dark past panels, and 1% past spheres. A ball that touches half a shell has 0.01."""
 
 _UPWARD = 0.5  # cosine of the angle to +y up to which land leans
@@ -55,9 +55,9 @@ def solid_behind(body: Body, others: tuple[Body, ...]) -> Land | None:
         others: The other bodies.
 
     Returns:
-        The solid. None where it is no land: its mesh is
-        closed or flat, faces look to both sides of any plane or lie above each other; others stand on both sides, as of
-        a tent, or on none; or the side on which they stand does not look up, as under a roof, past which light comes.
+        The solid. None where it is no land: its mesh is closed or flat, faces look to both sides of any plane or lie
+        above each other; others stand on both sides, as of a tent, or on none; or the side on which they stand does not
+        look up, as under a roof, past which light comes.
     """
     return None if body.mesh.surface.is_closed or body.mesh.is_flat else _solid_behind(body, others)
 
@@ -71,7 +71,7 @@ def _solid_behind(body: Body, others: tuple[Body, ...]) -> Land | None:
         return None
     meshes = [other.world_mesh().transformed(**to_own) for other in others]
     above, below = (np.array([_count_overlaps(mesh, other, side) for other in meshes]) for side in (axis, -axis))
-    if not above.any() or (above < _MIN_SHARE_BEFORE * below).any():
+    if not above.any() or (above < _MIN_RATIO_BEFORE * below).any():
         return None
     x, y, z = axis.tolist()
     is_deep = np.ptp(mesh.positions @ axis) > _DEEP * np.ptp(mesh.positions, axis=0).max()

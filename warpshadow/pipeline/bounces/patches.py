@@ -151,7 +151,7 @@ class ScenePatches:
     def albedo(self, materials: Materials, bodies: tuple[int, ...]) -> Node:
         """Node of the mean reflectance of the patches of some bodies, vec3 of shape [batch, patch].
 
-        It stays with the materials, so that of the scene's is computed once.
+        It is cached for as long as the materials live: that of the scene's is computed once.
         """
         nodes = self._albedo.setdefault(materials, {})
         if bodies not in nodes:

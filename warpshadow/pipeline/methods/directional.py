@@ -278,7 +278,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         return find_share_of_sharpest_light(group, sharpest, towards, **scales)
 
     def lobe_transmittance(self, lobes: LitLobes, directions: Node) -> Node:
-        """Transmittance towards the samples of lobes, between cells; of known light, to where it comes from in them."""
+        """Transmittance towards the samples of lobes, between cells; in known light, between where their light is."""
         transmittance, projected_light = self._cell_transmittance(lobes)
         item_text = functools.partial(receiver_text, lobes.points.weak)
         arguments = transmittance, lobes.points.receivers_node, directions, projected_light

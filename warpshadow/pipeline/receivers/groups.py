@@ -32,7 +32,7 @@ RECEIVERS_AT_ONCE = 1 << 13  # receivers of each instance that are lit at once w
 
 
 class BodyExtents:
-    """How far out bodies reach, and so on which side of planes each lies.
+    """On which side of planes each body lies, by its farthest vertices; found once for all groups.
 
     Args:
         planes: Of the scene.
@@ -46,11 +46,11 @@ class BodyExtents:
 
     def sides_of(self, frames: wp.array, planes: PlaneBlockers) -> wp.array:
         """The side of each plane on which each body lies, [batch, body, plane], found once for all receivers."""
-        if id(frames) in self._sides:  # frames are held, so that no others get their id
+        if id(frames) in self._sides:  # held with their result, so that the id stays theirs
             return self._sides[id(frames)][1]
         corners, first_corner = self._planes.corners(self.positions), self._planes.first_corner
         sides = find_body_sides(corners, first_corner, frames, planes)
-        if frames.device.is_capturing == self._is_captured:  # else only a replay of a graph fills them
+        if frames.device.is_capturing == self._is_captured:  # what a graph makes, only its replays fill
             self._sides[id(frames)] = frames, sides
         return sides
 

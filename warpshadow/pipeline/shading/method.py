@@ -77,7 +77,7 @@ class LitLobes(NamedTuple):
     points: LitPoints
     light: LightInput  # known or free, which says where shadows have to be sharp
     all_points: LitPoints  # the receivers of the image, among which they are
-    select: Callable[[Node], Node]  # makes a node of light on all these one of light on the points
+    select: Callable[[Node], Node]  # of a node of light on all_points makes one of light on points
 
 
 def _repeat_directions(directions: np.ndarray, receivers: Receivers) -> wp.array:
@@ -378,7 +378,7 @@ class Method(abc.ABC):
             lobes: The receivers.
             suns: The suns of their light.
 
-        By default it is that towards samples of lobes, :attr:`sun_samples` of each sun.
+        By default :meth:`lobe_transmittance` finds it, in :attr:`sun_samples` directions that are even over each sun.
         """
         directions = directions_in_suns(suns, self.sun_samples).reshape(1, -1, 3)
         towards = Node("", functools.partial(_repeat_directions, directions), lobes.points.receivers_node)

@@ -50,7 +50,7 @@ MAX_COSINE = 0.99999
 _BLUR_POWER = 0.2
 """Power of the number of places by which blur is narrower, as samples of other places lie between those of one: with 4
 places and 8 samples a metal of roughness 0.4 in a room with windows is 2.9% off, 4.2% with 0 and 2.8% with 0.5;
-under a sun that samples look up, as free light has one, 16, 10 and 33%."""
+under a sun, before suns were taken out of maps, 16, 10 and 33%."""
 
 _SHAPE_COST, _COST = 50.0, 15.0  # nanoseconds that a lobe takes, and a sample
 

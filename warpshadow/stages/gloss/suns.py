@@ -6,8 +6,9 @@ that samples look up, and each, of irradiance E and solid angle Ω around ω, ad
     f c T E,   f c T E (1 − v·h)⁵,   f = D V,   c = n·ω,
 
 with the transmittance T towards it, the reflection f and the widths W of :mod:`.lobes`, and the mean of D over the
-disc: it is reflected by mirrors whose slopes h_t / n·h, as W sees them, are about a disc of radius q at a distance d
-from the lobe's middle, and over a disc D has an integral (it is an area of a sphere, projected from its pole):
+disc: the mirrors that reflect it to the viewer have slopes W⁻¹h_t / n·h that fill about a disc of radius q, at a
+distance d from 0. In these slopes D is the area of a sphere, projected from its pole, so its integral over a disc is
+known, the share F of a sphere:
 
     D = 4 (v·h) F / (Ω n·h),   F = 2 q² / (B (B + d² + 1 − q²)),   B² = (d² + 1 − q²)² + 4 q²,
     d = |W⁻¹h_t| / n·h,        q² = Ω / (4π (v·h) (n·h)³ |W|).
@@ -31,11 +32,11 @@ from warpshadow.stages.gloss.lobes import Lobes
 from warpshadow.stages.gloss.reflection import LobeLight
 
 _MAX_SUNS = 4
-_BRIGHTNESS = 10.0  # times as bright as all on average is a sun …
-_MIN_SHARE = 0.003  # … that has so much of all light at least …
-_MAX_RADIUS = np.radians(6.0)  # … within this radius
-_ISOLATION = 0.9  # part of the light within twice the radius that a sun has: other spots are larger
-_MAX_TRIALS = 32  # spots that are looked at
+_BRIGHTNESS = 10.0  # radiance above which a pixel may be of a sun, in means of the map
+_MIN_SHARE = 0.003  # of all light, that a sun has at least
+_MAX_RADIUS = np.radians(6.0)  # of a sun
+_ISOLATION = 0.9  # of the bright light within twice that radius, that is within it: of wider spots it is less
+_MAX_TRIALS = 32  # brightest spots that are tried
 
 _MIN_HORIZON_WEIGHT = 1.0e-7
 
@@ -59,7 +60,7 @@ def separate_suns(radiance: np.ndarray) -> tuple[Suns, np.ndarray]:
         radiance: Linear RGB, shape [height, 2·height, 3].
 
     Returns:
-        The suns, and the map without their light, as bright there as the darkest that could be a sun.
+        The suns, and the map, in which their pixels are cut to ten times its mean radiance.
     """
     solid_angles = np.repeat(sh.pixel_solid_angles(len(radiance)), 2 * len(radiance))
     brightness = radiance.mean(axis=2, dtype=np.float64).ravel()

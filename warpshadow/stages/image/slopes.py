@@ -56,7 +56,7 @@ from warpshadow.stages.silhouettes.lines import (
 
 MIN_DISTANCE = 0.02  # distance of an edge [samples] below which rounding outweighs how color changes on the way to it
 
-_COST, _MEAN_SLOPE_COST = 20.0, 4.0  # nanoseconds that a sample takes, and one that is far from silhouettes
+_COST, _MEAN_SLOPE_COST = 20.0, 4.0  # nanoseconds of a sample: its gradient, and the search for its mean slope
 
 
 @wp.func
