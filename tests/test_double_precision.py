@@ -565,9 +565,11 @@ def test_gradients_of_textures_are_exact(double, device, check, clip):
 
 
 @pytest.mark.slow
-def test_gradients_of_upright_silhouettes_are_exact(double, device, check):
-    """Of edges that lean, how the lean changes is left out of the gradient."""
-    corners = np.array([[2.3, 1.2], [5.6, 1.2], [5.6, 4.4], [2.3, 4.4]])  # [pixels]
+@pytest.mark.parametrize("across", [0, 1], ids=["upright", "level"])
+def test_gradients_of_a_band_are_exact(double, device, check, across):
+    """Of edges that lean, how the lean changes is left out of the gradient, and at corners how areas overlap."""
+    low, high = (2.3, 5.6) if across == 0 else (1.2, 3.4)  # [pixels]; along the other axis the band leaves the image
+    corners = np.array([[low, -3.0], [high, -3.0], [high, 12.0], [low, 12.0]])[:, :: 1 if across == 0 else -1]
     depths = np.array([[1.0], [1.5], [2.0], [1.2]])
     clip_positions = np.hstack([depths * (2 * corners / SIZE - 1), np.full((4, 1), 0.1), depths])[None]
     sides = np.int32([[0, 1, 2], [0, 2, 3]])

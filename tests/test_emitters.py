@@ -425,9 +425,26 @@ def test_a_fit_finds_emission(free):
     np.testing.assert_allclose(result.scene.bodies[0].emission, (6, 5, 4), rtol=0.05)
 
 
+@pytest.mark.parametrize("width", [0.1, 0.02])
+def test_a_ground_hides_nothing_of_a_thin_lamp_that_lies_on_it(width):
+    """Discs as large as its samples reach below the ground: light was 11% less."""
+    strip = trimesh.creation.box((1, width, width))
+    lamp = ws.Body(ws.Mesh(strip.vertices, strip.faces), emission=(9, 9, 9), translation=(0, width / 2, 0.8))
+    ground = ws.Body(ws.plane(6.0), albedo=(0, 0, 0))
+    camera = ws.Camera.look_at((0, 1.2, 2.2), (0, 0.3, 0), fov_y=12, size=(16, 16))
+    ball = ws.Body(ws.icosphere(0.25, 3), translation=(0, 0.3, 0))
+    dark = ws.EnvironmentMap(np.zeros((8, 16, 3), np.float32))
+    above, alone = (ws.Renderer(ws.Scene(bodies, dark, camera)) for bodies in ([ball, lamp, ground], [ball, lamp]))
+    shows_ball = above.layers().bodies == 0
+    light, expected = (renderer.render()[shows_ball][:, :3].mean() for renderer in (above, alone))
+    assert light == pytest.approx(expected, rel=2e-3)
+
+
 def test_receivers_are_lifted_off_planes_once_however_many_lamps_there_are(monkeypatch):
     find, calls, counts = groups.find_fronts, [], []
-    monkeypatch.setattr(groups, "find_fronts", lambda *arguments: calls.append(1) or find(*arguments))
+    monkeypatch.setattr(
+        groups, "find_fronts", lambda *arguments, **options: calls.append(1) or find(*arguments, **options)
+    )
     for number in (1, 3):
         lamps = [ws.Body(ws.icosphere(0.1, 1), emission=(3, 3, 3), translation=(x, 2, 0)) for x in range(number)]
         flat = [ws.Body(ws.plane(size, 2), translation=(0, height, 0)) for size, height in ((4.0, 0), (0.5, 1))]

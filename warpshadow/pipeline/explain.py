@@ -133,10 +133,10 @@ def decide_which_nodes_run(image: Node, call: Call) -> dict[Node, Decision]:
 
 def _decision(node: Node, call: Call, reason: Decision) -> Decision:
     """Whether a node runs, given why it is asked for, or why it is not."""
-    if node.value_if_known(call) is not None:
-        return Decision(False, f"cached: {_names(node.root_inputs)} are the same")
     if node.stage is not None and (idle := _text(node.stage.idle)):
         return Decision(False, idle)
+    if node.value_if_known(call) is not None:
+        return Decision(False, f"cached: {_names(node.root_inputs)} are the same")
     return _reason_to_run([node], reason, "nothing is cached yet" if node.caches else "")
 
 

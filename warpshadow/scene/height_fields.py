@@ -32,9 +32,10 @@ _DEEP = 0.25
 """Depth of bowls, over the longest side of their bounds. A ball in half a shell (0.5) is 18% too bright past spheres of
 the solid under an even sky, 2% too dark past panels; in a shell of 0.35 5% and 0%. Land of demos/kinds.py has 0.1."""
 
-_MAX_SHARE_BEHIND = 0.1
-"""Share of a body between panels and the bowl they stand for, above which panels would shade it: a slab that
-lies in a basin is 24% too dark past panels, and 1% past spheres. A ball that touches half a shell has 0.01."""
+_MAX_SHARE_BEHIND = 0.3
+"""Share of a body between panels and the bowl they stand for, above which panels would shade it: a slab that lies in a
+basin is 24% too dark past panels, and 1% past spheres. A ball on the bottom of that basin has 0.51. A ball in the
+smaller of two bowls of one mesh has 0.12, and is 50% too bright past spheres, which are as large as the other bowl."""
 
 _UPWARD = 0.5  # cosine of the angle to +y up to which land leans
 

@@ -80,7 +80,7 @@ def _attenuate(
             if share < 1.0 and others[batch, receiver, q][0] > 0.0:
                 share = _open_share(coverages[batch, receiver, q], others[batch, receiver, q])
             else:  # one of the two covers nothing, or all: the other's share is exact
-                share = wp.min(share, wp.max(0.0, 1.0 - others[batch, receiver, q][0]))
+                share = wp.min(share, wp.clamp(1.0 - others[batch, receiver, q][0], 0.0, 1.0))
         if transmittance:
             share *= transmittance[batch, receiver, q]
         attenuated[batch, receiver, q] = share

@@ -270,6 +270,13 @@ def rectangle(size, device):
     return blockers, blockers.frames(wp.array(mesh.positions[None], dtype=wp.vec3, device=device))
 
 
+def log_past_planes(*arguments):
+    """Past a plane that the emitter, the only body, may be on both sides of."""
+    *seen, skipped = arguments
+    sides = wp.zeros((1, 1, 1), dtype=wp.float32, device=seen[0].device)
+    return plane_transmittance.find_log_transmittance_of_planes(*seen, sides, 0, skipped)
+
+
 def test_planes_block_as_the_twin_does(device):
     size = (1.5, 0.8)
     blockers, frames = rectangle(size, device)
@@ -280,7 +287,7 @@ def test_planes_block_as_the_twin_does(device):
     samples = samples_of(BALL, device)
     own = placed(samples, BALL.positions + np.float32([0.2, 1.5, 0.1]), device)
     span = next(samples.spans())
-    got = numbers(plane_transmittance.find_log_transmittance_of_planes(*arrays, own, span, frames, blockers, (-1, -1)))
+    got = numbers(log_past_planes(*arrays, own, span, frames, blockers, (-1, -1)))
     sample_points, areas = numbers(own.points), numbers(own.areas)
     expected = np.zeros(got.shape)
     for receiver, sample in np.ndindex(*got.shape):
@@ -291,7 +298,7 @@ def test_planes_block_as_the_twin_does(device):
             expected[receiver, sample] = np.log(max(1 - share, 1e-4))
     assert (expected < -0.5).sum() > 200 and (expected == 0).sum() > 200
     np.testing.assert_allclose(np.exp(got), np.exp(expected), atol=50 * FLOAT32)
-    none = plane_transmittance.find_log_transmittance_of_planes(*arrays, own, span, frames, blockers, (-1, 0))
+    none = log_past_planes(*arrays, own, span, frames, blockers, (-1, 0))
     assert not none.numpy().any()
 
 
@@ -305,7 +312,7 @@ def test_planes_hide_the_part_of_a_lamp_that_lies_beyond_them(height, device):
     points = np.stack([1.5 * np.cos(angles), np.linspace(0.05, 0.8, 24), 1.5 * np.sin(angles)], axis=1)
     normals = twins.unit(-points * (1, 0, 1))
     arrays = [wp.array(item[None], dtype=wp.vec3, device=device) for item in (points, normals)]
-    log = plane_transmittance.find_log_transmittance_of_planes(*arrays, own, span, frames, blockers, (-1, -1))
+    log = log_past_planes(*arrays, own, span, frames, blockers, (-1, -1))
     ones = wp.full((1, span.size), wp.vec3(1.0), dtype=wp.vec3, device=device)
     through = light.find_transmittance_to_samples(log_of_planes=log)
     got = numbers(light.sum_light(*arrays, own, ones, span, through))[:, 0]
@@ -487,7 +494,7 @@ def test_gradients_of_light_agree_with_differences(between, device):
             found = sphere_transmittance.find_log_transmittance(*seen, arrays[4], radii, ((0, 0), (0, 0)))
             logs = {"log_of_spheres": found}
         if between in ("planes", "cutting plane"):
-            found = plane_transmittance.find_log_transmittance_of_planes(*seen, arrays[4], blockers, (-1, -1))
+            found = log_past_planes(*seen, arrays[4], blockers, (-1, -1))
             logs = {"log_of_planes": found}
         if between in ("parts", "panels"):
             parts = box_blockers.placed(arrays[4])

@@ -1,5 +1,7 @@
 """Suns: discs that are taken out of maps, and their light in the lobes of receivers, against sums over the discs."""
 
+import functools
+
 import numpy as np
 import pytest
 import twins
@@ -142,6 +144,27 @@ def test_two_suns_are_separated_and_lamps_that_are_larger_stay_in_the_map():
         found, rest = suns.separate_suns(even.radiance)
         assert not len(found.directions)
         np.testing.assert_array_equal(rest, even.radiance)
+
+
+@pytest.mark.parametrize(("gap", "count"), [(2.5, 0), (8.0, 2), (11.0, 2)])
+def test_lights_close_to_each_other_are_not_one_sun_between_them(gap, count):
+    sky, side = ws.synthetic_sky(sun_strength=0, height=256), np.radians(gap / 2)
+    middles = [np.array([sign * np.sin(side), 0.3, np.cos(side)]) for sign in (-1, 1)]
+    lights = functools.reduce(lambda light, middle: light.with_sun(middle, 2.0, angular_radius=0.5), middles, sky)
+    found, rest = suns.separate_suns(lights.radiance)
+    assert len(found.directions) == count
+    if count:
+        order = np.argsort(found.directions[:, 0])
+        np.testing.assert_allclose(found.directions[order], twins.unit(np.array(middles)), atol=0.01)
+    else:
+        np.testing.assert_array_equal(rest, lights.radiance)
+
+
+def test_a_tube_of_light_stays_in_the_map():
+    tube = ws.synthetic_sky(sun_strength=0, height=256)
+    for angle in np.radians(np.linspace(-5, 5, 21)):
+        tube = tube.with_sun((np.sin(angle), 0.3, np.cos(angle)), 1.0, angular_radius=0.7)
+    assert not len(suns.separate_suns(tube.radiance)[0].directions)
 
 
 @pytest.mark.parametrize("count", [1, 16])

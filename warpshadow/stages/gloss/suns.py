@@ -34,7 +34,8 @@ from warpshadow.stages.gloss.reflection import LobeLight
 _MAX_SUNS = 4
 _BRIGHTNESS = 10.0  # radiance above which a pixel may be of a sun, in means of the map
 _MIN_SHARE = 0.003  # of all light, that a sun has at least
-_MAX_RADIUS = np.radians(6.0)  # of a sun
+_RADII = np.radians([6.0, 3.0, 1.5])  # of discs that are tried around the brightest spot, the widest first
+_MAX_SPREAD = 2.0  # size by the mean square of angles over the area that shines: 1 of discs, more of tubes and pairs
 _ISOLATION = 0.9  # of the bright light within twice that radius, that is within it: of wider spots it is less
 _MAX_TRIALS = 32  # brightest spots that are tried
 
@@ -77,19 +78,25 @@ def separate_suns(radiance: np.ndarray) -> tuple[Suns, np.ndarray]:
         if not is_candidate.any() or len(suns) == _MAX_SUNS:
             break
         brightest = np.argmax(np.where(is_candidate, brightness[pixels], -1))
-        is_close = is_candidate & (directions @ directions[brightest] > np.cos(2 * _MAX_RADIUS))
-        middle = power[is_close] @ directions[is_close]
-        cosines = directions @ (middle / np.linalg.norm(middle))
-        is_in_disc = is_candidate & (cosines > np.cos(_MAX_RADIUS))
-        disc_power, wider_power = power[is_in_disc].sum(), power[cosines > np.cos(2 * _MAX_RADIUS)].sum()
-        if disc_power > max(_MIN_SHARE * total, _ISOLATION * wider_power):
-            mean = power[is_in_disc] @ directions[is_in_disc] / disc_power
-            length = np.linalg.norm(mean)
-            # of a disc the mean square of angles to its middle is Ω / (2π); pixels have a size, too
-            size = 4 * np.pi * (1 - length) + power[is_in_disc] @ solid_angles[pixels[is_in_disc]] / disc_power
-            suns.append((mean / length, light[is_in_disc].sum(axis=0), size))
-            is_sun |= is_in_disc
-        is_candidate &= ~(is_close | is_in_disc)
+        from_brightest, is_in_disc = directions @ directions[brightest], np.zeros(len(pixels), bool)
+        for radius in _RADII:
+            is_close = is_candidate & (from_brightest > np.cos(2 * radius))
+            middle = power[is_close] @ directions[is_close]
+            cosines = directions @ (middle / np.linalg.norm(middle))
+            is_near = is_candidate & (cosines > np.cos(radius))
+            disc, wider_power = power[is_near], power[cosines > np.cos(2 * radius)].sum()
+            if disc.sum() > max(_MIN_SHARE * total, _ISOLATION * wider_power):
+                mean = disc @ directions[is_near] / disc.sum()
+                length = np.linalg.norm(mean)
+                # of a disc the mean square of angles to its middle is Ω / (2π); pixels have a size, too
+                size = 4 * np.pi * (1 - length) + disc @ solid_angles[pixels[is_near]] / disc.sum()
+                area = disc.sum() ** 2 / (disc**2 / solid_angles[pixels[is_near]]).sum()
+                if size < _MAX_SPREAD * area:
+                    suns.append((mean / length, light[is_near].sum(axis=0), size))
+                    is_in_disc = is_near
+                    break
+        is_sun |= is_in_disc
+        is_candidate &= ~(is_in_disc if is_in_disc.any() else from_brightest > np.cos(2 * _RADII[0]))
     rest = radiance.reshape(-1, 3).copy()
     rest[pixels[is_sun]] *= (1 - shares[is_sun])[:, None]
     columns = np.array([[*direction, *irradiance, size] for direction, irradiance, size in suns]).reshape(-1, 7)
