@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 from pathlib import Path
 from typing import Any
@@ -211,6 +212,7 @@ def plot_losses(result: Result, path: AnyPath) -> list[Path]:
         check.warn(check.missing(f"{path} is not drawn, which", "matplotlib", "plot"))
         return []
     matplotlib.use("agg")
+    logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)  # of fonts that a machine does not have
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(figsize=(6, 4), layout="constrained")

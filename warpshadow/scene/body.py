@@ -305,7 +305,9 @@ class Body:
             if value is None:
                 continue
             if self.roughness is None:
-                raise ValueError(f"{name}: got {check.described(value)} without roughness, expected roughness, too")
+                raise ValueError(
+                    f"{name}: got {check.described(value)} without roughness, expected roughness, too, such as 0.3"
+                )
             number = f"a number from {minimum:g} to {maximum:g}"
             expected = f"{number}, one for each of the {count} vertices, or a texture [height, width]"
             numbers = np.atleast_1d(check.numbers(name, value, expected=expected))

@@ -348,9 +348,10 @@ class Scene:
                 items[number] = item
             return [items.get(number) for number in range(count)]
         if not isinstance(value, Sequence) or isinstance(value, str):
+            example = f"{{{self.bodies[0].name!r}: …}}"
             raise ValueError(
                 f"{argument}: got {check.described(value)}, expected a list of {count} items, one for each body, None "
-                "for the scene's own; or some by their bodies, such as {0: …}"
+                f"for the scene's own; or some by their bodies, such as {example}"
             )
         if len(value) != count:
             raise ValueError(f"{argument}: got {len(value)} items, expected {count}, one for each body")

@@ -351,4 +351,7 @@ def check_float32(name: str, tensor: object) -> None:
             "torch.as_tensor(…, dtype=torch.float32)"
         )
     if tensor.dtype != torch.float32:
-        raise ValueError(f"{name}: got {tensor.dtype}, expected a tensor of torch.float32: .float() converts it")
+        remedy = ".float() converts it"
+        if tensor.dtype == torch.uint8:
+            remedy = "of an 8-bit picture warpshadow.srgb_to_linear(values / 255)"
+        raise ValueError(f"{name}: got {tensor.dtype}, expected a tensor of torch.float32: {remedy}")

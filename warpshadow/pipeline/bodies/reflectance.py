@@ -182,7 +182,7 @@ class Materials:
         """Raise ValueError for an array that is not one of a body."""
         body, where, body_input = self.merged_scene.scene.bodies[number], f"{name}[{number}]", INPUTS_OF_BODIES[name]
         if name in GLOSS_ARGUMENTS and not body.is_glossy:
-            expected = "one for bodies that have roughness in the scene"
+            expected = "one for bodies that have roughness in the scene, such as Body(…, roughness=0.5)"
             raise ValueError(f"{where}: got some for {body.name!r}, expected {expected}")
         if name == "emission" and body.emission is None:
             raise ValueError(f"{where}: got some for {body.name!r}, expected one for bodies that have it in the scene")
