@@ -221,7 +221,7 @@ def motion_gradients(mesh: ws.Mesh, receivers: str, supersampling: int) -> tuple
 def test_gradients_of_motions_of_creased_bodies_are_those_of_differences(mesh, receivers, supersampling):
     """By pixel they are 16 to 99% off if creases do not move.
 
-    The rock's faces are as small as samples, whose mean slopes along outlines reach across creases, and some creases lie
+    The rock's faces are as small as samples, whose mean slopes along outlines reach across creases; some creases lie
     between two samples unseen: 12% off, and 13% on average over eight poses; by normals of edges it was 7.6 and 6.3%.
     """
     got, expected = motion_gradients(mesh.creased(), receivers, supersampling)

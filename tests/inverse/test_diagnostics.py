@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import warpshadow as ws
-from warpshadow.inverse import DiagnosticWarning, Exposure, Light, Pose, Problem, Stage, Target, fit
+from warpshadow.inverse import DiagnosticWarning, Exposure, Light, Pose, Problem, Stage, Target, Texture, fit
 from warpshadow.inverse.diagnostics import gain_of_last
 
 
@@ -39,6 +39,16 @@ def test_pixels_that_see_no_body_are_told():
     mask = seen[..., 3] == 1
     assert not messages(Problem(small, Target(seen[..., :3], mask), Light(2)), stage)
     assert not messages(Problem(small, Target(seen), Light(2)), stage)  # its coverage is compared
+
+
+def test_a_texture_that_may_keep_a_shadow_is_told():
+    ball = ws.Body(ws.icosphere(0.4, 1), translation=(0, 0.4, 0), name="ball", blockers=8)
+    both = dataclasses.replace(scene(), bodies=[dataclasses.replace(scene().bodies[0], name="ground"), ball])
+    target, moved, painted = Target(ws.render(both)[..., :3]), Pose("ball"), Texture("ground", (4, 4))
+    (message,) = messages(Problem(both, target, [moved, painted]), Stage(1, 0.05))
+    assert message.startswith("the texture of 'ground' is free beside the pose of 'ball'")
+    for free in ([moved], [painted], [moved, dataclasses.replace(painted, palette=1.0)]):
+        assert not any("is free beside" in text for text in messages(Problem(both, target, free), Stage(1, 0.05)))
 
 
 def test_light_that_has_not_converged_is_told():

@@ -17,7 +17,7 @@ from warpshadow import check
 from warpshadow.check import AnyPath
 from warpshadow.device.progress import progress_bar, remark
 from warpshadow.inverse import checkpoint as checkpoints
-from warpshadow.inverse.diagnostics import warn_of
+from warpshadow.inverse.diagnostics import warn_before, warn_of
 from warpshadow.inverse.free.base import Free, Values
 from warpshadow.inverse.free.lamp import Lamp
 from warpshadow.inverse.one_thread import torch_on_one_thread
@@ -420,6 +420,7 @@ def fit(
     for name, file in (("checkpoint", checkpoint), ("preview", preview)):
         if file is not None and not Path(file).parent.is_dir():
             raise ValueError(f"{name}: got {str(file)!r}, expected a file in a folder that is there")
+    warn_before(problem)
     with checkpoints.exclusive(checkpoint), watching(view, progress=progress) as watch:
         descent = _Descent(problem, stages, optimizer, tolerance, seed, torch_device, progress)
         durations = _descend(descent, checkpoint, checkpoint_seconds, preview, preview_seconds, progress, watch)

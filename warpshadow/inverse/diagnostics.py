@@ -1,5 +1,5 @@
-"""Diagnostics of a fit that has ended: pixels without a body, wrong exposure, images that are not explained, a loss
-that was still falling.
+"""Diagnostics of a fit: a texture that may explain any shadow; and of one that has ended: pixels without a body, wrong
+exposure, images that are not explained, a loss that was still falling.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ import torch
 
 from warpshadow import check
 from warpshadow.inverse.free.base import Values
+from warpshadow.inverse.free.pose import Pose
+from warpshadow.inverse.free.reflectance import Texture
 from warpshadow.inverse.free.views import Exposure
 from warpshadow.inverse.loss import clip_saturated
 from warpshadow.inverse.model import Model
@@ -35,7 +37,7 @@ _SIDE = 96  # shorter side of small images [pixels]
 
 
 class DiagnosticWarning(UserWarning):
-    """A fit that ended, and a reason to doubt it."""
+    """A reason to doubt a fit."""
 
 
 def small_stage(problem: Problem) -> Stage:
@@ -116,6 +118,21 @@ def warn_of(
         )
     if stage.compares == "all" and not is_doubted:
         _warn_of_error(model, images, is_falling)
+
+
+def warn_before(problem: Problem) -> None:
+    """Warn of a pose and the texture of another body, both free, by one image: the texture may keep any shadow."""
+    poses = {pose.number for pose in problem.free_of(Pose)}
+    textures = [texture.number for texture in problem.free_of(Texture) if not texture.palette]
+    names = [body.name for body in problem.scene.bodies]
+    for texture in textures if len(problem.targets) == 1 else ():
+        if moved := sorted(poses - {texture}):
+            check.warn(
+                f"the texture of {names[texture]!r} is free beside the pose of {names[moved[0]]!r}: it may keep a "
+                "shadow where the body began, and the uncertainty of the pose does not know; fit the pose first, then the "
+                "texture, or give the texture a palette",
+                DiagnosticWarning,
+            )
 
 
 def _warn_of_unseen(model: Model, images: torch.Tensor) -> bool:
