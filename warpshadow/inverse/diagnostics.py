@@ -129,8 +129,8 @@ def warn_before(problem: Problem) -> None:
         if moved := sorted(poses - {texture}):
             check.warn(
                 f"the texture of {names[texture]!r} is free beside the pose of {names[moved[0]]!r}: it may keep a "
-                "shadow where the body began, and the uncertainty of the pose does not know; fit the pose first, then the "
-                "texture, or give the texture a palette",
+                "shadow where the body began, and the uncertainty of the pose does not know; fit the pose first, then "
+                "the texture, or give the texture a palette",
                 DiagnosticWarning,
             )
 
