@@ -223,15 +223,18 @@ def find_plane_patches(
     is_two_sided: bool,
     others: np.ndarray | None = None,
     contact: Contact | None = None,
+    half_spaces: np.ndarray | None = None,
 ) -> Patches:
     """Find the patches of a body that lies in a plane: the texels of a grid over its smallest rectangle.
 
     Args:
-        positions, faces, is_two_sided, others, contact: As for :func:`warpshadow.stages.planes.grid.find_grid`.
+        positions, faces, is_two_sided, others, contact, half_spaces: As for :func:`.stages.planes.grid.find_grid`.
     Returns:
         Patches, row by row: texels off the mesh have no area and no patch sample.
     """
-    grid, texel_points = find_grid(positions, faces, is_two_sided=is_two_sided, others=others, contact=contact)
+    grid, texel_points = find_grid(
+        positions, faces, is_two_sided=is_two_sided, others=others, contact=contact, half_spaces=half_spaces
+    )
     frame, origin = grid.frame, grid.origin
     texel_sizes = grid.texel_sizes().reshape(-1, 2)
 

@@ -13,11 +13,13 @@ import numpy as np
 import warp as wp
 
 from warpshadow.maths.directions import fibonacci
+from warpshadow.maths.plane import principal_axes
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.stages.planes.grid import find_grid
 from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneBody
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
+_ROUNDING = 1e-5  # height over a plane, in sizes of its body, up to which a point counts as in it
 _CORNERS = 64  # directions in which the vertices of a body are sought that are farthest out
 
 
@@ -55,6 +57,24 @@ class ScenePlanes:
         """Vertices of each other body where the scene has it, in a body's frame."""
         bodies = self._merged_scene.scene.bodies
         return [bodies[number].from_world(body.world_points()) for other, body in enumerate(bodies) if other != number]
+
+    def half_spaces(self, number: int) -> np.ndarray:
+        """Planes (n, d) of the other flat bodies, in a body's frame, n·x + d > 0 on the side from which they are seen.
+
+        That is where most of the other bodies and the camera are; a plane that has as many on both sides is left out.
+        """
+        scene, result = self._merged_scene.scene, []
+        solids = [body.world_points().mean(axis=0) for n, body in enumerate(scene.bodies) if n not in self.numbers]
+        viewers, body = np.array([*solids, scene.camera.eye]), scene.bodies[number]
+        for other in self.numbers:
+            points = scene.bodies[other].world_points()
+            normal = principal_axes(points)[2]
+            heights = (viewers - points[0]) @ normal
+            side = np.sign(heights[np.abs(heights) > _ROUNDING * np.ptp(points, axis=0).max()]).sum()
+            if other != number and side:
+                normal = np.sign(side) * normal @ body.rotation_matrix()
+                result.append([*normal, -normal @ body.from_world(points[0])])
+        return np.array(result).reshape(-1, 4)
 
     def blockers(self, bodies: tuple[int, ...], blocking_bodies: tuple[int, ...]) -> PlaneBlockers:
         """Plane blockers of some flat bodies, which send no light; ``blocking_bodies`` cast shadows."""

@@ -16,8 +16,10 @@ _CONTACT_SPREAD = 0.05  # within how far of a contact texels are about even, in 
 _EVEN_SPREAD = 100.0  # spread of a grid that is even, in sizes of its body
 _ROUNDING = 1e-6  # how far off a face a point may lie and still count as on it, as a part of the face or texel
 _WHOLE = 1e-4  # share of its rectangle up to which gaps of a mesh do not count
+_HIDDEN_WEIGHT = 1e-5  # of a texel that another plane hides; much less than the weight of texels in their neighbors …
+_MAX_HIDING = 5  # … for each of so many planes, so that products do not underflow
 # points along each side of a texel that are tested to lie on the mesh; odd, so that its middle is one
-_TESTS_PER_SIDE = 3
+_TESTS_PER_SIDE = 7
 
 
 class PlaneTexture(NamedTuple):
@@ -37,6 +39,7 @@ class PlaneTexture(NamedTuple):
     high: np.ndarray  # corners of the rectangle in (ξ, η), float64 of shape [2]
     covered: np.ndarray  # share of each texel that the mesh covers, float32 of shape [row, column]
     sides: int  # 1 if the front alone sends light, 2 if the back does, too; its patches follow the front's
+    shown: np.ndarray  # weight of each texel, 1 unless another plane hides it, float32 of shape [row, column]
     outline: np.ndarray  # edges (a, b) around the mesh and its holes, the mesh to their left, float64 [edge, 2, 2]
 
     @property
@@ -120,6 +123,7 @@ def find_grid(
     is_two_sided: bool,
     others: np.ndarray | None = None,
     contact: Contact | None = None,
+    half_spaces: np.ndarray | None = None,
 ) -> tuple[PlaneTexture, CoveredPoints]:
     """Find the grid of a body that lies in a plane, over its smallest rectangle.
 
@@ -130,6 +134,9 @@ def find_grid(
         others: Points of the scene's other bodies, in this body's frame, shape [point, 3]: texels are small near them.
             None for an even grid.
         contact: Where another body touches this one, in its frame, if texels are to be smallest there.
+        half_spaces: Other planes (n, d), in its frame, shape [plane, 4]: n·x + d is positive on the side from which
+            they are seen. A texel that one of them crosses, as a wall does a ground, has its point on that side, and
+            beside it texels behind the plane hardly count.
     Returns:
         The grid, and a point in each texel of which the mesh covers some.
     Raises:
@@ -161,9 +168,8 @@ def find_grid(
     vertices_in_plane = (positions[unique_vertices].astype(np.float64) - origin) @ frame[:2].T
     outline = vertices_in_plane[find_outline(vertices_in_plane, vertex_index.reshape(-1)[faces])]
     full_coverage = np.ones((height, width), np.float32)
-    grid = PlaneTexture(frame, origin, float(spread), low, high, full_coverage, sides, outline)
-    covered, covered_points = _find_covered(grid, corners)
-    return grid._replace(covered=covered), covered_points
+    grid = PlaneTexture(frame, origin, float(spread), low, high, full_coverage, sides, full_coverage, outline)
+    return _with_covered(grid, corners, np.empty((0, 4)) if half_spaces is None else half_spaces)
 
 
 def _smallest_rectangle(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -183,8 +189,10 @@ def _smallest_rectangle(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return np.stack([edges[smallest] @ basis, normals_of_edges[smallest] @ basis, normal])
 
 
-def _find_covered(grid: PlaneTexture, corners: np.ndarray) -> tuple[np.ndarray, CoveredPoints]:
-    """Find which share of each texel the faces [face, 3, 2] cover, and a point in each that is not empty."""
+def _with_covered(
+    grid: PlaneTexture, corners: np.ndarray, half_spaces: np.ndarray
+) -> tuple[PlaneTexture, CoveredPoints]:
+    """Find which share of each texel the faces [face, 3, 2] cover, a point in each that is not empty, and weights."""
     height, width = grid.covered.shape
     points = grid.points(_TESTS_PER_SIDE)
     shape = np.array([width, height]) * _TESTS_PER_SIDE
@@ -202,18 +210,31 @@ def _find_covered(grid: PlaneTexture, corners: np.ndarray) -> tuple[np.ndarray, 
     is_inside = (barycentrics > -_ROUNDING).all(axis=1)
     owners = np.full(points.shape[:2], -1)
     owners[row[is_inside], column[is_inside]] = np.flatnonzero(is_inside)
-    tested_points = (
-        owners.reshape(height, _TESTS_PER_SIDE, width, _TESTS_PER_SIDE).swapaxes(1, 2).reshape(height * width, -1)
-    )
-    covered = (tested_points >= 0).mean(axis=1)
-    by_centrality = np.abs(np.arange(_TESTS_PER_SIDE**2) - _TESTS_PER_SIDE**2 // 2).argsort(kind="stable")
-    nearest_test = (tested_points[:, by_centrality] >= 0).argmax(axis=1)
-    chosen_owners = tested_points[np.arange(len(tested_points)), by_centrality[nearest_test]]
+
+    def by_texel(values: np.ndarray) -> np.ndarray:
+        """Values of the points of each texel, [texel, point]."""
+        parted = values.reshape(height, _TESTS_PER_SIDE, width, _TESTS_PER_SIDE)
+        return parted.swapaxes(1, 2).reshape(height * width, -1)
+
+    owners_of_texels = by_texel(owners)
+    hidden_counts = by_texel(_count_hiding(grid, points, half_spaces))
+    off_centers = np.abs(np.arange(_TESTS_PER_SIDE**2) - _TESTS_PER_SIDE**2 // 2)
+    ranks = np.where(owners_of_texels >= 0, hidden_counts * _TESTS_PER_SIDE**2 + off_centers, np.iinfo(int).max)
+    chosen = np.arange(len(ranks)), ranks.argmin(axis=1)
+    chosen_owners, chosen_counts = owners_of_texels[chosen], hidden_counts[chosen]
     texels = np.flatnonzero(chosen_owners >= 0)
-    covered_points = CoveredPoints(
-        faces[chosen_owners[texels]], np.maximum(barycentrics[chosen_owners[texels]], 0), texels
-    )
-    return covered.reshape(height, width).astype(np.float32), covered_points
+    least = chosen_counts[texels].min(initial=chosen_counts.max())
+    shown = np.float32(_HIDDEN_WEIGHT) ** np.minimum(chosen_counts - least, _MAX_HIDING)
+    covered = (owners_of_texels >= 0).mean(axis=1).astype(np.float32)
+    grid = grid._replace(covered=covered.reshape(height, width), shown=shown.reshape(height, width))
+    chosen_barycentrics = np.maximum(barycentrics[chosen_owners[texels]], 0)
+    return grid, CoveredPoints(faces[chosen_owners[texels]], chosen_barycentrics, texels)
+
+
+def _count_hiding(grid: PlaneTexture, points: np.ndarray, half_spaces: np.ndarray) -> np.ndarray:
+    """Count the planes behind which points (a, b) [row, column, 2] of a grid lie."""
+    heights = (grid.origin + points @ grid.frame[:2]) @ half_spaces[:, :3].T + half_spaces[:, 3]
+    return (heights < -_ROUNDING * np.abs(grid.corners()).max()).sum(axis=-1)
 
 
 def _barycentrics(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:

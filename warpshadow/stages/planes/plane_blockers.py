@@ -102,7 +102,7 @@ class PlaneBlockers:
             grid, first_level, first_edge = body.grid, len(levels), sum(map(len, edges))
             is_exact = len(grid.outline) <= MAX_EDGES
             edges.append((grid.outline if is_exact else grid.rectangle()).reshape(-1, 4))
-            matrices = _halvings(*grid.covered.shape)
+            matrices, weights = _halvings(*grid.covered.shape), grid.covered * grid.shown
             for side in range(grid.sides):
                 for matrix, level_matrix, (height, width) in matrices:
                     levels.append((texel_count, width, height))
@@ -111,9 +111,7 @@ class PlaneBlockers:
                     covered.append(matrix @ grid.covered.ravel())
                     if patch_count:
                         first = body.first_patch + side * grid.covered.size
-                        pyramids.append(
-                            _shifted(level_matrix.multiply(grid.covered.ravel()).tocsr(), first, patch_count)
-                        )
+                        pyramids.append(_shifted(level_matrix.multiply(weights.ravel()).tocsr(), first, patch_count))
             grids.append(_kernel_grid(body, first_level, len(matrices), first_edge, edges[-1]))
             grids[-1].is_covered_by_texels = int(not is_exact)
             frames.append(_frame_matrix(body, vertex_count))
