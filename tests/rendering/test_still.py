@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import trimesh
 import warp as wp
 
 import warpshadow as ws
@@ -271,3 +272,13 @@ def test_a_still_of_a_post_has_the_light_of_a_finer_one():
         fine = still(320, shift).reshape(32, 10, 32, 10, 4).mean(axis=(1, 3))
         errors.append(error(still(32, shift), fine))
     assert np.mean(errors) < 0.02
+
+
+def test_small_stills_resolve_shadows_that_are_thinner_than_pixels():
+    posts = [trimesh.creation.box((0.015, 0.6, 0.015)).apply_translation((x, 0.3, 0)) for x in np.linspace(-1, 1, 33)]
+    fence = ws.Body(trimesh.util.concatenate(posts), (0.5, 0.5, 0.5)).creased()
+    ground = ws.Body(ws.infinite_ground(6.0), (0.5, 0.5, 0.5))
+    camera = ws.Camera.look_at((0, 2, 2), (0, 0, 0.3), fov_y=40, size=(48, 48))
+    scene = ws.Scene([fence, ground], ws.synthetic_sky((0.3, 0.6, -0.7)), camera)
+    fine, coarse = (ws.render(dataclasses.replace(scene, supersampling=count)) for count in (8, 2))
+    assert error(coarse, fine) < 0.07

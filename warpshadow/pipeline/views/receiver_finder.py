@@ -17,6 +17,11 @@ MAX_SHARED = 2
 """Samples of a pixel across in stills up to which those on a smooth surface share a receiver: whoever asks for more
 wants edges and bumps within pixels resolved."""
 
+_MIN_SHARED_SIZE = 128
+"""Pixels of the shorter side of stills from which they do: in smaller ones shadows are as thin as pixels. Crowds and
+fences of 72² to 96² pixels were 3.5 to 6.9% off, and are 2.7 to 2.9%, in 2.2 times the CPU time; from 128² on the error
+is the same."""
+
 
 class ReceiverFinder:
     """Finds the receivers of a view: which bodies have them where is known before anything is drawn.
@@ -39,7 +44,7 @@ class ReceiverFinder:
         self._merged_scene = method.merged_scene
         self._separate_bodies = method.separate_bodies(blocker_kinds)
         self._supersampling = supersampling
-        self._shares_surfaces = method.shares_directions and supersampling <= MAX_SHARED
+        self._may_share_surfaces = method.shares_directions and supersampling <= MAX_SHARED
 
     def find(
         self,
@@ -73,6 +78,9 @@ class ReceiverFinder:
                 quadtree = method.find_squares(self._blocker_kinds, surfaces)
         if at_samples.any() and fragments.barycentrics.requires_grad:
             has_mean_slope = find_mean_slopes(silhouettes, clip_positions, quadtree)
+        shares_surfaces = (
+            self._may_share_surfaces and min(fragments.face_ids.shape[1:]) >= _MIN_SHARED_SIZE * self._supersampling
+        )
         body_of_face, separate = merged_scene.body_of_face, self._separate_bodies
         return find_receivers(
             positions,
@@ -82,10 +90,10 @@ class ReceiverFinder:
             numbering,
             gather_of_owners(at_samples, body_of_face),
             bodies=None if separate is None else gather_of_owners(separate, body_of_face),
-            supersampling=1 if method.shares_directions and not self._shares_surfaces else self._supersampling,
+            supersampling=1 if method.shares_directions and not shares_surfaces else self._supersampling,
             quadtree=quadtree,
             rises=method.every_sample_receives,
-            smooth_pieces=merged_scene.smooth_pieces if self._shares_surfaces else None,
+            smooth_pieces=merged_scene.smooth_pieces if shares_surfaces else None,
             has_mean_slope=has_mean_slope,
             shares_receivers=None if method.shares_lobes else gather_of_owners(~merged_scene.is_glossy, body_of_face),
         )

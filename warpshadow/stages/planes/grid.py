@@ -223,8 +223,8 @@ def _with_covered(
     chosen = np.arange(len(ranks)), ranks.argmin(axis=1)
     chosen_owners, chosen_counts = owners_of_texels[chosen], hidden_counts[chosen]
     texels = np.flatnonzero(chosen_owners >= 0)
-    least = chosen_counts[texels].min(initial=chosen_counts.max())
-    shown = np.float32(_HIDDEN_WEIGHT) ** np.minimum(chosen_counts - least, _MAX_HIDING)
+    min_count = chosen_counts[texels].min(initial=chosen_counts.max())
+    shown = np.float32(_HIDDEN_WEIGHT) ** np.minimum(chosen_counts - min_count, _MAX_HIDING)
     covered = (owners_of_texels >= 0).mean(axis=1).astype(np.float32)
     grid = grid._replace(covered=covered.reshape(height, width), shown=shown.reshape(height, width))
     chosen_barycentrics = np.maximum(barycentrics[chosen_owners[texels]], 0)
