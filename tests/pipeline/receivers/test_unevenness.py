@@ -114,6 +114,22 @@ def test_no_dark_line_is_along_the_toe_of_a_wedge():
     assert (renderer.render()[..., 1][shows] / truth[shows]).min() > 0.85
 
 
+@pytest.mark.parametrize(("height", "expected"), [(0.3, "vertex"), (0.1, "pixel")], ids=["touching", "sunk"])
+def test_bodies_that_sink_into_a_ground_are_not_interpolated_from_below(height, expected):
+    ball = ws.Body(ws.icosphere(0.3, 4), translation=(0, height, 0))
+    camera = ws.Camera.look_at((0, 1.2, 3.5), (0, 0.2, 0), fov_y=30, size=(48, 48))
+    scene = ws.Scene([ball, ws.Body(ws.plane(6.0, 64))], ws.synthetic_sky((0.3, 0.9, 0.8)), camera)
+    assert chosen(scene)[0].receivers == expected
+
+
+@pytest.mark.parametrize(("distance", "expected"), [(-1.05, "adaptive"), (-3.05, "vertex")], ids=["across", "beyond"])
+def test_grounds_behind_a_wall_are_not_interpolated_across_it(distance, expected):
+    wall = ws.Body(ws.plane((1.0, 1.0), 4), translation=(0, 0.5, distance), rotation=(90, 0, 0))
+    camera = ws.Camera.look_at((0, 1.2, 3.5), (0, 0.2, -1), fov_y=30, size=(48, 48))
+    scene = ws.Scene([ws.Body(ws.plane(6.0, 64)), wall], ws.EnvironmentMap.constant(), camera)
+    assert chosen(scene)[0].receivers == expected
+
+
 def waves(**options):
     """A body of waves that are high enough for a low sun to leave their backs dark."""
     grid = ws.plane(4.0, 48)

@@ -1,7 +1,8 @@
-"""Buried vertices: corners of visible faces that lie inside another body, as below a box on a ground.
+"""Buried vertices: corners of visible faces that lie inside another body, as below a box on a ground, or behind a plane.
 
 They are dark, and pixels beside the other body would interpolate between them and vertices in the open: a dark line one
-pixel high along the toe of a wedge, 0.58 of the light there, which is too little of the ground to count as uneven.
+pixel high along the toe of a wedge, 0.58 of the light there, which is too little of the ground to count as uneven. So is
+the ground at the foot of a wall that stands on it, and a ball where it sinks into a ground.
 """
 
 from collections.abc import Sequence
@@ -9,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
+from warpshadow.maths.plane import principal_axes
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.stages.geometry.normals import vertex_normals
 from warpshadow.stages.self_visibility.buried import find_buried
@@ -19,7 +21,7 @@ _ROUNDING = 1e-5  # of the largest coordinate, by which a vertex may lie outside
 def find_bodies_with_buried_vertices(
     merged_scene: MergedScene, positions: np.ndarray, face_ids: Sequence[np.ndarray], bodies: Sequence[int]
 ) -> np.ndarray:
-    """Find the bodies of which images show a face from a buried vertex to one in the open.
+    """Find the bodies of which images show a face from a buried vertex to one in the open, or through a plane.
 
     Args:
         merged_scene: All bodies.
@@ -37,6 +39,10 @@ def find_bodies_with_buried_vertices(
     mesh = normals = None
     for number, body in enumerate(bodies):
         corners = faces[seen[merged_scene.body_of_face[seen] == body]]
+        planes = [run for run, casting in zip(runs, merged_scene.casting, strict=True) if merged_scene.is_flat[casting]]
+        if any(_cross(positions[corners], positions[run], margin) for run in planes):
+            result[number] = True
+            continue
         vertices = np.unique(corners)
         points, is_within = positions[vertices], np.zeros(len(vertices), bool)
         for casting, (low, high) in zip(merged_scene.casting, bounds, strict=True):
@@ -52,3 +58,13 @@ def find_bodies_with_buried_vertices(
             is_buried[candidates] = find_buried(mesh, positions[candidates], normals[candidates])
             result[number] = (is_buried[corners].any(axis=1) & ~is_buried[corners].all(axis=1)).any()
     return result
+
+
+def _cross(corners: np.ndarray, plane_points: np.ndarray, margin: float) -> bool:
+    """Whether a face [face, 3, 3] goes through the rectangle around points of a plane."""
+    axes, middle = principal_axes(plane_points.astype(np.float64)), plane_points.mean(axis=0)
+    local, (half_width, half_height, _) = (corners - middle) @ axes.T, np.abs((plane_points - middle) @ axes.T).max(0)
+    heights = local[..., 2]
+    is_cut = (heights.min(axis=1) < -margin) & (heights.max(axis=1) > margin)
+    is_beside = (np.abs(local[..., :2]) <= (half_width, half_height)).all(axis=-1).any(axis=1)
+    return bool((is_cut & is_beside).any())

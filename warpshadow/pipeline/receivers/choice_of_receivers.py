@@ -93,7 +93,7 @@ class ReceiverChoice(NamedTuple):
     receivers: str  # at every "vertex", at every "pixel" that shows the body, or "adaptive"
     size: FaceSize | None  # of its faces; None where nobody had to know
     unevenness: float = 0.0  # relative L2 error of light between its vertices; 0 where nobody had to know
-    shows_buried: bool = False  # whether it is flat, and pixels would have light of vertices inside other bodies
+    shows_buried: bool = False  # whether pixels would have light of vertices inside other bodies, or behind planes
 
 
 def choose_receivers(
@@ -142,9 +142,9 @@ def choose_receivers(
         light = EnvironmentMap.constant() if is_light_free else merged_scene.scene.known_light
         bodies = np.flatnonzero(is_open).tolist()
         unevenness[is_open] = light_unevenness(merged_scene, positions, seen, bodies, light, near_light)
-        flat_bodies = np.flatnonzero(is_open & merged_scene.is_flat & (unevenness <= UNEVEN)).tolist()
+        even_bodies = np.flatnonzero(is_open & (unevenness <= UNEVEN)).tolist()
         seen_faces = [seen for seen, _ in faces]
-        shows_buried[flat_bodies] = find_bodies_with_buried_vertices(merged_scene, positions, seen_faces, flat_bodies)
+        shows_buried[even_bodies] = find_bodies_with_buried_vertices(merged_scene, positions, seen_faces, even_bodies)
     chosen = np.where(
         shows_buried | (unevenness > UNEVEN), np.where(merged_scene.is_flat, where_edges_are, "pixel"), chosen
     )
@@ -227,7 +227,7 @@ def _reason(choice: ReceiverChoice) -> str:
     if choice.unevenness > UNEVEN:
         return f"between its vertices light is off by {choice.unevenness:.0%}, more than {UNEVEN:.0%}"
     if choice.shows_buried:
-        return "vertices inside other bodies are dark, beside pixels that are not"
+        return "vertices inside other bodies, or behind planes, are dark, beside pixels that are not"
     return str(choice.size)
 
 
