@@ -1,8 +1,8 @@
-"""Buried vertices: corners of visible faces that lie inside another body, as below a box on a ground, or behind a plane.
+"""Buried vertices: corners of visible faces that lie inside another body, as below a box, or behind a plane.
 
 They are dark, and pixels beside the other body would interpolate between them and vertices in the open: a dark line one
-pixel high along the toe of a wedge, 0.58 of the light there, which is too little of the ground to count as uneven. So is
-the ground at the foot of a wall that stands on it, and a ball where it sinks into a ground.
+pixel high along the toe of a wedge, 0.58 of the light there, which is too little of the ground to count as uneven. The
+ground at the foot of a wall that stands on it has such a line, too, and a ball where it sinks into a ground.
 """
 
 from collections.abc import Sequence
