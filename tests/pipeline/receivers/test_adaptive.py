@@ -36,8 +36,10 @@ def relative(image: np.ndarray, truth: np.ndarray) -> float:
 def test_an_image_is_that_by_pixel_with_far_fewer_receivers(segments):
     by_pixel, many = image_and_count(scene_of("pixel", segments=segments))
     adaptive, few = image_and_count(scene_of("adaptive", segments=segments))
-    assert relative(adaptive, by_pixel) < 0.02  # measured 1.6% and 1.1%
+    assert relative(adaptive, by_pixel) < 0.005  # measured 0.34% and 0.31%
     assert few < 0.4 * many
+    # measured 0.09 and 0.06; 0.38 by 64 segments where samples beside squares had the light of a corner
+    assert np.abs(adaptive - by_pixel).max() < 0.15 * by_pixel.mean()
 
 
 def test_walls_cast_shadows_with_edges_too():

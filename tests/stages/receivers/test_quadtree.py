@@ -112,10 +112,10 @@ def test_bodies_and_sides_do_not_share_squares(device):
 
 def test_gradients_to_corners_are_central_differences(device, verified_tape):
     """Receivers move along their rays, and the weights of samples stay."""
-    positions, faces, fragments = sheet_and_triangle(device, size=22)
-    matrix = wp.array(
-        [ws.Camera.look_at((0, 0, 3.0), (0, 0, 0), size=(22, 22)).clip_matrix()], dtype=wp.mat44, device=device
-    )
+    eye = (0.05, 0, 3.0)  # so no sample lies on the edge between the sheet's faces
+    positions, faces, fragments = sheet_and_triangle(device, (eye,), size=22)
+    camera = ws.Camera.look_at(eye, (0.05, 0, 0), size=(22, 22))
+    matrix = wp.array([camera.clip_matrix()], dtype=wp.mat44, device=device)
     shares = shares_of(fragments, 2, lambda x: 0.05 * np.abs(x - 6))
     quadtree = find_quadtree(fragments.face_ids, np.append(KEYS, KEYS), shares, 2)
     assert {2, 4} <= set(quadtree.sizes.numpy()[0, -3].tolist())

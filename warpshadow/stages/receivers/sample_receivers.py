@@ -94,8 +94,8 @@ def _find_owner_samples(
     """A thread owns a run of pixels of a row.
 
     A sample gets the owner of its receiver, the first sample that shares it, −1 if its receivers are vertices, or
-    −2 − t in a triangle t; and the weights of its receivers. A corner of squares is shared by the samples of its pixel
-    that see its body.
+    −2 − t in a triangle t; and the weights of its receivers. A corner of squares is at its sample, so others do not
+    share it.
     """
     view, thread = split_row(first_row + wp.tid(), sides.shape[1] // (supersampling * supersampling) // run)
     pixels = width // supersampling
@@ -106,7 +106,7 @@ def _find_owner_samples(
         size = int(0)
         square = int(0)
         square_key = int(-1)
-        corner_key = int(-1)
+        first_shared = int(0)
         square_position = wp.vec2()  # of the pixel in the square, from 0 to 1
         sample_step = wp.vec2()  # of a sample
         if sizes:
@@ -123,7 +123,7 @@ def _find_owner_samples(
                     float(column - left) * sample_step[0], float(row - top) * sample_step[1]
                 )
             if is_corner[view, corner]:
-                corner_key = keys[sides[view, corner]]
+                first_shared = 1
         for i in range(supersampling):
             for j in range(supersampling):
                 sample = corner + i * width + j
@@ -141,16 +141,13 @@ def _find_owner_samples(
                     if u + v > 1.0:
                         owner_sample -= 1
                         weight = wp.vec3(u + v - 1.0, 1.0 - u, 1.0 - v)
-                elif key >= 0 and key == corner_key:
-                    owner_sample = corner
-                    weight = wp.vec3(1.0, 0.0, 0.0)
                 elif side >= 0 and wants_samples[side % wants_samples.shape[0]]:
                     owner_sample = sample
                     weight = wp.vec3(1.0, 0.0, 0.0)
                     other_count = i * supersampling + j
                     if shares_receivers:
                         other_count = wp.where(shares_receivers[side % shares_receivers.shape[0]], other_count, 0)
-                    for k in range(other_count):
+                    for k in range(first_shared, other_count):
                         other = sample_of_pixel(corner, k, width, supersampling)
                         if owner_sample == sample and sides[view, other] == side:
                             owner_sample = owner_samples[view, other]
