@@ -6,7 +6,7 @@ import trimesh
 
 import warpshadow as ws
 from warpshadow.maths.convex import find_convex_parts
-from warpshadow.maths.panels import MAX_LEAVES, MAX_PANELS_OF, find_panels
+from warpshadow.maths.panels import MAX_PANELS_OF, find_panels
 
 TOLERANCE = 0.02
 
@@ -154,7 +154,7 @@ def leaves(count):
     return points, (np.array([(0, 1, 2), (0, 2, 3)]) + 4 * np.arange(count)[:, None, None]).reshape(-1, 3)
 
 
-@pytest.mark.parametrize("count", [40, 100, MAX_LEAVES])
+@pytest.mark.parametrize("count", [40, 100, max(MAX_PANELS_OF.values())])
 def test_all_leaves_of_a_tree_are_panels_each_a_piece_of_its_own(count):
     points, faces = leaves(count)
     parts = find_convex_parts(points.astype(np.float32), faces)
@@ -163,7 +163,7 @@ def test_all_leaves_of_a_tree_are_panels_each_a_piece_of_its_own(count):
 
 
 def test_more_leaves_than_that_have_spheres():
-    points, faces = leaves(MAX_LEAVES + 1)
+    points, faces = leaves(max(MAX_PANELS_OF.values()) + 1)
     assert find_convex_parts(points.astype(np.float32), faces) is None
 
 

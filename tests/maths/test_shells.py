@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import ConvexHull
 
 from warpshadow.maths.convex import find_convex_parts, is_panel
 from warpshadow.maths.shells import find_layer
@@ -72,6 +73,27 @@ def test_a_mug_blocks_as_panels_for_receivers_outside_and_others_for_receivers_i
             a, b, c = mesh.vertices[part.corners][part.faces[0]]
             assert sign * (np.cross(b - a, c - a) @ (a - middle)) > 0
             assert not np.ptp(part.faces[1])  # a face without area
+
+
+def bowl(pinhole=0.0):
+    """A bowl of radius 1 with a wall of 0.06, whose profile may stop before the axis."""
+    angles = np.linspace(0.05, 1.4, 24)[:, None]
+    outer, inner = (radius * np.hstack([np.sin(angles), -np.cos(angles)]) for radius in (1.06, 1.0))
+    return lathed((pinhole, -1.06), *outer, *inner[::-1], (pinhole, -1), sections=48)
+
+
+@pytest.mark.parametrize("pinhole", [0.0, 1e-3])
+def test_the_panels_of_a_bowl_are_those_of_its_outside_and_cast_a_shadow_of_its_size(pinhole):
+    mesh = bowl(pinhole)
+    assert mesh.is_watertight == (not pinhole)
+    parts = find_convex_parts(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    assert len({part.piece for part in parts}) == 2
+    corners = mesh.vertices[np.unique(np.concatenate([part.corners for part in parts]))]
+    inside = corners[np.linalg.norm(corners, axis=1) < 1.03]
+    assert inside[:, 2].min() > -0.2  # its rim
+    for axes in (np.eye(3)[:2], np.eye(3)[1:], np.array([(0.8, 0, -0.6), (0, 1, 0)])):
+        shadow, expected = (ConvexHull(points @ axes.T).volume for points in (corners, mesh.vertices))
+        assert shadow > 0.98 * expected  # of panels of both sides 0.94
 
 
 def test_a_mug_of_a_handle_and_a_spoon_has_their_parts_too():

@@ -218,6 +218,21 @@ def test_a_body_that_blocks_as_convex_parts_takes_few_spheres(method, body_optio
     assert blockers.fitted_meshes(scene)[0].steps == steps
 
 
+@pytest.mark.parametrize(
+    ("radius", "sides", "has_parts"),
+    [(0.35, 24, False), (0.35, 8, True), (0.1, 24, True)],
+    ids=["round", "of few sides", "thin"],
+)
+def test_rings_of_many_sides_block_as_spheres_where_few_cast_their_shadow(radius, sides, has_parts):
+    import trimesh
+
+    scene = scene_of(ws.Body(trimesh.creation.torus(1, radius, 48, sides)))
+    parts = scene.bodies[0].mesh.convex_parts
+    assert (sum(len(part.edges) for part in parts) > blockers.MANY_EDGES) == (sides == 24)
+    assert blockers.blocking_parts(scene) == ({0: parts} if has_parts else {})
+    assert blockers.fitted_counts(scene) == {0: blockers.SPHERES_BESIDE_PARTS}
+
+
 def test_short_fits_beside_convex_parts_send_the_same_light(tmp_path, monkeypatch):
     """An image of a box on a ground with all bounces: measured 1e-6."""
     import trimesh

@@ -13,7 +13,7 @@ import numpy as np
 from warpshadow.maths.adjacency import area_normals, edges_of
 from warpshadow.maths.components import connected_components
 from warpshadow.maths.outline import cut_outline, find_outline
-from warpshadow.maths.panels import MAX_FLAT_PANELS_OF, MAX_PANELS_OF, MAX_SHELL_PANELS_OF, find_panels_of_sheets
+from warpshadow.maths.panels import MAX_FLAT_PANELS_OF, MAX_PANELS_OF, find_panels_of_sheets
 from warpshadow.maths.shells import find_layer
 from warpshadow.maths.tubes import MAX_SEGMENTS, find_tube
 
@@ -31,6 +31,9 @@ _MAX_TRIANGLES = 16 * MAX_FACES
 _FLATNESS = 1e-4
 """Height over the size of the part up to which vertices lie in the plane of a face, and on a straight edge; and
 1 − cos α of the angle between neighboring triangles up to which they are of one face."""
+
+_MAX_HOLES = 0.05
+"""Border of a thin wall at most, over its size, such as a pinhole where a lathe's profile does not reach the axis."""
 
 _TWIST = 5e-3  # the same of faces of segments of bent tubes, whose sides twist
 
@@ -70,11 +73,11 @@ def find_convex_parts(
     Returns:
         The parts, which may touch and overlap: for each closed piece of the mesh a solid, or the prisms into which it
         is cut if it is one, with holes or without, or the segments of a bent tube; panels for each open one. They come
-        by pieces, and in each the seams come last. Panels of sheets that share edges are of one piece. A closed piece
-        around a thin wall (:mod:`.shells`) has one-sided panels: those for receivers outside are one piece, those for
-        receivers inside another, as a receiver may see both walls of a mug behind each other. None where a closed piece
-        is hollow or curved otherwise, where a part has more than 64 faces, or where there are more than 32 prisms of a
-        piece, 128 segments of all tubes, or 144 panels (256 of leaves, 64 flat ones, 160 of thin walls).
+        by pieces, and in each the seams come last. Panels of sheets that share edges are of one piece. A piece around a
+        thin wall (:mod:`.shells`), closed but for pinholes, has one-sided panels: those for receivers outside are one
+        piece, those for receivers inside another, as a receiver may see both walls of a mug behind each other. None
+        where a closed piece is hollow or curved otherwise, where a part has more than 64 faces, or where there are more
+        than 32 prisms of a piece, 128 segments of all tubes, or 352 panels (64 flat ones).
     """
     _, first, vertex = np.unique(positions, axis=0, return_index=True, return_inverse=True)
     triangles = vertex.reshape(-1)[faces]
@@ -82,26 +85,29 @@ def find_convex_parts(
     if not len(triangles):
         return None
     points, pieces, sheets, layers = positions.astype(np.float64)[first], [], [], []
-    segment_count, max_panels_of = 0, MAX_FLAT_PANELS_OF if flat_panels else MAX_PANELS_OF
+    segment_count = 0
     piece = _pieces(triangles)
     for number in range(piece.max() + 1):
         piece_triangles = triangles[piece == number]
-        if _is_open(piece_triangles):
-            sheets.append(piece_triangles)
-            continue
-        solid = _solid(points, piece_triangles)
-        parts_of_piece = [solid] if solid else _prisms(points, piece_triangles)
-        if parts_of_piece is None:
-            parts_of_piece = _segments(points, piece_triangles, MAX_SEGMENTS - segment_count)
+        border, parts_of_piece = _border_share(points, piece_triangles), None
+        if not border:
+            solid = _solid(points, piece_triangles)
+            parts_of_piece = [solid] if solid else _prisms(points, piece_triangles)
             if parts_of_piece is None:
-                layer = None if flat_panels else find_layer(points, piece_triangles)
-                if layer is None:
-                    return None
-                layers.append(layer)
-                max_panels_of = MAX_SHELL_PANELS_OF
-                continue
-            segment_count += len(parts_of_piece) - sum(part.is_seam for part in parts_of_piece)
-        pieces.append(parts_of_piece)
+                parts_of_piece = _segments(points, piece_triangles, MAX_SEGMENTS - segment_count)
+                segment_count += sum(not part.is_seam for part in parts_of_piece or [])
+        if parts_of_piece is not None:
+            pieces.append(parts_of_piece)
+            continue
+        has_layer = border <= _MAX_HOLES and not flat_panels
+        layer = find_layer(points, piece_triangles) if has_layer else None
+        if layer is not None:
+            layers.append(layer)
+        elif border:
+            sheets.append(piece_triangles)
+        else:
+            return None
+    max_panels_of = MAX_FLAT_PANELS_OF if flat_panels else MAX_PANELS_OF
     panels = find_panels_of_sheets(points, [*sheets, *layers], max_panels_of)
     if panels is None:
         return None
@@ -137,10 +143,11 @@ def _groups(sheets: list[np.ndarray]) -> np.ndarray:
     return connected_components(sheet[permutation[:-1][is_shared]], sheet[permutation[1:][is_shared]], len(sheets))
 
 
-def _is_open(triangles: np.ndarray) -> bool:
-    """Whether triangles have a border."""
-    _, counts = np.unique(np.sort(edges_of(triangles), axis=1), axis=0, return_counts=True)
-    return bool((counts % 2).any())
+def _border_share(points: np.ndarray, triangles: np.ndarray) -> float:
+    """Length of the border of triangles over their size; 0 where they are closed."""
+    edges, counts = np.unique(np.sort(edges_of(triangles), axis=1), axis=0, return_counts=True)
+    ends = points[edges[counts % 2 == 1]]
+    return float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum() / np.ptp(points[triangles], axis=(0, 1)).max())
 
 
 def _panel(corners: np.ndarray) -> ConvexPart:

@@ -144,6 +144,16 @@ def test_shadows_that_cross_faces_are_seen_by_pixel(sun, expected):
     assert body.receivers == expected and not body.size.exceeds(16)
 
 
+def test_shadows_that_cross_faces_of_several_pixels_are_seen_by_pixel_though_they_are_small():
+    bodies = [ws.Body(ws.icosphere(1.0, 4)), ws.Body(ws.icosphere(0.09, 3), translation=(0.45, 1.2, 0.2))]
+    camera = ws.Camera.look_at((0, 3, 2), (0, 0.3, 0), fov_y=40, size=(200, 200))
+    scene = ws.Scene(bodies, ws.synthetic_sky(), camera)
+    hill, _ = chosen(scene)
+    assert not hill.size.exceeds(16)
+    assert UNEVEN / 2 < hill.max_unevenness < hill.unevenness < UNEVEN and hill.receivers == "pixel"
+    assert f"{hill.unevenness:.1%}, more than {hill.max_unevenness:.1%}" in ws.Renderer(scene).explain().notes[0]
+
+
 def test_free_light_is_taken_as_even():
     scene = waves(light=ws.synthetic_sky((1, 0.2, 0)))
     free, _ = choose_receivers(MergedScene(scene), [scene.camera], is_light_free=True)
