@@ -160,6 +160,30 @@ def test_lights_close_to_each_other_are_not_one_sun_between_them(gap, count):
         np.testing.assert_array_equal(rest, lights.radiance)
 
 
+@pytest.mark.parametrize(("radius", "count"), [(5.5, 1), (6.2, 0), (6.3, 0)])
+def test_a_disc_is_separated_as_a_whole_or_not_at_all(radius, count):
+    sky = ws.synthetic_sky(sun_strength=0, height=256).with_sun((0.3, 1, 0.4), 3.0, angular_radius=radius)
+    found, rest = suns.separate_suns(sky.radiance)
+    assert len(found.directions) == count
+    assert rest.max() < 0.2 * sky.radiance.max() if count else np.array_equal(rest, sky.radiance)
+
+
+@pytest.mark.parametrize(("rows", "count"), [(8, 0), (32, 1)])
+def test_a_pixel_of_a_coarse_map_is_wider_than_a_sun(rows, count):
+    radiance = np.full((rows, 2 * rows, 3), 0.1, np.float32)
+    radiance[rows // 2, rows] = 100
+    assert len(suns.separate_suns(radiance)[0].directions) == count
+
+
+def test_eight_suns_are_separated():
+    sky = ws.synthetic_sky(sun_strength=0, height=128)
+    for angle in np.arange(8) * np.pi / 4:
+        sky = sky.with_sun((np.cos(angle), 0.8, np.sin(angle)), 1.0, angular_radius=1)
+    found, rest = suns.separate_suns(sky.radiance)
+    assert len(found.directions) == 8
+    assert rest.max() < 0.1 * sky.radiance.max()
+
+
 def test_a_tube_of_light_stays_in_the_map():
     tube = ws.synthetic_sky(sun_strength=0, height=256)
     for angle in np.radians(np.linspace(-5, 5, 21)):

@@ -31,12 +31,14 @@ from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.gloss.lobes import Lobes
 from warpshadow.stages.gloss.reflection import LobeLight
 
-_MAX_SUNS = 4
+_MAX_SUNS = 8
 _BRIGHTNESS = 10.0  # radiance above which a pixel may be of a sun, in means of the map
 _MIN_SHARE = 0.003  # of all light, that a sun has at least
 _RADII = np.radians([6.0, 3.0, 1.5])  # of discs that are tried around the brightest spot, the widest first
 _MAX_SPREAD = 2.0  # size by the mean square of angles over the area that shines: 1 of discs, more of tubes and pairs
 _ISOLATION = 0.9  # of the bright light within twice that radius, that is within it: of wider spots it is less
+_RIM = 1.25  # where a disc has ended, in radii: as far as that nothing beside it is half as bright
+_MAX_AREA = 1.2  # size of a sun, in discs of that radius: a pixel of a coarse map is larger
 _MAX_TRIALS = 32  # brightest spots that are tried
 
 _MIN_HORIZON_WEIGHT = 1.0e-7
@@ -55,7 +57,7 @@ class Suns(NamedTuple):
 
 
 def separate_suns(radiance: np.ndarray) -> tuple[Suns, np.ndarray]:
-    """Separate suns from a map, at most 4: discs of up to 6° in radius that are much brighter than all on average.
+    """Separate suns from a map, at most 8: discs of up to 6° in radius that are much brighter than all on average.
 
     Args:
         radiance: Linear RGB, shape [height, 2·height, 3].
@@ -85,13 +87,15 @@ def separate_suns(radiance: np.ndarray) -> tuple[Suns, np.ndarray]:
             cosines = directions @ (middle / np.linalg.norm(middle))
             is_near = is_candidate & (cosines > np.cos(radius))
             disc, wider_power = power[is_near], power[cosines > np.cos(2 * radius)].sum()
-            if disc.sum() > max(_MIN_SHARE * total, _ISOLATION * wider_power):
+            is_rim = (cosines <= np.cos(radius)) & (cosines > np.cos(_RIM * radius))
+            has_ended = brightness[pixels[is_rim]].max(initial=0) < brightness[pixels[brightest]] / 2
+            if has_ended and disc.sum() > max(_MIN_SHARE * total, _ISOLATION * wider_power):
                 mean = disc @ directions[is_near] / disc.sum()
                 length = np.linalg.norm(mean)
                 # of a disc the mean square of angles to its middle is Ω / (2π); pixels have a size, too
                 size = 4 * np.pi * (1 - length) + disc @ solid_angles[pixels[is_near]] / disc.sum()
                 area = disc.sum() ** 2 / (disc**2 / solid_angles[pixels[is_near]]).sum()
-                if size < _MAX_SPREAD * area:
+                if size < min(_MAX_SPREAD * area, _MAX_AREA * 2 * np.pi * (1 - np.cos(radius))):
                     suns.append((mean / length, light[is_near].sum(axis=0), size))
                     is_in_disc = is_near
                     break
