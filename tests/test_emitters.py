@@ -271,7 +271,7 @@ def test_a_fit_finds_a_texture_of_emission(start):
 
 
 def test_a_texture_of_emission_that_cannot_be_is_refused():
-    with pytest.raises(ValueError, match="emission: got a texture, .* but mesh .* has no uvs"):
+    with pytest.raises(ValueError, match="emission: got an image, but mesh .* has no uvs"):
         ws.Body(SMALL, emission=SCREEN)
     with pytest.raises(ValueError, match=r"emission: got shape \(32, 48, 2\), expected \[3\], .* or a texture"):
         ws.Body(ws.plane(1.0, 1), emission=SCREEN[..., :2])
