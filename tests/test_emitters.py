@@ -203,7 +203,7 @@ def with_screen(mesh, emission, **options):
     return scene_of(screen, BALL, GROUND, light=DARK, camera=camera, **options)
 
 
-@pytest.mark.parametrize("settings", [{"method": "directional"}, {}, {"method": "ray-traced", "samples": 8192}])
+@pytest.mark.parametrize("settings", [{"method": "directional"}, {}, {"method": "ray-traced", "samples": 4096}])
 def test_a_texture_of_emission_lights_and_bounces_as_colors_of_many_vertices_do(settings):
     """In stills and paths grain differs; light that bounces is compared by its mean."""
     fine = ws.plane((1.2, 0.8), (48, 32))
