@@ -1,6 +1,9 @@
 """Settings of flat bodies and receivers, and a float64 twin of their light and of what passes them."""
 
+import cmath
 import functools
+import itertools
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -47,23 +50,25 @@ def bilinear(image, x, y):
 
 
 def part_in_disc(a, b):
-    """Area and moment of the triangle of the middle of a disc of radius 1, a and b that the disc takes, by pieces."""
+    """Area and moment of the triangle of the middle of a disc of radius 1, a and b that the disc takes, by pieces.
+
+    Points of the plane are complex numbers, which Python has ten times as fast as NumPy; a* b = a·b + i a×b.
+    """
     along = b - a
-    length = np.linalg.norm(along)
-    distance = np.linalg.det([a, along]) / length if length else 1.0
-    half = np.sqrt(max(0, 1 - distance**2))
-    cuts = [(-along @ a / length + sign * half) / length for sign in (-1, 1)] if half > 0 else []
-    ends = [a + t * along for t in (0, *np.clip(cuts, 0, 1), 1)]
-    total = np.zeros(3)
-    for p, q in zip(ends[:-1], ends[1:], strict=True):
-        cross = p[0] * q[1] - p[1] * q[0]
-        if np.linalg.norm(p + q) < 2:
-            total += cross / 2 * np.array([1.0, *((p + q) / 3)])
-        elif np.linalg.norm(p) > 0 and np.linalg.norm(q) > 0:
-            angle = np.arctan2(cross, p @ q)
-            p, q = p / np.linalg.norm(p), q / np.linalg.norm(q)
-            total += np.array([angle / 2, (q[1] - p[1]) / 3, (p[0] - q[0]) / 3])
-    return total
+    length = abs(along)
+    distance = (a.conjugate() * along).imag / length if length else 1.0
+    half = math.sqrt(max(0, 1 - distance**2))
+    middle = -(a.conjugate() * along).real / length if length else 0.0
+    cuts = [min(max((middle + sign * half) / length, 0), 1) for sign in (-1, 1)] if half > 0 else []
+    area, moment = 0.0, 0j
+    for p, q in itertools.pairwise([a + t * along for t in (0, *cuts, 1)]):
+        if abs(p + q) < 2:
+            triangle = (p.conjugate() * q).imag / 2
+            area, moment = area + triangle, moment + triangle * (p + q) / 3
+        elif p and q:
+            area += cmath.phase(p.conjugate() * q) / 2
+            moment += 1j * (p / abs(p) - q / abs(q)) / 3
+    return np.array([area, moment.real, moment.imag])
 
 
 def ahead(corners, direction):
@@ -87,11 +92,13 @@ def share_in_view(outline, at, toward, radius):
     total = np.zeros(3)
     for a, b in outline:
         corners = np.stack([outline[0, 0], a, b])
-        sign = np.sign(np.linalg.det(corners[1:] - corners[0]))
+        (x, y), (z, w) = (corners[1:] - corners[0]).tolist()
+        sign = np.sign(x * w - y * z)
         seen = ahead(np.column_stack([corners - at[:2], np.full(3, at[2])]), toward)
         if sign and len(seen):
             projected = seen @ unit_axes.T / (radius * seen @ toward)[:, None]
-            part = sum(map(part_in_disc, np.roll(projected, 1, axis=0), projected))
+            points = (projected @ [1, 1j]).tolist()
+            part = sum(map(part_in_disc, [points[-1], *points[:-1]], points))
             total += sign * np.sign(part[0]) * part
     return np.array([np.clip(total[0] / np.pi, 0, 1), *(total[1:] / np.pi @ unit_axes)])
 

@@ -203,7 +203,7 @@ def with_screen(mesh, emission, **options):
     return scene_of(screen, BALL, GROUND, light=DARK, camera=camera, **options)
 
 
-@pytest.mark.parametrize("settings", [{"method": "directional"}, {}, {"method": "ray-traced", "samples": 8192}])
+@pytest.mark.parametrize("settings", [{"method": "directional"}, {}, {"method": "ray-traced", "samples": 4096}])
 def test_a_texture_of_emission_lights_and_bounces_as_colors_of_many_vertices_do(settings):
     """In stills and paths grain differs; light that bounces is compared by its mean."""
     fine = ws.plane((1.2, 0.8), (48, 32))
@@ -271,7 +271,7 @@ def test_a_fit_finds_a_texture_of_emission(start):
 
 
 def test_a_texture_of_emission_that_cannot_be_is_refused():
-    with pytest.raises(ValueError, match="emission: got a texture, .* but mesh .* has no uvs"):
+    with pytest.raises(ValueError, match="emission: got an image, but mesh .* has no uvs"):
         ws.Body(SMALL, emission=SCREEN)
     with pytest.raises(ValueError, match=r"emission: got shape \(32, 48, 2\), expected \[3\], .* or a texture"):
         ws.Body(ws.plane(1.0, 1), emission=SCREEN[..., :2])

@@ -1,6 +1,7 @@
 """Names and docstrings: one word, one meaning."""
 
 import ast
+import functools
 import re
 from collections import Counter
 from collections.abc import Iterator
@@ -72,9 +73,14 @@ FIRST_WORDS = ("Those ", "That which ", "Whatever ")
 WHAT = re.compile(r"\bwhat\b", re.IGNORECASE)
 
 
+@functools.cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text("utf-8"))
+
+
 def trees() -> Iterator[tuple[str, ast.Module]]:
     for path in FILES:
-        yield str(path.relative_to(PACKAGE)), ast.parse(path.read_text("utf-8"))
+        yield str(path.relative_to(PACKAGE)), tree_of(path)
 
 
 def names(node: ast.AST) -> Iterator[tuple[str, int]]:
@@ -145,7 +151,7 @@ def test_no_two_classes_have_one_name():
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_a_module_uses_no_banned_name(path):
-    tree = ast.parse(path.read_text("utf-8"))
+    tree = tree_of(path)
     banned = {f"{name} (line {line})" for name, line in names(tree) if name in BANNED}
     for name, line in all_names(tree):
         if name in BANNED_EVERYWHERE or BANNED_PARTS.intersection(name.lower().split("_")):

@@ -64,7 +64,7 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
             smooth._make_blend,
             smooth._make_blend_adjoint,
         )
-        for dtype in (wp.float32, wp.vec2, wp.vec3, wp.vec4)
+        for dtype in (wp.float32, wp.vec4)
     },
     **{f"_make_copy {dtype.__name__}": partial(batch._make_copy, dtype) for dtype in (wp.float32, wp.vec3)},
     **{make.__name__: partial(make, LANES) for make in (sphere_light._make_light, sphere_light._make_light_adjoint)},

@@ -44,6 +44,31 @@ RECORD_OF_SYMBOL = 4  # a record's format: the symbol and a number
 REGISTER_COUNT, FRAME_SIZE = 0x2F, 0x11
 
 
+class Budget(NamedTuple):
+    """The most that an entry may take."""
+
+    registers: int
+    stack: int = 0  # [bytes]
+
+
+BUDGETS = {
+    "_make_transmit True": {"": Budget(80)},
+    "_make_transmit_adjoint True": {"": Budget(112)},
+    "_make_light": {"": Budget(120)},
+    "_make_light_adjoint": {"": Budget(168)},
+    "_make_accumulate 8 True": {"": Budget(96)},
+    # the stack is that of vectors of eight bands, which loops index
+    "_make_accumulate_adjoint 8 True": {"": Budget(128, 2 * 4 * 8)},
+    "_make_gather": {"": Budget(72)},
+    "_make_gather_adjoint": {"": Budget(80)},
+    "warpshadow.stages.self_visibility.lookup": {"find_weights": Budget(56), "find_weights_adjoint": Budget(64)},
+    "warpshadow.stages.planes.coverage": {"find_coverage": Budget(112), "find_coverage_adjoint": Budget(200)},
+    "warpshadow.stages.bounces.plane_light": {"light_receivers": Budget(160), "light_receivers_adjoint": Budget(200)},
+}
+"""Of kernels of visibility on sm_90, by the name of a factory's kernel, or of a file and its kernels: tests hold them
+to these, for one architecture, as compiling takes long. Budgets of sm_75 and sm_80 were the same."""
+
+
 class Resources(NamedTuple):
     """What an entry of a cubin takes."""
 

@@ -10,6 +10,7 @@ import sys
 import time
 from datetime import datetime
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -494,9 +495,13 @@ def test_tune_prints_what_it_tried_and_lines_that_the_scene_file_takes(scene, tm
     assert ws.load_scene(scene).visibility.method == method
 
 
-def test_tune_takes_a_mesh(tmp_path, quick_tuning):
+def test_tune_takes_a_mesh(tmp_path, quick_tuning, monkeypatch):
     import trimesh
 
+    from warpshadow.scene import blockers
+
+    fit = SimpleNamespace(spheres=ws.Spheres([[0, 0, 0]], [1.0]))  # in place of 16 s
+    monkeypatch.setattr(blockers, "fit_spheres", lambda *_, **__: fit)
     ball = ws.icosphere(1.0, 1)
     trimesh.Trimesh(ball.positions, ball.faces).export(tmp_path / "ball.ply")
     result = run("tune", tmp_path / "ball.ply", "--error", "0.9", "--up", "y", "--size", "16", "12")

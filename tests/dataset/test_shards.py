@@ -144,7 +144,7 @@ def test_two_workers_of_which_one_is_killed_write_the_same_bits_as_one(recipe, w
 @pytest.mark.slow
 def test_what_is_killed_goes_on_to_the_same_bits_and_keeps_what_is_whole(recipe, written, tmp_path):
     folder = tmp_path / "shards"
-    command = [sys.executable, "-m", "warpshadow", "dataset", str(recipe), "-o", str(folder), "--workers", "2"]
+    command = [sys.executable, "-m", "warpshadow", "dataset", str(recipe), "-o", str(folder), "--workers", "1"]
     process = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)})
     try:
         end = time.monotonic() + 120

@@ -1,14 +1,11 @@
 """The kernel report: what it reads of cubins, how many threads fit, and the budgets of the kernels of visibility."""
 
-from typing import NamedTuple
-
 import pytest
 import warp as wp
 
 from demos.tools import kernel_report
 from demos.tools.cuda_kernels import FACTORIES, file_modules
-
-ARCHITECTURES = [75, 80, 90]
+from demos.tools.kernel_report import BUDGETS
 
 
 @pytest.mark.parametrize(
@@ -62,38 +59,12 @@ def test_what_a_kernel_takes_stands_in_its_cubin():
     assert 8 <= found.registers <= 48
 
 
-class Budget(NamedTuple):
-    """The most that an entry may take, on each architecture that it is compiled for."""
-
-    registers: int
-    stack: int = 0  # [bytes]
-
-
-BUDGETS = {
-    "_make_transmit True": {"": Budget(80)},
-    "_make_transmit_adjoint True": {"": Budget(112)},
-    "_make_light": {"": Budget(120)},
-    "_make_light_adjoint": {"": Budget(168)},
-    "_make_accumulate 8 True": {"": Budget(96)},
-    # the stack is that of vectors of eight bands, which loops index
-    "_make_accumulate_adjoint 8 True": {"": Budget(128, 2 * 4 * 8)},
-    "_make_gather": {"": Budget(72)},
-    "_make_gather_adjoint": {"": Budget(80)},
-    "warpshadow.stages.self_visibility.lookup": {"find_weights": Budget(56), "find_weights_adjoint": Budget(64)},
-    "warpshadow.stages.planes.coverage": {"find_coverage": Budget(112), "find_coverage_adjoint": Budget(200)},
-    "warpshadow.stages.bounces.plane_light": {"light_receivers": Budget(160), "light_receivers_adjoint": Budget(200)},
-}
-"""By the name of a factory's kernel, or of a file and its kernels: compiling a file takes long, so it is for sm_90."""
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", BUDGETS)
 def test_kernels_of_visibility_stay_in_registers(name):
-    is_made = name in FACTORIES
-    module, architectures = (FACTORIES[name]().module, ARCHITECTURES) if is_made else (file_modules()[name], [90])
-    for architecture, found in zip(architectures, kernel_report.resources(module, architectures), strict=True):
-        taken = {kernel_report.label("", resources.entry).lstrip("."): resources for resources in found}
-        for kernel, budget in BUDGETS[name].items():
-            resources = taken[kernel]
-            assert resources.registers <= budget.registers, f"sm_{architecture}: {resources}"
-            assert resources.stack <= budget.stack, f"sm_{architecture}: {resources}"
+    module = FACTORIES[name]().module if name in FACTORIES else file_modules()[name]
+    (found,) = kernel_report.resources(module, [90])
+    taken = {kernel_report.label("", resources.entry).lstrip("."): resources for resources in found}
+    for kernel, budget in BUDGETS[name].items():
+        assert taken[kernel].registers <= budget.registers, taken[kernel]
+        assert taken[kernel].stack <= budget.stack, taken[kernel]

@@ -197,6 +197,7 @@ def test_a_damaged_record_is_none(tmp_path):
 def test_the_command_goes_on_after_a_kill_and_says_how_many_ended_how(photos, alone, tmp_path):
     (photos / "some.txt").write_text("a/fit.toml\nsize/fit.toml\n")
     arguments = ["fit", str(photos / "some.txt"), "-o", str(tmp_path / "results"), "--checkpoint-seconds", "0"]
+    arguments += ["--workers", "1"]
     program = [sys.executable, "-c", "from warpshadow.cli import app; app()"]
     with subprocess.Popen([*program, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as head:
         deadline = time.monotonic() + TIME

@@ -48,7 +48,7 @@ def test_narrow_lobes_have_finer_cells_unless_a_number_is_given(roughness, given
         ),
         (
             {"roughness": 0.5, "metallic": np.zeros((4, 4))},
-            r"metallic: got a texture, \(4, 4\), but mesh .* has no uvs",
+            r"metallic: got an image, but mesh .* has no uvs",
         ),
         ({"metallic": 1.0}, "metallic: got 1.0 without roughness, expected roughness, too, such as 0.3"),
         ({"roughness": 0.5, "receivers": "vertex"}, "receivers: got 'vertex' beside roughness"),

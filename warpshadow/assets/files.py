@@ -42,21 +42,28 @@ def atomic_write(path: AnyPath) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def locked(path: Path, *, timeout: float = -1) -> Iterator[None]:
+def locked(path: Path, *, timeout: float = -1, busy: Exception | None = None) -> Iterator[None]:
     """Lock a file against others that want to hold it, in this process or another; the lock ends with the process.
 
-    Raises:
-        filelock.Timeout: after this time [s]; by default it is waited for.
+    Args:
+        path: The file.
+        timeout: How long another's lock is waited for [s]; by default as long as it takes.
+        busy: The error to raise after that.
     """
-    from filelock import FileLock
+    from filelock import FileLock, Timeout
 
     lock_path = path.with_name(f".{path.name}.lock")
-    with FileLock(lock_path, timeout=timeout):
-        try:
-            yield
-        finally:
-            with contextlib.suppress(OSError):  # of Windows, where filelock removes it
-                lock_path.unlink()
+    lock = FileLock(lock_path, timeout=timeout)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise busy or error from error
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # of Windows, where filelock removes it
+            lock_path.unlink()
+        lock.release()
 
 
 def check_file(path: Path) -> None:

@@ -64,7 +64,8 @@ def read_image(
     if part is not None and reader is not _read_exr:
         raise ImageError(f"{path}: got part {part!r}, but only .exr files have parts")
     try:
-        pixels = reader(path, part, max_pixels)
+        options = {} if part is None else {"part": part}
+        pixels = reader(path, functools.partial(_check_size, max_pixels=max_pixels), **options)
     except ValueError as error:
         raise ImageError(f"{path}: {error}") from error
     exposure_record = None if undo_exposure is False else development(path)
@@ -219,7 +220,7 @@ def _check_size(width: int, height: int, max_pixels: int) -> None:
 # ---------------------------------------------------------------------------------------------------- OpenEXR
 
 
-def _read_exr(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray:
+def _read_exr(path: Path, check_size: Callable[[int, int], None], part: str | int | None = None) -> np.ndarray:
     import OpenEXR
 
     try:
@@ -232,7 +233,7 @@ def _read_exr(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray
     for candidate in parts:  # the library reads them all
         lower, upper = candidate.header["dataWindow"]
         width, height = (np.subtract(upper, lower, dtype=np.int64) + 1).tolist()
-        _check_size(width, height, max_pixels)
+        check_size(width, height)
     header = {channel.name: channel for channel in parts[part_index].header["channels"]}
     names = _find_channels(list(header))
     if any((channel.xSampling, channel.ySampling) != (1, 1) for channel in header.values()):
@@ -288,10 +289,9 @@ def _write_exr(path: Path, pixels: np.ndarray, layers: Mapping[str, np.ndarray])
 # ----------------------------------------------------------------------------------------- PNG, JPEG and TIFF
 
 
-def _read_pillow(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray:
+def _read_pillow(path: Path, check_size: Callable[[int, int], None]) -> np.ndarray:
     with _open(path) as picture:
-        width, height = picture.size
-        _check_size(width, height, max_pixels)
+        check_size(*picture.size)
         codes, has_alpha = _codes(path, picture)
     code_max = np.iinfo(codes.dtype).max
     pixels = srgb_to_linear(np.arange(code_max + 1) / code_max).astype(np.float32)[codes]
@@ -382,17 +382,10 @@ def _load(picture: Any) -> None:
         raise ImageError(f"truncated or damaged ({error})") from error
 
 
-def _read_radiance(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray:
-    return read_radiance(path, functools.partial(_check_size, max_pixels=max_pixels))
-
-
-def _read_raw(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray:
-    return read_raw(path, functools.partial(_check_size, max_pixels=max_pixels))
-
-
-_READERS: dict[str, Callable[[Path, str | int | None, int], np.ndarray]] = {
+_READERS: dict[str, Callable[..., np.ndarray]] = {
     ".exr": _read_exr,
-    **dict.fromkeys([".hdr", ".pic"], _read_radiance),
+    **dict.fromkeys([".hdr", ".pic"], read_radiance),
     **dict.fromkeys(INTEGER_SUFFIXES, _read_pillow),
-    **dict.fromkeys(RAW_SUFFIXES, _read_raw),
+    **dict.fromkeys(RAW_SUFFIXES, read_raw),
 }
+"""Readers by suffix, of a path and a function that raises for a width and height that are too large."""

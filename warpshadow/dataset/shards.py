@@ -71,7 +71,8 @@ def write_shards(
     folder = check.path("folder", folder)
     folder.mkdir(parents=True, exist_ok=True)
     shards = shards_of(data_set)
-    with _locked_folder(folder):
+    busy = FileExistsError(f"{folder}: another process writes into this folder")
+    with files.locked(folder / INDEX, timeout=0, busy=busy):
         _prepare_folder(folder, describe(data_set))
         missing_shards = [shard for shard in shards if not (folder / shard.name).exists()]
         numbers = [number for shard in missing_shards for number in shard.numbers]
@@ -179,19 +180,6 @@ def describe(data_set: DataSet) -> dict[str, Plain]:
     about = {"recipe": data_set.recipe.plain(), "splits": splits, "hashes": data_set.hashes, "made_by": made_by}
     plain: dict[str, Plain] = json.loads(json.dumps(about))
     return plain
-
-
-@contextlib.contextmanager
-def _locked_folder(folder: Path) -> Iterator[None]:
-    """Hold a folder against other processes."""
-    from filelock import Timeout
-
-    with contextlib.ExitStack() as lock_stack:
-        try:
-            lock_stack.enter_context(files.locked(folder / INDEX, timeout=0))
-        except Timeout as error:
-            raise FileExistsError(f"{folder}: another process writes into this folder") from error
-        yield
 
 
 def _prepare_folder(folder: Path, about: dict[str, Plain]) -> None:

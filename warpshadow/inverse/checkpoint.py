@@ -8,7 +8,7 @@ import contextlib
 import hashlib
 import io
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,24 +28,16 @@ class CheckpointError(ValueError):
     """A checkpoint that cannot be used; the message says why."""
 
 
-@contextlib.contextmanager
-def exclusive(path: AnyPath | None) -> Iterator[None]:
+def exclusive(path: AnyPath | None) -> contextlib.AbstractContextManager[None]:
     """Refuse a second fit that would write the same file; without a file nothing is refused.
 
     Raises:
         CheckpointError: while another fit, of this process or another, holds the file.
     """
-    from filelock import Timeout
-
     if path is None:
-        yield
-        return
-    path = Path(path)
-    try:
-        with files.locked(path, timeout=0):
-            yield
-    except Timeout as error:
-        raise CheckpointError(f"{path}: another fit is writing it; wait for its end, or {OTHER_FILE_REMEDY}") from error
+        return contextlib.nullcontext()
+    busy = CheckpointError(f"{path}: another fit is writing it; wait for its end, or {OTHER_FILE_REMEDY}")
+    return files.locked(Path(path), timeout=0, busy=busy)
 
 
 def save(path: AnyPath, state: Mapping[str, object]) -> None:

@@ -278,24 +278,20 @@ def _failed_ending(name: str, error: Exception) -> Ending:
 
 def _run_fit(job: _FitJob) -> Ending:
     """Do a fit, in its folder."""
-    from filelock import Timeout
-
     loaded_fit = load_fit(job.fit) if isinstance(job.fit, Path) else job.fit
     job.folder.parent.mkdir(parents=True, exist_ok=True)
     check_folder(job.folder)
     job.folder.mkdir(exist_ok=True)
-    try:
-        with files.locked(job.folder / _RECORD, timeout=_LOCK_TIMEOUT):
-            result = loaded_fit.run(
-                device=job.device,
-                checkpoint=job.folder / CHECKPOINT,
-                checkpoint_seconds=job.checkpoint_seconds,
-                progress=False,
-            )
-            report = Report(result)
-            report.write(job.folder)
-    except Timeout as error:
-        raise checkpoints.CheckpointError(f"{job.folder}: another process is writing it") from error
+    busy = checkpoints.CheckpointError(f"{job.folder}: another process is writing it")
+    with files.locked(job.folder / _RECORD, timeout=_LOCK_TIMEOUT, busy=busy):
+        result = loaded_fit.run(
+            device=job.device,
+            checkpoint=job.folder / CHECKPOINT,
+            checkpoint_seconds=job.checkpoint_seconds,
+            progress=False,
+        )
+        report = Report(result)
+        report.write(job.folder)
     is_good = result.reason in GOOD_ENDINGS
     return Ending(
         job.name,

@@ -38,9 +38,7 @@ class Setting:
         self.cameras = tuple(cameras)
         self.unit = unit
         self.device = device
-        self._graphs: dict[tuple[int, int], DeformationGraph] = {}
         self._cached: dict[object, Any] = {}
-        self._smoothings: dict[tuple[int, int, float], torch.Tensor] = {}
 
     def cached(self, key: object, make: Callable[[], T]) -> T:
         """A result that is the same for the whole fit, by its key."""
@@ -57,26 +55,28 @@ class Setting:
 
     def graph(self, body: int, count: int) -> DeformationGraph:
         """The deformation graph of a body, whose nodes are its spheres, even if the method casts no shadows."""
-        if (body, count) not in self._graphs:
+
+        def bind() -> DeformationGraph:
             shadowed_scene = replace(self.scene, visibility=Visibility())
             centers = scene_blockers(shadowed_scene, device=str(self.device))[body].centers
             points = self.scene.bodies[body].mesh.positions
-            self._graphs[body, count] = DeformationGraph.bind(points, centers, count=count, device=str(self.device))
-        return self._graphs[body, count]
+            return DeformationGraph.bind(points, centers, count=count, device=str(self.device))
+
+        return self.cached(("graph", body, count), bind)
 
     def smoothing(self, body: int, count: int, weight: float) -> torch.Tensor:
         """Matrix that smooths values over the nodes of a body's graph, (I + λ L)⁻¹, [node, node]."""
-        if (body, count, weight) not in self._smoothings:
+
+        def smooth() -> torch.Tensor:
             graph = self.graph(body, count)
             pairs = graph.neighbors.numpy()
             laplacian = np.zeros((graph.node_positions.shape[0],) * 2)
             laplacian[pairs[:, 0], pairs[:, 1]] = -1
             np.fill_diagonal(laplacian, -laplacian.sum(axis=1))
             laplacian /= len(pairs) / len(laplacian)
-            self._smoothings[body, count, weight] = self.tensor(
-                np.linalg.inv(np.eye(len(laplacian)) + weight * laplacian)
-            )
-        return self._smoothings[body, count, weight]
+            return self.tensor(np.linalg.inv(np.eye(len(laplacian)) + weight * laplacian))
+
+        return self.cached(("smoothing", body, count, weight), smooth)
 
     def spheres(self, body: int) -> Spheres:
         """Spheres of a body in its own space."""

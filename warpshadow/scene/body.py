@@ -258,11 +258,8 @@ class Body:
                 f"emission: got codes of a picture ({dtype}), expected linear radiance: of 8 bits "
                 "warpshadow.srgb_to_linear(image / 255), times the radiance of white"
             )
-        if emission.ndim == 3 and self.mesh.uvs is None:
-            raise ValueError(
-                f"emission: got a texture, {emission.shape}, but mesh {self.mesh.name!r} has no uvs; expected colors "
-                "of vertices, [vertex, 3], or uvs, as warpshadow.unwrap makes them"
-            )
+        if emission.ndim == 3:
+            self._check_uvs("emission", "colors of vertices, [vertex, 3]")
         if not emission.size or emission.shape not in ((3,), (count, 3), (*emission.shape[:2], 3)):
             raise ValueError(
                 f"emission: got shape {emission.shape}, expected [3], [{count}, 3] (one for each vertex), or a texture "
@@ -283,12 +280,15 @@ class Body:
             raise ValueError("beam: got one without emission, expected emission, too")
         return inner, outer
 
-    def _checked_texture(self, image: np.ndarray) -> np.ndarray:
+    def _check_uvs(self, name: str, alternative: str) -> None:
         if self.mesh.uvs is None:
             raise ValueError(
-                f"texture: got an image, but mesh {self.mesh.name!r} has no uvs; expected none, or uvs, as "
+                f"{name}: got an image, but mesh {self.mesh.name!r} has no uvs; expected {alternative}, or uvs, as "
                 "warpshadow.unwrap makes them"
             )
+
+    def _checked_texture(self, image: np.ndarray) -> np.ndarray:
+        self._check_uvs("texture", "none")
         texture = check.pixels("texture", image, expected="linear RGB [height, width, 3], or the path of a picture")
         check.shape("texture", texture.shape, ("height", "width", 3), check.channels_last(texture.shape))
         if texture.size == 0:
@@ -311,11 +311,8 @@ class Body:
             number = f"a number from {minimum:g} to {maximum:g}"
             expected = f"{number}, one for each of the {count} vertices, or a texture [height, width]"
             numbers = np.atleast_1d(check.numbers(name, value, expected=expected))
-            if numbers.ndim == 2 and numbers.size and self.mesh.uvs is None:
-                raise ValueError(
-                    f"{name}: got a texture, {numbers.shape}, but mesh {self.mesh.name!r} has no uvs; expected numbers "
-                    "of vertices, [vertex], or uvs, as warpshadow.unwrap makes them"
-                )
+            if numbers.ndim == 2 and numbers.size:
+                self._check_uvs(name, "numbers of vertices, [vertex]")
             if not numbers.size or (numbers.ndim != 2 and numbers.shape not in ((1,), (count,))):
                 raise ValueError(f"{name}: got shape {numbers.shape}, expected {expected}")
             check.finite(name, numbers, minimum=minimum, maximum=maximum)

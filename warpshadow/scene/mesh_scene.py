@@ -33,7 +33,6 @@ _FOOT_HEIGHT = 0.02  # height of the part that touches the ground, as a part of 
 _MIN_FOOTING_DIFFERENCE = 0.2  # difference of footings that decides
 _PLATE_THINNESS = 0.3  # extent of plates and doors along their normal, as a part of the next
 _SAMPLES = 4000
-_HULL_DIRECTIONS = 64
 _SYMMETRIC, _ASYMMETRIC = 1.1, 2.0  # distances to the mirrored surface, in distances between samples
 
 
@@ -114,30 +113,17 @@ def default_scene(
 
 def _standing_share(points: np.ndarray, middle: np.ndarray, axis: int) -> float:
     """Area on which points stand, as a part of that of their shadow from above; 0 where they would fall over."""
+    from scipy.spatial import ConvexHull, QhullError
+
     level = np.delete(points, axis, axis=1)
     height = points[:, axis] - points[:, axis].min()
-    base, shadow = _hull(level[height < _FOOT_HEIGHT * np.ptp(points, axis=0).max()]), _hull(level)
-    if _area(base) <= 1e-9 * np.ptp(points, axis=0).max() ** 2:
+    try:
+        foot = level[height < _FOOT_HEIGHT * np.ptp(points, axis=0).max()]
+        base, shadow = ConvexHull(foot), ConvexHull(level)
+    except (QhullError, ValueError):  # of a line or a point, or of too few
         return 0.0
-    ends = np.roll(base, -1, axis=0)
-    is_stable = (_cross_product(ends - base, np.delete(middle, axis) - base) > 0).all()
-    return _area(base) / _area(shadow) if is_stable else 0.0
-
-
-def _hull(points: np.ndarray) -> np.ndarray:
-    """Corners of about the convex hull of points in a plane, counterclockwise: the outermost in some directions."""
-    angles = 2 * np.pi * np.arange(_HULL_DIRECTIONS) / _HULL_DIRECTIONS
-    outermost = [np.argmax(points @ direction) for direction in np.stack([np.cos(angles), np.sin(angles)], axis=1)]
-    return points[[one for one, before in zip(outermost, np.roll(outermost, 1), strict=True) if one != before]]
-
-
-def _area(corners: np.ndarray) -> float:
-    """Area of a polygon."""
-    return float(_cross_product(corners, np.roll(corners, -1, axis=0)).sum() / 2)
-
-
-def _cross_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    is_stable = (base.equations @ [*np.delete(middle, axis), 1.0] < 0).all()
+    return float(base.volume / shadow.volume) if is_stable else 0.0
 
 
 def _upside_down(points: np.ndarray, axis: int) -> np.ndarray:
@@ -149,12 +135,9 @@ def _upside_down(points: np.ndarray, axis: int) -> np.ndarray:
 
 def _mean_distance(points: np.ndarray, others: np.ndarray) -> float:
     """Mean distance of points to the nearest of others."""
-    middle = others.mean(axis=0)
-    a, b = (points - middle).astype(np.float32), (others - middle).astype(np.float32)
-    nearest = [  # |a − b|² − |a|² in parts that fit a processor's cache
-        ((b**2).sum(axis=1) - 2 * part @ b.T).min(axis=1) for part in np.array_split(a, -(-len(a) // 32))
-    ]
-    return float(np.sqrt(np.maximum(np.concatenate(nearest) + (a**2).sum(axis=1), 0)).mean())
+    from scipy.spatial import cKDTree
+
+    return float(cKDTree(others).query(points)[0].mean())
 
 
 def _draw_surface_points(mesh: Mesh, rng: np.random.Generator) -> np.ndarray:
