@@ -46,7 +46,7 @@ BANNED = {
     *("find_openness", "HIT_ROWS", "load_hit", "node_centers", "open_shares", "open_weights", "Openness", "SIDE_ROWS"),
     *("BeamAdjoint", "NearestBorder", "on_static"),
     *("placed_blockers", "ShellLight"),
-    *("contact_density", "FLAT", "Rays", "TOLERANCES", "touching_points"),
+    *("contact_density", "FLAT", "Fronts", "Rays", "TOLERANCES", "touching_points"),
 }
 BANNED_EVERYWHERE = {
     *("bulging", "decide", "emitter_projection", "free_projection", "free_projection_of", "has_proxies", "in_words"),

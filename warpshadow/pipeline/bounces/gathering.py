@@ -158,15 +158,15 @@ class Gathering:
         # ball on a ground lost 4% of the ground's light by the former.
         middles = fibonacci(len(transmittance.directions))
         arguments = (
-            fronts.lifted,
+            fronts.lifted_points,
             group.normals,
             transmittance.transmittance_nonplanar,
             outgoing.frames,
             outgoing.texels,
             planes.blockers,
         )
-        coverages, weights = transmittance.part_coverages, fronts.weights
-        return plane_light(*arguments, middles, coverages=coverages, fronts=weights, skip=skip)
+        options = {"coverages": transmittance.part_coverages, "front_weights": fronts.front_weights, "skip": skip}
+        return plane_light(*arguments, middles, **options)
 
     def _from_spheres(
         self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance

@@ -176,10 +176,10 @@ class Proxies:
         if planes is not None:
             numbers, points, device = self.nearest_spheres, patch_samples.points, normals.device
             of_patch_samples = NearestBlockers(centers, radii, constant(numbers, wp.int32, device))
-            fronts = find_fronts(points, normals, None, of_patch_samples, frames, planes.blockers).weights
+            front_weights = find_fronts(points, normals, None, of_patch_samples, frames, planes.blockers).front_weights
             if self.overlays is not None:
                 numbers = np.where(self.overlays[1][senders.patch_of_sample] > 0, np.int32(-1), numbers)
-            normals = tilt_normals_off_planes(points, normals, radii, numbers, fronts, frames, planes.blockers)
+            normals = tilt_normals_off_planes(points, normals, radii, numbers, front_weights, frames, planes.blockers)
         directions, transmittance = transmittances[0].directions, _self_transmittance(transmittances)
         mean_points = multiply(senders.mean, patch_samples.points)
         mean_normals = multiply(senders.mean, patch_samples.normals)

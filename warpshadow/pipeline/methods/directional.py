@@ -200,8 +200,12 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         if planes is None or not group.is_blocked_by_planes:
             return visibility
         horizon_normals = group.normals if group.cached_rows is None else None
-        fronts, points = group.fronts_of_planes
-        options: dict[str, Any] = {"horizon_normals": horizon_normals, "fronts": fronts, "skip": planes.skip}
+        front_weights, points = group.fronts_of_planes
+        options: dict[str, Any] = {
+            "horizon_normals": horizon_normals,
+            "front_weights": front_weights,
+            "skip": planes.skip,
+        }
         covered = self._coverages(
             functools.partial(plane_coverage, points, planes.frames, planes.planes, **options), projected_light
         )

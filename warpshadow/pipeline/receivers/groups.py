@@ -21,7 +21,7 @@ from warpshadow.pipeline.receivers.lit_points import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.stages.convex.convex_blockers import PlacedParts
 from warpshadow.stages.light.cached_cells import CachedRows
-from warpshadow.stages.planes.fronts import Fronts, NearestBlockers, find_body_sides, find_fronts
+from warpshadow.stages.planes.fronts import NearestBlockers, PlaneFronts, find_body_sides, find_fronts
 from warpshadow.stages.planes.plane_blockers import PlaneBlockers
 from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.receivers.sample_receivers import Span
@@ -126,12 +126,12 @@ class Group:
         return self.own.lookup.transmittance(self.normals, self.own.probe_weights)
 
     @functools.cached_property
-    def fronts_of_planes(self) -> Fronts:
+    def fronts_of_planes(self) -> PlaneFronts:
         """As :meth:`find_fronts`, of the planes around the group."""
         assert self.planes is not None
         return self.find_fronts(self.planes.frames, self.planes.planes, self.planes.skip)
 
-    def find_fronts(self, frames: wp.array, planes: PlaneBlockers, skip: int | None) -> Fronts:
+    def find_fronts(self, frames: wp.array, planes: PlaneBlockers, skip: int | None) -> PlaneFronts:
         """Which part of each plane's front the receivers see, and the receivers lifted off planes they lie in."""
         extents = None if self.own is None else self.own.extents
         sides = None if extents is None else extents.sides_of(frames, planes)

@@ -231,7 +231,7 @@ def _log_of_planes(
     if planes is None or not group.is_blocked_by_planes:
         return None
     assert blockers.extents is not None
-    points, sides = group.fronts_of_planes.lifted, blockers.extents.sides_of(planes.frames, planes.planes)
+    points, sides = group.fronts_of_planes.lifted_points, blockers.extents.sides_of(planes.frames, planes.planes)
     skipped = -1 if planes.skip is None else planes.skip, numbers.index(body) if body in numbers else -1
     return find_log_transmittance_of_planes(
         points, group.normals, placed_samples, span, planes.frames, planes.planes, sides, body, skipped
