@@ -217,7 +217,7 @@ def _reflect_suns(
     solid_angles: wp.array(dtype=wp.float32),
     transmittance: wp.array3d(dtype=wp.float32),
     straight: wp.array2d(dtype=wp.vec3),
-    grazing_light: wp.array2d(dtype=wp.vec3),
+    grazing: wp.array2d(dtype=wp.vec3),
     # out
     straight_sum: wp.array2d(dtype=wp.vec3),
     grazing_sum: wp.array2d(dtype=wp.vec3),
@@ -233,8 +233,8 @@ def _reflect_suns(
     width = widths[lobe_batch, receiver]
     count = transmittance.shape[2] / directions.shape[0]  # directions of each sun
     transmittance_batch = instance_in(batch, transmittance.shape[0])
-    lobe_sum = wp.vec3()
-    total_grazing = wp.vec3()
+    straight_suns = wp.vec3()
+    grazing_suns = wp.vec3()
     for i in range(directions.shape[0]):
         cosine = wp.dot(normal, directions[i])
         if cosine > 0.0:
@@ -242,10 +242,10 @@ def _reflect_suns(
             weights = _reflect_disc(view, width, towards, solid_angles[i]) / float(count)
             for k in range(count):
                 light = transmittance[transmittance_batch, receiver, i * count + k] * irradiance[i]
-                lobe_sum += weights[0] * light
-                total_grazing += weights[1] * light
-    straight_sum[batch, receiver] = straight[light_batch, receiver] + lobe_sum
-    grazing_sum[batch, receiver] = grazing_light[light_batch, receiver] + total_grazing
+                straight_suns += weights[0] * light
+                grazing_suns += weights[1] * light
+    straight_sum[batch, receiver] = straight[light_batch, receiver] + straight_suns
+    grazing_sum[batch, receiver] = grazing[light_batch, receiver] + grazing_suns
 
 
 def add_suns(lobe_light: LobeLight, lobes: Lobes, suns: Suns, transmittance: wp.array) -> LobeLight:
