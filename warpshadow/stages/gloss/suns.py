@@ -30,6 +30,7 @@ from warpshadow.maths import sh
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.gloss.lobes import Lobes
 from warpshadow.stages.gloss.reflection import LobeLight
+from warpshadow.stages.gloss.transmittance import horizon_weight
 
 _MAX_SUNS = 4
 _BRIGHTNESS = 10.0  # radiance above which a pixel may be of a sun, in means of the map
@@ -38,8 +39,6 @@ _RADII = np.radians([6.0, 3.0, 1.5])  # of discs that are tried around the brigh
 _MAX_SPREAD = 2.0  # size by the mean square of angles over the area that shines: 1 of discs, more of tubes and pairs
 _ISOLATION = 0.9  # of the bright light within twice that radius, that is within it: of wider spots it is less
 _MAX_TRIALS = 32  # brightest spots that are tried
-
-_MIN_HORIZON_WEIGHT = 1.0e-7
 
 _COST = 20.0  # nanoseconds that a sun takes
 
@@ -135,10 +134,8 @@ def _find_sun_transmittance(
     transmittance_batch = instance_in(batch, transmittance.shape[0])
     for i in range(cells.shape[0]):
         height = wp.clamp(0.5 * per_radius * wp.dot(normal, directions[i]) + 0.5, 0.0, 1.0)
-        above = height * height * (3.0 - 2.0 * height) + _MIN_HORIZON_WEIGHT
-        sun_transmittance[batch, receiver, i] = wp.min(
-            transmittance[transmittance_batch, receiver, cells[i]] / above, 1.0
-        )
+        cell_transmittance = transmittance[transmittance_batch, receiver, cells[i]]
+        sun_transmittance[batch, receiver, i] = wp.min(cell_transmittance / horizon_weight(height), 1.0)
 
 
 def find_sun_transmittance(
