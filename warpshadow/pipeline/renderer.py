@@ -192,7 +192,7 @@ class SceneRenderer:
                 :func:`warpshadow.stages.raster.project.compose_clip_matrices`.
         Differentiable: geometry, clip_matrices.
         """
-        return self._views.find(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
+        return self._views.view(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
 
     at_points = delegated("_views", SceneViews.at_points)
     on_faces = delegated("_views", SceneViews.on_faces)
@@ -470,7 +470,7 @@ class SceneRenderer:
             hidden = {*decide_which_nodes_run(view.receivers_node, view.call), view.silhouettes}
         else:
             geometry = None if inputs.geometry is None else as_geometry("geometry", inputs.geometry)
-            view = self._views.view(geometry, inputs.clip_matrices)
+            view = self._views.lazy_view(geometry, inputs.clip_matrices)
         preview = view.preview()  # which the nodes' words ask, so it stays meanwhile
         light = self._method.light_input(preview, inputs.light, inputs.shell)
         materials = self.materials(inputs.of_bodies)

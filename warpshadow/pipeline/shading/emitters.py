@@ -86,24 +86,24 @@ class SceneEmitters:
         """Weights of all vertices of the scene, given those of each emitter's, [row, vertex]."""
         from scipy.sparse import block_diag, csr_matrix
 
-        scene, matrix = self._merged_scene, block_diag(weights, format="csr")
-        vertices = np.flatnonzero(scene.is_emitter[scene.body_of_vertex])
-        shape = matrix.shape[0], int(scene.first_vertex[-1])
+        merged_scene, matrix = self._merged_scene, block_diag(weights, format="csr")
+        vertices = np.flatnonzero(merged_scene.is_emitter[merged_scene.body_of_vertex])
+        shape = matrix.shape[0], int(merged_scene.first_vertex[-1])
         matrix = csr_matrix((matrix.data, vertices[matrix.indices], matrix.indptr), shape)
-        return SparseMatrix.from_matrix(matrix, device=scene.device)
+        return SparseMatrix.from_matrix(matrix, device=merged_scene.device)
 
     def _find_beams(self) -> EmitterBeams | None:
         """Beams of the emitters; None where none has one."""
         from scipy.sparse import block_diag
 
-        scene = self._merged_scene
-        if not scene.has_beams:
+        merged_scene = self._merged_scene
+        if not merged_scene.has_beams:
             return None
-        bodies = [body for body in scene.scene.bodies if body.is_emitter]
+        bodies = [body for body in merged_scene.scene.bodies if body.is_emitter]
         weights = [find_axis_weights(body.mesh.positions, body.mesh.surface.faces) for body in bodies]
         of_vertices, of_faces = ([row[None] for row in rows] for rows in zip(*weights, strict=True))
-        of_emitting_faces = SparseMatrix.from_matrix(block_diag(of_faces, format="csr"), device=scene.device)
-        return EmitterBeams(scene.emitter_beams, self._over_all_vertices(of_vertices), of_emitting_faces)
+        of_emitting_faces = SparseMatrix.from_matrix(block_diag(of_faces, format="csr"), device=merged_scene.device)
+        return EmitterBeams(merged_scene.emitter_beams, self._over_all_vertices(of_vertices), of_emitting_faces)
 
     def emission_towards_cameras(
         self, emission: Node, fragments: Node, vertices: Input, cameras: Input, placed_samples: Node
@@ -149,12 +149,12 @@ class SceneEmitters:
         """Luminance of their light past the scene's meshes, a :data:`.NearLight`."""
         from warpshadow.stages.emitters.traced_transmittance import trace_transmittance
 
-        scene, samples = self._merged_scene, self.samples
+        merged_scene, samples = self._merged_scene, self.samples
         at_points, along_normals = (
-            wp.array(item[None], dtype=wp.vec3, device=scene.device) for item in (points, normals)
+            wp.array(item[None], dtype=wp.vec3, device=merged_scene.device) for item in (points, normals)
         )
         placed_samples = place_samples(vertices.reshape((1, -1)), samples)
-        radiance = self.radiance(Materials.of_scene(scene)).value(Call(Clock()))
+        radiance = self.radiance(Materials.of_scene(merged_scene)).value(Call(Clock()))
         total = np.zeros(len(points))
         for span in samples.spans():
             at_samples = samples, vertices, placed_samples.points[0], placed_samples.areas[0], span
