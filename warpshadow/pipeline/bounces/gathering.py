@@ -89,7 +89,7 @@ class Gathering:
         senders: The bodies whose patches send light.
         self_form_factors: Form factors of bodies for themselves.
         item_text: Number of receivers, in words.
-        where: Put after the names of its stages.
+        suffix: Ends the names of its stages.
         why_not: Why nobody asks for it, in words; empty if somebody does.
         only_others: Leave out light from a body to itself.
     Attributes:
@@ -102,7 +102,7 @@ class Gathering:
         senders: Senders,
         self_form_factors: SelfFormFactors,
         item_text: str | Callable[[], str],
-        where: str = "",
+        suffix: str = "",
         why_not: str = "",
         only_others: bool = False,
     ):
@@ -116,7 +116,7 @@ class Gathering:
         )
         names = "self light", "plane light", "sphere light"
         stages = tuple(
-            NodeStage(f"{name}{where}", item_text, why_not or why) for name, why in zip(names, idle, strict=True)
+            NodeStage(f"{name}{suffix}", item_text, why_not or why) for name, why in zip(names, idle, strict=True)
         )
         functions = self._from_itself, self._from_planes, self._from_spheres
         first = 1 if only_others else 0

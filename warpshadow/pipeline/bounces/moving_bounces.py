@@ -96,7 +96,7 @@ class PortionedDirectLight(Node):
         visibility: Visibility of the receivers in free light, or their direct light if it is known.
         free_light: Free light projected for the method; None if light is known.
         item_text: Number of receivers, in words.
-        where: Put after the name of its stage.
+        suffix: Ends the name of its stage.
         others: More that it depends on.
         stages: Further ones, as for :class:`Node`.
     """
@@ -106,13 +106,13 @@ class PortionedDirectLight(Node):
         visibility: TransferForBounces | ShadingForBounces,
         free_light: Node | None,
         item_text: str | Callable[[], str],
-        where: str = "",
+        suffix: str = "",
         others: tuple[Node | None, ...] = (),
         stages: tuple[NodeStage, ...] = (),
     ):
         self._visibility = visibility
         if free_light is not None:
-            self._shading = NodeStage(f"shading{where}", item_text, inputs=(visibility, free_light))
+            self._shading = NodeStage(f"shading{suffix}", item_text, inputs=(visibility, free_light))
             stages = self._shading, *stages
         super().__init__("", None, free_light, *others, extra_inputs=(visibility,), stages=stages)
 
@@ -198,18 +198,16 @@ class Radiosity(Node):
         """Reflect direct light, then light that has bounced once, and so on; more often between patches of one body."""
         lit, albedo, projected_patches, frames, weights = self.values(call)
         senders, count = self._proxies.senders, self._count
-        between = (
-            None
-            if self._self_reflection.idle
-            else self._self_form_factors.between_patches(senders, [portion.group for portion in lit])
-        )
-        if between is not None and between.is_zero:
-            between = None
+        self_factors = None  # between patches of one body
+        if not self._self_reflection.idle:
+            self_factors = self._self_form_factors.between_patches(senders, [portion.group for portion in lit])
+        if self_factors is not None and self_factors.is_zero:
+            self_factors = None
 
         planes = self._proxies.planes
         texel_weights = None if planes is None else sum_weights(weights.weights, planes.blockers)
 
-        def sent(radiosity: wp.array) -> OutgoingRadiance:
+        def outgoing_of(radiosity: wp.array) -> OutgoingRadiance:
             return OutgoingRadiance(self._proxies, radiosity, projected_patches, frames, weights.weights, texel_weights)
 
         def radiosity_by_others(radiosity: wp.array | None) -> wp.array:
@@ -217,19 +215,19 @@ class Radiosity(Node):
             if radiosity is None:
                 portions = [portion.direct for portion in lit]
             else:
-                outgoing = sent(radiosity)
+                outgoing = outgoing_of(radiosity)
                 portions = [self._light(call, portion, outgoing) for portion in lit]
             with self.timed(call, self._reflection):
                 return patch_radiosity(albedo, join_portions(portions), senders.mean, weights.shares)
 
         def add_radiosity_by_self(by_others: wp.array, radiosity: wp.array | None) -> wp.array:
-            if between is None or radiosity is None:
+            if self_factors is None or radiosity is None:
                 return by_others
             with self.timed(call, self._self_reflection):
-                return patch_radiosity(albedo, radiosity, between, addend=by_others)
+                return patch_radiosity(albedo, radiosity, self_factors, addend=by_others)
 
-        self_bounces = 0 if between is None else SELF_BOUNCES
-        return sent(
+        self_bounces = 0 if self_factors is None else SELF_BOUNCES
+        return outgoing_of(
             after_bounces(count, radiosity_by_others, add_radiosity_by_self, senders.areas, self_bounces=self_bounces)
         )
 
@@ -320,8 +318,7 @@ class MovingBounces:
         )
         radiosity = self._radiosity(of_patch_samples, free_light, proxies, materials)
         item_text = functools.partial(receiver_text, points.weak)
-        at_points = self._gathering(senders, item_text)
-        return BouncedShading(visibility, free_light, item_text, radiosity, at_points)
+        return BouncedShading(visibility, free_light, item_text, radiosity, self._gathering(senders, item_text))
 
     def _patch_samples(
         self,
@@ -359,8 +356,8 @@ class MovingBounces:
         if materials.emission:
             lit = Node("", _add_emitted, lit, self._method.light_of_emitters(patch_samples.points, materials))
         albedo = self._patches.albedo(materials, senders.bodies)
-        among_senders = self._gathering(senders, *arguments, why_not, only_others=True)
-        return Radiosity(self._count, proxies, self._self_form_factors, among_senders, lit, albedo, patch_samples)
+        gathering = self._gathering(senders, *arguments, why_not, only_others=True)
+        return Radiosity(self._count, proxies, self._self_form_factors, gathering, lit, albedo, patch_samples)
 
     def _gathering(self, senders: Senders, *arguments: Any, **options: Any) -> Gathering:
         return Gathering(self._method.visibility, senders, self._self_form_factors, *arguments, **options)

@@ -349,10 +349,10 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         if not light.is_free and self._shades_with_cells(lobes.all_points):
             return field_of(self._shading_with_cells(lobes.all_points, light), "transmittance"), visibility_light
 
-        def in_cells() -> Node:
+        def make_cells() -> Node:
             return _TransmittanceOfCells(self, points, visibility_light, None, suffix=" of gloss")
 
-        return points.cached("cells", light.visibility_key, in_cells), visibility_light
+        return points.cached("cells", light.visibility_key, make_cells), visibility_light
 
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """Rows of the light of each cell that static bodies let through.

@@ -243,7 +243,7 @@ class Blockers(NamedTuple):
     def planes_around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> GroupPlanes | None:
         """Flat bodies around receivers of one body: all that block, or some."""
         planes = self.blocker_kinds.planes
-        chosen, skip = _blocking(planes, body, of_bodies)
+        chosen, skip = _choose_blocking(planes, body, of_bodies)
         if self.frames is None or not chosen:
             return None
         return GroupPlanes(self.planes.blockers(planes, chosen), self.frames, skip)
@@ -251,7 +251,7 @@ class Blockers(NamedTuple):
     def convex_parts_around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> GroupConvexParts | None:
         """Convex parts of bodies around receivers of one body: all that block, or some."""
         bodies = self.blocker_kinds.convex
-        chosen, skip = _blocking(bodies, body, of_bodies)
+        chosen, skip = _choose_blocking(bodies, body, of_bodies)
         if self.placed_parts is None or not chosen:
             return None
         return GroupConvexParts(self.parts.blockers(bodies, chosen), self.placed_parts, skip)
@@ -269,7 +269,7 @@ class Blockers(NamedTuple):
         return Group(points, normals, *self.spheres_of(self.bodies), planes=planes, convex_parts_around=parts)
 
 
-def _blocking(
+def _choose_blocking(
     bodies: tuple[int, ...], body: int, of_bodies: Iterable[int] | None
 ) -> tuple[tuple[int, ...], int | None]:
     """Bodies of one kind that block light around a body, () if none but itself does; and which of them it is itself."""

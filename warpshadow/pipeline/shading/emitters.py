@@ -150,17 +150,17 @@ class SceneEmitters:
         from warpshadow.stages.emitters.traced_transmittance import trace_transmittance
 
         merged_scene, samples = self._merged_scene, self.samples
-        at_points, along_normals = (
+        point_array, normal_array = (
             wp.array(item[None], dtype=wp.vec3, device=merged_scene.device) for item in (points, normals)
         )
         placed_samples = place_samples(vertices.reshape((1, -1)), samples)
         radiance = self.radiance(Materials.of_scene(merged_scene)).value(Call(Clock()))
         total = np.zeros(len(points))
         for span in samples.spans():
-            at_samples = samples, vertices, placed_samples.points[0], placed_samples.areas[0], span
-            traced = trace_transmittance(mesh, at_points[0], along_normals[0], *at_samples, rays=1)
-            transmittance = weigh_by_beam(at_points, placed_samples, span, traced.reshape((1, *traced.shape)))
-            light = sum_light(at_points, along_normals, placed_samples, radiance, span, transmittance)
+            sample_arguments = samples, vertices, placed_samples.points[0], placed_samples.areas[0], span
+            traced = trace_transmittance(mesh, point_array[0], normal_array[0], *sample_arguments, rays=1)
+            transmittance = weigh_by_beam(point_array, placed_samples, span, traced.reshape((1, *traced.shape)))
+            light = sum_light(point_array, normal_array, placed_samples, radiance, span, transmittance)
             total += light.numpy()[0] @ LUMINANCE
         return total
 
