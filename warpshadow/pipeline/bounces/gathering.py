@@ -15,7 +15,7 @@ from warpshadow.device.batch import common_batch, cut, expand, expand_rows
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance
 from warpshadow.pipeline.bounces.patches import Senders
-from warpshadow.pipeline.bounces.proxies import ProjectedPatches, Proxies
+from warpshadow.pipeline.bounces.proxies import PlacedProxies, Proxies
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.node import Call, Node, NodeStage
 from warpshadow.pipeline.receivers.groups import Group
@@ -40,7 +40,7 @@ class OutgoingRadiance:
     Args:
         proxies: Proxies of the bodies whose patches they are.
         radiosity: Of the patches, vec3 of shape [batch, patch].
-        projected_patches: The patches as receivers see them.
+        placed_proxies: Their proxies, in the world.
         frames: Where flat bodies are, vec3 of shape [batch, 3 · plane].
         patch_weights: Of the patches, vec3 of shape [batch, patch].
         texel_weights: Their sums of each texel of flat bodies, vec3 of shape [batch, texel]; None without any.
@@ -50,13 +50,13 @@ class OutgoingRadiance:
         self,
         proxies: Proxies,
         radiosity: wp.array,
-        projected_patches: ProjectedPatches,
+        placed_proxies: PlacedProxies,
         frames: wp.array,
         patch_weights: wp.array,
         texel_weights: wp.array | None,
     ):
         self.proxies, self.senders, self.radiosity = proxies, proxies.senders, radiosity
-        self.projected_patches, self.frames = projected_patches, frames
+        self.placed_proxies, self.frames = placed_proxies, frames
         self.patch_weights, self.texel_weights = patch_weights, texel_weights
 
     def of_body(self, body: int) -> wp.array:
@@ -67,11 +67,13 @@ class OutgoingRadiance:
     @functools.cached_property
     def proxy_radiance(self) -> wp.array:
         """Light that proxies of patches send towards cells, vec4 of shape [batch, proxy, cell]."""
-        proxies, radiosity, patches = self.proxies, self.radiosity, self.projected_patches
+        proxies, radiosity, placed_proxies = self.proxies, self.radiosity, self.placed_proxies
         if proxies.overlays is not None:
-            radiosity = overlaid_radiosity(radiosity, cut(patches.centers, 0, radiosity.shape[1]), *proxies.overlays)
+            radiosity = overlaid_radiosity(
+                radiosity, cut(placed_proxies.centers, 0, radiosity.shape[1]), *proxies.overlays
+            )
         return find_proxy_radiance(
-            radiosity, patches.areas, self.patch_weights, self.senders.areas, *proxies.seen_patches
+            radiosity, placed_proxies.projected_areas, self.patch_weights, self.senders.areas, *proxies.seen_patches
         )
 
     @functools.cached_property
@@ -173,13 +175,13 @@ class Gathering:
     ) -> wp.array | None:
         if not any(body != group.body and not self._is_flat[body] for body in outgoing.senders.bodies):
             return None
-        projected_patches, proxy_radiance = outgoing.projected_patches, outgoing.proxy_radiance
+        placed_proxies, proxy_radiance = outgoing.placed_proxies, outgoing.proxy_radiance
         softness = self._visibility.softness
         if group.convex_parts_around is not None:
             softness = max(softness, _SOFTNESS_OF_PARTS)
-        count = common_batch({"geometry": group.points, "light": proxy_radiance, "proxies": projected_patches.radii})
+        count = common_batch({"geometry": group.points, "light": proxy_radiance, "proxies": placed_proxies.radii})
         points, normals = expand(group.points, count), expand(group.normals, count)
-        centers, radii = expand(projected_patches.centers, count), expand(projected_patches.radii, count)
+        centers, radii = expand(placed_proxies.centers, count), expand(placed_proxies.radii, count)
         return sphere_light(
             points,
             normals,
@@ -192,8 +194,8 @@ class Gathering:
             softness=softness,
             merging=self._visibility.merging,
             skip=outgoing.proxies.span_of(group.body),
-            clusters=projected_patches.clusters
-            if radii is projected_patches.radii and centers is projected_patches.centers
+            clusters=placed_proxies.clusters
+            if radii is placed_proxies.radii and centers is placed_proxies.centers
             else None,
-            tangent_planes=projected_patches.tangent_planes,
+            tangent_planes=placed_proxies.tangent_planes,
         )

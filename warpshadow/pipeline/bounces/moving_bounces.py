@@ -26,7 +26,7 @@ from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance, find_cell_transmittance
 from warpshadow.pipeline.bounces.gathering import ALL_FLAT, Gathering, OutgoingRadiance
 from warpshadow.pipeline.bounces.patches import OF_PATCH_SAMPLES, ScenePatches, Senders, lit_patch_samples
-from warpshadow.pipeline.bounces.proxies import ProjectedPatches, Proxies
+from warpshadow.pipeline.bounces.proxies import PlacedProxies, Proxies
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.node import Call, Node, NodeStage, identity
@@ -162,7 +162,7 @@ class PatchSampleNodes(NamedTuple):
     points: LitPoints
     visibility: TransferForBounces | ShadingForBounces  # of the patch samples
     frames: Node  # of flat bodies
-    projected_patches: Node  # patches as receivers see them
+    placed_proxies: Node  # proxies of the patches, in the world
     weights: Node  # of patch samples and patches, by how open they are
 
 
@@ -179,7 +179,7 @@ class Radiosity(Node):
         albedo: Node,
         patch_samples: PatchSampleNodes,
     ):
-        _, _, frames, projected_patches, weights = patch_samples
+        _, _, frames, placed_proxies, weights = patch_samples
         self._count, self._proxies, self._self_form_factors, self._gathering = (
             count,
             proxies,
@@ -192,11 +192,11 @@ class Radiosity(Node):
         self._reflection = NodeStage("radiosity", item_text)
         self._self_reflection = NodeStage("self light of patches", item_text, idle)
         stages = self._reflection, self._self_reflection, *gathering.stages
-        super().__init__("", None, lit, albedo, projected_patches, frames, weights, stages=stages)
+        super().__init__("", None, lit, albedo, placed_proxies, frames, weights, stages=stages)
 
     def compute(self, call: Call) -> OutgoingRadiance:
         """Reflect direct light, then light that has bounced once, and so on; more often between patches of one body."""
-        lit, albedo, projected_patches, frames, weights = self.values(call)
+        lit, albedo, placed_proxies, frames, weights = self.values(call)
         senders, count = self._proxies.senders, self._count
         self_factors = None  # between patches of one body
         if not self._self_reflection.idle:
@@ -208,7 +208,7 @@ class Radiosity(Node):
         texel_weights = None if planes is None else sum_weights(weights.weights, planes.blockers)
 
         def outgoing_of(radiosity: wp.array) -> OutgoingRadiance:
-            return OutgoingRadiance(self._proxies, radiosity, projected_patches, frames, weights.weights, texel_weights)
+            return OutgoingRadiance(self._proxies, radiosity, placed_proxies, frames, weights.weights, texel_weights)
 
         def radiosity_by_others(radiosity: wp.array | None) -> wp.array:
             """Radiosity of patches by light from the sky and from other bodies."""
@@ -331,18 +331,16 @@ class MovingBounces:
 
         def project(
             patch_samples: Receivers, visibility: list[VisibilityOfPortion | DirectLightOfPortion], *arguments: Any
-        ) -> ProjectedPatches:
-            return proxies.projected_patches(
-                patch_samples, [portion.transmittance for portion in visibility], *arguments
-            )
+        ) -> PlacedProxies:
+            return proxies.place(patch_samples, [portion.transmittance for portion in visibility], *arguments)
 
         arguments = senders, points, proxies.nearest_spheres
         lit_samples = points.cached("patch samples beside proxies", proxies, lambda: lit_patch_samples(*arguments))
         visibility = make_visibility(lit_samples)
         frames = Node("", planes.blockers.frames if planes else lambda _: None, points.vertices)
-        projected_patches = Node("", project, lit_samples.receivers_node, visibility, spheres, frames)
+        placed_proxies = Node("", project, lit_samples.receivers_node, visibility, spheres, frames)
         weights = Node("", functools.partial(_patch_weights, senders), visibility)
-        return PatchSampleNodes(lit_samples, visibility, frames, projected_patches, weights)
+        return PatchSampleNodes(lit_samples, visibility, frames, placed_proxies, weights)
 
     def _radiosity(
         self, patch_samples: PatchSampleNodes, free_light: Node | None, proxies: Proxies, materials: Materials

@@ -35,10 +35,12 @@ class SenderPlanes(NamedTuple):
     index_of_body: dict[int | None, int]  # of each among them, by the number of the body
 
 
-class ProjectedPatches(NamedTuple):
-    """Patches of bodies that are not flat, as their proxy spheres send them."""
+class PlacedProxies(NamedTuple):
+    """Proxy spheres of patches of bodies that are not flat, in the world."""
 
-    areas: wp.array  # part of its area that each shows towards each cell, [batch, patch, cell]; 0 on flat bodies
+    projected_areas: (
+        wp.array
+    )  # part of its area that each shows towards each cell, [batch, patch, cell]; 0 on flat bodies
     centers: wp.array  # of the spheres, vec3 of shape [batch, patch + sphere of dark bodies]
     radii: wp.array  # likewise, 0 for patches of flat bodies
     clusters: ClusterTree
@@ -156,14 +158,14 @@ class Proxies:
         """Sphere nearest to the patch of each patch sample, −1 for none: int32 of shape [patch sample]."""
         return self._blockers[0][self.senders.patch_of_sample]
 
-    def projected_patches(
+    def place(
         self,
         patch_samples: Receivers,
         transmittances: list[CellTransmittance],
         spheres: tuple[wp.array, wp.array],
         frames: wp.array | None,
-    ) -> ProjectedPatches:
-        """Patches as receivers see them.
+    ) -> PlacedProxies:
+        """Place the proxies in the world, with the areas that receivers see of their patches.
 
         Args:
             patch_samples: Where they are lit.
@@ -183,16 +185,16 @@ class Proxies:
         directions, transmittance = transmittances[0].directions, _self_transmittance(transmittances)
         mean_points = multiply(senders.mean, patch_samples.points)
         mean_normals = multiply(senders.mean, patch_samples.normals)
-        placed = place_proxies(mean_points, mean_normals, radii, *self._blockers, self._depths)
+        proxies = place_proxies(mean_points, mean_normals, radii, *self._blockers, self._depths)
         if self.black_bodies:
             others = self.merged_scene.spheres_of(self.black_bodies, spheres)
             counts = [len(senders.areas), others[1].shape[1]]
-            placed = tuple(concatenate(pair, counts) for pair in zip(placed, others, strict=True))
+            proxies = tuple(concatenate(pair, counts) for pair in zip(proxies, others, strict=True))
         areas = find_projected_areas(normals, transmittance, self._mean_of_seen, directions)
-        clusters = find_clusters(*placed, self.merging)
-        proxies = clusters.nodes.centers, *self.patches_of_clusters, self._tolerances
-        tangent_planes = find_tangent_planes(mean_points, mean_normals, *proxies)
-        return ProjectedPatches(areas, *placed, clusters, tangent_planes)
+        clusters = find_clusters(*proxies, self.merging)
+        of_clusters = clusters.nodes.centers, *self.patches_of_clusters, self._tolerances
+        tangent_planes = find_tangent_planes(mean_points, mean_normals, *of_clusters)
+        return PlacedProxies(areas, *proxies, clusters, tangent_planes)
 
 
 def _self_transmittance(transmittances: list[CellTransmittance]) -> wp.array | None:
