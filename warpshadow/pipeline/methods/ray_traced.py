@@ -12,7 +12,9 @@ from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node, NodeStage, detached
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
-from warpshadow.pipeline.shading.method import LightInput, LitLobes, Method
+from warpshadow.pipeline.shading.light_input import LightInput
+from warpshadow.pipeline.shading.lobe_light import LitLobes, LobeVisibility
+from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.gloss.reflection import find_blocked_radiance
 from warpshadow.stages.gloss.traced_lobes import trace_lobes
 from warpshadow.stages.light.light_samples import cut_map, sample_map
@@ -38,8 +40,6 @@ class RayTraced(Method):
 
     every_sample_receives = True
     shares_lobes = True
-    sun_samples = 16
-    lobe_samples = 64  # each is blocked or not: with 32, reflected edges show as many edges
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
         super().__init__(merged_scene, HarmonicBasis(merged_scene.scene.visibility.order), basis, progress=progress)
@@ -50,7 +50,7 @@ class RayTraced(Method):
         return Node(
             f"shading{points.suffix}",
             self._shade_shared if self.shares_directions else self._shade,
-            self._trees_around(points) if self.shares_directions else self._meshes(points),
+            self.trees_around(points) if self.shares_directions else self._meshes(points),
             points.receivers_node,
             light,
             self.shell_of(light),
@@ -105,26 +105,10 @@ class RayTraced(Method):
             for span in samples.spans()
         ]
 
-    def lobe_transmittance(self, lobes: LitLobes, directions: Node) -> Node:
-        """Transmittance towards the samples of lobes: rays, each of its own."""
-        points = lobes.points
-        item_text = functools.partial(receiver_text, points.weak)
-        return Node(
-            "transmittance of lobes",
-            _trace_lobes,
-            self._trees_around(points),
-            points.receivers_node,
-            directions,
-            items=item_text,
-        )
-
-    def blocked_radiance(self, lobes: LitLobes, diffuse: Node, openness: Node | None) -> Node:
-        """Mean radiance of the blockers of receivers, by their light with bounces and without."""
-        points = lobes.points
-        direct, trees = self.direct_shading(lobes.all_points, lobes.light), self._trees_around(points)
-        if openness is None:
-            openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
-        return Node("light of blockers", find_blocked_radiance, diffuse, lobes.select(direct), openness)
+    @functools.cached_property
+    def lobes(self) -> "TracedLobes":
+        """Visibility in lobes, by rays."""
+        return TracedLobes(self)
 
     def transfers(self, points: LitPoints, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""
@@ -141,7 +125,7 @@ class RayTraced(Method):
             node.function = _refuse
         return node
 
-    def _trees_around(self, points: LitPoints) -> Node:
+    def trees_around(self, points: LitPoints) -> Node:
         """Node of the trees of all vertices around points."""
         name, vertices = "visibility" if self.shares_directions else "", points.vertices
         items = f"{len(self.merged_scene.body_of_face):,} faces"
@@ -237,10 +221,37 @@ class RayTraced(Method):
         return [transfer]
 
 
+class TracedLobes(LobeVisibility):
+    """Visibility in lobes by rays, each of its own."""
+
+    sample_count = 64  # each is blocked or not: with 32, reflected edges show as many edges
+    sun_sample_count = 16
+
+    def __init__(self, method: RayTraced):
+        super().__init__(method)
+        self._ray_traced = method
+
+    def transmittance(self, lobes: LitLobes, directions: Node) -> Node:
+        """Transmittance towards the samples of lobes."""
+        points = lobes.points
+        arguments = self._ray_traced.trees_around(points), points.receivers_node, directions
+        item_text = functools.partial(receiver_text, points.weak)
+        return Node("transmittance of lobes", _trace_lobes, *arguments, items=item_text)
+
+    def blocked_radiance(self, lobes: LitLobes, diffuse: Node, openness: Node | None) -> Node:
+        """Mean radiance of the blockers of receivers, by their light with bounces and without."""
+        points = lobes.points
+        direct = self._ray_traced.direct_shading(lobes.all_points, lobes.light)
+        trees = self._ray_traced.trees_around(points)
+        if openness is None:
+            openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
+        return Node("light of blockers", find_blocked_radiance, diffuse, lobes.select(direct), openness)
+
+
 def _trace_lobes(trees: list[FaceTree], receivers: Receivers, directions: wp.array) -> wp.array:
     points, normals, count = _checked_points(receivers.points), receivers.normals, len(directions)
     traced = wp.empty(directions.shape, dtype=wp.float32, device=points.device)
-    for instance in range(count if points.size else 0):
+    for instance in range(count if directions.size else 0):
         point_batch = min(instance, len(points) - 1)
         arguments = points[point_batch], normals[point_batch], directions[instance]
         wp.copy(traced[instance], trace_lobes(trees[min(instance, len(trees) - 1)], *arguments))

@@ -53,14 +53,18 @@ class Suns(NamedTuple):
     solid_angles: np.ndarray  # Ω [sr], [sun]
 
 
-def separate_suns(radiance: np.ndarray) -> tuple[Suns, np.ndarray]:
+class SeparatedLight(NamedTuple):
+    """A map that is separated from its suns."""
+
+    suns: Suns
+    rest: np.ndarray  # the map, in which their pixels are cut to ten times its mean radiance
+
+
+def separate_suns(radiance: np.ndarray) -> SeparatedLight:
     """Separate suns from a map, at most 4: discs of up to 6° in radius that are much brighter than all on average.
 
     Args:
         radiance: Linear RGB, shape [height, 2·height, 3].
-
-    Returns:
-        The suns, and the map, in which their pixels are cut to ten times its mean radiance.
     """
     solid_angles = np.repeat(sh.pixel_solid_angles(len(radiance)), 2 * len(radiance))
     brightness = radiance.mean(axis=2, dtype=np.float64).ravel()
@@ -99,7 +103,8 @@ def separate_suns(radiance: np.ndarray) -> tuple[Suns, np.ndarray]:
     rest = radiance.reshape(-1, 3).copy()
     rest[pixels[is_sun]] *= (1 - shares[is_sun])[:, None]
     columns = np.array([[*direction, *irradiance, size] for direction, irradiance, size in suns]).reshape(-1, 7)
-    return Suns(columns[:, :3], columns[:, 3:6], columns[:, 6]), rest.reshape(radiance.shape)
+    suns_of_map = Suns(columns[:, :3], columns[:, 3:6], columns[:, 6])
+    return SeparatedLight(suns_of_map, rest.reshape(radiance.shape))
 
 
 def directions_in_suns(suns: Suns, count: int) -> np.ndarray:
@@ -258,6 +263,8 @@ def add_suns(lobe_light: LobeLight, lobes: Lobes, suns: Suns, transmittance: wp.
     Differentiable: all but suns.
     """
     device = transmittance.device
+    if not len(suns.directions):
+        return lobe_light
     if transmittance.shape[2] % len(suns.directions):
         raise ValueError(f"transmittance: got {transmittance.shape[2]} directions of {len(suns.directions)} suns")
     arrays = {"lobe_light": lobe_light.straight, "lobes": lobes.normals, "transmittance": transmittance}
