@@ -456,8 +456,7 @@ class SceneRenderer:
             inputs: All that an image takes.
         Returns:
             The stages, which print as a table: whether each runs and on how many items, how long it took last, and why
-            it does or does not run; then the same of the adjoints. Nothing of the call is computed, but where
-            bodies shine the suns of a map that it gives.
+            it does or does not run; then the same of the adjoints. Nothing of the call is computed.
         """
         return self.explain_inputs(inputs, inputs.view)
 
