@@ -65,7 +65,7 @@ def immutable(values: np.ndarray) -> np.ndarray:
     return values
 
 
-class _Identity:
+class Identity:
     """A key that equals those of the same object only, which it holds."""
 
     __slots__ = ("_value",)
@@ -77,13 +77,13 @@ class _Identity:
         return id(self._value)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Identity) and self._value is other._value
+        return isinstance(other, Identity) and self._value is other._value
 
 
 def _key(value: Any) -> Hashable:
     if isinstance(value, np.ndarray):
         if _immutable.get(id(value)) is value:
-            return _Identity(value)
+            return Identity(value)
         return value.tobytes(), value.dtype.str, value.shape
     return str(value) if isinstance(value, wp.Device) else value
 

@@ -13,6 +13,7 @@ from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.batch import common_batch
+from warpshadow.device.constants import Identity
 from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.bodies.geometry import GEOMETRY_DTYPES, PLACED, Geometry, as_geometry
 from warpshadow.pipeline.image_inputs import ImageInputs
@@ -138,19 +139,6 @@ class Arguments:
         return common_batch({"cameras": self._cameras, **dict(zip(self.names, self.tensors, strict=True))})
 
 
-class _ById:
-    """A value that equals itself alone."""
-
-    def __init__(self, value: object):
-        self._value = value
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _ById) and self._value is other._value
-
-    def __hash__(self) -> int:
-        return id(self._value)
-
-
 def _key(value: Any) -> Hashable:
     """Key of an input, which equals the key of others that differ in their tensors alone."""
     if isinstance(value, Slot):
@@ -159,7 +147,7 @@ def _key(value: Any) -> Hashable:
         return *value.arrays().values(), value.rotations, value.moving, value.deformed
     if isinstance(value, ImageInputs):
         return tuple(map(_key, vars(value).values()))
-    return tuple(map(_key, value)) if isinstance(value, list) else _ById(value)
+    return tuple(map(_key, value)) if isinstance(value, list) else Identity(value)
 
 
 def _filled(value: Any, arrays: Sequence[wp.array]) -> Any:
