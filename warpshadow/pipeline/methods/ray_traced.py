@@ -1,7 +1,8 @@
 """The ray-traced method: rays past the meshes themselves. It has no gradient to geometry."""
 
 import functools
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -169,27 +170,25 @@ class RayTraced(Method):
     def _shade(
         self, meshes: Meshes, receivers: Receivers, light: KnownLight, shell: wp.array | None = None
     ) -> wp.array:
-        points, normals, shells = _checked_points(receivers.points), receivers.normals, _shells(receivers, shell)
+        points, shells = _checked_points(receivers.points), _shells(receivers, shell)
         samples = sample_map(light.radiance, self._sample_count)
         traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
-        for instance, mesh in enumerate(meshes):
-            lit_points, own_shell = (points[instance], normals[instance]), shells[min(instance, len(shells) - 1)]
-            lit = trace_shading(mesh, *lit_points, samples, shell=own_shell, progress=self.progress)
-            wp.copy(traced[instance], lit)
+        for result, *lit_points, own_shell in _instances(
+            len(meshes), traced, meshes, points, receivers.normals, shells
+        ):
+            wp.copy(result, trace_shading(*lit_points, samples, shell=own_shell, progress=self.progress))
         return traced
 
     def _shade_shared(
         self, trees: list[FaceTree], receivers: Receivers, light: KnownLight, shell: wp.array | None = None
     ) -> wp.array:
         """Shading by rays in directions that all receivers share, or to points of a shell."""
-        points, normals, progress = _checked_points(receivers.points), receivers.normals, self.progress
-        shells = _shells(receivers, shell)
+        points, shells = _checked_points(receivers.points), _shells(receivers, shell)
         count = -(-self.visibility.ray_count // PACKET) * PACKET
         traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
-        for instance in range(len(points) if points.size else 0):
-            tree = trees[min(instance, len(trees) - 1)]
-            lit_points = tree, points[instance], normals[instance]
-            options = {"shell": shells[min(instance, len(shells) - 1)]}
+        batches = traced, trees, points, receivers.normals, shells
+        for instance, (result, *lit_points, own_shell) in enumerate(_instances(_count(points), *batches)):
+            options = {"shell": own_shell}
             # a ratio image has the same directions with the bodies and without
             pilots = (
                 None if self.merged_scene.scene.catchers else functools.partial(find_shares, *lit_points, **options)
@@ -198,26 +197,19 @@ class RayTraced(Method):
             corners = None
             if receivers.fragments.face_ids.ndim == 3:  # of an image
                 corners = find_corners(receivers, instance, self.merged_scene.scene.supersampling)
-            wp.copy(traced[instance], trace_shared(*lit_points, samples, corners=corners, progress=progress, **options))
+            wp.copy(result, trace_shared(*lit_points, samples, corners=corners, progress=self.progress, **options))
         return traced
 
     def _transfer(self, meshes: Meshes, receivers: Receivers, shell: wp.array | None = None) -> list[wp.array]:
-        points, normals, shells = receivers.points, receivers.normals, _shells(receivers, shell)
+        points, shells = receivers.points, _shells(receivers, shell)
         transfer = wp.empty((*points.shape, self.basis.size), dtype=wp.float32, device=points.device)
         functions, count = self.basis.functions, self.visibility.ray_count
         if isinstance(self.basis, CellBasis):
             functions, count = self.basis.balanced_functions, max(count, _RAYS_OF_CELL * self.basis.size)
-        for instance, mesh in enumerate(meshes):
-            traced = trace_transfer(
-                mesh,
-                points[instance],
-                normals[instance],
-                functions,
-                count,
-                shell=shells[min(instance, len(shells) - 1)],
-                progress=self.progress,
-            )
-            wp.copy(transfer[instance], traced)
+        batches = transfer, meshes, points, receivers.normals, shells
+        for result, *lit_points, own_shell in _instances(len(meshes), *batches):
+            traced = trace_transfer(*lit_points, functions, count, shell=own_shell, progress=self.progress)
+            wp.copy(result, traced)
         return [transfer]
 
 
@@ -249,24 +241,32 @@ class TracedLobes(LobeVisibility):
 
 
 def _trace_lobes(trees: list[FaceTree], receivers: Receivers, directions: wp.array) -> wp.array:
-    points, normals, count = _checked_points(receivers.points), receivers.normals, len(directions)
+    points = _checked_points(receivers.points)
     traced = wp.empty(directions.shape, dtype=wp.float32, device=points.device)
-    for instance in range(count if directions.size else 0):
-        point_batch = min(instance, len(points) - 1)
-        arguments = points[point_batch], normals[point_batch], directions[instance]
-        wp.copy(traced[instance], trace_lobes(trees[min(instance, len(trees) - 1)], *arguments))
+    for result, *arguments in _instances(_count(directions), traced, trees, points, receivers.normals, directions):
+        wp.copy(result, trace_lobes(*arguments))
     return traced
 
 
 def _openness(trees: list[FaceTree], receivers: Receivers) -> wp.array:
     """Light under an even sky of 1, vec3 of shape [batch, receiver]."""
-    points, normals = _checked_points(receivers.points), receivers.normals
-    result = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
+    points = _checked_points(receivers.points)
+    openness = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
     samples = cut_map(np.ones((64, 128, 3), np.float32), _EVEN_RAYS)
-    for instance in range(len(points) if points.size else 0):
-        arguments = trees[min(instance, len(trees) - 1)], points[instance], normals[instance], samples
-        wp.copy(result[instance], trace_shared(*arguments))
-    return result
+    for result, *lit_points in _instances(_count(points), openness, trees, points, receivers.normals):
+        wp.copy(result, trace_shared(*lit_points, samples))
+    return openness
+
+
+def _count(array: wp.array) -> int:
+    """Number of instances; 0 where nothing is in them."""
+    return len(array) if array.size else 0
+
+
+def _instances(count: int, *batches: Sequence[Any] | wp.array | np.ndarray) -> Iterator[tuple[Any, ...]]:
+    """The parts of one instance after another; the last of a batch serves all after it."""
+    for instance in range(count):
+        yield tuple(batch[min(instance, len(batch) - 1)] for batch in batches)
 
 
 def _checked_points(points: wp.array) -> wp.array:
