@@ -69,13 +69,13 @@ class RayTraced(Method):
 
     def emitted_light(self, points: LitPoints, materials: Materials) -> Node:
         """Direct light of emitters on points, by rays to their samples. Differentiable: emission."""
-        return self.emitters.traced_light(
-            *self._rays_to_emitters(points, materials), f"light of emitters{points.suffix}"
-        )
+        name = f"light of emitters{points.suffix}"
+        return Node(name, self.emitters.traced_light, *self._rays_to_emitters(points, materials))
 
     def highlights(self, points: LitPoints, materials: Materials, roughness: Node, cameras: Input) -> Node:
         """Direct light of emitters in the lobes of points, by rays to their samples."""
-        return self.emitters.traced_highlights(*self._rays_to_emitters(points, materials), roughness, cameras)
+        rays = self._rays_to_emitters(points, materials)
+        return Node("highlights", self.emitters.traced_highlights, *rays, roughness, cameras)
 
     def _rays_to_emitters(self, points: LitPoints, materials: Materials) -> tuple[Node, Node, Node, Node]:
         """Receivers, samples, their radiance, and the transmittance between."""

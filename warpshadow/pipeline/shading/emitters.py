@@ -106,25 +106,19 @@ class SceneEmitters:
         return EmitterBeams(merged_scene.emitter_beams, self._over_all_vertices(of_vertices), of_emitting_faces)
 
     def emission_towards_cameras(
-        self, emission: Node, fragments: Node, vertices: Input, cameras: Input, placed_samples: Node
-    ) -> Node:
-        """Node of the emission that samples of an image show, given all of it, vec3 of shape [batch, height, width]."""
-        merged_scene = self._merged_scene
-
-        def show(
-            emission: wp.array,
-            fragments: Fragments,
-            vertices: wp.array,
-            cameras: wp.array,
-            placed_samples: PlacedSamples,
-        ) -> wp.array:
-            beams = self.samples.beams
-            assert beams is not None
-            emitter_of_face = constant(merged_scene.emitter_of_face, wp.int32, merged_scene.device)
-            seen = fragments, merged_scene.faces, vertices, cameras
-            return show_beams(emission, *seen, placed_samples, emitter_of_face, beams.beams)
-
-        return Node("beams", show, emission, fragments, vertices, cameras, placed_samples)
+        self,
+        emission: wp.array,
+        fragments: Fragments,
+        vertices: wp.array,
+        cameras: wp.array,
+        placed_samples: PlacedSamples,
+    ) -> wp.array:
+        """Emission that samples of an image show, given all of it, vec3 of shape [batch, height, width]."""
+        merged_scene, beams = self._merged_scene, self.samples.beams
+        assert beams is not None
+        emitter_of_face = constant(merged_scene.emitter_of_face, wp.int32, merged_scene.device)
+        seen = fragments, merged_scene.faces, vertices, cameras
+        return show_beams(emission, *seen, placed_samples, emitter_of_face, beams.beams)
 
     @functools.cached_property
     def self_visibility(self) -> list[EmitterSelfVisibility | None]:
@@ -167,10 +161,10 @@ class SceneEmitters:
     def samples_node(self, points: LitPoints) -> Node:
         """Node of the samples among the bodies around points."""
 
-        def place(vertices: wp.array) -> PlacedSamples:
-            return place_samples(vertices, self.samples)
+        return points.cached_of_bodies("emitters", None, lambda: Node("", self._place, points.vertices))
 
-        return points.cached_of_bodies("emitters", None, lambda: Node("", place, points.vertices))
+    def _place(self, vertices: wp.array) -> PlacedSamples:
+        return place_samples(vertices, self.samples)
 
     def radiance(self, materials: Materials) -> Node:
         """Node of the samples' radiance, vec3 of shape [batch, sample]."""
@@ -205,44 +199,27 @@ class SceneEmitters:
         return self._texel_matrices[number, size]
 
     def traced_light(
-        self, receivers: Node, placed_samples: Node, radiance: Node, transmittance: Node, name: str
-    ) -> Node:
-        """Node of their light on receivers, given the transmittance to the samples of each, a list."""
-
-        def light(
-            receivers: Receivers, placed_samples: PlacedSamples, radiance: wp.array, transmittance: list[wp.array]
-        ) -> wp.array:
-            lit = receivers.points, receivers.normals, placed_samples, radiance
-            pairs = self._within_beams(receivers, placed_samples, transmittance)
-            return add_light(*(sum_light(*lit, *pair) for pair in pairs))
-
-        return Node(name, light, receivers, placed_samples, radiance, transmittance)
+        self, receivers: Receivers, placed_samples: PlacedSamples, radiance: wp.array, transmittance: list[wp.array]
+    ) -> wp.array:
+        """Their light on receivers, given the transmittance to the samples of each."""
+        lit = receivers.points, receivers.normals, placed_samples, radiance
+        pairs = self._within_beams(receivers, placed_samples, transmittance)
+        return add_light(*(sum_light(*lit, *pair) for pair in pairs))
 
     def traced_highlights(
         self,
-        receivers: Node,
-        placed_samples: Node,
-        radiance: Node,
-        transmittance: Node,
-        roughness: Node,
-        cameras: Input,
-    ) -> Node:
-        """Node of their light in the lobes of receivers, G and G', given transmittance as for :meth:`traced_light`."""
-
-        def highlights(
-            receivers: Receivers,
-            placed_samples: PlacedSamples,
-            radiance: wp.array,
-            transmittance: list[wp.array],
-            roughness: wp.array,
-            clip_matrices: wp.array,
-        ) -> LobeLight:
-            seen = receivers.points, receivers.normals, roughness, clip_matrices, placed_samples, radiance
-            pairs = self._within_beams(receivers, placed_samples, transmittance)
-            of_emitters = [sum_highlights(*seen, *pair) for pair in pairs]
-            return LobeLight(*(add_light(*parts) for parts in zip(*of_emitters, strict=True)))
-
-        return Node("highlights", highlights, receivers, placed_samples, radiance, transmittance, roughness, cameras)
+        receivers: Receivers,
+        placed_samples: PlacedSamples,
+        radiance: wp.array,
+        transmittance: list[wp.array],
+        roughness: wp.array,
+        clip_matrices: wp.array,
+    ) -> LobeLight:
+        """Their light in the lobes of receivers, G and G', given transmittance as for :meth:`traced_light`."""
+        seen = receivers.points, receivers.normals, roughness, clip_matrices, placed_samples, radiance
+        pairs = self._within_beams(receivers, placed_samples, transmittance)
+        of_emitters = [sum_highlights(*seen, *pair) for pair in pairs]
+        return LobeLight(*(add_light(*parts) for parts in zip(*of_emitters, strict=True)))
 
     def _within_beams(
         self, receivers: Receivers, placed_samples: PlacedSamples, transmittance: list[wp.array]

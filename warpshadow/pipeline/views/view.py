@@ -229,10 +229,8 @@ class View(LitPoints):
         """Node of the part of emission that goes towards the cameras; itself where no emitter has a beam."""
         if not self.merged_scene.has_beams:
             return emission
-        emitters = self.method.emitters
-        return emitters.emission_towards_cameras(
-            emission, self.fragments_node, self.vertices, self.cameras, emitters.samples_node(self)
-        )
+        emitters, inputs = self.method.emitters, (self.fragments_node, self.vertices, self.cameras)
+        return Node("beams", emitters.emission_towards_cameras, emission, *inputs, emitters.samples_node(self))
 
     def _sum_of(self, first: Node, second: Node) -> Node:
         """Node of the samples, of light of two kinds."""
