@@ -313,9 +313,8 @@ class SceneRenderer:
             Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]; the background is 0.
         Differentiable: all; not by "ray-traced": geometry, clip_matrices, shell.
         """
-        if inputs.view is None and inputs.geometry is None and inputs.clip_matrices is None:
-            return self.draw_inputs(inputs, self._scene_view)
-        return self.draw_inputs(inputs, inputs.view)
+        is_of_scene = inputs.view is None and inputs.geometry is None and inputs.clip_matrices is None
+        return self.draw_inputs(inputs, self._scene_view if is_of_scene else inputs.view)  # the former warns
 
     @announced
     def draw_inputs(self, inputs: ImageArrays, view: View | None = None) -> wp.array:
