@@ -173,10 +173,9 @@ class RayTraced(Method):
         points, shells = _checked_points(receivers.points), _shells(receivers, shell)
         samples = sample_map(light.radiance, self._sample_count)
         traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
-        for result, *lit_points, own_shell in _instances(
-            len(meshes), traced, meshes, points, receivers.normals, shells
-        ):
-            wp.copy(result, trace_shading(*lit_points, samples, shell=own_shell, progress=self.progress))
+        batches = traced, meshes, points, receivers.normals, shells
+        for result, mesh, origins, normals, own_shell in _instances(len(meshes), *batches):
+            wp.copy(result, trace_shading(mesh, origins, normals, samples, shell=own_shell, progress=self.progress))
         return traced
 
     def _shade_shared(
@@ -187,8 +186,8 @@ class RayTraced(Method):
         count = -(-self.visibility.ray_count // PACKET) * PACKET
         traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
         batches = traced, trees, points, receivers.normals, shells
-        for instance, (result, *lit_points, own_shell) in enumerate(_instances(_count(points), *batches)):
-            options = {"shell": own_shell}
+        for instance, (result, tree, origins, normals, own_shell) in enumerate(_instances(_count(points), *batches)):
+            lit_points, options = (tree, origins, normals), {"shell": own_shell}
             # a ratio image has the same directions with the bodies and without
             pilots = (
                 None if self.merged_scene.scene.catchers else functools.partial(find_shares, *lit_points, **options)
@@ -207,8 +206,9 @@ class RayTraced(Method):
         if isinstance(self.basis, CellBasis):
             functions, count = self.basis.balanced_functions, max(count, _RAYS_OF_CELL * self.basis.size)
         batches = transfer, meshes, points, receivers.normals, shells
-        for result, *lit_points, own_shell in _instances(len(meshes), *batches):
-            traced = trace_transfer(*lit_points, functions, count, shell=own_shell, progress=self.progress)
+        for result, mesh, origins, normals, own_shell in _instances(len(meshes), *batches):
+            arguments = mesh, origins, normals, functions, count
+            traced = trace_transfer(*arguments, shell=own_shell, progress=self.progress)
             wp.copy(result, traced)
         return [transfer]
 
@@ -253,8 +253,8 @@ def _openness(trees: list[FaceTree], receivers: Receivers) -> wp.array:
     points = _checked_points(receivers.points)
     openness = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
     samples = cut_map(np.ones((64, 128, 3), np.float32), _EVEN_RAYS)
-    for result, *lit_points in _instances(_count(points), openness, trees, points, receivers.normals):
-        wp.copy(result, trace_shared(*lit_points, samples))
+    for result, tree, origins, normals in _instances(_count(points), openness, trees, points, receivers.normals):
+        wp.copy(result, trace_shared(tree, origins, normals, samples))
     return openness
 
 

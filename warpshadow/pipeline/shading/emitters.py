@@ -20,7 +20,7 @@ from warpshadow.device.constants import constant
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
-from warpshadow.pipeline.node import Call, Clock, Input, Node
+from warpshadow.pipeline.node import Call, Clock, Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.stages.bounces.albedo import mean_over_texels
 from warpshadow.stages.emitters.beams import find_axis_weights, weigh_by_beam
@@ -160,7 +160,6 @@ class SceneEmitters:
 
     def samples_node(self, points: LitPoints) -> Node:
         """Node of the samples among the bodies around points."""
-
         return points.cached_of_bodies("emitters", None, lambda: Node("", self._place, points.vertices))
 
     def _place(self, vertices: wp.array) -> PlacedSamples:

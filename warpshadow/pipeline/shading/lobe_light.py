@@ -134,7 +134,7 @@ class LobeVisibility:
         Args:
             lobes: The receivers.
             diffuse: Node of their shading.
-            openness: Of them, as of :meth:`.LightTransport.openness`.
+            openness: Of them, by the rays along which light bounces, vec3 of shape [batch, receiver]; None to find it.
         """
         raise NotImplementedError
 
