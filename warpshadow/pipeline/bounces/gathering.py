@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import warp as wp
 
@@ -26,12 +27,21 @@ from warpshadow.stages.bounces.plane_texels import find_texels
 from warpshadow.stages.bounces.proxy_radiance import find_proxy_radiance
 from warpshadow.stages.bounces.self_light import self_light
 from warpshadow.stages.bounces.sphere_light import sphere_light
+from warpshadow.stages.light.sums import add_light
 
 ALL_FLAT = "all that reflects is flat"  # why no body sends light to itself, in words
 
 _SOFTNESS_OF_PARTS = 1.0
 """κ of proxies where convex parts block, at least: parts are seen by a cell's whole disc, of radius ρ. With less, cells
 that parts block have no proxy in them, which loses light, and light jumps as a proxy comes or goes."""
+
+
+class PortionForBounces(NamedTuple):
+    """Some receivers, and their visibility of bounced light."""
+
+    direct: wp.array  # direct light, vec3 of shape [batch, receiver]; if it is free, transfer vectors
+    group: Group
+    transmittance: CellTransmittance
 
 
 class OutgoingRadiance:
@@ -124,19 +134,18 @@ class Gathering:
         first = 1 if only_others else 0
         self.stages, self._functions = stages[first:], functions[first:]
 
-    def lights(
-        self, node: Node, call: Call, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance
-    ) -> list[wp.array]:
-        """Bounced light of a group by each path: its own body, planes, spheres; vec3 of shape [batch, receiver].
+    def add_bounced(self, node: Node, call: Call, portion: PortionForBounces, outgoing: OutgoingRadiance) -> wp.array:
+        """Add bounced light to direct light of a portion, by each path: its own body, planes, spheres.
 
-        ``node`` has the stages.
+        ``node`` has the stages. The result is vec3 of shape [batch, receiver].
         """
-        result = []
+        lights = [portion.direct]
         for stage, function in zip(self.stages, self._functions, strict=True):
             if not stage.idle:
                 with node.timed(call, stage):
-                    result.append(function(group, transmittance, outgoing))
-        return [light for light in result if light is not None]
+                    bounced = function(portion.group, portion.transmittance, outgoing)
+                lights += [] if bounced is None else [bounced]
+        return add_light(*lights)
 
     def _from_itself(self, group: Group, _: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
         own = group.own

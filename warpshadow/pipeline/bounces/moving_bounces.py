@@ -23,14 +23,13 @@ import warp as wp
 
 from warpshadow.device.batch import cut
 from warpshadow.pipeline.bodies.reflectance import Materials
-from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance, find_cell_transmittance
-from warpshadow.pipeline.bounces.gathering import ALL_FLAT, Gathering, OutgoingRadiance
+from warpshadow.pipeline.bounces.cell_transmittance import find_cell_transmittance
+from warpshadow.pipeline.bounces.gathering import ALL_FLAT, Gathering, OutgoingRadiance, PortionForBounces
 from warpshadow.pipeline.bounces.patches import OF_PATCH_SAMPLES, ScenePatches, Senders, lit_patch_samples
 from warpshadow.pipeline.bounces.proxies import PlacedProxies, Proxies
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.node import Call, Node, NodeStage, identity
-from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.sphere_method import (
@@ -49,44 +48,29 @@ from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.receivers.find import Receivers
 
 
-class VisibilityOfPortion(NamedTuple):
-    """Some receivers, and their visibility, which holds for any free light."""
-
-    transfer: wp.array  # of direct light, [batch, receiver, coefficient]
-    group: Group
-    transmittance: CellTransmittance
-
-
-class DirectLightOfPortion(NamedTuple):
-    """Some receivers in direct light, and their visibility of bounced light."""
-
-    direct: wp.array  # vec3 of shape [batch, receiver]
-    group: Group
-    transmittance: CellTransmittance
-
-
 class TransferForBounces(PortionedTransfer):
-    """Visibility of receivers for direct and bounced light, a list of :class:`VisibilityOfPortion`: in free light."""
+    """Receivers in free light, a list of :class:`PortionForBounces`: transfer vectors, and transmittance of cells."""
 
-    def result_of(self, portion: LitPortion) -> VisibilityOfPortion:
+    def result_of(self, portion: LitPortion) -> PortionForBounces:
         """Visibility of a portion."""
-        return VisibilityOfPortion(portion.result, portion.group, _find_transmittance(self.method, portion))
+        return _portion_for_bounces(self.method, portion)
 
 
 class ShadingForBounces(PortionedShading):
-    """Direct light of receivers, and their visibility of bounced light, a list of :class:`DirectLightOfPortion`."""
+    """Receivers in known light, a list of :class:`PortionForBounces`: direct light, and transmittance of cells."""
 
     def compute(self, call: Call) -> Any:
         """Shade all portions."""
         return list(self.portions(call))
 
-    def result_of(self, portion: LitPortion) -> DirectLightOfPortion:
+    def result_of(self, portion: LitPortion) -> PortionForBounces:
         """Light and visibility of a portion."""
-        return DirectLightOfPortion(portion.result, portion.group, _find_transmittance(self.method, portion))
+        return _portion_for_bounces(self.method, portion)
 
 
-def _find_transmittance(method: SphereMethod, portion: LitPortion) -> CellTransmittance:
-    return find_cell_transmittance(method, portion.group, portion.visibility, portion.spheres)
+def _portion_for_bounces(method: SphereMethod, portion: LitPortion) -> PortionForBounces:
+    transmittance = find_cell_transmittance(method, portion.group, portion.visibility, portion.spheres)
+    return PortionForBounces(portion.result, portion.group, transmittance)
 
 
 class PortionedDirectLight(Node):
@@ -121,18 +105,15 @@ class PortionedDirectLight(Node):
         (free_light,) = self.values(call)
         return [self._light(call, portion, free_light) for portion in self._visibility.value(call)]
 
-    def _light(
-        self, call: Call, portion: VisibilityOfPortion | DirectLightOfPortion, free_light: ProjectedLight | None
-    ) -> DirectLightOfPortion:
-        if isinstance(portion, DirectLightOfPortion):
+    def _light(self, call: Call, portion: PortionForBounces, free_light: ProjectedLight | None) -> PortionForBounces:
+        if free_light is None:
             return portion
-        assert free_light is not None
         with self.timed(call, self._shading):
-            direct = self._visibility.method.shade_transfer(portion.transfer, portion.group, free_light)
-        return DirectLightOfPortion(direct, portion.group, portion.transmittance)
+            direct = self._visibility.method.shade_transfer(portion.direct, portion.group, free_light)
+        return portion._replace(direct=direct)
 
 
-def _patch_weights(senders: Senders, visibility: list[VisibilityOfPortion | DirectLightOfPortion]) -> PatchWeights:
+def _patch_weights(senders: Senders, visibility: list[PortionForBounces]) -> PatchWeights:
     """Weights of patch samples and patches by how open they are."""
     portions = [
         find_mean_transmittance(
@@ -146,7 +127,7 @@ def _patch_weights(senders: Senders, visibility: list[VisibilityOfPortion | Dire
     return find_patch_weights(join_portions(portions), senders.mean, senders.patch_of_sample)
 
 
-def _add_emitted(lit: list[DirectLightOfPortion], emitted: wp.array) -> list[DirectLightOfPortion]:
+def _add_emitted(lit: list[PortionForBounces], emitted: wp.array) -> list[PortionForBounces]:
     """Add direct light of emitters, vec3 of shape [batch, receiver], to that of portions."""
     result, first = [], 0
     for portion in lit:
@@ -180,13 +161,8 @@ class Radiosity(Node):
         patch_samples: PatchSampleNodes,
     ):
         _, _, frames, placed_proxies, weights = patch_samples
-        self._count, self._proxies, self._self_form_factors, self._gathering = (
-            count,
-            proxies,
-            self_form_factors,
-            gathering,
-        )
-        senders = proxies.senders
+        self._count, self._proxies, senders = count, proxies, proxies.senders
+        self._self_form_factors, self._gathering = self_form_factors, gathering
         item_text = f"{len(senders.areas):,} patches"
         idle = ALL_FLAT if all(senders.merged_scene.is_flat[body] for body in senders.bodies) else ""
         self._reflection = NodeStage("radiosity", item_text)
@@ -216,7 +192,7 @@ class Radiosity(Node):
                 portions = [portion.direct for portion in lit]
             else:
                 outgoing = outgoing_of(radiosity)
-                portions = [self._light(call, portion, outgoing) for portion in lit]
+                portions = [self._gathering.add_bounced(self, call, portion, outgoing) for portion in lit]
             with self.timed(call, self._reflection):
                 return patch_radiosity(albedo, join_portions(portions), senders.mean, weights.shares)
 
@@ -230,11 +206,6 @@ class Radiosity(Node):
         return outgoing_of(
             after_bounces(count, radiosity_by_others, add_radiosity_by_self, senders.areas, self_bounces=self_bounces)
         )
-
-    def _light(self, call: Call, portion: DirectLightOfPortion, outgoing: OutgoingRadiance) -> wp.array:
-        """Light of a portion of the patch samples past its own body, from the sky and from others."""
-        bounced = self._gathering.lights(self, call, portion.group, portion.transmittance, outgoing)
-        return add_light(portion.direct, *bounced)
 
 
 class BouncedShading(PortionedDirectLight):
@@ -261,13 +232,8 @@ class BouncedShading(PortionedDirectLight):
         """Light all portions, directly and by the patches' radiosity."""
         free_light, outgoing = self.values(call)
         portions = self._visibility.value(call) if self._visibility.caches else self._visibility.portions(call)
-        return join_portions(
-            [self._bounced(call, self._light(call, portion, free_light), outgoing) for portion in portions]
-        )
-
-    def _bounced(self, call: Call, portion: DirectLightOfPortion, outgoing: OutgoingRadiance) -> wp.array:
-        bounced = self._gathering.lights(self, call, portion.group, portion.transmittance, outgoing)
-        return add_light(portion.direct, *bounced)
+        lit = (self._light(call, portion, free_light) for portion in portions)
+        return join_portions([self._gathering.add_bounced(self, call, portion, outgoing) for portion in lit])
 
 
 class MovingBounces:
@@ -296,10 +262,7 @@ class MovingBounces:
             materials: Reflectance of the bodies.
         """
         method, senders = self._method, self._patches.senders(materials)
-        projected_light, visibility_light = (
-            method.projected_light(points, light),
-            method.light_of_visibility(points, light),
-        )
+        projected_light = method.projected_light(points, light)
         if not senders.bodies:
             direct = PortionedShading(method, points, projected_light, light)
             return Node("bounces", identity, direct, idle="every body is black")
@@ -307,7 +270,7 @@ class MovingBounces:
         make_visibility = functools.partial(
             TransferForBounces if light.is_free else ShadingForBounces,
             method,
-            projected_light=visibility_light,
+            projected_light=method.light_of_visibility(points, light),
             light=light,
         )
         free_light = projected_light if light.is_free else None
@@ -329,9 +292,7 @@ class MovingBounces:
         """Nodes of the patch samples of the bodies around points."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
 
-        def project(
-            patch_samples: Receivers, visibility: list[VisibilityOfPortion | DirectLightOfPortion], *arguments: Any
-        ) -> PlacedProxies:
+        def project(patch_samples: Receivers, visibility: list[PortionForBounces], *arguments: Any) -> PlacedProxies:
             return proxies.place(patch_samples, [portion.transmittance for portion in visibility], *arguments)
 
         arguments = senders, points, proxies.nearest_spheres
