@@ -33,14 +33,14 @@ class CellLobes(LobeVisibility):
     """
 
     def __init__(self, method: SphereMethod[ProjectedCells, CellVisibility], middles: np.ndarray):
-        super().__init__(method)
-        self._sphere_method, self._middles = method, middles
+        super().__init__(method.merged_scene, method.light, shares_receivers=method.shares_lobes)
+        self._method, self._middles = method, middles
 
     def shading(self, points: LitPoints, light: LightInput) -> Node:
         """Node of the shading of points in known light, and of the transmittance of the glossy ones' cells."""
-        projected_light = self._sphere_method.projected_light(points, light)
-        make = functools.partial(_ShadingWithCells, self._sphere_method, points, projected_light, light)
-        return self._sphere_method.cached_for_light("direct with cells", points, light, make)
+        projected_light = self._method.projected_light(points, light)
+        make = functools.partial(_ShadingWithCells, self._method, points, projected_light, light)
+        return self._method.cached_for_light("direct with cells", points, light, make)
 
     def _cells(self, lobes: LitLobes) -> tuple[Node, Node, Node | ProjectedCells]:
         """Nodes of the transmittance of cells and of their receivers, and the projected light that says which cells.
@@ -48,10 +48,10 @@ class CellLobes(LobeVisibility):
         In known light that does not bounce the shading of the view has found it.
         """
         points, light = lobes.points, lobes.light
-        visibility_light = self._sphere_method.light_of_visibility(points, light)
-        if light.is_free or self._sphere_method.merged_scene.scene.bounces:
+        visibility_light = self._method.light_of_visibility(points, light)
+        if light.is_free or self._merged_scene.scene.bounces:
             make = functools.partial(
-                _TransmittanceOfCells, self._sphere_method, points, visibility_light, None, suffix=" of gloss"
+                _TransmittanceOfCells, self._method, points, visibility_light, None, suffix=" of gloss"
             )
             return points.cached("cells", light.visibility_key, make), points.receivers_node, visibility_light
         transmittance = field_of(self.shading(lobes.all_points, light), "transmittance")
@@ -87,9 +87,7 @@ class CellLobes(LobeVisibility):
         if projected_light.patches is not None:
             arguments = receivers.points, receivers.normals, transmittance, projected_light.blocking_directions
             transfer = projected_light.patches.transfer(*arguments)
-        light = (
-            projected_light.coefficients if free is None else change_basis(free, self._sphere_method.native_from_basis)
-        )
+        light = projected_light.coefficients if free is None else change_basis(free, self._method.native_from_basis)
         assert light is not None
         even = wp.full((1, transmittance.shape[2]), wp.vec3(1.0), dtype=wp.vec3, device=diffuse.device)
         direct, openness = shade(transfer, light, maximum=LARGEST_COEFFICIENT), shade(of_cells, even)

@@ -220,21 +220,21 @@ class TracedLobes(LobeVisibility):
     sun_sample_count = 16
 
     def __init__(self, method: RayTraced):
-        super().__init__(method)
-        self._ray_traced = method
+        super().__init__(method.merged_scene, method.light, shares_receivers=method.shares_lobes)
+        self._method = method
 
     def transmittance(self, lobes: LitLobes, directions: Node) -> Node:
         """Transmittance towards the samples of lobes."""
         points = lobes.points
-        arguments = self._ray_traced.trees_around(points), points.receivers_node, directions
+        arguments = self._method.trees_around(points), points.receivers_node, directions
         item_text = functools.partial(receiver_text, points.weak)
         return Node("transmittance of lobes", _trace_lobes, *arguments, items=item_text)
 
     def blocked_radiance(self, lobes: LitLobes, diffuse: Node, openness: Node | None) -> Node:
         """Mean radiance of the blockers of receivers, by their light with bounces and without."""
         points = lobes.points
-        direct = self._ray_traced.direct_shading(lobes.all_points, lobes.light)
-        trees = self._ray_traced.trees_around(points)
+        direct = self._method.direct_shading(lobes.all_points, lobes.light)
+        trees = self._method.trees_around(points)
         if openness is None:
             openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
         return Node("light of blockers", find_blocked_radiance, diffuse, lobes.select(direct), openness)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import warp as wp
 
@@ -12,7 +12,7 @@ from warpshadow.assets.known_light import KnownLight
 from warpshadow.device.batch import expand
 from warpshadow.device.constants import constant
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
-from warpshadow.pipeline.node import Input, Node, field_of
+from warpshadow.pipeline.node import Node, field_of
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.stages.gloss.prefilter import prefilter
@@ -31,17 +31,6 @@ class LitLobes(NamedTuple):
     select: Callable[[Node], Node]  # of a node of light on all_points makes one of light on points
 
 
-class ShadingMethod(Protocol):
-    """The members of :class:`.Method` that lobes ask for."""
-
-    merged_scene: MergedScene
-    light: LightInput
-    shares_lobes: bool
-
-    def shell_of(self, light: LightInput) -> Input | wp.array | None:
-        """Center and radius of the sphere that sends light."""
-
-
 class LobeVisibility:
     """How a method blocks light in lobes.
 
@@ -55,7 +44,9 @@ class LobeVisibility:
     | :meth:`blocked_radiance` | light that bounces | refused |
 
     Args:
-        method: The method.
+        merged_scene: The bodies.
+        scene_light: Their light.
+        shares_receivers: As :attr:`.Method.shares_lobes`.
     """
 
     sample_count = 32
@@ -64,13 +55,14 @@ class LobeVisibility:
 
     sun_sample_count = 1  # directions in which each sun is looked for from the lobe of a receiver
 
-    def __init__(self, method: ShadingMethod):
-        self._method, self._of_scene = method, dict[str, Node]()
+    def __init__(self, merged_scene: MergedScene, scene_light: LightInput, *, shares_receivers: bool):
+        self._merged_scene, self._scene_light = merged_scene, scene_light
+        self._shares_receivers, self._of_scene = shares_receivers, dict[str, Node]()
 
     @property
     def receivers_across(self) -> int:
         """How many receivers a pixel has across and down, if it sees one face of a body that shines alone."""
-        return 1 if self._method.shares_lobes else self._method.merged_scene.scene.supersampling
+        return 1 if self._shares_receivers else self._merged_scene.scene.supersampling
 
     @property
     def samples_of_receiver(self) -> int:
@@ -79,7 +71,7 @@ class LobeVisibility:
 
     def _cached(self, name: str, points: LitPoints, light: LightInput, make: Callable[[], Node]) -> Node:
         """A node of known light, cached for the scene's light and, with points, for the last other one."""
-        if light is not self._method.light:
+        if light is not self._scene_light:
             return points.cached(name, light, make)
         if name not in self._of_scene:
             self._of_scene[name] = make()
@@ -87,7 +79,7 @@ class LobeVisibility:
 
     def _separated(self, points: LitPoints, light: LightInput) -> Node | None:
         """Node of known light that is separated from its suns; None for light whose suns are not separated."""
-        if light.is_free or self._method.shell_of(light) is not None:
+        if light.is_free or self._merged_scene.scene.shell is not None:
             return None
         return self._cached("separated light", points, light, lambda: Node("", _separate_suns, light))
 
@@ -103,7 +95,7 @@ class LobeVisibility:
 
     def _prefilter(self, light: KnownLight, separated: SeparatedLight | None) -> wp.array:
         radiance = light.radiance if separated is None else separated.rest
-        return constant(prefilter(radiance)[None], wp.vec3, self._method.merged_scene.device)
+        return constant(prefilter(radiance)[None], wp.vec3, self._merged_scene.device)
 
     def transmittance(self, lobes: LitLobes, directions: Node) -> Node:
         """Transmittance towards the samples of lobes, float32 of shape [batch, receiver, sample].

@@ -270,7 +270,7 @@ class Method(abc.ABC):
         """How light in the lobes of bodies that shine is blocked."""
         from warpshadow.pipeline.shading.lobe_light import LobeVisibility
 
-        return LobeVisibility(self)
+        return LobeVisibility(self.merged_scene, self.light, shares_receivers=self.shares_lobes)
 
     def along_paths(self, direct: Node, points: LitPoints, light: LightInput, materials: Materials) -> Node:
         """Shading of points in known light that bounces along paths, added to direct light."""
