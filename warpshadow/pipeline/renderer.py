@@ -31,7 +31,7 @@ from warpshadow.pipeline.node import Clock, Input, Node
 from warpshadow.pipeline.receivers.choice_of_receivers import choose_receivers, receiver_notes, with_receivers
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.receivers.unevenness import NearLight
-from warpshadow.pipeline.shading.transfers import Light, join_transfers
+from warpshadow.pipeline.shading.transfers import Light, join_rows
 from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.catchers import CatchersAlone
 from warpshadow.pipeline.views.layers import LayerArrays, Layers, find_layer_arrays, find_layers
@@ -237,7 +237,7 @@ class SceneRenderer:
                 "shade and draw take free light that bounces, with any method"
             )
         view = self._scene_view
-        return join_transfers(view.transfers.value(self._views.call(view)))
+        return join_rows(view.transfers.value(self._views.call(view)))
 
     @announced
     def shade(self, light: Light | None = None, view: LitPoints | None = None) -> wp.array:

@@ -16,7 +16,7 @@ from warpshadow.device.constants import constant
 from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance
 from warpshadow.pipeline.bounces.patches import Senders
 from warpshadow.pipeline.bounces.scene_overlays import find_overlays
-from warpshadow.pipeline.shading.transfers import join_portions
+from warpshadow.pipeline.shading.transfers import join_rows
 from warpshadow.stages.bounces.projected_areas import find_projected_areas, tilt_normals_off_planes
 from warpshadow.stages.bounces.proxies import find_depths, place_proxies
 from warpshadow.stages.bounces.proxy_radiance import patches_of_clusters
@@ -207,5 +207,4 @@ def _self_transmittance(transmittances: list[CellTransmittance]) -> wp.array | N
         else portion.transmittance_self
         for portion in transmittances
     ]
-    joined = join_portions([row.reshape((len(row), -1)) for row in rows])
-    return joined.reshape((len(joined), -1, rows[0].shape[2]))
+    return join_rows(rows)

@@ -15,7 +15,7 @@ from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.lobe_light import LitLobes, LobeVisibility
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells
 from warpshadow.pipeline.shading.sphere_method import LitPortion, PortionedShading, PortionedVisibility, SphereMethod
-from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, join_portions
+from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, join_portions, join_rows
 from warpshadow.stages.gloss.reflection import find_blocked_radiance
 from warpshadow.stages.gloss.suns import Suns, find_sun_transmittance
 from warpshadow.stages.gloss.transmittance import interpolate_transmittance
@@ -137,11 +137,10 @@ def _transmittance_of(portion: LitPortion) -> wp.array | None:
 
 def _join(method: SphereMethod, portions: list[wp.array]) -> wp.array:
     """Join the transmittance of portions, [batch, receiver, direction]. Differentiable: portions."""
-    count = method.merged_scene.scene.direction_count
+    merged_scene = method.merged_scene
     if not portions:
-        return wp.empty((1, 0, count), dtype=wp.float32, device=method.merged_scene.device)
-    rows = join_portions([portion.reshape((len(portion), -1)) for portion in portions])
-    return rows.reshape((len(rows), -1, count))
+        return wp.empty((1, 0, merged_scene.scene.direction_count), dtype=wp.float32, device=merged_scene.device)
+    return join_rows(portions)
 
 
 def _interpolate(

@@ -29,7 +29,7 @@ from warpshadow.stages.shell.beams import FAR, check_within
 if TYPE_CHECKING:  # it is imported where bodies emit
     from warpshadow.stages.emitters.samples import PlacedSamples
 
-Meshes = list[wp.Mesh | None]  # mesh that blocks the light of each instance of receivers; None for no blocker
+Meshes = list[wp.Mesh | None]  # mesh that blocks light of each instance, the last of the rest; None for no blocker
 _RAYS_OF_CELL = 4
 """Least number of rays to a cell of free light, on average."""
 
@@ -162,10 +162,8 @@ class RayTraced(Method):
         return max(1, self.visibility.ray_count // self.merged_scene.scene.supersampling**2)
 
     def _casting_meshes(self, positions: wp.array, receivers: Receivers) -> Meshes:
-        points = receivers.points
-        count = min(len(points) if points.size else 0, len(positions))
-        meshes = [self.merged_scene.casting_mesh(positions[instance]) for instance in range(count)]
-        return [*meshes, *meshes[-1:] * (len(points) - count)]
+        count = min(len(receivers.points) if receivers.points.size else 0, len(positions))
+        return [self.merged_scene.casting_mesh(positions[instance]) for instance in range(count)]
 
     def _shade(
         self, meshes: Meshes, receivers: Receivers, light: KnownLight, shell: wp.array | None = None
@@ -174,7 +172,7 @@ class RayTraced(Method):
         samples = sample_map(light.radiance, self._sample_count)
         traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
         batches = traced, meshes, points, receivers.normals, shells
-        for result, mesh, origins, normals, own_shell in _instances(len(meshes), *batches):
+        for result, mesh, origins, normals, own_shell in _instances(*batches):
             wp.copy(result, trace_shading(mesh, origins, normals, samples, shell=own_shell, progress=self.progress))
         return traced
 
@@ -186,7 +184,7 @@ class RayTraced(Method):
         count = -(-self.visibility.ray_count // PACKET) * PACKET
         traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
         batches = traced, trees, points, receivers.normals, shells
-        for instance, (result, tree, origins, normals, own_shell) in enumerate(_instances(_count(points), *batches)):
+        for instance, (result, tree, origins, normals, own_shell) in enumerate(_instances(*batches)):
             lit_points, options = (tree, origins, normals), {"shell": own_shell}
             # a ratio image has the same directions with the bodies and without
             pilots = (
@@ -206,10 +204,9 @@ class RayTraced(Method):
         if isinstance(self.basis, CellBasis):
             functions, count = self.basis.balanced_functions, max(count, _RAYS_OF_CELL * self.basis.size)
         batches = transfer, meshes, points, receivers.normals, shells
-        for result, mesh, origins, normals, own_shell in _instances(len(meshes), *batches):
-            arguments = mesh, origins, normals, functions, count
-            traced = trace_transfer(*arguments, shell=own_shell, progress=self.progress)
-            wp.copy(result, traced)
+        for result, mesh, origins, normals, own_shell in _instances(*batches):
+            options = {"shell": own_shell, "progress": self.progress}
+            wp.copy(result, trace_transfer(mesh, origins, normals, functions, count, **options))
         return [transfer]
 
 
@@ -243,7 +240,7 @@ class TracedLobes(LobeVisibility):
 def _trace_lobes(trees: list[FaceTree], receivers: Receivers, directions: wp.array) -> wp.array:
     points = _checked_points(receivers.points)
     traced = wp.empty(directions.shape, dtype=wp.float32, device=points.device)
-    for result, *arguments in _instances(_count(directions), traced, trees, points, receivers.normals, directions):
+    for result, *arguments in _instances(traced, trees, points, receivers.normals, directions):
         wp.copy(result, trace_lobes(*arguments))
     return traced
 
@@ -253,20 +250,15 @@ def _openness(trees: list[FaceTree], receivers: Receivers) -> wp.array:
     points = _checked_points(receivers.points)
     openness = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
     samples = cut_map(np.ones((64, 128, 3), np.float32), _EVEN_RAYS)
-    for result, tree, origins, normals in _instances(_count(points), openness, trees, points, receivers.normals):
+    for result, tree, origins, normals in _instances(openness, trees, points, receivers.normals):
         wp.copy(result, trace_shared(tree, origins, normals, samples))
     return openness
 
 
-def _count(array: wp.array) -> int:
-    """Number of instances; 0 where nothing is in them."""
-    return len(array) if array.size else 0
-
-
-def _instances(count: int, *batches: Sequence[Any] | wp.array | np.ndarray) -> Iterator[tuple[Any, ...]]:
-    """The parts of one instance after another; the last of a batch serves all after it."""
-    for instance in range(count):
-        yield tuple(batch[min(instance, len(batch) - 1)] for batch in batches)
+def _instances(results: wp.array, *batches: Sequence[Any] | wp.array | np.ndarray) -> Iterator[tuple[Any, ...]]:
+    """Results of each instance, unless empty, with its part of each batch, of which the last serves the rest."""
+    for instance in range(len(results) if results.size else 0):
+        yield results[instance], *(batch[min(instance, len(batch) - 1)] for batch in batches)
 
 
 def _checked_points(points: wp.array) -> wp.array:

@@ -27,7 +27,7 @@ from warpshadow.stages.gloss.lobes import LobeSamples, sample_lobes
 from warpshadow.stages.gloss.normal_spread import NormalSpread, find_normal_spread
 from warpshadow.stages.gloss.prefilter import look_up_light, prefilter
 from warpshadow.stages.gloss.reflection import LobeLight, mix_reflection, number_runs, sum_lobes
-from warpshadow.stages.gloss.suns import Suns, add_suns
+from warpshadow.stages.gloss.suns import add_suns
 from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.rasterization import Fragments
@@ -99,14 +99,15 @@ class GlossyPoints(LitPoints):
         texels = self._prefiltered(light)
         shell, exits = self.method.shell_of(light), directions
         if shell is not None:
-            exits = Node("", _find_exits, self.receivers_node, directions, shell)
+            exits = Node("", exits_from_shell, field_of(self.receivers_node, "points"), directions, shell)
         radiance = Node("prefiltered light", look_up_light, texels, exits, filters, items=item_text)
         transmittance = visibility.transmittance(lobes, directions)
         lobe_light = Node("gloss", sum_lobes, filters, radiance, transmittance, blocked, items=item_text)
         suns = visibility.suns(self, light)
         if suns is not None:
             sun_transmittance = visibility.sun_transmittance(lobes, suns)
-            lobe_light = Node("suns", _add_suns, lobe_light, samples, suns, sun_transmittance, items=item_text)
+            inputs = lobe_light, field_of(samples, "lobes"), suns, sun_transmittance
+            lobe_light = Node("suns", add_suns, *inputs, items=item_text)
         if materials.emission:
             highlights = self.method.highlights(self, materials, roughness, self._cameras)
             lobe_light = Node("", _add_highlights, lobe_light, highlights)
@@ -195,16 +196,6 @@ def _prefilter_basis(basis: object) -> np.ndarray:
     directions = sh.equirectangular_directions(_CELL_ROWS)
     functions = basis.functions(directions.reshape(-1, 3))  # type: ignore[attr-defined]
     return prefilter(functions.reshape(_CELL_ROWS, 2 * _CELL_ROWS, -1))
-
-
-def _find_exits(receivers: Receivers, directions: wp.array, shell: wp.array) -> wp.array:
-    """Find directions from the center of a shell to where samples of lobes meet it. Differentiable: all."""
-    return exits_from_shell(receivers.points, directions, shell)
-
-
-def _add_suns(lobe_light: LobeLight, samples: LobeSamples, suns: Suns, transmittance: wp.array) -> LobeLight:
-    """Add the light of suns to other light in lobes. Differentiable: all but suns."""
-    return add_suns(lobe_light, samples.lobes, suns, transmittance)
 
 
 def _add_highlights(lobe_light: LobeLight, highlights: LobeLight) -> LobeLight:
